@@ -1,0 +1,171 @@
+"""What the numbers mean, in words: weak directions, outliers, and everything worth a warning.
+
+Takes a :class:`jaxcal.Calibration` whose arrays are numpy's.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxcal.model.parameters import BLOCK_SIZE
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+
+_AXES = {
+    "translation": ("lateral", "elevational", "axial"),
+    "rotation": ("lateral", "elevational", "axial"),
+    "point": ("x", "y", "z"),
+    "scale": ("lateral", "axial"),
+}
+_NOUN = {
+    "translation": "translation along the {} axis",
+    "rotation": "rotation about the {} axis",
+    "point": "target position along the tracker's {}",
+    "scale": "{} pixel scale",
+}
+_OBLIQUE = {
+    "translation": "translation along an oblique axis (lateral {:.2f}, elevational {:.2f}, "
+    "axial {:.2f})",
+    "rotation": "rotation about an oblique axis (lateral {:.2f}, elevational {:.2f}, axial {:.2f})",
+    "point": "target position along the tracker's ({:.2f}, {:.2f}, {:.2f})",
+    "scale": "both pixel scales ({:.2f}, {:.2f})",
+}
+
+OUTLIER_SDS = 5.0
+STEADY = 1e-3
+WEAK_TRANSLATION_MM = 0.3
+
+
+def direction_in_words(vector: np.ndarray, blocks: tuple[str, ...]) -> str:
+    """Name a direction of the unknowns.
+
+    Args:
+        vector: components in scaled units (mm at the lever arm), in the order of ``blocks``.
+        blocks: the unknowns.
+    """
+    parts, start = {}, 0
+    for block in blocks:
+        parts[block] = np.asarray(vector[start : start + BLOCK_SIZE[block]], dtype=float)
+        start += BLOCK_SIZE[block]
+    size = {block: float(np.linalg.norm(part)) for block, part in parts.items()}
+    total = float(np.linalg.norm(vector))
+    if not np.isfinite(total) or total == 0:
+        return "unknown"
+    # X's own blocks lead: a target that moves along with X is a consequence for a person.
+    leading = [block for block in blocks if size[block] > 0.35 * total]
+    named = [block for block in leading if block != "point"] or leading or [max(size, key=size.get)]
+    words = [_block_in_words(block, parts[block]) for block in named]
+    if "point" in leading and "point" not in named:
+        words.append("the target moving along")
+    return " with ".join(words[:3])
+
+
+def _block_in_words(block: str, part: np.ndarray) -> str:
+    unit = part / np.linalg.norm(part)
+    largest = int(np.argmax(np.abs(unit)))
+    if abs(unit[largest]) > 0.9:
+        return _NOUN[block].format(_AXES[block][largest])
+    unit = unit * np.sign(unit[largest])
+    return _OBLIQUE[block].format(*unit)
+
+
+def observability(result: Calibration) -> dict[str, float | str | None]:
+    """The least known direction and what is known only from the prior, as plain values."""
+    from_prior = None
+    if np.any(result.prior_direction != 0):
+        from_prior = direction_in_words(result.prior_direction, result.blocks)
+    return {
+        "condition": _finite(result.condition),
+        "weakest_direction": direction_in_words(result.weakest, result.blocks),
+        "weakest_sd_mm": _finite(result.weakest_sd),
+        "known_only_from_prior": from_prior,
+    }
+
+
+def outliers(result: Calibration) -> list[int]:
+    """Images whose residual stands out by more than five robust SDs in any component.
+
+    They are named, not left out. The SD is the median absolute deviation's, so that the outliers
+    themselves do not hide behind it.
+    """
+    used = np.flatnonzero(result.mask > 0)
+    residual = result.residual[used]
+    if len(used) < 8 or not np.isfinite(residual).all():
+        return []
+    deviation = np.abs(residual - np.median(residual, axis=0))
+    spread = 1.4826 * np.median(deviation, axis=0)
+    # A component without any spread (exact data) has no outliers worth naming.
+    spread = np.maximum(spread, 1e-3 * max(float(result.rms), 1e-9))
+    return [int(i) for i in used[(deviation > OUTLIER_SDS * spread).any(axis=1)]]
+
+
+def warnings(result: Calibration) -> list[str]:
+    """Everything that a person should know before using the answer, most important first."""
+    found: list[str] = []
+    status = result.status
+    sight = observability(result)
+    weakest, from_prior = sight["weakest_direction"], sight["known_only_from_prior"]
+    bounded = result.prior == "bounded"
+    resting = int(np.sum(result.at_bound > 0))
+    used = int(result.images_used)
+    if status == "failed":
+        found.append("the solve failed: its result holds no usable numbers")
+        return found
+    if status == "unobservable":
+        found.append(f"not observable: these images do not determine {weakest}")
+    if status == "max_iterations":
+        found.append(
+            "not converged: the iteration limit was reached "
+            f"(scaled KKT residual {float(result.stationarity):.1e})"
+        )
+    if bounded and from_prior:
+        held = f"{resting} of {used} images rest on it"
+        if resting == 0:
+            held = "no image rests on it, so any value in an interval fits equally well"
+        found.append(f"{from_prior} is fixed by nothing but the bound on the offsets: {held}")
+    if result.searched_start:
+        found.append(
+            "the closed-form start was degenerate (points on a line in the image, too few images, "
+            "or heavy noise); the start was searched for among 24 rotations"
+        )
+    if result.method == "alternating" and result.tolerance_met and result.stationarity > STEADY:
+        found.append(
+            "the alternation stopped on its tolerance while its objective was still falling "
+            f"(scaled KKT residual {float(result.stationarity):.1e})"
+        )
+    if result.prior == "gaussian" and not result.sigma_tuned:
+        found.append(
+            "noise SDs were held fixed, not estimated"
+            + (f": {used} images are fewer than the 8 that it takes" if used < 8 else "")
+        )
+    if np.any(result.sigma_floored):
+        names = [
+            name
+            for name, floored in zip(
+                ("lateral", "range", "elevational"), result.sigma_floored, strict=True
+            )
+            if floored
+        ]
+        found.append(
+            f"the {' and '.join(names)} error is too small to estimate; its SD rests on its floor"
+        )
+    if result.prior == "gaussian" and status == "converged":
+        sd = float(np.sqrt(result.covariance[1, 1]))
+        if sd > WEAK_TRANSLATION_MM:
+            found.append(
+                "translation along the elevational axis is weakly seen "
+                f"(SD {sd:.2f} mm) and rests on offsets that average zero"
+            )
+    named = outliers(result)
+    if named:
+        listed = ", ".join(map(str, named[:10])) + (", ..." if len(named) > 10 else "")
+        found.append(f"images that do not fit the rest: {listed}")
+    return found
+
+
+def _finite(value: np.ndarray | float) -> float | None:
+    number = float(value)
+    return number if np.isfinite(number) else None

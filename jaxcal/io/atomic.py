@@ -1,0 +1,117 @@
+"""Files that are complete or absent, whatever happens while they are written.
+
+The new content goes to a temporary file in the target's own folder, is flushed to the disk, and
+then takes the target's name in one step. A process that is killed in between leaves the target as
+it was, and at worst a hidden file ``.partial-*`` beside it.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from jaxcal.errors import CalibrationError, OutputError
+
+
+@contextmanager
+def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path to write to; it becomes ``target`` when the block ends well.
+
+    Args:
+        target: the file to make or replace. A symbolic link is followed: the file that it names is
+            replaced. An existing file keeps its permissions, a new one gets the umask's.
+
+    Yields:
+        An existing, empty file in the same folder and with the same suffix. The block fills it,
+        and has closed it when it ends.
+
+    Raises:
+        OutputError: on any OSError (no such folder, no permission, a directory, disk full), the
+            block's own included. The temporary file is gone then, and the target as it was; so it
+            is after every other exception, which passes through.
+    """
+    name = os.fspath(target)
+    try:
+        final = Path(os.path.realpath(name))
+        mode = _existing_mode(final)
+        temporary = _create_beside(final, mode)
+    except FileNotFoundError as error:
+        raise OutputError(f"{name}: cannot be written: its folder does not exist") from error
+    except (OSError, ValueError) as error:
+        raise _output_error(name, error) from error
+
+    try:
+        yield temporary
+        if mode is not None:
+            os.chmod(temporary, mode)
+        _flush(temporary, os.O_RDWR)
+        os.replace(temporary, final)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError) and not isinstance(error, CalibrationError):
+            raise _output_error(name, error) from error
+        raise
+    # The file has its name by now. Where folders cannot be flushed (Windows, some network file
+    # systems) a power cut may still bring the old content back, never half of the new one.
+    with suppress(OSError):
+        _flush(final.parent, os.O_RDONLY)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a UTF-8 text file, complete or not at all.
+
+    Args:
+        path: the file to make or replace.
+        text: its content; line ends are written as they are.
+
+    Raises:
+        OutputError: it could not be written; the file is as it was.
+    """
+    # Names of files that are not UTF-8 reach us as lone surrogates, which have no encoding.
+    content = text.encode("utf-8", errors="backslashreplace")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _existing_mode(final: Path) -> int | None:
+    """The permissions of the file to be replaced, or None where there is none."""
+    try:
+        status = final.stat()
+    except FileNotFoundError:
+        return None
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, "it is a directory")
+    # Renaming onto a device (/dev/null, /dev/stdout) or a pipe would destroy it.
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "it is not a regular file")
+    # Renaming needs the folder's permission only: a write-protected file would be lost silently.
+    if not os.access(final, os.W_OK, effective_ids=os.access in os.supports_effective_ids):
+        raise PermissionError(errno.EACCES, "it is write-protected")
+    return stat.S_IMODE(status.st_mode) & 0o777
+
+
+def _create_beside(final: Path, mode: int | None) -> Path:
+    # Not mkstemp: its 0600 would outlive the renaming, and reading the umask means setting it.
+    temporary = final.parent / f".partial-{secrets.token_hex(8)}{final.suffix}"
+    created = 0o666 if mode is None else (mode & 0o666) | 0o600
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, created))
+    return temporary
+
+
+def _flush(path: Path, flags: int) -> None:
+    descriptor = os.open(path, flags)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _output_error(name: str, error: Exception) -> OutputError:
+    reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+    return OutputError(f"{name}: cannot be written: {' '.join(reason.split())}")

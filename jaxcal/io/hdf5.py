@@ -1,0 +1,308 @@
+"""Recordings as HDF5 files: format "jaxcal-recording", version 1.
+
+    /            attrs format, version; complete (false is refused)
+    /probe       optional; attrs kind, elements, pitch_mm, sound_speed_m_s
+    /calibration pose (n, 4, 4) [mm] probe -> tracker, and one of
+                 point (n, 2) [mm: lateral, range], pixel (n, 2) [px: u lateral, v axial],
+                 time_of_flight (n, elements) [s, one-way, NaN = no response; needs /probe];
+                 optional covariance (n, 2, 2) [mm^2, px^2 for pixels], amplitude (n,),
+                 mask (n,) bool, time (n,) [s], max_elevation (n,) [mm];
+                 pixel has attrs spacing_mm [lateral, axial] and face_offset_mm, both optional
+    /test        optional, as /calibration
+    /truth       optional; image_to_probe (4, 4), point (3,), elevation (n,) [mm]
+
+Where both ``point`` and ``time_of_flight`` are there, the points were segmented from the times, and
+they are what is read. Datasets may have a ``units`` attribute; one that differs is refused.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+
+import h5py
+import numpy as np
+
+from jaxcal.errors import FormatError, InputError
+from jaxcal.geometry import check_poses
+from jaxcal.io.atomic import atomic_path
+from jaxcal.io.readable import check_readable, quoted
+from jaxcal.io.untrusted import (
+    Node,
+    UpTo,
+    array,
+    child,
+    flag,
+    group,
+    number,
+    numbers,
+    open_root,
+    text,
+)
+from jaxcal.probe import LinearProbe
+from jaxcal.recording import MINIMUM_IMAGES, Images, Kind, Recording, Truth, make_images, unit_of
+
+FORMAT = "jaxcal-recording"
+VERSION = 1
+IMAGES = UpTo(100_000, "images")
+ELEMENTS = UpTo(4096, "elements")
+
+_SPELLINGS = {
+    "mm": ("mm", "millimeter", "millimeters", "millimetre", "millimetres"),
+    "px": ("px", "pixel", "pixels"),
+    "s": ("s", "second", "seconds"),
+    "mm^2": ("mm^2", "mm2", "mm**2", "mm²"),
+    "px^2": ("px^2", "px2", "px**2", "px²"),
+}
+# Dimensionless, or of any unit: written as "1" and not compared.
+_FREE = "1"
+
+
+def load(path: str | os.PathLike[str]) -> Recording:
+    """Read a recording; the file is not trusted.
+
+    Args:
+        path: an HDF5 file of format "jaxcal-recording", version 1.
+
+    Returns:
+        The checked recording.
+
+    Raises:
+        FormatError: no such file, not HDF5, truncated or damaged, another format, a newer version,
+            incomplete, wrong units, shapes or types, data that lie outside the file, absurd sizes.
+        InputError: well-formed but unusable: NaN, a reflection, metres, fewer than 4 images, a
+            curvilinear probe. Either is one line that starts with the path.
+    """
+    check_readable(path)
+    return _read(path, os.fspath(path))
+
+
+def save(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Write a recording, complete or not at all; what it writes is what :func:`load` reads.
+
+    Args:
+        recording: what to write.
+        path: the file to make or replace.
+
+    Raises:
+        InputError: the recording is one that ``load`` would refuse (its arrays were not checked by
+            :func:`jaxcal.recording.make_images`, or are too large).
+        OutputError: the file could not be written; it is as it was.
+    """
+    # Built in memory: HDF5 takes a full disk badly, an ordinary write reports it.
+    image = io.BytesIO()
+    with h5py.File(image, "w") as file:
+        _write(file, recording)
+    _read(io.BytesIO(image.getvalue()), os.fspath(path))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(image.getvalue())
+
+
+def _read(source: str | os.PathLike[str] | io.BytesIO, name: str) -> Recording:
+    try:
+        with open_root(source) as root:
+            return _read_root(root, name)
+    except InputError as error:
+        raise type(error)(f"{name}: {error}") from None
+
+
+def _read_root(root: Node, name: str) -> Recording:
+    _check_header(root)
+    probe = _read_probe(root)
+    selected = _read_images(root, "calibration", probe, MINIMUM_IMAGES)
+    if selected is None:
+        raise FormatError("has no /calibration: there are no images to calibrate with")
+    return Recording(
+        calibration=selected,
+        test=_read_images(root, "test", probe, minimum=1),
+        truth=_read_truth(root, len(selected)),
+        probe=probe,
+        source=name,
+    )
+
+
+def _check_header(root: Node) -> None:
+    found = text(root, "format")
+    if found != FORMAT:
+        what = "it has no attribute format" if found is None else f"its format is {quoted(found)}"
+        raise FormatError(f"is not a recording: {what}, {FORMAT!r} is needed")
+    version = number(root, "version")
+    if version is None or version < 1 or not version.is_integer():
+        raise FormatError("attribute version must be a whole number from 1")
+    if version > VERSION:
+        raise FormatError(
+            f"is version {version:g} of the recording format; this jaxcal understands version "
+            f"{VERSION}: update jaxcal"
+        )
+    if flag(root, "complete") is False:
+        raise FormatError("is marked incomplete (complete = false): its writer did not finish")
+    _check_units(root, "mm")
+
+
+def _read_probe(root: Node) -> LinearProbe | None:
+    node = group(root, "probe")
+    if node is None:
+        return None
+    kind = text(node, "kind")
+    if kind == "curvilinear":
+        raise InputError("has a curvilinear probe; this version of jaxcal reads linear probes only")
+    if kind != "linear":
+        what = "missing" if kind is None else quoted(kind)
+        raise FormatError(f"/probe: attribute kind is {what}, 'linear' is needed")
+    elements = _needed(node, "elements")
+    if not elements.is_integer():
+        raise FormatError(f"/probe: attribute elements must be a whole number, not {elements:g}")
+    pitch, sound_speed = _needed(node, "pitch_mm"), _needed(node, "sound_speed_m_s")
+    try:
+        return LinearProbe(int(elements), pitch, sound_speed)
+    except InputError as error:
+        raise FormatError(f"/probe: {error}") from None
+
+
+def _read_images(root: Node, name: str, probe: LinearProbe | None, minimum: int) -> Images | None:
+    node = group(root, name)
+    if node is None:
+        return None
+    _check_units(node, "mm")
+    kind = _kind(node)
+    if kind == "time_of_flight" and probe is None:
+        raise FormatError(f"{node}/time_of_flight needs /probe, which is missing")
+    columns = ELEMENTS if kind == "time_of_flight" else 2
+    poses = _dataset(node, "pose", (IMAGES, 4, 4), "mm")
+    measurements = _dataset(node, kind, (IMAGES, columns), unit_of(kind))
+    if poses is None or measurements is None:
+        raise FormatError(f"{node}/pose is missing")
+    if kind == "time_of_flight" and probe and measurements.shape[1] != probe.elements:
+        raise FormatError(
+            f"{node}/time_of_flight has {measurements.shape[1]} columns, /probe has "
+            f"{probe.elements} elements"
+        )
+    spacing, offset = _read_scale(node) if kind == "pixel" else (None, None)
+    area = "px^2" if kind == "pixel" else "mm^2"
+    return make_images(
+        poses,
+        measurements,
+        kind,
+        mask=_dataset(node, "mask", (IMAGES,), _FREE, kinds="biu"),
+        covariance=_dataset(node, "covariance", (IMAGES, 2, 2), area),
+        max_elevation=_dataset(node, "max_elevation", (IMAGES,), "mm"),
+        amplitude=_dataset(node, "amplitude", (IMAGES,), _FREE),
+        time=_dataset(node, "time", (IMAGES,), "s"),
+        spacing_mm=spacing,
+        face_offset_mm=0.0 if offset is None else offset,
+        minimum=minimum,
+        where=str(node),
+    )
+
+
+def _kind(node: Node) -> Kind:
+    found: list[Kind] = []
+    for kind in ("point", "pixel", "time_of_flight"):
+        if child(node, kind) is not None:
+            found.append(kind)
+    if found == ["point", "time_of_flight"]:
+        return "point"
+    if len(found) != 1:
+        what = "none" if not found else " and ".join(found)
+        raise FormatError(f"{node} must hold one of point, pixel, time_of_flight; it has {what}")
+    return found[0]
+
+
+def _read_scale(node: Node) -> tuple[np.ndarray | None, float | None]:
+    """Attributes spacing_mm and face_offset_mm of the pixels, or else of their group."""
+    pixels = child(node, "pixel")
+    owners = [node] if pixels is None else [pixels, node]
+    spacings = [numbers(owner, "spacing_mm", 2) for owner in owners]
+    offsets = [number(owner, "face_offset_mm") for owner in owners]
+    return (
+        next((value for value in spacings if value is not None), None),
+        next((value for value in offsets if value is not None), None),
+    )
+
+
+def _read_truth(root: Node, count: int) -> Truth | None:
+    node = group(root, "truth")
+    if node is None:
+        return None
+    image_to_probe = _dataset(node, "image_to_probe", (4, 4), "mm")
+    point = _dataset(node, "point", (3,), "mm")
+    elevation = _dataset(node, "elevation", (IMAGES,), "mm")
+    if image_to_probe is None or point is None or elevation is None:
+        raise FormatError(f"{node} must hold image_to_probe, point and elevation")
+    if len(elevation) != count:
+        raise FormatError(f"{node}/elevation has {len(elevation)} rows for {count} images")
+    if not (np.isfinite(point).all() and np.isfinite(elevation).all()):
+        raise FormatError(f"{node} holds NaN or Inf")
+    try:
+        transform = check_poses(image_to_probe[None], what="image_to_probe")[0]
+    except InputError as error:
+        raise type(error)(f"{node}: {error}") from None
+    return Truth(transform, point, elevation)
+
+
+def _dataset(
+    node: Node, name: str, shape: tuple[int | UpTo, ...], unit: str, kinds: str = "iuf"
+) -> np.ndarray | None:
+    found = child(node, name)
+    if found is None:
+        return None
+    _check_units(found, unit)
+    return array(found, shape, kinds)
+
+
+def _check_units(node: Node, unit: str) -> None:
+    found = None if unit == _FREE else text(node, "units")
+    if found is not None and found.strip() not in _SPELLINGS[unit]:
+        raise FormatError(f"{node} is in units {quoted(found)}, {unit} is needed")
+
+
+def _needed(node: Node, name: str) -> float:
+    value = number(node, name)
+    if value is None or not np.isfinite(value):
+        raise FormatError(f"{node}: attribute {name} is missing or not finite")
+    return value
+
+
+def _write(file: h5py.File, recording: Recording) -> None:
+    file.attrs["format"] = FORMAT
+    file.attrs["version"] = VERSION
+    if recording.probe is not None:
+        probe = file.create_group("probe")
+        probe.attrs["kind"] = recording.probe.kind
+        probe.attrs["elements"] = recording.probe.elements
+        probe.attrs["pitch_mm"] = recording.probe.pitch_mm
+        probe.attrs["sound_speed_m_s"] = recording.probe.sound_speed_m_s
+    _write_images(file.create_group("calibration"), recording.calibration)
+    if recording.test is not None:
+        _write_images(file.create_group("test"), recording.test)
+    if recording.truth is not None:
+        truth = file.create_group("truth")
+        _put(truth, "image_to_probe", recording.truth.image_to_probe, "mm")
+        _put(truth, "point", recording.truth.point, "mm")
+        _put(truth, "elevation", recording.truth.elevation, "mm")
+    file.attrs["complete"] = True
+
+
+def _write_images(target: h5py.Group, images: Images) -> None:
+    _put(target, "pose", images.poses, "mm")
+    measurements = _put(target, images.kind, images.measurements, unit_of(images.kind))
+    if images.kind == "pixel":
+        if images.spacing_mm is not None:
+            measurements.attrs["spacing_mm"] = images.spacing_mm
+        measurements.attrs["face_offset_mm"] = images.face_offset_mm
+    _put(target, "mask", images.mask, _FREE)
+    optional = {
+        "covariance": (images.covariance, "px^2" if images.kind == "pixel" else "mm^2"),
+        "amplitude": (images.amplitude, _FREE),
+        "time": (images.time, "s"),
+        "max_elevation": (images.max_elevation, "mm"),
+    }
+    for name, (values, unit) in optional.items():
+        if values is not None:
+            _put(target, name, values, unit)
+
+
+def _put(target: h5py.Group, name: str, values: np.ndarray, unit: str) -> h5py.Dataset:
+    dataset = target.create_dataset(name, data=values)
+    dataset.attrs["units"] = unit
+    return dataset

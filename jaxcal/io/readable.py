@@ -1,0 +1,57 @@
+"""What every reader asks of a file before it opens it, and how it quotes what it found."""
+
+from __future__ import annotations
+
+import os
+import stat
+
+from jaxcal.errors import FormatError
+
+
+def check_readable(path: str | os.PathLike[str], *, maximum_bytes: int | None = None) -> None:
+    """Check that a path names an ordinary, readable, non-empty file.
+
+    Args:
+        path: the file.
+        maximum_bytes: largest size that is read, or None for any.
+
+    Raises:
+        FormatError: missing, a directory, a device or pipe (opening one may hang), not permitted,
+            empty or too large; one line that starts with the path.
+    """
+    try:
+        status = os.stat(path)
+    except FileNotFoundError:
+        raise FormatError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:
+        raise FormatError(f"{path}: cannot be opened: {one_line(error)}") from None
+    if stat.S_ISDIR(status.st_mode):
+        raise FormatError(f"{path}: is a directory, not a file")
+    if not stat.S_ISREG(status.st_mode):
+        raise FormatError(f"{path}: is not an ordinary file")
+    try:
+        with open(path, "rb"):
+            pass
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be opened: {one_line(error)}") from None
+    if status.st_size == 0:
+        raise FormatError(f"{path}: is empty")
+    if maximum_bytes is not None and status.st_size > maximum_bytes:
+        raise FormatError(
+            f"{path}: is too large ({status.st_size} bytes; at most {maximum_bytes} are read)"
+        )
+
+
+def one_line(error: Exception) -> str:
+    """An exception's own words on one line."""
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        text = error.strerror
+    elif isinstance(error, KeyError) and error.args:
+        text = str(error.args[0])  # a KeyError's str is quoted
+    return " ".join(text.split()) or type(error).__name__
+
+
+def quoted(text: str, limit: int = 40) -> str:
+    """Text of an untrusted file, short and with control characters escaped, for a message."""
+    return ascii(text if len(text) <= limit else f"{text[:limit]}...")

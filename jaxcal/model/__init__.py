@@ -1,0 +1,1 @@
+"""The measurement model: unknowns, residuals and the offset's prior, as pieces that compose."""

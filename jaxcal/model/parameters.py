@@ -1,0 +1,80 @@
+"""The unknowns other than the offsets, in named blocks, and how a step moves them.
+
+X steps on its manifold by the right perturbation X Exp([v, omega]), so v (mm) and omega (rad) are
+along and about the image's own axes (lateral, elevational, axial). Pixel scales step in their
+logarithm, which keeps them positive. A solver is told which blocks are free; the rest stay fixed.
+A further unknown (sound speed, delay, latency) is one field, one size and one line here.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from jaxcal.geometry import matrix_from_rotation
+
+Blocks = tuple[str, ...]
+
+BLOCK_SIZE = {"translation": 3, "rotation": 3, "point": 3, "scale": 2}
+
+RIGID: Blocks = ("translation", "rotation", "point")
+"""The unknowns of Eq. 7: X and the target."""
+
+
+class Parameters(eqx.Module):
+    """A value of the unknowns.
+
+    Attributes:
+        image_to_probe: X (mm).
+        point: the target c in the tracker's frame, mm.
+        scale: factors on the problem's [lateral, axial] spacing.
+    """
+
+    image_to_probe: jaxlie.SE3
+    point: Float[Array, "3"]
+    scale: Float[Array, "2"]
+
+    def matrix(self) -> Float[Array, "4 4"]:
+        """X as a 4x4 matrix, mm."""
+        return matrix_from_rotation(
+            self.image_to_probe.rotation().as_matrix(), self.image_to_probe.translation()
+        )
+
+
+def size(blocks: Blocks) -> int:
+    """Number of scalar unknowns in the given blocks."""
+    return sum(BLOCK_SIZE[name] for name in blocks)
+
+
+def block_slice(blocks: Blocks, name: str) -> slice:
+    """Where a block lies in the tangent vector of the given blocks."""
+    start = 0
+    for block in blocks:
+        if block == name:
+            return slice(start, start + BLOCK_SIZE[name])
+        start += BLOCK_SIZE[block]
+    raise KeyError(name)
+
+
+def retract(parameters: Parameters, tangent: Float[Array, " p"], blocks: Blocks) -> Parameters:
+    """Move parameters by a tangent vector (mm, rad, mm, log units; in the order of ``blocks``)."""
+
+    def part(name: str) -> Float[Array, " k"]:
+        if name in blocks:
+            return tangent[block_slice(blocks, name)]
+        return jnp.zeros(BLOCK_SIZE[name], tangent.dtype)
+
+    # R Exp([v, w]) with Exp's translation taken as v itself: the same first order as SE(3)'s
+    # exponential, defined for any step, and cheaper.
+    rotation = parameters.image_to_probe.rotation()
+    moved = jaxlie.SE3.from_rotation_and_translation(
+        rotation @ jaxlie.SO3.exp(part("rotation")),
+        parameters.image_to_probe.translation() + rotation.apply(part("translation")),
+    )
+    return Parameters(
+        image_to_probe=moved,
+        point=parameters.point + part("point"),
+        scale=parameters.scale * jnp.exp(part("scale")),
+    )

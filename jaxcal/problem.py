@@ -1,0 +1,144 @@
+"""Arrays that a solver eats. From here on everything is pure, batched and differentiable.
+
+Every array of a :class:`Problem` is floating, the mask included, so that ``jax.grad`` takes a whole
+problem as its argument; whatever is not an array (are the measurements pixels?) is static. A batch
+is the same class with leading axes on every array.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxcal.errors import InputError
+from jaxcal.recording import Images, Kind, Recording, make_images
+
+
+class Problem(eqx.Module):
+    """Tracked measurements of one target in n images; ``*batch`` may be empty.
+
+    Attributes:
+        poses: probe -> tracker, mm.
+        measurements: [lateral, range] in mm, or [u, v] in px when ``pixels``.
+        mask: 1 where the image is used, 0 where it is left out (its values are then ignored).
+        spacing: [lateral, axial] mm per px (1 for points in mm); where pixels come without a known
+            spacing it only sets the unit of the estimated scale.
+        face_offset: range of pixel row 0, mm.
+        covariance: of the measurements, in their unit squared, or None. Its *shape* across images
+            and axes is used by the joint solver, whose sigmas scale it.
+        max_elevation: bound on |elevational offset| of each image, mm, or None.
+        pixels: whether the measurements are pixels (static).
+        spacing_known: whether ``spacing`` was given (static); if not, the scale must be estimated.
+    """
+
+    poses: Float[Array, "*batch n 4 4"]
+    measurements: Float[Array, "*batch n 2"]
+    mask: Float[Array, "*batch n"]
+    spacing: Float[Array, "*batch 2"]
+    face_offset: Float[Array, "*batch"]
+    covariance: Float[Array, "*batch n 2 2"] | None = None
+    max_elevation: Float[Array, "*batch n"] | None = None
+    pixels: bool = eqx.field(static=True, default=False)
+    spacing_known: bool = eqx.field(static=True, default=True)
+
+    @property
+    def images(self) -> int:
+        """Number of images, those left out included."""
+        return self.mask.shape[-1]
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes; () for one problem."""
+        return self.mask.shape[:-1]
+
+    @classmethod
+    def from_recording(cls, recording: Recording | Images, dtype: object = None) -> Problem:
+        """The calibration images of a recording as arrays.
+
+        Args:
+            recording: a :class:`Recording`, or one set of :class:`Images`.
+            dtype: float64 by default (float32 where JAX runs in 32 bits).
+
+        Raises:
+            InputError: for raw times of flight, which must be segmented into points first.
+        """
+        images = recording.calibration if isinstance(recording, Recording) else recording
+        if images.kind == "time_of_flight":
+            raise InputError(
+                "times of flight must be segmented into points first; this recording has none"
+            )
+        dtype = jnp.result_type(float) if dtype is None else dtype
+        pixels = images.kind == "pixel"
+        known = not pixels or images.spacing_mm is not None
+        if images.spacing_mm is not None:
+            spacing = np.asarray(images.spacing_mm)
+        else:
+            spacing = np.ones(2)
+
+        def array(values: np.ndarray | float) -> Array:
+            return jnp.asarray(values, dtype=dtype)
+
+        return cls(
+            poses=array(images.poses),
+            measurements=array(images.measurements),
+            mask=array(images.mask.astype(float)),
+            spacing=array(spacing),
+            face_offset=array(images.face_offset_mm),
+            covariance=None if images.covariance is None else array(images.covariance),
+            max_elevation=None if images.max_elevation is None else array(images.max_elevation),
+            pixels=pixels,
+            spacing_known=known,
+        )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        poses: np.ndarray,
+        measurements: np.ndarray,
+        *,
+        kind: Kind = "point",
+        mask: np.ndarray | None = None,
+        covariance: np.ndarray | None = None,
+        max_elevation: np.ndarray | float | None = None,
+        spacing_mm: np.ndarray | tuple[float, float] | None = None,
+        dtype: object = None,
+    ) -> Problem:
+        """One checked problem from numpy arrays in memory; units as in :class:`Images`.
+
+        Args:
+            poses: (n, 4, 4) probe -> tracker, mm.
+            measurements: (n, 2) [lateral, range] mm, or [u, v] px with ``kind="pixel"``.
+            kind: ``point`` or ``pixel``.
+            mask: (n,) bool, True = used.
+            covariance: (n, 2, 2).
+            max_elevation: (n,) or one number, mm.
+            spacing_mm: [lateral, axial] mm/px; without it a pixel problem estimates its scale.
+            dtype: float64 by default.
+
+        Raises:
+            InputError: whatever cannot be a calibration problem, with the row named.
+        """
+        images = make_images(
+            poses, measurements, kind, mask=mask, covariance=covariance,
+            max_elevation=max_elevation, spacing_mm=spacing_mm,
+        )  # fmt: skip
+        return cls.from_recording(images, dtype=dtype)
+
+
+def stack(problems: list[Problem]) -> Problem:
+    """Problems of one structure as a batch with one leading axis.
+
+    Raises:
+        InputError: where they differ in the number of images or in what they hold.
+    """
+    first = jax.tree.structure(problems[0])
+    for index, problem in enumerate(problems):
+        if jax.tree.structure(problem) != first or problem.images != problems[0].images:
+            raise InputError(
+                f"problem {index} differs from problem 0 in its number of images or in its parts; "
+                "pad it with images that are masked out"
+            )
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)

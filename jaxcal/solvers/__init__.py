@@ -1,0 +1,1 @@
+"""Solvers: closed form, conventional, alternating, joint, self-tuned; none knows of files or plots."""

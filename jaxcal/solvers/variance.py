@@ -1,0 +1,157 @@
+"""Self-tuning: the SDs of lateral position, range and elevational offset from the data themselves.
+
+Restricted maximum likelihood (REML) by Helmert's iteration for variance components: solve with the
+current SDs, then set each component's variance to
+
+    sigma_k^2 = |residual_k|^2 / (n - leverage_k),
+
+where leverage_k, the trace of S^-1 J_k' J_k, is the number of degrees of freedom that the unknowns
+take from component k, and again until the SDs stand still. So no noise level and no maximum
+elevational distance is chosen by hand.
+
+A component whose error truly vanishes (no noise, or every target in the plane) would drive its SD to
+zero and the weights to infinity; it is held at a thousandth of the largest SD, which is as good as
+exact for X.
+
+References: Helmert 1924; Patterson and Thompson 1971 (REML); Foerstner 1979.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxcal.model.parameters import Blocks, Parameters
+from jaxcal.model.priors import Gaussian, covariance_shape
+from jaxcal.model.residuals import measurement_residual
+from jaxcal.problem import Problem
+from jaxcal.solvers import arrow as arrows
+from jaxcal.solvers.least_squares import Fit, linearise, minimise
+
+MINIMUM_SELF_TUNING = 8
+"""With fewer used images the residuals cannot tell three SDs apart from nine unknowns."""
+
+DEFAULT_SIGMA = (0.5, 0.5, 1.0)
+"""SDs (mm) that are held when there are too few images to estimate them."""
+
+RELATIVE_FLOOR = 1e-3
+ABSOLUTE_FLOOR_MM = 1e-6
+
+
+class SelfTuned(eqx.Module):
+    """A self-tuned fit.
+
+    Attributes:
+        fit: the last weighted solve; ``iterations`` counts all linearisations.
+        sigma: (3,) lateral, range, elevational SD, mm.
+        rounds: variance updates.
+        settled: whether the SDs stood still at the end.
+        floored: (3,) which SDs rest on their floor.
+    """
+
+    fit: Fit
+    sigma: Float[Array, "3"]
+    rounds: Int[Array, ""]
+    settled: Bool[Array, ""]
+    floored: Bool[Array, "3"]
+
+
+def self_tuned(
+    start: Parameters,
+    problem: Problem,
+    blocks: Blocks,
+    *,
+    tolerance: float | None = None,
+    max_rounds: int = 60,
+    max_steps: int = 100,
+    trace: int = 0,
+) -> SelfTuned:
+    """Solve with the Gaussian prior, its three SDs estimated by REML.
+
+    Args:
+        start: a conventional fit.
+        problem: one problem; with fewer than 8 used images the SDs are held at
+            :data:`DEFAULT_SIGMA`.
+        blocks: the free unknowns.
+        tolerance: relative change of the SDs to stop at; 1e-9 in float64, 1e-4 in float32.
+        max_rounds: most variance updates.
+        max_steps: most linearisations in each weighted solve.
+        trace: how many values of the last solve's objective to keep.
+    """
+    dtype = problem.mask.dtype
+    if tolerance is None:
+        tolerance = 1e-9 if float(jnp.finfo(dtype).eps) < 1e-10 else 1e-4
+    enough = jnp.sum(problem.mask) >= MINIMUM_SELF_TUNING
+    rms = jnp.sqrt(
+        jnp.sum(measurement_residual(start, problem) ** 2, axis=0) / jnp.sum(problem.mask)
+    )
+    first = jnp.where(enough, with_floor(rms), jnp.asarray(DEFAULT_SIGMA, dtype))
+
+    tightest = tolerance / 10
+
+    def solve(parameters: Parameters, sigma: Float[Array, "3"], change: Float[Array, ""]) -> Fit:
+        # No use in solving far beyond how well the SDs are known yet.
+        wanted = jnp.clip(0.01 * change, tightest, 1e-3)
+        return minimise(
+            parameters, Gaussian(sigma, covariance_shape(problem)), problem, blocks,
+            damping=1e-6, max_steps=max_steps, exact=True, tolerance=wanted,
+            trace=trace,
+        )  # fmt: skip
+
+    def unfinished(state: tuple) -> Bool[Array, ""]:
+        _, _, rounds, change, _ = state
+        return (rounds == 0) | ((change > tolerance) & (rounds < max_rounds))
+
+    def one_round(state: tuple) -> tuple:
+        fit, sigma, rounds, change, iterations = state
+        fit = solve(fit.parameters, sigma, change)
+        updated = update_or_hold(fit.parameters, sigma, problem, blocks)
+        change = jnp.max(jnp.abs(jnp.log(updated / sigma)))
+        # With held SDs only the solve itself has to arrive.
+        change = jnp.where(enough, change, jnp.minimum(change, fit.stationarity))
+        # A lane that is lost (NaN) must stop, not hold up its neighbours.
+        change = jnp.where(jnp.isfinite(change), change, 0.0)
+        return fit, updated, rounds + 1, change, iterations + fit.iterations
+
+    shapes = jax.eval_shape(solve, start, first, first[0])
+    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    empty = eqx.tree_at(lambda fit: fit.parameters, empty, start)
+    zero = jnp.zeros((), jnp.int32)
+    state = (empty, first, zero, jnp.ones((), dtype), jnp.zeros_like(empty.iterations))
+    fit, sigma, rounds, change, iterations = jax.lax.while_loop(unfinished, one_round, state)
+    fit = eqx.tree_at(lambda fit: fit.iterations, fit, iterations)
+    floor = RELATIVE_FLOOR * jnp.max(sigma)
+    return SelfTuned(fit, sigma, rounds, change <= tolerance, sigma <= 1.001 * floor)
+
+
+def update(
+    parameters: Parameters, sigma: Float[Array, "3"], problem: Problem, blocks: Blocks
+) -> Float[Array, "3"]:
+    """One Helmert update of the three SDs (mm) at a weighted solution."""
+    prior = Gaussian(sigma, covariance_shape(problem))
+    none = jnp.zeros(0, problem.mask.dtype)
+    arrow, jacobian, residual = linearise(parameters, none, prior, problem, blocks)
+    # Solving for all rows at once gives every leverage; p x p, so the inverse is no dearer.
+    inverse = jax.vmap(
+        lambda column: arrows.solve_symmetric(arrow.shared, column, jnp.diagonal(arrow.shared))
+    )(jnp.eye(arrow.shared.shape[0], dtype=residual.dtype))
+    leverage = jnp.einsum("anm,ab,bnm->m", jacobian, inverse, jacobian)
+    count = jnp.sum(problem.mask)
+    freedom = jnp.maximum(count - leverage, 0.05 * count)
+    return with_floor(sigma * jnp.sqrt(jnp.sum(residual**2, axis=0) / freedom))
+
+
+def update_or_hold(
+    parameters: Parameters, sigma: Float[Array, "3"], problem: Problem, blocks: Blocks
+) -> Float[Array, "3"]:
+    """:func:`update`, or the held SDs where there are too few images to estimate them."""
+    enough = jnp.sum(problem.mask) >= MINIMUM_SELF_TUNING
+    held = jnp.asarray(DEFAULT_SIGMA, sigma.dtype)
+    return jnp.where(enough, update(parameters, sigma, problem, blocks), held)
+
+
+def with_floor(sigma: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The SDs, none below a thousandth of the largest."""
+    return jnp.maximum(sigma, jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma), ABSOLUTE_FLOOR_MM))

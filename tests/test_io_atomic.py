@@ -1,0 +1,210 @@
+"""Files are complete or absent, whatever happens while they are written."""
+
+import os
+import resource
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from jaxcal.errors import OutputError
+from jaxcal.io.atomic import atomic_path, write_text
+
+ROOT = Path(__file__).parents[1]
+
+
+def run_python(code, *arguments):
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+
+
+@pytest.mark.parametrize("text", ["", "one\ntwo\r\nµ°\n", "x" * 100_000])
+def test_write_text_writes_exactly_the_text(tmp_path, text):
+    target = tmp_path / "report.txt"
+    write_text(target, text)
+    assert target.read_bytes() == text.encode()
+    assert os.listdir(tmp_path) == ["report.txt"]
+
+
+def test_write_text_takes_undecodable_file_names(tmp_path):
+    write_text(tmp_path / "a", os.fsdecode(b"\xff.h5"))
+    assert (tmp_path / "a").read_text() == r"\udcff.h5"
+
+
+def test_replaces_an_old_file_and_accepts_a_bare_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_text("name", "old")
+    write_text("name", "new")
+    assert Path("name").read_text() == "new"
+
+
+def test_temporary_is_beside_the_target_with_its_suffix(tmp_path):
+    with atomic_path(tmp_path / "figure.svg") as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".svg"
+        assert not (tmp_path / "figure.svg").exists()
+    assert os.listdir(tmp_path) == ["figure.svg"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
+@pytest.mark.parametrize("old", [None, "old"])
+def test_exception_leaves_the_target_as_it_was(tmp_path, error, old):
+    target = tmp_path / "out"
+    if old is not None:
+        target.write_text(old)
+
+    def interrupted():
+        with atomic_path(target) as temporary:
+            temporary.write_text("half")
+            raise error
+
+    with pytest.raises(error):
+        interrupted()
+    assert os.listdir(tmp_path) == ([] if old is None else ["out"])
+    assert old is None or target.read_text() == old
+
+
+def test_oserror_in_the_block_is_an_output_error(tmp_path):
+    target = tmp_path / "out"
+    with pytest.raises(OutputError, match="No space left on device"), atomic_path(target):
+        Path("/dev/full").write_text("x" * 100_000)
+    assert os.listdir(tmp_path) == []
+
+
+def test_output_error_of_the_block_passes_unchanged(tmp_path):
+    with pytest.raises(OutputError, match=r"^inner$"), atomic_path(tmp_path / "out"):
+        raise OutputError("inner")
+
+
+def test_too_long_a_file_is_an_output_error(tmp_path):
+    target = tmp_path / "out"
+    target.write_text("old")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OutputError, match="out: cannot be written: File too large"):
+            write_text(target, "x" * 100_000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert target.read_text() == "old"
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_missing_folder(tmp_path):
+    with pytest.raises(OutputError, match="none/out: cannot be written: its folder does not"):
+        write_text(tmp_path / "none" / "out", "x")
+
+
+def test_folder_that_is_a_file(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="Not a directory"):
+        write_text(tmp_path / "file" / "out", "x")
+
+
+def test_target_that_is_a_directory(tmp_path):
+    with pytest.raises(OutputError, match="it is a directory"):
+        write_text(tmp_path, "x")
+
+
+@pytest.mark.parametrize("name", ["x" * 256, "zero\0byte"])
+def test_impossible_name(tmp_path, name):
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_text(tmp_path / name, "x")
+
+
+def test_devices_and_pipes_are_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for target in (Path("/dev/null"), tmp_path / "pipe"):
+        with pytest.raises(OutputError, match="not a regular file"):
+            write_text(target, "x")
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+    assert stat.S_ISFIFO(os.stat(tmp_path / "pipe").st_mode)
+
+
+@pytest.mark.parametrize(
+    ("existing", "reason"), [(False, "Permission denied"), (True, "it is write-protected")]
+)
+def test_no_permission(existing, reason):
+    # Not tmp_path: its parents are closed to the ordinary user that a superuser becomes here.
+    folder = Path(tempfile.mkdtemp())
+    target = folder / "out"
+    if existing:
+        target.write_text("old")
+        target.chmod(0o444)
+    folder.chmod(0o777 if existing else 0o555)
+    superuser = os.geteuid() == 0
+    if superuser:
+        os.seteuid(65534)
+    try:
+        with pytest.raises(OutputError, match=f"out: cannot be written: {reason}"):
+            write_text(target, "x")
+    finally:
+        if superuser:
+            os.seteuid(0)
+        left = os.listdir(folder)
+        folder.chmod(0o755)
+        shutil.rmtree(folder)
+    assert left == (["out"] if existing else [])
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o027, 0o077])
+def test_new_file_gets_the_umask(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        write_text(tmp_path / "out", "x")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "out").stat().st_mode) == 0o666 & ~mask
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o666, 0o755])
+def test_existing_file_keeps_its_permissions_all_along(tmp_path, mode):
+    target = tmp_path / "out"
+    target.write_text("old")
+    target.chmod(mode)
+    with atomic_path(target) as temporary:
+        assert stat.S_IMODE(temporary.stat().st_mode) & ~mode == 0
+        temporary.write_text("new")
+    assert target.read_text() == "new"
+    assert stat.S_IMODE(target.stat().st_mode) == mode
+
+
+def test_symbolic_link_stays_and_its_file_is_replaced(tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "real").write_text("old")
+    (tmp_path / "link").symlink_to("data/real")
+    write_text(tmp_path / "link", "new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "data" / "real").read_text() == "new"
+
+
+@pytest.mark.parametrize("old", [None, "old"])
+def test_killed_writer_leaves_the_target_as_it_was(tmp_path, old):
+    target = tmp_path / "out"
+    if old is not None:
+        target.write_text(old)
+    code = (
+        "import sys, time\n"
+        "from jaxcal.io.atomic import atomic_path\n"
+        "with atomic_path(sys.argv[1]) as temporary:\n"
+        "    temporary.write_text('half')\n"
+        "    print('writing', flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    with run_python(code, target) as process:
+        assert process.stdout.readline() == "writing\n"
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    assert target.exists() == (old is not None)
+    assert old is None or target.read_text() == old
+    write_text(target, "new")
+    assert target.read_text() == "new"

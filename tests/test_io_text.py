@@ -1,0 +1,222 @@
+"""Text recordings: the cross-wire pair and comma-separated tables."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxcal.errors import FormatError, InputError
+from jaxcal.io import text
+from jaxcal.io.text import read_crosswire, read_csv
+
+CROSSWIRE = Path(__file__).parents[2] / "shared" / "data" / "crosswire"
+HEADER = "time_s," + ",".join(f"m{i}{j}" for i in range(3) for j in range(4)) + ",u,v"
+
+
+def random_poses(generator, count):
+    rotations = np.linalg.qr(generator.normal(size=(count, 3, 3)))[0]
+    rotations[:, :, 0] *= np.linalg.det(rotations)[:, None]
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = rotations
+    poses[:, :3, 3] = generator.uniform(-200, 200, (count, 3))
+    return poses
+
+
+def csv_lines(count=5, rows=3, seed=0):
+    generator = np.random.default_rng(seed)
+    poses = random_poses(generator, count)
+    points = generator.uniform(10, 500, (count, 2))
+    time = np.arange(count) / 30
+    table = np.column_stack([time, poses[:, :rows].reshape(count, -1), points])
+    return [",".join(map(repr, row)) for row in table.tolist()], poses, points, time
+
+
+@pytest.fixture
+def pair(tmp_path):
+    generator = np.random.default_rng(1)
+    poses = random_poses(generator, 6)
+    pixels = generator.integers(0, 600, (6, 2)).astype(float)
+    rows = [" ".join(map(repr, row)) for row in poses[:, :3].reshape(-1, 4).tolist()]
+    (tmp_path / "poses.txt").write_text("\n".join(rows) + "\n")
+    (tmp_path / "points.txt").write_text("".join(f"{u}\t{v}\n" for u, v in pixels))
+    return tmp_path / "poses.txt", tmp_path / "points.txt", poses, pixels
+
+
+def test_crosswire_pair(pair):
+    recording = read_crosswire(*pair[:2], spacing_mm=(0.15, 0.14))
+    images = recording.calibration
+    assert images.kind == "pixel"
+    np.testing.assert_allclose(images.poses, pair[2], atol=1e-12)
+    np.testing.assert_array_equal(images.measurements, pair[3])
+    np.testing.assert_array_equal(images.spacing_mm, [0.15, 0.14])
+    assert recording.source == f"{pair[0]} with {pair[1]}"
+    assert read_crosswire(str(pair[0]), str(pair[1])).calibration.spacing_mm is None
+
+
+def test_real_crosswire_recording():
+    if not CROSSWIRE.exists():
+        pytest.skip("the cross-wire recording is not beside this checkout")
+    names = ("crossWirePhantomTransformations.txt", "crossWirePhantom2DPoints.txt")
+    images = read_crosswire(*(CROSSWIRE / name for name in names)).calibration
+    given_rows = np.loadtxt(CROSSWIRE / names[0]).reshape(54, 3, 4)
+    assert len(images) == 54
+    np.testing.assert_array_equal(images.measurements, np.loadtxt(CROSSWIRE / names[1]))
+    np.testing.assert_array_equal(images.poses[:, :3, 3], given_rows[:, :, 3])
+    np.testing.assert_allclose(images.poses[:, :3, :3], given_rows[:, :, :3], atol=1e-3)
+    gram = images.poses[:, :3, :3].swapaxes(1, 2) @ images.poses[:, :3, :3]
+    np.testing.assert_allclose(gram, np.tile(np.eye(3), (54, 1, 1)), atol=1e-12)
+
+
+def test_crosswire_rows_that_are_not_whole_poses(pair):
+    lines = pair[0].read_text().splitlines()
+    pair[0].write_text("# comment\n\n" + "\n".join(lines[:-1]))
+    with pytest.raises(FormatError, match=r"poses\.txt:19: 17 rows are not whole poses"):
+        read_crosswire(*pair[:2])
+
+
+def test_crosswire_counts_differ(pair):
+    lines = pair[1].read_text().splitlines()
+    pair[1].write_text("\n".join(lines[:-1]))
+    with pytest.raises(FormatError, match=r"poses\.txt with .*points\.txt: 6 poses but 5 points"):
+        read_crosswire(*pair[:2])
+
+
+def test_crosswire_files_exchanged(pair):
+    with pytest.raises(FormatError, match=r"points\.txt:1: 2 columns; 4 are needed"):
+        read_crosswire(pair[1], pair[0])
+
+
+def test_crosswire_reflection_names_the_file(pair):
+    flipped = np.diag([-1.0, 1, 1]) @ pair[2][:, :3]
+    np.savetxt(pair[0], flipped.reshape(-1, 4))
+    with pytest.raises(InputError, match=r"^.*poses\.txt with .*: pose 0 is a reflection"):
+        read_crosswire(*pair[:2])
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(4, 9),
+    rows=st.sampled_from([3, 4]),
+    header=st.booleans(),
+    end=st.sampled_from(["\n", "\r\n", "\r"]),
+    mark=st.sampled_from(["", "\ufeff"]),
+)
+def test_csv_round_trip(tmp_path_factory, seed, count, rows, header, end, mark):
+    lines, poses, points, time = csv_lines(count, rows, seed)
+    if header:
+        lines.insert(0, HEADER)
+    lines[1:1] = ["", "  # a comment, with commas", "   "]
+    path = tmp_path_factory.mktemp("csv") / "table.csv"
+    path.write_bytes((mark + end.join(lines)).encode())
+    images = read_csv(path).calibration
+    assert images.kind == "pixel"
+    np.testing.assert_allclose(images.poses, poses, atol=1e-12)
+    np.testing.assert_array_equal(images.measurements, points)
+    np.testing.assert_array_equal(images.time, time)
+
+
+def test_csv_units(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("\n".join(csv_lines()[0]))
+    assert read_csv(path, units="mm").calibration.kind == "point"
+    spaced = read_csv(path, spacing_mm=(0.1, 0.2)).calibration
+    np.testing.assert_array_equal(spaced.spacing_mm, [0.1, 0.2])
+    with pytest.raises(InputError, match="belongs to pixels"):
+        read_csv(path, units="mm", spacing_mm=(0.1, 0.2))
+
+
+def edited(line, column, value):
+    fields = line.split(",")
+    fields[column] = value
+    return ",".join(fields)
+
+
+@pytest.mark.parametrize("value", ["x", "", "1_000", "0x10", "1.5.", "--1", "1 2"])
+def test_csv_slip_names_line_and_column(tmp_path, value):
+    lines = csv_lines()[0]
+    lines[2] = edited(lines[2], 4, value)
+    path = tmp_path / "table.csv"
+    path.write_text("\n".join([HEADER, "", *lines]))
+    with pytest.raises(FormatError, match=r"table\.csv:5: column 5 is not a number: '"):
+        read_csv(path)
+
+
+def test_csv_slip_in_the_first_row_is_not_a_header(tmp_path):
+    lines = csv_lines()[0]
+    path = tmp_path / "table.csv"
+    path.write_text("\n".join([edited(lines[0], 0, "t"), *lines[1:]]))
+    with pytest.raises(FormatError, match=r"table\.csv:1: column 1 is not a number: 't'"):
+        read_csv(path)
+
+
+def test_csv_only_one_header(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("\n".join([HEADER, HEADER, *csv_lines()[0]]))
+    with pytest.raises(FormatError, match=r"table\.csv:2: column 1 is not a number: 'time_s'"):
+        read_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda lines: [line + ",1" for line in lines], r":1: 16 columns; 15 or 19 are needed"),
+        (lambda lines: [*lines[:3], lines[3] + ",1"], r":4: 16 columns; 15 as before are needed"),
+        (lambda lines: [*lines, *csv_lines(rows=4)[0]], r":6: 19 columns; 15 as before"),
+        (lambda lines: [line.replace(",", ";") for line in lines], r":2: 1 columns; 15 or 19"),
+        (lambda lines: [HEADER], r": holds no rows of numbers"),
+        (lambda lines: ["# nothing", "  "], r": holds no rows of numbers"),
+        (lambda lines: [], r": is empty"),
+        (lambda lines: [*lines, "1,2\0,3"], r":6: is not text .*zero byte"),
+        (lambda lines: ["\0" + "1,2,3"], r":1: is not text .*zero byte"),
+        (lambda lines: lines[:3], r": 3 used images are too few"),
+        (lambda lines: [edited(lines[0], 3, "nan"), *lines], r": pose 0 holds NaN or Inf"),
+        (lambda lines: [edited(lines[0], 0, "inf"), *lines], r": time 0 is NaN or Inf"),
+    ],
+)
+def test_csv_refusals(tmp_path, change, message):
+    path = tmp_path / "table.csv"
+    path.write_text("\n".join(change(csv_lines()[0])))
+    with pytest.raises(InputError, match=r"table\.csv" + message) as caught:
+        read_csv(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"1,2\n\xff\xfe\n", "µ,\n\n".encode("utf-16"), b"\x89HDF\r\n"])
+def test_csv_that_is_not_text(tmp_path, content):
+    path = tmp_path / "table.csv"
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match=r"table\.csv:[12]: is not text"):
+        read_csv(path)
+
+
+def test_controls_in_a_slip_are_escaped(tmp_path):
+    lines = csv_lines()[0]
+    path = tmp_path / "table.csv"
+    path.write_text("\n".join([edited(lines[0], 1, "\x1b[31m" + "x" * 1000), *lines]))
+    with pytest.raises(FormatError) as caught:
+        read_csv(path)
+    assert "\x1b" not in str(caught.value)
+    assert len(str(caught.value)) < len(str(path)) + 120
+
+
+def test_too_large_a_file_is_not_read(tmp_path):
+    path = tmp_path / "table.csv"
+    with open(path, "wb") as file:
+        file.truncate(text.MAXIMUM_BYTES + 1)
+    with pytest.raises(FormatError, match="too large"):
+        read_csv(path)
+
+
+def test_missing_directory_and_device(tmp_path):
+    for path, message in (
+        (tmp_path / "none", "no such file"),
+        (tmp_path, "is a directory"),
+        (Path("/dev/zero"), "not an ordinary file"),
+        (tmp_path / "zero\0byte", "cannot be opened"),
+    ):
+        with pytest.raises(FormatError, match=message):
+            read_csv(path)
