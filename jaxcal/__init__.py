@@ -47,7 +47,6 @@ _HOME = {
 __all__ = [*sorted(_HOME), "__version__"]
 
 if TYPE_CHECKING:
-    from jaxcal.solve import Options, calibrate, calibrate_batch
     from jaxcal.calibration import Calibration, Status
     from jaxcal.errors import (
         CalibrationError,
@@ -62,6 +61,7 @@ if TYPE_CHECKING:
     from jaxcal.problem import Problem, stack
     from jaxcal.recording import Images, Recording, make_images
     from jaxcal.simulation import Protocol, simulate, simulate_recording
+    from jaxcal.solve import Options, calibrate, calibrate_batch
 
 
 def __getattr__(name: str) -> object:

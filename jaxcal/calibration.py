@@ -62,7 +62,8 @@ class Calibration(eqx.Module):
             stationary point, well determined, and no offset about to reach or leave its bound.
         rotation_change: X's last move in rad (alternating), else 0.
         translation_change: X's last move in mm (alternating), else 0.
-        trace: objective after each of the first iterations; NaN beyond the last.
+        trace: objective after each of the first iterations; NaN beyond the last;
+            None where none was asked for.
         method: ``conventional``, ``alternating`` or ``joint`` (static).
         prior: ``none``, ``bounded`` or ``gaussian`` (static).
         blocks: the free unknowns (static).
@@ -96,7 +97,7 @@ class Calibration(eqx.Module):
     differentiable: Bool[Array, "*batch"]
     rotation_change: Float[Array, "*batch"]
     translation_change: Float[Array, "*batch"]
-    trace: Float[Array, "*batch trace"]
+    trace: Float[Array, "*batch trace"] | None
     method: str = eqx.field(static=True)
     prior: str = eqx.field(static=True)
     blocks: Blocks = eqx.field(static=True)
@@ -141,7 +142,7 @@ class Calibration(eqx.Module):
         return jax.tree.map(self._concrete, self)
 
     @staticmethod
-    def _concrete(value: Array) -> np.ndarray:
+    def _concrete(value: Array | np.ndarray) -> np.ndarray:
         if isinstance(value, jax.core.Tracer):
             raise CalibrationError(
                 "text is not available under jit, vmap or grad; use the arrays (status_code, "

@@ -128,8 +128,8 @@ def warnings(result: Calibration) -> list[str]:
         found.append(f"{from_prior} is fixed by nothing but the bound on the offsets: {held}")
     if result.searched_start:
         found.append(
-            "the closed-form start was degenerate (points on a line in the image, too few images, "
-            "or heavy noise); the start was searched for among 24 rotations"
+            "the closed-form start was unusable (degenerate poses or points, or too few images for "
+            "their noise); the start was searched for among 24 rotations"
         )
     if result.method == "alternating" and result.tolerance_met and result.stationarity > STEADY:
         found.append(

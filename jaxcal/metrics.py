@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxcal.geometry import transform_points
+from jaxcal.geometry import AnyArray, transform_points
 
 
 def reconstruction_precision(
-    image_to_probe: Float[Array, "4 4"],
-    poses: Float[Array, "n 4 4"],
-    points: Float[Array, "n columns"],
-    mask: Float[Array, " n"] | None = None,
-) -> Float[Array, ""]:
+    image_to_probe: Float[AnyArray, "4 4"],
+    poses: Float[AnyArray, "n 4 4"],
+    points: Float[AnyArray, "n columns"],
+    mask: Float[AnyArray, " n"] | None = None,
+) -> Float[AnyArray, ""]:
     """Point reconstruction precision, Eq. 8: norm of the SD of B_i X p_i over the images, mm.
 
     Args:
@@ -35,10 +35,10 @@ def reconstruction_precision(
 
 
 def reconstruct(
-    image_to_probe: Float[Array, "4 4"],
-    poses: Float[Array, "n 4 4"],
-    points: Float[Array, "n columns"],
-) -> Float[Array, "n 3"]:
+    image_to_probe: Float[AnyArray, "4 4"],
+    poses: Float[AnyArray, "n 4 4"],
+    points: Float[AnyArray, "n columns"],
+) -> Float[AnyArray, "n 3"]:
     """B_i X p_i: image points in the tracker's frame, mm; (n, 2) points lie in the plane."""
     points = jnp.asarray(points)
     if points.shape[1] == 2:
@@ -48,8 +48,8 @@ def reconstruct(
 
 
 def calibration_reproducibility(
-    transforms: Float[Array, "k 4 4"], image_points: Float[Array, "m 2"]
-) -> Float[Array, " m"]:
+    transforms: Float[AnyArray, "k 4 4"], image_points: Float[AnyArray, "m 2"]
+) -> Float[AnyArray, " m"]:
     """How far repeated calibrations scatter at image points: mean distance from their mean, mm.
 
     Args:
@@ -68,7 +68,7 @@ def calibration_reproducibility(
     return jnp.mean(jnp.linalg.norm(images - jnp.mean(images, axis=0), axis=-1), axis=0)
 
 
-def image_corners(width_mm: float, depth_mm: float) -> Float[Array, "5 2"]:
+def image_corners(width_mm: float, depth_mm: float) -> Float[AnyArray, "5 2"]:
     """The four corners of a linear probe's image and its centre, [lateral, axial] mm."""
     half = 0.5 * width_mm
     return jnp.asarray(
@@ -77,8 +77,8 @@ def image_corners(width_mm: float, depth_mm: float) -> Float[Array, "5 2"]:
 
 
 def root_mean_square(
-    residual: Float[Array, "n 3"], mask: Float[Array, " n"] | None = None
-) -> Float[Array, ""]:
+    residual: Float[AnyArray, "n 3"], mask: Float[AnyArray, " n"] | None = None
+) -> Float[AnyArray, ""]:
     """Root mean square length of residual vectors (mm) over the used images."""
     residual = jnp.asarray(residual)
     weight = jnp.ones(residual.shape[0], residual.dtype) if mask is None else jnp.asarray(mask)

@@ -50,7 +50,7 @@ class Images:
     max_elevation: Float[np.ndarray, " n"] | None = None
     amplitude: Float[np.ndarray, " n"] | None = None
     time: Float[np.ndarray, " n"] | None = None
-    spacing_mm: Float[np.ndarray, "2"] | None = None
+    spacing_mm: Float[np.ndarray, 2] | None = None
     face_offset_mm: float = 0.0
 
     def __len__(self) -> int:
@@ -64,7 +64,7 @@ class Truth:
     """
 
     image_to_probe: Float[np.ndarray, "4 4"]
-    point: Float[np.ndarray, "3"]
+    point: Float[np.ndarray, 3]
     elevation: Float[np.ndarray, " n"]
 
 

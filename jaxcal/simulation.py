@@ -86,7 +86,7 @@ class Experiment(eqx.Module):
     covariance: Float[Array, "n 2 2"]
     elevation: Float[Array, " n"]
     image_to_probe: Float[Array, "4 4"]
-    point: Float[Array, "3"]
+    point: Float[Array, 3]
     test_poses: Float[Array, "m 4 4"]
     test_points: Float[Array, "m 2"]
 
@@ -149,7 +149,7 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
 
 
 def _positions(
-    key: Key[Array, ""], count: int, half: Float[Array, "2"], middle: Float[Array, "2"]
+    key: Key[Array, ""], count: int, half: Float[Array, 2], middle: Float[Array, 2]
 ) -> tuple[Float[Array, " count"], Float[Array, " count"]]:
     draw = jax.random.uniform(key, (count, 2), minval=-1.0, maxval=1.0)
     positions = middle + half * draw
@@ -166,13 +166,13 @@ def _rotation(key: Key[Array, ""], largest: float) -> jaxlie.SO3:
 def _poses(
     key: Key[Array, ""],
     truth: jaxlie.SE3,
-    point: Float[Array, "3"],
+    point: Float[Array, 3],
     in_image: Float[Array, "n 3"],
     protocol: Protocol,
 ) -> Float[Array, "n 4 4"]:
     """Poses that put the target where it was drawn: t_i = c - R_i X p_i."""
 
-    def pose(key: Key[Array, ""], position: Float[Array, "3"]) -> Float[Array, "4 4"]:
+    def pose(key: Key[Array, ""], position: Float[Array, 3]) -> Float[Array, "4 4"]:
         rotation = _rotation(key, protocol.rotation_rad)
         translation = point - rotation.apply(truth.apply(position))
         return matrix_from_rotation(rotation.as_matrix(), translation)

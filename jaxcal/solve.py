@@ -28,7 +28,7 @@ from jaxcal.recording import MINIMUM_IMAGES, Recording
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import alternate
 from jaxcal.solvers.conventional import from_scratch, pairwise_gradient
-from jaxcal.solvers.least_squares import minimise
+from jaxcal.solvers.joint import joint
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING, self_tuned
 from jaxcal.uncertainty import LARGEST_SD, Uncertainty, assess, lever_arm
 
@@ -94,9 +94,9 @@ class _Plan:
 class _Given(eqx.Module):
     """Numbers given by the caller beside the problem."""
 
-    sigma: Float[Array, "3"] | None
+    sigma: Float[Array, 3] | None
     tracker_sd: Float[Array, ""] | None
-    max_elevation: Float[Array, ""] | None
+    max_elevation: Float[Array, "*images"] | None
 
 
 def calibrate(
@@ -287,8 +287,8 @@ class _Solution(eqx.Module):
     parameters: Parameters
     offset: Float[Array, " k"]
     prior: AbstractPrior
-    sigma: Float[Array, "3"] | None
-    sigma_floored: Bool[Array, "3"]
+    sigma: Float[Array, 3] | None
+    sigma_floored: Bool[Array, 3]
     cost: Float[Array, ""]
     stationarity: Float[Array, ""]
     arrived: Bool[Array, ""]
@@ -296,7 +296,7 @@ class _Solution(eqx.Module):
     variance_rounds: Array
     rotation_change: Float[Array, ""]
     translation_change: Float[Array, ""]
-    trace: Float[Array, " trace"]
+    trace: Float[Array, " trace"] | None
     searched_start: Bool[Array, ""]
 
 
@@ -359,8 +359,9 @@ def _run_method(problem: Problem, given: _Given, plan: _Plan) -> _Solution:
                 done, prior, done.tolerance_met, rotation_change=done.rotation_change,
                 translation_change=done.translation_change,
             )  # fmt: skip
-        fit = minimise(start, prior, problem, blocks, max_steps=options.max_iterations, exact=True,
-                       trace=options.trace)  # fmt: skip
+        fit = joint(
+            start, prior, problem, blocks, max_steps=options.max_iterations, trace=options.trace
+        )
         return solution(fit, prior, fit.settled)
 
     shape = covariance_shape(problem)
@@ -372,12 +373,13 @@ def _run_method(problem: Problem, given: _Given, plan: _Plan) -> _Solution:
             sigma=tuned.sigma, sigma_floored=tuned.floored, variance_rounds=tuned.rounds,
         )  # fmt: skip
     prior = Gaussian(_given_sigma(given), shape, given.tracker_sd)
-    fit = minimise(start, prior, problem, blocks, max_steps=options.max_iterations, exact=True,
-                   trace=options.trace)  # fmt: skip
+    fit = joint(
+        start, prior, problem, blocks, max_steps=options.max_iterations, trace=options.trace
+    )
     return solution(fit, prior, fit.settled, sigma=given.sigma)
 
 
-def _given_sigma(given: _Given) -> Float[Array, "3"]:
+def _given_sigma(given: _Given) -> Float[Array, 3]:
     if given.sigma is None:
         raise InputError("the gaussian prior without self-tuning needs sigma")
     return given.sigma
@@ -414,7 +416,7 @@ def _assemble(
     parameters: Parameters,
     offset: Float[Array, " k"],
     prior: AbstractPrior,
-    sigma: Float[Array, "3"] | None,
+    sigma: Float[Array, 3] | None,
     uncertainty: Uncertainty,
     problem: Problem,
     plan: _Plan,

@@ -27,20 +27,20 @@ class Parameters(eqx.Module):
     """A value of the unknowns.
 
     Attributes:
-        image_to_probe: X (mm).
+        rotation: of X; its columns are the lateral, elevational and axial axes in the probe's frame.
+        translation: of X, mm.
         point: the target c in the tracker's frame, mm.
         scale: factors on the problem's [lateral, axial] spacing.
     """
 
-    image_to_probe: jaxlie.SE3
-    point: Float[Array, "3"]
-    scale: Float[Array, "2"]
+    rotation: Float[Array, "3 3"]
+    translation: Float[Array, 3]
+    point: Float[Array, 3]
+    scale: Float[Array, 2]
 
     def matrix(self) -> Float[Array, "4 4"]:
         """X as a 4x4 matrix, mm."""
-        return matrix_from_rotation(
-            self.image_to_probe.rotation().as_matrix(), self.image_to_probe.translation()
-        )
+        return matrix_from_rotation(self.rotation, self.translation)
 
 
 def size(blocks: Blocks) -> int:
@@ -67,14 +67,12 @@ def retract(parameters: Parameters, tangent: Float[Array, " p"], blocks: Blocks)
         return jnp.zeros(BLOCK_SIZE[name], tangent.dtype)
 
     # R Exp([v, w]) with Exp's translation taken as v itself: the same first order as SE(3)'s
-    # exponential, defined for any step, and cheaper.
-    rotation = parameters.image_to_probe.rotation()
-    moved = jaxlie.SE3.from_rotation_and_translation(
-        rotation @ jaxlie.SO3.exp(part("rotation")),
-        parameters.image_to_probe.translation() + rotation.apply(part("translation")),
-    )
+    # exponential, defined for any step, and cheaper. Rotations are kept as matrices: the residuals
+    # need nothing else, and a product of quaternions to get there doubles what XLA must compile.
+    turn = jaxlie.SO3.exp(part("rotation")).as_matrix().astype(tangent.dtype)
     return Parameters(
-        image_to_probe=moved,
+        rotation=parameters.rotation @ turn,
+        translation=parameters.translation + parameters.rotation @ part("translation"),
         point=parameters.point + part("point"),
         scale=parameters.scale * jnp.exp(part("scale")),
     )

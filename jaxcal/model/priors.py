@@ -56,9 +56,9 @@ class AbstractPrior(eqx.Module):
         """Bound on the magnitude of the offset unknowns, inf where there is none."""
         return jnp.full_like(self.start(parameters, problem), jnp.inf)
 
-    def largest_weight(self) -> Float[Array, ""]:
+    def largest_weight(self) -> Float[Array, ""] | float:
         """How much a mm of error can be in a whitened residual."""
-        return jnp.ones(())
+        return 1.0
 
 
 class InPlane(AbstractPrior):
@@ -133,13 +133,13 @@ class Gaussian(AbstractPrior):
         tracker_sd: tau, mm, or None.
     """
 
-    sigma: Float[Array, "3"]
+    sigma: Float[Array, 3]
     covariance: Float[Array, "n 2 2"] | None = None
     tracker_sd: Float[Array, ""] | None = None
 
     def residual(
         self, parameters: Parameters, offset: Float[Array, " k"], problem: Problem
-    ) -> Float[Array, "n k"]:
+    ) -> Float[Array, "n columns"]:
         tau = self.tracker_sd
         shift = None if tau is None else tau * offset
         values = measurement_residual(parameters, problem, shift)

@@ -35,8 +35,7 @@ def target_in_image(parameters: Parameters, problem: Problem) -> Float[Array, "n
     """q_i = X^-1 B_i^-1 c: lateral, elevational, axial, mm; (0, 0, 1) where left out."""
     rotations = problem.poses[:, :3, :3]
     in_probe = jnp.einsum("nji,nj->ni", rotations, parameters.point - problem.poses[:, :3, 3])
-    rotation = parameters.image_to_probe.rotation().as_matrix()
-    q = (in_probe - parameters.image_to_probe.translation()) @ rotation
+    q = (in_probe - parameters.translation) @ parameters.rotation
     # hypot has no derivative at 0, where an image left out may well put the target.
     unused = jnp.asarray([0.0, 0.0, 1.0], q.dtype)
     return jnp.where(problem.mask[:, None] > 0, q, unused)

@@ -11,13 +11,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxcal.geometry import AnyArray
+
 
 def fit_distances(
-    distances: Float[Array, "*batch elements"],
-    element_lateral: Float[Array, " elements"],
+    distances: Float[AnyArray, "*batch elements"],
+    element_lateral: Float[AnyArray, " elements"],
     *,
     steps: int = 5,
-) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch 2 2"]]:
+) -> tuple[Float[AnyArray, "*batch 2"], Float[AnyArray, "*batch 2 2"]]:
     """Least squares on Eq. 5 from every element's distance to the target.
 
     Args:
@@ -44,7 +46,7 @@ def fit_distances(
         model = jnp.sqrt(along**2 + r[..., None] ** 2)
         return along / model, r[..., None] / model, model, distances - model
 
-    def step(_: int, estimate: tuple[Array, Array]) -> tuple[Array, Array]:
+    def step(_: Array, estimate: tuple[Array, Array]) -> tuple[Array, Array]:
         x, r = estimate
         jx, jr, _, residual = normal(x, r)
         a, b, c = (jx * jx).sum(-1), (jx * jr).sum(-1), (jr * jr).sum(-1)

@@ -33,7 +33,8 @@ class Alternation(eqx.Module):
         tolerance_met: True when it stopped because X had stopped moving, False at the round limit.
         rotation_change: X's rotation in the last round, rad.
         translation_change: X's translation in the last round, mm.
-        trace: (trace,) cost after each of the first rounds; NaN beyond the last.
+        trace: (trace,) cost after each of the first rounds, NaN beyond the last; None if none was
+            asked for.
     """
 
     parameters: Parameters
@@ -44,7 +45,7 @@ class Alternation(eqx.Module):
     tolerance_met: Bool[Array, ""]
     rotation_change: Float[Array, ""]
     translation_change: Float[Array, ""]
-    trace: Float[Array, " trace"]
+    trace: Float[Array, " trace"] | None
 
 
 class _State(eqx.Module):
@@ -100,7 +101,8 @@ def alternate(
             return retract(parameters, move, blocks), arrow.cost
 
         parameters, _ = jax.lax.scan(step, state.parameters, length=inner_steps)
-        change = state.parameters.image_to_probe.inverse() @ parameters.image_to_probe
+        turned = state.parameters.rotation - parameters.rotation
+        moved = state.parameters.translation - parameters.translation
         recorded = state.trace
         if trace:
             cost = jnp.sum(held.residual(parameters, none, problem) ** 2)
@@ -109,8 +111,9 @@ def alternate(
             parameters,
             offset,
             state.rounds + 1,
-            jnp.linalg.norm(change.rotation().log()),
-            jnp.linalg.norm(change.translation()),
+            # 2 asin(|R1 - R2| / sqrt 8), the angle, keeps its digits where acos would lose them.
+            2 * jnp.arcsin(jnp.minimum(jnp.linalg.norm(turned) / jnp.sqrt(8.0).astype(dtype), 1)),
+            jnp.linalg.norm(moved),
             recorded,
         )
 
@@ -132,5 +135,5 @@ def alternate(
         & (state.translation_change < tolerance_mm),
         rotation_change=state.rotation_change,
         translation_change=state.translation_change,
-        trace=state.trace,
+        trace=state.trace if trace else None,
     )

@@ -16,6 +16,7 @@ descent on the Euclidean group", ICRA 2014.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import equinox as eqx
@@ -91,10 +92,7 @@ def from_scratch(
 def pairwise_points(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:
     """B_i X p_i, the target as reconstructed from every image, in the tracker's frame, mm."""
     points = point_on_circle(measured_points(parameters, problem), jnp.zeros_like(problem.mask))
-    in_probe = (
-        points @ parameters.image_to_probe.rotation().as_matrix().T
-        + parameters.image_to_probe.translation()
-    )
+    in_probe = points @ parameters.rotation.T + parameters.translation
     rotated = jnp.einsum("nij,nj->ni", problem.poses[:, :3, :3], in_probe)
     return rotated + problem.poses[:, :3, 3]
 
@@ -160,10 +158,9 @@ def pairwise_gradient(
     moved = retract(start, unit * solution.value, movable)
     cloud = pairwise_points(moved, problem)
     point = jnp.sum(problem.mask[:, None] * cloud, axis=0) / count
-    parameters = Parameters(moved.image_to_probe, point, moved.scale)
+    parameters = replace(moved, point=point)
     none = jnp.zeros(0, problem.mask.dtype)
     arrow, _, _ = linearise(parameters, none, InPlane(), problem, blocks)
-    history = jnp.full(trace, jnp.nan, problem.mask.dtype)
     return Fit(
         parameters=parameters,
         offset=none,
@@ -171,5 +168,5 @@ def pairwise_gradient(
         stationarity=arrows.stationarity(arrow),
         settled=solution.result == optx.RESULTS.successful,
         iterations=solution.stats["num_steps"],
-        trace=history,
+        trace=jnp.full(trace, jnp.nan, problem.mask.dtype) if trace else None,
     )

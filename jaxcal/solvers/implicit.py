@@ -90,8 +90,8 @@ def _optimum_jvp(blocks: Blocks, primals: tuple, tangents: tuple) -> tuple:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def self_tuned_optimum(
-    blocks: Blocks, reference: Parameters, sigma: Float[Array, "3"], problem: Problem
-) -> tuple[Float[Array, " p"], Float[Array, "3"]]:
+    blocks: Blocks, reference: Parameters, sigma: Float[Array, 3], problem: Problem
+) -> tuple[Float[Array, " p"], Float[Array, 3]]:
     """How a self-tuned solution and its three SDs move with the problem.
 
     Args:

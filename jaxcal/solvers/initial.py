@@ -9,8 +9,9 @@ whether the pixel scales s are known or not: unknown scales are |a1| and |a3|. T
 [a1, a3] is projected to orthonormal columns by SVD (y = z cross x completes it, so no reflection can
 arise), and t and c (and unknown scales) follow from the linear system with the rotation held.
 
-The system is singular where the points lie on a line in the image (all at one depth, say) although
-X may still be determined by its being a rotation, and it is useless where noise drowns it. The start
+The system is singular where the poses or the points (all on a line in the image) determine less than
+12 unknowns, and useless where few images and much noise drown it, although X's being a rotation may
+still determine it. The start
 is then marked unsound, and :func:`jaxcal.solvers.conventional.from_scratch` also tries the 24
 rotations of the cube.
 
@@ -27,7 +28,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxcal.geometry import se3_from_parts
 from jaxcal.model.parameters import Blocks, Parameters
 from jaxcal.problem import Problem
 
@@ -137,7 +137,7 @@ def start_from_rotation(
         known = points[:, :1] * lateral + points[:, 1:] * axial
         rest, _ = _weighted(jnp.concatenate([rotations, -eye], axis=2), rhs - known, weight)
         scale = jnp.ones(2, points.dtype)
-    return Parameters(se3_from_parts(rotation, rest[:3]), rest[3:] + centre, scale)
+    return Parameters(rotation, rest[:3], rest[3:] + centre, scale)
 
 
 def _weighted(

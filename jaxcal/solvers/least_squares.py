@@ -43,7 +43,8 @@ class Fit(eqx.Module):
         stationarity: scaled KKT residual there.
         settled: whether it stopped because it had arrived, as far as rounding allows.
         iterations: linearisations taken.
-        trace: (trace,) cost after each of the first iterations; NaN beyond the last.
+        trace: (trace,) cost after each of the first iterations; NaN beyond the last; None if none
+            was asked for (lax.map cannot chunk arrays without elements).
     """
 
     parameters: Parameters
@@ -52,7 +53,7 @@ class Fit(eqx.Module):
     stationarity: Float[Array, ""]
     settled: Bool[Array, ""]
     iterations: Int[Array, ""]
-    trace: Float[Array, " trace"]
+    trace: Float[Array, " trace"] | None
 
 
 def linearise(
@@ -341,5 +342,5 @@ def minimise(
         stationarity=stationarity,
         settled=(stationarity <= 10 * tolerance) | (solution.state.search_state.idle >= 4),
         iterations=solution.stats["num_steps"],
-        trace=solution.state.search_state.trace,
+        trace=solution.state.search_state.trace if trace else None,
     )

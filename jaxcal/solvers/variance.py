@@ -52,10 +52,10 @@ class SelfTuned(eqx.Module):
     """
 
     fit: Fit
-    sigma: Float[Array, "3"]
+    sigma: Float[Array, 3]
     rounds: Int[Array, ""]
     settled: Bool[Array, ""]
-    floored: Bool[Array, "3"]
+    floored: Bool[Array, 3]
 
 
 def self_tuned(
@@ -91,7 +91,7 @@ def self_tuned(
 
     tightest = tolerance / 10
 
-    def solve(parameters: Parameters, sigma: Float[Array, "3"], change: Float[Array, ""]) -> Fit:
+    def solve(parameters: Parameters, sigma: Float[Array, 3], change: Float[Array, ""]) -> Fit:
         # No use in solving far beyond how well the SDs are known yet.
         wanted = jnp.clip(0.01 * change, tightest, 1e-3)
         return minimise(
@@ -127,8 +127,8 @@ def self_tuned(
 
 
 def update(
-    parameters: Parameters, sigma: Float[Array, "3"], problem: Problem, blocks: Blocks
-) -> Float[Array, "3"]:
+    parameters: Parameters, sigma: Float[Array, 3], problem: Problem, blocks: Blocks
+) -> Float[Array, 3]:
     """One Helmert update of the three SDs (mm) at a weighted solution."""
     prior = Gaussian(sigma, covariance_shape(problem))
     none = jnp.zeros(0, problem.mask.dtype)
@@ -144,14 +144,14 @@ def update(
 
 
 def update_or_hold(
-    parameters: Parameters, sigma: Float[Array, "3"], problem: Problem, blocks: Blocks
-) -> Float[Array, "3"]:
+    parameters: Parameters, sigma: Float[Array, 3], problem: Problem, blocks: Blocks
+) -> Float[Array, 3]:
     """:func:`update`, or the held SDs where there are too few images to estimate them."""
     enough = jnp.sum(problem.mask) >= MINIMUM_SELF_TUNING
     held = jnp.asarray(DEFAULT_SIGMA, sigma.dtype)
     return jnp.where(enough, update(parameters, sigma, problem, blocks), held)
 
 
-def with_floor(sigma: Float[Array, "3"]) -> Float[Array, "3"]:
+def with_floor(sigma: Float[Array, 3]) -> Float[Array, 3]:
     """The SDs, none below a thousandth of the largest."""
     return jnp.maximum(sigma, jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma), ABSOLUTE_FLOOR_MM))

@@ -1,0 +1,53 @@
+"""What the experiments share: where results go, how they are written, and what machine it was."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import platform
+from collections.abc import Iterable
+from pathlib import Path
+
+from jaxcal.io.atomic import atomic_path
+
+RESULTS = Path(__file__).parent / "results"
+
+ELEVATIONS_MM = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
+NOISES_MM = (0.0, 0.5, 2.0, 4.0, 6.0, 8.0, 10.0)
+"""The grid of the paper's Tables 1 and 2."""
+
+
+def arguments(description: str) -> argparse.Namespace:
+    """Parse ``--quick``."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--quick", action="store_true", help="few trials; minutes on two cores")
+    return parser.parse_args()
+
+
+def results_folder(quick: bool) -> Path:
+    """The folder for tables and figures, made if need be."""
+    folder = RESULTS / "quick" if quick else RESULTS
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def write_table(path: Path, header: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write a CSV whole or not at all; floats with six significant digits."""
+    with atomic_path(path) as temporary, temporary.open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(header)
+        for row in rows:
+            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in row])
+
+
+def machine() -> str:
+    """Processor, cores and versions, for a table's foot."""
+    import jax
+
+    model = platform.processor() or platform.machine()
+    for line in Path("/proc/cpuinfo").read_text().splitlines() if os.name == "posix" else ():
+        if line.startswith("model name"):
+            model = line.split(":", 1)[1].strip()
+            break
+    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, jax {jax.__version__}"

@@ -1,0 +1,234 @@
+"""Joint `bounded` and the alternation on one objective: sum |q_i - p_i(y_i)|^2, |y_i| <= m.
+
+1,000 simulated problems (n = 50; offsets, noise and bound drawn at random) are solved from the same
+conventional start by the joint solver and by the alternation run until X moves by less than 1e-10;
+50 of them by scipy's bounded trust region as well. Reported: the objectives reached, the scaled KKT
+residual, iterations and rounds, and the time that both take to the same objective. Seed 20261120.
+"""
+
+from __future__ import annotations
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from common import arguments, machine, results_folder, write_table
+from jaxtyping import Array
+
+from jaxcal.geometry import rotation_angle
+from jaxcal.io.atomic import atomic_path
+from jaxcal.model.parameters import RIGID, Parameters, retract
+from jaxcal.model.priors import Bounded
+from jaxcal.problem import Problem
+from jaxcal.simulation import Protocol, simulate
+from jaxcal.solvers.alternating import alternate
+from jaxcal.solvers.conventional import from_scratch
+from jaxcal.solvers.joint import joint
+from jaxcal.uncertainty import assess
+
+SEED = 20261120
+IMAGES = 50
+ELEVATIONS = (0.5, 1.0, 2.0, 3.0, 5.0)
+NOISES = (0.05, 0.5, 2.0, 4.0, 10.0)
+BOUNDS = (0.25, 0.5, 1.0, 2.0, 4.0)
+ROUNDS = (1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000)
+TOLERANCE = 1e-10
+
+
+def draw(count: int) -> tuple[Problem, np.ndarray, np.ndarray]:
+    """``count`` problems, and for each its (elevation, noise) mm and its bound, mm."""
+    choice = np.random.default_rng(SEED).integers(0, 5, size=(count, 3))
+    root = jax.random.key(SEED)
+    problems, settings = [], []
+    makers: dict = {}
+    for index, (i, j, _) in enumerate(choice):
+        if (i, j) not in makers:
+            protocol = Protocol(
+                images=IMAGES, elevation_mm=ELEVATIONS[i], noise_mm=NOISES[j], test_images=2
+            )
+            makers[i, j] = protocol
+        settings.append((ELEVATIONS[i], NOISES[j]))
+    for (i, j), protocol in makers.items():
+        rows = np.flatnonzero((choice[:, 0] == i) & (choice[:, 1] == j))
+        keys = jax.vmap(lambda k: jax.random.fold_in(root, k))(jnp.asarray(rows))
+        made = jax.jit(jax.vmap(lambda k, p=protocol: simulate(k, p).problem()))(keys)
+        problems.append((rows, made))
+    order = np.argsort(np.concatenate([rows for rows, _ in problems]))
+    together = jax.tree.map(
+        lambda *leaves: jnp.concatenate(leaves)[order], *[made for _, made in problems]
+    )
+    return together, np.array(settings), np.array([BOUNDS[k] for k in choice[:, 2]])
+
+
+def chunked(function, *arguments, chunk: int = 64):
+    """A jitted vmap in chunks of lanes, compiled once."""
+
+    @jax.jit
+    def run(*arguments):
+        return jax.lax.map(lambda lane: function(*lane), arguments, batch_size=chunk)
+
+    compiled = run.lower(*arguments).compile()
+
+    def timed(*arguments):
+        began = time.perf_counter()
+        result = jax.block_until_ready(compiled(*arguments))
+        return result, time.perf_counter() - began
+
+    return timed
+
+
+def scipy_solution(problem: Problem, start: Parameters, bound: float):
+    """scipy.optimize.least_squares (trf, bounds) on X's tangent, c and every y."""
+    from scipy.optimize import least_squares
+
+    prior = Bounded(jnp.full(IMAGES, bound))
+
+    @jax.jit
+    def residual(unknowns: Array) -> Array:
+        parameters = retract(start, unknowns[:9], RIGID)
+        return prior.residual(parameters, unknowns[9:], problem).ravel()
+
+    jacobian = jax.jit(jax.jacfwd(residual))
+    first = np.concatenate([np.zeros(9), 0.999 * np.asarray(prior.start(start, problem))])
+    limit = np.concatenate([np.full(9, np.inf), np.full(IMAGES, bound)])
+    fit = least_squares(
+        lambda u: np.asarray(residual(jnp.asarray(u))), first, lambda u: np.asarray(jacobian(u)),
+        bounds=(-limit, limit), method="trf", x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15,
+        max_nfev=3000,
+    )  # fmt: skip
+    return 2 * fit.cost, retract(start, jnp.asarray(fit.x[:9]), RIGID).matrix()
+
+
+def main() -> None:
+    quick = arguments(__doc__).quick
+    count, compared = (100, 10) if quick else (1000, 50)
+    problems, settings, bounds = draw(count)
+    per_image = jnp.asarray(bounds)[:, None] * jnp.ones(IMAGES)
+
+    def begin(problem: Problem) -> Parameters:
+        return from_scratch(problem, RIGID).fit.parameters
+
+    starts, _ = chunked(begin, problems)(problems)
+
+    def solve_jointly(problem: Problem, start: Parameters, bound: Array):
+        return joint(start, Bounded(bound), problem, RIGID)
+
+    solve = chunked(solve_jointly, problems, starts, per_image)
+    fit, _ = solve(problems, starts, per_image)
+    joint_times = [solve(problems, starts, per_image)[1] for _ in range(3)]
+
+    def assessed(problem: Problem, parameters: Parameters, offset: Array, bound: Array):
+        return assess(
+            parameters, offset, Bounded(bound), problem, RIGID, whitened=False, uses_prior=True
+        )
+
+    sight, _ = chunked(assessed, problems, fit.parameters, fit.offset, per_image)(
+        problems, fit.parameters, fit.offset, per_image
+    )
+
+    def segment(problem: Problem, start: Parameters, bound: Array, rounds: Array):
+        return alternate(
+            start, Bounded(bound), problem, RIGID, tolerance_rad=TOLERANCE, tolerance_mm=TOLERANCE,
+            max_rounds=rounds, inner_steps=2,
+        )  # fmt: skip
+
+    lanes = jnp.zeros(count, jnp.int32)
+    advance = chunked(segment, problems, starts, per_image, lanes)
+    here, done, seconds = starts, 0, 0.0
+    costs, elapsed, finished = [], [], np.zeros(count, bool)
+    for rounds in ROUNDS:
+        # The state of the alternation is X and c alone, so it can be continued segment by segment.
+        steps = np.where(finished, 0, rounds - done)
+        state, took = advance(problems, here, per_image, jnp.asarray(steps, jnp.int32))
+        here, done, seconds = state.parameters, rounds, seconds + took
+        finished |= np.asarray(state.tolerance_met)
+        costs.append(np.asarray(state.cost))
+        elapsed.append(seconds)
+        print(f"alternation: {rounds} rounds, {finished.sum()} of {count} stopped, {seconds:.1f} s")
+    costs = np.array(costs)
+
+    joint_cost = np.asarray(fit.cost)
+    squares = np.asarray(jnp.sum(problems.measurements**2, axis=(1, 2)))
+    allowed = costs[-1] * (1 + 1e-8) + 1e-12 * squares
+    worse = joint_cost > allowed
+    better = joint_cost < costs[-1] * (1 - 1e-8) - 1e-12 * squares
+    reached = costs <= joint_cost * (1 + 1e-8) + 1e-12 * squares
+    rounds_needed = np.array([ROUNDS[np.argmax(r)] if r.any() else -1 for r in reached.T])
+
+    disagreements, angles, singular = 0, [], np.asarray(sight.singular)
+    for index in np.linspace(0, count - 1, compared).astype(int):
+        pick = jax.tree.map(lambda leaf, i=index: leaf[i], (problems, starts, fit.parameters))
+        cost, matrix = scipy_solution(pick[0], pick[1], float(bounds[index]))
+        if joint_cost[index] > cost * (1 + 1e-8) + 1e-12 * squares[index]:
+            disagreements += 1
+        if not singular[index]:
+            angles.append(rotation_angle(np.asarray(matrix), np.asarray(pick[2].matrix())))
+
+    folder = results_folder(quick)
+    write_table(
+        folder / "same_objective.csv",
+        ["problem", "elevation_mm", "noise_mm", "bound_mm", "joint_cost_mm2", "joint_iterations",
+         "joint_kkt", "alternation_cost_mm2", "alternation_stopped", "rounds_to_joint_cost",
+         "interval_of_minimisers"],
+        (
+            [k, *settings[k].tolist(), float(bounds[k]), float(joint_cost[k]),
+             int(fit.iterations[k]), float(fit.stationarity[k]), float(costs[-1, k]),
+             bool(finished[k]), int(rounds_needed[k]), bool(singular[k])]
+            for k in range(count)
+        ),
+    )  # fmt: skip
+    iterations = np.asarray(fit.iterations)
+    summary = [
+        ("problems", count),
+        ("joint objective above alternation's x (1 + 1e-8) + 1e-12 sum r^2", int(worse.sum())),
+        ("joint objective lower by more than that", int(better.sum())),
+        ("joint scaled KKT residual, largest", float(fit.stationarity.max())),
+        ("joint iterations, median", float(np.median(iterations))),
+        ("joint iterations, largest", int(iterations.max())),
+        ("joint time per problem (us), median of 3", 1e6 * float(np.median(joint_times)) / count),
+        ("alternation rounds to the joint's objective, median where reached",
+         float(np.median(rounds_needed[rounds_needed > 0]))),
+        ("alternation: problems that reach it within 20,000 rounds", int((rounds_needed > 0).sum())),
+        ("alternation: problems stopped by X moving < 1e-10", int(finished.sum())),
+        ("alternation time per problem (us), until stopped or 20,000 rounds",
+         1e6 * elapsed[-1] / count),
+        ("problems whose minimiser is an interval (no bound active in some direction)",
+         int(singular.sum())),
+        ("scipy trf: problems compared", compared),
+        ("scipy trf: problems where it found a lower objective", disagreements),
+        ("scipy trf: X compared (observable)", len(angles)),
+        ("scipy trf: largest angle between X and ours (rad)", float(max(angles))),
+        ("machine", machine()),
+    ]  # fmt: skip
+    write_table(folder / "same_objective_summary.csv", ["quantity", "value"], summary)
+    for name, value in summary:
+        print(f"{name}: {value}")
+    plot(folder / "same_objective.png", costs, joint_cost, iterations)
+
+
+def plot(path, costs: np.ndarray, joint_cost: np.ndarray, iterations: np.ndarray) -> None:
+    """Excess of the alternation's objective over the joint one against rounds."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    excess = np.maximum(costs / joint_cost - 1, 1e-15)
+    for quantile, style in ((50, "-"), (90, "--"), (99, ":")):
+        axes.loglog(ROUNDS, np.percentile(excess, quantile, axis=1), style, color="tab:blue",
+                    label=f"alternation, {quantile}th percentile")  # fmt: skip
+    axes.axvline(np.median(iterations), color="tab:orange",
+                 label="joint: median iterations to its optimum")  # fmt: skip
+    axes.axvline(iterations.max(), color="tab:orange", linestyle=":",
+                 label="joint: most iterations")  # fmt: skip
+    axes.set(xlabel="rounds (alternation), iterations (joint)",
+             ylabel="objective above the joint optimum (relative)",
+             title="Same objective, same start, n = 50")  # fmt: skip
+    axes.legend()
+    axes.grid(alpha=0.3)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=150)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,231 @@
+"""``jaxcal calibrate``: one recording to its transform, with a verdict and a report."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from jaxcal.cli.common import (
+    POSITIVE,
+    exit_code,
+    import_engine,
+    print_json,
+    print_page,
+    progress,
+)
+from jaxcal.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+    from jaxcal.recording import Recording
+    from jaxcal.report.convergence import Curve
+
+Method = Literal["joint", "alternating", "conventional"]
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What was asked for, checked as far as it can be without the data."""
+
+    method: Method
+    prior: Literal["auto", "gaussian", "bounded"]
+    max_elevation: float | None
+    estimate: tuple[str, ...]
+    sigma: tuple[float, float, float] | None
+    options: dict[str, Any]
+
+
+@click.command()
+@click.argument("recording", type=click.Path(), metavar="REC")
+@click.option(
+    "--method",
+    type=click.Choice(["joint", "alternating", "conventional"]),
+    default="joint",
+    show_default=True,
+    help="joint: transform, target and elevational offsets together; alternating: the paper's; "
+    "conventional: every target taken for in-plane.",
+)
+@click.option(
+    "--prior",
+    type=click.Choice(["auto", "gaussian", "uniform", "bounded"]),
+    default="auto",
+    show_default=True,
+    help="What the joint method takes the offsets for; auto: Gaussian, with SDs tuned to the data.",
+)
+@click.option(
+    "--max-elevation",
+    type=POSITIVE,
+    metavar="MM",
+    help="Bound on the offsets, for --method alternating and --prior bounded; without it the "
+    "recording's own, or 1 mm.",
+)
+@click.option(
+    "--sigma",
+    type=POSITIVE,
+    nargs=3,
+    metavar="LATERAL RANGE ELEVATIONAL",
+    help="SDs of the errors, mm, for the Gaussian prior instead of tuned ones.",
+)
+@click.option(
+    "--estimate",
+    metavar="LIST",
+    help="Further unknowns, separated by commas: scale (the size of a pixel).",
+)
+@click.option(
+    "--solver",
+    type=click.Choice(["lm", "gauss-newton", "gradient"]),
+    help="Of the conventional method; lm by default.",
+)
+@click.option(
+    "--tolerance-mm",
+    type=POSITIVE,
+    metavar="MM",
+    help="The alternation stops when a round moves the transform by less than this (0.1 by "
+    "default)",
+)
+@click.option(
+    "--tolerance-rad",
+    type=POSITIVE,
+    metavar="RAD",
+    help="and turns it by less than this (0.001 by default).",
+)
+@click.option(
+    "--test",
+    type=click.Path(),
+    metavar="REC2",
+    help="Recording whose images are the independent test set.",
+)
+@click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+def calibrate(
+    recording: str,
+    method: Method,
+    prior: str,
+    max_elevation: float | None,
+    sigma: tuple[float, float, float] | None,
+    estimate: str | None,
+    solver: str | None,
+    tolerance_mm: float | None,
+    tolerance_rad: float | None,
+    test: str | None,
+    out: str | None,
+    as_json: bool,
+) -> int:
+    """Calibrate from the recording REC; nobody has to supply a starting guess."""
+    request = _request(
+        method, prior, max_elevation, sigma, estimate, solver, tolerance_mm, tolerance_rad
+    )
+    import_engine()
+    from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.io.hdf5 import load
+    from jaxcal.report.record import calibration_record, check_test_images
+    from jaxcal.report.write import prepare_folder, write_report
+
+    data = load(recording)
+    test_data = None if test is None else load(test)
+    check_test_images(data, test_data)
+    enable_compilation_cache()
+    with nullcontext() if out is None else prepare_folder(out) as folder:
+        with progress(f"calibrating ({method})"):
+            result = _solve(data, request, traced=folder is not None and method == "conventional")
+            record = calibration_record(result, data, test_data)
+        if folder is not None:
+            with progress("drawing the report"):
+                curves = _curves(data, request, result)
+                write_report(folder, record, result, data, curves)
+    if as_json:
+        print_json(record)
+    else:
+        _print(record, out)
+    return exit_code([record])
+
+
+def _request(
+    method: Method,
+    prior: str,
+    max_elevation: float | None,
+    sigma: tuple[float, float, float] | None,
+    estimate: str | None,
+    solver: str | None,
+    tolerance_mm: float | None,
+    tolerance_rad: float | None,
+) -> _Request:
+    """Refuse options that would be without effect: whoever gives one counts on it."""
+    if prior == "uniform":
+        raise InputError("--prior uniform is not in this version; there are gaussian and bounded")
+    fitting = {"joint": ("auto", "gaussian", "bounded"), "alternating": ("auto", "bounded")}
+    if prior not in fitting.get(method, ("auto",)):
+        raise InputError(f"--prior {prior} does not go with --method {method}")
+    bounded = method == "alternating" or (method == "joint" and prior == "bounded")
+    if max_elevation is not None and not bounded:
+        raise InputError("--max-elevation needs --method alternating or --prior bounded")
+    if sigma is not None and (method != "joint" or prior == "bounded"):
+        raise InputError("--sigma needs --method joint with the gaussian prior")
+    if solver is not None and method != "conventional":
+        raise InputError("--solver needs --method conventional")
+    tolerances = {"tolerance_mm": tolerance_mm, "tolerance_rad": tolerance_rad}
+    options: dict[str, Any] = {key: value for key, value in tolerances.items() if value is not None}
+    if options and method != "alternating":
+        raise InputError("--tolerance-mm and --tolerance-rad need --method alternating")
+    if solver is not None:
+        options["solver"] = solver
+    chosen: Literal["auto", "gaussian", "bounded"] = "auto"
+    if prior == "gaussian" or prior == "bounded":
+        chosen = prior
+    return _Request(method, chosen, max_elevation, _unknowns(estimate), sigma, options)
+
+
+def _unknowns(estimate: str | None) -> tuple[str, ...]:
+    if estimate is None:
+        return ()
+    names = [name.strip() for name in estimate.split(",")]
+    for name in names:
+        if name in ("sound-speed", "delay"):
+            raise InputError(f"this version cannot estimate {name}; it estimates: scale")
+        if name != "scale":
+            raise InputError(f"cannot estimate {name!r}; this version estimates: scale")
+    return ("scale",)
+
+
+def _solve(recording: Recording, request: _Request, *, traced: bool) -> Calibration:
+    import jax
+
+    from jaxcal.report.convergence import KEPT
+    from jaxcal.solve import Options
+    from jaxcal.solve import calibrate as solve
+
+    result = solve(
+        recording,
+        request.method,
+        request.prior,
+        max_elevation=request.max_elevation,
+        sigma=request.sigma,
+        estimate=request.estimate,
+        options=Options(**request.options, trace=KEPT if traced else 0),
+    )
+    return jax.block_until_ready(result)
+
+
+def _curves(recording: Recording, request: _Request, result: Calibration) -> list[Curve]:
+    from jaxcal.problem import Problem
+    from jaxcal.report.convergence import bounded_curves, own_curve
+
+    if request.method == "conventional":
+        return [own_curve(result)]
+    return bounded_curves(
+        Problem.from_recording(recording),
+        max_elevation=request.max_elevation,
+        estimate=request.estimate,
+        alternating=result if request.method == "alternating" else None,
+    )
+
+
+def _print(record: dict[str, Any], out: str | None) -> None:
+    from jaxcal.report.tables import calibration_table
+    from jaxcal.report.verdict import verdict
+
+    report = [] if out is None else ["", f"report: {out}"]
+    print_page(calibration_table(record), *verdict(record), *report)

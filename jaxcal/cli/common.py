@@ -1,0 +1,126 @@
+"""What the commands share: numbers that are numbers, progress, JSON, exit codes."""
+
+from __future__ import annotations
+
+import enum
+import importlib
+import json
+import math
+import os
+import signal
+import sys
+import textwrap
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+
+class ExitCode(enum.IntEnum):
+    """How the process ends; the last two are the shell's names for signals 2 and 13."""
+
+    CONVERGED = 0
+    INTERNAL_ERROR = 1
+    BAD_INPUT = 2
+    NOT_CONVERGED = 3
+    INTERRUPTED = 130
+    BROKEN_PIPE = 141
+
+
+class Number(click.ParamType):
+    """A finite number, positive (or, if asked for, zero)."""
+
+    name = "number"
+
+    def __init__(self, *, zero: bool = False) -> None:
+        self.zero = zero
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """The number, or a usage error."""
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number) or number < 0 or (number == 0 and not self.zero):
+            wanted = "zero or a positive number" if self.zero else "a positive number"
+            self.fail(f"{value!r} is not {wanted}", param, ctx)
+        return number
+
+
+POSITIVE = Number()
+NOT_NEGATIVE = Number(zero=True)
+
+
+def exit_code(records: Iterable[dict[str, Any]]) -> ExitCode:
+    """0 where every calibration converged, else 3."""
+    converged = all(record["converged"] for record in records)
+    return ExitCode.CONVERGED if converged else ExitCode.NOT_CONVERGED
+
+
+def print_json(record: dict[str, Any]) -> None:
+    """One JSON object on one line of standard output."""
+    click.echo(json.dumps(record, allow_nan=False))
+
+
+def print_page(*parts: RenderableType) -> None:
+    """Print tables, and sentences wrapped to the page, on standard output."""
+    from rich.console import Console
+
+    # What goes to a file or a pipe must not be cut to the width of no terminal.
+    width = None if sys.stdout is not None and sys.stdout.isatty() else 100
+    # Nothing in a message or a file's name is to be taken for markup.
+    page = Console(markup=False, highlight=False, emoji=False, width=width)
+    with page.capture() as captured:
+        for part in parts:
+            if isinstance(part, str):
+                indent = "  " if part.startswith("- ") else ""
+                part = textwrap.fill(part, page.width, subsequent_indent=indent)
+            page.print(part)
+    # Not straight from rich, which leaves the process when the pipe is closed early.
+    click.echo(captured.get(), nl=False)
+
+
+@contextmanager
+def progress(message: str) -> Iterator[None]:
+    """Show what is being done on standard error, if somebody is watching."""
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True, markup=False, highlight=False).status(message):
+        yield
+
+
+def import_engine() -> None:
+    """Import the numerical libraries, which takes most of a second; Ctrl-C then leaves at once.
+
+    Nothing has been written yet, and a KeyboardInterrupt inside their C code would come out as
+    tracebacks and import errors.
+    """
+
+    def leave(*_: object) -> None:
+        os.write(2, b"jaxcal: interrupted\n")
+        os._exit(ExitCode.INTERRUPTED)
+
+    def load() -> None:
+        importlib.import_module("jaxcal.solve")
+        importlib.import_module("jaxcal.io.hdf5")
+
+    # Python handles signals in its main thread only, and there only if nobody took them over.
+    main_thread = threading.current_thread() is threading.main_thread()
+    if not main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        load()
+        return
+    previous = signal.signal(signal.SIGINT, leave)
+    try:
+        load()
+    finally:
+        signal.signal(signal.SIGINT, previous)

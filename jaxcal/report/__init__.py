@@ -1,0 +1,1 @@
+"""A calibration for a program (record), for a person (verdict, tables) and on paper (figures)."""

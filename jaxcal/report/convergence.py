@@ -1,0 +1,83 @@
+"""How fast the methods fall on one and the same objective: the bounded problem of the paper.
+
+The alternation is run on past its own stopping rule, so that its rate shows; where the rule would
+have stopped it is marked. The joint solver begins with a few rounds of the same alternation, so the
+two curves share their beginning.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.calibration import Calibration
+from jaxcal.problem import Problem
+from jaxcal.solve import Options, calibrate
+from jaxcal.solvers.joint import WARM_UP_ROUNDS
+
+KEPT = 200
+"""Iterations that are drawn."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """How an objective fell.
+
+    Attributes:
+        label: for the legend.
+        objective: (k,) after iteration 0 (the start), 1, 2 and so on; NaN where it was not kept.
+        stopped: iteration at which the method's own rule stopped, or None.
+    """
+
+    label: str
+    objective: Float[np.ndarray, " k"]
+    stopped: int | None = None
+
+
+def own_curve(result: Calibration) -> Curve:
+    """The objective of one conventional solve, from the values kept in its trace."""
+    return Curve(result.method, _trace(result))
+
+
+def bounded_curves(
+    problem: Problem,
+    *,
+    max_elevation: float | None = None,
+    estimate: tuple[str, ...] = (),
+    alternating: Calibration | None = None,
+) -> list[Curve]:
+    """Joint solver and alternation on the bounded objective, from the same start.
+
+    Args:
+        problem: one problem.
+        max_elevation: bound, mm; the problem's own or 1 mm without.
+        estimate: further unknowns.
+        alternating: an alternation that stopped by its own rule, to mark where that was.
+
+    Returns:
+        Curves of the sum of squares, mm^2.
+    """
+    joint = calibrate(
+        problem, "joint", "bounded", max_elevation=max_elevation, estimate=estimate,
+        options=Options(trace=KEPT),
+    )  # fmt: skip
+    # A tolerance of nothing: every round is taken.
+    patient = Options(trace=KEPT, max_rounds=KEPT, tolerance_mm=1e-300, tolerance_rad=1e-300)
+    slow = calibrate(
+        problem, "alternating", max_elevation=max_elevation, estimate=estimate, options=patient
+    )
+    # The alternation keeps no value before its first round.
+    rounds = np.concatenate([[np.nan], _trace(slow)])
+    # The joint solver's first value is that of its start, the warm-up's last round.
+    steps = np.concatenate([rounds[:WARM_UP_ROUNDS], _trace(joint)])
+    stopped = None if alternating is None else int(alternating.iterations)
+    return [
+        Curve(f"joint (after {WARM_UP_ROUNDS} alternating rounds)", steps),
+        Curve("alternating", rounds, stopped),
+    ]
+
+
+def _trace(result: Calibration) -> Float[np.ndarray, " k"]:
+    return np.empty(0) if result.trace is None else np.asarray(result.trace, dtype=float)

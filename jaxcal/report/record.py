@@ -1,0 +1,169 @@
+"""A calibration as one JSON object: plain values with units in their names, finite or null."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+import jaxcal
+from jaxcal import diagnosis
+from jaxcal.calibration import Calibration
+from jaxcal.errors import InputError
+from jaxcal.geometry import rotation_angle
+from jaxcal.metrics import reconstruction_precision
+from jaxcal.recording import Images, Recording, Truth
+
+CONVENTION = {
+    "units": "lengths in mm; rotations in rad where no unit is in the name",
+    "image_frame": "x lateral along the elements, y elevational (z cross x), z axial away from the "
+    "transducer; pixels: lateral = scale u, range = scale v + face offset",
+    "image_to_probe": "4x4, row-major; maps the image frame to the probe's (tracked) frame",
+    "point_mm": "target in the tracker's frame",
+    "elevation_mm": "estimated distance of the target from the image's mid-plane, along y; 0 where "
+    "an image was left out",
+    "covariance": "of image_to_probe under the right perturbation X Exp([v, omega]): v in mm, then "
+    "omega in rad, along and about the image's axes",
+    "objective": "the minimised sum of squares: mm^2, or in SDs with the gaussian prior",
+}
+
+
+def calibration_record(
+    result: Calibration, recording: Recording, test: Recording | None = None
+) -> dict[str, Any]:
+    """Everything about one calibration that goes into ``calibration.json`` and ``--json``.
+
+    Args:
+        result: of one problem (not a batch), with concrete values.
+        recording: what was calibrated; its truth and test set are used where it has them.
+        test: another recording whose calibration images are the test set instead.
+
+    Returns:
+        A dictionary that ``json.dumps(..., allow_nan=False)`` takes.
+
+    Raises:
+        InputError: test images that cannot be brought to mm (see :func:`check_test_images`).
+    """
+    answer = result.numpy()
+    precision, precision_set = _precision(answer, recording, test)
+    record: dict[str, Any] = {
+        "method": result.method,
+        "prior": result.prior,
+        "converged": bool(result.converged),
+        "status": result.status,
+        "iterations": int(answer.iterations),
+        "variance_rounds": int(answer.variance_rounds),
+        "images": len(answer.mask),
+        "images_used": int(result.images_used),
+        "image_to_probe": answer.image_to_probe,
+        "point_mm": answer.point,
+        "elevation_mm": answer.elevation,
+        "elevation_sd_mm": answer.elevation_sd,
+        "sigma_lateral_mm": answer.sigma[0],
+        "sigma_range_mm": answer.sigma[1],
+        "sigma_elevation_mm": answer.sigma[2],
+        "covariance": answer.covariance if np.isfinite(answer.covariance).all() else None,
+        "observability": result.observability,
+        "rms_mm": answer.rms,
+        "reconstruction_precision_mm": precision,
+        "reconstruction_precision_set": precision_set,
+        "scale_mm_per_px": answer.scale_mm_per_px,
+        "objective": answer.cost,
+        "scaled_kkt_residual": answer.stationarity,
+        "outliers": diagnosis.outliers(answer),
+        "warnings": result.warnings,
+    }
+    if recording.truth is not None:
+        record["truth_error"] = truth_error(answer, recording.truth)
+    record |= {"source": recording.source, "convention": CONVENTION}
+    record["jaxcal_version"] = jaxcal.__version__
+    return plain(record)
+
+
+def truth_error(result: Calibration, truth: Truth) -> dict[str, float]:
+    """How far a calibration is from a simulation's truth.
+
+    Args:
+        result: one calibration.
+        truth: what the simulation knows.
+
+    Returns:
+        ``rotation_deg`` and ``translation_mm`` of X, ``point_mm`` of the target.
+    """
+    transform = np.asarray(result.image_to_probe)
+    moved = transform[:3, 3] - truth.image_to_probe[:3, 3]
+    return {
+        "rotation_deg": math.degrees(rotation_angle(truth.image_to_probe, transform)),
+        "translation_mm": float(np.linalg.norm(moved)),
+        "point_mm": float(np.linalg.norm(np.asarray(result.point) - truth.point)),
+    }
+
+
+def check_test_images(recording: Recording, test: Recording | None = None) -> Images | None:
+    """The images of the independent test set, if there are any, and whether they can be used.
+
+    Args:
+        recording: what is to be calibrated.
+        test: another recording whose calibration images are the test set; without it the
+            recording's own test set is.
+
+    Raises:
+        InputError: times of flight, or pixels without a spacing beside points in mm.
+    """
+    images = recording.test if test is None else test.calibration
+    source = recording.source if test is None else test.source
+    if images is None:
+        return None
+    if images.kind == "time_of_flight":
+        raise InputError(f"{source}: test images must hold points or pixels, not times of flight")
+    unscaled = images.kind == "pixel" and images.spacing_mm is None
+    if unscaled and recording.calibration.kind != "pixel":
+        raise InputError(
+            f"{source}: test images are pixels without spacing_mm: their mm are unknown"
+        )
+    return images
+
+
+def plain(value: Any) -> Any:
+    """Arrays as lists, numpy's scalars as Python's, and null for whatever is not finite."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _precision(
+    result: Calibration, recording: Recording, test: Recording | None
+) -> tuple[float | None, str]:
+    images = check_test_images(recording, test)
+    name = "calibration" if images is None else "test"
+    if images is None:
+        images = recording.calibration
+    if images.mask.sum() < 2:
+        return None, name
+    value = reconstruction_precision(
+        jnp.asarray(result.image_to_probe),
+        jnp.asarray(images.poses),
+        jnp.asarray(_points_mm(images, result)),
+        jnp.asarray(images.mask.astype(float)),
+    )
+    return float(value), name
+
+
+def _points_mm(images: Images, result: Calibration) -> Float[np.ndarray, "n 2"]:
+    """[lateral, range] in mm."""
+    if images.kind != "pixel":
+        return images.measurements
+    # An estimated scale replaces whatever was written down; a known one is each set's own.
+    scale = result.scale_mm_per_px
+    if images.spacing_mm is not None and "scale" not in result.blocks:
+        scale = images.spacing_mm
+    return images.measurements * np.asarray(scale) + [0.0, images.face_offset_mm]

@@ -1,0 +1,120 @@
+"""Tables for a terminal, from the records of :mod:`jaxcal.report.record`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+
+from jaxcal.report.verdict import spread_of_transform
+
+_UNKNOWN = "-"
+
+
+def calibration_table(record: dict[str, Any]) -> RenderableType:
+    """One calibration: transform, target, errors and quality.
+
+    Args:
+        record: of :func:`jaxcal.report.record.calibration_record`.
+    """
+    transform = Table(title="image_to_probe (mm)", box=box.SIMPLE, show_header=False)
+    for row in record["image_to_probe"]:
+        transform.add_row(*(_number(value, ".6f") for value in row))
+    for _ in range(4):
+        transform.columns[_].justify = "right"
+
+    facts = Table(box=box.SIMPLE, show_header=False)
+    facts.add_column(style="bold")
+    facts.add_column()
+    for name, value in _facts(record):
+        facts.add_row(name, value)
+    return Group(transform, facts)
+
+
+def comparison_table(
+    records: dict[str, dict[str, Any]], milliseconds: dict[str, float] | None = None
+) -> Table:
+    """Several calibrations of one recording, a row each.
+
+    Args:
+        records: by the name to show.
+        milliseconds: solve times by the same names, if they were measured.
+    """
+    table = Table(box=box.SIMPLE)
+    table.add_column("method", style="bold")
+    for heading in (
+        "reconstruction\nprecision (mm)",
+        "error of X\n(mm)",
+        "error of X\n(deg)",
+        "RMS\n(mm)",
+        "iterations",
+        *(["solve\n(ms)"] if milliseconds else []),
+    ):
+        table.add_column(heading, justify="right")
+    table.add_column("status")
+    for name, record in records.items():
+        error = record.get("truth_error", {})
+        cells = [
+            _number(record["reconstruction_precision_mm"], ".3f"),
+            _number(error.get("translation_mm"), ".3f"),
+            _number(error.get("rotation_deg"), ".3f"),
+            _number(record["rms_mm"], ".3f"),
+            str(record["iterations"]),
+        ]
+        if milliseconds:
+            cells.append(_number(milliseconds.get(name), ".1f"))
+        table.add_row(name, *cells, record["status"])
+    return table
+
+
+def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
+    prior = "" if record["prior"] == "none" else f", {record['prior']} prior"
+    facts = [
+        ("method", f"{record['method']}{prior}"),
+        ("status", f"{record['status']} after {record['iterations']} iterations"),
+        ("images", f"{record['images_used']} used of {record['images']}"),
+        ("target in tracker frame (mm)", _numbers(record["point_mm"], ".3f")),
+        (
+            "error SD (mm)",
+            f"lateral {_number(record['sigma_lateral_mm'], '.3f')}, "
+            f"range {_number(record['sigma_range_mm'], '.3f')}, "
+            f"elevational {_number(record['sigma_elevation_mm'], '.3f')}",
+        ),
+        ("RMS in the image plane (mm)", _number(record["rms_mm"], ".3f")),
+        (
+            f"reconstruction precision, {record['reconstruction_precision_set']} images (mm)",
+            _number(record["reconstruction_precision_mm"], ".3f"),
+        ),
+    ]
+    spread = spread_of_transform(record)
+    if spread is not None:
+        facts.append(("SD of image_to_probe", f"{spread[0]:.3f} mm, {spread[1]:.3f} deg"))
+    if record["scale_mm_per_px"] is not None:
+        facts.append(("pixel scale (mm/px)", _numbers(record["scale_mm_per_px"], ".6f")))
+    sight = record["observability"]
+    # Where it is not determined at all, the SD says only where rounding begins.
+    sd = sight["weakest_sd_mm"] if record["status"] != "unobservable" else None
+    facts.append(
+        ("least known", sight["weakest_direction"] + ("" if sd is None else f" (SD {sd:.2f} mm)"))
+    )
+    if "truth_error" in record:
+        error = record["truth_error"]
+        facts.append(
+            (
+                "error against truth",
+                f"{_number(error['translation_mm'], '.3f')} mm, "
+                f"{_number(error['rotation_deg'], '.3f')} deg; "
+                f"target {_number(error['point_mm'], '.3f')} mm",
+            )
+        )
+    return facts
+
+
+def _number(value: float | None, form: str) -> str:
+    return _UNKNOWN if value is None else format(value, form)
+
+
+def _numbers(values: list[float | None], form: str) -> str:
+    return ", ".join(_number(value, form) for value in values)

@@ -1,0 +1,138 @@
+"""The report folder: calibration.json, residuals.csv and the figures, each complete or absent."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxcal.calibration import Calibration
+from jaxcal.errors import OutputError
+from jaxcal.io.atomic import atomic_path, write_text
+from jaxcal.io.readable import one_line
+from jaxcal.recording import Recording
+from jaxcal.report.convergence import Curve
+
+COLUMNS = (
+    "image",
+    "used",
+    "lateral_mm",
+    "elevational_mm",
+    "axial_mm",
+    "elevation_mm",
+    "elevation_sd_mm",
+    "at_bound",
+)
+"""Of residuals.csv: the residual from the image plane, then the estimated offset."""
+
+
+@contextmanager
+def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Make a folder, and see that it can be written to, before any work is done for it.
+
+    Args:
+        path: the folder; missing parents are made.
+
+    Yields:
+        The folder. Where the block raises, folders that were made for it and are still empty are
+        removed again.
+
+    Raises:
+        OutputError: it cannot be made or written to.
+    """
+    folder = Path(path)
+    made: list[Path] = []
+    try:
+        try:
+            missing = [place for place in (folder, *folder.parents) if not place.exists()]
+            for place in reversed(missing):
+                place.mkdir(exist_ok=True)
+                made.append(place)
+            if not folder.is_dir():
+                raise OutputError(f"{path}: is a file, not a folder")
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OutputError:
+            raise
+        except (OSError, ValueError) as error:
+            reason = one_line(error)
+            raise OutputError(f"{path}: cannot be made or written to: {reason}") from error
+        yield folder
+    except BaseException:
+        for place in reversed(made):
+            with suppress(OSError):
+                place.rmdir()
+        raise
+
+
+def write_report(
+    folder: Path,
+    record: dict[str, Any],
+    result: Calibration,
+    recording: Recording,
+    curves: list[Curve],
+) -> list[Path]:
+    """Write the report of one calibration.
+
+    Args:
+        folder: an existing folder; files of the same names are replaced.
+        record: of :func:`jaxcal.report.record.calibration_record`.
+        result: the calibration.
+        recording: what was calibrated.
+        curves: for convergence.png.
+
+    Returns:
+        The files: calibration.json, residuals.csv, residuals.png, offsets.png, convergence.png.
+
+    Raises:
+        OutputError: a file could not be written; it is as it was.
+    """
+    # Matplotlib takes half a second to import: only when there is something to draw.
+    from jaxcal.report.figures import convergence_figure, offset_figure, residual_figure
+
+    figures = {
+        "residuals.png": residual_figure(result),
+        "offsets.png": offset_figure(result, recording),
+        "convergence.png": convergence_figure(curves),
+    }
+    write_json(folder / "calibration.json", record)
+    write_text(folder / "residuals.csv", _residual_table(result))
+    for name, figure in figures.items():
+        with atomic_path(folder / name) as temporary:
+            figure.savefig(temporary, format="png")
+    return [folder / name for name in ("calibration.json", "residuals.csv", *figures)]
+
+
+def write_json(path: Path, record: dict[str, Any]) -> None:
+    """Write a record as a JSON file, complete or not at all.
+
+    Raises:
+        OutputError: it could not be written.
+    """
+    write_text(path, json.dumps(record, indent=2, allow_nan=False) + "\n")
+
+
+def _residual_table(result: Calibration) -> str:
+    answer = result.numpy()
+    table = io.StringIO()
+    rows = csv.writer(table, lineterminator="\n")
+    rows.writerow(COLUMNS)
+    for image in range(len(answer.mask)):
+        used = bool(answer.mask[image] > 0)
+        numbers = [*answer.residual[image], answer.elevation[image], answer.elevation_sd[image]]
+        cells = [_cell(value) if used else "" for value in numbers]
+        rows.writerow([image, int(used), *cells, int(answer.at_bound[image] > 0)])
+    return table.getvalue()
+
+
+def _cell(value: np.floating) -> str:
+    """Nothing where a number is not known: NaN means something else in every program."""
+    return repr(float(value)) if np.isfinite(value) else ""

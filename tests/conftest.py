@@ -1,0 +1,51 @@
+"""Shared problems and the folder of real recordings, where there is one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import jaxcal
+
+REAL_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    if not REAL_DATA.is_dir():
+        pytest.skip("the real recordings (../shared/data) are not here")
+    return REAL_DATA
+
+
+def experiment(seed: int = 0, **protocol) -> jaxcal.Recording:
+    """A simulated recording without covariances, so that common SDs apply."""
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(**protocol), seed)
+    return replace(recording, calibration=replace(recording.calibration, covariance=None))
+
+
+def problem(seed: int = 0, **protocol) -> jaxcal.Problem:
+    return jaxcal.Problem.from_recording(experiment(seed, **protocol))
+
+
+def select(problem: jaxcal.Problem, rows: object) -> jaxcal.Problem:
+    """The problem with only some of its images."""
+
+    def pick(name: str) -> object:
+        value = getattr(problem, name)
+        return None if value is None else value[rows]
+
+    names = ("poses", "measurements", "mask", "covariance", "max_elevation")
+    return replace(problem, **{name: pick(name) for name in names})
+
+
+def angle(first: np.ndarray, second: np.ndarray) -> float:
+    return jaxcal.geometry.rotation_angle(np.asarray(first), np.asarray(second))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _float64() -> None:
+    assert jax.config.read("jax_enable_x64")

@@ -1,0 +1,510 @@
+"""The command line: exit codes, one line of error, pure JSON, whole files or none.
+
+Commands that compile run in processes of their own and share one cache of compiled programs; what
+must be refused before that runs in this one.
+"""
+
+import json
+import os
+import subprocess
+import sys
+
+import click
+import h5py
+import jax
+import numpy as np
+import pytest
+
+import jaxcal
+from jaxcal.cli import cache, common, demo
+from jaxcal.cli.main import commands, main
+from jaxcal.recording import Recording, make_images
+from jaxcal.simulation import Protocol
+
+REPORT = {"calibration.json", "residuals.csv", "residuals.png", "offsets.png", "convergence.png"}
+SCHEMA = {
+    "method": str,
+    "prior": str,
+    "converged": bool,
+    "status": str,
+    "iterations": int,
+    "variance_rounds": int,
+    "images": int,
+    "images_used": int,
+    "image_to_probe": list,
+    "point_mm": list,
+    "elevation_mm": list,
+    "elevation_sd_mm": list,
+    "sigma_lateral_mm": float,
+    "sigma_range_mm": float,
+    "sigma_elevation_mm": float,
+    "observability": dict,
+    "rms_mm": float,
+    "reconstruction_precision_mm": float,
+    "reconstruction_precision_set": str,
+    "objective": float,
+    "scaled_kkt_residual": float,
+    "outliers": list,
+    "warnings": list,
+    "source": str,
+    "convention": dict,
+    "jaxcal_version": str,
+}
+
+
+@pytest.fixture(autouse=True)
+def _no_cache_in_this_process(monkeypatch):
+    monkeypatch.setenv("JAXCAL_NO_CACHE", "1")
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    return tmp_path_factory.mktemp("cli")
+
+
+@pytest.fixture(scope="module")
+def jaxcal_process(shared):
+    """Run the command line in its own process: ``jaxcal_process("demo", "--json")``."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(shared / "cache"), "COLUMNS": "100"}
+    for name in ("JAXCAL_NO_CACHE", "JAX_COMPILATION_CACHE_DIR"):
+        environment.pop(name, None)
+
+    def run(*arguments, **others):
+        options = {"capture_output": True, "text": True, "check": False, "timeout": 300, **others}
+        command = [sys.executable, "-m", "jaxcal.cli.main", *map(str, arguments)]
+        return subprocess.run(command, env=environment, **options)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def simulated(shared, jaxcal_process):
+    path = shared / "simulated.h5"
+    done = jaxcal_process("simulate", path, "--elevation", 2, "--seed", 4)
+    assert (done.returncode, done.stderr) == (0, "")
+    return path
+
+
+@pytest.fixture(scope="module")
+def calibrated(shared, simulated, jaxcal_process):
+    done = jaxcal_process("calibrate", simulated, "--json", "--out", shared / "deep" / "report")
+    assert done.stderr == ""
+    return done, shared / "deep" / "report"
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """A recording that is well-formed; nothing here solves it."""
+    generator = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, 3] = generator.uniform(-50, 50, (6, 3))
+    path = tmp_path / "rec.h5"
+    jaxcal.save(Recording(make_images(poses, generator.uniform(10, 50, (6, 2)))), path)
+    return path
+
+
+def refused(capfd, *arguments):
+    """Run what must be refused; the one line that says why."""
+    assert main([str(argument) for argument in arguments]) == 2
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.startswith("jaxcal: error: ")
+    assert err.count("\n") == 1
+    assert err.endswith("\n")
+    return err
+
+
+def numbers_in(value):
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        return [number for item in value for number in numbers_in(item)]
+    return [value] if isinstance(value, float) else []
+
+
+def test_help_and_version_import_nothing_heavy():
+    code = (
+        "import sys; from jaxcal.cli.main import main; codes = [main(args) for args in "
+        "(['--help'], ['-h'], ['--version'], ['calibrate', '--help'], ['demo', '--help'])]; "
+        "heavy = {'jax', 'numpy', 'matplotlib', 'rich', 'h5py'} & set(sys.modules); "
+        "sys.exit(f'{codes} {heavy}' if any(codes) or heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"jaxcal, version {jaxcal.__version__}" in done.stdout
+    assert all(name in done.stdout for name in commands.commands)
+
+
+def test_simulate_writes_what_load_reads(simulated):
+    recording = jaxcal.load(simulated)
+    assert len(recording) == 50
+    assert recording.truth is not None
+    assert recording.test is not None
+    assert 1 < np.abs(recording.truth.elevation).max() <= 2
+
+
+def test_simulate_defaults_are_the_protocols():
+    defaults = {option.name: option.default for option in commands.commands["simulate"].params}
+    protocol = Protocol()
+    assert defaults["images"] == protocol.images
+    assert defaults["elevation"] == protocol.elevation_mm
+    assert defaults["elevation_distribution"] == protocol.elevation_distribution
+    assert defaults["noise"] == protocol.noise_mm
+
+
+def test_calibrate_json_keeps_the_contract(calibrated, simulated):
+    done, _ = calibrated
+    assert done.returncode == 0
+    assert done.stdout.count("\n") == 1
+    record = json.loads(done.stdout, parse_constant=lambda name: pytest.fail(f"holds {name}"))
+    for name, kind in SCHEMA.items():
+        assert isinstance(record[name], kind), name
+    assert np.isfinite(numbers_in(record)).all()
+    assert (record["status"], record["converged"]) == ("converged", True)
+    assert np.shape(record["image_to_probe"]) == (4, 4)
+    assert np.shape(record["covariance"]) == (6, 6)
+    assert len(record["elevation_mm"]) == len(record["elevation_sd_mm"]) == record["images"] == 50
+    assert record["scale_mm_per_px"] is None
+    assert record["reconstruction_precision_set"] == "test"
+    truth = jaxcal.load(simulated).truth
+    assert record["truth_error"]["translation_mm"] < 1
+    assert np.linalg.norm(np.array(record["point_mm"]) - truth.point) < 1
+    assert np.std(np.array(record["elevation_mm"]) - truth.elevation) < 0.5
+
+
+def test_calibrate_writes_the_whole_report(calibrated):
+    done, folder = calibrated
+    assert {path.name for path in folder.iterdir()} == REPORT
+    assert json.loads((folder / "calibration.json").read_text()) == json.loads(done.stdout)
+    assert len((folder / "residuals.csv").read_text().splitlines()) == 51
+    for path in folder.glob("*.png"):
+        assert path.read_bytes().endswith(b"IEND\xaeB`\x82")
+
+
+def test_programs_are_kept_for_the_next_run(calibrated, shared):
+    folder = shared / "cache" / "jaxcal" / "xla"
+    assert len(list(folder.iterdir())) >= 4
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+def test_calibrate_speaks_to_a_person(calibrated, simulated, jaxcal_process):
+    done = jaxcal_process("calibrate", simulated, "--test", simulated)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "image_to_probe (mm)" in done.stdout
+    assert "the target stays within" in done.stdout
+    assert max(map(len, done.stdout.splitlines())) <= 100
+
+
+def test_demo_compares_and_reports(calibrated, jaxcal_process, tmp_path):
+    done = jaxcal_process("demo", "--json", "--seed", 4, "--out", tmp_path / "new")
+    assert (done.returncode, done.stderr) == (0, "")
+    answer = json.loads(done.stdout)
+    records = answer["calibrations"]
+    precision = {name: record["reconstruction_precision_mm"] for name, record in records.items()}
+    assert precision["joint"] < min(precision["alternating"], precision["conventional"])
+    assert set(answer["solve_ms"]) == set(precision)
+    # The same experiment as that of the simulate command, so the same calibration.
+    for name in ("image_to_probe", "point_mm", "covariance"):
+        known = json.loads(calibrated[0].stdout)[name]
+        np.testing.assert_allclose(records["joint"][name], known, rtol=0, atol=1e-9)
+
+    names = {path.name for path in (tmp_path / "new").iterdir()}
+    assert names == REPORT | {"comparison.json", "recording.h5"}
+    assert json.loads((tmp_path / "new" / "comparison.json").read_text()) == records
+    assert json.loads((tmp_path / "new" / "calibration.json").read_text()) == records["joint"]
+
+
+def test_demo_prints_a_row_for_each_method(calibrated, capfd):
+    record = json.loads(calibrated[0].stdout)
+    methods = ("conventional", "alternating", "joint")
+    demo._print(dict.fromkeys(methods, record), dict.fromkeys(methods, 1.5), 0, "folder")
+    lines = capfd.readouterr().out.splitlines()
+    for method in methods:
+        (row,) = (line for line in lines if line.startswith(f"  {method} "))
+        assert f" {record['reconstruction_precision_mm']:.3f} " in row
+    assert lines[-1] == "report: folder"
+    assert max(map(len, lines)) <= 100
+
+
+@pytest.fixture(scope="module")
+def degenerate(shared, simulated):
+    """Poses without any rotation, and one image fifty times."""
+    images = jaxcal.load(simulated).calibration
+    parallel = images.poses.copy()
+    parallel[:, :3, :3] = np.eye(3)
+    first = [0] * len(images)
+    sets = {
+        "parallel": (parallel, images.measurements),
+        "duplicates": (images.poses[first], images.measurements[first]),
+    }
+    for name, (poses, points) in sets.items():
+        made = make_images(poses, points, covariance=images.covariance)
+        jaxcal.save(Recording(made), shared / f"{name}.h5")
+    return shared
+
+
+@pytest.mark.parametrize(("name", "files"), [("parallel", set()), ("duplicates", REPORT)])
+def test_degenerate_sets_are_solved_but_not_observable(
+    name, files, degenerate, calibrated, jaxcal_process, tmp_path
+):
+    report = ["--out", tmp_path] if files else []
+    done = jaxcal_process("calibrate", degenerate / f"{name}.h5", "--json", *report)
+    assert (done.returncode, done.stderr) == (3, "")
+    record = json.loads(done.stdout)
+    assert (record["status"], record["converged"]) == ("unobservable", False)
+    assert record["covariance"] is None
+    assert record["warnings"]
+    assert np.isfinite(numbers_in(record)).all()
+    assert {path.name for path in tmp_path.iterdir()} == files
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "Missing command"),
+        (["nonsense"], "No such command 'nonsense'"),
+        (["--nonsense"], "No such option '--nonsense'"),
+        (["calibrate"], "Missing argument 'REC'"),
+        (["demo", "--seed", "-1"], "--seed"),
+        (["demo", "--seed", "x"], "'x' is not a valid integer"),
+        (["demo", "too", "many"], "unexpected extra argument"),
+        (["demo", "--out", "/proc/nope"], "/proc/nope: cannot be made or written to"),
+        (["simulate"], "Missing argument 'OUT.h5'"),
+        (["simulate", "x.h5", "--probe", "curvilinear"], "simulates linear probes only"),
+        (["simulate", "x.h5", "--probe", "square"], "'square' is not one of"),
+        (["simulate", "x.h5", "--images", "3"], "between 4 and"),
+        (["simulate", "x.h5", "--images", "10000000000000000000000"], "between 4 and"),
+        (["simulate", "x.h5", "--noise", "-1"], "'-1' is not zero or a positive number"),
+        (["simulate", "x.h5", "--noise", "inf"], "'inf' is not zero or a positive number"),
+        (["simulate", "x.h5", "--elevation", "nan"], "'nan' is not zero or a positive number"),
+        (["simulate", "x.h5", "--elevation", "1e9"], "between 0 and 1000 mm"),
+        (["import", "x.h5"], "Missing argument"),
+        (["import", "a", "b", "c", "x.h5"], "3 sources"),
+        (["import", "a.igs.mha", "x.h5"], "does not read PLUS sequences"),
+        (["import", "a.csv", "x.h5"], "a.csv: no such file"),
+        (["import", "a.txt", "b.txt", "x.h5", "--units", "mm"], "holds pixels"),
+        (["import", "a.csv", "x.h5", "--units", "mm", "--spacing", "1", "1"], "no pixel size"),
+        (["import", "a.csv", "x.h5", "--spacing", "1", "0"], "'0' is not a positive number"),
+        (["calibrate", "nope.h5"], "nope.h5: no such file"),
+        (["calibrate", "/proc"], "/proc: is a directory"),
+    ],
+)
+def test_refused_without_a_recording(arguments, said, capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert said in refused(capfd, *arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--method", "magic"], "'magic' is not one of"),
+        (["--prior", "uniform"], "--prior uniform is not in this version"),
+        (["--prior", "gaussian", "--method", "alternating"], "does not go with"),
+        (["--prior", "bounded", "--method", "conventional"], "does not go with"),
+        (["--max-elevation", "1"], "--max-elevation needs"),
+        (["--max-elevation", "1", "--method", "conventional"], "--max-elevation needs"),
+        (["--max-elevation", "0", "--prior", "bounded"], "'0' is not a positive number"),
+        (["--max-elevation", "-1", "--prior", "bounded"], "'-1' is not a positive number"),
+        (["--max-elevation", "nan", "--prior", "bounded"], "'nan' is not a positive number"),
+        (["--max-elevation", "1mm", "--prior", "bounded"], "'1mm' is not a positive number"),
+        (["--sigma", "1", "1"], "--sigma"),
+        (["--sigma", "1", "1", "inf"], "'inf' is not a positive number"),
+        (["--sigma", "1", "1", "1", "--prior", "bounded"], "--sigma needs"),
+        (["--solver", "lm"], "--solver needs"),
+        (["--solver", "magic", "--method", "conventional"], "'magic' is not one of"),
+        (["--tolerance-mm", "1"], "need --method alternating"),
+        (["--tolerance-rad", "0", "--method", "alternating"], "'0' is not a positive number"),
+        (["--estimate", "sound-speed"], "cannot estimate sound-speed"),
+        (["--estimate", "scale,delay"], "cannot estimate delay"),
+        (["--estimate", "everything"], "cannot estimate 'everything'"),
+        (["--estimate", ""], "cannot estimate ''"),
+        (["--estimate", "scale"], "no pixel scale to estimate"),
+        (["--estimate", "scale", "--out", "report/deep"], "no pixel scale to estimate"),
+        (["--test", "nope.h5"], "nope.h5: no such file"),
+        (["--out", "/proc/nope"], "/proc/nope: cannot be made or written to"),
+        (["--out", "rec.h5"], "rec.h5: is a file, not a folder"),
+    ],
+)
+def test_refused_with_a_recording(options, said, capfd, recording, monkeypatch):
+    monkeypatch.chdir(recording.parent)
+    assert said in refused(capfd, "calibrate", "rec.h5", "--json", *options)
+    assert [path.name for path in recording.parent.iterdir()] == ["rec.h5"]
+
+
+def test_bad_recordings_are_refused(capfd, recording, tmp_path):
+    with h5py.File(recording, "r+") as file:
+        file["calibration/pose"][2, 0, 0] = np.nan
+    assert "pose 2 holds NaN" in refused(capfd, "calibrate", recording)
+    (tmp_path / "text.h5").write_text("not a recording")
+    assert "is not an HDF5 file" in refused(capfd, "calibrate", tmp_path / "text.h5")
+
+
+def test_pixels_without_a_spacing_are_refused(capfd, recording, tmp_path):
+    images = jaxcal.load(recording).calibration
+    made = make_images(images.poses, images.measurements * 10, "pixel")
+    jaxcal.save(Recording(made), tmp_path / "pixels.h5")
+    line = refused(capfd, "calibrate", tmp_path / "pixels.h5", "--out", tmp_path / "report")
+    assert "--estimate scale" in line
+    assert not (tmp_path / "report").exists()
+
+
+def test_a_name_cannot_break_the_one_line(capfd):
+    line = refused(capfd, "calibrate", "a\nb\x1b[31m\udc80.h5")
+    assert r"a b\x1b[31m\udc80.h5: no such file" in line
+
+
+def test_simulate_into_no_folder(capfd, tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxcal.simulation.simulate_recording", lambda *_: jaxcal.load(tmp_path))
+    assert "is a directory" in refused(capfd, "simulate", tmp_path / "no" / "x.h5")
+
+
+def table(count, columns):
+    generator = np.random.default_rng(3)
+    pose = np.eye(4)[:3]
+    rows = []
+    for image in range(count):
+        pose[:, 3] = generator.uniform(-100, 100, 3)
+        rows.append([image, *pose.ravel(), *generator.uniform(100, 400, 2)][:columns])
+    return rows
+
+
+def test_import_csv(tmp_path, capfd):
+    lines = [",".join(map(str, row)) for row in table(5, 15)]
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    assert main(["import", str(tmp_path / "t.csv"), str(tmp_path / "t.h5")]) == 0
+    assert "--estimate scale" in capfd.readouterr().out
+    assert jaxcal.load(tmp_path / "t.h5").calibration.kind == "pixel"
+    arguments = ["import", str(tmp_path / "t.csv"), str(tmp_path / "t.h5")]
+    assert main([*arguments, "--spacing", "0.1", "0.2"]) == 0
+    np.testing.assert_array_equal(jaxcal.load(tmp_path / "t.h5").calibration.spacing_mm, [0.1, 0.2])
+    assert main([*arguments, "--units", "mm"]) == 0
+    assert jaxcal.load(tmp_path / "t.h5").calibration.kind == "point"
+
+
+def test_import_pair(tmp_path, capfd):
+    rows = table(5, 15)
+    poses = "\n".join(" ".join(map(str, row[1:13][i : i + 4])) for row in rows for i in (0, 4, 8))
+    (tmp_path / "poses.txt").write_text(poses)
+    (tmp_path / "points.txt").write_text("\n".join(f"{row[13]} {row[14]}" for row in rows))
+    sources = [tmp_path / "poses.txt", tmp_path / "points.txt"]
+    assert main(["import", *map(str, sources), str(tmp_path / "p.h5")]) == 0
+    capfd.readouterr()
+    assert len(jaxcal.load(tmp_path / "p.h5")) == 5
+    # Without OUT.h5 the last source would be overwritten.
+    before = sources[1].read_bytes()
+    assert "name the output file last" in refused(capfd, "import", *sources)
+    assert sources[1].read_bytes() == before
+
+
+def test_ctrl_c_is_one_line(capfd, monkeypatch):
+    def interrupt():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo, "import_engine", interrupt)
+    assert main(["demo"]) == 130
+    assert capfd.readouterr() == ("", "jaxcal: interrupted\n")
+
+
+def test_ctrl_c_while_importing_leaves_at_once():
+    code = (
+        "import os, signal; from jaxcal.cli import common; "
+        "common.importlib.import_module = lambda _: os.kill(os.getpid(), signal.SIGINT); "
+        "common.import_engine()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "jaxcal: interrupted\n")
+
+
+def test_a_bug_is_one_line_too(capfd, monkeypatch):
+    def fail():
+        raise ZeroDivisionError("a\nb")
+
+    monkeypatch.setattr(demo, "import_engine", fail)
+    assert main(["demo"]) == 1
+    err = capfd.readouterr().err
+    assert err.startswith("jaxcal: internal error: ZeroDivisionError: a b (please report")
+    assert err.count("\n") == 1
+    monkeypatch.setenv("JAXCAL_TRACEBACK", "1")
+    with pytest.raises(ZeroDivisionError):
+        main(["demo"])
+
+
+def test_a_pipe_closed_early_is_no_error(jaxcal_process):
+    read, write = os.pipe()
+    os.close(read)
+    done = jaxcal_process("--help", capture_output=False, stdout=write, stderr=subprocess.PIPE)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+def test_a_full_disk_is_one_line(jaxcal_process):
+    with open("/dev/full", "w") as full:
+        done = jaxcal_process("--help", capture_output=False, stdout=full, stderr=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (2, "jaxcal: error: No space left on device\n")
+
+
+def test_messages_are_not_markup(capfd):
+    common.print_page("[bold]a[/bold] :smile:", "- " + "word " * 30)
+    lines = capfd.readouterr().out.splitlines()
+    assert lines[0] == "[bold]a[/bold] :smile:"
+    assert lines[2].startswith("  word")
+
+
+def test_cache_folder_is_private(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "c"))
+    folder = cache._private_folder()
+    assert folder == tmp_path / "c" / "jaxcal" / "xla"
+    assert folder.stat().st_mode & 0o777 == folder.parent.stat().st_mode & 0o777 == 0o700
+    assert cache._private_folder() == folder
+
+
+@pytest.mark.parametrize("spoil", ["open", "open_parent", "link", "file", "unwritable", "off"])
+def test_cache_that_cannot_be_trusted_is_not_used(spoil, tmp_path, monkeypatch, capfd):
+    monkeypatch.delenv("JAXCAL_NO_CACHE")
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = cache._private_folder()
+    if spoil == "open":
+        folder.chmod(0o770)
+    elif spoil == "open_parent":
+        folder.parent.chmod(0o777)
+    elif spoil in ("link", "file"):
+        folder.rmdir()
+        if spoil == "link":
+            (tmp_path / "elsewhere").mkdir(mode=0o700)
+            folder.symlink_to(tmp_path / "elsewhere")
+        else:
+            folder.write_text("")
+    elif spoil == "unwritable":
+        monkeypatch.setenv("XDG_CACHE_HOME", "/proc/nope")
+    else:
+        monkeypatch.setenv("JAXCAL_NO_CACHE", "1")
+    before = jax.config.jax_compilation_cache_dir
+    cache.enable_compilation_cache()
+    assert jax.config.jax_compilation_cache_dir == before
+    assert capfd.readouterr() == ("", "")
+
+
+def test_cache_keeps_the_newest(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "KEPT_PROGRAMS", 2)
+    for age, name in enumerate("abcd"):
+        (tmp_path / name).write_text("")
+        os.utime(tmp_path / name, (0, -age))
+    cache._prune(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
+
+
+def test_relative_cache_home_is_ignored(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert cache._private_folder() == tmp_path / ".cache" / "jaxcal" / "xla"
+
+
+def test_numbers_are_positive_and_finite():
+    assert common.POSITIVE.convert("1e-3", None, None) == 1e-3
+    assert common.NOT_NEGATIVE.convert("0", None, None) == 0
+    for text in ("0", "-1", "nan", "inf", "1_000x", ""):
+        with pytest.raises(click.BadParameter):
+            common.POSITIVE.convert(text, None, None)

@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxcal import InputError
+from jaxcal.geometry import check_poses, nearest_rotations, rotation_angle, transform_points
+
+
+def random_poses(seed: int, count: int = 5) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = nearest_rotations(rng.normal(size=(count, 3, 3)))[0]
+    poses[:, :3, 3] = rng.normal(size=(count, 3)) * 100
+    return poses
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=50, deadline=None)
+def test_nearest_rotation_is_a_rotation_and_no_other_is_nearer(seed):
+    rng = np.random.default_rng(seed)
+    matrices = rng.normal(size=(4, 3, 3))
+    rotations, distance = nearest_rotations(matrices)
+    identity = np.tile(np.eye(3), (4, 1, 1))
+    np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2), identity, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-12)
+    others = random_poses(seed, 4)[:, :3, :3]
+    assert (np.linalg.norm(others - matrices, axis=(1, 2)) >= distance - 1e-12).all()
+
+
+def test_rounded_rotations_are_projected():
+    poses = random_poses(0)
+    checked = check_poses(np.round(poses, 4))
+    np.testing.assert_allclose(checked[:, :3, :3] @ checked[:, :3, :3].swapaxes(1, 2),
+                               np.tile(np.eye(3), (5, 1, 1)), atol=1e-14)  # fmt: skip
+    assert max(rotation_angle(a, b) for a, b in zip(checked, poses, strict=True)) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda p: p[2, :3, :3].__imul__(1.1), "pose 2 is not a rotation"),
+        (lambda p: p[3, :3, 0].__imul__(-1), "pose 3 is a reflection"),
+        (lambda p: p[1].__setitem__((0, 3), np.nan), "pose 1 holds NaN"),
+        (lambda p: p[1].__setitem__((0, 3), np.inf), "pose 1 holds NaN or Inf"),
+        (lambda p: p[4].__setitem__((3, 0), 7.0), "pose 4 is not a rigid transform"),
+    ],
+)
+def test_bad_poses_are_refused_by_row(spoil, words):
+    poses = random_poses(1)
+    spoil(poses)
+    with pytest.raises(InputError, match=words):
+        check_poses(poses)
+
+
+def test_images_left_out_are_not_looked_at():
+    poses = random_poses(2)
+    poses[3] = np.nan
+    checked = check_poses(poses, np.array([1, 1, 1, 0, 1], bool))
+    np.testing.assert_array_equal(checked[3], np.eye(4))
+
+
+def test_transposed_poses_are_called_so():
+    with pytest.raises(InputError, match="transposed"):
+        check_poses(random_poses(3).swapaxes(1, 2))
+
+
+def test_points_are_rotated_then_translated():
+    poses = random_poses(4)
+    point = np.array([1.0, 2.0, 3.0])
+    expected = np.stack([(p @ [*point, 1])[:3] for p in poses])
+    np.testing.assert_allclose(transform_points(poses, np.tile(point, (5, 1))), expected)

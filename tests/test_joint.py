@@ -1,0 +1,168 @@
+"""The joint solver against the alternation and scipy on one objective, and REML against its likelihood."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import angle, problem, select
+from scipy.optimize import least_squares, minimize
+
+import jaxcal
+from jaxcal import Options
+from jaxcal.model.parameters import RIGID, Parameters, retract
+from jaxcal.model.priors import Bounded, Gaussian, InPlane
+from jaxcal.model.residuals import measurement_residual
+from jaxcal.solvers.least_squares import linearise
+
+SETTINGS = [(0.5, 0.05, 0.25), (1.0, 0.5, 1.0), (2.0, 2.0, 1.0), (3.0, 0.5, 2.0), (5.0, 4.0, 4.0),
+            (2.0, 10.0, 2.0), (5.0, 0.05, 0.5), (1.0, 2.0, 4.0)]  # fmt: skip
+
+
+def parameters_of(result: jaxcal.Calibration) -> Parameters:
+    matrix = jnp.asarray(result.image_to_probe)
+    return Parameters(matrix[:3, :3], matrix[:3, 3], jnp.asarray(result.point), jnp.ones(2))
+
+
+@pytest.fixture(scope="module")
+def same_objective():
+    lanes = [
+        replace(problem(k, images=20, elevation_mm=e, noise_mm=s), max_elevation=jnp.full(20, m))
+        for k in range(5)
+        for e, s, m in SETTINGS
+    ]
+    problems = jaxcal.stack(lanes)
+    joint = jaxcal.calibrate_batch(problems, method="joint", prior="bounded")
+    options = Options(tolerance_rad=1e-10, tolerance_mm=1e-10, max_rounds=3000)
+    return problems, joint, jaxcal.calibrate_batch(problems, "alternating", options=options)
+
+
+def test_joint_reaches_the_alternations_objective_at_kkt_precision(same_objective):
+    problems, joint, alternation = same_objective
+    squares = np.sum(np.asarray(problems.measurements) ** 2, axis=(1, 2))
+    allowed = np.asarray(alternation.cost) * (1 + 1e-8) + 1e-12 * squares
+    assert (np.asarray(joint.cost) <= allowed).all()
+    assert float(jnp.max(joint.stationarity)) <= 1e-8
+    assert np.asarray(joint.converged).all()
+    # It does so in a fraction of the rounds, and never leaves the bounds.
+    assert np.sum(joint.iterations) < 0.2 * np.sum(alternation.iterations)
+    assert (np.abs(joint.elevation) <= np.asarray(problems.max_elevation) + 1e-12).all()
+
+
+def test_joint_agrees_with_scipy_where_observable(same_objective):
+    problems, joint, _ = same_objective
+    compared = 0
+
+    @jax.jit
+    def residual(unknowns, reference, lane):
+        moved = retract(reference, unknowns[:9], RIGID)
+        return Bounded(lane.max_elevation).residual(moved, unknowns[9:], lane).ravel()
+
+    jacobian = jax.jit(jax.jacfwd(residual))
+    for k in range(len(SETTINGS)):
+        lane = jax.tree.map(lambda leaf, k=k: leaf[k], problems)
+        result = jax.tree.map(lambda leaf, k=k: leaf[k], joint)
+        conventional = jaxcal.calibrate(lane, method="conventional")
+        start = parameters_of(conventional)
+        bound = np.concatenate([np.full(9, np.inf), lane.max_elevation])
+        first = np.concatenate(
+            [np.zeros(9), 0.999 * Bounded(lane.max_elevation).start(start, lane)]
+        )
+        fit = least_squares(
+            lambda u, r=start, p=lane: np.asarray(residual(jnp.asarray(u), r, p)), first,
+            lambda u, r=start, p=lane: np.asarray(jacobian(jnp.asarray(u), r, p)),
+            bounds=(-bound, bound), x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15,
+            max_nfev=2000,
+        )  # fmt: skip
+        assert float(result.cost) <= 2 * fit.cost * (1 + 1e-8) + 1e-9
+        if np.isfinite(result.covariance).all() and float(result.cost) > 2 * fit.cost * (1 - 1e-6):
+            theirs = retract(start, jnp.asarray(fit.x[:9]), RIGID).matrix()
+            assert angle(theirs, result.image_to_probe) < 1e-4
+            compared += 1
+    assert compared >= len(SETTINGS) // 2
+
+
+def test_self_tuning_maximises_the_restricted_likelihood():
+    data = problem(4, images=30, elevation_mm=2.0, noise_mm=2.0)
+    result = jaxcal.calibrate(data)
+    parameters, none = parameters_of(result), jnp.zeros(0)
+    _, jacobian, residual = linearise(parameters, none, Gaussian(jnp.ones(3)), data, RIGID)
+    design = np.moveaxis(np.asarray(jacobian), 0, -1)
+
+    def negative_likelihood(log_sigma: np.ndarray) -> float:
+        """Of the model linearised at the solution, the unknowns integrated out."""
+        scale = np.exp(log_sigma)
+        whitened = (design / scale[:, None]).reshape(-1, 9)
+        values = (np.asarray(residual) / scale).ravel()
+        rest = values - whitened @ np.linalg.lstsq(whitened, values)[0]
+        _, determinant = np.linalg.slogdet(whitened.T @ whitened)
+        return 0.5 * rest @ rest + 0.5 * determinant + 30 * np.sum(log_sigma)
+
+    best = minimize(negative_likelihood, np.zeros(3), method="Nelder-Mead",
+                    options={"xatol": 1e-7, "fatol": 1e-10, "maxiter": 4000})  # fmt: skip
+    np.testing.assert_allclose(result.sigma, np.exp(best.x), rtol=2e-4)
+
+
+def test_self_tuned_beats_conventional_and_recovers_the_sds():
+    lanes = [problem(k, images=30, elevation_mm=3.0, noise_mm=2.0) for k in range(40)]
+    problems = jaxcal.stack(lanes)
+    truth = [jaxcal.simulate_recording(jaxcal.Protocol(images=30, elevation_mm=3.0, noise_mm=2.0), k)
+             for k in range(40)]  # fmt: skip
+    precision = {}
+    for method in ("conventional", "joint"):
+        result = jaxcal.calibrate_batch(problems, method=method)
+        assert np.asarray(result.converged).all()
+        precision[method] = np.mean([
+            jaxcal.reconstruction_precision(x, t.test.poses, t.test.measurements)
+            for x, t in zip(result.image_to_probe, truth, strict=True)
+        ])  # fmt: skip
+    realised = np.mean([np.sqrt(np.mean(t.truth.elevation**2)) for t in truth])
+    assert precision["joint"] < 0.9 * precision["conventional"]
+    assert float(result.sigma[:, 2].mean()) == pytest.approx(realised, rel=0.05)
+
+
+def test_given_covariances_set_the_weights():
+    recording = jaxcal.simulate_recording(
+        jaxcal.Protocol(images=30, elevation_mm=2.0, noise_mm=2.0), 4
+    )
+    weighted = jaxcal.calibrate(recording)
+    plain = jaxcal.calibrate(problem(4, images=30, elevation_mm=2.0, noise_mm=2.0))
+    assert weighted.status == "converged"
+    assert angle(weighted.image_to_probe, plain.image_to_probe) > 1e-5
+    # One covariance for all images is no information: the answer is the plain one.
+    data = jaxcal.Problem.from_recording(recording)
+    same = replace(data, covariance=jnp.tile(jnp.diag(jnp.array([4.0, 0.25])), (30, 1, 1)))
+    np.testing.assert_allclose(
+        jaxcal.calibrate(same).image_to_probe, plain.image_to_probe, atol=1e-6
+    )
+
+
+def test_conventional_is_scipys_least_squares():
+    data = problem(2, images=15, elevation_mm=2.0, noise_mm=2.0)
+    result = jaxcal.calibrate(data, method="conventional")
+    start = parameters_of(result)
+
+    @jax.jit
+    def residual(tangent):
+        return InPlane().residual(retract(start, tangent, RIGID), jnp.zeros(0), data).ravel()
+
+    away = 0.1 * np.random.default_rng(0).normal(size=9)
+    fit = least_squares(lambda u: np.asarray(residual(jnp.asarray(u))), away, method="lm",
+                        xtol=1e-15, ftol=1e-15, gtol=1e-15)  # fmt: skip
+    assert float(result.cost) == pytest.approx(2 * fit.cost, rel=1e-12)
+    np.testing.assert_allclose(fit.x, 0, atol=1e-5)
+
+
+def test_elevation_is_where_the_target_is_in_the_image():
+    data = problem(2, images=15, elevation_mm=2.0, noise_mm=2.0)
+    result = jaxcal.calibrate(data, method="conventional")
+    np.testing.assert_allclose(
+        result.elevation, measurement_residual(parameters_of(result), data)[:, 2], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        result.rms, np.sqrt(float(result.cost) / 15), rtol=1e-12
+    )  # Eq. 7's residuals are the in-plane ones
+    assert select(data, np.arange(4)).images == 4

@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+import numpy as np
+from test_geometry import random_poses
+
+from jaxcal import calibration_reproducibility, reconstruction_precision
+from jaxcal.metrics import image_corners, root_mean_square
+
+
+def test_reconstruction_precision_is_the_norm_of_unbiased_sds():
+    rng = np.random.default_rng(0)
+    poses, transform = random_poses(0, 9), random_poses(1, 1)[0]
+    points = rng.normal(size=(9, 2)) * 30
+    cloud = np.stack(
+        [(b @ transform @ [x, 0, r, 1])[:3] for b, (x, r) in zip(poses, points, strict=True)]
+    )
+    expected = np.linalg.norm(np.std(cloud, axis=0, ddof=1))
+    np.testing.assert_allclose(reconstruction_precision(transform, poses, points), expected)
+    full = np.stack([points[:, 0], np.zeros(9), points[:, 1]], axis=1)
+    np.testing.assert_allclose(reconstruction_precision(transform, poses, full), expected)
+    mask = np.array([1, 1, 0, 1, 1, 0, 1, 1, 1.0])
+    masked = reconstruction_precision(transform, poses, points, mask)
+    expected = np.linalg.norm(np.std(cloud[mask > 0], axis=0, ddof=1))
+    np.testing.assert_allclose(masked, expected)
+
+
+def test_reproducibility_of_shifted_calibrations():
+    transforms = np.tile(np.eye(4), (2, 1, 1))
+    transforms[1, 1, 3] = 4.0
+    corners = image_corners(40.0, 80.0)
+    np.testing.assert_allclose(calibration_reproducibility(transforms, corners), 2.0)
+    turned = random_poses(5, 3)
+    spread = calibration_reproducibility(turned, corners)
+    points = np.stack([corners[:, 0], 0 * corners[:, 0], corners[:, 1]], axis=1)
+    images = np.einsum("kij,mj->kmi", turned[:, :3, :3], points) + turned[:, None, :3, 3]
+    expected = np.linalg.norm(images - images.mean(axis=0), axis=-1).mean(axis=0)
+    np.testing.assert_allclose(spread, expected)
+
+
+def test_root_mean_square_counts_used_images():
+    residual = np.array([[3.0, 0, 4], [1, 0, 0], [100, 0, 0]])
+    np.testing.assert_allclose(root_mean_square(residual, np.array([1, 1, 0.0])), np.sqrt(13))

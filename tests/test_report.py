@@ -1,0 +1,351 @@
+"""The report layer: record, verdict, tables, figures and files."""
+
+import csv
+import dataclasses
+import json
+import subprocess
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+
+import jaxcal
+from jaxcal.calibration import Status
+from jaxcal.errors import InputError, OutputError
+from jaxcal.recording import Recording, make_images
+from jaxcal.report.convergence import KEPT, Curve, bounded_curves
+from jaxcal.report.figures import convergence_figure, offset_figure, residual_figure
+from jaxcal.report.record import calibration_record, check_test_images, plain, truth_error
+from jaxcal.report.tables import calibration_table, comparison_table
+from jaxcal.report.verdict import verdict
+from jaxcal.report.write import COLUMNS, prepare_folder, write_report
+from jaxcal.simulation import Protocol, simulate_recording
+from jaxcal.solve import Options
+
+LEFT_OUT = 5
+CURVES = [Curve("joint", np.array([3.0, 1.0, np.nan])), Curve("alternating", np.array([3.0, 2.0]))]
+
+
+@pytest.fixture(scope="module")
+def recording():
+    simulated = simulate_recording(Protocol(images=20, test_images=20, elevation_mm=2.0), seed=1)
+    mask = np.arange(20) != LEFT_OUT
+    return dataclasses.replace(
+        simulated, calibration=dataclasses.replace(simulated.calibration, mask=mask)
+    )
+
+
+@pytest.fixture(scope="module")
+def result(recording):
+    # As bounded_curves solves it, so that both are compiled once.
+    return jaxcal.calibrate(recording, "joint", "bounded", options=Options(trace=KEPT))
+
+
+@pytest.fixture(scope="module")
+def record(result, recording):
+    return calibration_record(result, recording)
+
+
+@pytest.fixture(scope="module")
+def failed(result):
+    """What a solve full of NaN comes back as."""
+    lost = {
+        name: jnp.full_like(getattr(result, name), jnp.nan)
+        for name in (
+            "image_to_probe", "point", "elevation", "elevation_sd", "sigma", "covariance",
+            "residual", "rms", "cost", "stationarity", "condition", "weakest", "weakest_sd",
+        )
+    }  # fmt: skip
+    return dataclasses.replace(result, **lost, status_code=jnp.asarray(int(Status.FAILED)))
+
+
+def with_status(result, status):
+    unknown = jnp.full_like(result.covariance, jnp.nan)
+    return dataclasses.replace(result, covariance=unknown, status_code=jnp.asarray(int(status)))
+
+
+def text_of(*renderables):
+    console = Console(width=100, markup=False)
+    with console.capture() as captured:
+        for renderable in renderables:
+            console.print(renderable)
+    return captured.get()
+
+
+def test_record_holds_what_the_result_holds(record, result, recording):
+    assert record["method"] == "joint"
+    assert record["prior"] == "bounded"
+    assert record["converged"] is True
+    assert record["status"] == "converged"
+    assert (record["images"], record["images_used"]) == (20, 19)
+    np.testing.assert_array_equal(record["image_to_probe"], result.image_to_probe)
+    np.testing.assert_array_equal(record["covariance"], result.covariance)
+    np.testing.assert_array_equal(record["elevation_mm"], result.elevation)
+    assert record["elevation_sd_mm"][LEFT_OUT] is None
+    known = [None if np.isnan(sd) else sd for sd in np.array(result.elevation_sd)]
+    assert record["elevation_sd_mm"] == known
+    assert record["scale_mm_per_px"] is None
+    assert record["reconstruction_precision_set"] == "test"
+    assert record["jaxcal_version"] == jaxcal.__version__
+    assert set(record["observability"]) == {
+        "condition", "weakest_direction", "weakest_sd_mm", "known_only_from_prior",
+    }  # fmt: skip
+
+
+def test_rms_is_that_of_the_contract(record, recording):
+    images, used = recording.calibration, recording.calibration.mask
+    transform = np.array(record["image_to_probe"])
+    points = np.c_[images.measurements[:, 0], np.zeros(20), images.measurements[:, 1], np.ones(20)]
+    cloud = np.einsum("nij,jk,nk->ni", images.poses, transform, points)[used, :3]
+    misses = np.linalg.norm(np.array(record["point_mm"]) - cloud, axis=1)
+    assert record["rms_mm"] == pytest.approx(np.sqrt(np.mean(misses**2)), rel=1e-9)
+
+
+def test_precision_is_eq_8_over_the_used_images(result, recording):
+    images, used = recording.calibration, recording.calibration.mask
+    alone = dataclasses.replace(recording, test=None)
+    record = calibration_record(result, alone)
+    points = np.c_[images.measurements[:, 0], np.zeros(20), images.measurements[:, 1], np.ones(20)]
+    cloud = np.einsum("nij,jk,nk->ni", images.poses, np.array(result.image_to_probe), points)
+    expected = np.sqrt(np.var(cloud[used, :3], axis=0, ddof=1).sum())
+    assert record["reconstruction_precision_mm"] == pytest.approx(expected, rel=1e-9)
+    assert record["reconstruction_precision_set"] == "calibration"
+
+
+def test_precision_needs_two_test_images(result, recording):
+    only = np.arange(20) == 0
+    test = dataclasses.replace(recording.test, mask=only)
+    record = calibration_record(result, dataclasses.replace(recording, test=test))
+    assert record["reconstruction_precision_mm"] is None
+    assert record["reconstruction_precision_set"] == "test"
+
+
+def pixels(images, spacing, face_offset, *, known=True):
+    values = (images.measurements - [0.0, face_offset]) / spacing
+    return make_images(
+        images.poses,
+        values,
+        "pixel",
+        spacing_mm=np.array(spacing) if known else None,
+        face_offset_mm=face_offset,
+    )
+
+
+def test_pixel_test_images_are_brought_to_mm(result, recording, record):
+    other = Recording(pixels(recording.test, (0.1, 0.2), 3.0))
+    converted = calibration_record(result, recording, other)
+    assert converted["reconstruction_precision_mm"] == pytest.approx(
+        record["reconstruction_precision_mm"], rel=1e-9
+    )
+
+
+def test_an_estimated_scale_replaces_the_written_one(result, recording, record):
+    scaled = dataclasses.replace(
+        result, scale_mm_per_px=jnp.array([0.1, 0.2]), blocks=(*result.blocks, "scale")
+    )
+    test = pixels(recording.test, (0.1, 0.2), 0.0)
+    for written in (None, np.array([5.0, 5.0])):
+        other = Recording(dataclasses.replace(test, spacing_mm=written))
+        calibrated = dataclasses.replace(recording, calibration=test)
+        precision = calibration_record(scaled, calibrated, other)["reconstruction_precision_mm"]
+        assert precision == pytest.approx(record["reconstruction_precision_mm"], rel=1e-9)
+
+
+def test_test_images_that_cannot_be_used_are_refused(recording):
+    unscaled = Recording(pixels(recording.test, (0.1, 0.2), 0.0, known=False), source="t.h5")
+    with pytest.raises(InputError, match=r"t\.h5: test images are pixels without spacing_mm"):
+        check_test_images(recording, unscaled)
+    times = make_images(recording.test.poses, np.full((20, 8), 1e-5), "time_of_flight")
+    with pytest.raises(InputError, match="not times of flight"):
+        check_test_images(recording, Recording(times))
+    assert check_test_images(dataclasses.replace(recording, test=None)) is None
+
+
+def test_truth_error(result, recording, record):
+    truth = recording.truth
+    exact = dataclasses.replace(
+        result, image_to_probe=jnp.array(truth.image_to_probe), point=jnp.array(truth.point)
+    )
+    assert all(value < 1e-9 for value in truth_error(exact, truth).values())
+    turned = truth.image_to_probe @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    turned[:3, 3] += [3.0, 4.0, 0.0]
+    moved = truth_error(dataclasses.replace(exact, image_to_probe=jnp.array(turned)), truth)
+    assert moved == pytest.approx({"rotation_deg": 180, "translation_mm": 5, "point_mm": 0})
+    assert 0 < record["truth_error"]["translation_mm"] < 5
+    unknown = dataclasses.replace(recording, truth=None)
+    assert "truth_error" not in calibration_record(result, unknown)
+
+
+def test_a_failed_solve_is_null_not_nan(failed, recording):
+    record = calibration_record(failed, recording)
+    text = json.dumps(record, allow_nan=False)
+    assert json.loads(text) == record
+    assert record["status"] == "failed"
+    assert record["converged"] is False
+    assert record["covariance"] is None
+    assert record["image_to_probe"][0][0] is None
+    assert record["reconstruction_precision_mm"] is None
+
+
+def test_covariance_is_whole_or_null(result, recording):
+    broken = dataclasses.replace(result, covariance=result.covariance.at[2, 2].set(jnp.nan))
+    assert calibration_record(broken, recording)["covariance"] is None
+
+
+def test_plain():
+    values = {"a": (np.float64(1.0), np.inf), "b": np.array([[np.nan, 2.0]]), "c": np.int32(3)}
+    assert plain(values) == {"a": [1.0, None], "b": [[None, 2.0]], "c": 3}
+    assert plain(np.array(True)) is True
+    assert plain(None) is None
+    assert plain("NaN") == "NaN"
+
+
+def test_verdict_tells_good_from_fair_from_uncertain(record):
+    def first(sd_mm, sd_rad):
+        variances = [sd_mm**2 / 3] * 3 + [sd_rad**2 / 3] * 3
+        return verdict({**record, "covariance": np.diag(variances).tolist()})[0]
+
+    assert first(0.4, 0.005).startswith("Good: ")
+    assert first(0.4, 0.02).startswith("Fair: ")
+    assert first(2.0, 0.005).startswith("Uncertain: ")
+    assert verdict({**record, "covariance": None})[0].startswith("Uncertain: ")
+    assert f"{record['reconstruction_precision_mm']:.2f} mm" in first(0.4, 0.005)
+
+
+@pytest.mark.parametrize("status", [Status.UNOBSERVABLE, Status.MAX_ITERATIONS])
+def test_verdict_on_what_must_not_be_used(result, recording, status):
+    record = calibration_record(with_status(result, status), recording)
+    lines = verdict(record)
+    assert lines[0].startswith(("Do not use", "Do not trust"))
+    assert "What to do:" in lines
+    assert record["warnings"]
+    assert all(f"- {text}" in lines for text in record["warnings"])
+
+
+def test_verdict_names_outliers_and_out_of_plane_errors(record):
+    lines = verdict({**record, "outliers": [3, 7]})
+    assert any("Check images 3, 7 (" in line for line in lines)
+    plain_fit = {**record, "method": "conventional", "prior": "none"}
+    assert any("--method joint" in line for line in verdict(plain_fit))
+    assert not any("--method joint" in line for line in verdict(record))
+
+
+def test_verdict_says_what_rests_on_an_assumption(record):
+    sight = {**record["observability"], "known_only_from_prior": "rotation about the lateral axis"}
+    said = verdict({**record, "prior": "gaussian", "observability": sight})
+    assert any("do not show rotation about the lateral axis" in line for line in said)
+
+
+def test_tables(record, failed, recording):
+    text = text_of(calibration_table(record))
+    assert f"{record['image_to_probe'][0][3]:.6f}" in text
+    assert "19 used of 20" in text
+    lost = calibration_record(failed, recording)
+    assert "failed" in text_of(calibration_table(lost))
+    text = text_of(comparison_table({"joint": record, "lost": lost}, {"joint": 1.25}))
+    assert f"{record['truth_error']['rotation_deg']:.3f}" in text
+    assert "1.2" in text
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_figures_have_units_and_data(result, recording):
+    residuals = residual_figure(result)
+    assert [panel.get_ylabel() for panel in residuals.axes] == [
+        "lateral (mm)", "elevational (mm)", "axial (mm)",
+    ]  # fmt: skip
+    drawn = residuals.axes[0].lines[-1].get_xydata()
+    used = np.flatnonzero(recording.calibration.mask)
+    np.testing.assert_array_equal(drawn[:, 0], used)
+    np.testing.assert_array_equal(drawn[:, 1], result.residual[used, 0])
+
+    offsets = offset_figure(result, recording).axes[0]
+    assert "(mm)" in offsets.get_ylabel()
+    labels = offsets.get_legend_handles_labels()[1]
+    assert set(labels) == {"true", "estimated, with one SD", "at its bound"}
+
+
+def test_convergence_figure_shows_the_excess_over_the_best():
+    curves = [*CURVES, Curve("lost", np.full(3, np.nan))]
+    stopping = dataclasses.replace(CURVES[1], stopped=1)
+    panel = convergence_figure([curves[0], stopping, curves[2]]).axes[0]
+    assert panel.get_yscale() == "log"
+    np.testing.assert_array_equal(panel.lines[0].get_ydata()[0], 2.0)
+    np.testing.assert_array_equal(panel.lines[1].get_ydata(), [2.0, 1.0])
+    assert "alternating: stops here" in panel.get_legend_handles_labels()[1]
+    nothing = convergence_figure([curves[2]]).axes[0]
+    assert "no objective values" in nothing.texts[0].get_text()
+
+
+def test_figures_leave_pyplot_alone():
+    code = "import jaxcal.report.figures, sys; sys.exit('matplotlib.pyplot' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_bounded_curves_end_in_one_minimum(recording, result):
+    joint, alternating = bounded_curves(jaxcal.Problem.from_recording(recording))
+    np.testing.assert_array_equal(joint.objective[1:5], alternating.objective[1:5])
+    np.testing.assert_array_equal(joint.objective[5:], result.trace)
+    values = [curve.objective[np.isfinite(curve.objective)] for curve in (joint, alternating)]
+    for curve in values:
+        assert (np.diff(curve) <= 1e-12 * curve[0]).all()
+    assert values[0].min() <= values[1].min() + 1e-9
+    assert len(values[0]) < len(values[1])
+
+
+def test_report_files(tmp_path, record, result, recording):
+    files = write_report(tmp_path, record, result, recording, CURVES)
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in files}
+    assert json.loads((tmp_path / "calibration.json").read_text()) == record
+    with (tmp_path / "residuals.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    assert tuple(rows[0]) == COLUMNS
+    assert len(rows) == 20
+    assert float(rows[0]["lateral_mm"]) == result.residual[0, 0]
+    assert float(rows[3]["elevation_mm"]) == result.elevation[3]
+    assert rows[LEFT_OUT]["used"] == "0"
+    assert rows[LEFT_OUT]["lateral_mm"] == rows[LEFT_OUT]["elevation_mm"] == ""
+    for path in tmp_path.glob("*.png"):
+        content = path.read_bytes()
+        assert content.startswith(b"\x89PNG")
+        assert content.endswith(b"IEND\xaeB`\x82")
+
+
+def test_report_of_a_failed_solve(tmp_path, failed, recording):
+    lost = calibration_record(failed, recording)
+    assert len(write_report(tmp_path, lost, failed, recording, [])) == 5
+    assert "nan" not in (tmp_path / "residuals.csv").read_text().lower()
+
+
+def test_prepare_folder(tmp_path):
+    with prepare_folder(tmp_path / "a" / "b") as folder:
+        assert folder.is_dir()
+    with prepare_folder(tmp_path / "a"):
+        pass
+    assert list((tmp_path / "a" / "b").iterdir()) == []
+
+
+def test_prepare_folder_removes_only_what_it_made(tmp_path):
+    (tmp_path / "mine").mkdir()
+
+    def fail_in(path, name=None):
+        with prepare_folder(path) as folder:
+            if name:
+                (folder / name).write_text("x")
+            raise InputError("no")
+
+    for path, name in (("mine/a/b", None), ("mine", None), ("kept/deep", "file")):
+        with pytest.raises(InputError):
+            fail_in(tmp_path / path, name)
+    assert {path.name for path in tmp_path.iterdir()} == {"mine", "kept"}
+    assert list((tmp_path / "mine").iterdir()) == []
+    assert (tmp_path / "kept" / "deep" / "file").exists()
+
+
+@pytest.mark.parametrize("path", ["/proc/nope", "/proc", "file", "file/below", "nul\0byte"])
+def test_prepare_folder_refuses(tmp_path, path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match=r"^[^\n]+$"), prepare_folder(tmp_path / path):
+        pass
+    assert [item.name for item in tmp_path.iterdir()] == ["file"]

@@ -1,0 +1,180 @@
+"""One suite that every solver passes: recovery, sizes, masks, batches, derivatives, precision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import angle, experiment, problem, select
+
+import jaxcal
+from jaxcal import Options
+
+
+@dataclass(frozen=True)
+class Solver:
+    """A way to call ``calibrate``, and what it is good for."""
+
+    name: str
+    arguments: dict
+    self_tuning: bool = False
+    # Plain gradient descent stops on a coarse tolerance, so its answers agree only so far.
+    agreement: float = 1e-8
+
+
+TIGHT = Options(tolerance_rad=1e-10, tolerance_mm=1e-8, max_rounds=20_000)
+SOLVERS = [
+    Solver("lm", {"method": "conventional"}),
+    Solver("gauss-newton", {"method": "conventional", "options": Options(solver="gauss-newton")}),
+    Solver(
+        "gradient",
+        {
+            "method": "conventional",
+            "options": Options(solver="gradient", gradient_tolerance=1e-11),
+        },
+        agreement=2e-4,
+    ),
+    Solver("alternating", {"method": "alternating", "options": TIGHT}, agreement=1e-6),
+    Solver("bounded", {"method": "joint", "prior": "bounded"}),
+    Solver("gaussian", {"method": "joint", "sigma": (0.3, 0.15, 1.0)}),
+    Solver("gaussian-tracker", {"method": "joint", "sigma": (0.3, 0.15, 1.0), "tracker_sd": 0.1}),
+    Solver("self-tuned", {"method": "joint"}, self_tuning=True),
+]
+
+
+@pytest.fixture(params=SOLVERS, ids=lambda s: s.name)
+def solver(request: pytest.FixtureRequest) -> Solver:
+    return request.param
+
+
+def noisy(images: int = 12, seed: int = 3, **protocol) -> jaxcal.Problem:
+    return problem(seed, images=images, **({"elevation_mm": 2.0, "noise_mm": 2.0} | protocol))
+
+
+def assert_same(first: jaxcal.Calibration, second: jaxcal.Calibration, tolerance: float) -> None:
+    np.testing.assert_allclose(first.image_to_probe, second.image_to_probe, atol=30 * tolerance)
+    np.testing.assert_allclose(first.point, second.point, atol=30 * tolerance)
+
+
+def test_recovers_the_truth_from_exact_data(solver):
+    recording = jaxcal.simulate_recording(
+        jaxcal.Protocol(images=12, elevation_mm=0.0, noise_mm=0.0), 1
+    )
+    result = jaxcal.calibrate(recording, **solver.arguments)
+    truth = recording.truth
+    assert result.status == "converged"
+    if result.prior == "bounded":
+        # Exact data rest on no bound, so nothing but the bound confines that rotation.
+        assert result.observability["known_only_from_prior"] == "rotation about the lateral axis"
+        assert "rotation about the lateral axis" in result.warnings[0]
+    precision = 1e-7 if solver.agreement < 1e-5 else 1e-3
+    assert angle(result.image_to_probe, truth.image_to_probe) < precision / 50
+    np.testing.assert_allclose(result.image_to_probe, truth.image_to_probe, atol=precision)
+    np.testing.assert_allclose(result.point, truth.point, atol=precision)
+    np.testing.assert_allclose(result.elevation, 0, atol=precision)
+    assert float(result.rms) < precision
+
+
+def test_images_left_out_do_not_count(solver):
+    everything = noisy(12, noise_mm=0.2, elevation_mm=0.3)
+    keep = np.array([1, 4, 7, 11])
+    mask = np.zeros(12)
+    mask[keep] = 1
+    rubbish = np.array(everything.measurements)
+    rubbish[mask == 0] = 1e4
+    masked = replace(everything, mask=jnp.asarray(mask), measurements=jnp.asarray(rubbish))
+    left_out = jaxcal.calibrate(masked, **solver.arguments)
+    without = jaxcal.calibrate(select(everything, keep), **solver.arguments)
+    assert_same(left_out, without, solver.agreement)
+    np.testing.assert_allclose(
+        np.asarray(left_out.elevation)[keep], without.elevation, atol=100 * solver.agreement
+    )
+    np.testing.assert_allclose(left_out.rms, without.rms, atol=solver.agreement)
+    assert int(left_out.images_used) == 4
+    assert np.all(np.asarray(left_out.elevation)[mask == 0] == 0)
+
+
+@pytest.mark.parametrize("images", [4, 1000])
+def test_any_number_of_images(solver, images):
+    recording = experiment(5, images=images, noise_mm=0.2, elevation_mm=0.3)
+    result = jaxcal.calibrate(recording, **solver.arguments)
+    assert result.status == "converged"
+    assert result.elevation.shape == (images,)
+    truth = recording.truth
+    # Noise of 0.2 mm on 128 distances and offsets of 0.3 mm: mm with 4 images, hundredths with 1000.
+    assert np.linalg.norm(result.point - truth.point) < (20 if images == 4 else 0.3)
+    assert angle(result.image_to_probe, truth.image_to_probe) < (0.2 if images == 4 else 0.01)
+    if solver.self_tuning and images < 8:
+        assert not result.sigma_tuned
+        np.testing.assert_array_equal(result.sigma, [0.5, 0.5, 1.0])
+        assert any("held fixed" in warning for warning in result.warnings)
+    elif solver.self_tuning:
+        assert result.sigma_tuned
+        realised = np.sqrt(np.mean(truth.elevation**2))
+        assert float(result.sigma[2]) == pytest.approx(realised, rel=0.05)
+
+
+def test_batches_of_any_shape_and_bad_lanes(solver):
+    lanes = [noisy(12, seed) for seed in range(5)]
+    poisoned = replace(lanes[0], poses=lanes[0].poses.at[3, 0, 3].set(jnp.nan))
+    too_few = replace(lanes[1], mask=jnp.zeros(12).at[:3].set(1.0))
+    batch = jaxcal.stack([lanes[0], poisoned, lanes[1], too_few, lanes[2], lanes[3]])
+    batch = jax.tree.map(lambda leaf: leaf.reshape((2, 3, *leaf.shape[1:])), batch)
+    result = jaxcal.calibrate_batch(batch, **solver.arguments, chunk=4)
+    expected = [["converged", "failed", "converged"], ["failed", "converged", "converged"]]
+    assert result.status.tolist() == expected
+    assert result.image_to_probe.shape == (2, 3, 4, 4)
+    assert np.isfinite(np.asarray(result.image_to_probe)[result.status == "converged"]).all()
+    alone = jaxcal.calibrate(lanes[2], **solver.arguments)
+    lane = jax.tree.map(lambda leaf: leaf[1, 1], result)
+    assert_same(lane, alone, solver.agreement)
+    np.testing.assert_allclose(lane.covariance, alone.covariance, rtol=1e-3)
+
+
+def test_derivative_under_jit_matches_finite_differences(solver):
+    start = noisy(12)
+    weight = jnp.asarray(np.random.default_rng(0).normal(size=(4, 4)))
+    direction = jax.tree.map(
+        lambda leaf: jnp.asarray(np.random.default_rng(1).normal(size=leaf.shape)),
+        (start.poses[:, :3, 3], start.measurements),
+    )
+
+    def value(step):
+        moved = replace(
+            start,
+            poses=start.poses.at[:, :3, 3].add(step * direction[0]),
+            measurements=start.measurements + step * direction[1],
+        )
+        result = jaxcal.calibrate(moved, **solver.arguments)
+        total = jnp.sum(weight * result.image_to_probe) + jnp.sum(result.point)
+        return total + jnp.sum(result.elevation[::2]), (result.differentiable, result.status_code)
+
+    compiled = jax.jit(jax.value_and_grad(value, has_aux=True))
+    (_, (valid, status)), derivative = compiled(0.0)
+    assert valid
+    assert status == jaxcal.Status.CONVERGED
+    # Gradient descent stops short of the minimum by more than a small step moves it.
+    step = 1e-5 if solver.agreement < 1e-5 else 0.1
+    difference = (compiled(step)[0][0] - compiled(-step)[0][0]) / (2 * step)
+    tolerance = 1e-5 if solver.agreement < 1e-5 else 2e-2
+    np.testing.assert_allclose(derivative, difference, rtol=tolerance)
+
+
+def test_float32(solver):
+    reference = noisy(12)
+    single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), reference)
+    arguments = dict(solver.arguments)
+    if solver.agreement > 1e-8:
+        arguments["options"] = Options(solver=arguments["options"].solver)
+        if solver.name == "alternating":
+            arguments["options"] = Options(tolerance_rad=1e-5, tolerance_mm=1e-3)
+    result = jaxcal.calibrate(single, **arguments)
+    exact = jaxcal.calibrate(reference, **solver.arguments)
+    assert result.image_to_probe.dtype == jnp.float32
+    assert result.status == "converged"
+    np.testing.assert_allclose(
+        result.image_to_probe, exact.image_to_probe, atol=5e-3 if solver.agreement < 1e-5 else 0.1
+    )
