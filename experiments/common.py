@@ -50,4 +50,5 @@ def machine() -> str:
         if line.startswith("model name"):
             model = line.split(":", 1)[1].strip()
             break
-    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, jax {jax.__version__}"
+    cores, python = os.cpu_count(), platform.python_version()
+    return f"{model}, {cores} cores, Python {python}, jax {jax.__version__}"

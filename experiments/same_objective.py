@@ -42,7 +42,7 @@ def draw(count: int) -> tuple[Problem, np.ndarray, np.ndarray]:
     root = jax.random.key(SEED)
     problems, settings = [], []
     makers: dict = {}
-    for index, (i, j, _) in enumerate(choice):
+    for i, j, _ in choice:
         if (i, j) not in makers:
             protocol = Protocol(
                 images=IMAGES, elevation_mm=ELEVATIONS[i], noise_mm=NOISES[j], test_images=2
@@ -90,6 +90,10 @@ def scipy_solution(problem: Problem, start: Parameters, bound: float):
         return prior.residual(parameters, unknowns[9:], problem).ravel()
 
     jacobian = jax.jit(jax.jacfwd(residual))
+
+    def jac(unknowns: np.ndarray) -> np.ndarray:
+        return np.asarray(jacobian(jnp.asarray(unknowns)))
+
     first = np.concatenate([np.zeros(9), 0.999 * np.asarray(prior.start(start, problem))])
     limit = np.concatenate([np.full(9, np.inf), np.full(IMAGES, bound)])
     fit = least_squares(
@@ -101,7 +105,7 @@ def scipy_solution(problem: Problem, start: Parameters, bound: float):
 
 
 def main() -> None:
-    quick = arguments(__doc__).quick
+    quick = arguments(__doc__ or "").quick
     count, compared = (100, 10) if quick else (1000, 50)
     problems, settings, bounds = draw(count)
     per_image = jnp.asarray(bounds)[:, None] * jnp.ones(IMAGES)
@@ -189,8 +193,8 @@ def main() -> None:
         ("joint time per problem (us), median of 3", 1e6 * float(np.median(joint_times)) / count),
         ("alternation rounds to the joint's objective, median where reached",
          float(np.median(rounds_needed[rounds_needed > 0]))),
-        ("alternation: problems that reach it within 20,000 rounds", int((rounds_needed > 0).sum())),
-        ("alternation: problems stopped by X moving < 1e-10", int(finished.sum())),
+        ("alternation: problems that reach it within 20,000 rounds", int((rounds_needed >
+        0).sum())), ("alternation: problems stopped by X moving < 1e-10", int(finished.sum())),
         ("alternation time per problem (us), until stopped or 20,000 rounds",
          1e6 * elapsed[-1] / count),
         ("problems whose minimiser is an interval (no bound active in some direction)",

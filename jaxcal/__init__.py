@@ -44,24 +44,31 @@ _HOME = {
     "stack": "jaxcal.problem",
 }
 
-__all__ = [*sorted(_HOME), "__version__"]
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration, Status
-    from jaxcal.errors import (
-        CalibrationError,
-        FormatError,
-        InputError,
-        MissingExtraError,
-        OutputError,
-    )
-    from jaxcal.io.hdf5 import load, save
-    from jaxcal.metrics import calibration_reproducibility, reconstruction_precision
-    from jaxcal.probe import LinearProbe
-    from jaxcal.problem import Problem, stack
-    from jaxcal.recording import Images, Recording, make_images
-    from jaxcal.simulation import Protocol, simulate, simulate_recording
-    from jaxcal.solve import Options, calibrate, calibrate_batch
+    from jaxcal.calibration import Calibration as Calibration
+    from jaxcal.calibration import Status as Status
+    from jaxcal.errors import CalibrationError as CalibrationError
+    from jaxcal.errors import FormatError as FormatError
+    from jaxcal.errors import InputError as InputError
+    from jaxcal.errors import MissingExtraError as MissingExtraError
+    from jaxcal.errors import OutputError as OutputError
+    from jaxcal.io.hdf5 import load as load
+    from jaxcal.io.hdf5 import save as save
+    from jaxcal.metrics import calibration_reproducibility as calibration_reproducibility
+    from jaxcal.metrics import reconstruction_precision as reconstruction_precision
+    from jaxcal.probe import LinearProbe as LinearProbe
+    from jaxcal.problem import Problem as Problem
+    from jaxcal.problem import stack as stack
+    from jaxcal.recording import Images as Images
+    from jaxcal.recording import Recording as Recording
+    from jaxcal.recording import make_images as make_images
+    from jaxcal.simulation import Protocol as Protocol
+    from jaxcal.simulation import simulate as simulate
+    from jaxcal.simulation import simulate_recording as simulate_recording
+    from jaxcal.solve import Options as Options
+    from jaxcal.solve import calibrate as calibrate
+    from jaxcal.solve import calibrate_batch as calibrate_batch
 
 
 def __getattr__(name: str) -> object:
@@ -73,4 +80,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*_HOME, "__version__"]

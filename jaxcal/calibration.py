@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxcal import diagnosis
 from jaxcal.errors import CalibrationError
 from jaxcal.model.parameters import Blocks
+from jaxcal.problem import is_traced
 
 
 class Status(enum.IntEnum):
@@ -143,7 +144,7 @@ class Calibration(eqx.Module):
 
     @staticmethod
     def _concrete(value: Array | np.ndarray) -> np.ndarray:
-        if isinstance(value, jax.core.Tracer):
+        if is_traced(value):
             raise CalibrationError(
                 "text is not available under jit, vmap or grad; use the arrays (status_code, "
                 "converged, ...) there, and the text outside"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.geometry import AnyArray
 from jaxcal.model.parameters import BLOCK_SIZE
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ STEADY = 1e-3
 WEAK_TRANSLATION_MM = 0.3
 
 
-def direction_in_words(vector: np.ndarray, blocks: tuple[str, ...]) -> str:
+def direction_in_words(vector: AnyArray, blocks: tuple[str, ...]) -> str:
     """Name a direction of the unknowns.
 
     Args:
@@ -56,7 +57,11 @@ def direction_in_words(vector: np.ndarray, blocks: tuple[str, ...]) -> str:
         return "unknown"
     # X's own blocks lead: a target that moves along with X is a consequence for a person.
     leading = [block for block in blocks if size[block] > 0.35 * total]
-    named = [block for block in leading if block != "point"] or leading or [max(size, key=size.get)]
+    named = (
+        [block for block in leading if block != "point"]
+        or leading
+        or [max(size, key=lambda block: size[block])]
+    )
     words = [_block_in_words(block, parts[block]) for block in named]
     if "point" in leading and "point" not in named:
         words.append("the target moving along")
@@ -166,6 +171,6 @@ def warnings(result: Calibration) -> list[str]:
     return found
 
 
-def _finite(value: np.ndarray | float) -> float | None:
+def _finite(value: AnyArray | float) -> float | None:
     number = float(value)
     return number if np.isfinite(number) else None

@@ -1,8 +1,8 @@
 """Rigid transforms at the boundary: 4x4 matrices in millimetres, checked and projected to SE(3).
 
 Inside the engine a pose is a 4x4 array whose rotation can be trusted; this module is where somebody
-else's matrices become such poses. A rotation block within 1e-2 (Frobenius) of SO(3) is projected to it by
-SVD (text files and optical trackers round); anything farther is refused with its row named.
+else's matrices become such poses. A rotation block within 1e-2 (Frobenius) of SO(3) is projected to
+it by SVD (text files and optical trackers round); anything farther is refused with its row named.
 """
 
 from __future__ import annotations
@@ -97,15 +97,15 @@ def check_poses(
 
 def transform_points(
     transform: Float[AnyArray, "*#batch 4 4"], points: Float[AnyArray, "*#batch 3"]
-) -> Float[AnyArray, "*batch 3"]:
+) -> Float[Array, "*batch 3"]:
     """Apply 4x4 rigid transforms to points (mm); leading axes broadcast."""
     rotated = jnp.einsum("...ij,...j->...i", transform[..., :3, :3], points)
     return rotated + transform[..., :3, 3]
 
 
 def matrix_from_rotation(
-    rotation: Float[AnyArray, "3 3"], translation: Float[AnyArray, 3]
-) -> Float[AnyArray, "4 4"]:
+    rotation: Float[Array, "3 3"], translation: Float[Array, 3]
+) -> Float[Array, "4 4"]:
     """The 4x4 transform with the given rotation and translation (mm)."""
     top = jnp.concatenate([rotation, translation[:, None]], axis=1)
     bottom = jnp.asarray([[0.0, 0.0, 0.0, 1.0]], dtype=top.dtype)

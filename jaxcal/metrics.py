@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxcal.geometry import AnyArray, transform_points
 
@@ -13,7 +13,7 @@ def reconstruction_precision(
     poses: Float[AnyArray, "n 4 4"],
     points: Float[AnyArray, "n columns"],
     mask: Float[AnyArray, " n"] | None = None,
-) -> Float[AnyArray, ""]:
+) -> Float[Array, ""]:
     """Point reconstruction precision, Eq. 8: norm of the SD of B_i X p_i over the images, mm.
 
     Args:
@@ -38,7 +38,7 @@ def reconstruct(
     image_to_probe: Float[AnyArray, "4 4"],
     poses: Float[AnyArray, "n 4 4"],
     points: Float[AnyArray, "n columns"],
-) -> Float[AnyArray, "n 3"]:
+) -> Float[Array, "n 3"]:
     """B_i X p_i: image points in the tracker's frame, mm; (n, 2) points lie in the plane."""
     points = jnp.asarray(points)
     if points.shape[1] == 2:
@@ -49,7 +49,7 @@ def reconstruct(
 
 def calibration_reproducibility(
     transforms: Float[AnyArray, "k 4 4"], image_points: Float[AnyArray, "m 2"]
-) -> Float[AnyArray, " m"]:
+) -> Float[Array, " m"]:
     """How far repeated calibrations scatter at image points: mean distance from their mean, mm.
 
     Args:
@@ -68,7 +68,7 @@ def calibration_reproducibility(
     return jnp.mean(jnp.linalg.norm(images - jnp.mean(images, axis=0), axis=-1), axis=0)
 
 
-def image_corners(width_mm: float, depth_mm: float) -> Float[AnyArray, "5 2"]:
+def image_corners(width_mm: float, depth_mm: float) -> Float[Array, "5 2"]:
     """The four corners of a linear probe's image and its centre, [lateral, axial] mm."""
     half = 0.5 * width_mm
     return jnp.asarray(
@@ -78,7 +78,7 @@ def image_corners(width_mm: float, depth_mm: float) -> Float[AnyArray, "5 2"]:
 
 def root_mean_square(
     residual: Float[AnyArray, "n 3"], mask: Float[AnyArray, " n"] | None = None
-) -> Float[AnyArray, ""]:
+) -> Float[Array, ""]:
     """Root mean square length of residual vectors (mm) over the used images."""
     residual = jnp.asarray(residual)
     weight = jnp.ones(residual.shape[0], residual.dtype) if mask is None else jnp.asarray(mask)

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxcal.errors import InputError
@@ -55,7 +57,9 @@ class Problem(eqx.Module):
         return self.mask.shape[:-1]
 
     @classmethod
-    def from_recording(cls, recording: Recording | Images, dtype: object = None) -> Problem:
+    def from_recording(
+        cls, recording: Recording | Images, dtype: DTypeLike | None = None
+    ) -> Problem:
         """The calibration images of a recording as arrays.
 
         Args:
@@ -73,10 +77,7 @@ class Problem(eqx.Module):
         dtype = jnp.result_type(float) if dtype is None else dtype
         pixels = images.kind == "pixel"
         known = not pixels or images.spacing_mm is not None
-        if images.spacing_mm is not None:
-            spacing = np.asarray(images.spacing_mm)
-        else:
-            spacing = np.ones(2)
+        spacing = np.ones(2) if images.spacing_mm is None else np.asarray(images.spacing_mm)
 
         def array(values: np.ndarray | float) -> Array:
             return jnp.asarray(values, dtype=dtype)
@@ -104,7 +105,7 @@ class Problem(eqx.Module):
         covariance: np.ndarray | None = None,
         max_elevation: np.ndarray | float | None = None,
         spacing_mm: np.ndarray | tuple[float, float] | None = None,
-        dtype: object = None,
+        dtype: DTypeLike | None = None,
     ) -> Problem:
         """One checked problem from numpy arrays in memory; units as in :class:`Images`.
 
@@ -142,3 +143,8 @@ def stack(problems: list[Problem]) -> Problem:
                 "pad it with images that are masked out"
             )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)
+
+
+def is_traced(value: object) -> bool:
+    """Whether a value is unknown because jit, vmap or grad is looking at the code."""
+    return isinstance(value, jax.core.Tracer)

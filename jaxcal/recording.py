@@ -59,8 +59,12 @@ class Images:
 
 @dataclass(frozen=True)
 class Truth:
-    """What a simulation knows: image -> probe (4, 4) mm, target (3,) mm in the tracker's frame,
-    elevational offsets (n,) mm.
+    """What a simulation knows.
+
+    Attributes:
+        image_to_probe: (4, 4) X, mm.
+        point: (3,) target in the tracker's frame, mm.
+        elevation: (n,) elevational offsets, mm.
     """
 
     image_to_probe: Float[np.ndarray, "4 4"]

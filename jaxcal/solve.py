@@ -23,7 +23,7 @@ from jaxcal.metrics import root_mean_square
 from jaxcal.model.parameters import RIGID, Blocks, Parameters, block_slice, retract
 from jaxcal.model.priors import AbstractPrior, Bounded, Gaussian, InPlane, covariance_shape
 from jaxcal.model.residuals import circle_residual, measurement_residual
-from jaxcal.problem import Problem
+from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES, Recording
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import alternate
@@ -211,9 +211,11 @@ def _prepare(
             'the pixels have no spacing_mm: give it, or estimate the scale (estimate=("scale",), '
             "--estimate scale)"
         )
-    kind = {"conventional": "none", "alternating": "bounded"}.get(method)
-    if kind is None:
-        kind = "bounded" if prior == "bounded" else "gaussian"
+    kind: Literal["none", "gaussian", "bounded"] = "gaussian"
+    if method == "conventional":
+        kind = "none"
+    elif method == "alternating" or prior == "bounded":
+        kind = "bounded"
     if kind != "gaussian" and (sigma is not None or tracker_sd is not None):
         raise InputError("sigma and tracker_sd belong to the joint method's gaussian prior")
     if tracker_sd is not None and sigma is None:
@@ -241,7 +243,7 @@ def _prepare(
 
 
 def _check_positive(name: str, value: object, least: float) -> None:
-    if value is None or isinstance(value, jax.core.Tracer):
+    if value is None or is_traced(value):
         return
     numbers = np.asarray(value, dtype=float)
     if not (np.isfinite(numbers).all() and (numbers >= least).all()):
@@ -250,7 +252,7 @@ def _check_positive(name: str, value: object, least: float) -> None:
 
 def _check_values(problem: Problem) -> None:
     leaves = jax.tree.leaves(problem)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+    if any(is_traced(leaf) for leaf in leaves):
         return
     used = np.asarray(problem.mask) > 0
     if used.sum() < MINIMUM_IMAGES:

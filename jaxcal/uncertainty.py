@@ -1,10 +1,11 @@
 """How certain an answer is, and which directions the data do not see.
 
-The Schur complement S of the whitened arrow (:mod:`jaxcal.solvers.arrow`) is the marginal information
-of the shared unknowns: S^-1 is their covariance (the Cramer-Rao bound, where no bound on an offset is
-active), and eigenvectors of S with small eigenvalues are directions that the images barely determine.
-To compare mm with rad and log units, rotations and scales are multiplied by the lever arm, the root
-mean square distance of the measured points from the image origin: all are then mm at the target.
+The Schur complement S of the whitened arrow (:mod:`jaxcal.solvers.arrow`) is the marginal
+information of the shared unknowns: S^-1 is their covariance (the Cramer-Rao bound, where no bound
+on an offset is active), and eigenvectors of S with small eigenvalues are directions that the images
+barely determine. To compare mm with rad and log units, rotations and scales are multiplied by the
+lever arm, the root mean square distance of the measured points from the image origin: all are then
+mm at the target.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The joint solver against the alternation and scipy on one objective, and REML against its likelihood."""
+"""The joint solver against the alternation and scipy, and REML against its likelihood."""
 
 from __future__ import annotations
 
@@ -109,7 +109,8 @@ def test_self_tuning_maximises_the_restricted_likelihood():
 def test_self_tuned_beats_conventional_and_recovers_the_sds():
     lanes = [problem(k, images=30, elevation_mm=3.0, noise_mm=2.0) for k in range(40)]
     problems = jaxcal.stack(lanes)
-    truth = [jaxcal.simulate_recording(jaxcal.Protocol(images=30, elevation_mm=3.0, noise_mm=2.0), k)
+    truth = [jaxcal.simulate_recording(jaxcal.Protocol(images=30, elevation_mm=3.0, noise_mm=2.0),
+    k)
              for k in range(40)]  # fmt: skip
     precision = {}
     for method in ("conventional", "joint"):

@@ -104,7 +104,8 @@ def test_any_number_of_images(solver, images):
     assert result.status == "converged"
     assert result.elevation.shape == (images,)
     truth = recording.truth
-    # Noise of 0.2 mm on 128 distances and offsets of 0.3 mm: mm with 4 images, hundredths with 1000.
+    # Noise of 0.2 mm on 128 distances and offsets of 0.3 mm: mm with 4 images, hundredths with
+    # 1000.
     assert np.linalg.norm(result.point - truth.point) < (20 if images == 4 else 0.3)
     assert angle(result.image_to_probe, truth.image_to_probe) < (0.2 if images == 4 else 0.01)
     if solver.self_tuning and images < 8:

@@ -27,10 +27,9 @@ class Parameters(eqx.Module):
     """A value of the unknowns.
 
     Attributes:
-        rotation: of X; its columns are the lateral, elevational and axial axes in the probe's frame.
-        translation: of X, mm.
-        point: the target c in the tracker's frame, mm.
-        scale: factors on the problem's [lateral, axial] spacing.
+        rotation: of X; its columns are the lateral, elevational and axial axes in the probe's
+            frame. translation: of X, mm. point: the target c in the tracker's frame, mm. scale:
+            factors on the problem's [lateral, axial] spacing.
     """
 
     rotation: Float[Array, "3 3"]

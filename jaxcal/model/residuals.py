@@ -1,12 +1,12 @@
 """What the model says of an image: where the target is in it, and how far from the measurement.
 
-With q_i = X^-1 B_i^-1 c, the target in image i's frame, and (x_i, r_i) the measured lateral position
-and range, the target lies on a circle about the element line (the paper's Eq. 5):
+With q_i = X^-1 B_i^-1 c, the target in image i's frame, and (x_i, r_i) the measured lateral
+position and range, the target lies on a circle about the element line (the paper's Eq. 5):
 
     p_i(y) = (x_i, y, sqrt(r_i^2 - y^2)).
 
-Two residuals follow. :func:`circle_residual` is the paper's: the three components of q_i - p_i(y_i),
-equally weighted (Eq. 7 with y = 0; Fig. 4 and the bounded joint problem with y free).
+Two residuals follow. :func:`circle_residual` is the paper's: the three components of q_i -
+p_i(y_i), equally weighted (Eq. 7 with y = 0; Fig. 4 and the bounded joint problem with y free).
 :func:`measurement_residual` is in the coordinates that were measured: lateral, range, and the
 elevational offset itself, each with its own noise.
 

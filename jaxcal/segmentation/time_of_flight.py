@@ -19,7 +19,7 @@ def fit_distances(
     element_lateral: Float[AnyArray, " elements"],
     *,
     steps: int = 5,
-) -> tuple[Float[AnyArray, "*batch 2"], Float[AnyArray, "*batch 2 2"]]:
+) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch 2 2"]]:
     """Least squares on Eq. 5 from every element's distance to the target.
 
     Args:
@@ -31,7 +31,7 @@ def fit_distances(
         points [lateral, range] mm, and the inverse normal matrices: times the variance of a
         distance they are the points' covariances.
     """
-    e = element_lateral
+    e, distances = jnp.asarray(element_lateral), jnp.asarray(distances)
     centred = e - jnp.mean(e)
     # d^2 - e^2 = -2 x e + (x^2 + r^2): slope and mean of a straight line over the elements.
     square = distances**2 - e**2

@@ -1,1 +1,1 @@
-"""Solvers: closed form, conventional, alternating, joint, self-tuned; none knows of files or plots."""
+"""Solvers: closed form, conventional, alternating, joint, self-tuned; they see arrays only."""

@@ -1,10 +1,11 @@
 """The paper's alternation (Fig. 4): closest points on the arcs, then a new X and c, and again.
 
-From the conventional X and c, each round (1) moves every p_i to the point of its arc |y| <= m_i that
-is closest to where X and c put the target, and (2) improves X and c with those points held, by a few
-Gauss-Newton steps of Eq. 7. It stops when a round moves X by less than a tolerance. Both half-rounds
-lower the same sum of squares as the joint ``bounded`` problem; like every ICP it converges linearly,
-and where the arcs can slide along themselves (rotation about the lateral axis) at a rate near 1.
+From the conventional X and c, each round (1) moves every p_i to the point of its arc |y| <= m_i
+that is closest to where X and c put the target, and (2) improves X and c with those points held, by
+a few Gauss-Newton steps of Eq. 7. It stops when a round moves X by less than a tolerance. Both
+half-rounds lower the same sum of squares as the joint ``bounded`` problem; like every ICP it
+converges linearly, and where the arcs can slide along themselves (rotation about the lateral axis)
+at a rate near 1.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def alternate(
     *,
     tolerance_rad: float = 1e-3,
     tolerance_mm: float = 0.1,
-    max_rounds: int = 1000,
+    max_rounds: int | Int[Array, ""] = 1000,
     inner_steps: int = 2,
     trace: int = 0,
 ) -> Alternation:
@@ -95,7 +96,7 @@ def alternate(
         offset = prior.start(state.parameters, problem)
         held = Fixed(offset)
 
-        def step(parameters: Parameters, _: None) -> tuple[Parameters, Float[Array, ""]]:
+        def step(parameters: Parameters, _: object) -> tuple[Parameters, Float[Array, ""]]:
             arrow, _, _ = linearise(parameters, none, held, problem, blocks)
             move, _ = arrows.solve(arrow, jnp.zeros((), dtype))
             return retract(parameters, move, blocks), arrow.cost

@@ -1,7 +1,8 @@
 """The arrow: normal equations in which every image's offset meets only the p shared unknowns.
 
 Per image i let J_i (m x p) be the Jacobian of its m residuals r_i with respect to the shared
-unknowns (pose, target, scales) and k_i (m) that with respect to its own offset. The normal matrix is
+unknowns (pose, target, scales) and k_i (m) that with respect to its own offset. The normal
+matrix is
 
     [ A   E_1 ... E_n ]      A   = sum_i J_i' J_i      g   = sum_i J_i' r_i
     [ E_1'  D_1       ]      E_i = J_i' k_i            D_i = k_i' k_i        d_i = k_i' r_i

@@ -4,10 +4,11 @@ Three ways to the same minimum of sum_i |c - B_i X p_i|^2, p_i = (x_i, 0, r_i):
 
 - ``lm``: Levenberg-Marquardt, the default;
 - ``gauss-newton``: the same steps without damping;
-- ``gradient``: the paper's first step, after Ackerman et al. 2013: gradient descent on the Euclidean
-  group over all pairs, sum_{i<j} |B_i X p_i - B_j X p_j|^2, stopped on a tolerance. The target is not
-  an unknown there. Since sum_{i<j} |a_i - a_j|^2 = n sum_i |a_i - mean a|^2, the pairs cost no more
-  than the points, and the minimiser is that of Eq. 7 with c the mean; the path to it is not.
+- ``gradient``: the paper's first step, after Ackerman et al. 2014: gradient descent on the
+  Euclidean group over all pairs, sum_{i<j} |B_i X p_i - B_j X p_j|^2, stopped on a tolerance. The
+  target is no unknown there. Since sum_{i<j} |a_i - a_j|^2 = n sum_i |a_i - mean a|^2, the pairs
+  cost no more than the points, and the minimiser is that of Eq. 7 with c the mean; the path to it
+  is not.
 
 Reference: Ackerman, Cheng, Boctor, Chirikjian, "Online ultrasound sensor calibration using gradient
 descent on the Euclidean group", ICRA 2014.
@@ -103,8 +104,8 @@ class SteepestDescent(optx.AbstractGradientDescent):
     rtol: float
     atol: float
     norm: Callable
-    descent: optx.SteepestDescent
-    search: optx.BacktrackingArmijo
+    descent: optx.SteepestDescent  # pyright: ignore[reportIncompatibleVariableOverride]
+    search: optx.BacktrackingArmijo  # pyright: ignore[reportIncompatibleVariableOverride]
     verbose: Callable[..., None] = eqx.field(static=True, default=lambda **_: None)
 
 

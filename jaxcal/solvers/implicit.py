@@ -2,9 +2,10 @@
 
 At a solution the stationarity conditions F(unknowns, data) = 0 hold, so by the implicit function
 theorem d unknowns = -(dF/d unknowns)^-1 dF/d data. The first matrix is the exact Hessian, which has
-the arrow's shape: p tangents and one all-ones offset tangent read it, and the offsets are eliminated
-by scalar divisions (:mod:`jaxcal.solvers.arrow`). Offsets resting on their bound move with the bound.
-For the self-tuned solve the conditions are those of X and c together with those of the three SDs.
+the arrow's shape: p tangents and one all-ones offset tangent read it, and the offsets are
+eliminated by scalar divisions (:mod:`jaxcal.solvers.arrow`). Offsets resting on their bound move
+with the bound. For the self-tuned solve the conditions are those of X and c together with those of
+the three SDs.
 
 Both functions return the tangent (zero in value) by which the solution moves with the data; being
 ``jax.custom_jvp`` with rules that call themselves, they work in forward and reverse mode, to any

@@ -6,14 +6,13 @@ With r1 and r3 the lateral and axial columns of X's rotation, B_i X p_i = c of E
     R_i (u_i a1 + v_i a3 + t) + t_i - c = 0,         3 n equations, 12 unknowns,
 
 whether the pixel scales s are known or not: unknown scales are |a1| and |a3|. The 3x2 matrix
-[a1, a3] is projected to orthonormal columns by SVD (y = z cross x completes it, so no reflection can
-arise), and t and c (and unknown scales) follow from the linear system with the rotation held.
+[a1, a3] is projected to orthonormal columns by SVD (y = z cross x completes it, so no reflection
+can arise), and t and c (and unknown scales) follow from the linear system with the rotation held.
 
-The system is singular where the poses or the points (all on a line in the image) determine less than
-12 unknowns, and useless where few images and much noise drown it, although X's being a rotation may
-still determine it. The start
-is then marked unsound, and :func:`jaxcal.solvers.conventional.from_scratch` also tries the 24
-rotations of the cube.
+The system is singular where the poses or the points (all on a line in the image) determine less
+than 12 unknowns, and useless where few images and much noise drown it, although X's being a
+rotation may still determine it. The start is then marked unsound, and
+:func:`jaxcal.solvers.conventional.from_scratch` also tries the 24 rotations of the cube.
 
 References: the linear form is the hand-eye (AX = XB family) elimination used for single-point
 phantoms, e.g. Melvaer et al. 2012; the projection is Schoenemann's.

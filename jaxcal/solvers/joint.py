@@ -5,8 +5,8 @@ Without bounds this is one Levenberg-Marquardt minimisation (:mod:`jaxcal.solver
 With bounds the objective can have more than one local minimum along the direction that lateral
 position and range do not see, rotation about the lateral axis: the offsets slide along their arcs
 together until one set of bounds or another stops them. So it is solved from three starts, the
-conventional one and that turned either way by half of what the bounds allow, each after a few rounds
-of the alternation, which descend gently; the lowest of the three is the answer.
+conventional one and that turned either way by half of what the bounds allow, each after a few
+rounds of the alternation, which descend gently; the lowest of the three is the answer.
 """
 
 from __future__ import annotations

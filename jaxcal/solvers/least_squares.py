@@ -247,11 +247,11 @@ class ArrowLeastSquares(optx.AbstractGaussNewton):
     """
 
     rtol: float
-    atol: Array | float
+    atol: Array | float  # pyright: ignore[reportIncompatibleVariableOverride]
     rounding: Float[Array, ""]
     residuals: int = eqx.field(static=True)
-    descent: ArrowDescent
-    search: GainRatio
+    descent: ArrowDescent  # pyright: ignore[reportIncompatibleVariableOverride]
+    search: GainRatio  # pyright: ignore[reportIncompatibleVariableOverride]
     norm: Callable = optx.max_norm
     verbose: Callable[..., None] = eqx.field(static=True, default=lambda **_: None)
 
@@ -310,11 +310,8 @@ def minimise(
     def residual(unknowns: Unknowns, _: None) -> Float[Array, "n m"]:
         return prior.residual(retract(start, unknowns.tangent, blocks), unknowns.offset, problem)
 
-    best = None
-    if prior.closed_form_offset:
-
-        def best(tangent: Float[Array, " p"]) -> Float[Array, " k"]:
-            return prior.start(retract(start, tangent, blocks), problem)
+    def best_offset(tangent: Float[Array, " p"]) -> Float[Array, " k"]:
+        return prior.start(retract(start, tangent, blocks), problem)
 
     def curvature(unknowns: Unknowns) -> Arrow:
         return exact_arrow(residual, unknowns, limit)
@@ -328,7 +325,12 @@ def minimise(
         atol=tolerance,
         rounding=rounding,
         residuals=3 * problem.images,
-        descent=ArrowDescent(limit, damping, best, curvature if exact else None),
+        descent=ArrowDescent(
+            limit,
+            damping,
+            best_offset if prior.closed_form_offset else None,
+            curvature if exact else None,
+        ),
         search=GainRatio(rounding, trace, damping == 0),
     )
     solution = optx.least_squares(residual, solver, first, max_steps=max_steps, throw=False)

@@ -9,9 +9,9 @@ where leverage_k, the trace of S^-1 J_k' J_k, is the number of degrees of freedo
 take from component k, and again until the SDs stand still. So no noise level and no maximum
 elevational distance is chosen by hand.
 
-A component whose error truly vanishes (no noise, or every target in the plane) would drive its SD to
-zero and the weights to infinity; it is held at a thousandth of the largest SD, which is as good as
-exact for X.
+A component whose error truly vanishes (no noise, or every target in the plane) would drive its SD
+to zero and the weights to infinity; it is held at a thousandth of the largest SD, which is as good
+as exact for X.
 
 References: Helmert 1924; Patterson and Thompson 1971 (REML); Foerstner 1979.
 """
