@@ -97,7 +97,8 @@ def scipy_solution(problem: Problem, start: Parameters, bound: float):
     first = np.concatenate([np.zeros(9), 0.999 * np.asarray(prior.start(start, problem))])
     limit = np.concatenate([np.full(9, np.inf), np.full(IMAGES, bound)])
     fit = least_squares(
-        lambda u: np.asarray(residual(jnp.asarray(u))), first, lambda u: np.asarray(jacobian(u)),
+        lambda u: np.asarray(residual(jnp.asarray(u))), first,
+        jac=jac,  # pyright: ignore[reportArgumentType]
         bounds=(-limit, limit), method="trf", x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15,
         max_nfev=3000,
     )  # fmt: skip

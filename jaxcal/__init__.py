@@ -12,9 +12,9 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from jaxcal._precision import enable_float64
+from jaxcal._configuration import configure_jax
 
-enable_float64()
+configure_jax()
 
 __version__ = "0.1.0"
 

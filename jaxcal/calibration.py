@@ -52,7 +52,7 @@ class Calibration(eqx.Module):
         stationarity: scaled KKT residual of that objective.
         condition: of the information about all unknowns, in scaled units (largest / smallest).
         weakest: unit vector (scaled units) of the least known direction of all unknowns.
-        weakest_sd: standard deviation along it, mm at the lever arm.
+        weakest_sd: standard deviation along it, mm at the lever arm; NaN where it has none.
         prior_direction: direction that the measurements alone, without the offset's prior or bound,
             leave undetermined; zeros where there is none.
         searched_start: the closed-form start was unsound and one was searched for.
@@ -106,7 +106,7 @@ class Calibration(eqx.Module):
     @property
     def converged(self) -> Bool[Array, "*batch"]:
         """Whether the answer is a converged and observable one (traceable)."""
-        return self.status_code == Status.CONVERGED
+        return jnp.asarray(self.status_code == Status.CONVERGED)
 
     @property
     def status(self) -> str | np.ndarray:

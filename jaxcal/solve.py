@@ -144,7 +144,7 @@ def calibrate(
             tracker_sd=tracker_sd, estimate=estimate, options=options,
         )  # fmt: skip
     _check_values(problem)
-    return _solve_jit(_with_bound(problem, given), given, plan)
+    return _finished(_solve_jit(_with_bound(problem, given), given, plan))
 
 
 def calibrate_batch(
@@ -190,6 +190,7 @@ def calibrate_batch(
     problems = _with_bound(problems, given)
     flat = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
     result = _solve_chunks(flat, given, plan, min(chunk, flat.mask.shape[0]))
+    result = _finished(result)
     return jax.tree.map(lambda leaf: leaf.reshape((*shape, *leaf.shape[1:])), result)
 
 
@@ -271,6 +272,15 @@ def _with_bound(problem: Problem, given: _Given) -> Problem:
         return problem
     bound = jnp.broadcast_to(given.max_elevation, problem.mask.shape)
     return replace(problem, max_elevation=bound)
+
+
+def _finished(result: Calibration) -> Calibration:
+    """Wait for a result (a no-op under a transformation).
+
+    Solves in flight at once would share one thread pool; one at a time is as fast, since each uses
+    every core, and it cannot deadlock (:mod:`jaxcal._configuration`).
+    """
+    return jax.block_until_ready(result)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -430,8 +440,12 @@ def _assemble(
     if sigma is None:
         errors = measurement_residual(parameters, problem).at[:, 2].set(elevation)
         # The unknowns' degrees of freedom are shared equally by the three components.
-        freedom = jnp.maximum(used - jnp.asarray(uncertainty.weakest.shape[0] / 3), 1.0)
-        sigma = jnp.sqrt(jnp.sum(errors**2, axis=0) / freedom)
+        freedom = jnp.maximum(used - uncertainty.weakest.shape[0] / 3, 1.0)
+        mean_square = jnp.sum(errors**2, axis=0) / freedom
+        if plan.prior == "bounded":
+            # Offsets within a bound have a root mean square within it, too.
+            mean_square = mean_square.at[2].set(jnp.sum(elevation**2) / used)
+        sigma = jnp.sqrt(mean_square)
     status = _status(solution, matrix, uncertainty, parameters, problem, plan)
     pose = slice(0, 6)
     point = block_slice(plan.blocks, "point")
@@ -510,5 +524,6 @@ def _differentiable(
         # An offset about to reach its bound, or to leave it, makes the answer's kink.
         gap = jnp.abs(prior.limit(solution.parameters, problem) - jnp.abs(offset))
         closest = jnp.where((uncertainty.at_bound > 0) | (problem.mask == 0), jnp.inf, gap)
-        good = good & (jnp.min(closest) > 1e-6) & jnp.logical_not(uncertainty.singular)
+        good = good & (jnp.min(closest) > 1e-6) & (uncertainty.weakest_hold > 1e-6)
+        good = good & jnp.logical_not(uncertainty.singular)
     return good

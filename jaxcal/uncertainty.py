@@ -37,11 +37,13 @@ class Uncertainty(eqx.Module):
         elevation_sd: (n,) mm; NaN where an offset rests on its bound or an image is left out.
         condition: largest over smallest eigenvalue of the scaled information.
         weakest: (p,) unit vector of the smallest, in scaled units.
-        weakest_sd: SD along it, mm.
+        weakest_sd: SD along it, mm; NaN where singular.
         prior_direction: (p,) direction that lateral position and range alone leave undetermined.
         degenerate: whether the poses do not determine the unknowns.
         singular: whether the information (with the bounds that are active) is singular.
         at_bound: (n,) 1 where an offset rests on its bound.
+        weakest_hold: least force with which a bound holds an offset, in root mean square residuals;
+            inf where no bound is active.
     """
 
     covariance: Float[Array, "p p"]
@@ -53,6 +55,7 @@ class Uncertainty(eqx.Module):
     degenerate: Bool[Array, ""]
     singular: Bool[Array, ""]
     at_bound: Float[Array, " n"]
+    weakest_hold: Float[Array, ""]
 
 
 def assess(
@@ -86,6 +89,12 @@ def assess(
         free = jnp.sum(problem.mask) - jnp.sum(resting) if offsets else 0.0
         variance = arrow.cost / jnp.maximum(3 * used - size(blocks) - free, 1.0)
 
+    hold = jnp.asarray(jnp.inf, problem.mask.dtype)
+    if offsets:
+        force = jnp.abs(arrow.offset_gradient) / jnp.sqrt(arrow.diagonal)
+        typical = jnp.sqrt(arrow.cost / (3 * used)) + jnp.finfo(force.dtype).tiny
+        hold = jnp.min(jnp.where(resting > 0, force / typical, jnp.inf))
+
     scale = unit_scale(parameters, problem, blocks)
     values, vectors = _spectrum(information, scale)
     floor = jnp.finfo(values.dtype).eps * values[-1]
@@ -113,13 +122,14 @@ def assess(
         ),
         condition=values[-1] / smallest,
         weakest=weakest,
-        weakest_sd=weakest_sd,
+        weakest_sd=jnp.where(unknown, jnp.nan, weakest_sd),
         prior_direction=_unseen(parameters, problem, blocks, scale, threshold)
         if uses_prior
         else jnp.zeros_like(scale),
         degenerate=degenerate,
         singular=singular,
         at_bound=resting,
+        weakest_hold=hold,
     )
 
 

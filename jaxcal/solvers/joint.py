@@ -5,7 +5,7 @@ Without bounds this is one Levenberg-Marquardt minimisation (:mod:`jaxcal.solver
 With bounds the objective can have more than one local minimum along the direction that lateral
 position and range do not see, rotation about the lateral axis: the offsets slide along their arcs
 together until one set of bounds or another stops them. So it is solved from three starts, the
-conventional one and that turned either way by half of what the bounds allow, each after a few
+conventional one and that turned either way by what the bounds allow, each after a few
 rounds of the alternation, which descend gently; the lowest of the three is the answer.
 """
 
@@ -22,8 +22,8 @@ from jaxcal.problem import Problem
 from jaxcal.solvers.alternating import alternate
 from jaxcal.solvers.least_squares import Fit, minimise
 
-WARM_UP_ROUNDS = 2
-TURNS = (0.0, 0.5, -0.5)
+WARM_UP_ROUNDS = 10
+TURNS = (0.0, 1.0, -1.0)
 """Starts, in units of the rotation that moves a target at mean range by the mean bound."""
 
 
