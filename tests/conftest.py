@@ -49,3 +49,18 @@ def angle(first: np.ndarray, second: np.ndarray) -> float:
 @pytest.fixture(scope="session", autouse=True)
 def _float64() -> None:
     assert jax.config.read("jax_enable_x64")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Every solver takes the whole suite; what repeats another's code path does so with -m slow."""
+    for item in items:
+        parameters = getattr(item, "callspec", None)
+        if parameters is None or "solver" not in parameters.params:
+            continue
+        solver = parameters.params["solver"].name
+        large = parameters.params.get("images") == 1000
+        costly = large or getattr(item, "originalname", "") == "test_float32"
+        if solver in ("gauss-newton", "gradient", "gaussian", "gaussian-tracker") or (
+            costly and solver in ("alternating", "bounded")
+        ):
+            item.add_marker(pytest.mark.slow)

@@ -67,7 +67,12 @@ def joint(
                         trace=trace)  # fmt: skip
 
     fits = jax.vmap(solve)(turns)
-    best = jnp.argmin(jnp.where(jnp.isfinite(fits.cost), fits.cost, jnp.inf))
+    cost = jnp.where(jnp.isfinite(fits.cost), fits.cost, jnp.inf)
+    # Where minimisers form an interval all starts reach the same cost, and the conventional one's
+    # is the answer to keep: another must be lower by more than rounding.
+    eps = jnp.finfo(cost.dtype).eps
+    floor = count * (100 * eps * jnp.max(jnp.abs(problem.poses[:, :3, 3]))) ** 2
+    best = jnp.where(cost[0] <= jnp.min(cost) * (1 + 1e-9) + floor, 0, jnp.argmin(cost))
     fit = jax.tree.map(lambda leaf: leaf[best], fits)
     total = jnp.sum(fits.iterations) + WARM_UP_ROUNDS * len(TURNS)
     return Fit(**(vars(fit) | {"iterations": total.astype(fit.iterations.dtype)}))
