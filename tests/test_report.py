@@ -285,12 +285,13 @@ def test_figures_leave_pyplot_alone():
 
 def test_bounded_curves_end_in_one_minimum(recording, result):
     joint, alternating = bounded_curves(jaxcal.Problem.from_recording(recording))
-    np.testing.assert_array_equal(joint.objective[1:5], alternating.objective[1:5])
-    np.testing.assert_array_equal(joint.objective[5:], result.trace)
+    trace = np.asarray(result.trace)
+    np.testing.assert_array_equal(joint.objective[-len(trace) :], trace)
     values = [curve.objective[np.isfinite(curve.objective)] for curve in (joint, alternating)]
     for curve in values:
         assert (np.diff(curve) <= 1e-12 * curve[0]).all()
     assert values[0].min() <= values[1].min() + 1e-9
+    # The joint steps alone, without the warm-up that both share the like of.
     assert len(values[0]) < len(values[1])
 
 

@@ -70,11 +70,14 @@ def bounded_curves(
     )
     # The alternation keeps no value before its first round.
     rounds = np.concatenate([[np.nan], _trace(slow)])
-    # The joint solver's first value is that of its start, the warm-up's last round.
-    steps = np.concatenate([rounds[:WARM_UP_ROUNDS], _trace(joint)])
+    # The joint solver's first value is that of the best of its starts after their warm-up, which
+    # keeps no values of its own.
+    steps = np.concatenate([np.full(WARM_UP_ROUNDS, np.nan), _trace(joint)])
     stopped = None if alternating is None else int(alternating.iterations)
     return [
-        Curve(f"joint (after {WARM_UP_ROUNDS} alternating rounds)", steps),
+        Curve(
+            f"joint (best of three starts, after {WARM_UP_ROUNDS} alternating rounds each)", steps
+        ),
         Curve("alternating", rounds, stopped),
     ]
 
