@@ -18,6 +18,9 @@ from jaxcal.model.priors import Bounded, Gaussian, InPlane
 from jaxcal.model.residuals import measurement_residual
 from jaxcal.solvers.least_squares import linearise
 
+# Minutes of compilation and of alternation; the solvers' own suite is in test_solvers.
+pytestmark = pytest.mark.slow
+
 SETTINGS = [(0.5, 0.05, 0.25), (1.0, 0.5, 1.0), (2.0, 2.0, 1.0), (3.0, 0.5, 2.0), (5.0, 4.0, 4.0),
             (2.0, 10.0, 2.0), (5.0, 0.05, 0.5), (1.0, 2.0, 4.0)]  # fmt: skip
 
