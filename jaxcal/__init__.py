@@ -31,7 +31,7 @@ _HOME = {
     "Protocol": "jaxcal.simulation",
     "Recording": "jaxcal.recording",
     "Status": "jaxcal.calibration",
-    "Options": "jaxcal.solve",
+    "Options": "jaxcal.options",
     "calibrate": "jaxcal.solve",
     "calibrate_batch": "jaxcal.solve",
     "calibration_reproducibility": "jaxcal.metrics",
@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from jaxcal.io.hdf5 import save as save
     from jaxcal.metrics import calibration_reproducibility as calibration_reproducibility
     from jaxcal.metrics import reconstruction_precision as reconstruction_precision
+    from jaxcal.options import Options as Options
     from jaxcal.probe import LinearProbe as LinearProbe
     from jaxcal.problem import Problem as Problem
     from jaxcal.problem import stack as stack
@@ -66,7 +67,6 @@ if TYPE_CHECKING:
     from jaxcal.simulation import Protocol as Protocol
     from jaxcal.simulation import simulate as simulate
     from jaxcal.simulation import simulate_recording as simulate_recording
-    from jaxcal.solve import Options as Options
     from jaxcal.solve import calibrate as calibrate
     from jaxcal.solve import calibrate_batch as calibrate_batch
 

@@ -38,9 +38,14 @@ class Calibration(eqx.Module):
             image was left out.
         elevation_sd: its standard deviation, mm; NaN where it rests on a bound or is not known.
         sigma: SDs of lateral position, range and elevational offset, mm.
+        channel_sigma: SD of an element's distance, mm; None for solves on points.
         covariance: of X (v mm, omega rad); NaN where X is not observable.
         point_covariance: of the target, mm^2.
         scale_mm_per_px: [lateral, axial], or None for points in mm.
+        sound_speed_m_s: where it was estimated, else None; so are the following.
+        sound_speed_sd_m_s: its standard deviation.
+        delay_s: electronic delay, s.
+        delay_sd_s: its standard deviation.
         residual: q_i - p_i with p_i in the plane (y = 0), in the image frame, mm.
         rms: root mean square length of those residuals over the used images, mm.
         mask: 1 for used images.
@@ -67,6 +72,7 @@ class Calibration(eqx.Module):
             None where none was asked for.
         method: ``conventional``, ``alternating`` or ``joint`` (static).
         prior: ``none``, ``bounded`` or ``gaussian`` (static).
+        data: ``points`` or ``channels``: whose residuals were minimised (static).
         blocks: the free unknowns (static).
     """
 
@@ -75,9 +81,14 @@ class Calibration(eqx.Module):
     elevation: Float[Array, "*batch n"]
     elevation_sd: Float[Array, "*batch n"]
     sigma: Float[Array, "*batch 3"]
+    channel_sigma: Float[Array, "*batch"] | None
     covariance: Float[Array, "*batch 6 6"]
     point_covariance: Float[Array, "*batch 3 3"]
     scale_mm_per_px: Float[Array, "*batch 2"] | None
+    sound_speed_m_s: Float[Array, "*batch"] | None
+    sound_speed_sd_m_s: Float[Array, "*batch"] | None
+    delay_s: Float[Array, "*batch"] | None
+    delay_sd_s: Float[Array, "*batch"] | None
     residual: Float[Array, "*batch n 3"]
     rms: Float[Array, "*batch"]
     mask: Float[Array, "*batch n"]
@@ -101,6 +112,7 @@ class Calibration(eqx.Module):
     trace: Float[Array, "*batch trace"] | None
     method: str = eqx.field(static=True)
     prior: str = eqx.field(static=True)
+    data: str = eqx.field(static=True)
     blocks: Blocks = eqx.field(static=True)
 
     @property

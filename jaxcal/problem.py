@@ -19,6 +19,20 @@ from jaxcal.errors import InputError
 from jaxcal.recording import Images, Kind, Recording, make_images
 
 
+class Channels(eqx.Module):
+    """What every element heard, for the solves on the times of flight themselves.
+
+    Attributes:
+        distances: one-way distances at the nominal sound speed and delay, mm; 0 where not heard.
+        heard: 1 where an element's time of flight is used, 0 where it is missing or rejected.
+        elements: positions in the image frame [lateral, elevational, axial], mm.
+    """
+
+    distances: Float[Array, "*batch n elements"]
+    heard: Float[Array, "*batch n elements"]
+    elements: Float[Array, "*batch elements 3"]
+
+
 class Problem(eqx.Module):
     """Tracked measurements of one target in n images; ``*batch`` may be empty.
 
@@ -32,8 +46,13 @@ class Problem(eqx.Module):
         covariance: of the measurements, in their unit squared, or None. Its *shape* across images
             and axes is used by the joint solver, whose sigmas scale it.
         max_elevation: bound on |elevational offset| of each image, mm, or None.
+        sound_speed: the nominal one, by which times of flight became distances, m/s.
+        delay: the nominal electronic delay, already taken off the times of flight, s.
+        channels: the distances of every element, or None.
         pixels: whether the measurements are pixels (static).
         spacing_known: whether ``spacing`` was given (static); if not, the scale must be estimated.
+        curved: whether the elements lie on an arc (static): only the channels then tell lateral
+            position, range and elevational offset apart without bias.
     """
 
     poses: Float[Array, "*batch n 4 4"]
@@ -43,8 +62,12 @@ class Problem(eqx.Module):
     face_offset: Float[Array, "*batch"]
     covariance: Float[Array, "*batch n 2 2"] | None = None
     max_elevation: Float[Array, "*batch n"] | None = None
+    sound_speed: Float[Array, "*batch"] | None = None
+    delay: Float[Array, "*batch"] | None = None
+    channels: Channels | None = None
     pixels: bool = eqx.field(static=True, default=False)
     spacing_known: bool = eqx.field(static=True, default=True)
+    curved: bool = eqx.field(static=True, default=False)
 
     @property
     def images(self) -> int:

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.model.parameters import BLOCK_SIZE, Blocks, Parameters, retract, size
-from jaxcal.model.priors import AbstractPrior, InPlane
-from jaxcal.model.residuals import measured_points, measurement_residual
+from jaxcal.model.priors import AbstractPrior, ChannelGaussian, InPlane, channels_of
+from jaxcal.model.residuals import channel_residual, measured_points, measurement_residual
 from jaxcal.problem import Problem
 from jaxcal.solvers import arrow as arrows
 from jaxcal.solvers import dense
@@ -39,7 +39,7 @@ class Uncertainty(eqx.Module):
         condition: largest over smallest eigenvalue of the scaled information.
         weakest: (p,) unit vector of the smallest, in scaled units.
         weakest_sd: SD along it, mm; NaN where singular.
-        prior_direction: (p,) direction that lateral position and range alone leave undetermined.
+        prior_direction: (p,) direction that the measurements alone leave undetermined.
         degenerate: whether the poses do not determine the unknowns.
         singular: whether the information (with the bounds that are active) is singular.
         at_bound: (n,) 1 where an offset rests on its bound.
@@ -109,7 +109,8 @@ def assess(
     degenerate = design_values[0] < threshold * design_values[-1]
 
     weakest_sd = jnp.sqrt(variance / smallest)
-    weakest = jnp.where(degenerate, design_vectors[:, 0], vectors[:, 0])
+    unseen = _one_of_many(design_vectors, design_values < threshold * design_values[-1])
+    weakest = jnp.where(degenerate, unseen, vectors[:, 0])
     inverse = arrows.inverse_symmetric(information, jnp.diagonal(arrow.shared))
     unknown = degenerate | (singular & jnp.logical_not(whitened))
     covariance = jnp.where(unknown, jnp.nan, variance * 0.5 * (inverse + inverse.T))
@@ -121,7 +122,14 @@ def assess(
         condition=values[-1] / smallest,
         weakest=weakest,
         weakest_sd=jnp.where(unknown, jnp.nan, weakest_sd),
-        prior_direction=_unseen(parameters, problem, blocks, scale, threshold)
+        prior_direction=_unseen(
+            parameters,
+            problem,
+            blocks,
+            scale,
+            threshold,
+            channels=isinstance(prior, ChannelGaussian),
+        )
         if uses_prior
         else jnp.zeros_like(scale),
         degenerate=degenerate,
@@ -142,7 +150,7 @@ def unit_scale(parameters: Parameters, problem: Problem, blocks: Blocks) -> Floa
     lever = lever_arm(parameters, problem)
     one = jnp.ones_like(lever)
     parts = [
-        jnp.full(BLOCK_SIZE[name], lever if name in ("rotation", "scale") else one)
+        jnp.full(BLOCK_SIZE[name], lever if name in ("rotation", "scale", "sound-speed") else one)
         for name in blocks
     ]
     return jnp.concatenate(parts)
@@ -157,17 +165,35 @@ def _spectrum(
     return found.values, found.right
 
 
+def _one_of_many(vectors: Float[Array, "p p"], null: Bool[Array, " p"]) -> Float[Array, " p"]:
+    """The unit vector of a null space that lies closest to one single unknown, X's shift first.
+
+    Where the space has several dimensions its eigenvectors are any mixture; this one has a name.
+    """
+    projector = (vectors * null) @ vectors.T
+    purity = jnp.diagonal(projector)
+    chosen = jnp.argmax(purity > 0.5 * jnp.max(purity))
+    picked = projector @ (jnp.arange(len(purity)) == chosen).astype(projector.dtype)
+    length = jnp.linalg.norm(picked)
+    return picked / jnp.where(length > 0, length, 1.0)
+
+
 def _unseen(
     parameters: Parameters,
     problem: Problem,
     blocks: Blocks,
     scale: Float[Array, " p"],
     threshold: Float[Array, ""],
+    *,
+    channels: bool,
 ) -> Float[Array, " p"]:
-    """The direction that lateral position and range alone do not see; zeros if they see all."""
+    """The direction that the measurements do not see without a prior; zeros if they see all."""
 
-    def residual(tangent: Float[Array, " p"]) -> Float[Array, "n 2"]:
-        return measurement_residual(retract(parameters, tangent, blocks), problem)[:, :2]
+    def residual(tangent: Float[Array, " p"]) -> Float[Array, "n m"]:
+        moved = retract(parameters, tangent, blocks)
+        if channels:
+            return channel_residual(moved, channels_of(problem), problem)
+        return measurement_residual(moved, problem)[:, :2]
 
     jacobian = jax.jacfwd(residual)(jnp.zeros_like(scale))
     values, vectors = _spectrum(jnp.einsum("nma,nmb->ab", jacobian, jacobian), scale)

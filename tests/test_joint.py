@@ -27,7 +27,7 @@ SETTINGS = [(0.5, 0.05, 0.25), (1.0, 0.5, 1.0), (2.0, 2.0, 1.0), (3.0, 0.5, 2.0)
 
 def parameters_of(result: jaxcal.Calibration) -> Parameters:
     matrix = jnp.asarray(result.image_to_probe)
-    return Parameters(matrix[:3, :3], matrix[:3, 3], jnp.asarray(result.point), jnp.ones(2))
+    return Parameters.of(matrix[:3, :3], matrix[:3, 3], jnp.asarray(result.point))
 
 
 @pytest.fixture(scope="module")

@@ -101,7 +101,7 @@ def test_a_start_drowned_in_noise_is_searched_for():
         jaxcal.Protocol(images=4, elevation_mm=5.0, noise_mm=10.0), 6
     ).truth
     matrix = jnp.asarray(truth.image_to_probe)
-    start = Parameters(matrix[:3, :3], matrix[:3, 3], jnp.asarray(truth.point), jnp.ones(2))
+    start = Parameters.of(matrix[:3, :3], matrix[:3, 3], jnp.asarray(truth.point))
     assert float(result.cost) <= float(minimise(start, InPlane(), data, RIGID).cost) * (1 + 1e-9)
 
 
@@ -151,7 +151,7 @@ def test_predicted_covariance_is_the_scatter_of_repeats():
     fixed = jaxcal.calibrate(base, sigma=(0.5, 0.5, 1.0))
     # Repeats of one geometry: errors drawn anew about a target placed where the model puts it.
     x = jnp.asarray(fixed.image_to_probe)
-    truth = Parameters(x[:3, :3], x[:3, 3], fixed.point, jnp.ones(2))
+    truth = Parameters.of(x[:3, :3], x[:3, 3], fixed.point)
     q = np.asarray(target_in_image(truth, base))
     rows = []
     for _ in range(count):

@@ -14,6 +14,7 @@ from rich.console import Console
 import jaxcal
 from jaxcal.calibration import Status
 from jaxcal.errors import InputError, OutputError
+from jaxcal.options import Options
 from jaxcal.recording import Recording, make_images
 from jaxcal.report.convergence import KEPT, Curve, bounded_curves
 from jaxcal.report.figures import convergence_figure, offset_figure, residual_figure
@@ -22,7 +23,6 @@ from jaxcal.report.tables import calibration_table, comparison_table
 from jaxcal.report.verdict import verdict
 from jaxcal.report.write import COLUMNS, prepare_folder, write_report
 from jaxcal.simulation import Protocol, simulate_recording
-from jaxcal.solve import Options
 
 LEFT_OUT = 5
 CURVES = [Curve("joint", np.array([3.0, 1.0, np.nan])), Curve("alternating", np.array([3.0, 2.0]))]

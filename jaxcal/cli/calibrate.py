@@ -193,8 +193,8 @@ def _unknowns(estimate: str | None) -> tuple[str, ...]:
 def _solve(recording: Recording, request: _Request, *, traced: bool) -> Calibration:
     import jax
 
+    from jaxcal.options import Options
     from jaxcal.report.convergence import KEPT
-    from jaxcal.solve import Options
     from jaxcal.solve import calibrate as solve
 
     result = solve(

@@ -1,9 +1,9 @@
 """The unknowns other than the offsets, in named blocks, and how a step moves them.
 
 X steps on its manifold by the right perturbation X Exp([v, omega]), so v (mm) and omega (rad) are
-along and about the image's own axes (lateral, elevational, axial). Pixel scales step in their
-logarithm, which keeps them positive. A solver is told which blocks are free; the rest stay fixed.
-A further unknown (sound speed, delay, latency) is one field, one size and one line here.
+along and about the image's own axes (lateral, elevational, axial). Pixel scales and sound speed
+step in their logarithm, which keeps them positive. A solver is told which blocks are free; the rest
+stay fixed. A further unknown (latency) is one field, one size and one line here.
 """
 
 from __future__ import annotations
@@ -17,7 +17,13 @@ from jaxcal.geometry import matrix_from_rotation
 
 Blocks = tuple[str, ...]
 
-BLOCK_SIZE = {"translation": 3, "rotation": 3, "point": 3, "scale": 2}
+BLOCK_SIZE = {"translation": 3, "rotation": 3, "point": 3, "scale": 2, "sound-speed": 1, "delay": 1}
+
+EXTRA = ("scale", "sound-speed", "delay")
+"""Blocks that a caller may ask for beside X and the target."""
+
+MEDIUM = ("sound-speed", "delay")
+"""Blocks between a time of flight and a distance."""
 
 RIGID: Blocks = ("translation", "rotation", "point")
 """The unknowns of Eq. 7: X and the target."""
@@ -29,13 +35,30 @@ class Parameters(eqx.Module):
     Attributes:
         rotation: of X; its columns are the lateral, elevational and axial axes in the probe's
             frame. translation: of X, mm. point: the target c in the tracker's frame, mm. scale:
-            factors on the problem's [lateral, axial] spacing.
+            factors on the problem's [lateral, axial] spacing. sound_speed: factor on the speed by
+            which times became distances. delay: what the system adds to a distance, mm at that
+            speed.
     """
 
     rotation: Float[Array, "3 3"]
     translation: Float[Array, 3]
     point: Float[Array, 3]
     scale: Float[Array, 2]
+    sound_speed: Float[Array, ""]
+    delay: Float[Array, ""]
+
+    @classmethod
+    def of(
+        cls,
+        rotation: Float[Array, "3 3"],
+        translation: Float[Array, 3],
+        point: Float[Array, 3],
+        scale: Float[Array, 2] | None = None,
+    ) -> Parameters:
+        """X and the target, with nominal scale, sound speed and delay."""
+        one = jnp.ones((), translation.dtype)
+        scale = jnp.ones(2, translation.dtype) if scale is None else scale
+        return cls(rotation, translation, point, scale, one, jnp.zeros_like(one))
 
     def matrix(self) -> Float[Array, "4 4"]:
         """X as a 4x4 matrix, mm."""
@@ -74,4 +97,6 @@ def retract(parameters: Parameters, tangent: Float[Array, " p"], blocks: Blocks)
         translation=parameters.translation + parameters.rotation @ part("translation"),
         point=parameters.point + part("point"),
         scale=parameters.scale * jnp.exp(part("scale")),
+        sound_speed=parameters.sound_speed * jnp.exp(part("sound-speed")[0]),
+        delay=parameters.delay + part("delay")[0],
     )

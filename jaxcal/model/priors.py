@@ -4,7 +4,8 @@ A prior turns (unknowns, offset unknowns) into residuals and says how its offset
 the elevational offset y_i; the joint solver needs no more than :class:`AbstractPrior`.
 
 Bounded is the paper's belief, |y_i| <= m_i with everything else weighted alike. Gaussian is
-y_i ~ N(0, sigma_elevation^2) beside N(0, sigma^2) errors of the lateral position and range.
+y_i ~ N(0, sigma_elevation^2) beside N(0, sigma^2) errors of the lateral position and range, or of
+every element's distance.
 """
 
 from __future__ import annotations
@@ -16,16 +17,18 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxcal.errors import InputError
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import (
     LARGEST_ELEVATION,
+    channel_residual,
     circle_residual,
     closest_elevation,
     measured_points,
     measurement_residual,
     target_in_image,
 )
-from jaxcal.problem import Problem
+from jaxcal.problem import Channels, Problem
 
 
 class AbstractPrior(eqx.Module):
@@ -119,7 +122,32 @@ class Bounded(AbstractPrior):
         return problem.mask * offset
 
 
-class Gaussian(AbstractPrior):
+class AbstractSelfTuned(AbstractPrior):
+    """A Gaussian belief whose SDs can be estimated from the residuals (REML).
+
+    Attributes:
+        sigma: SD of each component, mm.
+    """
+
+    sigma: eqx.AbstractVar[Float[Array, " components"]]
+
+    @abc.abstractmethod
+    def columns(self, problem: Problem) -> tuple[slice, ...]:
+        """Which columns of the residual each component of ``sigma`` whitens."""
+
+    @abc.abstractmethod
+    def count(self, problem: Problem) -> Float[Array, " components"]:
+        """How many residuals of each component there are."""
+
+    def with_sigma(self, sigma: Float[Array, " components"]) -> AbstractSelfTuned:
+        """The same belief with other SDs."""
+        return eqx.tree_at(lambda prior: prior.sigma, self, sigma)
+
+    def largest_weight(self) -> Float[Array, ""]:
+        return 1 / jnp.min(self.sigma)
+
+
+class Gaussian(AbstractSelfTuned):
     """Independent Gaussian errors of lateral position, range and elevational offset.
 
     Without tracker noise y_i is q_iy itself, so the offsets are eliminated exactly and no offset
@@ -131,11 +159,13 @@ class Gaussian(AbstractPrior):
         sigma: (3,) SDs of lateral position, range and elevational offset, mm.
         covariance: (n, 2, 2) shape of the measurement covariance, mean diagonal (1, 1), or None.
         tracker_sd: tau, mm, or None.
+        medium_sd: SDs of sound speed (relative) and delay (mm) about their nominal values, or None.
     """
 
     sigma: Float[Array, 3]
     covariance: Float[Array, "n 2 2"] | None = None
     tracker_sd: Float[Array, ""] | None = None
+    medium_sd: Float[Array, 2] | None = None
 
     def residual(
         self, parameters: Parameters, offset: Float[Array, " k"], problem: Problem
@@ -147,17 +177,22 @@ class Gaussian(AbstractPrior):
         if tau is not None:
             extra = jnp.stack([tau, tau, jnp.zeros_like(tau)])
             sigma = jnp.hypot(self.sigma, extra)
-        whitened = whiten(values / sigma, self.covariance)
-        if tau is None:
-            return whitened
-        return jnp.concatenate([whitened, (problem.mask * offset)[:, None]], axis=1)
+        parts = [whiten(values / sigma, self.covariance)]
+        if tau is not None:
+            parts.append((problem.mask * offset)[:, None])
+        if self.medium_sd is not None:
+            parts.append(medium_residual(parameters, self.medium_sd, problem))
+        return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=1)
+
+    def columns(self, problem: Problem) -> tuple[slice, ...]:
+        return (slice(0, 1), slice(1, 2), slice(2, 3))
+
+    def count(self, problem: Problem) -> Float[Array, 3]:
+        return jnp.full(3, jnp.sum(problem.mask))
 
     def start(self, parameters: Parameters, problem: Problem) -> Float[Array, " k"]:
         count = 0 if self.tracker_sd is None else problem.images
         return jnp.zeros(count, problem.mask.dtype)
-
-    def largest_weight(self) -> Float[Array, ""]:
-        return 1 / jnp.min(self.sigma)
 
     def elevation(
         self, parameters: Parameters, offset: Float[Array, " k"], problem: Problem
@@ -166,6 +201,64 @@ class Gaussian(AbstractPrior):
         if self.tracker_sd is None:
             return problem.mask * q
         return problem.mask * (q + self.tracker_sd * offset)
+
+
+class ChannelGaussian(AbstractSelfTuned):
+    """Independent Gaussian errors of every element's distance, and Gaussian offsets.
+
+    On a curvilinear probe each image's distances say something of |y_i|, through Eq. 6, and nothing
+    of its sign; poses that share one X and one target settle the signs.
+
+    Attributes:
+        sigma: (2,) SDs of an element's distance and of the elevational offset, mm.
+        medium_sd: SDs of sound speed (relative) and delay (mm) about their nominal values, or None.
+    """
+
+    sigma: Float[Array, 2]
+    medium_sd: Float[Array, 2] | None = None
+
+    def residual(
+        self, parameters: Parameters, offset: Float[Array, " k"], problem: Problem
+    ) -> Float[Array, "n columns"]:
+        distances = channel_residual(parameters, channels_of(problem), problem) / self.sigma[0]
+        elevation = self.elevation(parameters, offset, problem)[:, None] / self.sigma[1]
+        parts = [distances, elevation]
+        if self.medium_sd is not None:
+            parts.append(medium_residual(parameters, self.medium_sd, problem))
+        return jnp.concatenate(parts, axis=1)
+
+    def columns(self, problem: Problem) -> tuple[slice, ...]:
+        elements = channels_of(problem).distances.shape[-1]
+        return (slice(0, elements), slice(elements, elements + 1))
+
+    def count(self, problem: Problem) -> Float[Array, 2]:
+        heard = jnp.sum(problem.mask[:, None] * channels_of(problem).heard)
+        return jnp.stack([heard, jnp.sum(problem.mask)])
+
+    def elevation(
+        self, parameters: Parameters, offset: Float[Array, " k"], problem: Problem
+    ) -> Float[Array, " n"]:
+        return problem.mask * target_in_image(parameters, problem)[:, 1]
+
+
+def medium_residual(
+    parameters: Parameters, medium_sd: Float[Array, 2], problem: Problem
+) -> Float[Array, "n 2"]:
+    """How far sound speed and delay are from nominal, in SDs; the images share it equally."""
+    off = jnp.stack([jnp.log(parameters.sound_speed), parameters.delay]) / medium_sd
+    # Rows are images, and each sees the shared unknowns: n n-th parts make the whole belief.
+    return (problem.mask / jnp.sqrt(jnp.sum(problem.mask)))[:, None] * off
+
+
+def channels_of(problem: Problem) -> Channels:
+    """The problem's channels.
+
+    Raises:
+        InputError: where it has none.
+    """
+    if problem.channels is None:
+        raise InputError("this problem has no times of flight: there are no channels to solve on")
+    return problem.channels
 
 
 def whiten(

@@ -10,6 +10,9 @@ p_i(y_i), equally weighted (Eq. 7 with y = 0; Fig. 4 and the bounded joint probl
 :func:`measurement_residual` is in the coordinates that were measured: lateral, range, and the
 elevational offset itself, each with its own noise.
 
+Where the times of flight to all elements are there, :func:`channel_residual` is in these: what each
+element should have heard less what it heard, sqrt(|q_i - e_k|^2) of Eqs. 5 and 6.
+
 Images left out give zeros.
 """
 
@@ -19,16 +22,22 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.model.parameters import Parameters
-from jaxcal.problem import Problem
+from jaxcal.problem import Channels, Problem
 
 LARGEST_ELEVATION = 0.95
 """Offsets are kept below this fraction of the range: at 1 the circle's tangent turns axial."""
 
 
 def measured_points(parameters: Parameters, problem: Problem) -> Float[Array, "n 2"]:
-    """Lateral position and range of every image, mm (pixels times spacing times scale)."""
+    """Lateral position and range of every image, mm.
+
+    Pixels are multiplied by spacing and scale; a range is a time of flight in disguise and follows
+    sound speed and delay, while lateral positions come from where the elements are.
+    """
     points = problem.measurements * (problem.spacing * parameters.scale)
-    return points + jnp.stack([jnp.zeros_like(problem.face_offset), problem.face_offset])
+    distance = points[:, 1] + problem.face_offset
+    distance = (distance - parameters.delay) * parameters.sound_speed
+    return jnp.stack([points[:, 0], distance], axis=1)
 
 
 def target_in_image(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:
@@ -93,3 +102,18 @@ def measurement_residual(
         [q[:, 0] - points[:, 0], jnp.hypot(elevation, q[:, 2]) - points[:, 1], elevation], axis=1
     )
     return problem.mask[:, None] * residual
+
+
+def channel_residual(
+    parameters: Parameters, channels: Channels, problem: Problem
+) -> Float[Array, "n elements"]:
+    """Distance error of every element that heard the target, mm at the nominal sound speed.
+
+    With the sound speed s times the nominal one, and a delay worth d mm, an element at distance
+    |q_i - e_k| measures |q_i - e_k| / s + d.
+    """
+    q = target_in_image(parameters, problem)
+    apart = q[:, None, :] - channels.elements
+    exact = jnp.sqrt(jnp.sum(apart**2, axis=-1))
+    error = exact / parameters.sound_speed + parameters.delay - channels.distances
+    return problem.mask[:, None] * channels.heard * error

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxcal.calibration import Calibration
+from jaxcal.options import Options
 from jaxcal.problem import Problem
-from jaxcal.solve import Options, calibrate
+from jaxcal.solve import calibrate
 from jaxcal.solvers.joint import WARM_UP_ROUNDS
 
 KEPT = 200

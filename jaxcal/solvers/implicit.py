@@ -5,7 +5,7 @@ theorem d unknowns = -(dF/d unknowns)^-1 dF/d data. The first matrix is the exac
 the arrow's shape: p tangents and one all-ones offset tangent read it, and the offsets are
 eliminated by scalar divisions (:mod:`jaxcal.solvers.arrow`). Offsets resting on their bound move
 with the bound. For the self-tuned solve the conditions are those of X and c together with those of
-the three SDs.
+the SDs.
 
 Both functions return the tangent (zero in value) by which the solution moves with the data; being
 ``jax.custom_jvp`` with rules that call themselves, they work in forward and reverse mode, to any
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.model.parameters import Blocks, Parameters, retract, size
-from jaxcal.model.priors import AbstractPrior, Gaussian, covariance_shape
+from jaxcal.model.priors import AbstractPrior, AbstractSelfTuned
 from jaxcal.problem import Problem
 from jaxcal.solvers import dense, variance
 
@@ -91,14 +91,19 @@ def _optimum_jvp(blocks: Blocks, primals: tuple, tangents: tuple) -> tuple:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def self_tuned_optimum(
-    blocks: Blocks, reference: Parameters, sigma: Float[Array, 3], problem: Problem
-) -> tuple[Float[Array, " p"], Float[Array, 3]]:
-    """How a self-tuned solution and its three SDs move with the problem.
+    blocks: Blocks,
+    reference: Parameters,
+    sigma: Float[Array, " components"],
+    belief: AbstractSelfTuned,
+    problem: Problem,
+) -> tuple[Float[Array, " p"], Float[Array, " components"]]:
+    """How a self-tuned solution and its SDs move with the problem.
 
     Args:
         blocks: the free unknowns.
         reference: the solution (not differentiated).
         sigma: its SDs, mm (not differentiated).
+        belief: the belief that was tuned, with the SDs to hold where there are too few images.
         problem: the data.
 
     Returns:
@@ -109,27 +114,31 @@ def self_tuned_optimum(
 
 @self_tuned_optimum.defjvp
 def _self_tuned_jvp(blocks: Blocks, primals: tuple, tangents: tuple) -> tuple:
-    reference, sigma, problem = primals
-    problem_dot = tangents[2]
-    tangent, sigma = self_tuned_optimum(blocks, reference, sigma, problem)
+    reference, sigma, belief, problem = primals
+    _, _, belief_dot, problem_dot = tangents
+    tangent, sigma = self_tuned_optimum(blocks, reference, sigma, belief, problem)
     count = tangent.shape[0]
 
-    def conditions(unknowns: Array, problem: Problem) -> Array:
+    def conditions(unknowns: Array, belief: AbstractSelfTuned, problem: Problem) -> Array:
         x, log_sigma = unknowns[:count], unknowns[count:]
         none = jnp.zeros(0, x.dtype)
 
         def cost(x: Array) -> Array:
-            prior = Gaussian(jnp.exp(log_sigma), covariance_shape(problem))
+            prior = belief.with_sigma(jnp.exp(log_sigma))
             residual = prior.residual(retract(reference, x, blocks), none, problem)
             return 0.5 * jnp.sum(residual**2)
 
         parameters = retract(reference, x, blocks)
-        updated = variance.update_or_hold(parameters, jnp.exp(log_sigma), problem, blocks)
+        updated = variance.update_or_hold(parameters, jnp.exp(log_sigma), belief, problem, blocks)
         return jnp.concatenate([jax.grad(cost)(x), log_sigma - jnp.log(updated)])
 
     here = jnp.concatenate([tangent, jnp.log(sigma)])
-    matrix = jax.jacfwd(conditions)(here, problem)
-    _, data = jax.jvp(lambda problem: conditions(here, problem), (problem,), (problem_dot,))
+    matrix = jax.jacfwd(conditions)(here, belief, problem)
+    _, data = jax.jvp(
+        lambda belief, problem: conditions(here, belief, problem),
+        (belief, problem),
+        (belief_dot, problem_dot),
+    )
     # Gradients of X come in 1/sigma^2, conditions of the SDs in units of one: balance the rows.
     scale = 1 / jnp.max(jnp.abs(matrix), axis=1)
     moved = -dense.inverse(scale[:, None] * matrix) @ (scale * data)

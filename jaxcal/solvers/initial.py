@@ -144,7 +144,7 @@ def start_from_rotation(
         known = points[:, :1] * lateral + points[:, 1:] * axial
         rest, _ = _weighted(jnp.concatenate([rotations, -eye], axis=2), rhs - known, weight)
         scale = jnp.ones(2, points.dtype)
-    return Parameters(rotation, rest[:3], rest[3:] + centre, scale)
+    return Parameters.of(rotation, rest[:3], rest[3:] + centre, scale)
 
 
 def _weighted(

@@ -1,13 +1,16 @@
-"""Self-tuning: the SDs of lateral position, range and elevational offset from the data themselves.
+"""Self-tuning: the SDs of the measurements and of the elevational offset from the data themselves.
 
 Restricted maximum likelihood (REML) by Helmert's iteration for variance components: solve with the
 current SDs, then set each component's variance to
 
-    sigma_k^2 = |residual_k|^2 / (n - leverage_k),
+    sigma_k^2 = |residual_k|^2 / (n_k - leverage_k),
 
 where leverage_k, the trace of S^-1 J_k' J_k, is the number of degrees of freedom that the unknowns
 take from component k, and again until the SDs stand still. So no noise level and no maximum
 elevational distance is chosen by hand.
+
+The components are those of the belief in use (:class:`jaxcal.model.priors.AbstractSelfTuned`):
+lateral position, range and offset, or the elements' distances and the offset.
 
 A component whose error truly vanishes (no noise, or every target in the plane) would drive its SD
 to zero and the weights to infinity; it is held at a thousandth of the largest SD, which is as good
@@ -24,17 +27,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.model.parameters import Blocks, Parameters
-from jaxcal.model.priors import Gaussian, covariance_shape
-from jaxcal.model.residuals import measurement_residual
+from jaxcal.model.priors import AbstractSelfTuned
 from jaxcal.problem import Problem
 from jaxcal.solvers import arrow as arrows
 from jaxcal.solvers.least_squares import Fit, linearise, minimise
 
 MINIMUM_SELF_TUNING = 8
 """With fewer used images the residuals cannot tell three SDs apart from nine unknowns."""
-
-DEFAULT_SIGMA = (0.5, 0.5, 1.0)
-"""SDs (mm) that are held when there are too few images to estimate them."""
 
 RELATIVE_FLOOR = 1e-3
 ABSOLUTE_FLOOR_MM = 1e-6
@@ -45,21 +44,22 @@ class SelfTuned(eqx.Module):
 
     Attributes:
         fit: the last weighted solve; ``iterations`` counts all linearisations.
-        sigma: (3,) lateral, range, elevational SD, mm.
+        sigma: SD of each component, mm.
         rounds: variance updates.
         settled: whether the SDs stood still at the end.
-        floored: (3,) which SDs rest on their floor.
+        floored: which SDs rest on their floor.
     """
 
     fit: Fit
-    sigma: Float[Array, 3]
+    sigma: Float[Array, " components"]
     rounds: Int[Array, ""]
     settled: Bool[Array, ""]
-    floored: Bool[Array, 3]
+    floored: Bool[Array, " components"]
 
 
 def self_tuned(
     start: Parameters,
+    belief: AbstractSelfTuned,
     problem: Problem,
     blocks: Blocks,
     *,
@@ -68,12 +68,13 @@ def self_tuned(
     max_steps: int = 100,
     trace: int = 0,
 ) -> SelfTuned:
-    """Solve with the Gaussian prior, its three SDs estimated by REML.
+    """Solve with a Gaussian belief, its SDs estimated by REML.
 
     Args:
         start: a conventional fit.
-        problem: one problem; with fewer than 8 used images the SDs are held at
-            :data:`DEFAULT_SIGMA`.
+        belief: the Gaussian belief; its SDs are those that are held where there are too few images
+            (fewer than 8 used ones) to estimate them.
+        problem: one problem.
         blocks: the free unknowns.
         tolerance: relative change of the SDs to stop at; 1e-9 in float64, 1e-4 in float32.
         max_rounds: most variance updates.
@@ -84,20 +85,19 @@ def self_tuned(
     if tolerance is None:
         tolerance = 1e-9 if float(jnp.finfo(dtype).eps) < 1e-10 else 1e-4
     enough = jnp.sum(problem.mask) >= MINIMUM_SELF_TUNING
-    rms = jnp.sqrt(
-        jnp.sum(measurement_residual(start, problem) ** 2, axis=0) / jnp.sum(problem.mask)
-    )
-    first = jnp.where(enough, with_floor(rms), jnp.asarray(DEFAULT_SIGMA, dtype))
+    unit = belief.with_sigma(jnp.ones_like(belief.sigma))
+    errors = unit.residual(start, unit.start(start, problem), problem)
+    rms = jnp.sqrt(_sums(errors**2, unit, problem) / unit.count(problem))
+    first = jnp.where(enough, with_floor(rms), belief.sigma)
 
     tightest = tolerance / 10
 
-    def solve(parameters: Parameters, sigma: Float[Array, 3], change: Float[Array, ""]) -> Fit:
+    def solve(parameters: Parameters, sigma: Float[Array, " k"], change: Float[Array, ""]) -> Fit:
         # No use in solving far beyond how well the SDs are known yet.
         wanted = jnp.clip(0.01 * change, tightest, 1e-3)
         return minimise(
-            parameters, Gaussian(sigma, covariance_shape(problem)), problem, blocks,
-            damping=1e-6, max_steps=max_steps, exact=True, tolerance=wanted,
-            trace=trace,
+            parameters, belief.with_sigma(sigma), problem, blocks, damping=1e-6,
+            max_steps=max_steps, exact=True, tolerance=wanted, trace=trace,
         )  # fmt: skip
 
     def unfinished(state: tuple) -> Bool[Array, ""]:
@@ -107,7 +107,7 @@ def self_tuned(
     def one_round(state: tuple) -> tuple:
         fit, sigma, rounds, change, iterations = state
         fit = solve(fit.parameters, sigma, change)
-        updated = update_or_hold(fit.parameters, sigma, problem, blocks)
+        updated = update_or_hold(fit.parameters, sigma, belief, problem, blocks)
         change = jnp.max(jnp.abs(jnp.log(updated / sigma)))
         # With held SDs only the solve itself has to arrive.
         change = jnp.where(enough, change, jnp.minimum(change, fit.stationarity))
@@ -127,28 +127,43 @@ def self_tuned(
 
 
 def update(
-    parameters: Parameters, sigma: Float[Array, 3], problem: Problem, blocks: Blocks
-) -> Float[Array, 3]:
-    """One Helmert update of the three SDs (mm) at a weighted solution."""
-    prior = Gaussian(sigma, covariance_shape(problem))
+    parameters: Parameters,
+    sigma: Float[Array, " components"],
+    belief: AbstractSelfTuned,
+    problem: Problem,
+    blocks: Blocks,
+) -> Float[Array, " components"]:
+    """One Helmert update of the SDs (mm) at a weighted solution."""
+    prior = belief.with_sigma(sigma)
     none = jnp.zeros(0, problem.mask.dtype)
     arrow, jacobian, residual = linearise(parameters, none, prior, problem, blocks)
     inverse = arrows.inverse_symmetric(arrow.shared, jnp.diagonal(arrow.shared))
-    leverage = jnp.einsum("anm,ab,bnm->m", jacobian, inverse, jacobian)
-    count = jnp.sum(problem.mask)
-    freedom = jnp.maximum(count - leverage, 0.05 * count)
-    return with_floor(sigma * jnp.sqrt(jnp.sum(residual**2, axis=0) / freedom))
+    leverage = jnp.einsum("anm,ab,bnm->nm", jacobian, inverse, jacobian)
+    count = prior.count(problem)
+    freedom = jnp.maximum(count - _sums(leverage, prior, problem), 0.05 * count)
+    return with_floor(sigma * jnp.sqrt(_sums(residual**2, prior, problem) / freedom))
+
+
+def _sums(
+    values: Float[Array, "n columns"], belief: AbstractSelfTuned, problem: Problem
+) -> Float[Array, " components"]:
+    """Sums over the images and the columns of each component."""
+    over_images = jnp.sum(values, axis=0)
+    return jnp.stack([jnp.sum(over_images[columns]) for columns in belief.columns(problem)])
 
 
 def update_or_hold(
-    parameters: Parameters, sigma: Float[Array, 3], problem: Problem, blocks: Blocks
-) -> Float[Array, 3]:
-    """:func:`update`, or the held SDs where there are too few images to estimate them."""
+    parameters: Parameters,
+    sigma: Float[Array, " components"],
+    belief: AbstractSelfTuned,
+    problem: Problem,
+    blocks: Blocks,
+) -> Float[Array, " components"]:
+    """:func:`update`, or the belief's own SDs where there are too few images to estimate them."""
     enough = jnp.sum(problem.mask) >= MINIMUM_SELF_TUNING
-    held = jnp.asarray(DEFAULT_SIGMA, sigma.dtype)
-    return jnp.where(enough, update(parameters, sigma, problem, blocks), held)
+    return jnp.where(enough, update(parameters, sigma, belief, problem, blocks), belief.sigma)
 
 
-def with_floor(sigma: Float[Array, 3]) -> Float[Array, 3]:
+def with_floor(sigma: Float[Array, " components"]) -> Float[Array, " components"]:
     """The SDs, none below a thousandth of the largest."""
     return jnp.maximum(sigma, jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma), ABSOLUTE_FLOOR_MM))
