@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Num
 
 from jaxcal.errors import InputError
 from jaxcal.sound import check_sound_speed
@@ -104,7 +104,7 @@ class LinearProbe(_Array):
         return np.stack([self._along(), zero, zero], axis=-1)
 
     def contains(
-        self, points: Float[np.ndarray, "*batch d"], depth_mm: float
+        self, points: Num[np.ndarray, "*batch d"], depth_mm: float
     ) -> Bool[np.ndarray, "*batch"]:
         """Whether points lie under the array, in front of it and no deeper than ``depth_mm``.
 
@@ -113,10 +113,11 @@ class LinearProbe(_Array):
             depth_mm: deepest range from the array, mm.
         """
         lateral, axial = _in_plane(points)
-        return (np.abs(lateral) <= self.width_mm / 2) & (axial > 0) & (axial <= depth_mm)
+        inside = (np.abs(lateral) <= self.width_mm / 2) & (axial > 0) & (axial <= depth_mm)
+        return np.asarray(inside)
 
     def image_to_cartesian(
-        self, line: Float[np.ndarray, "*batch"], range_mm: Float[np.ndarray, "*batch"]
+        self, line: Num[np.ndarray, "*#batch"] | float, range_mm: Num[np.ndarray, "*#batch"] | float
     ) -> Float[np.ndarray, "*batch 2"]:
         """[lateral, axial] (mm) on scan line ``line`` (element number) at ``range_mm`` (Eq. 3)."""
         lateral = (np.asarray(line, dtype=np.float64) - (self.elements - 1) / 2) * self.pitch_mm
@@ -124,7 +125,7 @@ class LinearProbe(_Array):
         return np.stack([lateral, axial], axis=-1)
 
     def cartesian_to_image(
-        self, points: Float[np.ndarray, "*batch d"]
+        self, points: Num[np.ndarray, "*batch d"]
     ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
         """Scan line (element number) and range (mm) of places in the image plane."""
         lateral, axial = _in_plane(points)
@@ -183,15 +184,16 @@ class CurvilinearProbe(_Array):
         return self.element_positions()[:, 0]
 
     def polar(
-        self, points: Float[np.ndarray, "*batch d"]
+        self, points: Num[np.ndarray, "*batch d"]
     ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
         """Angle (rad from the axis) and range from the arc (mm) of places in the image plane."""
         lateral, axial = _in_plane(points)
         behind = axial + self.radius_mm
-        return np.arctan2(lateral, behind), np.hypot(lateral, behind) - self.radius_mm
+        depth = np.hypot(lateral, behind) - self.radius_mm
+        return np.asarray(np.arctan2(lateral, behind)), np.asarray(depth)
 
     def contains(
-        self, points: Float[np.ndarray, "*batch d"], depth_mm: float
+        self, points: Num[np.ndarray, "*batch d"], depth_mm: float
     ) -> Bool[np.ndarray, "*batch"]:
         """Whether points lie in the sector in front of the arc, no deeper than ``depth_mm``.
 
@@ -200,10 +202,13 @@ class CurvilinearProbe(_Array):
             depth_mm: deepest range from the arc, mm.
         """
         angle, depth = self.polar(points)
-        return (np.abs(angle) <= self.half_angle_rad) & (depth > 0) & (depth <= depth_mm)
+        inside = (np.abs(angle) <= self.half_angle_rad) & (depth > 0) & (depth <= depth_mm)
+        return np.asarray(inside)
 
     def polar_to_cartesian(
-        self, angle_rad: Float[np.ndarray, "*batch"], range_mm: Float[np.ndarray, "*batch"]
+        self,
+        angle_rad: Num[np.ndarray, "*#batch"] | float,
+        range_mm: Num[np.ndarray, "*#batch"] | float,
     ) -> Float[np.ndarray, "*batch 2"]:
         """[lateral, axial] (mm) in the direction ``angle_rad`` at ``range_mm`` from the arc."""
         angle, depth = np.asarray(angle_rad, np.float64), np.asarray(range_mm, np.float64)
@@ -213,7 +218,7 @@ class CurvilinearProbe(_Array):
         return np.stack(np.broadcast_arrays(lateral, axial), axis=-1)
 
     def image_to_cartesian(
-        self, line: Float[np.ndarray, "*batch"], range_mm: Float[np.ndarray, "*batch"]
+        self, line: Num[np.ndarray, "*#batch"] | float, range_mm: Num[np.ndarray, "*#batch"] | float
     ) -> Float[np.ndarray, "*batch 2"]:
         """[lateral, axial] (mm) on scan line ``line`` (element number) at ``range_mm``."""
         line = np.asarray(line, dtype=np.float64)
@@ -221,7 +226,7 @@ class CurvilinearProbe(_Array):
         return self.polar_to_cartesian(angle, range_mm)
 
     def cartesian_to_image(
-        self, points: Float[np.ndarray, "*batch d"]
+        self, points: Num[np.ndarray, "*batch d"]
     ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
         """Scan line (element number) and range from the arc (mm) of places in the image plane."""
         angle, depth = self.polar(points)

@@ -246,11 +246,12 @@ def simulate_recording(
         seed: of the draws.
         clock_hz: times of flight are rounded to this clock.
     """
+    curved = isinstance(protocol.probe, CurvilinearProbe)
+    if clock_hz is not None and not (protocol.raw or curved):
+        raise InputError("a clock rounds times of flight: it needs a raw simulation")
     experiment = jax.jit(simulate, static_argnums=1)(jax.random.key(seed), protocol)
     array = {name: np.asarray(value) for name, value in vars(experiment).items()}
     if experiment.distances is None:
-        if clock_hz is not None:
-            raise InputError("a clock rounds times of flight: it needs a raw simulation")
         calibration = make_images(
             array["poses"],
             array["points"],

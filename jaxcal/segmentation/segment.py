@@ -28,6 +28,8 @@ MINIMUM_LINES = 8
 _LONGEST_S = 2e-3
 # |elevation| is determined where its square lies this many SDs above zero.
 _SIGNIFICANT = 3.0
+# A frame this many times as noisy as the median one was fitted to something else.
+_NOISIEST = 5.0
 _MANY = 0.1
 
 
@@ -104,7 +106,9 @@ def segment(
             the calibration images.
         probe: the transducer; by default the recording's.
         method: ``least-squares`` on every element (Eqs. 5 and 6) or ``shortest`` (Eqs. 2 and 3).
-        robust: bisquare weights against lines that are not the target's echo.
+        robust: bisquare weights against lines that are not the target's echo (up to a fifth of a
+            frame's are certainly seen); frames that are 5 times as noisy as the median one are
+            left out: they have more, and the fit found something else.
         scale: noise of each ``frame`` by itself, or ``pooled``: the median over the frames, better
             where all are alike and few lines answer.
         interpolate: between elements, for ``shortest``.
@@ -146,8 +150,11 @@ def segment(
     else:
         points, covariance, noise, rejected, full = _fit(distances, probe, robust, scale, failed)
         failed |= used & (2 * rejected > lines)
-        good = np.isfinite(covariance).all(axis=(1, 2)) & (noise > 0)
+        good = np.isfinite(covariance).all(axis=(1, 2))
         failed |= used & ~good
+        if robust and (used & ~failed).any():
+            typical = max(float(np.median(noise[used & ~failed])), 1e-3)
+            failed |= used & (noise > _NOISIEST * typical)
         if full is not None:
             out_of_plane = _out_of_plane(*full, used & ~failed)
     with np.errstate(invalid="ignore"):
@@ -267,8 +274,9 @@ def _fit(distances: np.ndarray, probe: Probe, robust: bool, scale: Scale, failed
     """Points, covariances, noise, rejected lines and, curved arrays, [x, z, y^2] and covariance."""
     curved = isinstance(probe, CurvilinearProbe)
     fits = compiled_fit(curved, robust)(distances, probe.element_positions())
-    plane = fits[0] if curved else fits
-    noise, rejected = np.asarray(plane.noise), np.asarray(plane.rejected).astype(int)
+    # Far out of the plane the in-plane fit has more than noise in its residuals; the other has not.
+    plane, whole = fits if curved else (fits, fits)
+    noise, rejected = np.asarray(whole.noise), np.asarray(whole.rejected).astype(int)
 
     def scaled(fit) -> tuple[np.ndarray, np.ndarray]:
         own = np.asarray(fit.noise)
@@ -281,7 +289,7 @@ def _fit(distances: np.ndarray, probe: Probe, robust: bool, scale: Scale, failed
     # A frame without any residual, such as a noise-free simulation, still needs a variance.
     covariance = covariance + 1e-12 * np.eye(2)
     noise = np.maximum(noise, 1e-6)
-    return points, covariance, noise, rejected, scaled(fits[1]) if curved else None
+    return points, covariance, noise, rejected, scaled(whole) if curved else None
 
 
 def _out_of_plane(position: np.ndarray, covariance: np.ndarray, kept: np.ndarray) -> OutOfPlane:

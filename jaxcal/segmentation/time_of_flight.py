@@ -13,11 +13,14 @@ for the range r. Three estimators:
 Both fits take a fixed number of Gauss-Newton steps. A step passes once over the elements and
 accumulates all its sums in one reduction, so that XLA keeps residuals and derivatives in registers.
 The robust fits are MM-estimators (Yohai 1987; Maronna, Martin and Yohai 2006, section 5.4): from
-plain least squares, steps with Tukey's bisquare weights whose scale is the S-scale of half
-breakdown, then steps with the efficient scale of the weighted residuals.
+plain least squares, steps by absolute deviations, then with Tukey's bisquare weights, whose scale
+is the S-scale of half breakdown, then steps with the efficient scale of the weighted residuals.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -28,13 +31,17 @@ from jaxcal.geometry import AnyArray
 
 # Tukey's bisquare: 95 % efficiency for the place, half breakdown for the S-scale.
 _CUT, _CUT_SCALE = 4.685, 1.547645
+# Residuals of less than this many S-scales count alike in the steps by absolute deviations.
+_KNEE = 0.5
 # Under a unit normal law: E w, E w u^2 and the variance of the estimate of place.
 _MEAN_WEIGHT, _MEAN_SQUARE, _VARIANCE = 0.9151076239875573, 0.757775918619908, 1.0526345151671421
 # No scale below this (mm): clocks are coarser, and a residual of rounding is no outlier.
 _FINEST_MM = 1e-6
 
-FIRST_STEPS, SCALE_STEPS, LAST_STEPS = 2, 6, 3
-"""Steps of the robust fit: with equal weights, with the S-scale, with the efficient scale."""
+ABSOLUTE_STEPS, SCALE_STEPS, LAST_STEPS = 5, 3, 3
+"""Steps of the robust fit: by absolute deviations, with the S-scale, with the efficient scale."""
+
+_Stage = Literal["absolute", "scale", "efficient"]
 
 
 class Fit(eqx.Module):
@@ -255,7 +262,6 @@ def _iterate(
 ) -> Fit:  # fmt: skip
     """Gauss-Newton from a start; the last pass also gives the covariance."""
     unknowns = 3 if out_of_plane else 2
-    linear = not out_of_plane
 
     def derivatives(at: _State) -> tuple[tuple[Array, ...], Array]:
         across, deep = at.x[..., None] - ex, at.z[..., None] - ez
@@ -273,7 +279,7 @@ def _iterate(
         z = at.z + jnp.clip(step[1], -0.5 * reach, reach)
         return _State(x, z, at.square + step[2] if out_of_plane else at.square, scale)
 
-    def equal(at: _State) -> tuple[_State, tuple[Array, ...]]:
+    def equal(at: _State) -> tuple[_State, list[Array], Array]:
         columns, residual = derivatives(at)
         weighted = [m * column for column in columns]
         *products, rss = _sums(*_products(weighted, columns, residual), m * residual * residual)
@@ -282,14 +288,16 @@ def _iterate(
         gradient = products[-unknowns:]
         rss = jnp.maximum(rss - sum(g * s for g, s in zip(gradient, step, strict=True)), 0.0)
         noise = jnp.sqrt(rss / (lines - unknowns))
-        return moved(at, step, noise), (inverse, noise)
+        return moved(at, step, noise), inverse, noise
 
-    def weighed(at: _State, *, efficient: bool) -> tuple[_State, tuple[Array, ...]]:
+    def weighed(at: _State, stage: _Stage) -> tuple[_State, list[Array], Array]:
         columns, residual = derivatives(at)
         scale = jnp.maximum(at.scale, _FINEST_MM)
         square = (residual / scale[..., None]) ** 2
         root = jnp.maximum(1 - square / _CUT**2, 0.0)
-        weight = m * root * root
+        # About 1/|residual| where that is large: a convex loss, without false minima.
+        weight = m * (jax.lax.rsqrt(1 + square / _KNEE**2) if stage == "absolute" else root * root)
+        efficient = stage == "efficient"
         extra = weight if efficient else m * jnp.maximum(1 - square / _CUT_SCALE**2, 0.0) ** 3
         weighted = [weight * column for column in columns]
         *products, total, spread, lost = _sums(
@@ -303,21 +311,22 @@ def _iterate(
             # S-scale: mean rho = 1/2. Its own fixed-point step, squared, is twice as quick.
             ratio = (2 * (lines - total) / (lines - unknowns)) ** 2
         scale = jnp.maximum(scale * jnp.sqrt(ratio), _FINEST_MM)
-        return moved(at, step, scale), (inverse, lost)
+        return moved(at, step, scale), inverse, lost
 
-    def repeat(count: int, step, at: _State) -> _State:
+    def repeat(count: int, step: Callable, at: _State) -> _State:
         return jax.lax.fori_loop(0, count, lambda _, state: step(state)[0], at)
 
     if robust:
-        if linear:
-            state = repeat(FIRST_STEPS, equal, state)
-        state = repeat(SCALE_STEPS, lambda at: weighed(at, efficient=False), state)
-        state = repeat(LAST_STEPS - 1, lambda at: weighed(at, efficient=True), state)
-        state, (inverse, rejected) = weighed(state, efficient=True)
+        if not out_of_plane:
+            state, *_ = equal(state)
+            state = repeat(ABSOLUTE_STEPS, lambda at: weighed(at, "absolute"), state)
+        state = repeat(SCALE_STEPS, lambda at: weighed(at, "scale"), state)
+        state = repeat(LAST_STEPS - 1, lambda at: weighed(at, "efficient"), state)
+        state, inverse, rejected = weighed(state, "efficient")
         inverse, noise = [entry * (_VARIANCE * _MEAN_WEIGHT) for entry in inverse], state.scale
     else:
         state = repeat(steps - 1, equal, state)
-        state, (inverse, noise) = equal(state)
+        state, inverse, noise = equal(state)
         rejected = jnp.zeros_like(lines)
     entries = [state.x, state.z, state.square][:unknowns]
     few = lines <= unknowns
