@@ -535,8 +535,9 @@ def test_segment_command(raw_file, capfd):
     again = jaxcal.load(target)
     assert again.calibration.covariance is None
     assert again.probe.sound_speed_m_s == pytest.approx(1490 * 1.02)
-    ratio = again.calibration.measurements[:, 1] / images.measurements[:, 1]
-    assert np.median(ratio[images.mask]) == pytest.approx(1.02, abs=0.02)
+    slower = segment(jaxcal.load(raw_file), method="shortest").images
+    ratio = again.calibration.measurements[:, 1] / slower.measurements[:, 1]
+    np.testing.assert_allclose(ratio[images.mask], 1.02, rtol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -319,7 +319,7 @@ def _iterate(
     if robust:
         if not out_of_plane:
             state, *_ = equal(state)
-            state = repeat(ABSOLUTE_STEPS, lambda at: weighed(at, "absolute"), state)
+        state = repeat(ABSOLUTE_STEPS, lambda at: weighed(at, "absolute"), state)
         state = repeat(SCALE_STEPS, lambda at: weighed(at, "scale"), state)
         state = repeat(LAST_STEPS - 1, lambda at: weighed(at, "efficient"), state)
         state, inverse, rejected = weighed(state, "efficient")
