@@ -21,6 +21,7 @@ __version__ = "0.1.0"
 _HOME = {
     "Calibration": "jaxcal.calibration",
     "CalibrationError": "jaxcal.errors",
+    "CurvilinearProbe": "jaxcal.probe",
     "FormatError": "jaxcal.errors",
     "Images": "jaxcal.recording",
     "InputError": "jaxcal.errors",
@@ -30,6 +31,7 @@ _HOME = {
     "Problem": "jaxcal.problem",
     "Protocol": "jaxcal.simulation",
     "Recording": "jaxcal.recording",
+    "Segmentation": "jaxcal.segmentation.segment",
     "Status": "jaxcal.calibration",
     "Options": "jaxcal.options",
     "calibrate": "jaxcal.solve",
@@ -39,8 +41,11 @@ _HOME = {
     "make_images": "jaxcal.recording",
     "reconstruction_precision": "jaxcal.metrics",
     "save": "jaxcal.io.hdf5",
+    "segment": "jaxcal.segmentation.segment",
+    "segment_recording": "jaxcal.segmentation.segment",
     "simulate": "jaxcal.simulation",
     "simulate_recording": "jaxcal.simulation",
+    "sound_speed_in_water": "jaxcal.sound",
     "stack": "jaxcal.problem",
 }
 
@@ -58,17 +63,22 @@ if TYPE_CHECKING:
     from jaxcal.metrics import calibration_reproducibility as calibration_reproducibility
     from jaxcal.metrics import reconstruction_precision as reconstruction_precision
     from jaxcal.options import Options as Options
+    from jaxcal.probe import CurvilinearProbe as CurvilinearProbe
     from jaxcal.probe import LinearProbe as LinearProbe
     from jaxcal.problem import Problem as Problem
     from jaxcal.problem import stack as stack
     from jaxcal.recording import Images as Images
     from jaxcal.recording import Recording as Recording
     from jaxcal.recording import make_images as make_images
+    from jaxcal.segmentation.segment import Segmentation as Segmentation
+    from jaxcal.segmentation.segment import segment as segment
+    from jaxcal.segmentation.segment import segment_recording as segment_recording
     from jaxcal.simulation import Protocol as Protocol
     from jaxcal.simulation import simulate as simulate
     from jaxcal.simulation import simulate_recording as simulate_recording
     from jaxcal.solve import calibrate as calibrate
     from jaxcal.solve import calibrate_batch as calibrate_batch
+    from jaxcal.sound import sound_speed_in_water as sound_speed_in_water
 
 
 def __getattr__(name: str) -> object:

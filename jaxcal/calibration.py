@@ -46,6 +46,8 @@ class Calibration(eqx.Module):
         sound_speed_sd_m_s: its standard deviation.
         delay_s: electronic delay, s.
         delay_sd_s: its standard deviation.
+        sound_speed_prior_m_s: SD that was believed before; None without such a belief.
+        delay_prior_s: SD that was believed before, likewise.
         residual: q_i - p_i with p_i in the plane (y = 0), in the image frame, mm.
         rms: root mean square length of those residuals over the used images, mm.
         mask: 1 for used images.
@@ -89,6 +91,8 @@ class Calibration(eqx.Module):
     sound_speed_sd_m_s: Float[Array, "*batch"] | None
     delay_s: Float[Array, "*batch"] | None
     delay_sd_s: Float[Array, "*batch"] | None
+    sound_speed_prior_m_s: Float[Array, "*batch"] | None
+    delay_prior_s: Float[Array, "*batch"] | None
     residual: Float[Array, "*batch n 3"]
     rms: Float[Array, "*batch"]
     mask: Float[Array, "*batch n"]

@@ -20,12 +20,16 @@ _AXES = {
     "rotation": ("lateral", "elevational", "axial"),
     "point": ("x", "y", "z"),
     "scale": ("lateral", "axial"),
+    "sound-speed": ("",),
+    "delay": ("",),
 }
 _NOUN = {
     "translation": "translation along the {} axis",
     "rotation": "rotation about the {} axis",
     "point": "target position along the tracker's {}",
     "scale": "{} pixel scale",
+    "sound-speed": "sound speed{}",
+    "delay": "delay{}",
 }
 _OBLIQUE = {
     "translation": "translation along an oblique axis (lateral {:.2f}, elevational {:.2f}, "
@@ -38,6 +42,8 @@ _OBLIQUE = {
 OUTLIER_SDS = 8.0
 STEADY = 1e-3
 WEAK_TRANSLATION_MM = 0.3
+WEAK_SHARE = 0.7
+"""SDs of sound speed or delay above this share of their prior's tell that the data added little."""
 
 
 def direction_in_words(vector: AnyArray, blocks: tuple[str, ...]) -> str:
@@ -165,10 +171,36 @@ def warnings(result: Calibration) -> list[str]:
                 "translation along the elevational axis is weakly seen "
                 f"(SD {sd:.2f} mm) and rests on offsets that average zero"
             )
+    found += _medium_warnings(result)
     named = outliers(result)
     if named:
         listed = ", ".join(map(str, named[:10])) + (", ..." if len(named) > 10 else "")
         found.append(f"images that do not fit the rest: {listed}")
+    return found
+
+
+def _medium_warnings(result: Calibration) -> list[str]:
+    """Sound speed and delay that only their priors tell, or that the data can hardly see."""
+    found = []
+    for name, value, sd, believed, unit in (
+        ("sound speed", result.sound_speed_m_s, result.sound_speed_sd_m_s,
+         result.sound_speed_prior_m_s, "m/s"),
+        ("delay", result.delay_s, result.delay_sd_s, result.delay_prior_s, "us"),
+    ):  # fmt: skip
+        if value is None or sd is None or not np.isfinite(sd):
+            continue
+        factor = 1e6 if unit == "us" else 1.0
+        shown = f"{factor * float(value):.4g} +- {factor * float(sd):.2g} {unit}"
+        if believed is not None and float(sd) > WEAK_SHARE * float(believed):
+            found.append(
+                f"the {name} is hardly seen in these data: {shown} is little more than what was "
+                f"believed before (SD {factor * float(believed):.2g} {unit})"
+            )
+        elif believed is None and name == "delay":
+            found.append(
+                f"the delay ({shown}) is nearly a shift of the transform along the axial axis: "
+                "only times of flight tell the two apart"
+            )
     return found
 
 

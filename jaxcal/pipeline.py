@@ -72,7 +72,7 @@ def solve_problem(problem: Problem, given: Given, plan: Plan) -> Calibration:
         parameters, offset, prior, problem, plan.blocks,
         whitened=plan.prior == "gaussian", uses_prior=plan.prior != "none",
     )  # fmt: skip
-    return _assemble(solution, parameters, offset, prior, uncertainty, problem, plan)
+    return _assemble(solution, parameters, offset, prior, uncertainty, problem, given, plan)
 
 
 def belief(problem: Problem, given: Given, plan: Plan) -> AbstractPrior:
@@ -186,6 +186,7 @@ def _assemble(
     prior: AbstractPrior,
     uncertainty: Uncertainty,
     problem: Problem,
+    given: Given,
     plan: Plan,
 ) -> Calibration:
     matrix = parameters.matrix()
@@ -197,19 +198,7 @@ def _assemble(
     covariance = jnp.where(usable, uncertainty.covariance, jnp.nan)
     point = block_slice(plan.blocks, "point")
     floored = solution.sigma_floored
-    speed = nominal_sound_speed(problem)
-    medium: dict[str, Array | None] = dict.fromkeys(
-        ("sound_speed_m_s", "sound_speed_sd_m_s", "delay_s", "delay_sd_s")
-    )
-    if "sound-speed" in plan.blocks:
-        at = block_slice(plan.blocks, "sound-speed").start
-        medium["sound_speed_m_s"] = speed * parameters.sound_speed
-        medium["sound_speed_sd_m_s"] = medium["sound_speed_m_s"] * jnp.sqrt(covariance[at, at])
-    if "delay" in plan.blocks:
-        at = block_slice(plan.blocks, "delay").start
-        before = 0.0 if problem.delay is None else problem.delay
-        medium["delay_s"] = before + parameters.delay / (1e3 * speed)
-        medium["delay_sd_s"] = jnp.sqrt(covariance[at, at]) / (1e3 * speed)
+    medium = _medium(parameters, covariance, problem, given, plan)
     return Calibration(
         image_to_probe=matrix,
         point=parameters.point,
@@ -247,6 +236,34 @@ def _assemble(
         data="channels" if plan.channels else "points",
         blocks=plan.blocks,
     )
+
+
+def _medium(
+    parameters: Parameters,
+    covariance: Float[Array, "p p"],
+    problem: Problem,
+    given: Given,
+    plan: Plan,
+) -> dict[str, Array | None]:
+    """Sound speed and delay in their units, with SDs; None where they were not estimated."""
+    speed = nominal_sound_speed(problem)
+    found: dict[str, Array | None] = dict.fromkeys(
+        ("sound_speed_m_s", "sound_speed_sd_m_s", "sound_speed_prior_m_s",
+         "delay_s", "delay_sd_s", "delay_prior_s")
+    )  # fmt: skip
+    if "sound-speed" in plan.blocks:
+        at = block_slice(plan.blocks, "sound-speed").start
+        estimate = speed * parameters.sound_speed
+        found["sound_speed_m_s"] = estimate
+        found["sound_speed_sd_m_s"] = estimate * jnp.sqrt(covariance[at, at])
+        found["sound_speed_prior_m_s"] = None if given.medium_sd is None else given.medium_sd[0]
+    if "delay" in plan.blocks:
+        at = block_slice(plan.blocks, "delay").start
+        before = 0.0 if problem.delay is None else problem.delay
+        found["delay_s"] = before + parameters.delay / (1e3 * speed)
+        found["delay_sd_s"] = jnp.sqrt(covariance[at, at]) / (1e3 * speed)
+        found["delay_prior_s"] = None if given.medium_sd is None else given.medium_sd[1]
+    return found
 
 
 def _three_sigmas(

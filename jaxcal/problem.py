@@ -16,7 +16,9 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxcal.errors import InputError
+from jaxcal.probe import CurvilinearProbe
 from jaxcal.recording import Images, Kind, Recording, make_images
+from jaxcal.segmentation.segment import segment
 
 
 class Channels(eqx.Module):
@@ -83,28 +85,37 @@ class Problem(eqx.Module):
     def from_recording(
         cls, recording: Recording | Images, dtype: DTypeLike | None = None
     ) -> Problem:
-        """The calibration images of a recording as arrays.
+        """The calibration images of a recording as arrays; times of flight are segmented first.
 
         Args:
             recording: a :class:`Recording`, or one set of :class:`Images`.
             dtype: float64 by default (float32 where JAX runs in 32 bits).
 
         Raises:
-            InputError: for raw times of flight, which must be segmented into points first.
+            InputError: for times of flight that cannot be segmented, or come without a probe.
         """
+        probe = recording.probe if isinstance(recording, Recording) else None
         images = recording.calibration if isinstance(recording, Recording) else recording
-        if images.kind == "time_of_flight":
-            raise InputError(
-                "times of flight must be segmented into points first; this recording has none"
-            )
         dtype = jnp.result_type(float) if dtype is None else dtype
-        pixels = images.kind == "pixel"
-        known = not pixels or images.spacing_mm is not None
-        spacing = np.ones(2) if images.spacing_mm is None else np.asarray(images.spacing_mm)
 
         def array(values: np.ndarray | float) -> Array:
             return jnp.asarray(values, dtype=dtype)
 
+        channels = None
+        raw = images.measurements if images.kind == "time_of_flight" else images.time_of_flight
+        if raw is not None and (probe is not None or images.kind == "time_of_flight"):
+            segmented = segment(recording)
+            if images.kind == "time_of_flight":
+                images = segmented.images
+            assert probe is not None
+            accepted = segmented.accepted & images.mask[:, None]
+            distances = np.where(accepted, probe.one_way_range_mm(raw), 0.0)
+            channels = Channels(
+                array(distances), array(accepted.astype(float)), array(probe.element_positions())
+            )
+        pixels = images.kind == "pixel"
+        known = not pixels or images.spacing_mm is not None
+        spacing = np.ones(2) if images.spacing_mm is None else np.asarray(images.spacing_mm)
         return cls(
             poses=array(images.poses),
             measurements=array(images.measurements),
@@ -113,8 +124,12 @@ class Problem(eqx.Module):
             face_offset=array(images.face_offset_mm),
             covariance=None if images.covariance is None else array(images.covariance),
             max_elevation=None if images.max_elevation is None else array(images.max_elevation),
+            sound_speed=None if probe is None else array(probe.sound_speed_m_s),
+            delay=None if probe is None else array(probe.delay_s),
+            channels=channels,
             pixels=pixels,
             spacing_known=known,
+            curved=isinstance(probe, CurvilinearProbe),
         )
 
     @classmethod

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from jaxcal.errors import InputError
 from jaxcal.geometry import check_poses
-from jaxcal.probe import LinearProbe
+from jaxcal.probe import Probe
 
 MINIMUM_IMAGES = 4
 """With fewer used images nothing can be solved: 3 residuals an image against 9 unknowns."""
@@ -40,6 +40,7 @@ class Images:
         time: (n,) s, or None.
         spacing_mm: (2,) mm per px [lateral, axial] for pixels; None when unknown.
         face_offset_mm: range of pixel row 0, mm.
+        time_of_flight: (n, elements) the times, s, that points were segmented from, or None.
     """
 
     poses: Float[np.ndarray, "n 4 4"]
@@ -52,6 +53,7 @@ class Images:
     time: Float[np.ndarray, " n"] | None = None
     spacing_mm: Float[np.ndarray, 2] | None = None
     face_offset_mm: float = 0.0
+    time_of_flight: Float[np.ndarray, "n elements"] | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -79,7 +81,7 @@ class Recording:
     calibration: Images
     test: Images | None = None
     truth: Truth | None = None
-    probe: LinearProbe | None = None
+    probe: Probe | None = None
     source: str = field(default="memory", compare=False)
 
     def __len__(self) -> int:
@@ -98,6 +100,7 @@ def make_images(
     time: np.ndarray | None = None,
     spacing_mm: np.ndarray | tuple[float, float] | None = None,
     face_offset_mm: float = 0.0,
+    time_of_flight: np.ndarray | None = None,
     minimum: int = MINIMUM_IMAGES,
     where: str = "",
 ) -> Images:
@@ -114,6 +117,7 @@ def make_images(
         time: (n,) s.
         spacing_mm: [lateral, axial] mm per px, pixels only.
         face_offset_mm: range of pixel row 0, mm.
+        time_of_flight: (n, elements) s, points only: the times that they were segmented from.
         minimum: least number of used images (0 for a test set).
         where: prefix of error messages, e.g. a file's name.
 
@@ -127,7 +131,7 @@ def make_images(
     try:
         return _make_images(
             poses, measurements, kind, mask, covariance, max_elevation, amplitude, time,
-            spacing_mm, face_offset_mm, minimum,
+            spacing_mm, face_offset_mm, time_of_flight, minimum,
         )  # fmt: skip
     except InputError as error:
         raise type(error)(f"{prefix}{error}") from None
@@ -135,7 +139,7 @@ def make_images(
 
 def _make_images(
     poses, measurements, kind, mask, covariance, max_elevation, amplitude, time,
-    spacing_mm, face_offset_mm, minimum,
+    spacing_mm, face_offset_mm, time_of_flight, minimum,
 ) -> Images:  # fmt: skip
     poses = np.asarray(poses, dtype=np.float64)
     values = np.array(measurements, dtype=np.float64)
@@ -193,9 +197,31 @@ def _make_images(
         time=_per_image("time", time, count, used, fill=0.0),
         spacing_mm=spacing,
         face_offset_mm=float(face_offset_mm),
+        time_of_flight=_raw_times(time_of_flight, kind, count, used),
     )
     _check_units(images)
     return images
+
+
+def _raw_times(
+    times: np.ndarray | None, kind: Kind, count: int, used: np.ndarray
+) -> Float[np.ndarray, "n elements"] | None:
+    """Rows of images left out are kept: another segmentation may have a use for them."""
+    if times is None:
+        return None
+    if kind != "point":
+        raise InputError(f"time_of_flight beside the measurements belongs to points, not to {kind}")
+    times = np.array(times, dtype=np.float64)
+    if times.ndim != 2 or len(times) != count:
+        raise InputError(
+            f"time_of_flight must have shape ({count}, elements), it has {times.shape}"
+        )
+    infinite = np.isinf(times)
+    bad = infinite.any(axis=1) & used
+    if bad.any():
+        raise InputError(f"time_of_flight {np.flatnonzero(bad)[0]} holds Inf")
+    times[infinite] = np.nan
+    return times
 
 
 def _mask(mask: np.ndarray | None, count: int) -> Bool[np.ndarray, " n"]:

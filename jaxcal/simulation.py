@@ -6,6 +6,10 @@ elevational offset uniform within a bound or normal, the probe turned about a ra
 segmented from the distances by least squares on Eq. 5. Test images lie in the plane and carry no
 noise. The paper leaves the ranges open; the defaults reproduce its tables (``test_fraction`` is a
 fitted choice: at 1.0 fewer cells agree).
+
+A curvilinear array sees a sector: the direction is uniform within 0.9 of its half angle, the depth
+counts from the arc. Its data are the distances themselves; the points beside them are the in-plane
+fit, which is what an image would show.
 """
 
 from __future__ import annotations
@@ -22,10 +26,10 @@ from jaxtyping import Array, Float, Key
 
 from jaxcal.errors import InputError
 from jaxcal.geometry import matrix_from_rotation
-from jaxcal.probe import L14_5, LinearProbe
-from jaxcal.problem import Problem
+from jaxcal.probe import L14_5, CurvilinearProbe, Probe
+from jaxcal.problem import Channels, Problem
 from jaxcal.recording import MINIMUM_IMAGES, Recording, Truth, make_images
-from jaxcal.segmentation.time_of_flight import fit_distances
+from jaxcal.segmentation.time_of_flight import fit_distances, fit_in_plane
 
 
 @dataclass(frozen=True)
@@ -38,11 +42,13 @@ class Protocol:
         elevation_mm: bound (uniform) or SD (normal) of the elevational offsets.
         elevation_distribution: ``uniform`` or ``normal``.
         noise_mm: SD of the noise on each element's distance.
-        lateral_mm: the target's lateral position is uniform within +- this.
-        depth_mm: its depth is uniform between these.
+        lateral_mm: the target's lateral position is uniform within +- this (linear probes).
+        depth_mm: its depth is uniform between these; curvilinear probes: its range from the arc.
         rotation_rad: the probe is turned by up to this about a random axis.
         test_fraction: test positions cover this fraction of the field (0.75: fitted).
         probe: the transducer.
+        sector: curvilinear probes: directions cover this fraction of the array's half angle.
+        raw: keep the distances that the points come from; curvilinear probes always do.
     """
 
     images: int = 50
@@ -54,7 +60,9 @@ class Protocol:
     depth_mm: tuple[float, float] = (10.0, 90.0)
     rotation_rad: float = float(np.radians(30.0))
     test_fraction: float = 0.75
-    probe: LinearProbe = L14_5
+    probe: Probe = L14_5
+    sector: float = 0.9
+    raw: bool = False
 
     def __post_init__(self) -> None:
         if not MINIMUM_IMAGES <= self.images <= 100_000:
@@ -79,6 +87,7 @@ class Experiment(eqx.Module):
         point: true target in the tracker's frame, mm.
         test_poses: poses of the test images.
         test_points: their exact [lateral, range], mm.
+        distances: measured distance of the target to every element, mm, or None (not kept).
     """
 
     poses: Float[Array, "n 4 4"]
@@ -89,11 +98,26 @@ class Experiment(eqx.Module):
     point: Float[Array, 3]
     test_poses: Float[Array, "m 4 4"]
     test_points: Float[Array, "m 2"]
+    distances: Float[Array, "n elements"] | None = None
 
-    def problem(self, max_elevation: float | None = None) -> Problem:
-        """The calibration images as a :class:`Problem` (traceable; without covariances)."""
+    def problem(self, max_elevation: float | None = None, probe: Probe | None = None) -> Problem:
+        """The calibration images as a :class:`Problem` (traceable; without covariances).
+
+        Args:
+            max_elevation: bound on the offsets, mm.
+            probe: the protocol's, where the distances are to be handed over beside the points.
+        """
         mask = jnp.ones(self.points.shape[0], self.points.dtype)
+        channels = None
+        if probe is not None and self.distances is not None:
+            heard = (self.distances > 0).astype(mask.dtype)
+            positions = jnp.asarray(probe.element_positions(), mask.dtype)
+            channels = Channels(heard * self.distances, heard, positions)
         return Problem(
+            channels=channels,
+            sound_speed=None if probe is None else jnp.asarray(probe.sound_speed_m_s, mask.dtype),
+            delay=None if probe is None else jnp.asarray(probe.delay_s, mask.dtype),
+            curved=isinstance(probe, CurvilinearProbe),
             poses=self.poses,
             measurements=self.points,
             mask=mask,
@@ -112,7 +136,10 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
         protocol: the distributions.
     """
     keys = jax.random.split(key, 9)
-    field = jnp.asarray([protocol.lateral_mm, 0.5 * np.ptp(protocol.depth_mm)])
+    probe = protocol.probe
+    curved = isinstance(probe, CurvilinearProbe)
+    width = protocol.sector * probe.half_angle_rad if curved else protocol.lateral_mm
+    field = jnp.asarray([width, 0.5 * np.ptp(protocol.depth_mm)])
     middle = jnp.asarray([0.0, 0.5 * sum(protocol.depth_mm)])
     truth = jaxlie.SE3.from_rotation_and_translation(
         _rotation(keys[0], np.pi), 50.0 * jax.random.normal(keys[1], (3,))
@@ -121,20 +148,32 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
 
     n = protocol.images
     lateral, depth = _positions(keys[3], n, field, middle)
+    if curved:
+        lateral, depth = _from_sector(lateral, depth, probe.radius_mm)
     draw = jax.random.uniform(keys[4], (n,), minval=-1.0, maxval=1.0)
     if protocol.elevation_distribution == "normal":
         draw = jax.random.normal(keys[4], (n,))
     elevation = protocol.elevation_mm * draw
     poses = _poses(keys[5], truth, point, jnp.stack([lateral, elevation, depth], -1), protocol)
 
-    elements = jnp.asarray(protocol.probe.element_lateral())
-    exact_range = jnp.hypot(elevation, depth)
-    distances = jnp.hypot(lateral[:, None] - elements, exact_range[:, None])
-    noise = jax.random.normal(keys[6], distances.shape)
-    points, inverse = fit_distances(distances + protocol.noise_mm * noise, elements)
+    noise = protocol.noise_mm * jax.random.normal(keys[6], (n, probe.elements))
+    if curved:
+        elements = jnp.asarray(probe.element_positions())
+        target = jnp.stack([lateral, elevation, depth], -1)
+        measured = jnp.linalg.norm(target[:, None] - elements, axis=-1) + noise
+        fit = fit_in_plane(measured, elements)
+        points, inverse = fit.position, fit.inverse_normal
+    else:
+        elements = jnp.asarray(probe.element_lateral())
+        exact_range = jnp.hypot(elevation, depth)
+        measured = jnp.hypot(lateral[:, None] - elements, exact_range[:, None]) + noise
+        points, inverse = fit_distances(measured, elements)
 
     m = protocol.test_images
-    test = jnp.stack(_positions(keys[7], m, protocol.test_fraction * field, middle), -1)
+    across, deep = _positions(keys[7], m, protocol.test_fraction * field, middle)
+    if curved:
+        across, deep = _from_sector(across, deep, probe.radius_mm)
+    test = jnp.stack([across, deep], -1)
     in_plane = jnp.stack([test[:, 0], jnp.zeros(m), test[:, 1]], -1)
     return Experiment(
         poses=poses,
@@ -145,7 +184,16 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
         point=point,
         test_poses=_poses(keys[8], truth, point, in_plane, protocol),
         test_points=test,
+        distances=measured if protocol.raw or curved else None,
     )
+
+
+def _from_sector(
+    angle: Float[Array, " count"], depth: Float[Array, " count"], radius: float
+) -> tuple[Float[Array, " count"], Float[Array, " count"]]:
+    """Lateral and axial from the direction (rad) and the range from the arc."""
+    lateral = (radius + depth) * jnp.sin(angle)
+    return lateral, depth * jnp.cos(angle) - 2 * radius * jnp.sin(angle / 2) ** 2
 
 
 def _positions(
@@ -180,22 +228,55 @@ def _poses(
     return jax.vmap(pose)(jax.random.split(key, in_image.shape[0]), in_image)
 
 
-def simulate_recording(protocol: Protocol, seed: int = 0) -> Recording:
+def times_of_flight(
+    distances: Float[np.ndarray, "*batch elements"], probe: Probe, clock_hz: float | None = None
+) -> Float[np.ndarray, "*batch elements"]:
+    """One-way times as the electronics would report them, s.
+
+    Args:
+        distances: measured, mm; what noise made negative is no answer (NaN).
+        probe: its sound speed and delay apply.
+        clock_hz: the counter's frequency: times are rounded to its period; None: not at all.
+
+    Raises:
+        InputError: a clock that is not positive.
+    """
+    times = probe.time_of_flight_s(np.where(np.asarray(distances) > 0, distances, np.nan))
+    if clock_hz is None:
+        return times
+    if not (np.isfinite(clock_hz) and clock_hz > 0):
+        raise InputError(f"the clock needs a positive frequency in Hz, not {clock_hz}")
+    return np.round(times * clock_hz) / clock_hz
+
+
+def simulate_recording(
+    protocol: Protocol, seed: int = 0, *, clock_hz: float | None = None
+) -> Recording:
     """One simulated experiment as a :class:`Recording` with truth and test set.
 
     Args:
-        protocol: the distributions.
+        protocol: the distributions; where it is ``raw`` or its probe curvilinear, the calibration
+            images hold times of flight, otherwise points. Test images always hold points.
         seed: of the draws.
+        clock_hz: times of flight are rounded to this clock.
     """
+    curved = isinstance(protocol.probe, CurvilinearProbe)
+    if clock_hz is not None and not (protocol.raw or curved):
+        raise InputError("a clock rounds times of flight: it needs a raw simulation")
     experiment = jax.jit(simulate, static_argnums=1)(jax.random.key(seed), protocol)
     array = {name: np.asarray(value) for name, value in vars(experiment).items()}
-    return Recording(
-        calibration=make_images(
+    if experiment.distances is None:
+        calibration = make_images(
             array["poses"],
             array["points"],
             covariance=array["covariance"] if protocol.noise_mm > 0 else None,
             where="simulation",
-        ),
+        )
+    else:
+        times = times_of_flight(array["distances"], protocol.probe, clock_hz)
+        calibration = make_images(array["poses"], times, "time_of_flight", where="simulation")
+    return Recording(
+        calibration=calibration,
         test=make_images(array["test_poses"], array["test_points"], where="simulation"),
         truth=Truth(array["image_to_probe"], array["point"], array["elevation"]),
         probe=protocol.probe,

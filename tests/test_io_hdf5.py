@@ -571,8 +571,12 @@ def test_bad_scale(path, name, value, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"kind": "curvilinear", "radius_mm": 60.0}, "reads linear probes only"),
-        ({"kind": "phased"}, "attribute kind is 'phased', 'linear' is needed"),
+        ({"kind": "curvilinear"}, "attribute radius_mm is missing"),
+        ({"kind": "curvilinear", "radius_mm": -60.0}, "radius must be in mm"),
+        ({"kind": "curvilinear", "radius_mm": 0.5}, "more than half way round"),
+        ({"kind": "phased"}, "attribute kind is 'phased', 'linear' or 'curvilinear' is needed"),
+        ({"delay_s": 0.5}, "delay must be in s"),
+        ({"delay_s": np.nan}, "delay must be in s"),
         ({"kind": None}, "attribute kind is missing"),
         ({"elements": None}, "attribute elements is missing"),
         ({"elements": 8.5}, "must be a whole number"),

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from jaxcal.report.convergence import Curve
 
 Method = Literal["joint", "alternating", "conventional"]
+UNKNOWNS = ("scale", "sound-speed", "delay")
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class _Request:
     prior: Literal["auto", "gaussian", "bounded"]
     max_elevation: float | None
     estimate: tuple[str, ...]
+    data: Literal["auto", "points", "channels"]
     sigma: tuple[float, float, float] | None
     options: dict[str, Any]
 
@@ -72,7 +74,15 @@ class _Request:
 @click.option(
     "--estimate",
     metavar="LIST",
-    help="Further unknowns, separated by commas: scale (the size of a pixel).",
+    help="Further unknowns, separated by commas: scale (the size of a pixel), sound-speed, delay.",
+)
+@click.option(
+    "--data",
+    type=click.Choice(["auto", "points", "channels"]),
+    default="auto",
+    show_default=True,
+    help="What the joint method fits where the recording holds times of flight: the points that "
+    "are segmented from them, or every element's; auto: whichever says more.",
 )
 @click.option(
     "--solver",
@@ -93,6 +103,12 @@ class _Request:
     help="and turns it by less than this (0.001 by default).",
 )
 @click.option(
+    "--max-rounds",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Most rounds of the alternation (1000 by default).",
+)
+@click.option(
     "--test",
     type=click.Path(),
     metavar="REC2",
@@ -110,37 +126,59 @@ def calibrate(
     solver: str | None,
     tolerance_mm: float | None,
     tolerance_rad: float | None,
+    max_rounds: int | None,
+    data: Literal["auto", "points", "channels"],
     test: str | None,
     out: str | None,
     as_json: bool,
 ) -> int:
     """Calibrate from the recording REC; nobody has to supply a starting guess."""
-    request = _request(
-        method, prior, max_elevation, sigma, estimate, solver, tolerance_mm, tolerance_rad
-    )
+    alternation = {
+        "tolerance_mm": tolerance_mm, "tolerance_rad": tolerance_rad, "max_rounds": max_rounds
+    }  # fmt: skip
+    request = _request(method, prior, max_elevation, sigma, estimate, data, solver, alternation)
     import_engine()
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.io.hdf5 import load
     from jaxcal.report.record import calibration_record, check_test_images
     from jaxcal.report.write import prepare_folder, write_report
 
-    data = load(recording)
-    test_data = None if test is None else load(test)
-    check_test_images(data, test_data)
+    measured, notes = _segmented(load(recording))
+    test_data = None if test is None else _segmented(load(test))[0]
+    check_test_images(measured, test_data)
     enable_compilation_cache()
     with nullcontext() if out is None else prepare_folder(out) as folder:
         with progress(f"calibrating ({method})"):
-            result = _solve(data, request, traced=folder is not None and method == "conventional")
-            record = calibration_record(result, data, test_data)
+            traced = folder is not None and method == "conventional"
+            result = _solve(measured, request, traced=traced)
+            record = calibration_record(result, measured, test_data)
+            record["warnings"] += notes
         if folder is not None:
             with progress("drawing the report"):
-                curves = _curves(data, request, result)
-                write_report(folder, record, result, data, curves)
+                curves = _curves(measured, request, result)
+                write_report(folder, record, result, measured, curves)
     if as_json:
         print_json(record)
     else:
         _print(record, out)
     return exit_code([record])
+
+
+def _segmented(recording: Recording) -> tuple[Recording, list[str]]:
+    """A recording with points in the place of times of flight, and what there is to say of them."""
+    from jaxcal.segmentation.segment import segment_recording
+
+    test = recording.test
+    raw = recording.calibration.kind == "time_of_flight"
+    if not raw and (test is None or test.kind != "time_of_flight"):
+        return recording, []
+    if not raw:
+        raise InputError(
+            f"{recording.source}: the test images hold times of flight beside other calibration "
+            "images: segment them first"
+        )
+    segmented, found = segment_recording(recording)
+    return segmented, list(found.warnings)
 
 
 def _request(
@@ -149,9 +187,9 @@ def _request(
     max_elevation: float | None,
     sigma: tuple[float, float, float] | None,
     estimate: str | None,
+    data: Literal["auto", "points", "channels"],
     solver: str | None,
-    tolerance_mm: float | None,
-    tolerance_rad: float | None,
+    alternation: dict[str, Any],
 ) -> _Request:
     """Refuse options that would be without effect: whoever gives one counts on it."""
     if prior == "uniform":
@@ -166,28 +204,30 @@ def _request(
         raise InputError("--sigma needs --method joint with the gaussian prior")
     if solver is not None and method != "conventional":
         raise InputError("--solver needs --method conventional")
-    tolerances = {"tolerance_mm": tolerance_mm, "tolerance_rad": tolerance_rad}
-    options: dict[str, Any] = {key: value for key, value in tolerances.items() if value is not None}
+    options: dict[str, Any] = {
+        key: value for key, value in alternation.items() if value is not None
+    }
     if options and method != "alternating":
-        raise InputError("--tolerance-mm and --tolerance-rad need --method alternating")
+        given = " and ".join("--" + name.replace("_", "-") for name in options)
+        raise InputError(f"{given} needs --method alternating")
+    if data == "channels" and (method != "joint" or prior == "bounded"):
+        raise InputError("--data channels needs --method joint with the gaussian prior")
     if solver is not None:
         options["solver"] = solver
     chosen: Literal["auto", "gaussian", "bounded"] = "auto"
     if prior == "gaussian" or prior == "bounded":
         chosen = prior
-    return _Request(method, chosen, max_elevation, _unknowns(estimate), sigma, options)
+    return _Request(method, chosen, max_elevation, _unknowns(estimate), data, sigma, options)
 
 
 def _unknowns(estimate: str | None) -> tuple[str, ...]:
     if estimate is None:
         return ()
-    names = [name.strip() for name in estimate.split(",")]
+    names = tuple(name.strip() for name in estimate.split(","))
     for name in names:
-        if name in ("sound-speed", "delay"):
-            raise InputError(f"this version cannot estimate {name}; it estimates: scale")
-        if name != "scale":
-            raise InputError(f"cannot estimate {name!r}; this version estimates: scale")
-    return ("scale",)
+        if name not in UNKNOWNS:
+            raise InputError(f"cannot estimate {name!r}; there are: {', '.join(UNKNOWNS)}")
+    return names
 
 
 def _solve(recording: Recording, request: _Request, *, traced: bool) -> Calibration:
@@ -204,6 +244,7 @@ def _solve(recording: Recording, request: _Request, *, traced: bool) -> Calibrat
         max_elevation=request.max_elevation,
         sigma=request.sigma,
         estimate=request.estimate,
+        data=request.data,
         options=Options(**request.options, trace=KEPT if traced else 0),
     )
     return jax.block_until_ready(result)

@@ -14,6 +14,7 @@ from jaxcal.cli.calibrate import calibrate
 from jaxcal.cli.common import ExitCode
 from jaxcal.cli.demo import demo
 from jaxcal.cli.import_ import import_
+from jaxcal.cli.segment import segment
 from jaxcal.cli.simulate import simulate
 from jaxcal.errors import CalibrationError
 
@@ -29,7 +30,7 @@ def commands() -> None:
     """Calibrate a tracked or robotic ultrasound probe from images of one small fixed target."""
 
 
-for _command in (demo, simulate, import_, calibrate):
+for _command in (demo, simulate, import_, segment, calibrate):
     commands.add_command(_command)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from jaxcal.cli.common import NOT_NEGATIVE, ExitCode, import_engine, progress
+from jaxcal.cli.common import NOT_NEGATIVE, POSITIVE, ExitCode, import_engine, progress
 from jaxcal.errors import InputError
 
 
@@ -39,7 +39,14 @@ from jaxcal.errors import InputError
     type=click.Choice(["linear", "curvilinear"]),
     default="linear",
     show_default=True,
-    help="Transducer.",
+    help="Transducer: L14-5 or C5-2. The data of a curvilinear one are its times of flight.",
+)
+@click.option("--raw", is_flag=True, help="Write times of flight, not the points fitted to them.")
+@click.option(
+    "--clock-mhz",
+    type=POSITIVE,
+    metavar="MHZ",
+    help="Round times of flight to a clock of this frequency.",
 )
 @click.option(
     "--seed",
@@ -56,17 +63,22 @@ def simulate(
     elevation_distribution: str,
     noise: float,
     probe: str,
+    raw: bool,
+    clock_mhz: float | None,
     seed: int,
 ) -> int:
     """Simulate an experiment after the paper's section 3.1 and write it to OUT.h5.
 
-    The file holds the calibration images, noise-free test images and the truth.
+    The file holds the calibration images, noise-free test images and the truth. Calibration images
+    are points, or times of flight with --raw and of curvilinear probes; test images are points.
     """
-    if probe != "linear":
-        raise InputError("this version simulates linear probes only")
+    raw = raw or probe == "curvilinear"
+    if clock_mhz is not None and not raw:
+        raise InputError("--clock-mhz rounds times of flight: it needs --raw")
     import_engine()
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.io.hdf5 import save
+    from jaxcal.probe import PRESETS
     from jaxcal.simulation import Protocol, simulate_recording
 
     protocol = Protocol(
@@ -74,10 +86,14 @@ def simulate(
         elevation_mm=elevation,
         elevation_distribution="normal" if elevation_distribution == "normal" else "uniform",
         noise_mm=noise,
+        probe=PRESETS[probe],
+        raw=raw,
     )
     enable_compilation_cache()
     with progress("simulating"):
-        recording = simulate_recording(protocol, seed)
+        clock = None if clock_mhz is None else 1e6 * clock_mhz
+        recording = simulate_recording(protocol, seed, clock_hz=clock)
     save(recording, out)
-    click.echo(f"{out}: {images} images, {protocol.test_images} test images, seed {seed}")
+    what = "images of times of flight" if raw else "images"
+    click.echo(f"{out}: {images} {what}, {protocol.test_images} test images, seed {seed}")
     return ExitCode.CONVERGED

@@ -1,7 +1,9 @@
 """Recordings as HDF5 files: format "jaxcal-recording", version 1.
 
     /            attrs format, version; complete (false is refused)
-    /probe       optional; attrs kind, elements, pitch_mm, sound_speed_m_s
+    /probe       optional; attrs kind ("linear" or "curvilinear"), elements, pitch_mm (curvilinear:
+                 along the arc), radius_mm (curvilinear: of the arc of elements), sound_speed_m_s,
+                 optional delay_s: time of flight = distance / sound speed + delay
     /calibration pose (n, 4, 4) [mm] probe -> tracker, and one of
                  point (n, 2) [mm: lateral, range], pixel (n, 2) [px: u lateral, v axial],
                  time_of_flight (n, elements) [s, one-way, NaN = no response; needs /probe];
@@ -10,15 +12,18 @@
                  pixel has attrs spacing_mm [lateral, axial] and face_offset_mm, both optional
     /test        optional, as /calibration
     /truth       optional; image_to_probe (4, 4), point (3,), elevation (n,) [mm]
+    /segmentation  written by ``jaxcal segment``, for other programs; not read (see _write_fate)
 
-Where both ``point`` and ``time_of_flight`` are there, the points were segmented from the times, and
-they are what is read. Datasets may have a ``units`` attribute; one that differs is refused.
+Where both ``point`` and ``time_of_flight`` are there, the points were segmented from the times: the
+points are what is read, and the times are kept beside them. Datasets may have a ``units``
+attribute; one that differs is refused.
 """
 
 from __future__ import annotations
 
 import io
 import os
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -39,8 +44,11 @@ from jaxcal.io.untrusted import (
     open_root,
     text,
 )
-from jaxcal.probe import LinearProbe
+from jaxcal.probe import CurvilinearProbe, LinearProbe, Probe
 from jaxcal.recording import MINIMUM_IMAGES, Images, Kind, Recording, Truth, make_images, unit_of
+
+if TYPE_CHECKING:
+    from jaxcal.segmentation.segment import Segmentation
 
 FORMAT = "jaxcal-recording"
 VERSION = 1
@@ -70,19 +78,24 @@ def load(path: str | os.PathLike[str]) -> Recording:
     Raises:
         FormatError: no such file, not HDF5, truncated or damaged, another format, a newer version,
             incomplete, wrong units, shapes or types, data that lie outside the file, absurd sizes.
-        InputError: well-formed but unusable: NaN, a reflection, metres, fewer than 4 images, a
-            curvilinear probe. Either is one line that starts with the path.
+        InputError: well-formed but unusable: NaN, a reflection, metres, fewer than 4 images.
+            Either is one line that starts with the path.
     """
     check_readable(path)
     return _read(path, os.fspath(path))
 
 
-def save(recording: Recording, path: str | os.PathLike[str]) -> None:
+def save(
+    recording: Recording,
+    path: str | os.PathLike[str],
+    segmentation: Segmentation | None = None,
+) -> None:
     """Write a recording, complete or not at all; what it writes is what :func:`load` reads.
 
     Args:
         recording: what to write.
         path: the file to make or replace.
+        segmentation: where the calibration points came from, as a group of its own.
 
     Raises:
         InputError: the recording is one that ``load`` would refuse (its arrays were not checked by
@@ -93,6 +106,8 @@ def save(recording: Recording, path: str | os.PathLike[str]) -> None:
     image = io.BytesIO()
     with h5py.File(image, "w") as file:
         _write(file, recording)
+        if segmentation is not None:
+            _write_fate(file.create_group("segmentation"), segmentation)
     _read(io.BytesIO(image.getvalue()), os.fspath(path))
     with atomic_path(path) as temporary:
         temporary.write_bytes(image.getvalue())
@@ -139,27 +154,30 @@ def _check_header(root: Node) -> None:
     _check_units(root, "mm")
 
 
-def _read_probe(root: Node) -> LinearProbe | None:
+def _read_probe(root: Node) -> Probe | None:
     node = group(root, "probe")
     if node is None:
         return None
     kind = text(node, "kind")
-    if kind == "curvilinear":
-        raise InputError("has a curvilinear probe; this version of jaxcal reads linear probes only")
-    if kind != "linear":
+    if kind not in ("linear", "curvilinear"):
         what = "missing" if kind is None else quoted(kind)
-        raise FormatError(f"/probe: attribute kind is {what}, 'linear' is needed")
+        raise FormatError(f"/probe: attribute kind is {what}, 'linear' or 'curvilinear' is needed")
     elements = _needed(node, "elements")
     if not elements.is_integer():
         raise FormatError(f"/probe: attribute elements must be a whole number, not {elements:g}")
     pitch, sound_speed = _needed(node, "pitch_mm"), _needed(node, "sound_speed_m_s")
+    delay = number(node, "delay_s")
+    delay = 0.0 if delay is None else delay
     try:
-        return LinearProbe(int(elements), pitch, sound_speed)
+        if kind == "curvilinear":
+            radius = _needed(node, "radius_mm")
+            return CurvilinearProbe(int(elements), pitch, radius, sound_speed, delay)
+        return LinearProbe(int(elements), pitch, sound_speed, delay)
     except InputError as error:
         raise FormatError(f"/probe: {error}") from None
 
 
-def _read_images(root: Node, name: str, probe: LinearProbe | None, minimum: int) -> Images | None:
+def _read_images(root: Node, name: str, probe: Probe | None, minimum: int) -> Images | None:
     node = group(root, name)
     if node is None:
         return None
@@ -172,9 +190,12 @@ def _read_images(root: Node, name: str, probe: LinearProbe | None, minimum: int)
     measurements = _dataset(node, kind, (IMAGES, columns), unit_of(kind))
     if poses is None or measurements is None:
         raise FormatError(f"{node}/pose is missing")
-    if kind == "time_of_flight" and probe and measurements.shape[1] != probe.elements:
+    times = measurements if kind == "time_of_flight" else None
+    if kind == "point":
+        times = _dataset(node, "time_of_flight", (IMAGES, ELEMENTS), "s")
+    if times is not None and probe and times.shape[1] != probe.elements:
         raise FormatError(
-            f"{node}/time_of_flight has {measurements.shape[1]} columns, /probe has "
+            f"{node}/time_of_flight has {times.shape[1]} columns, /probe has "
             f"{probe.elements} elements"
         )
     spacing, offset = _read_scale(node) if kind == "pixel" else (None, None)
@@ -190,6 +211,7 @@ def _read_images(root: Node, name: str, probe: LinearProbe | None, minimum: int)
         time=_dataset(node, "time", (IMAGES,), "s"),
         spacing_mm=spacing,
         face_offset_mm=0.0 if offset is None else offset,
+        time_of_flight=times if kind == "point" else None,
         minimum=minimum,
         where=str(node),
     )
@@ -272,6 +294,10 @@ def _write(file: h5py.File, recording: Recording) -> None:
         probe.attrs["elements"] = recording.probe.elements
         probe.attrs["pitch_mm"] = recording.probe.pitch_mm
         probe.attrs["sound_speed_m_s"] = recording.probe.sound_speed_m_s
+        if isinstance(recording.probe, CurvilinearProbe):
+            probe.attrs["radius_mm"] = recording.probe.radius_mm
+        if recording.probe.delay_s:
+            probe.attrs["delay_s"] = recording.probe.delay_s
     _write_images(file.create_group("calibration"), recording.calibration)
     if recording.test is not None:
         _write_images(file.create_group("test"), recording.test)
@@ -290,6 +316,8 @@ def _write_images(target: h5py.Group, images: Images) -> None:
         if images.spacing_mm is not None:
             measurements.attrs["spacing_mm"] = images.spacing_mm
         measurements.attrs["face_offset_mm"] = images.face_offset_mm
+    if images.time_of_flight is not None:
+        _put(target, "time_of_flight", images.time_of_flight, "s")
     _put(target, "mask", images.mask, _FREE)
     optional = {
         "covariance": (images.covariance, "px^2" if images.kind == "pixel" else "mm^2"),
@@ -300,6 +328,19 @@ def _write_images(target: h5py.Group, images: Images) -> None:
     for name, (values, unit) in optional.items():
         if values is not None:
             _put(target, name, values, unit)
+
+
+def _write_fate(target: h5py.Group, found: Segmentation) -> None:
+    """What became of every calibration frame; curved arrays: [lateral, axial, elevation^2]."""
+    target.attrs["method"] = found.method
+    _put(target, "missing", found.missing, _FREE)
+    _put(target, "rejected", found.rejected, _FREE)
+    _put(target, "failed", found.failed, _FREE)
+    _put(target, "noise", found.noise_mm, "mm")
+    if found.out_of_plane is not None:
+        _put(target, "out_of_plane", found.out_of_plane.position, "mm, mm, mm^2")
+        _put(target, "out_of_plane_covariance", found.out_of_plane.covariance, _FREE)
+        _put(target, "elevation_determined", found.out_of_plane.determined, _FREE)
 
 
 def _put(target: h5py.Group, name: str, values: np.ndarray, unit: str) -> h5py.Dataset:
