@@ -34,6 +34,9 @@ NOISES = (0.05, 0.5, 2.0, 4.0, 10.0)
 BOUNDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 ROUNDS = (1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000)
 TOLERANCE = 1e-10
+OBSERVABLE = 1e6
+"""Condition number (scaled units) up to which X is compared with scipy's: beyond it the objective
+is flat to rounding along one direction, and where in the valley a solver stops means nothing."""
 
 
 def draw(count: int) -> tuple[Problem, np.ndarray, np.ndarray]:
@@ -161,14 +164,20 @@ def main() -> None:
     reached = costs <= joint_cost * (1 + 1e-8) + 1e-12 * squares
     rounds_needed = np.array([ROUNDS[np.argmax(r)] if r.any() else -1 for r in reached.T])
 
-    disagreements, angles, singular = 0, [], np.asarray(sight.singular)
+    singular, condition = np.asarray(sight.singular), np.asarray(sight.condition)
+    peers = []
     for index in np.linspace(0, count - 1, compared).astype(int):
         pick = jax.tree.map(lambda leaf, i=index: leaf[i], (problems, starts, fit.parameters))
         cost, matrix = scipy_solution(pick[0], pick[1], float(bounds[index]))
-        if joint_cost[index] > cost * (1 + 1e-8) + 1e-12 * squares[index]:
-            disagreements += 1
-        if not singular[index]:
-            angles.append(rotation_angle(np.asarray(matrix), np.asarray(pick[2].matrix())))
+        slack = 1e-8 * cost + 1e-12 * squares[index]
+        lower = bool(joint_cost[index] > cost + slack)
+        higher = bool(joint_cost[index] < cost - slack)
+        observable = bool(not singular[index] and condition[index] < OBSERVABLE)
+        angle = float(rotation_angle(np.asarray(matrix), np.asarray(pick[2].matrix())))
+        peers.append([int(index), float(joint_cost[index]), cost, lower, higher,
+                      float(condition[index]), observable, angle])  # fmt: skip
+    # Where scipy ends in another, higher minimum there is no X to compare.
+    angles = [peer[-1] for peer in peers if peer[6] and not peer[4]]
 
     folder = results_folder(quick)
     write_table(
@@ -182,6 +191,12 @@ def main() -> None:
              bool(finished[k]), int(rounds_needed[k]), bool(singular[k])]
             for k in range(count)
         ),
+    )  # fmt: skip
+    write_table(
+        folder / "same_objective_scipy.csv",
+        ["problem", "joint_cost_mm2", "scipy_cost_mm2", "scipy_lower", "scipy_higher", "condition",
+         "observable", "angle_between_rad"],
+        peers,
     )  # fmt: skip
     iterations = np.asarray(fit.iterations)
     summary = [
@@ -201,8 +216,9 @@ def main() -> None:
         ("problems whose minimiser is an interval (no bound active in some direction)",
          int(singular.sum())),
         ("scipy trf: problems compared", compared),
-        ("scipy trf: problems where it found a lower objective", disagreements),
-        ("scipy trf: X compared (observable)", len(angles)),
+        ("scipy trf: problems where it found a lower objective", sum(p[3] for p in peers)),
+        ("scipy trf: problems where it stopped higher", sum(p[4] for p in peers)),
+        ("scipy trf: X compared (same objective, condition below 1e6)", len(angles)),
         ("scipy trf: largest angle between X and ours (rad)", float(max(angles))),
         ("machine", machine()),
     ]  # fmt: skip

@@ -144,7 +144,7 @@ def calibrate(
             tracker_sd=tracker_sd, estimate=estimate, options=options,
         )  # fmt: skip
     _check_values(problem)
-    return _finished(_solve_jit(_with_bound(problem, given), given, plan))
+    return _solve_jit(_with_bound(problem, given), given, plan)
 
 
 def calibrate_batch(
@@ -190,7 +190,6 @@ def calibrate_batch(
     problems = _with_bound(problems, given)
     flat = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
     result = _solve_chunks(flat, given, plan, min(chunk, flat.mask.shape[0]))
-    result = _finished(result)
     return jax.tree.map(lambda leaf: leaf.reshape((*shape, *leaf.shape[1:])), result)
 
 
@@ -272,15 +271,6 @@ def _with_bound(problem: Problem, given: _Given) -> Problem:
         return problem
     bound = jnp.broadcast_to(given.max_elevation, problem.mask.shape)
     return replace(problem, max_elevation=bound)
-
-
-def _finished(result: Calibration) -> Calibration:
-    """Wait for a result (a no-op under a transformation).
-
-    Solves in flight at once would share one thread pool; one at a time is as fast, since each uses
-    every core, and it cannot deadlock (:mod:`jaxcal._configuration`).
-    """
-    return jax.block_until_ready(result)
 
 
 @partial(jax.jit, static_argnums=2)

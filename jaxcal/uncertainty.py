@@ -20,6 +20,7 @@ from jaxcal.model.priors import AbstractPrior, InPlane
 from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.problem import Problem
 from jaxcal.solvers import arrow as arrows
+from jaxcal.solvers import dense
 from jaxcal.solvers.least_squares import linearise
 
 SINGULAR = 1e-11
@@ -109,10 +110,7 @@ def assess(
 
     weakest_sd = jnp.sqrt(variance / smallest)
     weakest = jnp.where(degenerate, design_vectors[:, 0], vectors[:, 0])
-    unit = jnp.eye(len(scale), dtype=scale.dtype)
-    inverse = jax.vmap(
-        lambda column: arrows.solve_symmetric(information, column, jnp.diagonal(arrow.shared))
-    )(unit)
+    inverse = arrows.inverse_symmetric(information, jnp.diagonal(arrow.shared))
     unknown = degenerate | (singular & jnp.logical_not(whitened))
     covariance = jnp.where(unknown, jnp.nan, variance * 0.5 * (inverse + inverse.T))
     return Uncertainty(
@@ -154,7 +152,9 @@ def _spectrum(
     information: Float[Array, "p p"], scale: Float[Array, " p"]
 ) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
     scaled = jax.lax.stop_gradient(information / (scale[:, None] * scale[None, :]))
-    return jnp.linalg.eigh(scaled)
+    # Of a positive semidefinite matrix the singular values are the eigenvalues.
+    found = dense.singular_values(scaled)
+    return found.values, found.right
 
 
 def _unseen(

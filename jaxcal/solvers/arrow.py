@@ -28,8 +28,9 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
+
+from jaxcal.solvers import dense
 
 
 class Arrow(eqx.Module):
@@ -122,12 +123,25 @@ def solve_symmetric(
     A singular matrix (an unobservable direction) is met by a ridge at the rounding level of the
     scaled system, so the step there stays finite and small, and the other directions are exact.
     """
+    scale, scaled = _ridged(matrix, diagonal)
+    return scale * dense.solve_positive(scaled, (scale * vector)[:, None])[:, 0]
+
+
+def inverse_symmetric(
+    matrix: Float[Array, "p p"], diagonal: Float[Array, " p"]
+) -> Float[Array, "p p"]:
+    """The inverse, by the same scaling and ridge as :func:`solve_symmetric`."""
+    scale, scaled = _ridged(matrix, diagonal)
+    return scale[:, None] * dense.solve_positive(scaled, jnp.diag(scale))
+
+
+def _ridged(
+    matrix: Float[Array, "p p"], diagonal: Float[Array, " p"]
+) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
     eps = jnp.finfo(matrix.dtype).eps
     scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
     scaled = matrix * scale[:, None] * scale[None, :]
-    ridge = 16 * eps * jnp.eye(len(vector), dtype=matrix.dtype)
-    factor = jnp.linalg.cholesky(scaled + ridge)
-    return scale * jsl.cho_solve((factor, True), scale * vector)
+    return scale, scaled + 16 * eps * jnp.eye(len(scale), dtype=matrix.dtype)
 
 
 def stationarity(arrow: Arrow) -> Float[Array, ""]:

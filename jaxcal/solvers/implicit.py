@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from jaxcal.model.parameters import Blocks, Parameters, retract, size
 from jaxcal.model.priors import AbstractPrior, Gaussian, covariance_shape
 from jaxcal.problem import Problem
-from jaxcal.solvers import variance
+from jaxcal.solvers import dense, variance
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -47,7 +47,7 @@ def optimum(
     Returns:
         tangent of the shared unknowns about the reference (zero in value), and the offsets.
     """
-    return jnp.zeros(size(blocks), offset.dtype), offset
+    return _no_move(blocks, reference), offset
 
 
 @optimum.defjvp
@@ -84,7 +84,7 @@ def _optimum_jvp(blocks: Blocks, primals: tuple, tangents: tuple) -> tuple:
     weight = jnp.where(resting | jnp.logical_not(seen), 0.0, 1 / jnp.where(seen, diagonal, 1.0))
     schur = matrix - (coupling * weight) @ coupling.T
     rhs = -data + coupling @ (weight * offset_data) - coupling @ resting_dot
-    tangent_dot = jnp.linalg.solve(schur, rhs)
+    tangent_dot = dense.inverse(schur) @ rhs
     offset_dot = resting_dot - weight * (offset_data + tangent_dot @ coupling)
     return (tangent, offset), (tangent_dot, offset_dot)
 
@@ -104,7 +104,7 @@ def self_tuned_optimum(
     Returns:
         tangent of the shared unknowns about the reference (zero in value), and the SDs.
     """
-    return jnp.zeros(size(blocks), sigma.dtype), sigma
+    return _no_move(blocks, reference), sigma
 
 
 @self_tuned_optimum.defjvp
@@ -132,5 +132,12 @@ def _self_tuned_jvp(blocks: Blocks, primals: tuple, tangents: tuple) -> tuple:
     _, data = jax.jvp(lambda problem: conditions(here, problem), (problem,), (problem_dot,))
     # Gradients of X come in 1/sigma^2, conditions of the SDs in units of one: balance the rows.
     scale = 1 / jnp.max(jnp.abs(matrix), axis=1)
-    moved = -jnp.linalg.solve(scale[:, None] * matrix, scale * data)
+    moved = -dense.inverse(scale[:, None] * matrix) @ (scale * data)
     return (tangent, sigma), (moved[:count], sigma * moved[count:])
+
+
+def _no_move(blocks: Blocks, reference: Parameters) -> Float[Array, " p"]:
+    # Zeros that depend on the lane: where only a custom rule's tangent is batched and its value is
+    # not, JAX (0.10.2) mixes them up in the linearisation of a scan over batches.
+    zero = jnp.where(jnp.isfinite(reference.translation[0]), 0.0, 0.0)
+    return jnp.full(size(blocks), zero.astype(reference.translation.dtype))

@@ -6,7 +6,7 @@ With r1 and r3 the lateral and axial columns of X's rotation, B_i X p_i = c of E
     R_i (u_i a1 + v_i a3 + t) + t_i - c = 0,         3 n equations, 12 unknowns,
 
 whether the pixel scales s are known or not: unknown scales are |a1| and |a3|. The 3x2 matrix
-[a1, a3] is projected to orthonormal columns by SVD (y = z cross x completes it, so no reflection
+[a1, a3] is projected to orthonormal columns (y = z cross x completes it, so no reflection
 can arise), and t and c (and unknown scales) follow from the linear system with the rotation held.
 
 The system is singular where the poses or the points (all on a line in the image) determine less
@@ -29,6 +29,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxcal.model.parameters import Blocks, Parameters
 from jaxcal.problem import Problem
+from jaxcal.solvers import dense
 
 
 class Start(eqx.Module):
@@ -65,10 +66,15 @@ def _lstsq(
     """Least squares with unit columns, by SVD; also the ratio of the extreme singular values."""
     length = jnp.linalg.norm(matrix, axis=0)
     length = jnp.where(length > 0, length, 1.0)
-    u, s, vt = jnp.linalg.svd(matrix / length, full_matrices=False)
-    cut = s > 8 * jnp.finfo(s.dtype).eps * s[0] * matrix.shape[0]
-    inverse = jnp.where(cut, 1 / jnp.where(cut, s, 1.0), 0.0)
-    return (vt.T @ (inverse * (u.T @ vector))) / length, s[-1] / s[0]
+    columns = matrix.shape[1]
+    augmented = jnp.concatenate([matrix / length, vector[:, None]], axis=1)
+    reduced = dense.triangularise(augmented, columns)
+    found = dense.singular_values(reduced[:, :columns])
+    s = found.values
+    keep = s > 8 * jnp.finfo(s.dtype).eps * s[-1] * matrix.shape[0]
+    inverse = jnp.where(keep, 1 / jnp.where(keep, s, 1.0), 0.0)
+    along = found.scaled_left.T @ reduced[:, columns]
+    return (found.right @ (inverse**2 * along)) / length, s[0] / s[-1]
 
 
 def _linear_rotation(
@@ -100,10 +106,12 @@ def _linear_rotation(
     sound = sound & (ratio > 1e3 * jnp.finfo(points.dtype).eps)
     if not estimate_scale:
         sound = sound & jnp.all((lengths > 0.5) & (lengths < 2.0))
-    u, _, vt = jnp.linalg.svd(jnp.where(sound, unit, jnp.eye(3, 2, dtype=unit.dtype)),
-                              full_matrices=False)  # fmt: skip
-    orthonormal = u @ vt
-    lateral, axial = orthonormal[:, 0], orthonormal[:, 1]
+    # The nearest orthonormal pair to two unit vectors a, b has their sum and their difference
+    # (orthogonal to each other) for its diagonals.
+    a, b = jnp.where(sound, unit, jnp.eye(3, 2, dtype=unit.dtype)).T
+    plus, minus = a + b, a - b
+    plus, minus = plus / jnp.linalg.norm(plus), minus / jnp.linalg.norm(minus)
+    lateral, axial = (plus + minus) / jnp.sqrt(2.0), (plus - minus) / jnp.sqrt(2.0)
     return jnp.stack([lateral, jnp.cross(axial, lateral), axial], axis=1), sound
 
 

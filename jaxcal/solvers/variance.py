@@ -133,10 +133,7 @@ def update(
     prior = Gaussian(sigma, covariance_shape(problem))
     none = jnp.zeros(0, problem.mask.dtype)
     arrow, jacobian, residual = linearise(parameters, none, prior, problem, blocks)
-    # Solving for all rows at once gives every leverage; p x p, so the inverse is no dearer.
-    inverse = jax.vmap(
-        lambda column: arrows.solve_symmetric(arrow.shared, column, jnp.diagonal(arrow.shared))
-    )(jnp.eye(arrow.shared.shape[0], dtype=residual.dtype))
+    inverse = arrows.inverse_symmetric(arrow.shared, jnp.diagonal(arrow.shared))
     leverage = jnp.einsum("anm,ab,bnm->m", jacobian, inverse, jacobian)
     count = jnp.sum(problem.mask)
     freedom = jnp.maximum(count - leverage, 0.05 * count)

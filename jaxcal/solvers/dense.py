@@ -1,0 +1,184 @@
+"""Small dense linear algebra in plain array operations, for matrices of a dozen rows in a batch.
+
+XLA hands ``jnp.linalg`` to LAPACK on the CPU, one small call a lane, and spreads the lanes of a
+batch over its thread pool while a thread of that same pool waits for them. Two such calls that do
+not depend on each other can then wait for each other for ever: with two cores that stopped whole
+studies (jaxlib 0.10.2). These loops of array operations cannot; they also vectorise over the batch
+and run unchanged on a GPU, where LAPACK is not.
+
+References: Golub and Van Loan, Matrix Computations, 4th ed., 3.4, 5.2, 8.6; Brent and Luk 1985.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+MAX_SWEEPS = 30
+
+
+def solve_positive(matrix: Float[Array, "p p"], rhs: Float[Array, "p k"]) -> Float[Array, "p k"]:
+    """Solve a symmetric positive definite system by Gauss-Jordan elimination.
+
+    Args:
+        matrix: scaled to a diagonal of order one.
+        rhs: right-hand sides, one a column.
+
+    Returns:
+        The solutions; NaN where the matrix is not positive definite.
+    """
+    size = matrix.shape[0]
+    rows = jnp.arange(size)
+
+    def eliminate(k: Array, work: Float[Array, "p q"]) -> Float[Array, "p q"]:
+        here = (rows == k).astype(work.dtype)
+        column, row = _column(work, k), here @ work
+        pivot = column @ here
+        # Elimination needs no pivoting here, and a pivot that is not positive tells all.
+        row = row / jnp.where(pivot > 0, pivot, jnp.nan)
+        return work - (column - here)[:, None] * row
+
+    work = jnp.concatenate([matrix, rhs], axis=1)
+    return jax.lax.fori_loop(0, size, eliminate, work)[:, size:]
+
+
+def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
+    """Inverse of a square matrix by Gauss-Jordan elimination with partial pivoting.
+
+    An inverse and not a solution, so that a product with it stays linear in the right-hand side for
+    reverse-mode differentiation.
+
+    Args:
+        matrix: scaled to rows of order one.
+
+    Returns:
+        The inverse; Inf or NaN where the matrix is singular.
+    """
+    size = matrix.shape[0]
+    rows = jnp.arange(size)
+
+    def eliminate(k: Array, state: tuple) -> tuple:
+        work, unused, order = state
+        column = _column(work, k)
+        chosen = rows == jnp.argmax(jnp.where(unused, jnp.abs(column), -1.0))
+        here = chosen.astype(work.dtype)
+        row = (here @ work) / (column @ here)
+        order = jnp.where(rows[:, None] == k, here, order)
+        return work - (column - here)[:, None] * row, unused & ~chosen, order
+
+    eye = jnp.eye(size, dtype=matrix.dtype)
+    start = (jnp.concatenate([matrix, eye], axis=1), rows >= 0, jnp.zeros_like(matrix))
+    work, _, order = jax.lax.fori_loop(0, size, eliminate, start)
+    return order @ work[:, size:]
+
+
+def triangularise(matrix: Float[Array, "m q"], columns: int) -> Float[Array, "r q"]:
+    """Householder's R of the first columns, applied to all (so Q'b for columns that follow).
+
+    Args:
+        matrix: [A, b], m >= columns.
+        columns: of A.
+
+    Returns:
+        The first ``columns`` rows of Q'[A, b].
+    """
+    rows = jnp.arange(matrix.shape[0])
+
+    def reflect(k: Array, work: Float[Array, "m q"]) -> Float[Array, "m q"]:
+        column = jnp.where(rows >= k, _column(work, k), 0.0)
+        head = jnp.sum(jnp.where(rows == k, column, 0.0))
+        length = jnp.sqrt(jnp.sum(column**2))
+        mirror = column + jnp.where(rows == k, jnp.where(head < 0, -length, length), 0.0)
+        square = jnp.sum(mirror**2)
+        factor = jnp.where(square > 0, 2 / jnp.where(square > 0, square, 1.0), 0.0)
+        return work - factor * mirror[:, None] * (mirror @ work)
+
+    return jax.lax.fori_loop(0, columns, reflect, matrix)[:columns]
+
+
+def _column(matrix: Float[Array, "m q"], k: Array) -> Float[Array, " m"]:
+    # A masked sum: a gather of one column a lane is many times slower.
+    return jnp.sum(jnp.where(jnp.arange(matrix.shape[1]) == k, matrix, 0.0), axis=1)
+
+
+class SingularValues(eqx.Module):
+    """A = U diag(values) V', values ascending.
+
+    Attributes:
+        scaled_left: (m, p) U diag(values).
+        values: (p,) singular values.
+        right: (p, p) V.
+    """
+
+    scaled_left: Float[Array, "m p"]
+    values: Float[Array, " p"]
+    right: Float[Array, "p p"]
+
+
+def singular_values(matrix: Float[Array, "m p"]) -> SingularValues:
+    """Singular value decomposition by one-sided Jacobi rotations.
+
+    Of a symmetric positive semidefinite matrix this is the eigenvalue decomposition. Not
+    differentiable in reverse mode.
+    """
+    columns = matrix.shape[1]
+    even = columns + columns % 2
+    work = jnp.pad(matrix, ((0, 0), (0, even - columns)))
+    together = jnp.concatenate([work, jnp.eye(even, dtype=matrix.dtype)])
+    height = matrix.shape[0]
+    order = _next_pairs(even)
+    tolerance = 4 * jnp.finfo(matrix.dtype).eps
+
+    def one_round(_: Array, state: tuple) -> tuple:
+        together, largest = state
+        pairs = together.reshape(-1, even // 2, 2)
+        first, second = pairs[..., 0], pairs[..., 1]
+        a, b = jnp.sum(first[:height] ** 2, axis=0), jnp.sum(second[:height] ** 2, axis=0)
+        mixed = jnp.sum(first[:height] * second[:height], axis=0)
+        length = jnp.sqrt(a) * jnp.sqrt(b)
+        cosine_between = jnp.abs(mixed) / jnp.where(length > 0, length, 1.0)
+        turn = cosine_between > tolerance
+        zeta = (b - a) / jnp.where(turn, 2 * mixed, 1.0)
+        tangent = jnp.where(zeta < 0, -1.0, 1.0) / (jnp.abs(zeta) + jnp.hypot(1.0, zeta))
+        tangent = jnp.where(turn, tangent, 0.0)
+        cosine = 1 / jnp.sqrt(1 + tangent**2)
+        sine = cosine * tangent
+        turned = jnp.stack([cosine * first - sine * second, sine * first + cosine * second], -1)
+        together = turned.reshape(together.shape)[:, order]
+        return together, jnp.maximum(largest, jnp.max(cosine_between))
+
+    def unfinished(state: tuple) -> Bool[Array, ""]:
+        _, largest, sweeps = state
+        return (largest > tolerance) & (sweeps < MAX_SWEEPS)
+
+    def sweep(state: tuple) -> tuple:
+        together, _, sweeps = state
+        none = jnp.zeros((), matrix.dtype)
+        together, largest = jax.lax.fori_loop(0, even - 1, one_round, (together, none))
+        return together, largest, sweeps + 1
+
+    start = (together, jnp.ones((), matrix.dtype), jnp.zeros((), jnp.int32))
+    together, _, _ = jax.lax.while_loop(unfinished, sweep, start)
+    # After whole sweeps every column is where it was, so the padding is the last one again.
+    together = together[:, :columns]
+    values = jnp.sqrt(jnp.sum(together[:height] ** 2, axis=0))
+    ascending = jnp.argsort(values)
+    together = together[:, ascending]
+    return SingularValues(together[:height], values[ascending], together[height : height + columns])
+
+
+def _next_pairs(count: int) -> np.ndarray:
+    """The round-robin permutation: pairs (0, 1), (2, 3), ... meet all others in count - 1 rounds.
+
+    Two rows of a tournament table: the first player stays, the others move round by one seat.
+    """
+    seats = np.arange(count).reshape(-1, 2)
+    top, bottom = seats[:, 0], seats[:, 1]
+    if count == 2:
+        return np.arange(2)
+    new_top = np.concatenate([top[:1], bottom[:1], top[1:-1]])
+    new_bottom = np.concatenate([bottom[1:], top[-1:]])
+    return np.stack([new_top, new_bottom], axis=1).ravel()

@@ -1,0 +1,80 @@
+"""The small linear algebra of the solvers against numpy's LAPACK."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import problem
+
+import jaxcal
+from jaxcal.solvers import dense
+
+RANDOM = np.random.default_rng(5)
+
+
+def test_positive_systems_and_a_lane_that_is_not():
+    root = RANDOM.normal(size=(6, 9, 9))
+    matrix = root @ root.swapaxes(1, 2) + 0.1 * np.eye(9)
+    matrix[3] -= 5 * np.eye(9)
+    rhs = RANDOM.normal(size=(6, 9, 2))
+    got = np.asarray(jax.jit(jax.vmap(dense.solve_positive))(matrix, rhs))
+    assert np.isnan(got[3]).all()
+    good = [0, 1, 2, 4, 5]
+    np.testing.assert_allclose(got[good], np.linalg.solve(matrix[good], rhs[good]), rtol=1e-9)
+
+
+def test_inverse_needs_pivots_and_has_a_derivative():
+    matrix = RANDOM.normal(size=(5, 12, 12))
+    matrix[:, 0, 0] = 0.0
+    matrix[1] = np.eye(12)[::-1]
+    got = jax.jit(jax.vmap(dense.inverse))(jnp.asarray(matrix))
+    wanted = np.linalg.inv(matrix)
+    np.testing.assert_allclose(got, wanted, atol=1e-11 * np.abs(wanted).max())
+    gradient = jax.grad(lambda a: jnp.sum(dense.inverse(a)))(jnp.asarray(matrix[0]))
+    by_hand = -np.outer(wanted[0].sum(axis=0), wanted[0].sum(axis=1))
+    np.testing.assert_allclose(gradient, by_hand, atol=1e-9 * np.abs(by_hand).max())
+
+
+@pytest.mark.parametrize("columns", [2, 9, 12])
+def test_singular_values(columns: int):
+    matrix = RANDOM.normal(size=(3, 40, columns))
+    matrix[1, :, -1] = matrix[1, :, 0]  # singular
+    matrix[2] *= np.logspace(0, -10, columns)
+    got = jax.jit(jax.vmap(dense.singular_values))(jnp.asarray(matrix))
+    wanted = np.linalg.svd(matrix, compute_uv=False)[:, ::-1]
+    np.testing.assert_allclose(got.values, wanted, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(got.scaled_left, matrix @ got.right, atol=1e-13)
+    eye = np.broadcast_to(np.eye(columns), (3, columns, columns))
+    np.testing.assert_allclose(got.right.swapaxes(1, 2) @ got.right, eye, atol=1e-13)
+
+
+def test_singular_values_end_on_nan():
+    assert np.isnan(dense.singular_values(jnp.full((4, 3), jnp.nan)).values).all()
+
+
+def test_triangularised_least_squares():
+    matrix, rhs = RANDOM.normal(size=(50, 12)), RANDOM.normal(size=(50, 1))
+    reduced = np.asarray(dense.triangularise(jnp.asarray(np.hstack([matrix, rhs])), 12))
+    assert reduced.shape == (12, 13)
+    np.testing.assert_allclose(np.tril(reduced[:, :12], -1), 0, atol=1e-13)
+    wanted = np.linalg.lstsq(matrix, rhs, rcond=None)[0]
+    np.testing.assert_allclose(np.linalg.solve(reduced[:, :12], reduced[:, 12:]), wanted)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("conventional", "auto"), ("alternating", "auto"), ("joint", "auto"), ("joint", "bounded")],
+)
+def test_no_solver_calls_lapack(arguments: tuple):
+    """Batched LAPACK calls can deadlock XLA's thread pool; see jaxcal.solvers.dense."""
+    method, prior = arguments
+
+    def image_to_probe(problem: jaxcal.Problem):
+        return jaxcal.calibrate_batch(problem, method, prior).image_to_probe
+
+    batch = jaxcal.stack([problem(0, images=8), problem(1, images=8)])
+    program = jax.jit(image_to_probe).lower(batch).as_text()
+    assert "while" in program
+    assert "lapack" not in program
+    gradient = jax.jit(jax.grad(lambda p: jnp.sum(image_to_probe(p) ** 2)))
+    assert "lapack" not in gradient.lower(batch).as_text()
