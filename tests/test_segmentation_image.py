@@ -138,6 +138,11 @@ def test_two_equal_targets_are_ambiguous_unless_one_is_expected():
         located = localise(frame, near=place + 3.0, within_px=15.0)
         assert located.found[0]
         np.testing.assert_allclose(located.position[0], place, atol=0.3)
+    # On the flank of a target, or between the two, there is none.
+    for place in ((46.0, 40.6), (67.0, 48.0)):
+        located = localise(frame, near=place, within_px=4.0)
+        assert not located.found[0]
+        assert located.reason[0]
     left, top = 70, 20
     located = localise(frame, region=(left, top, 60, 70))
     np.testing.assert_allclose(located.position[0], places[1], atol=0.3)
@@ -182,11 +187,14 @@ def test_frames_without_a_target_say_why():
     edge = display(speckle(rng, shape) + 60 * ridge((0.0, 32.0), shape=shape))
     holed = display(speckle(rng, shape) + 60 * ridge((32.0, 32.0), shape=shape)).astype(float)
     holed[3, 4] = np.nan
-    frames = np.stack([np.zeros(shape), np.full(shape, 7.0), holed, hot, bright, edge])
+    outline = 255.0 * (ridge((32.0, 32.0), shape=shape) > 0.3)
+    frames = np.stack([np.zeros(shape), np.full(shape, 7.0), holed, hot, bright, edge, outline])
     located = localise(frames)
     assert not located.found.any()
     for reason, word in zip(
-        located.reason, ("constant", "constant", "NaN", "single", "", "border"), strict=True
+        located.reason,
+        ("constant", "constant", "NaN", "single", "", "border", "saturated"),
+        strict=True,
     ):
         assert reason
         assert word in reason

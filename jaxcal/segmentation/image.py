@@ -342,4 +342,7 @@ def _localise_one(
         raise NotFoundError("the bright spot is cut off by the border", contrast, margin)
     if extent[0] > LARGEST_SPOT * high or extent[1] > LARGEST_SPOT * wide:
         raise NotFoundError("the bright area is a structure, not a spot", contrast, margin)
-    return fit_spot(envelope, saturated, shape, extent, speckle, target, contrast, margin)
+    spot = fit_spot(envelope, saturated, shape, extent, speckle, target, contrast, margin)
+    if expected is not None and np.linalg.norm(spot.position - expected) > radius:
+        raise NotFoundError("the spot lies farther from the expected place", contrast, margin)
+    return spot

@@ -164,7 +164,11 @@ def fit_spot(
         one = [np.log(top / np.sqrt(2)), np.log(across), np.log(along)]
         first = [*start, np.log(speckle.sigma), *one, lean, *one, -lean]
     first = np.array(first)
+    if np.sum(window[use] > 0.1 * top) < len(first):
+        raise NotFoundError("the display is saturated: only the spot's outline is left", contrast,
+                            margin)  # fmt: skip
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def model(unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         du, dv = grid_u - unknowns[0], grid_v - unknowns[1]
         floor = np.exp(2 * unknowns[2])
@@ -202,17 +206,22 @@ def fit_spot(
         except (ValueError, np.linalg.LinAlgError):
             raise NotFoundError("no spot could be fitted", contrast, margin) from None
     unknowns = fit.x
-    value, _ = model(unknowns)
     moved = np.abs(unknowns[:2] - start)
-    width = _width(value, unknowns, grid_u, grid_v)
     if not np.isfinite(unknowns).all():
         raise NotFoundError("no spot could be fitted", contrast, margin)
     if (moved > 1 + np.array([extent[1], extent[0]])).any():
         raise NotFoundError("the fit left the bright spot", contrast, margin)
 
+    value, _ = model(unknowns)
+    if not np.isfinite(value).all():
+        raise NotFoundError("no spot could be fitted", contrast, margin)
+    width = _width(unknowns)
     misfit = float(np.mean((window - value)[use] ** 2))
     weights = np.zeros((2, *window.shape))
-    inverse = np.linalg.pinv(slope(unknowns), rcond=1e-9)[:2]
+    jacobian = slope(unknowns)
+    inverse = np.linalg.pinv(jacobian, rcond=1e-9)[:2]
+    if np.abs(inverse @ jacobian - np.eye(2, len(first))).max() > 1e-3:
+        raise NotFoundError("the position is not determined", contrast, margin)
     weights[:, use] = inverse[:, : use.sum()] / top
     covariance = _propagate(weights, value, misfit, speckle, (width[1], width[0]), v, u)
     if not np.isfinite(covariance).all():
@@ -238,9 +247,7 @@ def _steps(first: np.ndarray, extent: tuple[float, float]) -> np.ndarray:
     return np.array([extent[1], extent[0], 1.0] + components * [0.5, 0.3, 0.3, lean])
 
 
-def _width(
-    value: np.ndarray, unknowns: np.ndarray, grid_u: np.ndarray, grid_v: np.ndarray
-) -> Float[np.ndarray, 2]:
+def _width(unknowns: np.ndarray) -> Float[np.ndarray, 2]:
     """SDs along u and v of the brightest component of the fitted spot, px."""
     components = unknowns[3:].reshape(-1, 4)
     _, log_a, log_b, c = components[np.argmax(components[:, 0])]
