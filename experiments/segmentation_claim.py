@@ -237,9 +237,6 @@ def verdict(mean: float, half: float) -> str:
 
 def main() -> None:
     quick = arguments(__doc__ or "").quick
-    # With jaxlib 0.10.2 on two cores, programs dispatched asynchronously can starve the thread pool
-    # that their matrix factorisations wait for.
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
     trials = 20 if quick else 400
     seen = {}
     for contrast in CONTRASTS_DB:
