@@ -1,0 +1,166 @@
+"""From a displayed frame back to the echo's envelope, and what its speckle says of the noise.
+
+A log-compressed frame is a + k ln(envelope), and fully developed speckle says what k is: the
+logarithm of a Rayleigh variable has quantiles ln sigma + ln(-2 ln(1 - p)) / 2 [1, 2]. A scale k
+that is off raises the envelope to a power, which makes a spot narrower or wider but does not move
+it.
+
+For point spreads of Gaussian shape with SD s of the envelope, the in-phase part of the speckle has
+correlation exp(-k^2 / 4 s^2) at lag k, and the envelope about the square of that [3].
+
+References:
+    [1] R. F. Wagner et al., Statistics of speckle in ultrasound B-scans, 1983.
+    [2] R. W. Prager et al., Decompression and speckle detection for ultrasound images, 2003.
+    [3] J. W. Goodman, Speckle Phenomena in Optics, 2007, section 4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+Compression = Literal["log", "none"]
+
+SMALLEST_REGION = 16
+"""Least rows and columns to search: with fewer there is no background to compare with."""
+USUAL_DECIBELS = 60.0
+"""Range of a log-compressed frame where its background is too black to measure it."""
+HALF_MAXIMUM = 2 * np.log(2.0)
+"""Squared half width at half maximum of a Gaussian over its variance; also the squared median of a
+Rayleigh variable over sigma^2."""
+
+_SPECKLE_SAMPLE = 512
+"""Rows and columns of background that suffice for its statistics."""
+
+
+class NotFoundError(Exception):
+    """Why a frame has no credible target, with what was measured of it."""
+
+    def __init__(self, reason: str, contrast_db: float = np.nan, margin_db: float = np.nan):
+        super().__init__(reason)
+        self.contrast_db, self.margin_db = contrast_db, margin_db
+
+
+@dataclass(frozen=True)
+class Speckle:
+    """The background: SD of the in-phase part, and SDs (px) of a speckle along v and u."""
+
+    sigma: float
+    size: tuple[float, float]
+
+
+def envelope_of(
+    values: np.ndarray, dtype: np.dtype, compression: Compression, decibels_per_level: float | None
+) -> Float[np.ndarray, "rows columns"]:
+    """The frame on a linear scale, largest value 1.
+
+    Args:
+        values: (rows, columns) of the region, finite and not constant.
+        dtype: what the frame was stored as: 8 bits have a known range.
+        compression: ``log`` or ``none``.
+        decibels_per_level: dB for one unit, None to measure it.
+
+    Raises:
+        NotFoundError: an uncompressed frame with negative values is no envelope.
+    """
+    floor = float(values.min())
+    if compression == "none":
+        if floor < 0:
+            raise NotFoundError("the envelope has negative values")
+        return values / values.max()
+    full = 255.0 if dtype == np.uint8 else float(np.ptp(values))
+    nepers = np.log(10.0) / 20.0
+    if decibels_per_level is not None:
+        per_level = nepers * decibels_per_level
+    else:
+        # Two quantiles that a black floor does not reach.
+        per_level, speckle = 0.0, _without_brightest(values)
+        for low, high in ((0.5, 0.9), (0.8, 0.96)):
+            first, second = np.quantile(speckle, (low, high))
+            if first > floor and second > first:
+                expected = 0.5 * np.log(np.log1p(-high) / np.log1p(-low))
+                per_level = expected / (second - first)
+                break
+        usual = nepers * USUAL_DECIBELS / full
+        if per_level == 0.0:
+            per_level = usual
+        per_level = float(np.clip(per_level, nepers * 20.0 / full, nepers * 150.0 / full))
+    return np.exp(per_level * (values - values.max()))
+
+
+def _without_brightest(values: np.ndarray) -> Float[np.ndarray, " pixels"]:
+    """All pixels but those near the brightest: a target would widen the background's quantiles."""
+    peak = np.unravel_index(np.argmax(values), values.shape)
+    near = [
+        np.abs(np.arange(size) - k) <= size // 8 for k, size in zip(peak, values.shape, strict=True)
+    ]
+    return values[~(near[0][:, None] & near[1][None])]
+
+
+def background(envelope: np.ndarray, peak: tuple[int, int], keep_out: list[int]) -> Speckle:
+    """Speckle away from the target: the SD of its in-phase part, and its size."""
+    away = np.ones(envelope.shape, bool)
+    rows, columns = (slice(max(k - m, 0), k + m + 1) for k, m in zip(peak, keep_out, strict=True))
+    away[rows, columns] = False
+    if away.sum() < SMALLEST_REGION**2 / 2:
+        raise NotFoundError("the bright area fills the region: there is no background")
+    level = float(np.median(envelope[away]))
+    # The median of a Rayleigh variable is sqrt(2 ln 2) sigma; black pixels have none, and the
+    # least that can be told of them is a step of the display.
+    sigma = level / np.sqrt(HALF_MAXIMUM)
+    if sigma <= 0:
+        sigma = max(float(np.sqrt(0.5 * np.mean(envelope[away] ** 2))), 1e-3)
+    # Bright structures are not speckle: their shape would pass for its size.
+    centred = np.where(away, np.minimum(envelope, 4 * sigma), 0.0)
+    centred = np.where(away, centred - centred[away].mean(), 0.0)
+    centred = centred[:_SPECKLE_SAMPLE, :_SPECKLE_SAMPLE]
+    weight = away[:_SPECKLE_SAMPLE, :_SPECKLE_SAMPLE].astype(float)
+    return Speckle(sigma, (_speckle_size(centred, weight), _speckle_size(centred.T, weight.T)))
+
+
+def _speckle_size(centred: np.ndarray, weight: np.ndarray) -> float:
+    """SD s of a speckle along axis 0, px: the envelope's correlation at lag k is exp(-k^2 / 2 s^2).
+
+    The lag at which the correlation falls to a half is used, which neither white noise of the
+    electronics nor slow shading moves by much; zero for uncorrelated pixels.
+    """
+    variance = float(np.sum(centred**2) / max(np.sum(weight), 1.0))
+    if variance <= 0:
+        return 0.0
+    before = 1.0
+    for lag in range(1, max(2, len(centred) // 4)):
+        pairs = np.sum(weight[lag:] * weight[:-lag])
+        now = float(np.sum(centred[lag:] * centred[:-lag]) / max(pairs, 1.0)) / variance
+        if now < 0.5:
+            # At such lags a Gaussian's logarithm is far better interpolated in the squared lag.
+            if lag == 1:
+                return 0.0 if now < 0.02 else float(np.sqrt(-0.5 / np.log(now)))
+            a, b = np.log(before), np.log(max(now, 0.02))
+            square = (lag - 1) ** 2 + (2 * lag - 1) * (a - np.log(0.5)) / (a - b)
+            return float(np.sqrt(square / HALF_MAXIMUM))
+        before = now
+    return len(centred) / 4
+
+
+def spread(
+    weights: np.ndarray, size: tuple[float, float], v: np.ndarray, u: np.ndarray
+) -> Float[np.ndarray, "2 2"]:
+    """Covariance of weighted sums of the in-phase part, whose speckles have these SDs, px."""
+    along, across = (_coherence(axis, sd) for axis, sd in zip((v, u), size, strict=True))
+    return np.einsum("aij,bij->ab", weights, along @ weights @ across)
+
+
+def _coherence(axis: np.ndarray, size: float) -> np.ndarray:
+    """Correlation of the in-phase part between pixels along one axis."""
+    lag = axis[:, None] - axis[None]
+    if size <= 0:
+        return (lag == 0).astype(float)
+    return np.exp(-(lag**2) / (4 * size**2))
+
+
+def decibel(ratio: float) -> float:
+    """An amplitude ratio in dB."""
+    return float(20 * np.log10(max(ratio, 1e-12)))
