@@ -372,7 +372,9 @@ def test_a_name_cannot_break_the_one_line(capfd):
 
 
 def test_simulate_into_no_folder(capfd, tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxcal.simulation.simulate_recording", lambda *_: jaxcal.load(tmp_path))
+    monkeypatch.setattr(
+        "jaxcal.simulation.simulate_recording", lambda *_, **__: jaxcal.load(tmp_path)
+    )
     assert "is a directory" in refused(capfd, "simulate", tmp_path / "no" / "x.h5")
 
 
