@@ -104,7 +104,9 @@ def assess(
     singular = values[0] < threshold * values[-1]
 
     none = jnp.zeros(0, problem.mask.dtype)
-    design, _, _ = linearise(parameters, none, InPlane(), problem, blocks)
+    channels = isinstance(prior, ChannelGaussian)
+    unweighted = ChannelGaussian(jnp.ones(2, none.dtype)) if channels else InPlane()
+    design, _, _ = linearise(parameters, none, unweighted, problem, blocks)
     design_values, design_vectors = _spectrum(design.shared, scale)
     degenerate = design_values[0] < threshold * design_values[-1]
 
@@ -122,14 +124,7 @@ def assess(
         condition=values[-1] / smallest,
         weakest=weakest,
         weakest_sd=jnp.where(unknown, jnp.nan, weakest_sd),
-        prior_direction=_unseen(
-            parameters,
-            problem,
-            blocks,
-            scale,
-            threshold,
-            channels=isinstance(prior, ChannelGaussian),
-        )
+        prior_direction=_unseen(parameters, problem, blocks, scale, threshold, channels=channels)
         if uses_prior
         else jnp.zeros_like(scale),
         degenerate=degenerate,

@@ -143,6 +143,22 @@ def test_simulate_writes_what_load_reads(simulated):
     assert 1 < np.abs(recording.truth.elevation).max() <= 2
 
 
+def test_curvilinear_times_of_flight_become_points(jaxcal_process, tmp_path):
+    raw, points = tmp_path / "raw.h5", tmp_path / "points.h5"
+    options = ["--probe", "curvilinear", "--clock-mhz", 20, "--noise", 0.2]
+    done = jaxcal_process("simulate", raw, *options)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "50 images of times of flight" in done.stdout
+    ticks = jaxcal.load(raw).calibration.measurements * 20e6
+    np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-6)
+    done = jaxcal_process("segment", raw, "--out", points, "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["images_used"] == 50
+    with h5py.File(points) as file:
+        assert file["segmentation/out_of_plane"].shape == (50, 3)
+    assert jaxcal.load(points).probe.kind == "curvilinear"
+
+
 def test_simulate_defaults_are_the_protocols():
     defaults = {option.name: option.default for option in commands.commands["simulate"].params}
     protocol = Protocol()
@@ -356,7 +372,9 @@ def test_a_name_cannot_break_the_one_line(capfd):
 
 
 def test_simulate_into_no_folder(capfd, tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxcal.simulation.simulate_recording", lambda *_: jaxcal.load(tmp_path))
+    monkeypatch.setattr(
+        "jaxcal.simulation.simulate_recording", lambda *_, **__: jaxcal.load(tmp_path)
+    )
     assert "is a directory" in refused(capfd, "simulate", tmp_path / "no" / "x.h5")
 
 

@@ -363,8 +363,8 @@ def test_shortest_time_with_gaps():
         [np.nan, np.nan, np.nan, np.nan, 7.0],
         [3.0, 4.0, 5.0, 6.0, 7.0],
     ])  # fmt: skip
-    for interpolate in (False, True):
-        line, least = shortest(distances, interpolate=interpolate)
+    for pitch in (None, 1.0):
+        line, least = shortest(distances, pitch_mm=pitch)
         np.testing.assert_array_equal(line, [2, np.nan, 4, 0])
         np.testing.assert_array_equal(least, [4.0, np.nan, 7.0, 3.0])
 

@@ -11,13 +11,15 @@ from functools import lru_cache
 from typing import Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxcal.errors import InputError
+from jaxcal.geometry import AnyArray
 from jaxcal.probe import CurvilinearProbe, Probe
 from jaxcal.recording import MINIMUM_IMAGES, Images, Recording, make_images
-from jaxcal.segmentation.time_of_flight import fit_in_plane, fit_out_of_plane, shortest
+from jaxcal.segmentation.time_of_flight import Fit, fit_in_plane, fit_out_of_plane, shortest
 
 Method = Literal["least-squares", "shortest"]
 Scale = Literal["frame", "pooled"]
@@ -273,7 +275,7 @@ def check_times_of_flight(
 def _shortest(
     distances: np.ndarray, probe: Probe, interpolate: bool
 ) -> tuple[np.ndarray, None, np.ndarray, np.ndarray]:
-    line, least = shortest(distances, interpolate=interpolate)
+    line, least = shortest(distances, pitch_mm=probe.pitch_mm if interpolate else None)
     points = probe.image_to_cartesian(np.asarray(line), np.asarray(least))
     return points, None, np.full(len(points), np.nan), np.zeros(len(points), int)
 
@@ -335,12 +337,18 @@ def compiled_fit(curved: bool, robust: bool):
         "xla_cpu_enable_fast_math": True,
         "xla_cpu_fast_math_honor_nans": True,
         "xla_cpu_fast_math_honor_infs": True,
+        "xla_cpu_prefer_vector_width": 512,
     }
-    fit = fit_out_of_plane if curved else fit_in_plane
-    return jax.jit(
-        lambda distances, positions: fit(distances, positions, robust=robust),
-        compiler_options=flags if jax.default_backend() == "cpu" else None,
-    )
+
+    def fit(distances: AnyArray, positions: AnyArray) -> Fit | tuple[Fit, Fit]:
+        if curved:
+            return fit_out_of_plane(distances, positions, robust=robust)
+        # What the compiler knows to be zero it does not compute with.
+        zero = jnp.zeros_like(positions[:, 0])
+        line = jnp.stack([jnp.asarray(positions)[:, 0], zero, zero], axis=-1)
+        return fit_in_plane(distances, line, robust=robust)
+
+    return jax.jit(fit, compiler_options=flags if jax.default_backend() == "cpu" else None)
 
 
 def _warnings(used, failed, missing, rejected, elements: int) -> tuple[str, ...]:

@@ -119,16 +119,17 @@ def fit_distances(
 
 
 def shortest(
-    distances: Float[AnyArray, "*batch elements"], *, interpolate: bool = False
+    distances: Float[AnyArray, "*batch elements"], *, pitch_mm: float | None = None
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
     """The element that answered first, and its distance (Eqs. 2 and 3).
 
     Args:
         distances: mm; NaN where an element did not answer.
-        interpolate: place the minimum between elements, by the parabola through the squared
-            distances of the first element and its neighbours (for a linear array the squares *are*
-            a parabola, Eq. 5). Noise of more than about pitch^2 / range spoils it; it is then
-            kept within half an element.
+        pitch_mm: where given, the minimum is placed between elements, by the parabola through the
+            squared distances of the first element and its neighbours (for a linear array the
+            squares *are* a parabola, Eq. 5), kept within half an element. Noise of more than about
+            pitch^2 / range spoils it; it is not done where a neighbour is farther by more than the
+            pitch, which no echo of the same target can be.
 
     Returns:
         the element's number (whole unless interpolated) and the distance, mm; NaN for a frame
@@ -141,13 +142,14 @@ def shortest(
     answered = jnp.isfinite(least)
     line = jnp.where(answered, first.astype(distances.dtype), jnp.nan)
     least = jnp.where(answered, least, jnp.nan)
-    if not interpolate:
+    if pitch_mm is None:
         return line, least
     inner = jnp.clip(first, 1, distances.shape[-1] - 2)
     near = inner[..., None] + jnp.arange(-1, 2)
-    before, middle, after = jnp.moveaxis(jnp.take_along_axis(distances, near, -1) ** 2, -1, 0)
+    three = jnp.take_along_axis(distances, near, -1)
+    before, middle, after = jnp.moveaxis(three**2, -1, 0)
     slope, curvature = 0.5 * (after - before), after - 2 * middle + before
-    usable = (first == inner) & (curvature > 0) & jnp.isfinite(curvature)
+    usable = (first == inner) & (curvature > 0) & (jnp.max(three, -1) - least <= pitch_mm)
     shift = jnp.clip(jnp.where(usable, -slope / curvature, 0.0), -0.5, 0.5)
     square = middle + shift * (slope + 0.5 * shift * curvature)
     return line + shift, jnp.where(usable, jnp.sqrt(jnp.maximum(square, 0.0)), least)
