@@ -1,0 +1,175 @@
+"""Solves on the elements' distances: curved arrays, sound speed, delay, agreement with points."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import angle
+
+import jaxcal
+from jaxcal import Protocol
+from jaxcal.cli.main import main
+from jaxcal.errors import InputError
+from jaxcal.io.hdf5 import save
+from jaxcal.probe import CurvilinearProbe, LinearProbe
+
+CURVED = CurvilinearProbe(elements=32, pitch_mm=2.0, radius_mm=60.0)
+STRAIGHT = LinearProbe(elements=32, pitch_mm=1.8)
+
+
+def recording(probe, seed: int = 1, noise: float = 0.1, **protocol) -> jaxcal.Recording:
+    return jaxcal.simulate_recording(
+        Protocol(images=20, test_images=20, elevation_mm=2.0, noise_mm=noise, probe=probe, raw=True,
+                 **protocol),
+        seed,
+    )  # fmt: skip
+
+
+def precision(result: jaxcal.Calibration, data: jaxcal.Recording) -> float:
+    assert data.test is not None
+    return float(
+        jaxcal.reconstruction_precision(
+            result.image_to_probe, data.test.poses, data.test.measurements
+        )
+    )
+
+
+def test_a_curved_array_gives_the_offsets_with_their_signs():
+    data = recording(CURVED, noise=0.05)
+    assert data.truth is not None
+    joint, conventional = jaxcal.calibrate(data), jaxcal.calibrate(data, "conventional")
+    assert joint.status == "converged"
+    assert joint.data == "channels"
+    assert precision(joint, data) < 0.5 * precision(conventional, data)
+    error = np.asarray(joint.elevation) - data.truth.elevation
+    assert np.sqrt(np.mean((error / np.asarray(joint.elevation_sd)) ** 2)) < 2
+    visible = np.abs(data.truth.elevation) > 0.3
+    assert (np.sign(joint.elevation) == np.sign(data.truth.elevation))[visible].all()
+    assert joint.channel_sigma == pytest.approx(0.05, rel=0.1)
+
+
+def test_on_a_straight_array_points_with_covariances_say_the_same():
+    noise, offset = 0.05, 1.2
+    data = recording(STRAIGHT, noise=noise)
+    segmented, _ = jaxcal.segment_recording(data, scale="pooled", robust=False)
+    problem = jaxcal.Problem.from_recording(data)
+    covariance = jnp.asarray(segmented.calibration.covariance)
+    problem = replace(
+        problem, measurements=jnp.asarray(segmented.calibration.measurements), covariance=covariance
+    )
+    found = jnp.median(jnp.asarray(jaxcal.segment(data, robust=False).noise_mm))
+    spread = jnp.sqrt(jnp.mean(jnp.diagonal(covariance, axis1=1, axis2=2), axis=0))
+    points = jaxcal.calibrate(problem, sigma=jnp.append(spread, offset), data="points")
+    channels = jaxcal.calibrate(problem, sigma=jnp.stack([found, offset]), data="channels")
+    between = np.linalg.inv(points.image_to_probe) @ np.asarray(channels.image_to_probe)
+    sd = np.sqrt(np.diag(channels.covariance))
+    assert np.abs(between[:3, 3] / sd[:3]).max() < 0.05
+    turned = np.array([between[2, 1], between[0, 2], between[1, 0]])
+    assert np.abs(turned / sd[3:]).max() < 0.05
+    np.testing.assert_allclose(points.covariance, channels.covariance, atol=0.03 * sd.max() ** 2)
+
+
+def wrong_medium(data: jaxcal.Recording, speed: float, delay_s: float) -> jaxcal.Recording:
+    """The same times, read with a probe that knows neither its sound speed nor its delay."""
+    assert data.probe is not None
+    times = data.calibration.measurements * data.probe.sound_speed_m_s / speed + delay_s
+    return replace(data, calibration=replace(data.calibration, measurements=times))
+
+
+@pytest.mark.parametrize("probe", [STRAIGHT, CURVED], ids=["straight", "curved"])
+def test_sound_speed_and_delay_are_estimated_along(probe):
+    data = recording(probe, seed=3)
+    off = wrong_medium(data, 1520.0, 0.5e-6)
+    result = jaxcal.calibrate(off, estimate=("sound-speed", "delay"))
+    assert result.status == "converged"
+    assert result.data == "channels"
+    assert result.sound_speed_m_s is not None
+    assert result.sound_speed_sd_m_s is not None
+    assert result.delay_s is not None
+    assert result.delay_sd_s is not None
+    assert abs(result.sound_speed_m_s - 1520.0) < 3 * result.sound_speed_sd_m_s < 3.0
+    assert abs(result.delay_s - 0.5e-6) < 3 * result.delay_sd_s < 0.15e-6
+    known = jaxcal.calibrate(data, data="channels")
+    assert precision(result, data) < 1.3 * precision(known, data) + 0.01
+    assert precision(jaxcal.calibrate(off), data) > 1.5 * precision(result, data)
+
+
+def test_what_points_cannot_tell_is_said_or_refused():
+    data = recording(STRAIGHT, noise=0.2)
+    points = replace(jaxcal.Problem.from_recording(data), channels=None)
+    delay = jaxcal.calibrate(points, estimate=("delay",))
+    assert delay.status == "unobservable"
+    assert "delay" in delay.observability["weakest_direction"]
+    speed = jaxcal.calibrate(points, estimate=("sound-speed",))
+    assert speed.status == "converged"
+    assert speed.sound_speed_sd_m_s is not None
+    assert float(speed.sound_speed_sd_m_s) < 20.0
+    pixels = replace(points, pixels=True)
+    with pytest.raises(InputError, match="one and the same factor"):
+        jaxcal.calibrate(pixels, estimate=("scale", "sound-speed"))
+    with pytest.raises(InputError, match="needs times of flight"):
+        jaxcal.calibrate(points, data="channels")
+    with pytest.raises(InputError, match="gaussian prior only"):
+        jaxcal.calibrate(jaxcal.Problem.from_recording(data), "conventional", data="channels")
+
+
+def test_missing_and_late_lines_do_no_harm():
+    data = recording(CURVED, noise=0.05)
+    times = np.array(data.calibration.measurements)
+    rng = np.random.default_rng(0)
+    times[rng.random(times.shape) < 0.1] = np.nan
+    late = rng.random(times.shape) < 0.05
+    times[late] += rng.uniform(2e-6, 2e-5, late.sum())
+    times[4] = np.nan  # a whole frame without an answer
+    worse = replace(data, calibration=replace(data.calibration, measurements=times))
+    result = jaxcal.calibrate(worse)
+    assert result.status == "converged"
+    assert int(result.images_used) == 19
+    assert precision(result, data) < 2 * precision(jaxcal.calibrate(data), data) + 0.01
+
+
+def test_derivative_matches_finite_differences():
+    problem = jaxcal.Problem.from_recording(recording(CURVED, noise=0.2))
+    assert problem.channels is not None
+    rng = np.random.default_rng(2)
+    direction = jnp.asarray(rng.normal(size=problem.channels.distances.shape))
+
+    def value(step):
+        channels = problem.channels
+        moved = replace(channels, distances=channels.distances + step * direction)
+        result = jaxcal.calibrate(replace(problem, channels=moved))
+        return jnp.sum(result.image_to_probe[:3, 3]) + result.sigma[2]
+
+    step = 1e-3
+    numeric = (value(step) - value(-step)) / (2 * step)
+    assert float(jax.grad(value)(0.0)) == pytest.approx(float(numeric), rel=1e-5)
+
+
+def test_a_batch_is_its_lanes():
+    problems = [jaxcal.Problem.from_recording(recording(CURVED, seed=k)) for k in (1, 2, 3)]
+    batch = jaxcal.calibrate_batch(jaxcal.stack(problems))
+    for lane, problem in enumerate(problems):
+        alone = jaxcal.calibrate(problem)
+        assert angle(batch.image_to_probe[lane], alone.image_to_probe) < 1e-8
+        np.testing.assert_allclose(batch.elevation[lane], alone.elevation, atol=1e-6)
+
+
+def test_the_command_line_calibrates_raw_times(tmp_path, capsys):
+    path = tmp_path / "raw.h5"
+    save(wrong_medium(recording(STRAIGHT), 1500.0, 0.0), path)
+    assert main(["calibrate", str(path), "--json"]) == 0
+    points = json.loads(capsys.readouterr().out)
+    assert points["data"] == "points"
+    assert points["sound_speed_m_s"] is None
+    assert main(["calibrate", str(path), "--estimate", "sound-speed", "--json"]) == 0
+    channels = json.loads(capsys.readouterr().out)
+    assert channels["data"] == "channels"
+    assert channels["sound_speed_m_s"] == pytest.approx(1500.0, abs=5.0)
+    assert channels["reconstruction_precision_mm"] < points["reconstruction_precision_mm"]
+    assert main(["calibrate", str(path), "--data", "channels", "--method", "alternating"]) == 2
+    assert "needs --method joint" in capsys.readouterr().err
