@@ -1,18 +1,16 @@
 """Simulated experiments after the paper's section 3.1, as a pure function of a key.
 
 The target is imaged in n poses: lateral position and depth uniform over the field, the
-elevational offset uniform within a bound or normal, the probe turned about a random axis by up to
-30 degrees, and white noise on the distance to every element; lateral position and range are then
-segmented from the distances by least squares on Eq. 5. Test images lie in the plane and carry no
-noise. The paper leaves the ranges open; the defaults reproduce its tables (``test_fraction`` is a
+elevational offset after one of the laws of :mod:`jaxcal.offsets`, the probe turned about a random
+axis by up to 30 degrees, and white noise on the distance to every element; lateral position and
+range are then segmented from the distances by least squares on Eq. 5. The tracker may err, too.
+Test images lie in the plane and carry no noise. The paper leaves the ranges open; the defaults reproduce its tables (``test_fraction`` is a
 fitted choice: at 1.0 fewer cells agree).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,49 +20,65 @@ from jaxtyping import Array, Float, Key
 
 from jaxcal.errors import InputError
 from jaxcal.geometry import matrix_from_rotation
+from jaxcal.offsets import OffsetLaw, check_law, standard_offsets
 from jaxcal.probe import L14_5, LinearProbe
-from jaxcal.problem import Problem
+from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES, Recording, Truth, make_images
 from jaxcal.segmentation.time_of_flight import fit_distances
+
+
+Scalar = float | Float[Array, ""]
+"""A number of a protocol: a plain one, or one that is traced and so shared by a compiled program
+among all the values it may take."""
 
 
 @dataclass(frozen=True)
 class Protocol:
     """The distributions of a simulated experiment.
 
+    Counts, the law of the offsets and the probe shape the program that draws; every other field
+    may be a traced number (``dataclasses.replace`` inside the transformed function).
+
     Attributes:
         images: calibration images.
         test_images: noise-free in-plane test images.
-        elevation_mm: bound (uniform) or SD (normal) of the elevational offsets.
-        elevation_distribution: ``uniform`` or ``normal``.
+        elevation_mm: bound (uniform, one-sided, triangular) or SD (normal, heavy-tailed) of the
+            elevational offsets.
+        elevation_distribution: their law, see :mod:`jaxcal.offsets`.
         noise_mm: SD of the noise on each element's distance.
         lateral_mm: the target's lateral position is uniform within +- this.
         depth_mm: its depth is uniform between these.
         rotation_rad: the probe is turned by up to this about a random axis.
         test_fraction: test positions cover this fraction of the field (0.75: fitted).
         probe: the transducer.
+        tracker_mm: SD of the tracked position of every calibration pose, each axis.
+        tracker_rad: SD of its tracked rotation, about each of the probe's axes.
     """
 
     images: int = 50
     test_images: int = 50
-    elevation_mm: float = 1.0
-    elevation_distribution: Literal["uniform", "normal"] = "uniform"
-    noise_mm: float = 0.5
-    lateral_mm: float = 29.25
-    depth_mm: tuple[float, float] = (10.0, 90.0)
-    rotation_rad: float = float(np.radians(30.0))
-    test_fraction: float = 0.75
+    elevation_mm: Scalar = 1.0
+    elevation_distribution: OffsetLaw = "uniform"
+    noise_mm: Scalar = 0.5
+    lateral_mm: Scalar = 29.25
+    depth_mm: tuple[Scalar, Scalar] = (10.0, 90.0)
+    rotation_rad: Scalar = float(np.radians(30.0))
+    test_fraction: Scalar = 0.75
     probe: LinearProbe = L14_5
+    tracker_mm: Scalar = 0.0
+    tracker_rad: Scalar = 0.0
 
     def __post_init__(self) -> None:
         if not MINIMUM_IMAGES <= self.images <= 100_000:
             raise InputError(f"images must be between {MINIMUM_IMAGES} and 100000")
-        for name in ("elevation_mm", "noise_mm"):
+        for name, largest, unit in (
+            ("elevation_mm", 1000, "mm"), ("noise_mm", 1000, "mm"),
+            ("tracker_mm", 1000, "mm"), ("tracker_rad", 1, "rad"),
+        ):  # fmt: skip
             value = getattr(self, name)
-            if not (np.isfinite(value) and 0 <= value <= 1000):
-                raise InputError(f"{name} must be between 0 and 1000 mm, not {value}")
-        if self.elevation_distribution not in ("uniform", "normal"):
-            raise InputError("elevation_distribution must be uniform or normal")
+            if not (is_traced(value) or (np.isfinite(value) and 0 <= value <= largest)):
+                raise InputError(f"{name} must be between 0 and {largest} {unit}, not {value}")
+        check_law(self.elevation_distribution)
 
 
 class Experiment(eqx.Module):
@@ -112,8 +126,9 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
         protocol: the distributions.
     """
     keys = jax.random.split(key, 9)
-    field = jnp.asarray([protocol.lateral_mm, 0.5 * np.ptp(protocol.depth_mm)])
-    middle = jnp.asarray([0.0, 0.5 * sum(protocol.depth_mm)])
+    shallow, deep = protocol.depth_mm
+    field = jnp.asarray([protocol.lateral_mm, 0.5 * abs(deep - shallow)])
+    middle = jnp.asarray([0.0, 0.5 * (shallow + deep)])
     truth = jaxlie.SE3.from_rotation_and_translation(
         _rotation(keys[0], np.pi), 50.0 * jax.random.normal(keys[1], (3,))
     )
@@ -121,9 +136,7 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
 
     n = protocol.images
     lateral, depth = _positions(keys[3], n, field, middle)
-    draw = jax.random.uniform(keys[4], (n,), minval=-1.0, maxval=1.0)
-    if protocol.elevation_distribution == "normal":
-        draw = jax.random.normal(keys[4], (n,))
+    draw = standard_offsets(keys[4], protocol.elevation_distribution, n)
     elevation = protocol.elevation_mm * draw
     poses = _poses(keys[5], truth, point, jnp.stack([lateral, elevation, depth], -1), protocol)
 
@@ -137,7 +150,7 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
     test = jnp.stack(_positions(keys[7], m, protocol.test_fraction * field, middle), -1)
     in_plane = jnp.stack([test[:, 0], jnp.zeros(m), test[:, 1]], -1)
     return Experiment(
-        poses=poses,
+        poses=_tracked(jax.random.fold_in(keys[5], n), poses, protocol),
         points=points,
         covariance=protocol.noise_mm**2 * inverse,
         elevation=elevation,
@@ -156,7 +169,7 @@ def _positions(
     return positions[:, 0], positions[:, 1]
 
 
-def _rotation(key: Key[Array, ""], largest: float) -> jaxlie.SO3:
+def _rotation(key: Key[Array, ""], largest: Scalar) -> jaxlie.SO3:
     axis_key, angle_key = jax.random.split(key)
     axis = jax.random.normal(axis_key, (3,))
     angle = jax.random.uniform(angle_key, (), maxval=largest)
@@ -178,6 +191,23 @@ def _poses(
         return matrix_from_rotation(rotation.as_matrix(), translation)
 
     return jax.vmap(pose)(jax.random.split(key, in_image.shape[0]), in_image)
+
+
+def _tracked(
+    key: Key[Array, ""], poses: Float[Array, "n 4 4"], protocol: Protocol
+) -> Float[Array, "n 4 4"]:
+    """The poses as the tracker reports them: errors of its position, and of its rotation."""
+    if not is_traced(protocol.tracker_mm) and not is_traced(protocol.tracker_rad):
+        if protocol.tracker_mm == 0 and protocol.tracker_rad == 0:
+            return poses
+    errors = jax.random.normal(key, (poses.shape[0], 6))
+
+    def one(pose: Float[Array, "4 4"], error: Float[Array, " 6"]) -> Float[Array, "4 4"]:
+        turned = jaxlie.SO3.exp(protocol.tracker_rad * error[3:]).as_matrix()
+        moved = pose[:3, 3] + protocol.tracker_mm * error[:3]
+        return matrix_from_rotation(pose[:3, :3] @ turned, moved)
+
+    return jax.vmap(one)(poses, errors)
 
 
 def simulate_recording(protocol: Protocol, seed: int = 0) -> Recording:
