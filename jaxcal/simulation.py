@@ -1,16 +1,17 @@
 """Simulated experiments after the paper's section 3.1, as a pure function of a key.
 
-The target is imaged in n poses: lateral position and depth uniform over the field, the
-elevational offset after one of the laws of :mod:`jaxcal.offsets`, the probe turned about a random
-axis by up to 30 degrees, and white noise on the distance to every element; lateral position and
-range are then segmented from the distances by least squares on Eq. 5. The tracker may err, too.
-Test images lie in the plane and carry no noise. The paper leaves the ranges open; the defaults reproduce its tables (``test_fraction`` is a
-fitted choice: at 1.0 fewer cells agree).
+The target is imaged in n poses: lateral position and depth uniform over the field, the elevational
+offset after one of the laws of :mod:`jaxcal.offsets`, the probe turned about a random axis by up to
+30 degrees, and white noise on the distance to every element; lateral position and range are then
+segmented from the distances by least squares on Eq. 5. The tracker may err, too. Test images lie in
+the plane and carry no noise. The paper leaves the ranges open; the defaults reproduce its tables
+(``test_fraction`` is a fitted choice: at 1.0 fewer cells agree).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,6 @@ from jaxcal.probe import L14_5, LinearProbe
 from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES, Recording, Truth, make_images
 from jaxcal.segmentation.time_of_flight import fit_distances
-
 
 Scalar = float | Float[Array, ""]
 """A number of a protocol: a plain one, or one that is traced and so shared by a compiled program
@@ -197,9 +197,9 @@ def _tracked(
     key: Key[Array, ""], poses: Float[Array, "n 4 4"], protocol: Protocol
 ) -> Float[Array, "n 4 4"]:
     """The poses as the tracker reports them: errors of its position, and of its rotation."""
-    if not is_traced(protocol.tracker_mm) and not is_traced(protocol.tracker_rad):
-        if protocol.tracker_mm == 0 and protocol.tracker_rad == 0:
-            return poses
+    numbers = (protocol.tracker_mm, protocol.tracker_rad)
+    if not any(is_traced(number) or number > 0 for number in numbers):
+        return poses
     errors = jax.random.normal(key, (poses.shape[0], 6))
 
     def one(pose: Float[Array, "4 4"], error: Float[Array, " 6"]) -> Float[Array, "4 4"]:
