@@ -77,7 +77,7 @@ def _local_cluster(workers: int) -> Any:
     from distributed.diagnostics.plugin import WorkerPlugin
 
     # Where this process keeps its compiled programs its workers may, too.
-    cache = jax.config.read("jax_compilation_cache_dir")
+    cache = jax.config.jax_compilation_cache_dir
     groups = core_groups(workers)
 
     class OneGroup(WorkerPlugin):

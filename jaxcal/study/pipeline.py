@@ -2,15 +2,15 @@
 
 One compiled program draws (for each law of the offsets and number of images) and one solves (for
 each method and set of static options); elevation, noise, bounds and all other numbers are
-arguments, so that a whole grid runs through the same programs. A short last chunk is filled up to
-the common size for the same reason; what was filled in is dropped again.
+arguments, so that a whole grid runs through the same programs. They take blocks of a fixed number
+of trials, whatever the chunks; a short last block is filled up, and what was filled in dropped.
 
 The programs are compiled for one thread each. XLA's CPU client hands small factorisations to the
 pool on which it may be running itself, and two of them waiting for each other never end
 (:mod:`jaxcal._configuration`); and trials are independent, so that processes, one for each group of
 cores (:mod:`jaxcal.study.cluster`), use several cores better than threads do.
 
-Where a host has several accelerators a chunk is spread over them, trial by trial.
+Where a host has several devices each takes its share of a block.
 """
 
 from __future__ import annotations
@@ -33,8 +33,11 @@ from jaxcal.simulation import Experiment, Protocol, simulate
 from jaxcal.solve import Options, calibrate_batch
 from jaxcal.study.spec import Chunk, Condition, MethodSpec, Spec
 
-LANES = 64
-"""Experiments drawn or solved side by side; what they need at once stays in the caches."""
+LANES = {"cpu": 64}
+"""Trials drawn or solved side by side on a device; on a CPU what they need stays in its caches."""
+
+OTHER_LANES = 4096
+"""And on whatever else: enough to fill it."""
 
 _ONE_THREAD: dict[str, Any] = {"xla_cpu_multi_thread_eigen": False}
 
@@ -90,29 +93,40 @@ def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
         drawn, mm. They are the same whatever was computed before, and on whatever worker.
     """
     condition = spec.condition(chunk.condition)
-    size = spec.chunk_trials
-    trials = np.minimum(chunk.start + np.arange(size), chunk.stop - 1)
-    indices = (chunk.condition * spec.trials + trials).astype(np.uint32)
     shape = _Shape(
         condition.elevation_distribution,  # type: ignore[arg-type]
         condition.images,
         condition.test_images,
         spec.probe,
     )
-    devices = _devices(size)
+    devices = tuple(jax.local_devices())
+    block = len(devices) * LANES.get(devices[0].platform, OTHER_LANES)
     seed = np.asarray(spec.seed, np.uint64)
-    drawn, realised = _draw_program(shape, devices)(indices, seed, _numbers(condition))
-    measured = []
-    for method in spec.methods:
-        prior, options = _static(method)
-        bound = jnp.asarray(bound_mm(method, condition)) if method.bounded else None
-        solve = _solve_program(method.method, prior, options, devices)
-        measured.append(jax.tree.map(np.asarray, solve(drawn, bound)))
-    keep = slice(0, chunk.stop - chunk.start)
-    names = [field.name for field in dataclasses.fields(Measured)]
-    results = {name: np.stack([getattr(one, name)[keep] for one in measured]) for name in names}
-    results["realised"] = np.asarray(realised)[keep]
-    return results
+    draw = _draw_program(shape, devices)
+    blocks = []
+    for start in range(chunk.start, chunk.stop, block):
+        trials = np.minimum(start + np.arange(block), chunk.stop - 1)
+        indices = (chunk.condition * spec.trials + trials).astype(np.uint32)
+        drawn, realised = draw(indices, seed, _numbers(condition))
+        measured = [_solve_one(method, condition, drawn, devices) for method in spec.methods]
+        results = {name: np.stack([one[name] for one in measured]) for name in measured[0]}
+        blocks.append((results, np.asarray(realised)))
+    count = chunk.stop - chunk.start
+    together = {
+        name: np.concatenate([results[name] for results, _ in blocks], axis=1)[:, :count]
+        for name in blocks[0][0]
+    }
+    together["realised"] = np.concatenate([realised for _, realised in blocks])[:count]
+    return together
+
+
+def _solve_one(
+    method: MethodSpec, condition: Condition, drawn: Experiment, devices: Devices
+) -> dict[str, np.ndarray]:
+    prior, options = _static(method)
+    bound = jnp.asarray(bound_mm(method, condition)) if method.bounded else None
+    measured = _solve_program(method.method, prior, options, devices)(drawn, bound)
+    return {name: np.asarray(value) for name, value in vars(measured).items()}
 
 
 def device_name() -> str:
@@ -167,27 +181,19 @@ def _static(method: MethodSpec) -> tuple[str, Options]:
     return method.prior, options
 
 
-def _devices(size: int) -> Devices:
-    """The host's devices, as many as divide a chunk evenly."""
-    devices = jax.local_devices()
-    count = max(k for k in range(1, len(devices) + 1) if size % k == 0)
-    return tuple(devices[:count])
-
-
-def _compile(function: Any, devices: Devices, batched: int) -> Any:
-    """Compile; over several devices the first ``batched`` arguments are cut by trial."""
+def _compile(function: Any, devices: Devices) -> Any:
+    """Compile a function whose first argument is cut by trial where there are several devices."""
+    options = _ONE_THREAD if devices[0].platform == "cpu" else None
     if len(devices) == 1:
-        options = _ONE_THREAD if devices[0].platform == "cpu" else None
         return jax.jit(function, compiler_options=options)
     mesh = Mesh(np.asarray(devices), ("trials",))
     cut, whole = PartitionSpec("trials"), PartitionSpec()
 
-    def spread(*arguments: Any) -> Any:
-        specs = tuple(cut if k < batched else whole for k in range(len(arguments)))
+    def spread(batch: Any, *shared: Any) -> Any:
+        specs = (cut, *(whole for _ in shared))
         mapped = jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=cut, check_vma=False)
-        return mapped(*arguments)
+        return mapped(batch, *shared)
 
-    options = _ONE_THREAD if devices[0].platform == "cpu" else None
     return jax.jit(spread, compiler_options=options)
 
 
@@ -205,24 +211,24 @@ def _draw_program(shape: _Shape, devices: Devices) -> Any:
             experiment = simulate(jax.random.fold_in(root, index), given)
             return experiment, realised_errors(experiment)
 
-        return jax.lax.map(one, indices, batch_size=min(LANES, len(indices)))
+        return jax.vmap(one)(indices)
 
-    return _compile(draw, devices, 1)
+    return _compile(draw, devices)
 
 
 @cache
 def _solve_program(method: str, prior: str, options: Options, devices: Devices) -> Any:
-    return _compile(partial(_solve, method, prior, options), devices, 1)
+    return _compile(partial(_solve, method, prior, options), devices)
 
 
 def _solve(
     method: Any, prior: Any, options: Options, drawn: Experiment, bound: Array | None
 ) -> Measured:
     problems = jax.vmap(lambda experiment: experiment.problem())(drawn)
-    lanes = min(LANES, drawn.points.shape[0])
     result = calibrate_batch(
-        problems, method, prior, max_elevation=bound, options=options, chunk=lanes
-    )
+        problems, method, prior, max_elevation=bound, options=options,
+        chunk=drawn.points.shape[0],
+    )  # fmt: skip
     x, truth = result.image_to_probe, drawn.image_to_probe
     precision = jax.vmap(reconstruction_precision)(x, drawn.test_poses, drawn.test_points)
     chord = jnp.linalg.norm(x[:, :3, :3] - truth[:, :3, :3], axis=(1, 2))

@@ -8,7 +8,7 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -25,6 +25,7 @@ Computed = tuple[Chunk, dict[str, np.ndarray], str]
 """A chunk, its results, and what computed it."""
 
 
+@runtime_checkable
 class Watcher(Protocol):
     """Who wants to know how a study goes on."""
 

@@ -3,7 +3,7 @@
     name = "paper_tables"     # letters, digits, - and _
     seed = 20261121           # of all draws, 0 to 2^63 - 1
     trials = 400              # simulated experiments in each condition
-    chunk_trials = 400        # trials in one file; at most those are lost by an interruption
+    chunk_trials = 512        # trials in one file; at most those are lost by an interruption
 
     [conditions]              # a number, or a list of numbers: an axis of the grid
     images = 50               # calibration images
@@ -72,9 +72,11 @@ MAXIMUM_EXPERIMENTS = 2**32
 MAXIMUM_CHUNKS = 10**6
 MAXIMUM_CONDITIONS = 10**5
 MAXIMUM_METHODS = 100
-MAXIMUM_CHUNK_DRAWS = 2**31
-"""Distances drawn for one chunk, counted as trials x images x elements: about 16 GiB at most, were
-they all held at once (they are not: see pipeline.LANES)."""
+MAXIMUM_DISTANCES = 2**22
+"""Images times elements of one experiment: 64 of them take 2 GiB."""
+
+MAXIMUM_CHUNK = 2**24
+"""Trials times methods of one chunk, whose results are held at once."""
 
 AXES = (
     "elevation_distribution",
@@ -291,7 +293,7 @@ def parse_spec(text: str) -> Spec:
         raise InputError("name must be 1 to 100 letters, digits, - and _")
     seed = _integer("seed", _required(content, "seed"), 0, 2**63 - 1)
     trials = _integer("trials", _required(content, "trials"), 1, MAXIMUM_EXPERIMENTS)
-    chunk = _integer("chunk_trials", content.get("chunk_trials", 400), 1, 2**20)
+    chunk = _integer("chunk_trials", content.get("chunk_trials", 512), 1, 2**20)
     axes, listed = _axes(_table(content, "conditions"))
     probe = _probe(_table(content, "probe"))
     spec = Spec(name, seed, trials, min(chunk, trials), axes, listed, probe, _methods(content))
@@ -411,7 +413,7 @@ def _probe(table: dict[str, Any]) -> LinearProbe:
     _known(table, {"elements", "pitch_mm"}, "probe.")
     default = LinearProbe()
     elements = _integer("probe.elements", table.get("elements", default.elements), 2, 4096)
-    pitch = _number("probe.pitch_mm", table.get("pitch_mm", default.pitch_mm), 0, 99, above=True)
+    pitch = _number("probe.pitch_mm", table.get("pitch_mm", default.pitch_mm), 0.0, 99.0, above=True)
     return LinearProbe(elements=elements, pitch_mm=pitch)
 
 
@@ -475,7 +477,10 @@ def _check_size(spec: Spec) -> None:
     if spec.chunk_count > MAXIMUM_CHUNKS:
         raise InputError(f"chunk_trials = {spec.chunk_trials} makes {spec.chunk_count} files, at "
                          f"most {MAXIMUM_CHUNKS}: enlarge it")  # fmt: skip
+    if spec.chunk_trials * len(spec.methods) > MAXIMUM_CHUNK:
+        raise InputError(f"chunk_trials = {spec.chunk_trials} is too large for {len(spec.methods)} "
+                         "methods: reduce it")  # fmt: skip
     images = max(int(count) for name in _COUNTS for count in spec.axis(name))
-    if spec.chunk_trials * images * spec.probe.elements > MAXIMUM_CHUNK_DRAWS:
-        raise InputError(f"chunk_trials = {spec.chunk_trials} is too large for {images} images and "
-                         f"{spec.probe.elements} elements: reduce it")  # fmt: skip
+    if images * spec.probe.elements > MAXIMUM_DISTANCES:
+        raise InputError(f"{images} images times {spec.probe.elements} elements are too many: at "
+                         f"most {MAXIMUM_DISTANCES} distances are drawn")  # fmt: skip
