@@ -1,6 +1,7 @@
 """Studies: specs, files, resumption, and results that depend on nothing but the spec."""
 
 import dataclasses
+import fcntl
 import os
 import re
 import signal
@@ -246,8 +247,8 @@ def test_a_trial_is_that_of_the_public_functions(finished):
     np.testing.assert_allclose(stored.sigma, result.sigma, rtol=1e-5)
     realised = np.sqrt(np.mean(np.asarray(experiment.elevation) ** 2))
     assert float(stored.realised.sel(component="elevation")) == pytest.approx(realised)
-    assert float(data.bound.sel(elevation_mm=2.0, method="arcs")) == 3.0
-    assert np.isnan(data.bound.sel(elevation_mm=2.0, method="flat"))
+    assert float(data.bound.sel({"elevation_mm": 2.0, "method": "arcs"})) == 3.0
+    assert np.isnan(data.bound.sel({"elevation_mm": 2.0, "method": "flat"}))
 
 
 def load_spec_of(folder):
@@ -462,16 +463,45 @@ def test_interrupted(long_study, programs, tmp_path):
     path, folder = tmp_path / "spec.toml", tmp_path / "out"
     path.write_text(LONG)
     child = start_and_wait(["run", path, "--out", folder], programs, folder, 5)
-    second = process(["run", path, "--out", folder, "--resume"], programs)
-    _, err = second.communicate(timeout=120)
     child.send_signal(signal.SIGINT)
     _, told = child.communicate(timeout=120)
-    assert second.returncode == 2
-    assert "is being computed by another process" in err
     assert child.returncode == 130
     done = len(Store(folder, parse_spec(LONG)).present())
     again = f"jaxcal study run {path} --out {folder} --resume"
     assert told == f"jaxcal: interrupted: {done} of 240 chunks are done; continue with: {again}\n"
+
+
+def test_two_processes_do_not_share_a_folder(finished, tmp_path, capsys):
+    path = tmp_path / "spec.toml"
+    path.write_text(small())
+    with (finished / ".lock").open("wb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert main(["study", "run", str(path), "--out", str(finished), "--resume"]) == 2
+    assert "is being computed by another process" in capsys.readouterr().err
+
+
+def test_full_file_system(finished, programs, tmp_path):
+    """The same on a file system of 96 KiB, where the system lets us have one."""
+    small_disk, kept, path = tmp_path / "disk", tmp_path / "kept", tmp_path / "spec.toml"
+    small_disk.mkdir()
+    path.write_text(small())
+    mount = f"mount -t tmpfs -o size=96k tmpfs {small_disk}"
+    probe = subprocess.run(["unshare", "-rm", "sh", "-c", mount], capture_output=True, check=False)
+    if probe.returncode != 0:
+        pytest.skip("no file system may be mounted here; test_full_disk has a limit instead")
+    script = f'{mount}; "$@"; code=$?; cp -a {small_disk}/out {kept}; exit $code'
+    child = process(
+        ["run", path, "--out", small_disk / "out"], programs,
+        before=("unshare", "-rm", "bash", "-c", script, "bash"),
+    )  # fmt: skip
+    _, err = child.communicate(timeout=120)
+    assert child.returncode == 2, err
+    assert "No space left on device" in err.strip().splitlines()[-1]
+    there = files(kept)
+    assert 0 < len(there) < 6
+    assert there.items() <= files(finished).items()
+    run_study(parse_spec(small()), kept, resume=True)
+    assert files(kept) == files(finished)
 
 
 @pytest.mark.slow
