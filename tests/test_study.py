@@ -505,6 +505,21 @@ def test_full_file_system(finished, programs, tmp_path):
 
 
 @pytest.mark.slow
+def test_several_devices_share_a_block(finished, programs, tmp_path):
+    path, folder = tmp_path / "spec.toml", tmp_path / "out"
+    path.write_text(small())
+    child = process(
+        ["run", path, "--out", folder], programs, before=("env", "JAX_NUM_CPU_DEVICES=2")
+    )
+    _, err = child.communicate(timeout=300)
+    assert child.returncode == 0, err
+    assert "2 x cpu" in Store.open(folder).versions(parse_spec(small()).chunk(0))
+    one, two = open_results(finished), open_results(folder)
+    for name in one.data_vars:
+        np.testing.assert_allclose(one[name], two[name], rtol=1e-9, atol=1e-12, err_msg=str(name))
+
+
+@pytest.mark.slow
 def test_self_tuned_and_bounded_methods(programs):
     """Every method of a spec through the pipeline; bounds are those that were asked for."""
     text = (

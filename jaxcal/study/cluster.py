@@ -33,7 +33,7 @@ CONNECT_SECONDS = 30
 
 
 def compute_on_cluster(
-    spec: Spec, chunks: list[Chunk], *, workers: int = 0, scheduler: str | None = None
+    spec: Spec, chunks: list[Chunk], *, workers: int = 0, scheduler: Any = None
 ) -> Iterator[tuple[Chunk, dict[str, np.ndarray], str]]:
     """Compute chunks on worker processes; yields them as they are done.
 
@@ -41,7 +41,7 @@ def compute_on_cluster(
         spec: the study.
         chunks: what to compute.
         workers: so many processes on this machine, on loopback, each on cores of its own; or
-        scheduler: address of a running scheduler, e.g. ``tcp://127.0.0.1:8786``.
+        scheduler: address of a running scheduler, e.g. ``tcp://127.0.0.1:8786``, or a Dask cluster.
 
     Raises:
         MissingExtraError: Dask is not installed.
@@ -62,7 +62,7 @@ def compute_on_cluster(
         yield from _distribute(client, spec, chunks)
 
 
-def _connect(scheduler: str) -> Client:
+def _connect(scheduler: Any) -> Client:
     from distributed import Client
 
     try:
@@ -77,7 +77,7 @@ def _local_cluster(workers: int) -> Any:
     from distributed.diagnostics.plugin import WorkerPlugin
 
     # Where this process keeps its compiled programs its workers may, too.
-    cache = jax.config.jax_compilation_cache_dir
+    cache = getattr(jax.config, "jax_compilation_cache_dir", None)
     groups = core_groups(workers)
 
     class OneGroup(WorkerPlugin):

@@ -8,7 +8,7 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -75,7 +75,7 @@ def run_study(
     *,
     resume: bool = False,
     workers: int = 0,
-    scheduler: str | None = None,
+    scheduler: Any = None,
     watcher: Watcher | None = None,
 ) -> Summary:
     """Compute the missing chunks of a study and write each when it is done.
@@ -88,7 +88,8 @@ def run_study(
         folder: where its files are.
         resume: continue what is there; without it a folder that holds a study is refused.
         workers: processes on this machine, each on cores of its own; 0 computes in this process.
-        scheduler: address of a running Dask scheduler instead.
+        scheduler: instead, the address of a running Dask scheduler, or a Dask cluster (whatever
+            ``distributed.Client`` takes), e.g. a ``dask_jobqueue.SLURMCluster``.
         watcher: is told how it goes on.
 
     Raises:
@@ -136,7 +137,7 @@ def _missing(store: Store, watcher: Watcher) -> tuple[list[Chunk], int]:
 
 
 def _computed(
-    spec: Spec, missing: list[Chunk], workers: int, scheduler: str | None
+    spec: Spec, missing: list[Chunk], workers: int, scheduler: Any
 ) -> Generator[Computed]:
     if not missing:
         return

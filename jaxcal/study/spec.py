@@ -413,7 +413,9 @@ def _probe(table: dict[str, Any]) -> LinearProbe:
     _known(table, {"elements", "pitch_mm"}, "probe.")
     default = LinearProbe()
     elements = _integer("probe.elements", table.get("elements", default.elements), 2, 4096)
-    pitch = _number("probe.pitch_mm", table.get("pitch_mm", default.pitch_mm), 0.0, 99.0, above=True)
+    pitch = _number(
+        "probe.pitch_mm", table.get("pitch_mm", default.pitch_mm), 0.0, 99.0, above=True
+    )
     return LinearProbe(elements=elements, pitch_mm=pitch)
 
 
