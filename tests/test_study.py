@@ -402,9 +402,7 @@ def test_full_disk(finished, programs, tmp_path):
     assert "Traceback" not in err
     assert out == ""
     assert list((folder / "chunks").iterdir()) == []
-    child = process([*run, "--resume"], programs)
-    child.communicate(timeout=120)
-    assert child.returncode == 0
+    run_study(parse_spec(small()), folder, resume=True)
     assert files(folder) == files(finished)
 
 
@@ -481,11 +479,11 @@ def test_two_processes_do_not_share_a_folder(finished, tmp_path, capsys):
 
 
 def test_full_file_system(finished, programs, tmp_path):
-    """The same on a file system of 96 KiB, where the system lets us have one."""
+    """The same on a file system of 48 KiB, where the system lets us have one."""
     small_disk, kept, path = tmp_path / "disk", tmp_path / "kept", tmp_path / "spec.toml"
     small_disk.mkdir()
     path.write_text(small())
-    mount = f"mount -t tmpfs -o size=96k tmpfs {small_disk}"
+    mount = f"mount -t tmpfs -o size=48k tmpfs {small_disk}"
     probe = subprocess.run(["unshare", "-rm", "sh", "-c", mount], capture_output=True, check=False)
     if probe.returncode != 0:
         pytest.skip("no file system may be mounted here; test_full_disk has a limit instead")
