@@ -389,6 +389,7 @@ def test_unwritable_folder(tmp_path, capsys):
     assert occupied.read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_full_disk(finished, programs, tmp_path):
     """No file may grow beyond 4 KiB, a real refusal by the system: nothing half is left."""
     path, folder = tmp_path / "spec.toml", tmp_path / "out"
@@ -486,7 +487,7 @@ def test_full_file_system(finished, programs, tmp_path):
     mount = f"mount -t tmpfs -o size=48k tmpfs {small_disk}"
     probe = subprocess.run(["unshare", "-rm", "sh", "-c", mount], capture_output=True, check=False)
     if probe.returncode != 0:
-        pytest.skip("no file system may be mounted here; test_full_disk has a limit instead")
+        pytest.skip("no file system may be mounted here; test_full_disk (slow) has a limit instead")
     script = f'{mount}; "$@"; code=$?; cp -a {small_disk}/out {kept}; exit $code'
     child = process(
         ["run", path, "--out", small_disk / "out"], programs,
