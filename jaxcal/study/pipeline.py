@@ -5,10 +5,9 @@ each method and set of static options); elevation, noise, bounds and all other n
 arguments, so that a whole grid runs through the same programs. They take blocks of a fixed number
 of trials, whatever the chunks; a short last block is filled up, and what was filled in dropped.
 
-The programs are compiled for one thread each. XLA's CPU client hands small factorisations to the
-pool on which it may be running itself, and two of them waiting for each other never end
-(:mod:`jaxcal._configuration`); and trials are independent, so that processes, one for each group of
-cores (:mod:`jaxcal.study.cluster`), use several cores better than threads do.
+The programs are compiled for one thread each: trials are independent, so that processes, one for
+each group of cores (:mod:`jaxcal.study.cluster`), use several cores better than XLA's thread pool
+does, and neither results nor progress depend on how that pool is scheduled.
 
 Where a host has several devices each takes its share of a block.
 """
