@@ -6,7 +6,9 @@ import argparse
 import csv
 import os
 import platform
+import time
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from jaxcal.io.atomic import atomic_path
@@ -52,3 +54,45 @@ def machine() -> str:
             break
     cores, python = os.cpu_count(), platform.python_version()
     return f"{model}, {cores} cores, Python {python}, jax {jax.__version__}"
+
+
+def open_study(name: str, *, trials: int | None, quick: bool):
+    """Run (or go on with) the study ``name``.toml and open its results.
+
+    Args:
+        name: of the spec beside this file.
+        trials: in each condition, instead of the spec's.
+        quick: the quick one has a folder of its own.
+    """
+    from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.study import load_spec, open_results, run_study
+
+    here = Path(__file__).parent
+    spec = load_spec(here / f"{name}.toml")
+    if trials is not None:
+        spec = replace(spec, trials=trials, chunk_trials=min(trials, spec.chunk_trials))
+    enable_compilation_cache()
+    folder = here / "studies" / (f"{name}_quick" if quick else name)
+    summary = run_study(spec, folder, resume=True, watcher=_Lines())
+    if summary.trials:
+        print(f"{name}: {summary.trials} trials in {summary.seconds:.0f} s")
+    return open_results(folder)
+
+
+class _Lines:
+    """Tells now and then how far a study is."""
+
+    def begin(self, trials: int, done: int) -> None:
+        """Start counting."""
+        self._trials, self._done, self._told = trials, done, time.monotonic()
+
+    def advance(self, trials: int) -> None:
+        """Count."""
+        self._done += trials
+        if time.monotonic() - self._told > 30:
+            self._told = time.monotonic()
+            print(f"{self._done} of {self._trials} trials", flush=True)
+
+    def note(self, message: str) -> None:
+        """Pass on."""
+        print(message, flush=True)

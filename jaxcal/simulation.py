@@ -1,11 +1,11 @@
 """Simulated experiments after the paper's section 3.1, as a pure function of a key.
 
-The target is imaged in n poses: lateral position and depth uniform over the field, the
-elevational offset uniform within a bound or normal, the probe turned about a random axis by up to
+The target is imaged in n poses: lateral position and depth uniform over the field, the elevational
+offset after one of the laws of :mod:`jaxcal.offsets`, the probe turned about a random axis by up to
 30 degrees, and white noise on the distance to every element; lateral position and range are then
-segmented from the distances by least squares on Eq. 5. Test images lie in the plane and carry no
-noise. The paper leaves the ranges open; the defaults reproduce its tables (``test_fraction`` is a
-fitted choice: at 1.0 fewer cells agree).
+segmented from the distances by least squares on Eq. 5. The tracker may err, too. Test images lie in
+the plane and carry no noise. The paper leaves the ranges open; ``experiments/paper_tables`` says
+which choices come near its tables (``test_fraction`` is a fitted one).
 
 A curvilinear array sees a sector: the direction is uniform within 0.9 of its half angle, the depth
 counts from the arc. Its data are the distances themselves; the points beside them are the in-plane
@@ -15,7 +15,6 @@ fit, which is what an image would show.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -26,21 +25,30 @@ from jaxtyping import Array, Float, Key
 
 from jaxcal.errors import InputError
 from jaxcal.geometry import matrix_from_rotation
+from jaxcal.offsets import OffsetLaw, check_law, standard_offsets
 from jaxcal.probe import L14_5, CurvilinearProbe, Probe
-from jaxcal.problem import Channels, Problem
+from jaxcal.problem import Channels, Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES, Recording, Truth, make_images
 from jaxcal.segmentation.time_of_flight import fit_distances, fit_in_plane
+
+Scalar = float | Float[Array, ""]
+"""A number of a protocol: a plain one, or one that is traced and so shared by a compiled program
+among all the values it may take."""
 
 
 @dataclass(frozen=True)
 class Protocol:
     """The distributions of a simulated experiment.
 
+    Counts, the law of the offsets and the probe shape the program that draws; every other field
+    may be a traced number (``dataclasses.replace`` inside the transformed function).
+
     Attributes:
         images: calibration images.
         test_images: noise-free in-plane test images.
-        elevation_mm: bound (uniform) or SD (normal) of the elevational offsets.
-        elevation_distribution: ``uniform`` or ``normal``.
+        elevation_mm: bound (uniform, one-sided, triangular) or SD (normal, heavy-tailed) of the
+            elevational offsets.
+        elevation_distribution: their law, see :mod:`jaxcal.offsets`.
         noise_mm: SD of the noise on each element's distance.
         lateral_mm: the target's lateral position is uniform within +- this (linear probes).
         depth_mm: its depth is uniform between these; curvilinear probes: its range from the arc.
@@ -49,30 +57,36 @@ class Protocol:
         probe: the transducer.
         sector: curvilinear probes: directions cover this fraction of the array's half angle.
         raw: keep the distances that the points come from; curvilinear probes always do.
+        tracker_mm: SD of the tracked position of every calibration pose, each axis.
+        tracker_rad: SD of its tracked rotation, about each of the probe's axes.
     """
 
     images: int = 50
     test_images: int = 50
-    elevation_mm: float = 1.0
-    elevation_distribution: Literal["uniform", "normal"] = "uniform"
-    noise_mm: float = 0.5
-    lateral_mm: float = 29.25
-    depth_mm: tuple[float, float] = (10.0, 90.0)
-    rotation_rad: float = float(np.radians(30.0))
-    test_fraction: float = 0.75
+    elevation_mm: Scalar = 1.0
+    elevation_distribution: OffsetLaw = "uniform"
+    noise_mm: Scalar = 0.5
+    lateral_mm: Scalar = 29.25
+    depth_mm: tuple[Scalar, Scalar] = (10.0, 90.0)
+    rotation_rad: Scalar = float(np.radians(30.0))
+    test_fraction: Scalar = 0.75
     probe: Probe = L14_5
-    sector: float = 0.9
+    sector: Scalar = 0.9
     raw: bool = False
+    tracker_mm: Scalar = 0.0
+    tracker_rad: Scalar = 0.0
 
     def __post_init__(self) -> None:
         if not MINIMUM_IMAGES <= self.images <= 100_000:
             raise InputError(f"images must be between {MINIMUM_IMAGES} and 100000")
-        for name in ("elevation_mm", "noise_mm"):
+        for name, largest, unit in (
+            ("elevation_mm", 1000, "mm"), ("noise_mm", 1000, "mm"),
+            ("tracker_mm", 1000, "mm"), ("tracker_rad", 1, "rad"),
+        ):  # fmt: skip
             value = getattr(self, name)
-            if not (np.isfinite(value) and 0 <= value <= 1000):
-                raise InputError(f"{name} must be between 0 and 1000 mm, not {value}")
-        if self.elevation_distribution not in ("uniform", "normal"):
-            raise InputError("elevation_distribution must be uniform or normal")
+            if not (is_traced(value) or (np.isfinite(value) and 0 <= value <= largest)):
+                raise InputError(f"{name} must be between 0 and {largest} {unit}, not {value}")
+        check_law(self.elevation_distribution)
 
 
 class Experiment(eqx.Module):
@@ -139,8 +153,9 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
     probe = protocol.probe
     curved = isinstance(probe, CurvilinearProbe)
     width = protocol.sector * probe.half_angle_rad if curved else protocol.lateral_mm
-    field = jnp.asarray([width, 0.5 * np.ptp(protocol.depth_mm)])
-    middle = jnp.asarray([0.0, 0.5 * sum(protocol.depth_mm)])
+    shallow, deep = protocol.depth_mm
+    field = jnp.asarray([width, 0.5 * abs(deep - shallow)])
+    middle = jnp.asarray([0.0, 0.5 * (shallow + deep)])
     truth = jaxlie.SE3.from_rotation_and_translation(
         _rotation(keys[0], np.pi), 50.0 * jax.random.normal(keys[1], (3,))
     )
@@ -150,9 +165,7 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
     lateral, depth = _positions(keys[3], n, field, middle)
     if curved:
         lateral, depth = _from_sector(lateral, depth, probe.radius_mm)
-    draw = jax.random.uniform(keys[4], (n,), minval=-1.0, maxval=1.0)
-    if protocol.elevation_distribution == "normal":
-        draw = jax.random.normal(keys[4], (n,))
+    draw = standard_offsets(keys[4], protocol.elevation_distribution, n)
     elevation = protocol.elevation_mm * draw
     poses = _poses(keys[5], truth, point, jnp.stack([lateral, elevation, depth], -1), protocol)
 
@@ -176,7 +189,7 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
     test = jnp.stack([across, deep], -1)
     in_plane = jnp.stack([test[:, 0], jnp.zeros(m), test[:, 1]], -1)
     return Experiment(
-        poses=poses,
+        poses=_tracked(jax.random.fold_in(keys[5], n), poses, protocol),
         points=points,
         covariance=protocol.noise_mm**2 * inverse,
         elevation=elevation,
@@ -204,7 +217,7 @@ def _positions(
     return positions[:, 0], positions[:, 1]
 
 
-def _rotation(key: Key[Array, ""], largest: float) -> jaxlie.SO3:
+def _rotation(key: Key[Array, ""], largest: Scalar) -> jaxlie.SO3:
     axis_key, angle_key = jax.random.split(key)
     axis = jax.random.normal(axis_key, (3,))
     angle = jax.random.uniform(angle_key, (), maxval=largest)
@@ -247,6 +260,23 @@ def times_of_flight(
     if not (np.isfinite(clock_hz) and clock_hz > 0):
         raise InputError(f"the clock needs a positive frequency in Hz, not {clock_hz}")
     return np.round(times * clock_hz) / clock_hz
+
+
+def _tracked(
+    key: Key[Array, ""], poses: Float[Array, "n 4 4"], protocol: Protocol
+) -> Float[Array, "n 4 4"]:
+    """The poses as the tracker reports them: errors of its position, and of its rotation."""
+    numbers = (protocol.tracker_mm, protocol.tracker_rad)
+    if not any(is_traced(number) or number > 0 for number in numbers):
+        return poses
+    errors = jax.random.normal(key, (poses.shape[0], 6))
+
+    def one(pose: Float[Array, "4 4"], error: Float[Array, " 6"]) -> Float[Array, "4 4"]:
+        turned = jaxlie.SO3.exp(protocol.tracker_rad * error[3:]).as_matrix()
+        moved = pose[:3, 3] + protocol.tracker_mm * error[:3]
+        return matrix_from_rotation(pose[:3, :3] @ turned, moved)
+
+    return jax.vmap(one)(poses, errors)
 
 
 def simulate_recording(

@@ -16,6 +16,7 @@ from jaxcal.cli.demo import demo
 from jaxcal.cli.import_ import import_
 from jaxcal.cli.segment import segment
 from jaxcal.cli.simulate import simulate
+from jaxcal.cli.study import study
 from jaxcal.errors import CalibrationError
 
 
@@ -30,7 +31,7 @@ def commands() -> None:
     """Calibrate a tracked or robotic ultrasound probe from images of one small fixed target."""
 
 
-for _command in (demo, simulate, import_, segment, calibrate):
+for _command in (demo, simulate, import_, segment, calibrate, study):
     commands.add_command(_command)
 
 
@@ -48,8 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if sys.stdout is not None:
             sys.stdout.flush()
         return code
-    except (KeyboardInterrupt, click.Abort):
-        _report("interrupted", ExitCode.INTERRUPTED)
+    except (KeyboardInterrupt, click.Abort) as interruption:
+        _report(str(interruption) or "interrupted", ExitCode.INTERRUPTED)
         if arguments is None:
             # Under the threads of an interrupted compilation an orderly exit may crash.
             os._exit(ExitCode.INTERRUPTED)

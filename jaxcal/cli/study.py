@@ -1,0 +1,159 @@
+"""``jaxcal study``: run a Monte-Carlo study, and look at one."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from jaxcal.cli.common import ExitCode, print_json, print_page
+
+if TYPE_CHECKING:
+    from jaxcal.study.run import Watcher
+
+
+@click.group()
+def study() -> None:
+    """Monte-Carlo studies: a grid of conditions x methods x trials, from a TOML spec."""
+
+
+@study.command()
+@click.argument("spec", type=click.Path(), metavar="SPEC.toml")
+@click.option("--out", type=click.Path(), required=True, metavar="DIR", help="Folder of results.")
+@click.option("--resume", is_flag=True, help="Continue the study that is in DIR.")
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 4096),
+    metavar="N",
+    help="So many processes on this machine, each on cores of its own (needs jaxcal[cluster]).",
+)
+@click.option(
+    "--dask",
+    metavar="ADDRESS",
+    help="Workers of a running Dask scheduler, e.g. tcp://127.0.0.1:8786.",
+)
+def run(spec: str, out: str, resume: bool, workers: int | None, dask: str | None) -> int:
+    """Compute the study that SPEC.toml describes into DIR, chunk by chunk.
+
+    Interrupted or killed, it is continued with --resume: at most the chunks in work are lost.
+    """
+    if workers is not None and dask is not None:
+        raise click.UsageError("--workers and --dask exclude each other")
+    from jaxcal.study.spec import load_spec
+
+    checked = load_spec(spec)
+    from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.study.run import run_study
+    from jaxcal.study.store import Store
+
+    enable_compilation_cache()
+    again = _command(spec, out, workers, dask)
+    try:
+        with _watching() as watcher:
+            summary = run_study(
+                checked, out, resume=resume, workers=workers or 0, scheduler=dask, watcher=watcher
+            )
+    except KeyboardInterrupt:
+        done = len(Store(out, checked).present())
+        raise KeyboardInterrupt(
+            f"interrupted: {done} of {checked.chunk_count} chunks are done; continue with: {again}"
+        ) from None
+    rate = summary.trials / max(summary.seconds, 1e-9)
+    click.echo(
+        f"{out}: {summary.chunks} chunks are done, {summary.computed} of them now "
+        f"({summary.trials} trials in {summary.seconds:.1f} s, {rate:.0f} a second)"
+    )
+    return ExitCode.CONVERGED
+
+
+@study.command()
+@click.argument("folder", type=click.Path(), metavar="DIR")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on standard output.")
+@click.option("--csv", "csv_file", type=click.Path(), metavar="FILE", help="Write the table here.")
+def show(folder: str, as_json: bool, csv_file: str | None) -> int:
+    """Print mean, SD, 95 % interval, failures and paired differences of the study in DIR."""
+    from jaxcal.io.atomic import write_text
+    from jaxcal.study import show as tables
+    from jaxcal.study.store import Store
+
+    store = Store.open(folder)
+    cells = tables.summarise(store)
+    if csv_file is not None:
+        write_text(csv_file, tables.as_csv(store.spec, cells))
+    if as_json:
+        print_json(tables.as_record(store, cells))
+        return ExitCode.CONVERGED
+    done, chunks = len(store.present()), store.spec.chunk_count
+    notes = [] if done == chunks else [f"{done} of {chunks} chunks are done; the rest is missing."]
+    print_page(tables.as_table(store.spec, cells), *notes)
+    return ExitCode.CONVERGED
+
+
+def _command(spec: str, out: str, workers: int | None, dask: str | None) -> str:
+    parts = ["jaxcal", "study", "run", spec, "--out", out]
+    parts += ["--workers", str(workers)] if workers else []
+    parts += ["--dask", dask] if dask else []
+    return shlex.join([*parts, "--resume"])
+
+
+class _Bar:
+    """Trials done, trials a second and time left, on standard error."""
+
+    def __init__(self, progress: Any) -> None:
+        self._progress = progress
+        self._task = progress.add_task("starting", total=None, rate="")
+        self._begun, self._done = time.monotonic(), 0
+
+    def begin(self, trials: int, done: int) -> None:
+        self._progress.update(self._task, description="trials", total=trials, completed=done)
+        self._begun = time.monotonic()
+
+    def advance(self, trials: int) -> None:
+        self._done += trials
+        rate = self._done / max(time.monotonic() - self._begun, 1e-9)
+        self._progress.update(self._task, advance=trials, rate=f"{rate:.0f}/s")
+
+    def note(self, message: str) -> None:
+        self._progress.console.print(f"jaxcal: note: {message}", soft_wrap=True)
+
+
+class _Lines:
+    """What is to be noted, on standard error; nobody is watching."""
+
+    def begin(self, trials: int, done: int) -> None:
+        pass
+
+    def advance(self, trials: int) -> None:
+        pass
+
+    def note(self, message: str) -> None:
+        click.echo(f"jaxcal: note: {message}", err=True)
+
+
+@contextmanager
+def _watching() -> Iterator[Watcher]:
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield _Lines()
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True, markup=False, highlight=False)
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"), TimeRemainingColumn(),
+    )  # fmt: skip
+    # An hour's average: a chunk may take minutes.
+    with Progress(*columns, console=console, speed_estimate_period=3600) as progress:
+        yield _Bar(progress)

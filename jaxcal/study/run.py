@@ -1,0 +1,172 @@
+"""Compute what is missing of a study: here, on this machine's cores, or on a cluster."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from jaxcal.errors import FormatError, InputError
+from jaxcal.study.spec import Chunk, Spec
+from jaxcal.study.store import Store
+
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None
+
+Computed = tuple[Chunk, dict[str, np.ndarray], str]
+"""A chunk, its results, and what computed it."""
+
+
+@runtime_checkable
+class Watcher(Protocol):
+    """Who wants to know how a study goes on."""
+
+    def begin(self, trials: int, done: int) -> None:
+        """So many trials are to be done in all, so many were done before."""
+
+    def advance(self, trials: int) -> None:
+        """So many more are done and written."""
+
+    def note(self, message: str) -> None:
+        """Something that a person should know."""
+
+
+class Silence:
+    """Nobody watches."""
+
+    def begin(self, trials: int, done: int) -> None:
+        """Say nothing."""
+
+    def advance(self, trials: int) -> None:
+        """Say nothing."""
+
+    def note(self, message: str) -> None:
+        """Say nothing."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How a run ended.
+
+    Attributes:
+        chunks: of the study, all of which are there now.
+        computed: chunks that this run computed.
+        trials: that this run computed.
+        seconds: that it took, compilation included.
+    """
+
+    chunks: int
+    computed: int
+    trials: int
+    seconds: float
+
+
+def run_study(
+    spec: Spec,
+    folder: str | os.PathLike[str],
+    *,
+    resume: bool = False,
+    workers: int = 0,
+    scheduler: Any = None,
+    watcher: Watcher | None = None,
+) -> Summary:
+    """Compute the missing chunks of a study and write each when it is done.
+
+    Killed or interrupted at any moment, it is continued by the same call with ``resume``; the
+    files are then the same as without the interruption (on one machine).
+
+    Args:
+        spec: the study.
+        folder: where its files are.
+        resume: continue what is there; without it a folder that holds a study is refused.
+        workers: processes on this machine, each on cores of its own; 0 computes in this process.
+        scheduler: instead, the address of a running Dask scheduler, or a Dask cluster (whatever
+            ``distributed.Client`` takes), e.g. a ``dask_jobqueue.SLURMCluster``.
+        watcher: is told how it goes on.
+
+    Raises:
+        InputError: another spec's results are there, or the folder is in use.
+        OutputError: the folder or a file cannot be written; what was written before stays.
+        MissingExtraError: Dask is needed and not there.
+        CalibrationError: the cluster was lost; ``resume`` continues.
+    """
+    if workers < 0 or (workers and scheduler is not None):
+        raise InputError("workers must not be negative, nor be given beside a scheduler")
+    watcher = Silence() if watcher is None else watcher
+    begun = time.monotonic()
+    store = Store.create(folder, spec, resume=resume)
+    with _locked(store.folder):
+        store.sweep()
+        missing, done = _missing(store, watcher)
+        watcher.begin(spec.condition_count * spec.trials, done)
+        trials = 0
+        with closing(_computed(spec, missing, workers, scheduler)) as results:
+            for chunk, arrays, device in results:
+                store.write(chunk, arrays, device)
+                trials += chunk.stop - chunk.start
+                watcher.advance(chunk.stop - chunk.start)
+    return Summary(spec.chunk_count, len(missing), trials, time.monotonic() - begun)
+
+
+def _missing(store: Store, watcher: Watcher) -> tuple[list[Chunk], int]:
+    """The chunks to compute, and how many trials are done."""
+    sound, done, makers = set(), 0, {}
+    for index in store.present():
+        chunk = store.spec.chunk(index)
+        try:
+            store.read(chunk)
+        except FormatError as error:
+            watcher.note(f"{error}; it is computed again")
+            continue
+        makers.setdefault(store.versions(chunk), []).append(index)
+        sound.add(index)
+        done += chunk.stop - chunk.start
+    missing = [store.spec.chunk(k) for k in range(store.spec.chunk_count) if k not in sound]
+    if len(makers) > 1:
+        watcher.note(f"the chunks were computed by {len(makers)} different set-ups: "
+                     f"{'; '.join(sorted(makers))}")  # fmt: skip
+    return missing, done
+
+
+def _computed(
+    spec: Spec, missing: list[Chunk], workers: int, scheduler: Any
+) -> Generator[Computed]:
+    if not missing:
+        return
+    if workers or scheduler is not None:
+        from jaxcal.study.cluster import compute_on_cluster
+
+        yield from compute_on_cluster(spec, missing, workers=workers, scheduler=scheduler)
+    else:
+        yield from _compute_here(spec, missing)
+
+
+def _compute_here(spec: Spec, missing: Iterable[Chunk]) -> Iterator[Computed]:
+    from jaxcal.study.pipeline import compute_chunk, device_name
+
+    for chunk in missing:
+        yield chunk, compute_chunk(spec, chunk), device_name()
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other processes from computing the same study; the lock dies with its holder."""
+    if fcntl is None:
+        yield
+        return
+    with (folder / ".lock").open("wb") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{folder}: is being computed by another process") from None
+        except OSError:
+            pass  # a file system without locks
+        yield

@@ -1,0 +1,488 @@
+"""What a study computes: a TOML file, checked field by field.
+
+    name = "paper_tables"     # letters, digits, - and _
+    seed = 20261121           # of all draws, 0 to 2^63 - 1
+    trials = 400              # simulated experiments in each condition
+    chunk_trials = 512        # trials in one file; at most those are lost by an interruption
+
+    [conditions]              # a number, or a list of numbers: an axis of the grid
+    images = 50               # calibration images
+    test_images = 50          # noise-free in-plane test images
+    elevation_mm = [0.5, 1]   # size of the elevational offsets: bound or SD (jaxcal.offsets)
+    elevation_distribution = "uniform"  # or normal, one-sided, heavy-tailed, triangular; or a list
+    noise_mm = [0, 2]         # SD of the noise on every element's distance
+    lateral_mm = 29.25        # the target's lateral position is uniform within +- this
+    depth_min_mm = 10         # its depth is uniform between this
+    depth_max_mm = 90         # and this
+    rotation_deg = 30         # largest rotation of the probe, about a random axis
+    test_fraction = 0.75      # test positions cover this fraction of the field
+    tracker_mm = 0            # SD of the tracked position, each axis
+    tracker_deg = 0           # SD of the tracked rotation, about each axis
+
+    [probe]                   # a linear array
+    elements = 128
+    pitch_mm = 0.45703125
+
+    [[methods]]               # one table for each; names are unique
+    name = "alternation, 1 mm"
+    method = "alternating"    # or conventional, joint
+    prior = "auto"            # joint only: auto (self-tuned) or bounded
+    max_elevation_mm = 1      # the bound that alternating and bounded are told; or
+    max_elevation_factor = 1  # ... this times the true bound (jaxcal.offsets.nominal_bound)
+    tolerance_rad = 1e-3      # alternating: stop when X turns by less in a round
+    tolerance_mm = 0.1        # ... and its origin moves by less
+    max_rounds = 1000         # alternating: most rounds
+    inner_steps = 2           # alternating: Gauss-Newton steps in a round
+    max_iterations = 100      # of the other solvers
+
+Everything but ``name``, ``seed``, ``trials`` and the methods' ``name`` and ``method`` has a default
+(:class:`Condition`, :class:`MethodSpec`). A field that is not listed is refused. The unit of a
+number is in its name, nowhere else. Two files that say the same, in another order or with the
+defaults left out, are one spec: the same hash, the same study.
+
+Trial t of condition c is drawn from ``fold_in(key(seed), c * trials + t)`` whatever the chunks,
+workers and devices; conditions are counted with the last listed axis of :data:`AXES` fastest.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import itertools
+import json
+import math
+import os
+import re
+import tomllib
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+from jaxcal.errors import FormatError, InputError
+from jaxcal.io.readable import check_readable, quoted
+from jaxcal.probe import LinearProbe
+
+MAXIMUM_BYTES = 2**20
+"""Largest spec that is read."""
+
+MAXIMUM_EXPERIMENTS = 2**32
+"""Conditions times trials: fold_in takes 32 bits."""
+
+MAXIMUM_CHUNKS = 10**6
+MAXIMUM_CONDITIONS = 10**5
+MAXIMUM_METHODS = 100
+MAXIMUM_DISTANCES = 2**22
+"""Images times elements of one experiment: 64 of them take 2 GiB."""
+
+MAXIMUM_CHUNK = 2**24
+"""Trials times methods of one chunk, whose results are held at once."""
+
+AXES = (
+    "elevation_distribution",
+    "images",
+    "test_images",
+    "test_fraction",
+    "lateral_mm",
+    "depth_min_mm",
+    "depth_max_mm",
+    "rotation_deg",
+    "tracker_mm",
+    "tracker_deg",
+    "elevation_mm",
+    "noise_mm",
+)
+"""The fields of ``[conditions]`` in the order in which the grid is counted, the last fastest."""
+
+_COUNTS = {"images": (4, 100_000), "test_images": (2, 100_000)}
+_LIMITS = {
+    "elevation_mm": (0.0, 1000.0),
+    "noise_mm": (0.0, 1000.0),
+    "lateral_mm": (0.0, 1000.0),
+    "depth_min_mm": (0.0, 1000.0),
+    "depth_max_mm": (0.0, 1000.0),
+    "rotation_deg": (0.0, 180.0),
+    "test_fraction": (0.0, 10.0),
+    "tracker_mm": (0.0, 1000.0),
+    "tracker_deg": (0.0, 57.0),
+}
+_UNITS = ("_mm", "_deg", "_rad")
+_LAWS = ("uniform", "normal", "one-sided", "heavy-tailed", "triangular")
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One cell of the grid; the fields are those of ``[conditions]``, each with one value."""
+
+    elevation_distribution: str = "uniform"
+    images: int = 50
+    test_images: int = 50
+    test_fraction: float = 0.75
+    lateral_mm: float = 29.25
+    depth_min_mm: float = 10.0
+    depth_max_mm: float = 90.0
+    rotation_deg: float = 30.0
+    tracker_mm: float = 0.0
+    tracker_deg: float = 0.0
+    elevation_mm: float = 1.0
+    noise_mm: float = 0.5
+
+
+@dataclass(frozen=True)
+class MethodSpec:
+    """One method and its options.
+
+    Attributes:
+        name: how results call it.
+        method: ``conventional``, ``alternating`` or ``joint``.
+        prior: of the joint method: ``auto`` (self-tuned) or ``bounded``.
+        max_elevation_mm: bound on |y| of alternating and bounded; None where there is none, or
+            where the factor says it. Without either it is the paper's 1 mm.
+        max_elevation_factor: the bound as a multiple of the true one.
+        tolerance_rad: see :class:`jaxcal.Options`, and so are the following.
+        tolerance_mm: see there.
+        max_rounds: see there.
+        inner_steps: see there.
+        max_iterations: see there.
+    """
+
+    name: str
+    method: Literal["conventional", "alternating", "joint"]
+    prior: Literal["auto", "bounded"] = "auto"
+    max_elevation_mm: float | None = None
+    max_elevation_factor: float | None = None
+    tolerance_rad: float = 1e-3
+    tolerance_mm: float = 0.1
+    max_rounds: int = 1000
+    inner_steps: int = 2
+    max_iterations: int = 100
+
+    @property
+    def bounded(self) -> bool:
+        """Whether it needs a bound."""
+        return self.method == "alternating" or self.prior == "bounded"
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Trials ``start`` to ``stop`` (exclusive) of one condition; ``index`` names the file."""
+
+    index: int
+    condition: int
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A checked study.
+
+    Attributes:
+        name: of the study.
+        seed: of all draws.
+        trials: in each condition.
+        chunk_trials: most trials in one file.
+        axes: for every field of :data:`AXES` its values, and
+        listed: the names of those that were given as lists: the axes of the results.
+        probe: the transducer.
+        methods: in the order of the file.
+    """
+
+    name: str
+    seed: int
+    trials: int
+    chunk_trials: int
+    axes: tuple[tuple[str, tuple[float | int | str, ...]], ...]
+    listed: tuple[str, ...]
+    probe: LinearProbe
+    methods: tuple[MethodSpec, ...]
+
+    def axis(self, name: str) -> tuple[float | int | str, ...]:
+        """Values of one field of ``[conditions]``."""
+        return dict(self.axes)[name]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Lengths of all axes, in the order of :data:`AXES`."""
+        return tuple(len(values) for _, values in self.axes)
+
+    @property
+    def condition_count(self) -> int:
+        """Cells of the grid."""
+        return math.prod(self.shape)
+
+    def condition(self, index: int) -> Condition:
+        """Cell ``index`` of the grid, in counting order."""
+        values: dict[str, Any] = {}
+        for name, choices in reversed(self.axes):
+            index, place = divmod(index, len(choices))
+            values[name] = choices[place]
+        return Condition(**values)
+
+    def conditions(self) -> Iterator[Condition]:
+        """All cells, in counting order."""
+        names = [name for name, _ in self.axes]
+        for values in itertools.product(*(choices for _, choices in self.axes)):
+            yield Condition(**dict(zip(names, values, strict=True)))  # type: ignore[arg-type]
+
+    @property
+    def chunks_per_condition(self) -> int:
+        """Files of one condition."""
+        return -(-self.trials // self.chunk_trials)
+
+    @property
+    def chunk_count(self) -> int:
+        """Files of the study."""
+        return self.condition_count * self.chunks_per_condition
+
+    def chunk(self, index: int) -> Chunk:
+        """The trials of file ``index``."""
+        condition, part = divmod(index, self.chunks_per_condition)
+        start = part * self.chunk_trials
+        return Chunk(index, condition, start, min(start + self.chunk_trials, self.trials))
+
+    def canonical(self) -> str:
+        """The spec as one JSON text that does not depend on how the file was laid out."""
+        content = asdict(self)
+        content["axes"] = {name: list(values) for name, values in self.axes}
+        # In the order of AXES: whether the file lists noise or elevation first changes nothing.
+        content["listed"] = list(self.listed)
+        return json.dumps(content, sort_keys=True, allow_nan=False)
+
+    @property
+    def sha256(self) -> str:
+        """Hash of :meth:`canonical`; every file of the study carries it."""
+        return hashlib.sha256(self.canonical().encode()).hexdigest()
+
+
+def load_spec(path: str | os.PathLike[str]) -> Spec:
+    """Read and check a spec.
+
+    Args:
+        path: a TOML file, see the head of this module.
+
+    Raises:
+        FormatError: no such file, too large, not UTF-8, not TOML.
+        InputError: an unknown, missing or wrong field, which is named. Either is one line that
+            starts with the path.
+    """
+    check_readable(path, maximum_bytes=MAXIMUM_BYTES)
+    try:
+        return parse_spec(Path(path).read_text(encoding="utf-8"))
+    except InputError as error:
+        raise type(error)(f"{path}: {error}") from None
+    except UnicodeDecodeError:
+        raise FormatError(f"{path}: is not UTF-8 text") from None
+
+
+def parse_spec(text: str) -> Spec:
+    """:func:`load_spec` from the file's text; errors do not name the file.
+
+    Raises:
+        FormatError: not TOML.
+        InputError: see there.
+    """
+    try:
+        content = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        reason = " ".join(str(error).split()) or "nested too deep"
+        raise FormatError(f"is not TOML: {reason}") from None
+    _known(content, {"name", "seed", "trials", "chunk_trials", "conditions", "probe", "methods"})
+    name = _required(content, "name")
+    if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z0-9_-]{1,100}", name)):
+        raise InputError("name must be 1 to 100 letters, digits, - and _")
+    seed = _integer("seed", _required(content, "seed"), 0, 2**63 - 1)
+    trials = _integer("trials", _required(content, "trials"), 1, MAXIMUM_EXPERIMENTS)
+    chunk = _integer("chunk_trials", content.get("chunk_trials", 512), 1, 2**20)
+    axes, listed = _axes(_table(content, "conditions"))
+    probe = _probe(_table(content, "probe"))
+    spec = Spec(name, seed, trials, min(chunk, trials), axes, listed, probe, _methods(content))
+    _check_size(spec)
+    return spec
+
+
+def spec_from_canonical(text: str) -> Spec:
+    """The spec that :meth:`Spec.canonical` was made from (it travels to workers as this text).
+
+    Raises:
+        InputError: the text does not come from there.
+    """
+    try:
+        content = json.loads(text)
+        given = content["axes"]
+        axes = tuple((name, tuple(given[name])) for name in AXES)
+        methods = tuple(MethodSpec(**method) for method in content["methods"])
+        spec = Spec(
+            content["name"], content["seed"], content["trials"], content["chunk_trials"], axes,
+            tuple(content["listed"]), LinearProbe(**content["probe"]), methods,
+        )  # fmt: skip
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"is not a study's canonical spec: {error}") from None
+    if spec.canonical() != text:
+        raise InputError("is not a study's canonical spec")
+    return spec
+
+
+def _known(table: dict[str, Any], names: set[str], where: str = "") -> None:
+    for key in table:
+        if key in names:
+            continue
+        shown = quoted(f"{where}{key}")
+        unit = next((key + unit for unit in _UNITS if key + unit in names), None)
+        if unit is not None:
+            raise InputError(f"unknown field {shown}: its unit is missing, write {unit}")
+        close = difflib.get_close_matches(key, sorted(names), 1)
+        hint = f": did you mean {close[0]}?" if close else f"; known are {', '.join(sorted(names))}"
+        raise InputError(f"unknown field {shown}{hint}")
+
+
+def _required(table: dict[str, Any], key: str, where: str = "") -> Any:
+    if key not in table:
+        raise InputError(f"{where}{key} is missing")
+    return table[key]
+
+
+def _table(content: dict[str, Any], key: str) -> dict[str, Any]:
+    table = content.get(key, {})
+    if not isinstance(table, dict):
+        raise InputError(f"{key} must be a table: [{key}]")
+    return table
+
+
+def _integer(name: str, value: object, least: int, most: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise InputError(f"{name} must be a whole number, not {_shown(value)}")
+    if not least <= value <= most:
+        raise InputError(f"{name} must be between {least} and {most}, not {value}")
+    return value
+
+
+def _number(name: str, value: object, least: float, most: float, *, above: bool = False) -> float:
+    if isinstance(value, str):
+        raise InputError(f"{name} must be a plain number (its unit is in its name), not "
+                         f"{_shown(value)}")  # fmt: skip
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{name} must be a number, not {_shown(value)}")
+    number = float(value) if abs(value) < 2**1000 else math.inf
+    if not least <= number <= most or (above and number == least):
+        span = f"more than {least:g} and at most" if above else f"between {least:g} and"
+        raise InputError(f"{name} must be {span} {most:g}, not {_shown(value)}")
+    return number + 0.0  # -0.0 and 0 are one condition
+
+
+def _shown(value: object) -> str:
+    return quoted(str(value)) if isinstance(value, str) else quoted(repr(value)).strip("'")
+
+
+def _axes(
+    table: dict[str, Any],
+) -> tuple[tuple[tuple[str, tuple[float | int | str, ...]], ...], tuple[str, ...]]:
+    _known(table, set(AXES), "conditions.")
+    defaults = {field.name: field.default for field in fields(Condition)}
+    axes, listed = [], []
+    for name in AXES:
+        given = table.get(name, defaults[name])
+        values = given if isinstance(given, list) else [given]
+        if isinstance(given, list):
+            listed.append(name)
+        label = f"conditions.{name}"
+        if not 1 <= len(values) <= MAXIMUM_CONDITIONS:
+            raise InputError(f"{label} must hold 1 to {MAXIMUM_CONDITIONS} values")
+        checked = tuple(_condition_value(name, label, value) for value in values)
+        if len(set(checked)) < len(checked):
+            raise InputError(f"{label} holds a value twice")
+        axes.append((name, checked))
+    shallowest, deepest = max(dict(axes)["depth_min_mm"]), min(dict(axes)["depth_max_mm"])
+    if not shallowest < deepest:
+        raise InputError("conditions.depth_min_mm must be less than conditions.depth_max_mm")
+    return tuple(axes), tuple(listed)
+
+
+def _condition_value(name: str, label: str, value: object) -> float | int | str:
+    if name == "elevation_distribution":
+        if value not in _LAWS:
+            raise InputError(f"{label} must be one of {', '.join(_LAWS)}, not {_shown(value)}")
+        return str(value)
+    if name in _COUNTS:
+        return _integer(label, value, *_COUNTS[name])
+    above = name in ("depth_min_mm", "depth_max_mm")
+    return _number(label, value, *_LIMITS[name], above=above)
+
+
+def _probe(table: dict[str, Any]) -> LinearProbe:
+    _known(table, {"elements", "pitch_mm"}, "probe.")
+    default = LinearProbe()
+    elements = _integer("probe.elements", table.get("elements", default.elements), 2, 4096)
+    pitch = _number(
+        "probe.pitch_mm", table.get("pitch_mm", default.pitch_mm), 0.0, 99.0, above=True
+    )
+    return LinearProbe(elements=elements, pitch_mm=pitch)
+
+
+def _methods(content: dict[str, Any]) -> tuple[MethodSpec, ...]:
+    tables = _required(content, "methods")
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        raise InputError("methods must be tables: [[methods]]")
+    if not 1 <= len(tables) <= MAXIMUM_METHODS:
+        raise InputError(f"there must be 1 to {MAXIMUM_METHODS} [[methods]]")
+    methods = tuple(_method(table, f"methods[{k}].") for k, table in enumerate(tables))
+    names = [method.name for method in methods]
+    if len(set(names)) < len(names):
+        raise InputError("two [[methods]] have the same name")
+    return methods
+
+
+def _method(table: dict[str, Any], where: str) -> MethodSpec:
+    _known(table, {field.name for field in fields(MethodSpec)}, where)
+    name, method = _required(table, "name", where), _required(table, "method", where)
+    if not (isinstance(name, str) and 1 <= len(name) <= 100 and name.isprintable()):
+        raise InputError(f"{where}name must be 1 to 100 printable characters")
+    if method not in ("conventional", "alternating", "joint"):
+        raise InputError(f"{where}method must be conventional, alternating or joint, not "
+                         f"{_shown(method)}")  # fmt: skip
+    prior = table.get("prior", "auto")
+    if prior not in ("auto", "bounded"):
+        raise InputError(f"{where}prior must be auto or bounded, not {_shown(prior)}")
+    if method != "joint" and "prior" in table:
+        raise InputError(f"{where}prior belongs to the joint method")
+    bounded = method == "alternating" or prior == "bounded"
+    given = [key for key in ("max_elevation_mm", "max_elevation_factor") if key in table]
+    if len(given) == 2:
+        raise InputError(f"{where}{given[0]} and {where}{given[1]} contradict each other")
+    if given and not bounded:
+        raise InputError(f"{where}{given[0]} belongs to alternating and to joint with prior "
+                         '"bounded"')  # fmt: skip
+    for key in ("tolerance_rad", "tolerance_mm", "max_rounds", "inner_steps"):
+        if key in table and method != "alternating":
+            raise InputError(f"{where}{key} belongs to the alternating method")
+    values: dict[str, Any] = {}
+    for key in given:
+        values[key] = _number(where + key, table[key], 0.0, 1000.0)
+    if bounded and not given:
+        values["max_elevation_mm"] = 1.0
+    for key, most in (("tolerance_rad", 1.0), ("tolerance_mm", 1000.0)):
+        if key in table:
+            values[key] = _number(where + key, table[key], 0.0, most, above=True)
+    for key in ("max_rounds", "inner_steps", "max_iterations"):
+        if key in table:
+            values[key] = _integer(where + key, table[key], 1, 10**7)
+    return MethodSpec(name=name, method=method, prior=prior, **values)
+
+
+def _check_size(spec: Spec) -> None:
+    if spec.condition_count > MAXIMUM_CONDITIONS:
+        raise InputError(f"the grid has {spec.condition_count} conditions, at most "
+                         f"{MAXIMUM_CONDITIONS} are computed")  # fmt: skip
+    if spec.condition_count * spec.trials > MAXIMUM_EXPERIMENTS:
+        raise InputError(f"conditions times trials are {spec.condition_count * spec.trials}, at "
+                         f"most {MAXIMUM_EXPERIMENTS} have draws of their own")  # fmt: skip
+    if spec.chunk_count > MAXIMUM_CHUNKS:
+        raise InputError(f"chunk_trials = {spec.chunk_trials} makes {spec.chunk_count} files, at "
+                         f"most {MAXIMUM_CHUNKS}: enlarge it")  # fmt: skip
+    if spec.chunk_trials * len(spec.methods) > MAXIMUM_CHUNK:
+        raise InputError(f"chunk_trials = {spec.chunk_trials} is too large for {len(spec.methods)} "
+                         "methods: reduce it")  # fmt: skip
+    images = max(int(count) for name in _COUNTS for count in spec.axis(name))
+    if images * spec.probe.elements > MAXIMUM_DISTANCES:
+        raise InputError(f"{images} images times {spec.probe.elements} elements are too many: at "
+                         f"most {MAXIMUM_DISTANCES} distances are drawn")  # fmt: skip

@@ -1,0 +1,173 @@
+"""Studies on real Dask workers on loopback, one of which dies; no test here mocks a cluster."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from jaxcal import InputError
+from jaxcal.cli.main import main
+from jaxcal.study import open_results, run_study
+from jaxcal.study.cluster import core_groups
+from jaxcal.study.spec import parse_spec
+from jaxcal.study.store import Store
+
+SPEC = """
+name = "cluster"
+seed = 3
+trials = 1600
+chunk_trials = 8
+[conditions]
+images = 6
+test_images = 4
+elevation_mm = 1
+[probe]
+elements = 8
+pitch_mm = 7.0
+[[methods]]
+name = "flat"
+method = "conventional"
+"""
+ADDRESS = r"tcp://127\.0\.0\.1:\d+"
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
+    """The study computed in this process."""
+    folder = tmp_path_factory.mktemp("cluster") / "here"
+    run_study(parse_spec(SPEC), folder)
+    return folder
+
+
+@pytest.fixture
+def started():
+    """Start processes; those that are still there in the end are killed."""
+    children = []
+
+    def start(*arguments):
+        child = subprocess.Popen(
+            [sys.executable, *map(str, arguments)], stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        children.append(child)
+        return child
+
+    yield start
+    for child in children:
+        child.kill()
+        child.communicate()
+
+
+def wait_for(condition, seconds=180):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def same_files(one, two):
+    first, second = ({p.name: p.read_bytes() for p in (f / "chunks").iterdir()} for f in (one, two))
+    return first == second
+
+
+@pytest.mark.slow
+def test_a_scheduler_and_two_workers_of_which_one_is_killed(here, started, tmp_path):
+    scheduler = started(
+        "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0",
+        "--no-dashboard",
+    )  # fmt: skip
+    found = None
+    while found is None:
+        line = scheduler.stderr.readline()
+        assert line, "the scheduler is gone"
+        found = re.search(rf"Scheduler at:\s+({ADDRESS})", line)
+    address = found[1]
+    workers = [
+        started("-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny",
+                "--host", "127.0.0.1", "--no-dashboard")
+        for _ in range(2)
+    ]  # fmt: skip
+    spec, folder = tmp_path / "spec.toml", tmp_path / "out"
+    spec.write_text(SPEC)
+    store = Store(folder, parse_spec(SPEC))
+    study = started("-m", "jaxcal.cli.main", "study", "run", spec, "--out", folder,
+                    "--dask", address)  # fmt: skip
+    wait_for(lambda: len(store.present()) >= 20 or study.poll() is not None)
+    workers[0].send_signal(signal.SIGKILL)
+    workers[0].wait()
+    left = store.spec.chunk_count - len(store.present())
+    assert left > 0, "the study was over before the worker died"
+    out, err = study.communicate(timeout=300)
+    assert study.returncode == 0, err
+    assert "200 chunks are done, 200 of them now" in out
+    assert workers[1].poll() is None
+    assert open_results(folder).identical(open_results(here))
+    assert same_files(folder, here)
+
+
+@pytest.mark.slow
+def test_local_workers_of_which_one_is_killed(here, started, tmp_path):
+    spec, folder = tmp_path / "spec.toml", tmp_path / "out"
+    spec.write_text(SPEC)
+    store = Store(folder, parse_spec(SPEC))
+    study = started("-m", "jaxcal.cli.main", "study", "run", spec, "--out", folder,
+                    "--workers", 2)  # fmt: skip
+    wait_for(lambda: len(store.present()) >= 20 or study.poll() is not None)
+    assert study.poll() is None, study.communicate()
+    processes = workers_of(study.pid)
+    assert len(processes) == 2
+    if len(os.sched_getaffinity(0)) >= 2:
+        cores = [os.sched_getaffinity(pid) for pid in processes]
+        assert not cores[0] & cores[1], "each worker has cores of its own"
+    os.kill(processes[0], signal.SIGKILL)
+    out, err = study.communicate(timeout=300)
+    assert study.returncode == 0, err
+    assert "200 chunks are done, 200 of them now" in out
+    assert same_files(folder, here)
+
+
+def workers_of(parent):
+    """Processes below ``parent`` that have loaded JAX's library: the ones that compute."""
+    found = []
+    for name in os.listdir("/proc"):
+        if not name.isdigit() or int(name) == parent:
+            continue
+        try:
+            with open(f"/proc/{name}/stat") as stream:
+                above = int(stream.read().rsplit(")", 1)[1].split()[1])
+            with open(f"/proc/{name}/maps") as stream:
+                computes = "libjax" in stream.read()
+        except OSError:
+            continue
+        if above == parent and computes:
+            found.append(int(name))
+    return found
+
+
+def test_no_scheduler(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("jaxcal.study.cluster.CONNECT_SECONDS", 1)
+    spec = tmp_path / "spec.toml"
+    spec.write_text(SPEC)
+    for address in ("tcp://127.0.0.1:9", "nonsense://x"):
+        run = ["study", "run", str(spec), "--out", str(tmp_path / "out"), "--resume"]
+        assert main([*run, "--dask", address]) == 2
+        line = capsys.readouterr().err
+        assert "no Dask scheduler answers" in line
+        assert line.count("\n") == 1
+
+
+def test_cores_are_shared_out():
+    cores = os.sched_getaffinity(0)
+    for workers in range(1, len(cores) + 1):
+        groups = core_groups(workers)
+        assert set().union(*groups) == cores
+        assert sum(map(len, groups)) == len(cores)
+        assert max(map(len, groups)) - min(map(len, groups)) <= 1
+    groups = core_groups(len(cores) + 3)
+    assert all(len(group) == 1 for group in groups)
+    with pytest.raises(InputError):
+        run_study(parse_spec(SPEC), "nowhere", workers=-1)

@@ -1,0 +1,551 @@
+"""Studies: specs, files, resumption, and results that depend on nothing but the spec."""
+
+import dataclasses
+import fcntl
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+import jaxcal
+from jaxcal import FormatError, InputError
+from jaxcal.cli.main import main
+from jaxcal.offsets import OFFSET_LAWS, nominal_bound, standard_deviation, standard_offsets
+from jaxcal.study import load_spec, open_results, run_study
+from jaxcal.study.pipeline import bound_mm, compute_chunk, protocol
+from jaxcal.study.show import as_csv, as_record, mean_interval, summarise
+from jaxcal.study.spec import AXES, parse_spec, spec_from_canonical
+from jaxcal.study.store import Store
+
+SPEC = """
+name = "small"
+seed = 11
+trials = {trials}
+chunk_trials = {chunk}
+[conditions]
+images = 6
+test_images = 4
+elevation_mm = [0.5, 2]
+noise_mm = 0.5
+[probe]
+elements = 8
+pitch_mm = 7.0
+[[methods]]
+name = "flat"
+method = "conventional"
+[[methods]]
+name = "arcs"
+method = "alternating"
+max_elevation_factor = 1.5
+"""
+METHOD = '\n[[methods]]\nname = "a"\nmethod = "conventional"\n'
+MINIMAL = 'name = "a"\nseed = 1\ntrials = 3\n'
+
+
+def small(trials: int = 10, chunk: int = 4) -> str:
+    return SPEC.format(trials=trials, chunk=chunk)
+
+
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory):
+    """Compiled programs of this module and of its processes, compiled once."""
+    folder = tmp_path_factory.mktemp("programs")
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = [getattr(jax.config, name) for name in names]
+    for name, value in zip(names, (str(folder), 0.2), strict=True):
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+    yield folder
+    for name, value in zip(names, before, strict=True):
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+@pytest.fixture(scope="module")
+def finished(programs, tmp_path_factory):
+    """A study that nobody disturbed."""
+    folder = tmp_path_factory.mktemp("study") / "finished"
+    run_study(parse_spec(small()), folder)
+    return folder
+
+
+def process(arguments, programs, before=()):
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(programs),
+                   "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}  # fmt: skip
+    command = [*before, sys.executable, "-m", "jaxcal.cli.main", "study", *map(str, arguments)]
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )  # fmt: skip
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in (folder / "chunks").iterdir()}
+
+
+# --- specs
+
+
+def test_every_field_of_the_documentation_is_known():
+    text = jaxcal.study.spec.__doc__
+    example = "\n".join(line[4:] for line in text.splitlines() if line.startswith("    "))
+    with pytest.raises(InputError, match="prior belongs to the joint"):
+        parse_spec(example)
+    example = re.sub(r"^prior.*$", "", example, flags=re.M)
+    with pytest.raises(InputError, match=r"max_elevation_mm and .* contradict"):
+        parse_spec(example)
+    example = re.sub(r"^max_elevation_factor.*$", "", example, flags=re.M)
+    spec = parse_spec(example)
+    assert set(re.findall(r"^(\w+) =", example, flags=re.M)) >= set(AXES)
+    assert spec.listed == ("elevation_mm", "noise_mm")
+    # What stands there as a default is the default.
+    bare = 'name = "b"\nseed = 1\ntrials = 9\n[[methods]]\nname = "alternation, 1 mm"\n'
+    bare = parse_spec(bare + 'method = "alternating"\n')
+    assert bare.methods == spec.methods
+    assert bare.probe == spec.probe
+    for name in set(AXES) - {"elevation_mm", "noise_mm"}:
+        assert bare.axis(name) == spec.axis(name)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (MINIMAL + "colour = 3" + METHOD, r"unknown field 'colour'"),
+        (MINIMAL + "[conditions]\nnoise = 1" + METHOD, "unit is missing, write noise_mm"),
+        (MINIMAL + "[conditions]\nrotation = 1" + METHOD, "unit is missing, write rotation_deg"),
+        (MINIMAL + "[conditions]\nnoise_m = 1" + METHOD, "did you mean noise_mm"),
+        (MINIMAL + '[conditions]\nnoise_mm = "1 mm"' + METHOD, "plain number"),
+        (MINIMAL + "[conditions]\nnoise_mm = [1, 1.0]" + METHOD, "twice"),
+        (MINIMAL + "[conditions]\nnoise_mm = []" + METHOD, "1 to"),
+        (MINIMAL + "[conditions]\nnoise_mm = -0.1" + METHOD, "noise_mm must be between"),
+        (MINIMAL + "[conditions]\nnoise_mm = nan" + METHOD, "noise_mm must be between"),
+        (MINIMAL + "[conditions]\nimages = -4" + METHOD, "images must be between 4"),
+        (MINIMAL + "[conditions]\nimages = 5.0" + METHOD, "whole number"),
+        (MINIMAL + "[conditions]\nimages = true" + METHOD, "whole number"),
+        (MINIMAL + '[conditions]\nelevation_distribution = "flat"' + METHOD, "one of uniform"),
+        (MINIMAL + "[conditions]\ndepth_min_mm = 95" + METHOD, "less than"),
+        ('name = "a"\nseed = 1\ntrials = -3\n' + METHOD, "trials must be between 1"),
+        ('name = "a"\nseed = -1\ntrials = 3\n' + METHOD, "seed must be between 0"),
+        ('name = "a"\nseed = 1\n' + METHOD, "trials is missing"),
+        ('name = "../a"\nseed = 1\ntrials = 3\n' + METHOD, "name must be"),
+        ('name = "a"\nseed = 1\ntrials = 4294967297\n' + METHOD, "trials must be between"),
+        (MINIMAL, "methods is missing"),
+        (MINIMAL + METHOD + METHOD, "same name"),
+        (MINIMAL + METHOD + "tolerance_mm = 1", "belongs to the alternating"),
+        (MINIMAL + METHOD + "max_elevation_mm = 1", "belongs to alternating and to joint"),
+        (MINIMAL + METHOD + "max_elevation = 1", "unit is missing, write max_elevation_mm"),
+        (MINIMAL + "[probe]\npitch = 1" + METHOD, "unit is missing, write pitch_mm"),
+        (MINIMAL + "conditions = 3" + METHOD, "must be a table"),
+        ("name = ", "not TOML"),
+        (MINIMAL + "x = " + "[" * 5000 + METHOD, "not TOML"),
+    ],
+)
+def test_bad_specs_are_refused_with_the_field_named(text, message):
+    with pytest.raises(InputError, match=message) as caught:
+        parse_spec(text)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_says_the_same_has_the_same_hash():
+    spec = parse_spec(small())
+    again = small().replace("seed = 11\ntrials = 10", "trials = 10 # few\nseed = 11")
+    again = again.replace("noise_mm = 0.5", "test_fraction = 0.75\nnoise_mm = 0.50")
+    assert parse_spec(again).sha256 == spec.sha256
+    assert spec_from_canonical(spec.canonical()) == spec
+    edits = {"seed = 11": "seed = 12", "[0.5, 2]": "[0.5, 3]", "1.5": "1.6",
+             "elements = 8": "elements = 9", "noise_mm = 0.5": "noise_mm = [0.5]"}  # fmt: skip
+    for old, new in edits.items():
+        changed = small().replace(old, new)
+        assert changed != small()
+        assert parse_spec(changed).sha256 != spec.sha256
+    with pytest.raises(InputError):
+        spec_from_canonical(spec.canonical().replace('"seed": 11', '"seed": 11.0'))
+
+
+def test_the_grid_is_counted_in_order():
+    text = small().replace("noise_mm = 0.5", 'noise_mm = [1, 2, 3]\nimages = [6, 9]').replace(
+        "images = 6\n", "", 1
+    )  # fmt: skip
+    spec = parse_spec(text)
+    assert spec.condition_count == 12
+    assert [spec.condition(k) for k in range(12)] == list(spec.conditions())
+    cells = [(c.images, c.elevation_mm, c.noise_mm) for c in spec.conditions()]
+    assert cells == [(i, e, s) for i in (6, 9) for e in (0.5, 2.0) for s in (1.0, 2.0, 3.0)]
+    chunks = [spec.chunk(k) for k in range(spec.chunk_count)]
+    covered = [(c.condition, t) for c in chunks for t in range(c.start, c.stop)]
+    assert covered == [(c, t) for c in range(12) for t in range(10)]
+
+
+# --- offsets
+
+
+@pytest.mark.parametrize("law", OFFSET_LAWS)
+def test_offsets_have_their_size(law):
+    drawn = np.asarray(standard_offsets(jax.random.key(3), law, 200_000))
+    assert np.std(drawn) == pytest.approx(standard_deviation(law), rel=0.03)
+    mean = 0.5 if law == "one-sided" else 0.0
+    assert np.mean(drawn) == pytest.approx(mean, abs=0.01)
+    if law in ("uniform", "triangular", "one-sided"):
+        assert np.abs(drawn).max() <= nominal_bound(law, 1.0) == 1.0
+        assert np.abs(drawn).max() > 0.99
+    else:
+        assert nominal_bound(law, 2.0) == pytest.approx(2 * np.sqrt(3))
+    kurtosis = np.mean((drawn - drawn.mean()) ** 4) / np.var(drawn) ** 2
+    assert (kurtosis > 4) == (law == "heavy-tailed")
+
+
+def test_tracker_noise_has_its_size_and_moves_nothing_else():
+    quiet = jaxcal.Protocol(images=2000, test_images=5, probe=jaxcal.LinearProbe(elements=4))
+
+    @jax.jit
+    def draw(mm, rad):
+        noisy = dataclasses.replace(quiet, tracker_mm=mm, tracker_rad=rad)
+        return jaxcal.simulate(jax.random.key(4), noisy)
+
+    one, two = draw(0.0, 0.0), draw(0.2, 1e-3)
+    np.testing.assert_array_equal(one.points, two.points)
+    np.testing.assert_array_equal(one.test_poses, two.test_poses)
+    first, second = np.asarray(one.poses), np.asarray(two.poses)
+    np.testing.assert_allclose((second - first)[:, :3, 3].std(axis=0), 0.2, rtol=0.06)
+    rotation = np.swapaxes(first[:, :3, :3], 1, 2) @ second[:, :3, :3]
+    angle = np.linalg.norm(rotation - np.eye(3), axis=(1, 2)) / np.sqrt(2)
+    assert np.sqrt(np.mean(angle**2)) == pytest.approx(1e-3 * np.sqrt(3), rel=0.05)
+
+
+# --- results
+
+
+def test_a_trial_is_that_of_the_public_functions(finished):
+    """Oracle: draw and calibrate one trial by hand, with static numbers."""
+    spec = load_spec_of(finished)
+    data = open_results(finished)
+    cell, trial = 1, 7
+    condition = spec.condition(cell)
+    key = jax.random.fold_in(jax.random.key(spec.seed), cell * spec.trials + trial)
+    draw = jax.jit(jaxcal.simulate, static_argnums=1)
+    experiment = draw(key, protocol(condition, spec.probe))
+    result = jaxcal.calibrate(experiment.problem(), "conventional")
+    at = {"elevation_mm": 2.0, "method": "flat", "trial": trial}
+    rp = jaxcal.reconstruction_precision(
+        result.image_to_probe, experiment.test_poses, experiment.test_points
+    )
+    stored = data.sel(at)
+    assert float(stored.rp) == pytest.approx(float(rp), rel=1e-6)
+    found, true = np.asarray(result.image_to_probe), np.asarray(experiment.image_to_probe)
+    turned = jaxcal.geometry.rotation_angle(found, true)
+    assert float(stored.rotation_error) == pytest.approx(turned, rel=1e-5)
+    moved = (found - true)[:3, 3]
+    assert float(stored.translation_error) == pytest.approx(np.linalg.norm(moved), rel=1e-5)
+    np.testing.assert_allclose(stored.sigma, result.sigma, rtol=1e-5)
+    realised = np.sqrt(np.mean(np.asarray(experiment.elevation) ** 2))
+    assert float(stored.realised.sel(component="elevation")) == pytest.approx(realised)
+    assert float(data.bound.sel({"elevation_mm": 2.0, "method": "arcs"})) == 3.0
+    assert np.isnan(data.bound.sel({"elevation_mm": 2.0, "method": "flat"}))
+
+
+def load_spec_of(folder):
+    return Store.open(folder).spec
+
+
+def test_results_are_labelled(finished):
+    data = open_results(finished)
+    assert data.rp.dims == ("elevation_mm", "method", "trial")
+    assert data.rp.shape == (2, 2, 10)
+    assert data.sigma.dims == ("elevation_mm", "method", "trial", "component")
+    assert data.rp.attrs["units"] == "mm"
+    assert float(data.noise_mm) == 0.5
+    assert bool(np.isfinite(data.rp).all())
+    assert (data.status == 0).all()
+    # Another seed of the same cell, or the same draws for every cell, would show here.
+    assert len(np.unique(data.realised)) == data.realised.size
+
+
+def test_results_do_not_depend_on_the_chunks(finished, programs, tmp_path):
+    run_study(parse_spec(small(chunk=7)), tmp_path / "other")
+    one, two = open_results(finished), open_results(tmp_path / "other")
+    for name in one.data_vars:
+        np.testing.assert_array_equal(one[name], two[name], err_msg=str(name))
+
+
+def test_missing_and_damaged_chunks_are_computed_again(finished, programs, tmp_path, capsys):
+    folder, path = tmp_path / "copy", tmp_path / "spec.toml"
+    path.write_text(small())
+    run_study(parse_spec(small()), folder)
+    chunks = sorted((folder / "chunks").iterdir())
+    assert len(chunks) == 6
+    whole = chunks[1].read_bytes()
+    chunks[0].unlink()
+    chunks[1].write_bytes(whole[: len(whole) // 2])
+    flipped = bytearray(chunks[2].read_bytes())
+    place = flipped.find(Store.open(folder).read(load_spec_of(folder).chunk(2))["rp"].tobytes()[:8])
+    assert place > 0
+    flipped[place] ^= 1
+    chunks[2].write_bytes(bytes(flipped))
+    chunks[3].write_bytes(chunks[4].read_bytes())
+    with pytest.raises(FormatError, match="1 of 6 chunks are missing"):
+        open_results(folder)
+    with pytest.raises(FormatError, match="chunk-000001"):
+        open_results(folder, incomplete=True)
+    capsys.readouterr()
+    assert main(["study", "run", str(path), "--out", str(folder), "--resume"]) == 0
+    told = capsys.readouterr()
+    assert "6 chunks are done, 4 of them now" in told.out
+    notes = [line for line in told.err.splitlines() if "computed again" in line]
+    assert [re.search(r"chunk-\d+", line)[0] for line in notes] == [
+        "chunk-000001", "chunk-000002", "chunk-000003",
+    ]  # fmt: skip
+    assert "checksum" in notes[1]
+    assert files(folder) == files(finished)
+
+
+def test_another_spec_in_the_folder_is_refused(finished, tmp_path, capsys):
+    path, before = tmp_path / "spec.toml", files(finished)
+    edits = {"seed": ("seed = 11", "seed = 12"), "noise_mm": ("noise_mm = 0.5", "noise_mm = 1")}
+    for words, edit in edits.items():
+        path.write_text(small().replace(*edit))
+        for flags in ([], ["--resume"]):
+            assert main(["study", "run", str(path), "--out", str(finished), *flags]) == 2
+            line = capsys.readouterr().err
+            assert "another spec" in line
+            assert words in line
+            assert line.count("\n") == 1
+    path.write_text(small())
+    assert main(["study", "run", str(path), "--out", str(finished)]) == 2
+    assert "--resume continues it" in capsys.readouterr().err
+    assert files(finished) == before
+
+
+def test_show(finished, capsys, tmp_path):
+    store = Store.open(finished)
+    cells = summarise(store)
+    data = open_results(finished)
+    rp = data.rp.sel(elevation_mm=2.0).values
+    row = cells[1].rows[1]
+    assert row.mean_mm == pytest.approx(rp[1].mean())
+    assert row.sd_mm == pytest.approx(rp[1].std(ddof=1))
+    assert row.difference_mm == pytest.approx((rp[1] - rp[0]).mean())
+    assert cells[1].rows[0].difference_mm is None
+    record = as_record(store, cells)
+    assert record["chunks_done"] == record["chunks"] == 6
+    assert len(as_csv(store.spec, cells).splitlines()) == 1 + 4
+    table = tmp_path / "table.csv"
+    assert main(["study", "show", str(finished), "--csv", str(table)]) == 0
+    out = capsys.readouterr().out
+    assert f"{row.mean_mm:.4f}" in out
+    assert table.read_text() == as_csv(store.spec, cells)
+    assert main(["study", "show", str(finished), "--json"]) == 0
+    assert capsys.readouterr().out.count("\n") == 1
+    assert main(["study", "show", str(tmp_path)]) == 2
+    assert "holds no study" in capsys.readouterr().err
+
+
+def test_intervals_are_students():
+    from scipy import stats
+
+    values = np.random.default_rng(0).normal(size=12)
+    oracle = stats.t.interval(0.95, 11, values.mean(), stats.sem(values))
+    assert mean_interval(np.append(values, np.nan))[1:] == pytest.approx(oracle)
+    assert mean_interval(values[:1]) is None
+
+
+# --- the command line
+
+
+def test_bad_specs_on_the_command_line(tmp_path, capsys):
+    path = tmp_path / "bad.toml"
+    for text in (small().replace("trials = 10", "trials = -10"), small() + "colour = 1\n"):
+        path.write_text(text)
+        assert main(["study", "run", str(path), "--out", str(tmp_path / "out")]) == 2
+        line = capsys.readouterr().err
+        assert line.startswith(f"jaxcal: error: {path}: ")
+        assert line.count("\n") == 1
+        assert not (tmp_path / "out").exists()
+    assert main(["study", "run", str(tmp_path / "none.toml"), "--out", str(tmp_path / "out")]) == 2
+    assert "no such file" in capsys.readouterr().err
+
+
+def test_unwritable_folder(tmp_path, capsys):
+    path, occupied = tmp_path / "spec.toml", tmp_path / "file"
+    path.write_text(small())
+    occupied.write_text("mine")
+    places = [occupied, occupied / "below", Path("/proc/study")]
+    if os.geteuid() != 0:
+        locked = tmp_path / "locked"
+        locked.mkdir(mode=0o500)
+        places.append(locked / "study")
+    for place in places:
+        assert main(["study", "run", str(path), "--out", str(place)]) == 2
+        line = capsys.readouterr().err
+        assert "cannot be made or written to" in line
+        assert line.count("\n") == 1
+    assert occupied.read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_full_disk(finished, programs, tmp_path):
+    """No file may grow beyond 4 KiB, a real refusal by the system: nothing half is left."""
+    path, folder = tmp_path / "spec.toml", tmp_path / "out"
+    path.write_text(small())
+    run = ["run", path, "--out", folder]
+    child = process(run, programs, before=("bash", "-c", 'ulimit -f 4; exec "$@"', "bash"))
+    out, err = child.communicate(timeout=120)
+    assert child.returncode == 2, err
+    last = err.strip().splitlines()[-1]
+    assert "cannot be written" in last, err
+    assert "Traceback" not in err
+    assert out == ""
+    assert list((folder / "chunks").iterdir()) == []
+    run_study(parse_spec(small()), folder, resume=True)
+    assert files(folder) == files(finished)
+
+
+def start_and_wait(run, programs, folder, count):
+    child = process(run, programs)
+    deadline = time.monotonic() + 120
+    while len(Store(folder, parse_spec(LONG)).present()) < count:
+        if time.monotonic() > deadline or child.poll() is not None:
+            child.kill()
+            raise AssertionError(child.communicate())
+        time.sleep(0.002)
+    return child
+
+
+LONG = small(trials=240, chunk=2).split('\n[[methods]]\nname = "arcs"')[0]
+
+
+@pytest.fixture(scope="module")
+def long_study(finished, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("long") / "undisturbed"
+    run_study(parse_spec(LONG), folder)
+    return folder
+
+
+def kill_and_resume(kills, long_study, programs, tmp_path, seed):
+    random = np.random.default_rng(seed)
+    path, folder = tmp_path / "spec.toml", tmp_path / "killed"
+    path.write_text(LONG)
+    run = ["run", path, "--out", folder, "--resume"]
+    total = parse_spec(LONG).chunk_count
+    counts = np.sort(random.choice(np.arange(total - 10), kills, replace=False))
+    for count in counts:
+        child = start_and_wait(run, programs, folder, count)
+        time.sleep(random.uniform(0, 0.02))
+        child.kill()
+        child.communicate()
+        assert child.returncode == -signal.SIGKILL
+    assert len(Store(folder, parse_spec(LONG)).present()) < total
+    child = process(run, programs)
+    _, err = child.communicate(timeout=300)
+    assert child.returncode == 0, err
+    assert open_results(folder).identical(open_results(long_study))
+    assert files(folder) == files(long_study)
+
+
+def test_killed_and_resumed(long_study, programs, tmp_path):
+    kill_and_resume(2, long_study, programs, tmp_path, 1)
+
+
+@pytest.mark.slow
+def test_killed_ten_times_and_resumed(long_study, programs, tmp_path):
+    kill_and_resume(10, long_study, programs, tmp_path, 2)
+
+
+def test_interrupted(long_study, programs, tmp_path):
+    path, folder = tmp_path / "spec.toml", tmp_path / "out"
+    path.write_text(LONG)
+    child = start_and_wait(["run", path, "--out", folder], programs, folder, 5)
+    child.send_signal(signal.SIGINT)
+    _, told = child.communicate(timeout=120)
+    assert child.returncode == 130
+    done = len(Store(folder, parse_spec(LONG)).present())
+    again = f"jaxcal study run {path} --out {folder} --resume"
+    assert told == f"jaxcal: interrupted: {done} of 240 chunks are done; continue with: {again}\n"
+
+
+def test_two_processes_do_not_share_a_folder(finished, tmp_path, capsys):
+    path = tmp_path / "spec.toml"
+    path.write_text(small())
+    with (finished / ".lock").open("wb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert main(["study", "run", str(path), "--out", str(finished), "--resume"]) == 2
+    assert "is being computed by another process" in capsys.readouterr().err
+
+
+def test_full_file_system(finished, programs, tmp_path):
+    """The same on a file system of 48 KiB, where the system lets us have one."""
+    small_disk, kept, path = tmp_path / "disk", tmp_path / "kept", tmp_path / "spec.toml"
+    small_disk.mkdir()
+    path.write_text(small())
+    mount = f"mount -t tmpfs -o size=48k tmpfs {small_disk}"
+    probe = subprocess.run(["unshare", "-rm", "sh", "-c", mount], capture_output=True, check=False)
+    if probe.returncode != 0:
+        pytest.skip("no file system may be mounted here; test_full_disk (slow) has a limit instead")
+    script = f'{mount}; "$@"; code=$?; cp -a {small_disk}/out {kept}; exit $code'
+    child = process(
+        ["run", path, "--out", small_disk / "out"], programs,
+        before=("unshare", "-rm", "bash", "-c", script, "bash"),
+    )  # fmt: skip
+    _, err = child.communicate(timeout=120)
+    assert child.returncode == 2, err
+    assert "No space left on device" in err.strip().splitlines()[-1]
+    there = files(kept)
+    assert 0 < len(there) < 6
+    assert there.items() <= files(finished).items()
+    run_study(parse_spec(small()), kept, resume=True)
+    assert files(kept) == files(finished)
+
+
+@pytest.mark.slow
+def test_several_devices_share_a_block(finished, programs, tmp_path):
+    path, folder = tmp_path / "spec.toml", tmp_path / "out"
+    path.write_text(small())
+    child = process(
+        ["run", path, "--out", folder], programs, before=("env", "JAX_NUM_CPU_DEVICES=2")
+    )
+    _, err = child.communicate(timeout=300)
+    assert child.returncode == 0, err
+    assert "2 x cpu" in Store.open(folder).versions(parse_spec(small()).chunk(0))
+    one, two = open_results(finished), open_results(folder)
+    for name in one.data_vars:
+        np.testing.assert_allclose(one[name], two[name], rtol=1e-9, atol=1e-12, err_msg=str(name))
+
+
+@pytest.mark.slow
+def test_self_tuned_and_bounded_methods(programs):
+    """Every method of a spec through the pipeline; bounds are those that were asked for."""
+    text = (
+        small(trials=64, chunk=64).replace("images = 6", "images = 20")
+        + """
+[[methods]]
+name = "joint"
+method = "joint"
+[[methods]]
+name = "bounded"
+method = "joint"
+prior = "bounded"
+max_elevation_mm = 0.25
+"""
+    )
+    spec = parse_spec(text)
+    got = compute_chunk(spec, spec.chunk(1))
+    assert np.isfinite(got["rp"]).all()
+    # Uniform within 2 mm: 1.15 mm, from 20 images each.
+    assert np.median(got["sigma"][2, :, 2]) == pytest.approx(2 / np.sqrt(3), rel=0.1)
+    assert (got["sigma"][3, :, 2] <= 0.25 + 1e-9).all()
+    assert bound_mm(spec.methods[3], spec.condition(1)) == 0.25
+    assert not jnp.isnan(got["rotation_error"]).any()
+
+
+def test_load_spec_names_the_file(tmp_path):
+    path = tmp_path / "x.toml"
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(FormatError, match=re.escape(str(path))):
+        load_spec(path)
