@@ -20,6 +20,9 @@ from jaxcal.probe import Probe
 MINIMUM_IMAGES = 4
 """With fewer used images nothing can be solved: 3 residuals an image against 9 unknowns."""
 
+LARGEST = 1e7
+"""No coordinate in mm or px, no variance of one, is larger: ten kilometres."""
+
 Kind = Literal["point", "pixel", "time_of_flight"]
 _UNIT = {"point": "mm", "pixel": "px", "time_of_flight": "s"}
 
@@ -155,6 +158,7 @@ def _make_images(
         raise InputError(
             f"{int(used.sum())} used images are too few: at least {minimum} are needed"
         )
+    _check_magnitude("pose", poses, used)
     checked = check_poses(poses, used)
 
     if kind == "time_of_flight":
@@ -165,6 +169,8 @@ def _make_images(
         bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
         raise InputError(f"{kind} {np.flatnonzero(bad)[0]} holds NaN or Inf")
+    if kind != "time_of_flight":
+        _check_magnitude(kind, values, used)
     if kind == "point" and used.any():
         bad = (values[:, 1] <= 0) & used
         if bad.any():
@@ -224,6 +230,17 @@ def _raw_times(
     return times
 
 
+def _check_magnitude(name: str, values: np.ndarray, used: np.ndarray) -> None:
+    """Refuse what no unit makes sense of, before it overflows somewhere; NaN and Inf come later."""
+    rows = np.abs(values.reshape(len(used), -1)) if len(used) else np.zeros((0, 1))
+    bad = (np.isfinite(rows) & (rows > LARGEST)).any(axis=1) & used
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        raise InputError(
+            f"{name} {row} holds a number beyond {LARGEST:g}: that cannot be a measure"
+        )
+
+
 def _mask(mask: np.ndarray | None, count: int) -> Bool[np.ndarray, " n"]:
     if mask is None:
         return np.ones(count, bool)
@@ -258,6 +275,7 @@ def _covariance(
     if values.shape != (count, 2, 2):
         raise InputError(f"covariance must have shape ({count}, 2, 2), it has {values.shape}")
     values[~used] = np.eye(2)
+    _check_magnitude("covariance", values, used)
     bad = ~np.isfinite(values).all(axis=(1, 2))
     if bad.any():
         raise InputError(f"covariance {np.flatnonzero(bad)[0]} holds NaN or Inf")
