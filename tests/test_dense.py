@@ -63,7 +63,12 @@ def test_triangularised_least_squares():
 
 @pytest.mark.parametrize(
     "arguments",
-    [("conventional", "auto"), ("alternating", "auto"), ("joint", "auto"), ("joint", "bounded")],
+    [
+        ("joint", "auto"),
+        ("joint", "bounded"),
+        pytest.param(("conventional", "auto"), marks=pytest.mark.slow),
+        pytest.param(("alternating", "auto"), marks=pytest.mark.slow),
+    ],
 )
 def test_no_solver_calls_lapack(arguments: tuple):
     """Batched LAPACK calls can deadlock XLA's thread pool; see jaxcal.solvers.dense."""

@@ -209,7 +209,7 @@ def _request(
     }
     if options and method != "alternating":
         given = " and ".join("--" + name.replace("_", "-") for name in options)
-        raise InputError(f"{given} needs --method alternating")
+        raise InputError(f"{given} need{'s' * (len(options) == 1)} --method alternating")
     if data == "channels" and (method != "joint" or prior == "bounded"):
         raise InputError("--data channels needs --method joint with the gaussian prior")
     if solver is not None:
