@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -150,8 +151,14 @@ def _solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None)
     flat = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
     if chunk is None:
         chunk = CHANNELS_CHUNK if plan.channels else BATCH_CHUNK
-    result = _solve_chunks(flat, given, plan, min(chunk, flat.mask.shape[0]))
-    return jax.tree.map(lambda leaf: leaf.reshape((*shape, *leaf.shape[1:])), result)
+    count = flat.mask.shape[0]
+    # Chunks of one size, the last one filled up: a remainder would be compiled as a second program.
+    pieces = -(-count // chunk)
+    chunk = -(-count // max(pieces, 1))
+    spare = jnp.arange(pieces * chunk) % max(count, 1)
+    filled = flat if pieces * chunk == count else jax.tree.map(lambda leaf: leaf[spare], flat)
+    result = _solve_chunks(filled, given, plan, max(chunk, 1))
+    return jax.tree.map(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
 
 
 @partial(jax.jit, static_argnums=2)

@@ -148,7 +148,9 @@ def test_predicted_covariance_is_the_scatter_of_repeats():
     count = 200
     base = problem(0, images=20, elevation_mm=1.0, noise_mm=2.0, elevation_distribution="normal")
     rng = np.random.default_rng(0)
-    fixed = jaxcal.calibrate(base, sigma=(0.5, 0.5, 1.0))
+    tiled = jax.tree.map(lambda leaf: jnp.tile(leaf, (count, *[1] * leaf.ndim)), base)
+    fixed = jaxcal.calibrate_batch(tiled, sigma=(0.5, 0.5, 1.0))
+    fixed = jax.tree.map(lambda leaf: leaf[0], fixed)
     # Repeats of one geometry: errors drawn anew about a target placed where the model puts it.
     x = jnp.asarray(fixed.image_to_probe)
     truth = Parameters.of(x[:3, :3], x[:3, 3], fixed.point)
@@ -163,8 +165,7 @@ def test_predicted_covariance_is_the_scatter_of_repeats():
         points = np.stack([q[:, 0], np.hypot(offsets, q[:, 2])], axis=1)
         rows.append((poses, points + 0.5 * rng.normal(size=points.shape)))
     poses, points = (jnp.asarray(np.stack(part)) for part in zip(*rows, strict=True))
-    problems = jax.tree.map(lambda leaf: jnp.tile(leaf, (count, *[1] * leaf.ndim)), base)
-    problems = replace(problems, poses=poses, measurements=points)
+    problems = replace(tiled, poses=poses, measurements=points)
     results = jaxcal.calibrate_batch(problems, sigma=(0.5, 0.5, 1.0))
     moved = np.asarray(results.image_to_probe)
     lateral = (moved[:, :3, 3] - np.asarray(x[:3, 3])) @ np.asarray(x[:3, :3])
