@@ -26,12 +26,13 @@ from jaxtyping import Array, Float
 
 from jaxcal import Protocol, calibrate_batch, reconstruction_precision, simulate
 from jaxcal.io.atomic import atomic_path
-from jaxcal.model.parameters import RIGID, Parameters
+from jaxcal.model.parameters import RIGID
 from jaxcal.model.priors import Fixed
 from jaxcal.model.residuals import target_in_image
 from jaxcal.probe import C5_2
 from jaxcal.problem import Problem
 from jaxcal.segmentation.time_of_flight import fit_out_of_plane
+from jaxcal.solvers.conventional import from_scratch
 from jaxcal.solvers.least_squares import minimise
 
 SEED = 20261121
@@ -55,16 +56,10 @@ def paper_way(problem: Problem) -> Float[Array, "4 4"]:
 
     few = jnp.sort(size)[max(int(SUBSET * problem.images), 9) - 1]
     subset = replace(known, mask=jnp.where(size <= few, known.mask, 0.0))
-    first = calibrate_start(subset)
+    first = from_scratch(subset, RIGID).fit.parameters
     y = target_in_image(first, known)[:, 1]
     signed = jnp.where(y < 0, -size, size)
     return minimise(first, Fixed(signed), known, RIGID).parameters.matrix()
-
-
-def calibrate_start(problem: Problem) -> Parameters:
-    from jaxcal.solvers.conventional import from_scratch
-
-    return from_scratch(problem, RIGID).fit.parameters
 
 
 def run_cell(cell: int, bound: float, noise: float, trials: int) -> dict[str, np.ndarray]:
