@@ -149,15 +149,15 @@ def _solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None)
     shape = problems.batch_shape
     problems = with_bound(problems, given)
     flat = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
-    if chunk is None:
-        chunk = CHANNELS_CHUNK if plan.channels else BATCH_CHUNK
+    largest = chunk or (CHANNELS_CHUNK if plan.channels else BATCH_CHUNK)
     count = flat.mask.shape[0]
     # Chunks of one size, the last one filled up: a remainder would be compiled as a second program.
-    pieces = -(-count // chunk)
-    chunk = -(-count // max(pieces, 1))
-    spare = jnp.arange(pieces * chunk) % max(count, 1)
-    filled = flat if pieces * chunk == count else jax.tree.map(lambda leaf: leaf[spare], flat)
-    result = _solve_chunks(filled, given, plan, max(chunk, 1))
+    pieces = max(-(-count // largest), 1)
+    lanes = max(-(-count // pieces), 1)
+    if count and pieces * lanes != count:
+        rows = jnp.arange(pieces * lanes) % count
+        flat = jax.tree.map(lambda leaf: leaf[rows], flat)
+    result = _solve_chunks(flat, given, plan, lanes)
     return jax.tree.map(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
 
 
