@@ -19,6 +19,7 @@ Times are batched and compiled, medians of three interleaved repeats. Seeds 2026
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -544,7 +545,10 @@ def main() -> None:
     ]  # fmt: skip
     folder = results_folder(quick)
     foot: list[list[object]] = [
-        [f"{count} problems, {interval.sum()} with an interval of minimisers; {machine()}"]
+        [
+            f"{count} problems, {interval.sum()} with an interval of minimisers; {machine()}; "
+            f"load average {os.getloadavg()[2]:.1f} over the last 15 minutes"
+        ]
     ]
     write_table(folder / "same_objective_convergence.csv", header, rows + foot)
     by_iteration = curve_rows(paths, limits, best[0])
