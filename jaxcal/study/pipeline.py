@@ -32,8 +32,9 @@ from jaxcal.simulation import Experiment, Protocol, simulate
 from jaxcal.solve import Options, calibrate_batch
 from jaxcal.study.spec import Chunk, Condition, MethodSpec, Spec
 
-LANES = {"cpu": 64}
-"""Trials drawn or solved side by side on a device; on a CPU what they need stays in its caches."""
+LANES = {"cpu": 16}
+"""Trials drawn or solved side by side on a device; on a CPU what they need stays in its caches, and
+few wait for the slowest one's last iterations: 64 take from half as long again to three times."""
 
 OTHER_LANES = 4096
 """And on whatever else: enough to fill it."""
@@ -70,7 +71,7 @@ class Measured(eqx.Module):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Shape:
+class Shape:
     """All that is static about a draw."""
 
     law: OffsetLaw
@@ -92,22 +93,17 @@ def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
         drawn, mm. They are the same whatever was computed before, and on whatever worker.
     """
     condition = spec.condition(chunk.condition)
-    shape = _Shape(
-        condition.elevation_distribution,  # type: ignore[arg-type]
-        condition.images,
-        condition.test_images,
-        spec.probe,
-    )
+    shape = shape_of(condition, spec.probe)
     devices = tuple(jax.local_devices())
     block = len(devices) * LANES.get(devices[0].platform, OTHER_LANES)
     seed = np.asarray(spec.seed, np.uint64)
-    draw = _draw_program(shape, devices)
+    draw = draw_program(shape, devices)
     blocks = []
     for start in range(chunk.start, chunk.stop, block):
         trials = np.minimum(start + np.arange(block), chunk.stop - 1)
         indices = (chunk.condition * spec.trials + trials).astype(np.uint32)
-        drawn, realised = draw(indices, seed, _numbers(condition))
-        measured = [_solve_one(method, condition, drawn, devices) for method in spec.methods]
+        drawn, realised = draw(indices, seed, numbers_of(condition))
+        measured = [solve_one(method, condition, drawn, devices) for method in spec.methods]
         results = {name: np.stack([one[name] for one in measured]) for name in measured[0]}
         blocks.append((results, np.asarray(realised)))
     count = chunk.stop - chunk.start
@@ -119,9 +115,10 @@ def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
     return together
 
 
-def _solve_one(
+def solve_one(
     method: MethodSpec, condition: Condition, drawn: Experiment, devices: Devices
 ) -> dict[str, np.ndarray]:
+    """What one method makes of a block: the arrays of :class:`Measured`."""
     prior, options = _static(method)
     bound = jnp.asarray(bound_mm(method, condition)) if method.bounded else None
     measured = _solve_program(method.method, prior, options, devices)(drawn, bound)
@@ -151,12 +148,18 @@ def protocol(condition: Condition, probe: LinearProbe) -> Protocol:
         test_images=condition.test_images,
         elevation_distribution=condition.elevation_distribution,  # type: ignore[arg-type]
         probe=probe,
-        **_numbers(condition),
+        **numbers_of(condition),
     )
 
 
-def _numbers(condition: Condition) -> dict[str, Any]:
-    """The numeric fields of a protocol."""
+def shape_of(condition: Condition, probe: LinearProbe) -> Shape:
+    """What is static about a condition's draws."""
+    law: OffsetLaw = condition.elevation_distribution  # type: ignore[assignment]
+    return Shape(law, condition.images, condition.test_images, probe)
+
+
+def numbers_of(condition: Condition) -> dict[str, Any]:
+    """The numeric fields of its protocol."""
     return {
         "elevation_mm": condition.elevation_mm,
         "noise_mm": condition.noise_mm,
@@ -197,7 +200,9 @@ def _compile(function: Any, devices: Devices) -> Any:
 
 
 @cache
-def _draw_program(shape: _Shape, devices: Devices) -> Any:
+def draw_program(shape: Shape, devices: Devices) -> Any:
+    """From (trial indices, seed, numbers) to experiments and :func:`realised_errors`, compiled."""
+
     def draw(indices: Array, seed: Array, numbers: dict[str, Any]) -> tuple[Experiment, Array]:
         numbers = jax.tree.map(jnp.asarray, numbers)
         given = Protocol(
