@@ -34,7 +34,7 @@ from jaxcal.study.spec import Chunk, Condition, MethodSpec, Spec
 
 LANES = {"cpu": 16}
 """Trials drawn or solved side by side on a device; on a CPU what they need stays in its caches, and
-few wait for the slowest one's last iterations: 64 take from half as long again to three times."""
+few wait for the slowest one's last iterations: 64 take 1.3 times as long to tune their SDs."""
 
 OTHER_LANES = 4096
 """And on whatever else: enough to fill it."""
