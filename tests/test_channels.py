@@ -81,7 +81,9 @@ def wrong_medium(data: jaxcal.Recording, speed: float, delay_s: float) -> jaxcal
     return replace(data, calibration=replace(data.calibration, measurements=times))
 
 
-@pytest.mark.parametrize("probe", [STRAIGHT, CURVED], ids=["straight", "curved"])
+@pytest.mark.parametrize(
+    "probe", [pytest.param(STRAIGHT, marks=pytest.mark.slow), CURVED], ids=["straight", "curved"]
+)
 def test_sound_speed_and_delay_are_estimated_along(probe):
     data = recording(probe, seed=3)
     off = wrong_medium(data, 1520.0, 0.5e-6)
@@ -150,6 +152,7 @@ def test_derivative_matches_finite_differences():
     assert float(jax.grad(value)(0.0)) == pytest.approx(float(numeric), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_lanes():
     problems = [jaxcal.Problem.from_recording(recording(CURVED, seed=k)) for k in (1, 2, 3)]
     batch = jaxcal.calibrate_batch(jaxcal.stack(problems))

@@ -259,7 +259,10 @@ def degenerate(shared, simulated):
     return shared
 
 
-@pytest.mark.parametrize(("name", "files"), [("parallel", set()), ("duplicates", REPORT)])
+@pytest.mark.parametrize(
+    ("name", "files"),
+    [("parallel", set()), pytest.param("duplicates", REPORT, marks=pytest.mark.slow)],
+)
 def test_degenerate_sets_are_solved_but_not_observable(
     name, files, degenerate, calibrated, jaxcal_process, tmp_path
 ):

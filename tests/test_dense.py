@@ -64,8 +64,8 @@ def test_triangularised_least_squares():
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("joint", "auto"),
         ("joint", "bounded"),
+        pytest.param(("joint", "auto"), marks=pytest.mark.slow),
         pytest.param(("conventional", "auto"), marks=pytest.mark.slow),
         pytest.param(("alternating", "auto"), marks=pytest.mark.slow),
     ],
