@@ -227,7 +227,8 @@ def _check_size(name: str, value: object, least: float) -> None:
     numbers = np.asarray(value, dtype=float)
     if not (np.isfinite(numbers).all() and (numbers >= least).all()):
         unit = {"sound_speed_sd": "m/s", "delay_sd": "s"}.get(name, "mm")
-        raise InputError(f"{name} must be finite and not negative, in {unit}, not {value!r}")
+        wanted = "positive" if least > 0 else "not negative"
+        raise InputError(f"{name} must be finite and {wanted}, in {unit}, not {value!r}")
 
 
 def check_values(problem: Problem) -> None:

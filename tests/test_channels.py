@@ -68,10 +68,11 @@ def test_on_a_straight_array_points_with_covariances_say_the_same():
     channels = jaxcal.calibrate(problem, sigma=jnp.stack([found, offset]), data="channels")
     between = np.linalg.inv(points.image_to_probe) @ np.asarray(channels.image_to_probe)
     sd = np.sqrt(np.diag(channels.covariance))
-    assert np.abs(between[:3, 3] / sd[:3]).max() < 0.05
+    assert np.abs(between[:3, 3] / sd[:3]).max() < 0.01
     turned = np.array([between[2, 1], between[0, 2], between[1, 0]])
-    assert np.abs(turned / sd[3:]).max() < 0.05
-    np.testing.assert_allclose(points.covariance, channels.covariance, atol=0.03 * sd.max() ** 2)
+    assert np.abs(turned / sd[3:]).max() < 0.01
+    difference = np.asarray(points.covariance) - np.asarray(channels.covariance)
+    assert np.abs(difference / np.outer(sd, sd)).max() < 0.005
 
 
 def wrong_medium(data: jaxcal.Recording, speed: float, delay_s: float) -> jaxcal.Recording:
@@ -97,7 +98,7 @@ def test_sound_speed_and_delay_are_estimated_along(probe):
     assert abs(result.sound_speed_m_s - 1520.0) < 3 * result.sound_speed_sd_m_s < 3.0
     assert abs(result.delay_s - 0.5e-6) < 3 * result.delay_sd_s < 0.15e-6
     known = jaxcal.calibrate(data, data="channels")
-    assert precision(result, data) < 1.3 * precision(known, data) + 0.01
+    assert precision(result, data) < 1.1 * precision(known, data)
     assert precision(jaxcal.calibrate(off), data) > 1.5 * precision(result, data)
 
 
@@ -132,7 +133,7 @@ def test_missing_and_late_lines_do_no_harm():
     result = jaxcal.calibrate(worse)
     assert result.status == "converged"
     assert int(result.images_used) == 19
-    assert precision(result, data) < 2 * precision(jaxcal.calibrate(data), data) + 0.01
+    assert precision(result, data) < 1.5 * precision(jaxcal.calibrate(data), data)
 
 
 def test_derivative_matches_finite_differences():

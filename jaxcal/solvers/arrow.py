@@ -157,10 +157,3 @@ def stationarity(arrow: Arrow) -> Float[Array, ""]:
     offset_cosine = arrow.free * jnp.abs(arrow.offset_gradient)
     offset_cosine = offset_cosine / jnp.where(offset_length > 0, offset_length, 1.0)
     return jnp.maximum(jnp.max(cosine), jnp.max(offset_cosine, initial=0.0))
-
-
-def predicted_decrease(
-    arrow: Arrow, step: Float[Array, " p"], offset_step: Float[Array, " k"]
-) -> Float[Array, ""]:
-    """How much 1/2 |r|^2 falls along an undamped step, in the quadratic model."""
-    return -0.5 * (arrow.gradient @ step + arrow.offset_gradient @ offset_step)
