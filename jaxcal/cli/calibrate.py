@@ -114,6 +114,18 @@ class _Request:
     metavar="REC2",
     help="Recording whose images are the independent test set.",
 )
+@click.option(
+    "--cross-validate",
+    is_flag=True,
+    help="Leave out one image at a time: how well the others foretell it, and what it does to the "
+    "transform.",
+)
+@click.option(
+    "--bootstrap",
+    type=click.IntRange(min=2, max=100_000),
+    metavar="N",
+    help="Calibrate N sets of images drawn with replacement: how far the transform scatters.",
+)
 @click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def calibrate(
@@ -129,6 +141,8 @@ def calibrate(
     max_rounds: int | None,
     data: Literal["auto", "points", "channels"],
     test: str | None,
+    cross_validate: bool,
+    bootstrap: int | None,
     out: str | None,
     as_json: bool,
 ) -> int:
@@ -153,6 +167,7 @@ def calibrate(
             result = _solve(measured, request, traced=traced)
             record = calibration_record(result, measured, test_data)
             record["warnings"] += notes
+        record |= _resampled(measured, request, cross_validate, bootstrap)
         if folder is not None:
             with progress("drawing the report"):
                 curves = _curves(measured, request, result)
@@ -162,6 +177,31 @@ def calibrate(
     else:
         _print(record, out)
     return exit_code([record])
+
+
+def _resampled(
+    recording: Recording, request: _Request, cross_validate: bool, resamples: int | None
+) -> dict[str, Any]:
+    """What other sets of the same images say, for the record."""
+    if not cross_validate and resamples is None:
+        return {}
+    from jaxcal import resampling
+    from jaxcal.problem import Problem
+    from jaxcal.report.record import bootstrap_record, cross_validation_record
+
+    problem, arguments = Problem.from_recording(recording), _arguments(request)
+    record: dict[str, Any] = {}
+    if cross_validate:
+        with progress("leaving out one image at a time"):
+            record["cross_validation"] = cross_validation_record(
+                resampling.cross_validate(problem, **arguments),
+                resampling.influence(problem, **arguments),
+            )
+    if resamples is not None:
+        with progress(f"calibrating {resamples} resamples"):
+            found = resampling.bootstrap(problem, resamples, **arguments)
+            record["bootstrap"] = bootstrap_record(found)
+    return record
 
 
 def _segmented(recording: Recording) -> tuple[Recording, list[str]]:
@@ -233,21 +273,26 @@ def _unknowns(estimate: str | None) -> tuple[str, ...]:
 def _solve(recording: Recording, request: _Request, *, traced: bool) -> Calibration:
     import jax
 
-    from jaxcal.options import Options
     from jaxcal.report.convergence import KEPT
     from jaxcal.solve import calibrate as solve
 
-    result = solve(
-        recording,
-        request.method,
-        request.prior,
-        max_elevation=request.max_elevation,
-        sigma=request.sigma,
-        estimate=request.estimate,
-        data=request.data,
-        options=Options(**request.options, trace=KEPT if traced else 0),
-    )
-    return jax.block_until_ready(result)
+    trace = KEPT if traced else 0
+    return jax.block_until_ready(solve(recording, **_arguments(request, trace=trace)))
+
+
+def _arguments(request: _Request, *, trace: int = 0) -> dict[str, Any]:
+    """The request as :func:`jaxcal.calibrate` takes it."""
+    from jaxcal.options import Options
+
+    return {
+        "method": request.method,
+        "prior": request.prior,
+        "max_elevation": request.max_elevation,
+        "sigma": request.sigma,
+        "estimate": request.estimate,
+        "data": request.data,
+        "options": Options(**request.options, trace=trace),
+    }
 
 
 def _curves(recording: Recording, request: _Request, result: Calibration) -> list[Curve]:
