@@ -122,6 +122,42 @@ class Bounded(AbstractPrior):
         return problem.mask * offset
 
 
+class Explicit(AbstractPrior):
+    """q_i - p_i(y_i) with given SDs and Gaussian offsets y_i that stay unknowns of their own.
+
+    The 9 + n unknowns of the arrow as it is written down; no method of the package takes it, the
+    fused kernel and the benchmarks are held to it.
+
+    Attributes:
+        sigma: (3,) SDs of the lateral, elevational and axial components, mm.
+        offset_sd: SD of y_i, mm.
+    """
+
+    sigma: Float[Array, 3]
+    offset_sd: Float[Array, ""]
+
+    def residual(
+        self, parameters: Parameters, offset: Float[Array, " n"], problem: Problem
+    ) -> Float[Array, "n 4"]:
+        apart = circle_residual(parameters, offset, problem) / self.sigma
+        own = (problem.mask * offset / self.offset_sd)[:, None]
+        return jnp.concatenate([apart, own], axis=1)
+
+    def start(self, parameters: Parameters, problem: Problem) -> Float[Array, " n"]:
+        return jnp.zeros_like(problem.mask)
+
+    def limit(self, parameters: Parameters, problem: Problem) -> Float[Array, " n"]:
+        return LARGEST_ELEVATION * jnp.abs(measured_points(parameters, problem)[:, 1])
+
+    def elevation(
+        self, parameters: Parameters, offset: Float[Array, " n"], problem: Problem
+    ) -> Float[Array, " n"]:
+        return problem.mask * offset
+
+    def largest_weight(self) -> Float[Array, ""]:
+        return 1 / jnp.minimum(jnp.min(self.sigma), self.offset_sd)
+
+
 class AbstractSelfTuned(AbstractPrior):
     """A Gaussian belief whose SDs can be estimated from the residuals (REML).
 

@@ -1,0 +1,150 @@
+"""Small dense algebra written out scalar by scalar, for many problems side by side.
+
+A matrix is a list of rows of arrays that all have the same shape, one entry for every problem
+("lane"). Written out, a 9x9 Cholesky solve is one straight stretch of code that XLA turns into a
+few vectorised loops over the lanes: 0.07 us a lane, where the same by loops over rows and columns
+takes 2 us. Structural zeros are the number 0 and cost nothing.
+
+A matrix that is not positive definite gives NaN, in its own lane only.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+Entry = Any
+"""An array over the lanes, or the number 0."""
+
+Vector = list[Entry]
+Matrix = list[list[Entry]]
+
+
+def is_zero(value: Entry) -> bool:
+    """Whether an entry is a structural zero."""
+    return isinstance(value, int) and value == 0
+
+
+def add(*terms: Entry) -> Entry:
+    """Sum without the structural zeros."""
+    total: Entry = 0
+    for term in terms:
+        if not is_zero(term):
+            total = term if is_zero(total) else total + term
+    return total
+
+
+def times(first: Entry, second: Entry) -> Entry:
+    """Product; 0 where either is a structural zero."""
+    return 0 if is_zero(first) or is_zero(second) else first * second
+
+
+def dot(first: Vector, second: Vector) -> Entry:
+    """Scalar product."""
+    return add(*(times(a, b) for a, b in zip(first, second, strict=True)))
+
+
+def transpose(matrix: Matrix) -> Matrix:
+    """Transpose."""
+    return [list(row) for row in zip(*matrix, strict=True)]
+
+
+def product(first: Matrix, second: Matrix) -> Matrix:
+    """Matrix product."""
+    columns = transpose(second)
+    return [[dot(row, column) for column in columns] for row in first]
+
+
+def apply(matrix: Matrix, vector: Vector) -> Vector:
+    """Matrix times vector."""
+    return [dot(row, vector) for row in matrix]
+
+
+def cross(vector: Vector) -> Matrix:
+    """The matrix of v x."""
+    x, y, z = vector
+    return [[0, times(-1, z), y], [z, 0, times(-1, x)], [times(-1, y), x, 0]]
+
+
+def cholesky(matrix: Matrix) -> tuple[Matrix, Vector]:
+    """Lower factor (strictly below the diagonal) and the inverses of its diagonal."""
+    size = len(matrix)
+    factor: Matrix = [[0] * size for _ in range(size)]
+    inverse: Vector = []
+    for j in range(size):
+        pivot = add(matrix[j][j], *(-factor[j][k] * factor[j][k] for k in range(j)))
+        inverse.append(jnp.where(pivot > 0, jax.lax.rsqrt(pivot), jnp.nan))
+        for i in range(j + 1, size):
+            rest = add(matrix[i][j], *(-factor[i][k] * factor[j][k] for k in range(j)))
+            factor[i][j] = times(rest, inverse[j])
+    return factor, inverse
+
+
+def forward(factor: Matrix, inverse: Vector, vector: Vector) -> Vector:
+    """L^-1 v."""
+    found: Vector = []
+    for i, value in enumerate(vector):
+        rest = add(value, *(times(-1, times(factor[i][k], found[k])) for k in range(i)))
+        found.append(times(rest, inverse[i]))
+    return found
+
+
+def backward(factor: Matrix, inverse: Vector, vector: Vector) -> Vector:
+    """L'^-1 v."""
+    size = len(vector)
+    found: Vector = [0] * size
+    for i in reversed(range(size)):
+        later = (times(-1, times(factor[k][i], found[k])) for k in range(i + 1, size))
+        found[i] = times(add(vector[i], *later), inverse[i])
+    return found
+
+
+def solve(matrix: Matrix, vector: Vector) -> Vector:
+    """Solve a symmetric positive definite system by Cholesky's factor."""
+    factor, inverse = cholesky(matrix)
+    return backward(factor, inverse, forward(factor, inverse, vector))
+
+
+def invert(matrix: Matrix) -> Matrix:
+    """Inverse of a symmetric positive definite matrix."""
+    size = len(matrix)
+    factor, inverse = cholesky(matrix)
+    columns = [
+        forward(factor, inverse, [0] * j + [jnp.ones_like(inverse[0])] + [0] * (size - 1 - j))
+        for j in range(size)
+    ]
+    # S^-1 = L'^-1 L^-1, so its entries are scalar products of the columns of L^-1.
+    found: Matrix = [[0] * size for _ in range(size)]
+    for i in range(size):
+        for j in range(i + 1):
+            found[i][j] = found[j][i] = dot(columns[i], columns[j])
+    return found
+
+
+def rotation(vector: Vector) -> Matrix:
+    """Rodrigues' formula: the rotation of a rotation vector (rad)."""
+    square = dot(vector, vector)
+    small = square < 1e-8
+    safe = jnp.where(small, 1.0, square)
+    angle = jnp.sqrt(safe)
+    first = jnp.where(small, 1 - square / 6, jnp.sin(angle) / angle)
+    second = jnp.where(small, 0.5 - square / 24, 2 * jnp.sin(0.5 * angle) ** 2 / safe)
+    turn = [[times(first, entry) for entry in row] for row in cross(vector)]
+    out: Matrix = []
+    for i in range(3):
+        row: Vector = []
+        for j in range(3):
+            entry = second * vector[i] * vector[j]
+            if i == j:
+                entry = entry + (1 - second * square)
+            row.append(add(entry, turn[i][j]))
+        out.append(row)
+    return out
+
+
+def rows_of(stacked: Array) -> Vector:
+    """The entries of an array whose first axis counts them."""
+    return [stacked[k] for k in range(stacked.shape[0])]
