@@ -33,13 +33,13 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import peer_solvers as peers  # noqa: E402
 from common import arguments, machine, results_folder, write_table  # noqa: E402
-from jaxcal.solvers.fused import Circle, Guess, Images, targets  # noqa: E402
 from peer_solvers import Batch, Solved  # noqa: E402
 
 from jaxcal.io.atomic import atomic_path  # noqa: E402
 from jaxcal.model.parameters import Parameters  # noqa: E402
 from jaxcal.simulation import Protocol, simulate  # noqa: E402
 from jaxcal.solvers import lanes  # noqa: E402
+from jaxcal.solvers.fused import Circle, Guess, Images, targets  # noqa: E402
 
 SEED = 20261125
 SIGMA_MM, OFFSET_SD_MM = 0.5, 2 / np.sqrt(3)
