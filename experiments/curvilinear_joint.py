@@ -74,7 +74,7 @@ def run_cell(cell: int, bound: float, noise: float, trials: int) -> dict[str, np
 
     experiments, problems = draw(indices)
     conventional = calibrate_batch(problems, method="conventional")
-    joint = calibrate_batch(problems, method="joint")
+    joint = calibrate_batch(problems, method="joint", prior="gaussian")
     paper = _paper_batch(problems)
     precision = jax.jit(jax.vmap(reconstruction_precision))
     out = {

@@ -39,6 +39,7 @@ _HOME = {
     "calibration_reproducibility": "jaxcal.metrics",
     "load": "jaxcal.io.hdf5",
     "make_images": "jaxcal.recording",
+    "predicted_tre": "jaxcal.intervals",
     "reconstruction_precision": "jaxcal.metrics",
     "save": "jaxcal.io.hdf5",
     "segment": "jaxcal.segmentation.segment",
@@ -47,6 +48,7 @@ _HOME = {
     "simulate_recording": "jaxcal.simulation",
     "sound_speed_in_water": "jaxcal.sound",
     "stack": "jaxcal.problem",
+    "transform_intervals": "jaxcal.intervals",
 }
 
 
@@ -58,6 +60,8 @@ if TYPE_CHECKING:
     from jaxcal.errors import InputError as InputError
     from jaxcal.errors import MissingExtraError as MissingExtraError
     from jaxcal.errors import OutputError as OutputError
+    from jaxcal.intervals import predicted_tre as predicted_tre
+    from jaxcal.intervals import transform_intervals as transform_intervals
     from jaxcal.io.hdf5 import load as load
     from jaxcal.io.hdf5 import save as save
     from jaxcal.metrics import calibration_reproducibility as calibration_reproducibility

@@ -14,6 +14,7 @@ from jaxcal import diagnosis
 from jaxcal.errors import CalibrationError
 from jaxcal.model.parameters import Blocks
 from jaxcal.problem import is_traced
+from jaxcal.solvers.auto import OffsetLaw
 
 
 class Status(enum.IntEnum):
@@ -39,6 +40,8 @@ class Calibration(eqx.Module):
         elevation_sd: its standard deviation, mm; NaN where it rests on a bound or is not known.
         sigma: SDs of lateral position, range and elevational offset, mm.
         channel_sigma: SD of an element's distance, mm; None for solves on points.
+        offset_law: what the data say of the offsets' law, their mean and the noise; None where no
+            laws were weighed.
         covariance: of X (v mm, omega rad); NaN where X is not observable.
         point_covariance: of the target, mm^2.
         scale_mm_per_px: [lateral, axial], or None for points in mm.
@@ -73,7 +76,8 @@ class Calibration(eqx.Module):
         trace: objective after each of the first iterations; NaN beyond the last;
             None where none was asked for.
         method: ``conventional``, ``alternating`` or ``joint`` (static).
-        prior: ``none``, ``bounded`` or ``gaussian`` (static).
+        prior: ``none``, ``bounded``, ``gaussian``, or, where laws of the offsets were weighed,
+            ``auto`` or ``uniform`` (static).
         data: ``points`` or ``channels``: whose residuals were minimised (static).
         blocks: the free unknowns (static).
     """
@@ -83,6 +87,7 @@ class Calibration(eqx.Module):
     elevation: Float[Array, "*batch n"]
     elevation_sd: Float[Array, "*batch n"]
     sigma: Float[Array, "*batch 3"]
+    offset_law: OffsetLaw | None
     channel_sigma: Float[Array, "*batch"] | None
     covariance: Float[Array, "*batch 6 6"]
     point_covariance: Float[Array, "*batch 3 3"]

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxcal.geometry import AnyArray
 from jaxcal.model.parameters import BLOCK_SIZE
+from jaxcal.model.shapes import FAMILIES
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
@@ -38,6 +39,9 @@ _OBLIQUE = {
     "point": "target position along the tracker's ({:.2f}, {:.2f}, {:.2f})",
     "scale": "both pixel scales ({:.2f}, {:.2f})",
 }
+
+TUNED = ("gaussian", "auto", "uniform")
+"""Priors with SDs of lateral position, range and offset."""
 
 OUTLIER_SDS = 8.0
 STEADY = 1e-3
@@ -96,6 +100,43 @@ def observability(result: Calibration) -> dict[str, float | str | None]:
     }
 
 
+_FAMILY = {
+    "uniform": "uniform between edges",
+    "bell": "bell-shaped between edges",
+    "gaussian": "Gaussian",
+    "student": "heavy-tailed",
+}
+
+
+def offset_law(result: Calibration) -> dict[str, object] | None:
+    """What the data say of the offsets' law and of the noise, as plain values and in words."""
+    law = result.offset_law
+    if law is None:
+        return None
+    weighed = bool(law.weighed)
+    probability = {
+        family: float(value) for family, value in zip(FAMILIES, law.probability, strict=True)
+    }
+    own = bool(law.own_covariances)
+    words = "The laws of the offsets could not be weighed; they are taken for Gaussian."
+    if weighed:
+        ranked = sorted(probability.items(), key=lambda item: -item[1])
+        told = [f"{_FAMILY[name]} ({100 * p:.0f} %)" for name, p in ranked if p >= 0.1]
+        words = f"The data take the offsets to be {' or '.join(told)}"
+        if law.has_mean:
+            words += f", about a mean of {float(law.mean):.2f} +- {float(law.mean_sd):.2f} mm"
+        noise = "each image's own covariance" if own else "the same SDs in all images"
+        words += f", and the measurements' errors to have {noise}."
+    return {
+        "weighed": weighed,
+        "probability": probability if weighed else None,
+        "mean_mm": float(law.mean),
+        "mean_sd_mm": float(law.mean_sd),
+        "own_covariances": own,
+        "words": words,
+    }
+
+
 def outliers(result: Calibration) -> list[int]:
     """Images whose residual stands out by more than eight robust SDs in any component.
 
@@ -148,7 +189,7 @@ def warnings(result: Calibration) -> list[str]:
             "the alternation stopped on its tolerance while its objective was still falling "
             f"(scaled KKT residual {float(result.stationarity):.1e})"
         )
-    if result.prior == "gaussian" and not result.sigma_tuned:
+    if result.prior in TUNED and not result.sigma_tuned:
         found.append(
             "noise SDs were held fixed, not estimated"
             + (f": {used} images are fewer than the 8 that it takes" if used < 8 else "")
@@ -164,12 +205,16 @@ def warnings(result: Calibration) -> list[str]:
         found.append(
             f"the {' and '.join(names)} error is too small to estimate; its SD rests on its floor"
         )
-    if result.prior == "gaussian" and status == "converged":
+    if result.prior in TUNED and status == "converged":
         sd = float(np.sqrt(result.covariance[1, 1]))
         if sd > WEAK_TRANSLATION_MM:
+            law = result.offset_law
+            on = "a mean of the offsets that the data hardly show"
+            if law is None or not law.has_mean:
+                on = "offsets that average zero"
             found.append(
                 "translation along the elevational axis is weakly seen "
-                f"(SD {sd:.2f} mm) and rests on offsets that average zero"
+                f"(SD {sd:.2f} mm) and rests on {on}"
             )
     found += _medium_warnings(result)
     named = outliers(result)

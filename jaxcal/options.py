@@ -7,7 +7,7 @@ numbers that came with the request are a :class:`Given`, which is traced.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import equinox as eqx
 import jax
@@ -17,12 +17,17 @@ from jaxtyping import Array, Float
 
 from jaxcal.errors import InputError
 from jaxcal.model.parameters import EXTRA, MEDIUM, RIGID, Blocks
+from jaxcal.model.shapes import Shape
 from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES
+from jaxcal.solvers.auto import SHAPES, UNIFORM
 
 Method = Literal["joint", "alternating", "conventional"]
-PriorName = Literal["auto", "gaussian", "bounded"]
+PriorName = Literal["auto", "gaussian", "uniform", "bounded"]
 Data = Literal["auto", "points", "channels"]
+
+LAWS: dict[str, tuple[Shape, ...]] = {"auto": SHAPES, "uniform": UNIFORM}
+"""The priors of the joint method that weigh laws of the offsets, and which."""
 
 DEFAULT_MAX_ELEVATION_MM = 1.0
 """The bound on the offsets where none is given: the paper's."""
@@ -74,14 +79,24 @@ class Options:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything static about a solve: method, belief about the offsets, data, unknowns."""
+    """Everything static about a solve: method, belief about the offsets, data, unknowns.
+
+    ``laws`` are those to weigh after the self-tuned Gaussian solve; none: that is the answer.
+    """
 
     method: Method
     prior: Literal["none", "gaussian", "bounded"]
     self_tuning: bool
+    laws: tuple[Shape, ...]
     channels: bool
     blocks: Blocks
     options: Options
+
+    @property
+    def reported_prior(self) -> str:
+        """The prior's name in the result: that of the laws which were weighed, if any were."""
+        names = [name for name, laws in LAWS.items() if laws == self.laws]
+        return names[0] if names else self.prior
 
 
 class Given(eqx.Module):
@@ -154,7 +169,10 @@ def prepare(problem: Problem, request: Request) -> tuple[Plan, Given]:
         raise InputError(f"sigma must be {components} numbers: {names}, mm")
     tuning = kind == "gaussian" and request.sigma is None
     options = Options() if request.options is None else request.options
-    return Plan(request.method, kind, tuning, channels, blocks, options), given
+    laws: tuple[Shape, ...] = ()
+    if tuning and request.prior in LAWS:
+        laws = LAWS[request.prior]
+    return Plan(request.method, kind, tuning, laws, channels, blocks, options), given
 
 
 def _check_names(request: Request) -> None:
@@ -162,8 +180,9 @@ def _check_names(request: Request) -> None:
         raise InputError(
             f"method must be joint, alternating or conventional, not {request.method!r}"
         )
-    if request.prior not in ("auto", "gaussian", "bounded"):
-        raise InputError(f"prior must be auto, gaussian or bounded, not {request.prior!r}")
+    if request.prior not in get_args(PriorName):
+        names = "auto, gaussian, uniform or bounded"
+        raise InputError(f"prior must be {names}, not {request.prior!r}")
     if request.data not in ("auto", "points", "channels"):
         raise InputError(f"data must be auto, points or channels, not {request.data!r}")
     for name in request.estimate:
@@ -176,9 +195,13 @@ def _check_combination(request: Request, kind: str) -> None:
         raise InputError("sigma and tracker_sd belong to the joint method's gaussian prior")
     if request.tracker_sd is not None and request.sigma is None:
         raise InputError("tracker_sd needs given sigma: self-tuned SDs contain the tracker's noise")
-    if request.max_elevation is not None and kind != "bounded":
+    if request.sigma is not None and request.prior == "uniform":
+        raise InputError("the uniform prior tunes its SDs: sigma belongs to the gaussian one")
+    weighing = kind == "gaussian" and request.prior in LAWS and request.sigma is None
+    if request.max_elevation is not None and kind != "bounded" and not weighing:
         raise InputError(
-            "max_elevation belongs to the alternating method and to the joint one's bounded prior"
+            "max_elevation belongs to the alternating method and to the joint one's priors auto, "
+            "uniform (without given sigma) and bounded"
         )
     options = request.options
     historical = options is not None and options.solver == "gradient"

@@ -1,8 +1,8 @@
 """The road that every problem takes, whatever the method, as one pure function of arrays.
 
 The conventional fit from the closed-form start; the method itself from there; derivatives by the
-implicit function theorem; uncertainty at the solution; and all of it put together as a
-:class:`Calibration`.
+implicit function theorem; the average over the offsets' laws where they are to be weighed;
+uncertainty at the solution; and all of it put together as a :class:`Calibration`.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from jaxcal.problem import Problem
 from jaxcal.recording import MINIMUM_IMAGES
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import alternate
+from jaxcal.solvers.auto import Averaged, OffsetLaw, average_over_laws
 from jaxcal.solvers.conventional import from_scratch, pairwise_gradient
 from jaxcal.solvers.joint import joint
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING, self_tuned
@@ -68,11 +69,36 @@ def solve_problem(problem: Problem, given: Given, plan: Plan) -> Calibration:
     solution = _run_method(*frozen, plan)
     # The solver saw constants; here its answer becomes a function of the data again.
     parameters, offset, prior = _attach(solution, problem, given, plan)
+    averaged = None
+    if plan.laws and isinstance(prior, AbstractSelfTuned):
+        averaged = average_over_laws(parameters, prior, problem, plan.blocks, plan.laws)
+        parameters, prior = averaged.parameters, averaged.belief
     uncertainty = assess(
         parameters, offset, prior, problem, plan.blocks,
         whitened=plan.prior == "gaussian", uses_prior=plan.prior != "none",
     )  # fmt: skip
-    return _assemble(solution, parameters, offset, prior, uncertainty, problem, given, plan)
+    if averaged is not None:
+        uncertainty = _of_the_laws(uncertainty, averaged)
+    law = None if averaged is None else averaged.law
+    return _assemble(solution, parameters, offset, prior, uncertainty, law, problem, given, plan)
+
+
+def _of_the_laws(uncertainty: Uncertainty, averaged: Averaged) -> Uncertainty:
+    """The Gaussian solution's uncertainty with the covariances of the average over the laws."""
+    weighed = averaged.law.weighed
+
+    def either(new: Array, old: Array) -> Array:
+        # What the Gaussian solution cannot tell at all stays unknown.
+        return jnp.where(weighed & jnp.isfinite(old), new, old)
+
+    return eqx.tree_at(
+        lambda u: (u.covariance, u.elevation_sd),
+        uncertainty,
+        (
+            either(averaged.covariance, uncertainty.covariance),
+            either(averaged.elevation_sd, uncertainty.elevation_sd),
+        ),
+    )
 
 
 def belief(problem: Problem, given: Given, plan: Plan) -> AbstractPrior:
@@ -93,7 +119,9 @@ def belief(problem: Problem, given: Given, plan: Plan) -> AbstractPrior:
         medium = jnp.stack([given.medium_sd[0] / speed, given.medium_sd[1] * speed * 1e3])
     if plan.channels:
         return ChannelGaussian(sigma, medium)
-    return Gaussian(sigma, covariance_shape(problem), given.tracker_sd, medium)
+    # Where laws are weighed, so are the covariances, and the first fit does without.
+    covariance = None if plan.laws else covariance_shape(problem)
+    return Gaussian(sigma, covariance, given.tracker_sd, medium)
 
 
 def nominal_sound_speed(problem: Problem) -> Float[Array, ""]:
@@ -185,6 +213,7 @@ def _assemble(
     offset: Float[Array, " k"],
     prior: AbstractPrior,
     uncertainty: Uncertainty,
+    law: OffsetLaw | None,
     problem: Problem,
     given: Given,
     plan: Plan,
@@ -205,6 +234,7 @@ def _assemble(
         elevation=elevation,
         elevation_sd=uncertainty.elevation_sd,
         sigma=_three_sigmas(prior, parameters, elevation, uncertainty, problem),
+        offset_law=law,
         channel_sigma=prior.sigma[0] if isinstance(prior, ChannelGaussian) else None,
         covariance=covariance[:6, :6],
         point_covariance=covariance[point, point],
@@ -232,7 +262,7 @@ def _assemble(
         translation_change=solution.translation_change,
         trace=solution.trace,
         method=plan.method,
-        prior=plan.prior,
+        prior=plan.reported_prior,
         data="channels" if plan.channels else "points",
         blocks=plan.blocks,
     )

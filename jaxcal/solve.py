@@ -61,11 +61,15 @@ def calibrate(
         problem: one problem (a batch is handed to :func:`calibrate_batch`), or a recording.
         method: ``joint`` (X, c and every offset together), ``alternating`` (the paper's Fig. 4) or
             ``conventional`` (Eq. 7, every target in the plane).
-        prior: of the joint method. ``gaussian``: offsets and errors are Gaussian, with the SDs of
-            ``sigma`` or, without it, self-tuned by REML. ``bounded``: |y_i| <= max_elevation with
-            equal weights, the alternation's objective. ``auto``: self-tuned Gaussian.
+        prior: of the joint method. ``auto``: errors have self-tuned SDs, and the law of the
+            offsets, their mean and the noise are weighed by the data (:mod:`jaxcal.solvers.auto`).
+            ``uniform``: the same with offsets that are uniform between unknown edges.
+            ``gaussian``: offsets and errors are Gaussian, with the SDs of ``sigma`` or, without it,
+            self-tuned by REML. ``bounded``: |y_i| <= max_elevation with equal weights, the
+            alternation's objective. With given ``sigma``, ``auto`` is ``gaussian``.
         max_elevation: bound m on |y|, mm, one number or (n,); overrides the problem's own. The
-            alternation and ``bounded`` take 1 mm where there is neither.
+            alternation and ``bounded`` take 1 mm where there is neither; ``auto`` and ``uniform``
+            cut the law of each image's offset there.
         sigma: given SDs of lateral position, range and elevational offset, mm; on channels, of an
             element's distance and the elevational offset.
         tracker_sd: isotropic SD of the tracked position, mm, beside given ``sigma``.
@@ -73,8 +77,8 @@ def calibrate(
         data: ``channels``: the joint method's residuals are those of every element's time of flight
             (the recording must hold them); ``points``: those of the segmented points; ``auto``:
             channels where they say more, on curvilinear probes and for sound speed or delay.
-        sound_speed_sd: how far the sound speed may be from nominal, m/s (joint gaussian only).
-        delay_sd: how far the delay may be from nominal, s (joint gaussian only).
+        sound_speed_sd: how far the sound speed may be from nominal, m/s (joint only, not bounded).
+        delay_sd: how far the delay may be from nominal, s (joint only, not bounded).
         options: tolerances and limits.
 
     Returns:

@@ -319,7 +319,8 @@ def test_refused_without_a_recording(arguments, said, capfd, tmp_path, monkeypat
     ("options", "said"),
     [
         (["--method", "magic"], "'magic' is not one of"),
-        (["--prior", "uniform"], "--prior uniform is not in this version"),
+        (["--prior", "uniform", "--sigma", "1", "1", "1"], "--sigma needs"),
+        (["--prior", "gaussian", "--max-elevation", "1"], "--max-elevation needs"),
         (["--prior", "gaussian", "--method", "alternating"], "does not go with"),
         (["--prior", "bounded", "--method", "conventional"], "does not go with"),
         (["--max-elevation", "1"], "--max-elevation needs"),

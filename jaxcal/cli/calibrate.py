@@ -32,7 +32,7 @@ class _Request:
     """What was asked for, checked as far as it can be without the data."""
 
     method: Method
-    prior: Literal["auto", "gaussian", "bounded"]
+    prior: Literal["auto", "gaussian", "uniform", "bounded"]
     max_elevation: float | None
     estimate: tuple[str, ...]
     data: Literal["auto", "points", "channels"]
@@ -55,7 +55,8 @@ class _Request:
     type=click.Choice(["auto", "gaussian", "uniform", "bounded"]),
     default="auto",
     show_default=True,
-    help="What the joint method takes the offsets for; auto: Gaussian, with SDs tuned to the data.",
+    help="What the joint method takes the offsets for; auto: whatever law the data "
+    "speak for, SDs tuned to the data.",
 )
 @click.option(
     "--max-elevation",
@@ -232,15 +233,18 @@ def _request(
     alternation: dict[str, Any],
 ) -> _Request:
     """Refuse options that would be without effect: whoever gives one counts on it."""
-    if prior == "uniform":
-        raise InputError("--prior uniform is not in this version; there are gaussian and bounded")
-    fitting = {"joint": ("auto", "gaussian", "bounded"), "alternating": ("auto", "bounded")}
+    fitting = {
+        "joint": ("auto", "gaussian", "uniform", "bounded"), "alternating": ("auto", "bounded")
+    }  # fmt: skip
     if prior not in fitting.get(method, ("auto",)):
         raise InputError(f"--prior {prior} does not go with --method {method}")
-    bounded = method == "alternating" or (method == "joint" and prior == "bounded")
-    if max_elevation is not None and not bounded:
-        raise InputError("--max-elevation needs --method alternating or --prior bounded")
-    if sigma is not None and (method != "joint" or prior == "bounded"):
+    bounding = method == "alternating" or (method == "joint" and prior != "gaussian")
+    if max_elevation is not None and (not bounding or sigma is not None):
+        raise InputError(
+            "--max-elevation needs --method alternating, or --prior auto, uniform or bounded "
+            "without --sigma"
+        )
+    if sigma is not None and (method != "joint" or prior in ("uniform", "bounded")):
         raise InputError("--sigma needs --method joint with the gaussian prior")
     if solver is not None and method != "conventional":
         raise InputError("--solver needs --method conventional")
@@ -254,8 +258,8 @@ def _request(
         raise InputError("--data channels needs --method joint with the gaussian prior")
     if solver is not None:
         options["solver"] = solver
-    chosen: Literal["auto", "gaussian", "bounded"] = "auto"
-    if prior == "gaussian" or prior == "bounded":
+    chosen: Literal["auto", "gaussian", "uniform", "bounded"] = "auto"
+    if prior == "gaussian" or prior == "uniform" or prior == "bounded":
         chosen = prior
     return _Request(method, chosen, max_elevation, _unknowns(estimate), data, sigma, options)
 

@@ -319,5 +319,7 @@ def covariance_shape(problem: Problem) -> Float[Array, "n 2 2"] | None:
     variances = jnp.diagonal(problem.covariance, axis1=-2, axis2=-1)
     weight = problem.mask[:, None]
     mean = jnp.sum(weight * variances, axis=0) / jnp.sum(weight)
-    scale = 1 / jnp.sqrt(mean)
-    return problem.covariance * scale[:, None] * scale[None, :]
+    # Covariances of zero (exact data) have no shape.
+    scale = 1 / jnp.sqrt(jnp.where(mean > 0, mean, 1.0))
+    shape = problem.covariance * scale[:, None] * scale[None, :]
+    return jnp.where(jnp.all(mean > 0), shape, jnp.eye(2, dtype=shape.dtype))

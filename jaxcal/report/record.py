@@ -28,7 +28,10 @@ CONVENTION = {
     "an image was left out",
     "covariance": "of image_to_probe under the right perturbation X Exp([v, omega]): v in mm, then "
     "omega in rad, along and about the image's axes",
-    "objective": "the minimised sum of squares: mm^2, or in SDs with the gaussian prior",
+    "objective": "the minimised sum of squares: mm^2, or in SDs with the gaussian prior; with auto "
+    "and uniform that of the Gaussian fit before the laws are weighed",
+    "offset_law": "which law the elevational offsets follow and with what probability, their mean, "
+    "and which noise model is in use; null where no laws were weighed",
 }
 
 
@@ -63,6 +66,7 @@ def calibration_record(
         "point_mm": answer.point,
         "elevation_mm": answer.elevation,
         "elevation_sd_mm": answer.elevation_sd,
+        "offset_law": diagnosis.offset_law(answer),
         "sigma_lateral_mm": answer.sigma[0],
         "sigma_range_mm": answer.sigma[1],
         "sigma_elevation_mm": answer.sigma[2],

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from jaxcal import diagnosis
+
 GOOD = 0.5
 """Largest SD of X, in mm and in degrees, that is called good,"""
 FAIR = 1.5
@@ -82,11 +84,13 @@ def _certainty(record: dict[str, Any]) -> list[str]:
         f"{_AXES[about]} axis (one standard deviation)."
     ]
     unseen = record["observability"]["known_only_from_prior"]
-    if unseen and record["prior"] == "gaussian":
+    if unseen and record["prior"] in diagnosis.TUNED:
         lines.append(
             f"The images do not show {unseen}: it rests on the assumption that the target lay "
             "evenly on both sides of the image plane."
         )
+    if record.get("offset_law"):
+        lines.append(record["offset_law"]["words"])
     return lines
 
 

@@ -182,3 +182,34 @@ def _next_pairs(count: int) -> np.ndarray:
     new_top = np.concatenate([top[:1], bottom[:1], top[1:-1]])
     new_bottom = np.concatenate([bottom[1:], top[-1:]])
     return np.stack([new_top, new_bottom], axis=1).ravel()
+
+
+def inverse_positive(matrix: Float[Array, "p p"]) -> tuple[Float[Array, "p p"], Float[Array, ""]]:
+    """Inverse and log determinant of a symmetric positive definite matrix, by Gauss-Jordan.
+
+    Args:
+        matrix: of any scale; it is brought to a unit diagonal first.
+
+    Returns:
+        The inverse and ln det; NaN where the matrix is not positive definite.
+    """
+    size = matrix.shape[0]
+    rows = jnp.arange(size)
+    scale = 1 / jnp.sqrt(jnp.diagonal(matrix))
+    scaled = matrix * scale[:, None] * scale[None, :]
+
+    def eliminate(k: Array, state: tuple) -> tuple:
+        work, log_determinant = state
+        here = (rows == k).astype(work.dtype)
+        column = _column(work, k)
+        pivot = column @ here
+        pivot = jnp.where(pivot > 0, pivot, jnp.nan)
+        # In place: the eliminated column makes room for the inverse's.
+        row = jnp.where(rows == k, 1.0, here @ work) / pivot
+        work = jnp.where(rows == k, 0.0, work) - column[:, None] * row
+        work = jnp.where(rows[:, None] == k, row, work)
+        return work, log_determinant + jnp.log(pivot)
+
+    zero = jnp.zeros((), matrix.dtype)
+    inverse, log_determinant = jax.lax.fori_loop(0, size, eliminate, (scaled, zero))
+    return inverse * scale[:, None] * scale[None, :], log_determinant - 2 * jnp.sum(jnp.log(scale))

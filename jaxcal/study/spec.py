@@ -26,7 +26,7 @@
     [[methods]]               # one table for each; names are unique
     name = "alternation, 1 mm"
     method = "alternating"    # or conventional, joint
-    prior = "auto"            # joint only: auto (self-tuned) or bounded
+    prior = "auto"            # joint only: auto, gaussian, uniform (self-tuned) or bounded
     max_elevation_mm = 1      # the bound that alternating and bounded are told; or
     max_elevation_factor = 1  # ... this times the true bound (jaxcal.offsets.nominal_bound)
     tolerance_rad = 1e-3      # alternating: stop when X turns by less in a round
@@ -148,7 +148,7 @@ class MethodSpec:
 
     name: str
     method: Literal["conventional", "alternating", "joint"]
-    prior: Literal["auto", "bounded"] = "auto"
+    prior: Literal["auto", "gaussian", "uniform", "bounded"] = "auto"
     max_elevation_mm: float | None = None
     max_elevation_factor: float | None = None
     tolerance_rad: float = 1e-3
@@ -441,8 +441,9 @@ def _method(table: dict[str, Any], where: str) -> MethodSpec:
         raise InputError(f"{where}method must be conventional, alternating or joint, not "
                          f"{_shown(method)}")  # fmt: skip
     prior = table.get("prior", "auto")
-    if prior not in ("auto", "bounded"):
-        raise InputError(f"{where}prior must be auto or bounded, not {_shown(prior)}")
+    if prior not in ("auto", "gaussian", "uniform", "bounded"):
+        raise InputError(f"{where}prior must be auto, gaussian, uniform or bounded, not "
+                         f"{_shown(prior)}")  # fmt: skip
     if method != "joint" and "prior" in table:
         raise InputError(f"{where}prior belongs to the joint method")
     bounded = method == "alternating" or prior == "bounded"
