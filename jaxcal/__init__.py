@@ -34,8 +34,10 @@ _HOME = {
     "Segmentation": "jaxcal.segmentation.segment",
     "Status": "jaxcal.calibration",
     "Options": "jaxcal.options",
+    "Pivot": "jaxcal.pivot",
     "calibrate": "jaxcal.solve",
     "calibrate_batch": "jaxcal.solve",
+    "calibrate_pivot": "jaxcal.pivot",
     "calibration_reproducibility": "jaxcal.metrics",
     "load": "jaxcal.io.hdf5",
     "make_images": "jaxcal.recording",
@@ -67,6 +69,8 @@ if TYPE_CHECKING:
     from jaxcal.metrics import calibration_reproducibility as calibration_reproducibility
     from jaxcal.metrics import reconstruction_precision as reconstruction_precision
     from jaxcal.options import Options as Options
+    from jaxcal.pivot import Pivot as Pivot
+    from jaxcal.pivot import calibrate_pivot as calibrate_pivot
     from jaxcal.probe import CurvilinearProbe as CurvilinearProbe
     from jaxcal.probe import LinearProbe as LinearProbe
     from jaxcal.problem import Problem as Problem

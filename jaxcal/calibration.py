@@ -66,6 +66,9 @@ class Calibration(eqx.Module):
         prior_direction: direction that the measurements alone, without the offset's prior or bound,
             leave undetermined; zeros where there is none.
         searched_start: the closed-form start was unsound and one was searched for.
+        outlier: 1 where an image does not fit the rest; a robust solve leaves it out.
+        departure: (n, 3) errors of lateral position, range and elevational offset in robust SDs of
+            the images in use, those of images left out included; 0 where masked by the caller.
         sigma_tuned: the SDs were estimated from the data.
         sigma_floored: (3,) which SDs rest on their floor.
         tolerance_met: the method's own stopping rule was met.
@@ -80,6 +83,7 @@ class Calibration(eqx.Module):
             ``auto`` or ``uniform`` (static).
         data: ``points`` or ``channels``: whose residuals were minimised (static).
         blocks: the free unknowns (static).
+        robust: images that do not fit the rest were left out (static).
     """
 
     image_to_probe: Float[Array, "*batch 4 4"]
@@ -112,6 +116,8 @@ class Calibration(eqx.Module):
     weakest_sd: Float[Array, "*batch"]
     prior_direction: Float[Array, "*batch p"]
     searched_start: Bool[Array, "*batch"]
+    outlier: Float[Array, "*batch n"]
+    departure: Float[Array, "*batch n 3"]
     sigma_tuned: Bool[Array, "*batch"]
     sigma_floored: Bool[Array, "*batch 3"]
     tolerance_met: Bool[Array, "*batch"]
@@ -123,6 +129,7 @@ class Calibration(eqx.Module):
     prior: str = eqx.field(static=True)
     data: str = eqx.field(static=True)
     blocks: Blocks = eqx.field(static=True)
+    robust: bool = eqx.field(static=True, default=False)
 
     @property
     def converged(self) -> Bool[Array, "*batch"]:

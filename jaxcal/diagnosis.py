@@ -5,7 +5,7 @@ Takes a :class:`jaxcal.Calibration` whose arrays are numpy's.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -15,6 +15,27 @@ from jaxcal.model.shapes import FAMILIES
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
+
+
+@runtime_checkable
+class Judged(Protocol):
+    """What has images that may stand out."""
+
+    @property
+    def outlier(self) -> AnyArray:
+        """(n,) 1 where an image stands out."""
+        ...
+
+    @property
+    def departure(self) -> AnyArray:
+        """(n, 3) in SDs."""
+        ...
+
+    @property
+    def mask(self) -> AnyArray:
+        """(n,) 1 for used images."""
+        ...
+
 
 _AXES = {
     "translation": ("lateral", "elevational", "axial"),
@@ -43,7 +64,7 @@ _OBLIQUE = {
 TUNED = ("gaussian", "auto", "uniform")
 """Priors with SDs of lateral position, range and offset."""
 
-OUTLIER_SDS = 8.0
+COMPONENTS = ("lateral", "range", "elevational")
 STEADY = 1e-3
 WEAK_TRANSLATION_MM = 0.3
 WEAK_SHARE = 0.7
@@ -138,21 +159,44 @@ def offset_law(result: Calibration) -> dict[str, object] | None:
 
 
 def outliers(result: Calibration) -> list[int]:
-    """Images whose residual stands out by more than eight robust SDs in any component.
+    """Images that do not fit the rest (see :mod:`jaxcal.solvers.consensus`)."""
+    return images_that_stand_out(result)
 
-    They are named, not left out. The SD is the median absolute deviation's, so that the outliers
-    themselves do not hide behind it; eight, because lateral noise grows with depth, so that clean
-    images near the bottom of the field reach six.
+
+def images_that_stand_out(result: Judged) -> list[int]:
+    """Indices of the images marked as outliers."""
+    return [int(image) for image in np.flatnonzero(np.asarray(result.outlier) > 0)]
+
+
+def outlier_reasons(
+    result: Judged, components: tuple[str, ...] = COMPONENTS
+) -> list[dict[str, int | float | str | bool | None]]:
+    """For every outlier: the component that stands out most, by how many SDs, and if it was used.
+
+    ``image``, ``component`` (lateral, range or elevational, if not named otherwise), ``sds``
+    (signed), ``left_out``.
     """
-    used = np.flatnonzero(result.mask > 0)
-    residual = result.residual[used]
-    if len(used) < 8 or not np.isfinite(residual).all():
-        return []
-    deviation = np.abs(residual - np.median(residual, axis=0))
-    spread = 1.4826 * np.median(deviation, axis=0)
-    # A component without any spread (exact data) has no outliers worth naming.
-    spread = np.maximum(spread, 1e-3 * max(float(result.rms), 1e-9))
-    return [int(i) for i in used[(deviation > OUTLIER_SDS * spread).any(axis=1)]]
+    departure = np.asarray(result.departure, dtype=float)
+    found = []
+    for image in images_that_stand_out(result):
+        worst = int(np.argmax(np.abs(departure[image])))
+        found.append({
+            "image": image,
+            "component": components[worst],
+            "sds": _finite(departure[image, worst]),
+            "left_out": bool(np.asarray(result.mask)[image] == 0),
+        })  # fmt: skip
+    return found
+
+
+def listed_departures(result: Judged, components: tuple[str, ...] = COMPONENTS) -> str:
+    """The outliers with component and SDs, the first ten of them, in words."""
+    reasons = outlier_reasons(result, components)
+    told = [
+        f"{reason['image']} ({reason['component']}, {abs(float(reason['sds'] or 0)):.0f} SDs)"
+        for reason in reasons[:10]
+    ]
+    return ", ".join(told) + (", ..." if len(reasons) > 10 else "")
 
 
 def warnings(result: Calibration) -> list[str]:
@@ -218,9 +262,16 @@ def warnings(result: Calibration) -> list[str]:
             )
     found += _medium_warnings(result)
     named = outliers(result)
-    if named:
-        listed = ", ".join(map(str, named[:10])) + (", ..." if len(named) > 10 else "")
-        found.append(f"images that do not fit the rest: {listed}")
+    if named and result.robust:
+        found.append(
+            f"left out {len(named)} of {used + len(named)} images that do not fit the rest: "
+            f"{listed_departures(result)}"
+        )
+    elif named:
+        found.append(
+            f"images that do not fit the rest: {listed_departures(result)}; a robust solve "
+            "(--robust) leaves them out"
+        )
     return found
 
 

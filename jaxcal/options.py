@@ -82,6 +82,7 @@ class Plan:
     """Everything static about a solve: method, belief about the offsets, data, unknowns.
 
     ``laws`` are those to weigh after the self-tuned Gaussian solve; none: that is the answer.
+    ``robust``: find the images that agree first, and leave the others out.
     """
 
     method: Method
@@ -91,6 +92,7 @@ class Plan:
     channels: bool
     blocks: Blocks
     options: Options
+    robust: bool = False
 
     @property
     def reported_prior(self) -> str:
@@ -129,6 +131,7 @@ class Request:
     sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S
     delay_sd: float | Array = DELAY_SD_S
     options: Options | None = None
+    robust: bool = False
 
 
 def prepare(problem: Problem, request: Request) -> tuple[Plan, Given]:
@@ -172,7 +175,8 @@ def prepare(problem: Problem, request: Request) -> tuple[Plan, Given]:
     laws: tuple[Shape, ...] = ()
     if tuning and request.prior in LAWS:
         laws = LAWS[request.prior]
-    return Plan(request.method, kind, tuning, laws, channels, blocks, options), given
+    plan = Plan(request.method, kind, tuning, laws, channels, blocks, options, bool(request.robust))
+    return plan, given
 
 
 def _check_names(request: Request) -> None:

@@ -7,6 +7,8 @@ uncertainty at the solution; and all of it put together as a :class:`Calibration
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,6 +34,7 @@ from jaxcal.recording import MINIMUM_IMAGES
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import alternate
 from jaxcal.solvers.auto import Averaged, OffsetLaw, average_over_laws
+from jaxcal.solvers.consensus import CUT, FEWEST_IMAGES, departures, find_consensus, rigid_model
 from jaxcal.solvers.conventional import from_scratch, pairwise_gradient
 from jaxcal.solvers.joint import joint
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING, self_tuned
@@ -65,6 +68,11 @@ class _Solution(eqx.Module):
 
 def solve_problem(problem: Problem, given: Given, plan: Plan) -> Calibration:
     """Solve one problem (vmap it for a batch)."""
+    everything = problem
+    if plan.robust:
+        # Which images are left out is piecewise constant in the data: no derivative passes here.
+        agreed = find_consensus(jax.lax.stop_gradient(problem), rigid_model(plan.blocks))
+        problem = replace(problem, mask=agreed.keep)
     frozen = jax.lax.stop_gradient((problem, given))
     solution = _run_method(*frozen, plan)
     # The solver saw constants; here its answer becomes a function of the data again.
@@ -80,7 +88,8 @@ def solve_problem(problem: Problem, given: Given, plan: Plan) -> Calibration:
     if averaged is not None:
         uncertainty = _of_the_laws(uncertainty, averaged)
     law = None if averaged is None else averaged.law
-    return _assemble(solution, parameters, offset, prior, uncertainty, law, problem, given, plan)
+    result = _assemble(solution, parameters, offset, prior, uncertainty, law, problem, given, plan)
+    return judge_images(result, parameters, everything, plan)
 
 
 def _of_the_laws(uncertainty: Uncertainty, averaged: Averaged) -> Uncertainty:
@@ -99,6 +108,21 @@ def _of_the_laws(uncertainty: Uncertainty, averaged: Averaged) -> Uncertainty:
             either(averaged.elevation_sd, uncertainty.elevation_sd),
         ),
     )
+
+
+def judge_images(
+    result: Calibration, parameters: Parameters, everything: Problem, plan: Plan
+) -> Calibration:
+    """The result with every image's departure from it, the images left out included."""
+    frozen = jax.lax.stop_gradient((parameters, everything))
+    _, departure = departures(*frozen, result.mask, rigid_model(plan.blocks))
+    used = everything.mask
+    if plan.robust:
+        outlier = used * (1 - result.mask)
+    else:
+        judged = (jnp.sum(used) >= FEWEST_IMAGES) & jnp.all(jnp.isfinite(departure))
+        outlier = used * judged * jnp.any(jnp.abs(departure) > CUT, axis=1)
+    return replace(result, departure=departure, outlier=outlier)
 
 
 def belief(problem: Problem, given: Given, plan: Plan) -> AbstractPrior:
@@ -254,6 +278,8 @@ def _assemble(
         weakest_sd=uncertainty.weakest_sd,
         prior_direction=uncertainty.prior_direction,
         searched_start=solution.searched_start,
+        outlier=jnp.zeros_like(problem.mask),
+        departure=jnp.zeros_like(residual),
         sigma_tuned=jnp.asarray(plan.self_tuning) & (used >= MINIMUM_SELF_TUNING),
         sigma_floored=floored[jnp.asarray([0, 0, 1])] if plan.channels else floored,
         tolerance_met=solution.arrived,
@@ -265,6 +291,7 @@ def _assemble(
         prior=plan.reported_prior,
         data="channels" if plan.channels else "points",
         blocks=plan.blocks,
+        robust=plan.robust,
     )
 
 

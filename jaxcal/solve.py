@@ -54,6 +54,7 @@ def calibrate(
     sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S,
     delay_sd: float | Array = DELAY_SD_S,
     options: Options | None = None,
+    robust: bool = False,
 ) -> Calibration:
     """Find X, the target and the elevational offsets; nobody supplies a starting guess.
 
@@ -80,6 +81,9 @@ def calibrate(
         sound_speed_sd: how far the sound speed may be from nominal, m/s (joint only, not bounded).
         delay_sd: how far the delay may be from nominal, s (joint only, not bounded).
         options: tolerances and limits.
+        robust: first find the images that agree with each other, whatever up to nearly half of the
+            others are (:mod:`jaxcal.solvers.consensus`), and leave those out: ``outlier`` and
+            ``departure`` say which and why.
 
     Returns:
         A :class:`Calibration`; ask its ``status`` and ``warnings`` before using it.
@@ -92,7 +96,7 @@ def calibrate(
     if isinstance(problem, Recording):
         problem = Problem.from_recording(problem)
     request = Request(method, prior, max_elevation, sigma, tracker_sd, estimate, data,
-                      sound_speed_sd, delay_sd, options)  # fmt: skip
+                      sound_speed_sd, delay_sd, options, robust)  # fmt: skip
     plan, given = prepare(problem, request)
     if problem.batch_shape:
         return _solve_batch(problem, given, plan, None)
@@ -113,6 +117,7 @@ def calibrate_batch(
     sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S,
     delay_sd: float | Array = DELAY_SD_S,
     options: Options | None = None,
+    robust: bool = False,
     chunk: int | None = None,
 ) -> Calibration:
     """:func:`calibrate` for a batch: compiled, vmapped, in chunks of lanes.
@@ -131,6 +136,7 @@ def calibrate_batch(
         sound_speed_sd: see there.
         delay_sd: see there.
         options: see there.
+        robust: see there.
         chunk: lanes solved side by side; by default 64, on channels 8.
 
     Returns:
@@ -144,7 +150,7 @@ def calibrate_batch(
     if chunk is not None and chunk < 1:
         raise InputError(f"chunk must be at least 1, not {chunk}")
     request = Request(method, prior, max_elevation, sigma, tracker_sd, estimate, data,
-                      sound_speed_sd, delay_sd, options)  # fmt: skip
+                      sound_speed_sd, delay_sd, options, robust)  # fmt: skip
     plan, given = prepare(problems, request)
     return _solve_batch(problems, given, plan, chunk)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -38,6 +38,7 @@ class _Request:
     data: Literal["auto", "points", "channels"]
     sigma: tuple[float, float, float] | None
     options: dict[str, Any]
+    robust: bool = False
 
 
 @click.command()
@@ -84,6 +85,12 @@ class _Request:
     show_default=True,
     help="What the joint method fits where the recording holds times of flight: the points that "
     "are segmented from them, or every element's; auto: whichever says more.",
+)
+@click.option(
+    "--robust",
+    is_flag=True,
+    help="Find the images that agree with each other first, and leave the others out: wrong "
+    "echoes, wrong clicks, a slipped mount.",
 )
 @click.option(
     "--solver",
@@ -141,6 +148,7 @@ def calibrate(
     tolerance_rad: float | None,
     max_rounds: int | None,
     data: Literal["auto", "points", "channels"],
+    robust: bool,
     test: str | None,
     cross_validate: bool,
     bootstrap: int | None,
@@ -152,6 +160,7 @@ def calibrate(
         "tolerance_mm": tolerance_mm, "tolerance_rad": tolerance_rad, "max_rounds": max_rounds
     }  # fmt: skip
     request = _request(method, prior, max_elevation, sigma, estimate, data, solver, alternation)
+    request = replace(request, robust=robust)
     import_engine()
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.io.hdf5 import load
@@ -296,6 +305,7 @@ def _arguments(request: _Request, *, trace: int = 0) -> dict[str, Any]:
         "estimate": request.estimate,
         "data": request.data,
         "options": Options(**request.options, trace=trace),
+        "robust": request.robust,
     }
 
 

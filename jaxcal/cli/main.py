@@ -14,6 +14,7 @@ from jaxcal.cli.calibrate import calibrate
 from jaxcal.cli.common import ExitCode
 from jaxcal.cli.demo import demo
 from jaxcal.cli.import_ import import_
+from jaxcal.cli.pivot import pivot
 from jaxcal.cli.segment import segment
 from jaxcal.cli.simulate import simulate
 from jaxcal.cli.study import study
@@ -31,7 +32,7 @@ def commands() -> None:
     """Calibrate a tracked or robotic ultrasound probe from images of one small fixed target."""
 
 
-for _command in (demo, simulate, import_, segment, calibrate, study):
+for _command in (demo, simulate, import_, segment, calibrate, pivot, study):
     commands.add_command(_command)
 
 

@@ -22,6 +22,8 @@ from jaxcal.recording import Recording, make_images
 MAXIMUM_BYTES = 64 * 2**20
 """Largest text file that is read."""
 
+_QUATERNION_TOLERANCE = 1e-2
+
 
 def read_crosswire(
     transforms_path: str | os.PathLike[str],
@@ -95,6 +97,45 @@ def read_csv(
         where=os.fspath(path),
     )
     return Recording(images, source=os.fspath(path))
+
+
+def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "n 4 4"]:
+    """Read a text file of poses, one a row, separated by white space.
+
+    Args:
+        path: rows of 7 numbers, ``x y z qx qy qz qs`` (mm and a unit quaternion, scalar last), or
+            of 12 or 16, the matrix row by row.
+
+    Returns:
+        (n, 4, 4), mm; quaternions are normalised, other rotations as they stand.
+
+    Raises:
+        FormatError: a file that cannot be read, a row of another length, something that is not a
+            number, or a quaternion whose length is not 1; the file and the line are named.
+    """
+    rows, lines = _table(path, None, (7, 12, 16), "x y z qx qy qz qs, or a matrix row by row")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    if rows.shape[1] != 7:
+        matrices = rows.reshape(len(rows), -1, 4)
+        poses[:, : matrices.shape[1]] = matrices
+        return poses
+    length = np.linalg.norm(rows[:, 3:], axis=1)
+    off = np.flatnonzero(~(np.abs(length - 1) < _QUATERNION_TOLERANCE))
+    if len(off):
+        raise FormatError(
+            f"{os.fspath(path)}:{lines[off[0]]}: the quaternion's length is {length[off[0]]:g}, "
+            "not 1"
+        )
+    x, y, z, s = (rows[:, 3:] / length[:, None]).T
+    poses[:, :3, :3] = np.stack(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * s), 2 * (x * z + y * s)],
+            [2 * (x * y + z * s), 1 - 2 * (x * x + z * z), 2 * (y * z - x * s)],
+            [2 * (x * z - y * s), 2 * (y * z + x * s), 1 - 2 * (x * x + y * y)],
+        ]
+    ).transpose(2, 0, 1)
+    poses[:, :3, 3] = rows[:, :3]
+    return poses
 
 
 def _table(

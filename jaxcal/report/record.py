@@ -84,7 +84,9 @@ def calibration_record(
         "delay_sd_s": answer.delay_sd_s,
         "objective": answer.cost,
         "scaled_kkt_residual": answer.stationarity,
+        "robust": result.robust,
         "outliers": diagnosis.outliers(answer),
+        "outlier_reasons": diagnosis.outlier_reasons(answer),
         "warnings": result.warnings,
     }
     if recording.truth is not None:

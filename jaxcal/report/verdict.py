@@ -139,8 +139,12 @@ def _advice(record: dict[str, Any]) -> list[str]:
     if record["outliers"]:
         listed = ", ".join(map(str, record["outliers"][:10]))
         more = ", ..." if len(record["outliers"]) > 10 else ""
+        then = (
+            "they were left out."
+            if record.get("robust")
+            else "or calibrate again with --robust, which leaves them out."
+        )
         advice.append(
-            f"Check images {listed}{more} (counted from 0): pick the target again, or leave them "
-            "out (mask) and calibrate again."
+            f"Check images {listed}{more} (counted from 0) and pick the target again; {then}"
         )
     return advice

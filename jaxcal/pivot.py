@@ -1,0 +1,227 @@
+"""Pivot calibration: the tip of a tracked tool from poses taken while it turns about its tip.
+
+The degenerate case of Eq. 7: B_i p = c for all i, with p the tip in the tool's frame and c the
+pivot point. It is the calibration with every measurement (0, 0), which makes p the translation of
+X, and with X's rotation held fixed: the free blocks are X's translation and the point. Solver,
+consensus, covariance and observability are the calibration's own.
+
+The errors of the three axes share one SD, so this is plain least squares on the images that agree.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxcal import diagnosis
+from jaxcal.calibration import Status
+from jaxcal.errors import InputError
+from jaxcal.geometry import check_poses
+from jaxcal.metrics import root_mean_square
+from jaxcal.model.parameters import Parameters
+from jaxcal.model.priors import InPlane
+from jaxcal.model.residuals import circle_residual
+from jaxcal.problem import Problem, is_traced
+from jaxcal.recording import MINIMUM_IMAGES
+from jaxcal.solvers import dense
+from jaxcal.solvers.consensus import CUT, FEWEST_IMAGES, Model, departures, find_consensus
+from jaxcal.solvers.least_squares import minimise
+from jaxcal.uncertainty import LARGEST_SD, assess
+
+BLOCKS = ("translation", "point")
+AXES = ("x", "y", "z")
+"""Of the tool's frame: what a departure's components are."""
+_SUBSET = 4
+
+
+class Pivot(eqx.Module):
+    """A pivot calibration (or a batch, with leading axes).
+
+    Attributes:
+        tip: p in the tool's frame, mm.
+        point: c in the tracker's frame, mm.
+        covariance: of (tip, point), mm^2; NaN where the poses do not determine them.
+        sigma: SD of the error along one axis, mm.
+        rms: root mean square length of the errors B_i p - c over the used poses, mm.
+        residual: those errors in the tool's frame, mm; 0 where not used.
+        mask: 1 for used poses.
+        outlier: 1 where a pose does not fit the rest; a robust solve leaves it out.
+        departure: errors in robust SDs of the used poses', those of poses left out included.
+        status_code: a :class:`jaxcal.calibration.Status`.
+        weakest: unit vector of the least known direction of the tip, in the tool's frame.
+        weakest_sd: SD along it, mm; NaN where it has none.
+        robust: poses that do not fit the rest were left out (static).
+    """
+
+    tip: Float[Array, "*batch 3"]
+    point: Float[Array, "*batch 3"]
+    covariance: Float[Array, "*batch 6 6"]
+    sigma: Float[Array, "*batch"]
+    rms: Float[Array, "*batch"]
+    residual: Float[Array, "*batch n 3"]
+    mask: Float[Array, "*batch n"]
+    outlier: Float[Array, "*batch n"]
+    departure: Float[Array, "*batch n 3"]
+    status_code: Int[Array, "*batch"]
+    weakest: Float[Array, "*batch 3"]
+    weakest_sd: Float[Array, "*batch"]
+    robust: bool = eqx.field(static=True, default=True)
+
+    @property
+    def converged(self) -> Bool[Array, "*batch"]:
+        """Whether tip and point are determined (traceable)."""
+        return jnp.asarray(self.status_code == Status.CONVERGED)
+
+    @property
+    def status(self) -> str:
+        """converged, max_iterations, unobservable or failed (one calibration, concrete)."""
+        return Status(int(self.status_code)).name.lower()
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a person should know before using this answer (one calibration, concrete)."""
+        found = []
+        if self.status == "failed":
+            return ["the solve failed: its result holds no usable numbers"]
+        if self.status == "unobservable":
+            direction = ", ".join(f"{value:.2f}" for value in np.asarray(self.weakest))
+            found.append(
+                f"not observable: these poses do not determine the tip along ({direction}) of the "
+                "tool's frame; tilt the tool about a further axis"
+            )
+        named = diagnosis.images_that_stand_out(self)
+        if named:
+            told = diagnosis.listed_departures(self, AXES)
+            verb = "left out" if self.robust else "kept"
+            found.append(f"{verb} {len(named)} poses that do not fit the rest: {told}")
+        return found
+
+
+def calibrate_pivot(
+    poses: Float[np.ndarray | Array, "*batch n rows 4"],
+    mask: Float[np.ndarray | Array, "*batch n"] | Bool[np.ndarray, " n"] | None = None,
+    *,
+    robust: bool = True,
+) -> Pivot:
+    """Find a tool's tip and the point about which it turned.
+
+    Args:
+        poses: tool -> tracker, mm, (n, 4, 4) or (n, 3, 4); concrete ones are checked and their
+            rotations projected to SO(3). Leading axes make a batch.
+        mask: 1 (or True) for poses to use; all by default.
+        robust: find the poses that agree, whatever up to nearly half of the others are, and leave
+            those out.
+
+    Raises:
+        InputError: concrete poses that are none, or fewer than 4 used ones.
+    """
+    if not is_traced(poses) and np.ndim(poses) == 3:
+        used = np.ones(len(poses), bool) if mask is None else np.asarray(mask) > 0
+        poses = check_poses(np.asarray(poses, dtype=np.float64), used)
+        if used.sum() < MINIMUM_IMAGES:
+            raise InputError(
+                f"{int(used.sum())} used poses are too few: at least {MINIMUM_IMAGES} are needed"
+            )
+    array = jnp.asarray(poses, jnp.result_type(float))
+    weight = jnp.ones(array.shape[:-2]) if mask is None else jnp.asarray(mask)
+    weight = jnp.broadcast_to(weight.astype(array.dtype), array.shape[:-2])
+    return _solve_all(array, weight, robust)
+
+
+@partial(jax.jit, static_argnums=2)
+def _solve_all(
+    poses: Float[Array, "*batch n 4 4"], mask: Float[Array, "*batch n"], robust: bool
+) -> Pivot:
+    solve = partial(_solve, robust=robust)
+    for _ in poses.shape[:-3]:
+        solve = jax.vmap(solve)
+    return solve(poses, mask)
+
+
+def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bool) -> Pivot:
+    everything = Problem(
+        poses=poses,
+        measurements=jnp.zeros((*mask.shape, 2), poses.dtype),
+        mask=mask,
+        spacing=jnp.ones(2, poses.dtype),
+        face_offset=jnp.zeros((), poses.dtype),
+    )
+    model = Model(BLOCKS, _errors, _proposals, isotropic=True, subset=_SUBSET)
+    keep = find_consensus(everything, model).keep if robust else mask
+    problem = eqx.tree_at(lambda p: p.mask, everything, keep)
+    start = jax.tree.map(lambda leaf: leaf[0], _proposals(problem, keep[None]))
+    fit = minimise(start, InPlane(), problem, BLOCKS)
+    parameters = fit.parameters
+    none = jnp.zeros(0, poses.dtype)
+    uncertainty = assess(
+        parameters, none, InPlane(), problem, BLOCKS, whitened=False, uses_prior=False
+    )
+    _, departure = departures(parameters, everything, keep, model)
+    outlier = mask * (1 - keep)
+    if not robust:
+        judged = jnp.sum(mask) >= FEWEST_IMAGES
+        outlier = mask * judged * jnp.any(jnp.abs(departure) > CUT, axis=1)
+    residual = circle_residual(parameters, jnp.zeros_like(mask), problem)
+    used = jnp.sum(keep)
+    variance = jnp.sum(residual**2) / jnp.maximum(3 * used - 6, 1.0)
+    length = jnp.sqrt(jnp.sum(parameters.translation**2))
+    finite = jnp.all(jnp.isfinite(parameters.translation)) & jnp.isfinite(fit.cost)
+    failed = jnp.logical_not(finite) | (jnp.sum(mask) < MINIMUM_IMAGES)
+    unknown = uncertainty.degenerate | (
+        uncertainty.weakest_sd > LARGEST_SD * jnp.maximum(length, _spread(problem))
+    )
+    status = jnp.where(fit.settled, Status.CONVERGED, Status.MAX_ITERATIONS)
+    status = jnp.where(unknown, Status.UNOBSERVABLE, status)
+    weakest = uncertainty.weakest[:3]
+    return Pivot(
+        tip=parameters.translation,
+        point=parameters.point,
+        covariance=jnp.where(unknown, jnp.nan, uncertainty.covariance),
+        sigma=jnp.sqrt(variance),
+        rms=root_mean_square(residual, keep),
+        residual=residual,
+        mask=keep,
+        outlier=outlier,
+        departure=departure,
+        status_code=jnp.where(failed, Status.FAILED, status).astype(jnp.int32),
+        weakest=weakest / jnp.maximum(jnp.sqrt(jnp.sum(weakest**2)), 1e-30),
+        weakest_sd=uncertainty.weakest_sd,
+        robust=robust,
+    )
+
+
+def _errors(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:
+    return circle_residual(parameters, jnp.zeros_like(problem.mask), problem)
+
+
+def _spread(problem: Problem) -> Float[Array, ""]:
+    """Root mean square distance of the tool's origin from its mean, mm."""
+    total = jnp.sum(problem.mask)
+    origins = problem.poses[:, :3, 3]
+    mean = jnp.sum(problem.mask[:, None] * origins, axis=0) / total
+    return jnp.sqrt(jnp.sum(problem.mask[:, None] * (origins - mean) ** 2) / total)
+
+
+def _proposals(problem: Problem, subsets: Float[Array, "k n"]) -> Parameters:
+    """R_i p - c = -t_i for every subset at once, from each pose's moments."""
+    rotations, translations = problem.poses[:, :3, :3], problem.poses[:, :3, 3]
+    used = problem.mask
+    centre = jnp.sum(used[:, None] * translations, axis=0) / jnp.sum(used)
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=used.dtype), rotations.shape)
+    rows = jnp.concatenate([rotations, -eye, (centre - translations)[..., None]], axis=2)
+    rows = jnp.where(used[:, None, None] > 0, rows, 0.0)
+    moments = jnp.einsum("nia,nib->nab", rows, rows).reshape(len(used), -1)
+    systems = (subsets @ moments).reshape(-1, 7, 7)
+
+    def solve(system: Float[Array, "7 7"]) -> Parameters:
+        matrix, vector = system[:6, :6], system[:6, 6:]
+        ridge = 1e3 * jnp.finfo(system.dtype).eps * jnp.trace(matrix) / 6
+        found = dense.solve_positive(matrix + ridge * jnp.eye(6, dtype=matrix.dtype), vector)[:, 0]
+        return Parameters.of(jnp.eye(3, dtype=found.dtype), found[:3], found[3:] + centre)
+
+    return jax.vmap(solve)(systems)

@@ -1,0 +1,113 @@
+"""Pivot calibration: B_i p = c, on real recordings and on poses whose tip is known."""
+
+from __future__ import annotations
+
+import json
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import jaxcal
+from jaxcal.cli.main import main
+from jaxcal.io.text import read_poses
+
+TIP, POINT = np.array([3.0, -20.0, 150.0]), np.array([100.0, -200.0, 900.0])
+
+
+def swung(rotations: Rotation, noise: float = 0.0, seed: int = 0) -> np.ndarray:
+    poses = np.tile(np.eye(4), (len(rotations), 1, 1))
+    poses[:, :3, :3] = rotations.as_matrix()
+    poses[:, :3, 3] = POINT - rotations.apply(TIP)
+    poses[:, :3, 3] += noise * np.random.default_rng(seed).normal(size=(len(rotations), 3))
+    return poses
+
+
+def random_rotations(count: int, seed: int = 0) -> Rotation:
+    return Rotation.from_rotvec(0.4 * np.random.default_rng(seed).normal(size=(count, 3)))
+
+
+def test_a_known_tip():
+    exact = jaxcal.calibrate_pivot(swung(random_rotations(20)))
+    np.testing.assert_allclose(exact.tip, TIP, atol=1e-9)
+    np.testing.assert_allclose(exact.point, POINT, atol=1e-9)
+    assert exact.status == "converged"
+    assert not np.asarray(exact.outlier).any()
+    noisy = jaxcal.calibrate_pivot(swung(random_rotations(300), noise=0.5))
+    assert float(noisy.sigma) == pytest.approx(0.5, rel=0.1)
+    error = np.concatenate([noisy.tip - TIP, noisy.point - POINT])
+    # A chi-square with 6 degrees of freedom is below 22.5 in 999 of 1000.
+    assert error @ np.linalg.solve(noisy.covariance, error) < 22.5
+
+
+def test_rotation_about_one_axis_leaves_the_tip_open_along_it():
+    axis = np.array([0.0, 0.6, 0.8])
+    one = Rotation.from_rotvec(np.linspace(-0.5, 0.5, 30)[:, None] * axis)
+    for noise in (0.0, 0.3):
+        result = jaxcal.calibrate_pivot(swung(one, noise))
+        assert result.status == "unobservable"
+        assert np.isnan(result.covariance).all()
+        assert abs(float(np.asarray(result.weakest) @ axis)) > 0.999
+        assert "do not determine the tip along" in result.warnings[0]
+    still = jaxcal.calibrate_pivot(swung(Rotation.identity(10)))
+    assert still.status == "unobservable"
+
+
+def test_a_third_of_the_poses_may_be_anything():
+    poses = swung(random_rotations(60), noise=0.4)
+    poses[40:, :3, 3] += np.random.default_rng(2).uniform(20, 100, (20, 3))
+    robust = jaxcal.calibrate_pivot(poses)
+    assert np.flatnonzero(robust.outlier).tolist() == list(range(40, 60))
+    good = jaxcal.calibrate_pivot(poses[:40], robust=False)
+    np.testing.assert_allclose(robust.tip, good.tip, atol=1e-9)
+    plain = jaxcal.calibrate_pivot(poses, robust=False)
+    assert np.linalg.norm(plain.tip - TIP) > 20 * np.linalg.norm(robust.tip - TIP)
+
+
+def test_batches_and_masks():
+    poses = np.stack([swung(random_rotations(12, seed), 0.1, seed) for seed in range(3)])
+    together = jaxcal.calibrate_pivot(poses)
+    alone = jaxcal.calibrate_pivot(poses[1])
+    np.testing.assert_allclose(together.tip[1], alone.tip, atol=1e-9)
+    traced = jax.jit(jaxcal.calibrate_pivot)(poses[1], np.ones(12))
+    np.testing.assert_allclose(traced.tip, alone.tip, atol=1e-9)
+
+
+def test_bad_input_is_named():
+    with pytest.raises(jaxcal.InputError, match="3 used poses are too few"):
+        jaxcal.calibrate_pivot(swung(random_rotations(3)))
+    poses = swung(random_rotations(8))
+    poses[5, 0, 0] = np.nan
+    with pytest.raises(jaxcal.InputError, match="5"):
+        jaxcal.calibrate_pivot(poses)
+
+
+def test_reading_poses(tmp_path):
+    rotations = random_rotations(5)
+    poses = swung(rotations)
+    quaternions = np.hstack([poses[:, :3, 3], rotations.as_quat()])
+    for rows in (quaternions, poses.reshape(5, 16), poses[:, :3].reshape(5, 12)):
+        np.savetxt(tmp_path / "poses.txt", rows)
+        np.testing.assert_allclose(read_poses(tmp_path / "poses.txt"), poses, atol=1e-12)
+    quaternions[3, 3:] *= 2
+    np.savetxt(tmp_path / "poses.txt", quaternions)
+    with pytest.raises(jaxcal.FormatError, match=r"poses.txt:4: the quaternion's length is 2"):
+        read_poses(tmp_path / "poses.txt")
+
+
+def test_real_recording_with_outliers_reaches_the_clean_ones_precision(real_data, capsys):
+    folder = real_data / "crosswire"
+    clean = jaxcal.calibrate_pivot(read_poses(folder / "pivotCalibrationData.txt"))
+    assert float(clean.rms) == pytest.approx(0.511, abs=0.001)
+    assert not np.asarray(clean.outlier).any()
+    assert main(["pivot", str(folder / "pivotCalibrationDataWithOutliers.txt"), "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    # The last 144 of its 480 poses are wrong.
+    assert record["outliers"] == list(range(336, 480))
+    assert record["rms_mm"] == pytest.approx(float(clean.rms), rel=0.05)
+    assert np.linalg.norm(np.array(record["tip_mm"]) - np.asarray(clean.tip)) < 0.4
+    plain = jaxcal.calibrate_pivot(
+        read_poses(folder / "pivotCalibrationDataWithOutliers.txt"), robust=False
+    )
+    assert float(plain.rms) == pytest.approx(33.6, abs=0.1)

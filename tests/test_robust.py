@@ -1,0 +1,125 @@
+"""Gross outliers are found, named and left out; clean images stay."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import problem
+
+import jaxcal
+from jaxcal import diagnosis
+from jaxcal.cli.main import main
+from jaxcal.contamination import OUTLIER_KINDS, contaminate
+from jaxcal.model.parameters import RIGID
+from jaxcal.solvers.consensus import find_consensus, rigid_model
+
+
+@pytest.fixture(scope="module")
+def consensus():
+    return jax.jit(jax.vmap(lambda p: find_consensus(p, rigid_model(RIGID))))
+
+
+def batch(count: int, fraction: float, kind, **protocol):
+    clean = jaxcal.stack([problem(seed, images=50, **protocol) for seed in range(count)])
+    keys = jax.random.split(jax.random.key(1), count)
+    return clean, *jax.vmap(lambda k, p: contaminate(k, p, fraction, kind))(keys, clean)
+
+
+@pytest.mark.parametrize("kind", OUTLIER_KINDS)
+def test_contamination_spoils_what_it_says(kind):
+    clean, spoilt, outlier = batch(4, 0.3, kind)
+    assert np.asarray(outlier).sum(axis=1).tolist() == [15] * 4
+    moved = np.linalg.norm(spoilt.measurements - clean.measurements, axis=-1)
+    shifted = np.linalg.norm(spoilt.poses[..., :3, 3] - clean.poses[..., :3, 3], axis=-1)
+    off = np.asarray(outlier) > 0
+    assert not moved[~off].any()
+    assert not shifted[~off].any()
+    assert ((moved + shifted)[off] >= 20 - 1e-9).all()
+    assert ((moved + shifted)[off] <= 100 + 1e-9).all()
+    assert (np.asarray(spoilt.measurements)[..., 1] > 0).all()
+    assert (shifted[off] > 0).any() == (kind in ("pose", "slip", "mixed"))
+
+
+def test_nearly_all_outliers_and_hardly_anything_else(consensus):
+    for kind, fraction in (("mixed", 0.3), ("slip", 0.3), ("click", 0.1), ("mixed", 0.0)):
+        _, spoilt, outlier = batch(12, fraction, kind, elevation_mm=2.0, noise_mm=2.0)
+        found = consensus(spoilt)
+        kept, outlier = np.asarray(found.keep), np.asarray(outlier)
+        assert (outlier * kept).sum() <= 0.02 * outlier.sum(), (kind, fraction)
+        assert ((1 - outlier) * (1 - kept)).sum() <= 0.01 * (1 - outlier).sum(), (kind, fraction)
+
+
+def test_images_masked_by_the_caller_stay_out(consensus):
+    _, spoilt, outlier = batch(4, 0.2, "mixed")
+    mask = jnp.ones_like(spoilt.mask).at[:, 20:30].set(0.0)
+    found = consensus(replace(spoilt, mask=mask))
+    assert not np.asarray(found.keep)[:, 20:30].any()
+    assert not np.asarray(found.departure)[:, 20:30].any()
+    np.testing.assert_array_equal(found.keep, mask * (1 - outlier))
+
+
+def test_few_or_hopeless_images_are_all_kept(consensus):
+    _, spoilt, _ = batch(2, 0.2, "mixed")
+    few = jnp.zeros_like(spoilt.mask).at[:, :7].set(1.0)
+    np.testing.assert_array_equal(consensus(replace(spoilt, mask=few)).keep, few)
+    nan = replace(spoilt, poses=spoilt.poses.at[0].set(jnp.nan))
+    found = consensus(nan)
+    np.testing.assert_array_equal(found.keep[0], spoilt.mask[0])
+    np.testing.assert_array_equal(found.keep[1], consensus(spoilt).keep[1])
+
+
+def test_robust_solve_is_that_of_the_good_images():
+    _, spoilt, outlier = batch(2, 0.3, "mixed", elevation_mm=1.0, noise_mm=0.5)
+    robust = jaxcal.calibrate_batch(spoilt, "conventional", robust=True)
+    oracle = jaxcal.calibrate_batch(replace(spoilt, mask=1 - outlier), "conventional")
+    np.testing.assert_array_equal(robust.outlier, outlier)
+    np.testing.assert_allclose(robust.image_to_probe, oracle.image_to_probe, atol=1e-9)
+    np.testing.assert_array_equal(robust.mask, 1 - outlier)
+    first = jax.tree.map(lambda leaf: leaf[0], robust)
+    named = np.flatnonzero(outlier[0]).tolist()
+    assert diagnosis.outliers(first) == named
+    reasons = diagnosis.outlier_reasons(first)
+    assert [reason["image"] for reason in reasons] == named
+    assert all(abs(reason["sds"]) > 6 and reason["left_out"] for reason in reasons)
+    assert any("left out 15 of 50 images" in text for text in first.warnings)
+
+
+def test_a_wrong_echo_is_told_by_its_range():
+    data = problem(0, images=20, elevation_mm=0.5, noise_mm=0.5)
+    spoilt = replace(data, measurements=data.measurements.at[7, 1].add(40.0))
+    plain = jaxcal.calibrate(spoilt, "conventional")
+    robust = jaxcal.calibrate(spoilt, "conventional", robust=True)
+    reason = diagnosis.outlier_reasons(robust)
+    assert [(r["image"], r["component"], r["left_out"]) for r in reason] == [(7, "range", True)]
+    assert reason[0]["sds"] < -100
+    assert robust.status == "converged"
+    assert float(robust.rms) < 0.2 * float(plain.rms)
+    assert 7 in diagnosis.outliers(plain)
+    assert any("--robust" in text for text in plain.warnings)
+
+
+def test_command_line(tmp_path, capsys):
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=20), 3)
+    points = recording.calibration.measurements.copy()
+    points[4] += [30.0, -25.0]
+    images = replace(recording.calibration, measurements=points)
+    path = tmp_path / "spoilt.h5"
+    jaxcal.save(replace(recording, calibration=images), path)
+    arguments = ["calibrate", str(path), "--method", "conventional", "--robust", "--json"]
+    assert main(arguments) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["robust"]
+    assert record["outliers"] == [4]
+    assert record["images"] == 20
+    assert record["images_used"] == 19
+    assert record["outlier_reasons"][0]["image"] == 4
+
+
+def test_consensus_calls_no_lapack(consensus):
+    _, spoilt, _ = batch(2, 0.1, "mixed")
+    assert "lapack" not in consensus.lower(spoilt).as_text()
