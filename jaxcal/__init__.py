@@ -35,10 +35,12 @@ _HOME = {
     "Status": "jaxcal.calibration",
     "Options": "jaxcal.options",
     "Pivot": "jaxcal.pivot",
+    "bootstrap": "jaxcal.resampling",
     "calibrate": "jaxcal.solve",
     "calibrate_batch": "jaxcal.solve",
     "calibrate_pivot": "jaxcal.pivot",
     "calibration_reproducibility": "jaxcal.metrics",
+    "cross_validate": "jaxcal.resampling",
     "load": "jaxcal.io.hdf5",
     "make_images": "jaxcal.recording",
     "predicted_tre": "jaxcal.intervals",
@@ -78,6 +80,8 @@ if TYPE_CHECKING:
     from jaxcal.recording import Images as Images
     from jaxcal.recording import Recording as Recording
     from jaxcal.recording import make_images as make_images
+    from jaxcal.resampling import bootstrap as bootstrap
+    from jaxcal.resampling import cross_validate as cross_validate
     from jaxcal.segmentation.segment import Segmentation as Segmentation
     from jaxcal.segmentation.segment import segment as segment
     from jaxcal.segmentation.segment import segment_recording as segment_recording

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal import diagnosis
 from jaxcal.errors import CalibrationError
+from jaxcal.inspection import Inspection
 from jaxcal.model.parameters import Blocks
 from jaxcal.problem import is_traced
 from jaxcal.solvers.auto import OffsetLaw
@@ -66,9 +67,7 @@ class Calibration(eqx.Module):
         prior_direction: direction that the measurements alone, without the offset's prior or bound,
             leave undetermined; zeros where there is none.
         searched_start: the closed-form start was unsound and one was searched for.
-        outlier: 1 where an image does not fit the rest; a robust solve leaves it out.
-        departure: (n, 3) errors of lateral position, range and elevational offset in robust SDs of
-            the images in use, those of images left out included; 0 where masked by the caller.
+        inspection: images that stand out, the noise model's fit, and which poses to add.
         sigma_tuned: the SDs were estimated from the data.
         sigma_floored: (3,) which SDs rest on their floor.
         tolerance_met: the method's own stopping rule was met.
@@ -116,8 +115,7 @@ class Calibration(eqx.Module):
     weakest_sd: Float[Array, "*batch"]
     prior_direction: Float[Array, "*batch p"]
     searched_start: Bool[Array, "*batch"]
-    outlier: Float[Array, "*batch n"]
-    departure: Float[Array, "*batch n 3"]
+    inspection: Inspection
     sigma_tuned: Bool[Array, "*batch"]
     sigma_floored: Bool[Array, "*batch 3"]
     tolerance_met: Bool[Array, "*batch"]
@@ -146,6 +144,16 @@ class Calibration(eqx.Module):
         names = np.array([status.name.lower() for status in Status])
         chosen = names[self._concrete(self.status_code)]
         return str(chosen) if chosen.ndim == 0 else chosen
+
+    @property
+    def outlier(self) -> Float[Array, "*batch n"]:
+        """1 where an image does not fit the rest; a robust solve leaves it out."""
+        return self.inspection.outlier
+
+    @property
+    def departure(self) -> Float[Array, "*batch n 3"]:
+        """Each image's lateral, range and elevational errors in robust SDs of those in use."""
+        return self.inspection.departure
 
     @property
     def images_used(self) -> Int[Array, "*batch"]:

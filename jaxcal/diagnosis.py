@@ -5,16 +5,26 @@ Takes a :class:`jaxcal.Calibration` whose arrays are numpy's.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, TypedDict, runtime_checkable
 
 import numpy as np
 
 from jaxcal.geometry import AnyArray
+from jaxcal.inspection import FEWEST_TO_CHECK, MISFITS
 from jaxcal.model.parameters import BLOCK_SIZE
 from jaxcal.model.shapes import FAMILIES
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
+
+
+class OutlierReason(TypedDict):
+    """Why an image stands out: its most deviant component, and by how many SDs (signed)."""
+
+    image: int
+    component: str
+    sds: float | None
+    left_out: bool
 
 
 @runtime_checkable
@@ -66,6 +76,13 @@ TUNED = ("gaussian", "auto", "uniform")
 
 COMPONENTS = ("lateral", "range", "elevational")
 STEADY = 1e-3
+WEAK_MM = 1.5
+"""A weakest direction with a larger SD (mm at the target) is worth a warning."""
+WORTH = 0.7
+"""Kinds of further images are advised that tell at least this much of what the best one does."""
+MISFIT_SCORE = 3.3
+"""A standard normal score beyond this contradicts the noise model; of twelve scores, one in 140
+data sets that follow it has such a one."""
 WEAK_TRANSLATION_MM = 0.3
 WEAK_SHARE = 0.7
 """SDs of sound speed or delay above this share of their prior's tell that the data added little."""
@@ -118,6 +135,7 @@ def observability(result: Calibration) -> dict[str, float | str | None]:
         "weakest_direction": direction_in_words(result.weakest, result.blocks),
         "weakest_sd_mm": _finite(result.weakest_sd),
         "known_only_from_prior": from_prior,
+        "advice": poses_to_add(result),
     }
 
 
@@ -158,6 +176,62 @@ def offset_law(result: Calibration) -> dict[str, object] | None:
     }
 
 
+def poses_to_add(result: Calibration) -> str:
+    """Which further images would tell most about the weakest direction, in words."""
+    gain = np.nan_to_num(np.asarray(result.inspection.gain, dtype=float))
+    if not gain.max() > 0:
+        return "add images with the probe tilted about each of its axes"
+    worth = gain >= WORTH * gain.max()
+    tilts = [name for name, good in zip(_AXES["rotation"], worth[:3], strict=True) if good]
+    parts = []
+    if tilts:
+        listed = " and ".join([", ".join(tilts[:-1]), tilts[-1]] if tilts[1:] else tilts)
+        plural = "axes" if tilts[1:] else "axis"
+        parts.append(f"poses tilted by 20 to 30 degrees about the {listed} {plural}")
+    if worth[3]:
+        parts.append("images with the target nearer and farther")
+    if worth[4]:
+        parts.append("images with the target farther to both sides")
+    return "add " + ", and ".join(parts)
+
+
+def noise_model(result: Calibration) -> dict[str, object]:
+    """How the residuals compare with the noise model: scores by name, kurtosis, and complaints."""
+    scores = np.asarray(result.inspection.misfit, dtype=float)
+    return {
+        "checked": bool(int(result.images_used) >= FEWEST_TO_CHECK),
+        "kurtosis": [_finite(value) for value in result.inspection.kurtosis],
+        "scores": {
+            name: [_finite(value) for value in row]
+            for name, row in zip(MISFITS, scores, strict=True)
+        },
+        "complaints": misfits(result),
+    }
+
+
+def misfits(result: Calibration) -> list[str]:
+    """Where the residuals contradict the noise model, in words; empty where they do not."""
+    scores = np.asarray(result.inspection.misfit, dtype=float)
+    kurtosis = np.asarray(result.inspection.kurtosis, dtype=float)
+    found = []
+    for k, name in enumerate(("lateral errors", "range errors", "elevational offsets")):
+        tails, skewness, depth, drift = scores[:, k]
+        if tails > MISFIT_SCORE:
+            found.append(
+                f"the {name} have heavier tails than the noise model's (kurtosis "
+                f"{kurtosis[k]:.1f}, Gaussian 3)"
+            )
+        if abs(skewness) > MISFIT_SCORE:
+            found.append(f"the {name} lean to one side")
+        if depth > MISFIT_SCORE:
+            found.append(f"the {name} grow with depth; the noise model takes them for equal")
+        if drift > MISFIT_SCORE:
+            found.append(
+                f"the {name} of successive images are alike: drift, latency or a slipping mount?"
+            )
+    return found
+
+
 def outliers(result: Calibration) -> list[int]:
     """Images that do not fit the rest (see :mod:`jaxcal.solvers.consensus`)."""
     return images_that_stand_out(result)
@@ -170,14 +244,14 @@ def images_that_stand_out(result: Judged) -> list[int]:
 
 def outlier_reasons(
     result: Judged, components: tuple[str, ...] = COMPONENTS
-) -> list[dict[str, int | float | str | bool | None]]:
+) -> list[OutlierReason]:
     """For every outlier: the component that stands out most, by how many SDs, and if it was used.
 
     ``image``, ``component`` (lateral, range or elevational, if not named otherwise), ``sds``
     (signed), ``left_out``.
     """
     departure = np.asarray(result.departure, dtype=float)
-    found = []
+    found: list[OutlierReason] = []
     for image in images_that_stand_out(result):
         worst = int(np.argmax(np.abs(departure[image])))
         found.append({
@@ -193,7 +267,7 @@ def listed_departures(result: Judged, components: tuple[str, ...] = COMPONENTS) 
     """The outliers with component and SDs, the first ten of them, in words."""
     reasons = outlier_reasons(result, components)
     told = [
-        f"{reason['image']} ({reason['component']}, {abs(float(reason['sds'] or 0)):.0f} SDs)"
+        f"{reason['image']} ({reason['component']}, {abs(reason['sds'] or 0):.0f} SDs)"
         for reason in reasons[:10]
     ]
     return ", ".join(told) + (", ..." if len(reasons) > 10 else "")
@@ -212,12 +286,13 @@ def warnings(result: Calibration) -> list[str]:
         found.append("the solve failed: its result holds no usable numbers")
         return found
     if status == "unobservable":
-        found.append(f"not observable: these images do not determine {weakest}")
+        found.append(f"not observable: these images do not determine {weakest}; {sight['advice']}")
     if status == "max_iterations":
         found.append(
             "not converged: the iteration limit was reached "
             f"(scaled KKT residual {float(result.stationarity):.1e})"
         )
+    found += _weak_direction(result)
     if bounded and from_prior:
         held = f"{resting} of {used} images rest on it"
         if resting == 0:
@@ -261,6 +336,8 @@ def warnings(result: Calibration) -> list[str]:
                 f"(SD {sd:.2f} mm) and rests on {on}"
             )
     found += _medium_warnings(result)
+    if status == "converged":
+        found += [f"noise model: {text}" for text in misfits(result)]
     named = outliers(result)
     if named and result.robust:
         found.append(
@@ -273,6 +350,21 @@ def warnings(result: Calibration) -> list[str]:
             "(--robust) leaves them out"
         )
     return found
+
+
+def _weak_direction(result: Calibration) -> list[str]:
+    """The weakest direction of a solution that is none too certain, and what would help."""
+    sight = observability(result)
+    sd = sight["weakest_sd_mm"]
+    if result.status != "converged" or not isinstance(sd, float) or sd <= WEAK_MM:
+        return []
+    only = ""
+    if result.prior != "none" and abs(float(result.weakest @ result.prior_direction)) > 0.7:
+        only = ", known only from what is believed of the offsets"
+    return [
+        f"weakly determined: {sight['weakest_direction']} (SD {sd:.1f} mm at the target{only}); "
+        f"{sight['advice']}"
+    ]
 
 
 def _medium_warnings(result: Calibration) -> list[str]:

@@ -103,14 +103,6 @@ def transform_points(
     return rotated + transform[..., :3, 3]
 
 
-def inverse_transform_points(
-    transform: Float[AnyArray, "*#batch 4 4"], points: Float[AnyArray, "*#batch 3"]
-) -> Float[Array, "*batch 3"]:
-    """Apply the inverses of 4x4 rigid transforms to points (mm); leading axes broadcast."""
-    moved = jnp.asarray(points) - transform[..., :3, 3]
-    return jnp.einsum("...ji,...j->...i", transform[..., :3, :3], moved)
-
-
 def matrix_from_rotation(
     rotation: Float[Array, "3 3"], translation: Float[Array, 3]
 ) -> Float[Array, "4 4"]:

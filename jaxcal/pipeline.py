@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.calibration import Calibration, Status
+from jaxcal.inspection import Inspection, inspect
 from jaxcal.metrics import root_mean_square
 from jaxcal.model.parameters import Parameters, block_slice, retract
 from jaxcal.model.priors import (
@@ -34,7 +35,7 @@ from jaxcal.recording import MINIMUM_IMAGES
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import alternate
 from jaxcal.solvers.auto import Averaged, OffsetLaw, average_over_laws
-from jaxcal.solvers.consensus import CUT, FEWEST_IMAGES, departures, find_consensus, rigid_model
+from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.solvers.conventional import from_scratch, pairwise_gradient
 from jaxcal.solvers.joint import joint
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING, self_tuned
@@ -88,8 +89,15 @@ def solve_problem(problem: Problem, given: Given, plan: Plan) -> Calibration:
     if averaged is not None:
         uncertainty = _of_the_laws(uncertainty, averaged)
     law = None if averaged is None else averaged.law
-    result = _assemble(solution, parameters, offset, prior, uncertainty, law, problem, given, plan)
-    return judge_images(result, parameters, everything, plan)
+    elevation = prior.elevation(parameters, offset, problem)
+    sigma = _three_sigmas(prior, parameters, elevation, uncertainty, problem)
+    inspection = inspect(
+        parameters, offset, prior, problem, everything, plan.blocks, sigma=sigma,
+        weakest=uncertainty.weakest, left_out=plan.robust,
+    )  # fmt: skip
+    return _assemble(
+        solution, parameters, offset, prior, uncertainty, inspection, law, problem, given, plan
+    )
 
 
 def _of_the_laws(uncertainty: Uncertainty, averaged: Averaged) -> Uncertainty:
@@ -108,21 +116,6 @@ def _of_the_laws(uncertainty: Uncertainty, averaged: Averaged) -> Uncertainty:
             either(averaged.elevation_sd, uncertainty.elevation_sd),
         ),
     )
-
-
-def judge_images(
-    result: Calibration, parameters: Parameters, everything: Problem, plan: Plan
-) -> Calibration:
-    """The result with every image's departure from it, the images left out included."""
-    frozen = jax.lax.stop_gradient((parameters, everything))
-    _, departure = departures(*frozen, result.mask, rigid_model(plan.blocks))
-    used = everything.mask
-    if plan.robust:
-        outlier = used * (1 - result.mask)
-    else:
-        judged = (jnp.sum(used) >= FEWEST_IMAGES) & jnp.all(jnp.isfinite(departure))
-        outlier = used * judged * jnp.any(jnp.abs(departure) > CUT, axis=1)
-    return replace(result, departure=departure, outlier=outlier)
 
 
 def belief(problem: Problem, given: Given, plan: Plan) -> AbstractPrior:
@@ -237,6 +230,7 @@ def _assemble(
     offset: Float[Array, " k"],
     prior: AbstractPrior,
     uncertainty: Uncertainty,
+    inspection: Inspection,
     law: OffsetLaw | None,
     problem: Problem,
     given: Given,
@@ -278,8 +272,7 @@ def _assemble(
         weakest_sd=uncertainty.weakest_sd,
         prior_direction=uncertainty.prior_direction,
         searched_start=solution.searched_start,
-        outlier=jnp.zeros_like(problem.mask),
-        departure=jnp.zeros_like(residual),
+        inspection=inspection,
         sigma_tuned=jnp.asarray(plan.self_tuning) & (used >= MINIMUM_SELF_TUNING),
         sigma_floored=floored[jnp.asarray([0, 0, 1])] if plan.channels else floored,
         tolerance_met=solution.arrived,

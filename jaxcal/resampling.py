@@ -1,11 +1,12 @@
-"""How a calibration fares on other images: cross-validation, influence and bootstrap.
+"""Cross-validation and bootstrap: one problem solved many times over, as one batch.
 
-All three solve many variants of one problem as a batch, through one compiled program:
-cross-validation leaves out a fold of images at a time and looks at the images left out; influence
-leaves out one image at a time and looks at what that does to X; the bootstrap draws as many images
-as there are, with replacement, and looks at how far X scatters.
+Cross-validation masks images out and looks at them through the calibration of the rest: what Eq. 8
+says of images that the calibration has not seen. Leaving out one image at a time also tells how
+much each image moves the answer (its influence). The bootstrap draws the images anew with
+replacement and tells how the answer scatters (reproducibility).
 
-References: Stone 1974 (cross-validation); Efron and Tibshirani 1993, chapters 6 and 11.
+All of it is :func:`jaxcal.calibrate_batch` on masks or rows of the same problem: pure functions of
+arrays (and a key), which work under jit.
 """
 
 from __future__ import annotations
@@ -16,301 +17,297 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Key
 
 from jaxcal.calibration import Calibration
 from jaxcal.errors import InputError
-from jaxcal.geometry import inverse_transform_points, transform_points
-from jaxcal.options import check_values
-from jaxcal.problem import Channels, Problem
+from jaxcal.metrics import calibration_reproducibility
+from jaxcal.model.parameters import Parameters
+from jaxcal.model.residuals import measured_points, measurement_residual
+from jaxcal.pipeline import nominal_sound_speed
+from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES, Recording
 from jaxcal.solve import calibrate, calibrate_batch
 from jaxcal.solvers import dense
 
-DEFAULT_RESAMPLES = 200
-"""Enough for an SD to within five per cent of itself."""
+LARGEST_RESAMPLES = 100_000
 
 
 class CrossValidation(eqx.Module):
-    """Images judged by calibrations that have not seen them.
+    """Images seen through calibrations that did not use them.
 
     Attributes:
-        fold: which fold an image was left out with; -1 for images not used.
-        residual: of every image by the calibration without its fold: lateral error, range error and
-            elevational offset of the target, mm, in the image's frame; NaN for images not used and
-            where that calibration did not converge.
-        rms: root mean square of those, each component by itself, mm.
-        precision: Eq. 8 on the images left out: the spread of B_i X p_i, mm, each with the X that
-            did not see image i and p_i in the plane. It holds the images' own offsets, too.
-        converged: (folds,) whether the calibration without a fold converged.
+        residual: (n, 3) lateral, range and elevational errors of each held-out image, mm; 0 where
+            not used.
+        cloud: (n, 3) the target as reconstructed from each held-out image (in the plane), less the
+            target of the calibration that held it out, mm.
+        precision: norm of the SD of that cloud (Eq. 8 for images that were not seen), mm.
+        rms: its root mean square length, mm.
+        log_density: (n,) log predictive density of each image's three errors under the Gaussian
+            SDs of the calibration that held it out; 0 where not used.
+        moved: (n, 6) [v, omega] by which leaving the image (its fold) out moves X, right
+            perturbation, mm and rad.
+        influence: (n,) length of that in SDs of X: sqrt(moved' Cov^-1 moved / 6); NaN without a
+            covariance.
+        image_to_probe: (folds, 4, 4) X of each fold.
+        converged: (folds,) whether its solve converged.
+        mask: (n,) 1 for used images.
     """
 
-    fold: Int[Array, " n"]
     residual: Float[Array, "n 3"]
-    rms: Float[Array, 3]
+    cloud: Float[Array, "n 3"]
     precision: Float[Array, ""]
-    converged: Bool[Array, " folds"]
-
-
-class Influence(eqx.Module):
-    """What leaving out an image does to X; NaN for images not used or if it then fails.
-
-    Attributes:
-        displacement: largest move of the image's corners and centre (see :func:`field_points`), mm.
-        tangent: from X with all images to X without one: v (mm) and omega (rad) of X Exp([v,
-            omega]).
-        distance: the same in SDs of X: the square root of tangent' covariance^-1 tangent / 6.
-    """
-
-    displacement: Float[Array, " n"]
-    tangent: Float[Array, "n 6"]
-    distance: Float[Array, " n"]
+    rms: Float[Array, ""]
+    log_density: Float[Array, " n"]
+    moved: Float[Array, "n 6"]
+    influence: Float[Array, " n"]
+    image_to_probe: Float[Array, "folds 4 4"]
+    converged: Float[Array, " folds"]
+    mask: Float[Array, " n"]
 
 
 class Bootstrap(eqx.Module):
-    """X over resampled sets of images; resamples that did not converge are left out of the figures.
+    """How the answer scatters when the images are drawn anew.
 
     Attributes:
-        image_to_probe: X of every resample.
-        converged: which of them converged.
-        sd: SD of X over those: v (mm) and omega (rad) along and about the image's axes.
-        field_points: [lateral, axial] where reproducibility is looked at, mm.
-        reproducibility: mean distance from the mean there, mm.
+        image_to_probe: (k, 4, 4) X of each resample.
+        converged: (k,) 1 where its solve converged; only those count below.
+        spread: (6,) SD of X about the full data's, [v, omega], mm and rad; a median-based one, so
+            that a few resamples without enough different images do not spoil it.
+        reproducibility: (m,) mean distance of an image point from its mean over the resamples, mm.
+        image_points: (m, 2) [lateral, axial] of those points, mm: corners and middle of the box
+            that the measured points fill.
     """
 
-    image_to_probe: Float[Array, "resamples 4 4"]
-    converged: Bool[Array, " resamples"]
-    sd: Float[Array, 6]
-    field_points: Float[Array, "points 2"]
-    reproducibility: Float[Array, " points"]
+    image_to_probe: Float[Array, "k 4 4"]
+    converged: Float[Array, " k"]
+    spread: Float[Array, 6]
+    reproducibility: Float[Array, " m"]
+    image_points: Float[Array, "m 2"]
 
 
 def cross_validate(
-    problem: Problem | Recording, folds: int | None = None, *, seed: int = 0, **arguments: Any
+    problem: Problem | Recording,
+    *,
+    folds: int | None = None,
+    result: Calibration | None = None,
+    **arguments: Any,
 ) -> CrossValidation:
-    """Leave out a fold of images at a time and judge them by what the others say.
+    """Hold out each image (or each of some folds) in turn.
 
     Args:
-        problem: one problem, with concrete values.
-        folds: number of folds, the images shared out among them at random; by default one an image
-            (leave-one-out).
-        seed: of the shares.
+        problem: one problem or a recording.
+        folds: image i belongs to fold i mod folds; by default every image is a fold of its own.
+        result: the calibration of all images, where it is at hand. Images that it left out
+            as outliers are neither used nor held out.
         arguments: as for :func:`jaxcal.calibrate`.
 
     Raises:
-        InputError: fewer than two folds, more than there are used images, or folds so large that
-            fewer than 4 images remain.
+        InputError: too few images or folds, or options that contradict each other.
     """
-    problem = _one(problem)
-    used = np.flatnonzero(np.asarray(problem.mask) > 0)
-    count = len(used) if folds is None else folds
-    if not 2 <= count <= len(used):
-        raise InputError(f"folds must be between 2 and the {len(used)} used images, not {count}")
-    if len(used) - -(-len(used) // count) < MINIMUM_IMAGES:
-        raise InputError(
-            f"{count} folds of {len(used)} images leave fewer than {MINIMUM_IMAGES} to calibrate on"
-        )
-    order = used if folds is None else np.random.default_rng(seed).permutation(used)
-    fold = np.full(problem.images, -1)
-    fold[order] = np.arange(len(used)) % count
-    result = _without(problem, fold[None, :] == np.arange(count)[:, None], arguments)
-    return _judge_left_out(problem, jnp.asarray(fold), result)
-
-
-def influence(problem: Problem | Recording, **arguments: Any) -> Influence:
-    """Leave out one image at a time and see where X goes: which images carry the answer.
-
-    Args:
-        problem: one problem, with concrete values.
-        arguments: as for :func:`jaxcal.calibrate`.
-
-    Raises:
-        InputError: with four used images or fewer none can be left out.
-    """
-    problem = _one(problem)
-    if int(np.sum(np.asarray(problem.mask) > 0)) <= MINIMUM_IMAGES:
-        raise InputError(f"leaving out an image takes more than {MINIMUM_IMAGES} used images")
-    whole = calibrate(problem, **arguments)
-    result = _without(problem, np.eye(problem.images, dtype=bool), arguments)
-    return _compare(problem, whole, result)
+    problem = _one_problem(problem)
+    count = problem.images
+    folds = count if folds is None else folds
+    if not 2 <= folds <= count:
+        raise InputError(f"folds must be between 2 and the number of images {count}, not {folds}")
+    result = calibrate(problem, **arguments) if result is None else result
+    problem = replace(problem, mask=jnp.asarray(result.mask, problem.mask.dtype))
+    fold = np.arange(count) % folds
+    rest = jnp.asarray(fold[None, :] != np.arange(folds)[:, None], problem.mask.dtype)
+    _check_left(problem.mask, rest)
+    # What is an outlier was decided on all images.
+    options: dict[str, Any] = {**arguments, "robust": False}
+    fits = calibrate_batch(_many(problem, problem.mask * rest), **options)
+    held = jax.tree.map(lambda leaf: leaf[fold], fits)
+    errors, cloud = _seen(held, problem)
+    mask = problem.mask
+    used = jnp.sum(mask)
+    mean = jnp.sum(mask[:, None] * cloud, axis=0) / used
+    moved = jax.vmap(relative_twist, (None, 0))(jnp.asarray(result.image_to_probe),
+                                                held.image_to_probe)  # fmt: skip
+    moved = mask[:, None] * moved
+    density = -0.5 * jnp.sum((errors / held.sigma) ** 2 + jnp.log(2 * jnp.pi * held.sigma**2), 1)
+    return CrossValidation(
+        residual=errors,
+        cloud=cloud,
+        precision=jnp.sqrt(jnp.sum(mask[:, None] * (cloud - mean) ** 2) / (used - 1)),
+        rms=jnp.sqrt(jnp.sum(cloud**2) / used),
+        log_density=mask * density,
+        moved=moved,
+        influence=_in_sds(moved, jnp.asarray(result.covariance)),
+        image_to_probe=fits.image_to_probe,
+        converged=fits.converged.astype(mask.dtype),
+        mask=mask,
+    )
 
 
 def bootstrap(
     problem: Problem | Recording,
-    resamples: int = DEFAULT_RESAMPLES,
+    resamples: int = 200,
+    key: Key[Array, ""] | int = 0,
     *,
-    seed: int = 0,
+    result: Calibration | None = None,
     **arguments: Any,
 ) -> Bootstrap:
-    """Calibrate sets of as many images, drawn with replacement from those used.
+    """Draw the used images anew with replacement, and calibrate each draw.
 
     Args:
-        problem: one problem, with concrete values.
-        resamples: how many sets.
-        seed: of the draws; set k is the same whatever the number of sets.
+        problem: one problem or a recording.
+        resamples: how many draws.
+        key: of the draws, or a seed; draw k is fold_in(key, k).
+        result: the calibration of all images, where it is at hand. Images that it left out
+            as outliers are not drawn.
         arguments: as for :func:`jaxcal.calibrate`.
 
     Raises:
-        InputError: fewer than two resamples.
+        InputError: fewer than 2 resamples, or options that contradict each other.
     """
-    problem = _one(problem)
-    if resamples < 2:
-        raise InputError(f"resamples must be at least 2, not {resamples}")
-    used = np.flatnonzero(np.asarray(problem.mask) > 0)
-    rows = np.stack(
-        [np.random.default_rng([seed, k]).choice(used, len(used)) for k in range(resamples)]
+    problem = _one_problem(problem)
+    if not 2 <= resamples <= LARGEST_RESAMPLES:
+        raise InputError(f"resamples must be between 2 and {LARGEST_RESAMPLES}, not {resamples}")
+    root = jax.random.key(key) if isinstance(key, int) else key
+    result = calibrate(problem, **arguments) if result is None else result
+    mask = jnp.asarray(result.mask, problem.mask.dtype)
+    problem = replace(problem, mask=mask)
+    cumulative = jnp.cumsum(mask)
+
+    def draw(index: Array) -> Array:
+        uniform = jax.random.uniform(jax.random.fold_in(root, index), mask.shape, mask.dtype)
+        # The image at whose place the count of used ones passes the draw; unused ones never do.
+        chosen = jnp.searchsorted(cumulative, uniform * cumulative[-1], side="right")
+        return jnp.minimum(chosen, mask.shape[0] - 1)
+
+    rows = jax.vmap(draw)(jnp.arange(resamples))
+    # As many images as were used: the places of unused ones stay empty.
+    options: dict[str, Any] = {**arguments, "robust": False}
+    fits = calibrate_batch(_drawn(problem, rows, mask), **options)
+    converged = fits.converged.astype(mask.dtype)
+    whole = jnp.asarray(result.image_to_probe)
+    moved = jax.vmap(relative_twist, (None, 0))(whole, fits.image_to_probe)
+    moved = jnp.where(converged[:, None] > 0, jnp.abs(moved), jnp.nan)
+    points = _corners(problem, result)
+    # A resample that did not converge stands at the whole's X: it adds nothing to the scatter.
+    transforms = jnp.where(converged[:, None, None] > 0, fits.image_to_probe, whole)
+    share = jnp.maximum(jnp.mean(converged), 1e-9)
+    return Bootstrap(
+        image_to_probe=fits.image_to_probe,
+        converged=converged,
+        spread=1.4826 * jnp.nanmedian(moved, axis=0),
+        reproducibility=calibration_reproducibility(transforms, points) / share,
+        image_points=points,
     )
-    result = calibrate_batch(_rows(problem, jnp.asarray(rows)), **arguments)
-    whole = calibrate(problem, **arguments)
-    return _scatter(problem, whole, result)
 
 
-def field_points(result: Calibration, problem: Problem) -> Float[Array, "5 2"]:
-    """Corners and centre of the rectangle that the target was seen in: [lateral, axial], mm."""
-    points = _points_mm(result, problem)
-    used = problem.mask[:, None] > 0
-    low = jnp.min(jnp.where(used, points, jnp.inf), axis=0)
-    high = jnp.max(jnp.where(used, points, -jnp.inf), axis=0)
-    corners = [[low[0], low[1]], [high[0], low[1]], [low[0], high[1]], [high[0], high[1]]]
-    return jnp.concatenate([jnp.asarray(corners), 0.5 * (low + high)[None]])
+def relative_twist(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Float[Array, 6]:
+    """[v, omega] that take the first transform to the second: first Exp([v, omega]), mm and rad.
+
+    Exact for v, and for omega to third order: a calibration moves by fractions of a degree.
+    """
+    rotation = first[:3, :3].T @ second[:3, :3]
+    shift = first[:3, :3].T @ (second[:3, 3] - first[:3, 3])
+    turn = 0.5 * jnp.stack(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0],
+         rotation[1, 0] - rotation[0, 1]]
+    )  # fmt: skip
+    return jnp.concatenate([shift, turn])
 
 
-def _one(problem: Problem | Recording) -> Problem:
+def _one_problem(problem: Problem | Recording) -> Problem:
     if isinstance(problem, Recording):
         problem = Problem.from_recording(problem)
     if problem.batch_shape:
         raise InputError("resampling takes one problem at a time, not a batch")
-    check_values(problem)
     return problem
 
 
-def _without(problem: Problem, left_out: np.ndarray, arguments: dict[str, Any]) -> Calibration:
-    """A batch of calibrations, each without the images that its row of ``left_out`` marks."""
-    count = len(left_out)
-    batch = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), problem)
-    kept = batch.mask * jnp.asarray(~left_out, problem.mask.dtype)
-    return calibrate_batch(replace(batch, mask=kept), **arguments)
+def _check_left(mask: Array, rest: Array) -> None:
+    if is_traced(mask):
+        return
+    least = int(np.min(np.sum(np.asarray(mask) * np.asarray(rest) > 0, axis=1)))
+    if least < MINIMUM_IMAGES:
+        raise InputError(
+            f"holding out a fold leaves {least} images: at least {MINIMUM_IMAGES} are needed"
+        )
 
 
-def _rows(problem: Problem, rows: Int[Array, "b n"]) -> Problem:
-    """A batch of problems of the given images."""
-    count = len(rows)
+def _many(problem: Problem, masks: Float[Array, "k n"]) -> Problem:
+    """The same problem under many masks."""
+    count = masks.shape[0]
+    many = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), problem)
+    return replace(many, mask=masks)
 
-    def shared(leaf: Array | None) -> Array | None:
-        return None if leaf is None else jnp.broadcast_to(leaf, (count, *leaf.shape))
 
-    def taken(leaf: Array | None) -> Array | None:
-        return None if leaf is None else leaf[rows]
+def _drawn(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Problem:
+    """The problem with other rows of images in each of k copies."""
+    count = problem.images
 
-    channels = problem.channels
-    if channels is not None:
-        channels = Channels(
-            channels.distances[rows], channels.heard[rows],
-            jnp.broadcast_to(channels.elements, (count, *channels.elements.shape)),
+    def pick(leaf: Array) -> Array:
+        return leaf[rows]
+
+    many = _many(problem, jnp.broadcast_to(mask, rows.shape))
+    changed: dict[str, Any] = {
+        name: pick(getattr(problem, name))
+        for name in ("poses", "measurements", "covariance", "max_elevation")
+        if getattr(problem, name) is not None
+    }
+    if problem.channels is not None:
+        assert many.channels is not None
+        changed["channels"] = replace(
+            many.channels, distances=pick(problem.channels.distances),
+            heard=pick(problem.channels.heard),
         )  # fmt: skip
-    return replace(
-        problem,
-        **{name: taken(getattr(problem, name))
-           for name in ("poses", "measurements", "mask", "covariance", "max_elevation")},
-        **{name: shared(getattr(problem, name))
-           for name in ("spacing", "face_offset", "sound_speed", "delay")},
-        channels=channels,
+    assert rows.shape[1] == count
+    return replace(many, **changed)
+
+
+def _parameters(result: Calibration, problem: Problem) -> Parameters:
+    matrix = result.image_to_probe
+    scale = None
+    if result.scale_mm_per_px is not None:
+        scale = result.scale_mm_per_px / problem.spacing
+    found = Parameters.of(matrix[:3, :3], matrix[:3, 3], result.point, scale)
+    nominal = nominal_sound_speed(problem)
+    if result.sound_speed_m_s is not None:
+        found = replace(found, sound_speed=result.sound_speed_m_s / nominal)
+    if result.delay_s is not None:
+        before = 0.0 if problem.delay is None else problem.delay
+        found = replace(found, delay=(result.delay_s - before) * 1e3 * nominal)
+    return found
+
+
+def _seen(held: Calibration, problem: Problem) -> tuple[Array, Array]:
+    """Errors and reconstructed target of image i through calibration i."""
+
+    def one(result: Calibration, image: Array) -> tuple[Array, Array]:
+        parameters = _parameters(result, problem)
+        point = measured_points(parameters, problem)[image]
+        in_image = jnp.stack([point[0], jnp.zeros_like(point[0]), point[1]])
+        in_probe = parameters.rotation @ in_image + parameters.translation
+        pose = problem.poses[image]
+        there = pose[:3, :3] @ in_probe + pose[:3, 3]
+        return measurement_residual(parameters, problem)[image], there - parameters.point
+
+    errors, cloud = jax.vmap(one)(held, jnp.arange(problem.images))
+    return errors, problem.mask[:, None] * cloud
+
+
+def _in_sds(moved: Float[Array, "n 6"], covariance: Float[Array, "6 6"]) -> Float[Array, " n"]:
+    scale = jnp.sqrt(jnp.diagonal(covariance))
+    # In SDs of each unknown the matrix is a correlation, well scaled for elimination.
+    unit = moved / scale
+    solved = dense.solve_positive(covariance / (scale[:, None] * scale), unit.T)
+    return jnp.sqrt(jnp.sum(unit.T * solved, axis=0) / 6)
+
+
+def _corners(problem: Problem, result: Calibration) -> Float[Array, "5 2"]:
+    parameters = _parameters(jax.tree.map(jnp.asarray, result), problem)
+    points = measured_points(parameters, problem)
+    seen = problem.mask[:, None] > 0
+    low = jnp.min(jnp.where(seen, points, jnp.inf), axis=0)
+    high = jnp.max(jnp.where(seen, points, -jnp.inf), axis=0)
+    ends = jnp.stack([low, high])
+    return jnp.stack(
+        [ends[0], jnp.stack([high[0], low[1]]), jnp.stack([low[0], high[1]]), ends[1],
+         0.5 * (low + high)]
     )  # fmt: skip
-
-
-def _points_mm(result: Calibration, problem: Problem) -> Float[Array, "*batch n 2"]:
-    """[lateral, range] of every image, mm, with the pixel scale of each calibration."""
-    if result.scale_mm_per_px is None:
-        return problem.measurements
-    points = problem.measurements * result.scale_mm_per_px[..., None, :]
-    return points.at[..., 1].add(problem.face_offset)
-
-
-def _in_plane(points: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
-    return jnp.stack([points[:, 0], jnp.zeros_like(points[:, 0]), points[:, 1]], axis=1)
-
-
-@jax.jit
-def _judge_left_out(
-    problem: Problem, fold: Int[Array, " n"], result: Calibration
-) -> CrossValidation:
-    used = fold >= 0
-    row = jnp.maximum(fold, 0)
-    own = jnp.arange(problem.images)
-    matrix = result.image_to_probe[row]
-    points = _points_mm(result, problem)
-    points = jnp.broadcast_to(points, (result.mask.shape[0], *points.shape[-2:]))[row, own]
-    in_probe = inverse_transform_points(problem.poses, result.point[row])
-    q = inverse_transform_points(matrix, in_probe)
-    residual = jnp.stack(
-        [q[:, 0] - points[:, 0], jnp.hypot(q[:, 1], q[:, 2]) - points[:, 1], q[:, 1]], axis=1
-    )
-    good = (used & result.converged[row])[:, None]
-    count = jnp.sum(good)
-    cloud = transform_points(problem.poses, transform_points(matrix, _in_plane(points)))
-    mean = jnp.sum(jnp.where(good, cloud, 0.0), axis=0) / count
-    spread = jnp.sum(jnp.where(good, (cloud - mean) ** 2, 0.0)) / (count - 1)
-    mean_square = jnp.sum(jnp.where(good, residual**2, 0.0), axis=0) / count
-    return CrossValidation(
-        fold=fold,
-        residual=jnp.where(good, residual, jnp.nan),
-        rms=jnp.sqrt(mean_square),
-        precision=jnp.sqrt(spread),
-        converged=result.converged,
-    )
-
-
-@jax.jit
-def _compare(problem: Problem, whole: Calibration, result: Calibration) -> Influence:
-    tangent = _tangents(whole.image_to_probe, result.image_to_probe)
-    points = _in_plane(field_points(whole, problem))
-    before = transform_points(whole.image_to_probe, points)
-    after = transform_points(result.image_to_probe[:, None], points[None])
-    moved = jnp.max(jnp.linalg.norm(after - before, axis=-1), axis=1)
-    scale = jnp.sqrt(jnp.diagonal(whole.covariance))
-    correlation = whole.covariance / (scale[:, None] * scale[None, :])
-    good = (problem.mask > 0) & result.converged
-    return Influence(
-        displacement=jnp.where(good, moved, jnp.nan),
-        tangent=jnp.where(good[:, None], tangent, jnp.nan),
-        distance=jnp.where(good, _mahalanobis(tangent / scale, correlation), jnp.nan),
-    )
-
-
-def _mahalanobis(
-    standardised: Float[Array, "b 6"], correlation: Float[Array, "6 6"]
-) -> Float[Array, " b"]:
-    solved = dense.solve_positive(correlation, standardised.T)
-    return jnp.sqrt(jnp.sum(standardised.T * solved, axis=0) / 6)
-
-
-@jax.jit
-def _scatter(problem: Problem, whole: Calibration, result: Calibration) -> Bootstrap:
-    good = result.converged
-    count = jnp.sum(good)
-    tangent = jnp.where(good[:, None], _tangents(whole.image_to_probe, result.image_to_probe), 0.0)
-    mean = jnp.sum(tangent, axis=0) / count
-    square = jnp.sum(jnp.where(good[:, None], (tangent - mean) ** 2, 0.0), axis=0)
-    points = field_points(whole, problem)
-    images = transform_points(result.image_to_probe[:, None], _in_plane(points)[None])
-    images = jnp.where(good[:, None, None], images, 0.0)
-    centre = jnp.sum(images, axis=0) / count
-    away = jnp.linalg.norm(images - centre, axis=-1)
-    return Bootstrap(
-        image_to_probe=result.image_to_probe,
-        converged=good,
-        sd=jnp.sqrt(square / (count - 1)),
-        field_points=points,
-        reproducibility=jnp.sum(jnp.where(good[:, None], away, 0.0), axis=0) / count,
-    )
-
-
-def _tangents(reference: Float[Array, "4 4"], moved: Float[Array, "b 4 4"]) -> Float[Array, "b 6"]:
-    """[v, omega] with moved = reference Exp([v, omega]), Exp's translation taken as v."""
-    turn = reference[:3, :3]
-    relative = jnp.einsum("ji,bjk->bik", turn, moved[:, :3, :3])
-    omega = jax.vmap(lambda matrix: jaxlie.SO3.from_matrix(matrix).log())(relative)
-    shift = (moved[:, :3, 3] - reference[:3, 3]) @ turn
-    return jnp.concatenate([shift, omega], axis=1)

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from jaxcal.report.convergence import Curve
 
 Method = Literal["joint", "alternating", "conventional"]
+MOST_FOLDS = 100
+"""With more images than this, cross-validation holds out several at a time."""
+
 UNKNOWNS = ("scale", "sound-speed", "delay")
 
 
@@ -125,14 +128,14 @@ class _Request:
 @click.option(
     "--cross-validate",
     is_flag=True,
-    help="Leave out one image at a time: how well the others foretell it, and what it does to the "
-    "transform.",
+    help="Look at every image through a calibration of the others: precision on images that were "
+    "not used, and how much each image moves the answer.",
 )
 @click.option(
     "--bootstrap",
-    type=click.IntRange(min=2, max=100_000),
+    type=click.IntRange(2, 100_000),
     metavar="N",
-    help="Calibrate N sets of images drawn with replacement: how far the transform scatters.",
+    help="Calibrate N times from images drawn anew, and tell how the answers scatter.",
 )
 @click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
@@ -177,7 +180,9 @@ def calibrate(
             result = _solve(measured, request, traced=traced)
             record = calibration_record(result, measured, test_data)
             record["warnings"] += notes
-        record |= _resampled(measured, request, cross_validate, bootstrap)
+        if cross_validate or bootstrap is not None:
+            with progress("calibrating over and over"):
+                record |= _resampled(measured, request, result, cross_validate, bootstrap)
         if folder is not None:
             with progress("drawing the report"):
                 curves = _curves(measured, request, result)
@@ -187,31 +192,6 @@ def calibrate(
     else:
         _print(record, out)
     return exit_code([record])
-
-
-def _resampled(
-    recording: Recording, request: _Request, cross_validate: bool, resamples: int | None
-) -> dict[str, Any]:
-    """What other sets of the same images say, for the record."""
-    if not cross_validate and resamples is None:
-        return {}
-    from jaxcal import resampling
-    from jaxcal.problem import Problem
-    from jaxcal.report.record import bootstrap_record, cross_validation_record
-
-    problem, arguments = Problem.from_recording(recording), _arguments(request)
-    record: dict[str, Any] = {}
-    if cross_validate:
-        with progress("leaving out one image at a time"):
-            record["cross_validation"] = cross_validation_record(
-                resampling.cross_validate(problem, **arguments),
-                resampling.influence(problem, **arguments),
-            )
-    if resamples is not None:
-        with progress(f"calibrating {resamples} resamples"):
-            found = resampling.bootstrap(problem, resamples, **arguments)
-            record["bootstrap"] = bootstrap_record(found)
-    return record
 
 
 def _segmented(recording: Recording) -> tuple[Recording, list[str]]:
@@ -286,15 +266,18 @@ def _unknowns(estimate: str | None) -> tuple[str, ...]:
 def _solve(recording: Recording, request: _Request, *, traced: bool) -> Calibration:
     import jax
 
+    from jaxcal.options import Options
     from jaxcal.report.convergence import KEPT
     from jaxcal.solve import calibrate as solve
 
-    trace = KEPT if traced else 0
-    return jax.block_until_ready(solve(recording, **_arguments(request, trace=trace)))
+    options = Options(**request.options, trace=KEPT if traced else 0)
+    arguments: dict[str, Any] = {**_arguments(request), "options": options}
+    result = solve(recording, **arguments)
+    return jax.block_until_ready(result)
 
 
-def _arguments(request: _Request, *, trace: int = 0) -> dict[str, Any]:
-    """The request as :func:`jaxcal.calibrate` takes it."""
+def _arguments(request: _Request) -> dict[str, Any]:
+    """The request as the arguments of :func:`jaxcal.calibrate`."""
     from jaxcal.options import Options
 
     return {
@@ -304,9 +287,36 @@ def _arguments(request: _Request, *, trace: int = 0) -> dict[str, Any]:
         "sigma": request.sigma,
         "estimate": request.estimate,
         "data": request.data,
-        "options": Options(**request.options, trace=trace),
+        "options": Options(**request.options),
         "robust": request.robust,
     }
+
+
+def _resampled(
+    recording: Recording,
+    request: _Request,
+    result: Calibration,
+    cross_validate: bool,
+    draws: int | None,
+) -> dict[str, Any]:
+    """What cross-validation and bootstrap add to the record."""
+    from jaxcal import resampling
+    from jaxcal.problem import Problem
+    from jaxcal.report.resampled import bootstrap_record, cross_validation_record
+
+    found: dict[str, Any] = {}
+    if result.status not in ("converged", "max_iterations"):
+        return found
+    problem = Problem.from_recording(recording)
+    arguments = _arguments(request)
+    if cross_validate:
+        folds = min(problem.images, MOST_FOLDS)
+        held_out = resampling.cross_validate(problem, folds=folds, result=result, **arguments)
+        found["cross_validation"] = cross_validation_record(held_out)
+    if draws is not None:
+        scatter = resampling.bootstrap(problem, draws, result=result, **arguments)
+        found["bootstrap"] = bootstrap_record(scatter)
+    return found
 
 
 def _curves(recording: Recording, request: _Request, result: Calibration) -> list[Curve]:

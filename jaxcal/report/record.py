@@ -16,7 +16,6 @@ from jaxcal.errors import InputError
 from jaxcal.geometry import rotation_angle
 from jaxcal.metrics import reconstruction_precision
 from jaxcal.recording import Images, Recording, Truth
-from jaxcal.resampling import Bootstrap, CrossValidation, Influence
 
 CONVENTION = {
     "units": "lengths in mm; rotations in rad where no unit is in the name",
@@ -85,6 +84,7 @@ def calibration_record(
         "objective": answer.cost,
         "scaled_kkt_residual": answer.stationarity,
         "robust": result.robust,
+        "noise_model": diagnosis.noise_model(answer),
         "outliers": diagnosis.outliers(answer),
         "outlier_reasons": diagnosis.outlier_reasons(answer),
         "warnings": result.warnings,
@@ -94,46 +94,6 @@ def calibration_record(
     record |= {"source": recording.source, "convention": CONVENTION}
     record["jaxcal_version"] = jaxcal.__version__
     return plain(record)
-
-
-def cross_validation_record(left_out: CrossValidation, influence: Influence) -> dict[str, Any]:
-    """What leaving out images told, as plain values.
-
-    Args:
-        left_out: every image by the calibrations without its fold.
-        influence: what leaving out each image does to X.
-    """
-    displacement = np.asarray(influence.displacement)
-    most = None
-    if np.isfinite(displacement).any():
-        most = int(np.nanargmax(displacement))
-    return plain(
-        {
-            "folds": len(left_out.converged),
-            "folds_not_converged": int(np.sum(~np.asarray(left_out.converged))),
-            "held_out_precision_mm": np.asarray(left_out.precision),
-            "held_out_rms_mm": np.asarray(left_out.rms),
-            "held_out_residual_mm": np.asarray(left_out.residual),
-            "displacement_mm": displacement,
-            "displacement_sd": np.asarray(influence.distance),
-            "most_influential_image": most,
-        }
-    )
-
-
-def bootstrap_record(found: Bootstrap) -> dict[str, Any]:
-    """What resampled sets of images told, as plain values."""
-    sd = np.asarray(found.sd)
-    return plain(
-        {
-            "resamples": len(found.converged),
-            "resamples_not_converged": int(np.sum(~np.asarray(found.converged))),
-            "translation_sd_mm": sd[:3],
-            "rotation_sd_rad": sd[3:],
-            "field_points_mm": np.asarray(found.field_points),
-            "reproducibility_mm": np.asarray(found.reproducibility),
-        }
-    )
 
 
 def truth_error(result: Calibration, truth: Truth) -> dict[str, float]:

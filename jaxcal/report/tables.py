@@ -111,7 +111,6 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
     facts.append(
         ("least known", sight["weakest_direction"] + ("" if sd is None else f" (SD {sd:.2f} mm)"))
     )
-    facts += _resampled(record)
     if "truth_error" in record:
         error = record["truth_error"]
         facts.append(
@@ -122,35 +121,6 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
                 f"target {_number(error['point_mm'], '.3f')} mm",
             )
         )
-    return facts
-
-
-def _resampled(record: dict[str, Any]) -> list[tuple[str, str]]:
-    facts = []
-    if "cross_validation" in record:
-        found = record["cross_validation"]
-        facts.append((
-            "images left out, RMS (mm)",
-            "lateral {}, range {}, elevational {}; precision {}".format(
-                *(_number(value, ".3f") for value in found["held_out_rms_mm"]),
-                _number(found["held_out_precision_mm"], ".3f"),
-            ),
-        ))  # fmt: skip
-        most = found["most_influential_image"]
-        if most is not None:
-            facts.append((
-                "most influential image",
-                f"{most}: without it the image moves by up to "
-                f"{_number(found['displacement_mm'][most], '.3f')} mm",
-            ))  # fmt: skip
-    if "bootstrap" in record:
-        found = record["bootstrap"]
-        *corners, centre = found["reproducibility_mm"]
-        worst = max((value for value in corners if value is not None), default=None)
-        facts.append((
-            f"reproducibility, {found['resamples']} resamples (mm)",
-            f"centre {_number(centre, '.3f')}, worst corner {_number(worst, '.3f')}",
-        ))  # fmt: skip
     return facts
 
 

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from jaxcal import diagnosis
+from jaxcal.report.resampled import resampled_sentences
 
 GOOD = 0.5
 """Largest SD of X, in mm and in degrees, that is called good,"""
@@ -31,7 +32,7 @@ def verdict(record: dict[str, Any]) -> list[str]:
     """
     lines = [_headline(record)]
     if record["status"] in ("converged", "max_iterations"):
-        lines += [*_certainty(record), _errors(record)]
+        lines += [*_certainty(record), _errors(record), *resampled_sentences(record)]
     if record["warnings"]:
         lines += ["Look at this:", *(f"- {text}" for text in record["warnings"])]
     todo = _advice(record)
@@ -106,6 +107,14 @@ def _errors(record: dict[str, Any]) -> str:
     )
 
 
+def _addition(record: dict[str, Any]) -> str:
+    """What tells most about the weakest direction first, then what is good for all of them."""
+    first = record["observability"].get("advice")
+    if not first:
+        return _MORE_VARIED
+    return f"{first[0].upper()}{first[1:]}. {_MORE_VARIED}"
+
+
 def _out_of_plane(record: dict[str, Any]) -> bool:
     elevational = record["sigma_elevation_mm"] or 0.0
     in_plane = max(record["sigma_lateral_mm"] or 0.0, record["sigma_range_mm"] or 0.0)
@@ -121,7 +130,7 @@ def _advice(record: dict[str, Any]) -> list[str]:
             "that lengths are in mm."
         )
     elif status == "unobservable":
-        advice.append(_MORE_VARIED)
+        advice.append(_addition(record))
     elif status == "max_iterations":
         advice.append(
             "Leave out images whose target was mispicked (they have the largest residuals), or add "
@@ -130,7 +139,7 @@ def _advice(record: dict[str, Any]) -> list[str]:
     else:
         spread = spread_of_transform(record)
         if few or spread is None or max(spread) > FAIR:
-            advice.append(_MORE_VARIED)
+            advice.append(_addition(record))
     if status == "converged" and record["method"] == "conventional" and _out_of_plane(record):
         advice.append(
             "Most of the error is out of the image plane, which the conventional method takes for "

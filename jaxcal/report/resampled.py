@@ -1,0 +1,74 @@
+"""Cross-validation and bootstrap as plain values, and in words."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from jaxcal.report.record import plain
+from jaxcal.resampling import Bootstrap, CrossValidation
+
+INFLUENTIAL = 1.0
+"""An image that moves X by more than this many of its SDs is worth naming."""
+
+
+def cross_validation_record(found: CrossValidation) -> dict[str, Any]:
+    """For ``calibration.json`` and ``--json``."""
+    influence = np.asarray(found.influence, dtype=float)
+    used = np.asarray(found.mask) > 0
+    strongest = np.argsort(np.where(used & np.isfinite(influence), -influence, np.inf))[:5]
+    return plain({
+        "folds": len(np.asarray(found.converged)),
+        "folds_converged": int(np.asarray(found.converged).sum()),
+        "precision_mm": float(found.precision),
+        "rms_mm": float(found.rms),
+        "log_density": float(np.sum(np.asarray(found.log_density))),
+        "influence": np.where(used, influence, np.nan),
+        "most_influential": [int(image) for image in strongest if used[image]],
+    })  # fmt: skip
+
+
+def bootstrap_record(found: Bootstrap) -> dict[str, Any]:
+    """For ``calibration.json`` and ``--json``."""
+    spread = np.asarray(found.spread, dtype=float)
+    return plain({
+        "resamples": len(np.asarray(found.converged)),
+        "resamples_converged": int(np.asarray(found.converged).sum()),
+        "translation_sd_mm": spread[:3],
+        "rotation_sd_deg": np.degrees(spread[3:]),
+        "image_points_mm": np.asarray(found.image_points),
+        "reproducibility_mm": np.asarray(found.reproducibility),
+    })  # fmt: skip
+
+
+def resampled_sentences(record: dict[str, Any]) -> list[str]:
+    """What both say, for the verdict."""
+    lines = []
+    held = record.get("cross_validation")
+    if held is not None and held["precision_mm"] is not None:
+        lines.append(
+            f"On images that were not used for it, the calibration is as precise as "
+            f"{held['precision_mm']:.2f} mm ({held['folds']}-fold cross-validation)."
+        )
+        strong = [
+            image for image in held["most_influential"]
+            if (held["influence"][image] or 0.0) > INFLUENTIAL
+        ]  # fmt: skip
+        if strong:
+            first = strong[0]
+            lines.append(
+                f"Image {first} alone moves it by {held['influence'][first]:.1f} of its standard "
+                "deviations: look at that image."
+            )
+    drawn = record.get("bootstrap")
+    if drawn is not None and drawn["reproducibility_mm"][-1] is not None:
+        worst = max(value for value in drawn["reproducibility_mm"] if value is not None)
+        turned = math.sqrt(sum((value or 0.0) ** 2 for value in drawn["rotation_sd_deg"]))
+        lines.append(
+            f"Calibrated {drawn['resamples']} times from images drawn anew, a point in the middle "
+            f"of the image scatters by {drawn['reproducibility_mm'][-1]:.2f} mm, at the worst "
+            f"corner by {worst:.2f} mm, and the orientation by {turned:.2f} degrees."
+        )
+    return lines

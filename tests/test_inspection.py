@@ -1,0 +1,97 @@
+"""The noise model is doubted where it is wrong, and hardly ever where it is right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import problem
+from scipy import stats
+
+import jaxcal
+from jaxcal import diagnosis
+from jaxcal.inspection import MISFITS, check_noise_model, kurtosis_score, skewness_score
+from jaxcal.model.parameters import RIGID, Parameters
+from jaxcal.model.priors import Gaussian
+from jaxcal.model.residuals import target_in_image
+from jaxcal.solvers.least_squares import minimise
+
+SIGMA = np.array([0.4, 0.3, 1.0])
+
+
+@pytest.mark.parametrize("count", [20, 54, 300])
+def test_scores_are_those_of_scipy(count):
+    values = np.random.default_rng(count).standard_t(5, (4, count))
+    kurtosis = stats.kurtosis(values, axis=1, fisher=False)
+    np.testing.assert_allclose(
+        kurtosis_score(jnp.asarray(kurtosis), jnp.asarray(float(count))),
+        stats.kurtosistest(values, axis=1).statistic, rtol=1e-9,
+    )  # fmt: skip
+    np.testing.assert_allclose(
+        skewness_score(jnp.asarray(stats.skew(values, axis=1)), jnp.asarray(float(count))),
+        stats.skewtest(values, axis=1).statistic, rtol=1e-9,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scores():
+    """From (draws, n, 3) errors in SDs to the scores of a fit, on one geometry of 40 images."""
+    base = problem(0, images=40, elevation_mm=0.0, noise_mm=0.5)
+    fit = jaxcal.calibrate(base, "conventional")
+    x = jnp.asarray(fit.image_to_probe)
+    truth = Parameters.of(x[:3, :3], x[:3, 3], fit.point)
+    q = target_in_image(truth, base)
+    belief = Gaussian(jnp.asarray(SIGMA))
+    elevational = jnp.einsum("nij,j->ni", base.poses[:, :3, :3], x[:3, 1])
+
+    def one(errors):
+        errors = errors * SIGMA
+        # Moving the probe along its own elevational axis offsets the target by as much.
+        offset = errors[:, 2]
+        poses = base.poses.at[:, :3, 3].add(-(offset - q[:, 1])[:, None] * elevational)
+        points = jnp.stack([q[:, 0], jnp.hypot(offset, q[:, 2])], axis=1) + errors[:, :2]
+        data = replace(base, poses=poses, measurements=points)
+        found = minimise(truth, belief, data, RIGID)
+        return check_noise_model(found.parameters, found.offset, belief, data, RIGID)
+
+    return jax.jit(jax.vmap(one)), np.asarray(q[:, 2])
+
+
+def test_few_false_alarms_and_true_ones(scores):
+    run, depth = scores
+    rng = np.random.default_rng(0)
+    normal = rng.normal(size=(200, 40, 3))
+    _, misfit = run(normal)
+    limit = diagnosis.MISFIT_SCORE
+    alarms = (np.abs(misfit) > limit).any(axis=(1, 2))
+    # 0.7 % expected: more than 6 of 200 in one of a thousand such tests.
+    assert alarms.sum() <= 6
+    # Standard normal scores have a spread of one.
+    assert (np.abs(np.asarray(misfit).std(axis=0) - 1) < 0.25).all()
+
+    heavy = normal.copy()
+    heavy[..., 2] = rng.standard_t(2.5, (200, 40))
+    grown = normal * np.where(np.arange(3) == 0, (depth / 30)[:, None] ** 1.5, 1.0)
+    drifting = normal.copy()
+    drifting[:, 1:, 1] = normal[:, 1:, 1] + 1.5 * normal[:, :-1, 1]
+    for errors, name, column in ((heavy, "tails", 2), (grown, "depth", 0), (drifting, "drift", 1)):
+        _, misfit = run(errors)
+        found = np.asarray(misfit)[:, MISFITS.index(name), column] > limit
+        assert found.mean() > 0.4, name
+
+
+def test_complaints_are_warnings_in_words():
+    data = problem(1, images=40, elevation_mm=1.0, noise_mm=0.5)
+    result = jaxcal.calibrate(data, "conventional")
+    assert not [text for text in result.warnings if "heavier tails" in text]
+    wild = replace(data, measurements=data.measurements.at[5, 1].add(3.0))
+    spoilt = jaxcal.calibrate(wild, "conventional")
+    assert any(
+        "noise model: the range errors have heavier tails" in text for text in spoilt.warnings
+    )
+    few = jaxcal.calibrate(problem(1, images=12), "conventional")
+    assert not few.inspection.misfit.any()
+    assert not diagnosis.noise_model(few)["checked"]
