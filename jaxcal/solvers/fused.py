@@ -271,26 +271,33 @@ class Circle(Belief):
 
 
 def contributions(
-    q: Vector, turned: Matrix, term: Term, gate: Float[Array, "lanes 1"]
+    q: Vector, turned: Matrix, term: Term, gate: Float[Array, "lanes 1"] | int
 ) -> tuple[Vector, Vector]:
-    """An image's part of the 45 curvatures and the 9 gradients, as planes (or structural 0)."""
+    """An image's part of the 45 curvatures and the 9 gradients, as planes (or structural 0).
+
+    The gate says how much of the second derivatives of q there is to be; 0 for none.
+    """
     g, k = term.gradient, term.curvature
     lever = unrolled.cross(q)
     across, forth = unrolled.product(k, lever), unrolled.product(k, turned)
     back, inverse = unrolled.transpose(lever), unrolled.transpose(turned)
     about, mixed = unrolled.product(back, across), unrolled.product(back, forth)
     point = unrolled.product(inverse, forth)
-    gated = [gate * value for value in g]
+    gated = [unrolled.times(gate, value) for value in g]
     inner = unrolled.dot(gated, q)
     twist = unrolled.product(unrolled.cross(gated), turned)
     full: Matrix = [[0] * UNKNOWNS for _ in range(UNKNOWNS)]
     for i in range(3):
         for j in range(3):
-            bent = 0.5 * (gated[i] * q[j] + gated[j] * q[i])
+            bent = unrolled.add(
+                unrolled.times(gated[i], 0.5 * q[j]), unrolled.times(gated[j], 0.5 * q[i])
+            )
+            if i == j:
+                bent = unrolled.add(bent, unrolled.times(-1, inner))
             full[i][j] = k[i][j]
             full[i][3 + j] = unrolled.times(-1, across[i][j])
             full[i][6 + j] = unrolled.times(-1, forth[i][j])
-            full[3 + i][3 + j] = about[i][j] + (bent - inner if i == j else bent)
+            full[3 + i][3 + j] = unrolled.add(about[i][j], bent)
             full[3 + i][6 + j] = unrolled.add(mixed[i][j], twist[i][j])
             full[6 + i][6 + j] = point[i][j]
     gradient = [unrolled.times(-1, value) for value in g]
@@ -326,19 +333,11 @@ class Normal(eqx.Module):
 
     def matrix(self) -> Matrix:
         """The full matrix, as rows of lanes."""
-        return symmetric(unrolled.rows_of(self.curvature))
+        return unrolled.symmetric(unrolled.rows_of(self.curvature))
 
     def diagonal(self) -> Float[Array, "9 lanes"]:
         """Its diagonal."""
         return jnp.stack([self.curvature[PAIRS.index((k, k))] for k in range(UNKNOWNS)])
-
-
-def symmetric(flat: Vector) -> Matrix:
-    """A full matrix from its upper triangle."""
-    full: Matrix = [[0] * UNKNOWNS for _ in range(UNKNOWNS)]
-    for (i, j), value in zip(PAIRS, flat, strict=True):
-        full[i][j] = full[j][i] = value
-    return full
 
 
 def accumulate(
@@ -358,11 +357,19 @@ def accumulate(
     curvature, gradient = contributions(q, turned, term, wide)
     sums = total([*curvature, *gradient, term.cost])
     gradient = sums[45:54]
-    # The (v, w) block of the second derivatives of q needs nothing but the summed gradient.
-    twist = unrolled.cross([-gate * value for value in gradient[:3]])
-    flat = sums[:45]
+    flat = with_twist(sums[:45], [gate * value for value in gradient[:3]])
+    return Normal(jnp.stack(flat), jnp.stack(gradient), sums[54])
+
+
+def with_twist(flat: Vector, gradient: Vector) -> Vector:
+    """A flat curvature with the (v, w) block of q's second derivatives, [sum g]x, added.
+
+    It needs nothing but the summed gradient along v, which is -sum g.
+    """
+    twist = unrolled.cross([-value for value in gradient])
+    flat = list(flat)
     for i in range(3):
         for j in range(3):
             place = PAIRS.index((i, 3 + j))
             flat[place] = unrolled.add(flat[place], twist[i][j])
-    return Normal(jnp.stack(flat), jnp.stack(gradient), sums[54])
+    return flat
