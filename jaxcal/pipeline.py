@@ -49,7 +49,7 @@ HELD_CHANNEL_SIGMA = (0.5, 1.0)
 """SDs of an element's distance and of the offset (mm), likewise."""
 
 
-class _Solution(eqx.Module):
+class Solution(eqx.Module):
     """What the methods have in common when they are done."""
 
     parameters: Parameters
@@ -68,14 +68,33 @@ class _Solution(eqx.Module):
 
 
 def solve_problem(problem: Problem, given: Given, plan: Plan) -> Calibration:
-    """Solve one problem (vmap it for a batch)."""
-    everything = problem
-    if plan.robust:
-        # Which images are left out is piecewise constant in the data: no derivative passes here.
-        agreed = find_consensus(jax.lax.stop_gradient(problem), rigid_model(plan.blocks))
-        problem = replace(problem, mask=agreed.keep)
+    """Solve one problem (vmap it for a batch); plain ones take :mod:`jaxcal.abreast` instead."""
+    everything, problem = problem, agreeing(problem, plan)
     frozen = jax.lax.stop_gradient((problem, given))
-    solution = _run_method(*frozen, plan)
+    return finish(_run_method(*frozen, plan), problem, everything, given, plan)
+
+
+def agreeing(problem: Problem, plan: Plan) -> Problem:
+    """The problem with only those images that agree, where the plan is to find them first."""
+    if not plan.robust:
+        return problem
+    # Which images are left out is piecewise constant in the data: no derivative passes here.
+    agreed = find_consensus(jax.lax.stop_gradient(problem), rigid_model(plan.blocks))
+    return replace(problem, mask=agreed.keep)
+
+
+def finish(
+    solution: Solution, problem: Problem, everything: Problem, given: Given, plan: Plan
+) -> Calibration:
+    """Derivatives, uncertainty and status of a solution.
+
+    Args:
+        solution: where the method stopped.
+        problem: the images in use.
+        everything: with those that were left out because they do not agree.
+        given: numbers that came with the request.
+        plan: what is static about it.
+    """
     # The solver saw constants; here its answer becomes a function of the data again.
     parameters, offset, prior = _attach(solution, problem, given, plan)
     averaged = None
@@ -148,7 +167,7 @@ def nominal_sound_speed(problem: Problem) -> Float[Array, ""]:
     return problem.sound_speed
 
 
-def _run_method(problem: Problem, given: Given, plan: Plan) -> _Solution:
+def _run_method(problem: Problem, given: Given, plan: Plan) -> Solution:
     options, blocks = plan.options, plan.blocks
     conventional = plan.method == "conventional"
     historical = options.solver == "gradient"
@@ -161,13 +180,13 @@ def _run_method(problem: Problem, given: Given, plan: Plan) -> _Solution:
     start = begun.fit.parameters
     prior = belief(problem, given, plan)
 
-    def solution(fit, prior: AbstractPrior, arrived, **others) -> _Solution:
+    def solution(fit, prior: AbstractPrior, arrived, **others) -> Solution:
         zero = jnp.zeros((), problem.mask.dtype)
         common = {
             "sigma_floored": jnp.zeros(3, bool), "variance_rounds": jnp.zeros((), jnp.int32),
             "rotation_change": zero, "translation_change": zero,
         }  # fmt: skip
-        return _Solution(
+        return Solution(
             parameters=fit.parameters, offset=fit.offset, prior=prior, cost=fit.cost,
             stationarity=fit.stationarity, arrived=arrived, iterations=fit.iterations,
             trace=fit.trace, searched_start=begun.searched, **(common | others),
@@ -208,7 +227,7 @@ def _run_method(problem: Problem, given: Given, plan: Plan) -> _Solution:
 
 
 def _attach(
-    solution: _Solution, problem: Problem, given: Given, plan: Plan
+    solution: Solution, problem: Problem, given: Given, plan: Plan
 ) -> tuple[Parameters, Array, AbstractPrior]:
     """The solution as a differentiable function of the problem (and of given numbers)."""
     reference, offset = solution.parameters, solution.offset
@@ -225,7 +244,7 @@ def _attach(
 
 
 def _assemble(
-    solution: _Solution,
+    solution: Solution,
     parameters: Parameters,
     offset: Float[Array, " k"],
     prior: AbstractPrior,
@@ -360,7 +379,7 @@ def _point_sd(parameters: Parameters, problem: Problem) -> Float[Array, 2]:
 
 
 def _status(
-    solution: _Solution,
+    solution: Solution,
     matrix: Float[Array, "4 4"],
     uncertainty: Uncertainty,
     parameters: Parameters,
@@ -382,7 +401,7 @@ def _status(
 
 
 def _differentiable(
-    solution: _Solution,
+    solution: Solution,
     uncertainty: Uncertainty,
     prior: AbstractPrior,
     offset: Float[Array, " k"],

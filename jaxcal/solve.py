@@ -7,13 +7,14 @@ shapes and options, and mapped over batches.
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxcal import abreast
 from jaxcal.calibration import Calibration
 from jaxcal.errors import InputError
 from jaxcal.options import (
@@ -31,7 +32,7 @@ from jaxcal.options import (
     with_bound,
 )
 from jaxcal.pipeline import solve_problem
-from jaxcal.problem import Problem
+from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import Recording
 
 BATCH_CHUNK = 64
@@ -167,17 +168,48 @@ def _solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None)
     if count and pieces * lanes != count:
         rows = jnp.arange(pieces * lanes) % count
         flat = jax.tree.map(lambda leaf: leaf[rows], flat)
-    result = _solve_chunks(flat, given, plan, lanes)
+    result = _chunks_program(flat, given, plan)(flat, given, plan, lanes)
     return jax.tree.map(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
 
 
 @partial(jax.jit, static_argnums=2)
 def _solve_jit(problem: Problem, given: Given, plan: Plan) -> Calibration:
-    return solve_problem(problem, given, plan)
+    if not abreast.plain(problem, given, plan):
+        return solve_problem(problem, given, plan)
+    alone = jax.tree.map(lambda leaf: leaf[None], problem)
+    result = abreast.solve_problems(alone, given, plan)
+    return jax.tree.map(lambda leaf: leaf[0], result)
 
 
-@partial(jax.jit, static_argnums=(2, 3))
-def _solve_chunks(problems: Problem, given: Given, plan: Plan, chunk: int) -> Calibration:
-    return jax.lax.map(
-        lambda problem: solve_problem(problem, given, plan), problems, batch_size=chunk
+def solve_chunks(problems: Problem, given: Given, plan: Plan, chunk: int) -> Calibration:
+    """Solve a batch whose size is a multiple of the chunk's (traceable)."""
+    if not abreast.plain(problems, given, plan):
+        return jax.lax.map(
+            lambda problem: solve_problem(problem, given, plan), problems, batch_size=chunk
+        )
+    count = problems.mask.shape[0]
+    if count == chunk:
+        return abreast.solve_problems(problems, given, plan)
+    apart = jax.tree.map(lambda leaf: leaf.reshape((-1, chunk, *leaf.shape[1:])), problems)
+    result = jax.lax.map(lambda part: abreast.solve_problems(part, given, plan), apart)
+    return jax.tree.map(lambda leaf: leaf.reshape((count, *leaf.shape[2:])), result)
+
+
+_solve_chunks = partial(jax.jit, static_argnums=(2, 3))(solve_chunks)
+
+
+@cache
+def _solve_chunks_fast(platform: str):
+    return jax.jit(
+        solve_chunks, static_argnums=(2, 3), compiler_options=abreast.compiler_options(platform)
     )
+
+
+def _chunks_program(problems: Problem, given: Given, plan: Plan):
+    """The compiled form: with its own compiler flags where JAX lets a program have some."""
+    leaves = jax.tree.leaves((problems, given))
+    # Flags belong to a whole program: none inside somebody else's jit, grad or vmap.
+    inside = any(is_traced(leaf) for leaf in (*leaves, jnp.zeros(())))
+    if inside or not abreast.plain(problems, given, plan):
+        return _solve_chunks
+    return _solve_chunks_fast(jax.default_backend())

@@ -15,12 +15,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxcal.model.parameters import BLOCK_SIZE, Blocks, Parameters, retract, size
+from jaxcal.model.parameters import BLOCK_SIZE, RIGID, Blocks, Parameters, retract, size
 from jaxcal.model.priors import AbstractPrior, ChannelGaussian, InPlane, channels_of
 from jaxcal.model.residuals import channel_residual, measured_points, measurement_residual
 from jaxcal.problem import Problem
 from jaxcal.solvers import arrow as arrows
 from jaxcal.solvers import dense
+from jaxcal.solvers.fused import Guess, Held, Images, accumulate
 from jaxcal.solvers.least_squares import linearise
 
 SINGULAR = 1e-11
@@ -103,11 +104,9 @@ def assess(
     threshold = jnp.maximum(SINGULAR, 100 * jnp.finfo(values.dtype).eps)
     singular = values[0] < threshold * values[-1]
 
-    none = jnp.zeros(0, problem.mask.dtype)
     channels = isinstance(prior, ChannelGaussian)
-    unweighted = ChannelGaussian(jnp.ones(2, none.dtype)) if channels else InPlane()
-    design, _, _ = linearise(parameters, none, unweighted, problem, blocks)
-    design_values, design_vectors = _spectrum(design.shared, scale)
+    design = _design(*jax.lax.stop_gradient((parameters, problem)), blocks, channels=channels)
+    design_values, design_vectors = _spectrum(design, scale)
     degenerate = design_values[0] < threshold * design_values[-1]
 
     weakest_sd = jnp.sqrt(variance / smallest)
@@ -132,6 +131,21 @@ def assess(
         at_bound=resting,
         weakest_hold=hold,
     )
+
+
+def _design(
+    parameters: Parameters, problem: Problem, blocks: Blocks, *, channels: bool
+) -> Float[Array, "p p"]:
+    """The information of the unweighted residuals, offsets taken as known."""
+    if blocks == RIGID and not channels:
+        alone = jax.tree.map(lambda leaf: leaf[None], (parameters, problem))
+        images = Images.of(alone[1])
+        held = Held(jnp.zeros_like(images.mask))
+        normal = accumulate(Guess.of(alone[0]), held, images, jnp.zeros_like(images.used))
+        return jnp.stack([jnp.stack(row) for row in normal.matrix()])[..., 0]
+    none = jnp.zeros(0, problem.mask.dtype)
+    unweighted = ChannelGaussian(jnp.ones(2, none.dtype)) if channels else InPlane()
+    return linearise(parameters, none, unweighted, problem, blocks)[0].shared
 
 
 def lever_arm(parameters: Parameters, problem: Problem) -> Float[Array, ""]:

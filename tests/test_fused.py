@@ -24,7 +24,7 @@ TIGHT = 1e-12
 
 @pytest.fixture(scope="module")
 def drawn():
-    """Problems and a start half a degree and half a mm off the truth; one image of each is left out."""
+    """Problems, one image left out of each, and a start half a degree and half a mm off."""
     protocol = Protocol(images=IMAGES, elevation_mm=2.0, noise_mm=1.0)
     keys = jax.random.split(jax.random.key(3), LANES)
     experiments = jax.jit(jax.vmap(partial(simulate, protocol=protocol)))(keys)
@@ -119,6 +119,7 @@ def test_a_lost_lane_leaves_its_neighbours_alone(drawn):
     images = Images(**(vars(images) | {"lateral": spoilt}))
     broken = run(guess, belief, images)
     others = np.delete(np.arange(LANES), 2)
-    assert np.isnan(broken.normal.cost[2]) and not broken.active[2]
+    assert np.isnan(broken.normal.cost[2])
+    assert not broken.active[2]
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(broken), strict=True):
         assert np.array_equal(np.asarray(a)[..., others], np.asarray(b)[..., others])

@@ -14,7 +14,6 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 MAX_SWEEPS = 30
@@ -105,7 +104,7 @@ def _column(matrix: Float[Array, "m q"], k: Array) -> Float[Array, " m"]:
 
 
 class SingularValues(eqx.Module):
-    """A = U diag(values) V', values ascending.
+    """A = U diag(values) V', values ascending; a batch has its lanes last while it is computed.
 
     Attributes:
         scaled_left: (m, p) U diag(values).
@@ -113,75 +112,84 @@ class SingularValues(eqx.Module):
         right: (p, p) V.
     """
 
-    scaled_left: Float[Array, "m p"]
-    values: Float[Array, " p"]
-    right: Float[Array, "p p"]
+    scaled_left: Float[Array, "m p *lanes"]
+    values: Float[Array, p * lanes]
+    right: Float[Array, "p p *lanes"]
 
 
+@jax.custom_batching.custom_vmap
 def singular_values(matrix: Float[Array, "m p"]) -> SingularValues:
     """Singular value decomposition by one-sided Jacobi rotations.
 
     Of a symmetric positive semidefinite matrix this is the eigenvalue decomposition. Not
-    differentiable in reverse mode.
+    differentiable in reverse mode. A batch is decomposed side by side, its axis innermost.
     """
-    columns = matrix.shape[1]
+    return jax.tree.map(lambda leaf: leaf[..., 0], _side_by_side(matrix[..., None]))
+
+
+@singular_values.def_vmap
+def _singular_values_batch(size: int, batched: list, matrix: Array) -> tuple:
+    del size, batched
+    found = _side_by_side(jnp.moveaxis(matrix, 0, -1))
+    found = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), found)
+    return found, jax.tree.map(lambda _: True, found)
+
+
+def _side_by_side(matrix: Array) -> SingularValues:
+    """The decompositions of (m, p, lanes) matrices, lanes last throughout.
+
+    Columns meet in pairs as in a round-robin tournament: the first player stays, the others move
+    round by one seat, and after one round less than there are seats all are where they were.
+    """
+    height, columns, lanes = matrix.shape
     even = columns + columns % 2
-    work = jnp.pad(matrix, ((0, 0), (0, even - columns)))
-    together = jnp.concatenate([work, jnp.eye(even, dtype=matrix.dtype)])
-    height = matrix.shape[0]
-    order = _next_pairs(even)
+    work = jnp.pad(matrix, ((0, 0), (0, even - columns), (0, 0)))
+    eye = jnp.broadcast_to(jnp.eye(even, dtype=matrix.dtype)[..., None], (even, even, lanes))
+    together = jnp.concatenate([work, eye])
     tolerance = 4 * jnp.finfo(matrix.dtype).eps
 
     def one_round(_: Array, state: tuple) -> tuple:
-        together, largest = state
-        pairs = together.reshape(-1, even // 2, 2)
-        first, second = pairs[..., 0], pairs[..., 1]
+        first, second, largest = state
         a, b = jnp.sum(first[:height] ** 2, axis=0), jnp.sum(second[:height] ** 2, axis=0)
         mixed = jnp.sum(first[:height] * second[:height], axis=0)
         length = jnp.sqrt(a) * jnp.sqrt(b)
         cosine_between = jnp.abs(mixed) / jnp.where(length > 0, length, 1.0)
         turn = cosine_between > tolerance
         zeta = (b - a) / jnp.where(turn, 2 * mixed, 1.0)
-        tangent = jnp.where(zeta < 0, -1.0, 1.0) / (jnp.abs(zeta) + jnp.hypot(1.0, zeta))
+        tangent = jnp.where(zeta < 0, -1.0, 1.0) / (jnp.abs(zeta) + jnp.sqrt(1 + zeta**2))
         tangent = jnp.where(turn, tangent, 0.0)
         cosine = 1 / jnp.sqrt(1 + tangent**2)
         sine = cosine * tangent
-        turned = jnp.stack([cosine * first - sine * second, sine * first + cosine * second], -1)
-        together = turned.reshape(together.shape)[:, order]
-        return together, jnp.maximum(largest, jnp.max(cosine_between))
+        first, second = cosine * first - sine * second, sine * first + cosine * second
+        if even > 2:
+            first, second = (
+                jnp.concatenate([first[:, :1], second[:, :1], first[:, 1:-1]], axis=1),
+                jnp.concatenate([second[:, 1:], first[:, -1:]], axis=1),
+            )
+        return first, second, jnp.maximum(largest, jnp.max(cosine_between, axis=0))
 
     def unfinished(state: tuple) -> Bool[Array, ""]:
-        _, largest, sweeps = state
-        return (largest > tolerance) & (sweeps < MAX_SWEEPS)
+        _, _, largest, sweeps = state
+        return jnp.any(largest > tolerance) & (sweeps < MAX_SWEEPS)
 
     def sweep(state: tuple) -> tuple:
-        together, _, sweeps = state
-        none = jnp.zeros((), matrix.dtype)
-        together, largest = jax.lax.fori_loop(0, even - 1, one_round, (together, none))
-        return together, largest, sweeps + 1
+        first, second, _, sweeps = state
+        none = jnp.zeros(lanes, matrix.dtype)
+        first, second, largest = jax.lax.fori_loop(0, even - 1, one_round, (first, second, none))
+        return first, second, largest, sweeps + 1
 
-    start = (together, jnp.ones((), matrix.dtype), jnp.zeros((), jnp.int32))
-    together, _, _ = jax.lax.while_loop(unfinished, sweep, start)
+    start = (
+        together[:, 0::2], together[:, 1::2], jnp.ones(lanes, matrix.dtype),
+        jnp.zeros((), jnp.int32),
+    )  # fmt: skip
+    first, second, _, _ = jax.lax.while_loop(unfinished, sweep, start)
     # After whole sweeps every column is where it was, so the padding is the last one again.
-    together = together[:, :columns]
+    together = jnp.stack([first, second], axis=2).reshape(together.shape)[:, :columns]
     values = jnp.sqrt(jnp.sum(together[:height] ** 2, axis=0))
-    ascending = jnp.argsort(values)
-    together = together[:, ascending]
-    return SingularValues(together[:height], values[ascending], together[height : height + columns])
-
-
-def _next_pairs(count: int) -> np.ndarray:
-    """The round-robin permutation: pairs (0, 1), (2, 3), ... meet all others in count - 1 rounds.
-
-    Two rows of a tournament table: the first player stays, the others move round by one seat.
-    """
-    seats = np.arange(count).reshape(-1, 2)
-    top, bottom = seats[:, 0], seats[:, 1]
-    if count == 2:
-        return np.arange(2)
-    new_top = np.concatenate([top[:1], bottom[:1], top[1:-1]])
-    new_bottom = np.concatenate([bottom[1:], top[-1:]])
-    return np.stack([new_top, new_bottom], axis=1).ravel()
+    ascending = jnp.argsort(values, axis=0)
+    values = jnp.take_along_axis(values, ascending, axis=0)
+    together = jnp.take_along_axis(together, ascending[None], axis=1)
+    return SingularValues(together[:height], values, together[height : height + columns])
 
 
 def inverse_positive(matrix: Float[Array, "p p"]) -> tuple[Float[Array, "p p"], Float[Array, ""]]:

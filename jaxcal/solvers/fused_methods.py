@@ -4,9 +4,9 @@ They are :func:`jaxcal.solvers.conventional.from_scratch` and
 :func:`jaxcal.solvers.alternating.alternate` for points with known scales; those are the reference.
 
 The closed-form start needs the images once: the normal matrix of its 12 unknowns (a1, a3, t, c)
-consists of sums of x, z, their products and the rotations. Columns of length near 1 and a pivot well
-above rounding make it sound; where it is not, t and c for each rotation of the cube follow from the
-same sums, and the best of the fits from there is the answer.
+consists of sums of x, z, their products and the rotations. Columns of length near 1 and a pivot
+well above rounding make it sound; where it is not, t and c for each rotation of the cube follow
+from the same sums, and the best of the fits from there is the answer.
 """
 
 from __future__ import annotations
@@ -60,11 +60,10 @@ class _Moments(eqx.Module):
 
 def _moments(images: Images) -> _Moments:
     count = images.used
-    mean = [jnp.sum(images.mask * plane, axis=1) / count
-            for plane in (images.lateral, images.distance)]  # fmt: skip
+    points = [images.lateral, images.distance]
+    mean = [jnp.sum(images.mask * plane, axis=1) / count for plane in points]
     centre = [jnp.sum(images.mask * plane, axis=1) / count for plane in images.origin]
-    x, z = (images.mask * (plane - middle[:, None])
-            for plane, middle in zip((images.lateral, images.distance), mean, strict=True))  # fmt: skip
+    x, z = (images.mask * (p - m[:, None]) for p, m in zip(points, mean, strict=True))
     away = [c[:, None] - plane for plane, c in zip(images.origin, centre, strict=True)]
     turn = [[images.rotation[3 * i + j] for j in range(3)] for i in range(3)]
     back = unrolled.apply(unrolled.transpose(turn), away)
@@ -79,7 +78,7 @@ def _moments(images: Images) -> _Moments:
 
 
 def _rest(rotation: Matrix, moments: _Moments) -> Guess:
-    """t and c by linear least squares with X's rotation held."""
+    """X's origin and the target by linear least squares with X's rotation held."""
     zero, count = jnp.zeros_like(moments.count), moments.count
     lateral, axial = ([row[k] for row in rotation] for k in (0, 2))
     (x, z), centre = moments.mean, moments.centre
@@ -230,7 +229,7 @@ def alternate(
         return apart(guess.moved(unrolled.rows_of(apart(jnp.stack(move))))), held
 
     def one_round(state: tuple) -> tuple:
-        guess, rounds, turned, moved = state
+        guess, rounds, _, _ = state
         held = Held(apart(closest_offsets(guess, bound, images)))
         after, _ = jax.lax.fori_loop(0, inner_steps, gauss_newton, (guess, held))
         chord = jnp.sqrt(jnp.sum((guess.rotation - after.rotation) ** 2, axis=(0, 1)))

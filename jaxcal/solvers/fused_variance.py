@@ -195,7 +195,9 @@ class _Model(eqx.Module):
         scale = together(scale)
 
         def scaled(flat: Vector) -> Matrix:
-            return symmetric([v * scale[i] * scale[j] for (i, j), v in zip(PAIRS, flat, strict=True)])
+            return symmetric(
+                [v * scale[i] * scale[j] for (i, j), v in zip(PAIRS, flat, strict=True)]
+            )
 
         unit = symmetric(together(unrolled.upper(scaled(unrolled.upper(plain)))))
         for k in range(UNKNOWNS):

@@ -33,7 +33,8 @@ class Descent(eqx.Module):
     Attributes:
         guess: the best place so far. normal: the normal equations there. gate: 1 where their
             curvature is exact. damping: Marquardt's lambda. idle: steps without a gain.
-        iterations: passes. cosine: the gradient cosine. active: whether a lane goes on.
+        iterations: passes. cosine: the gradient cosine. settled: arrived, as far as rounding
+            allows. active: whether a lane goes on.
     """
 
     guess: Guess
@@ -43,6 +44,7 @@ class Descent(eqx.Module):
     idle: Int[Array, " lanes"]
     iterations: Int[Array, " lanes"]
     cosine: Float[Array, " lanes"]
+    settled: Bool[Array, " lanes"]
     active: Bool[Array, " lanes"]
 
 
@@ -73,7 +75,7 @@ def gradient_cosine(normal: Normal, vanished: Float[Array, " lanes"]) -> Float[A
     return jnp.where(normal.cost <= vanished, 0.0, cosine)
 
 
-def choose(which: Bool[Array, " lanes"], first, second):
+def choose(which: Bool[Array, "*lanes"], first, second):
     """Lane by lane one of two pytrees whose last axis counts the lanes."""
     return jax.tree.map(lambda a, b: jnp.where(which, a, b), first, second)
 
@@ -97,7 +99,8 @@ def begin(
     cosine = gradient_cosine(normal, rounding.vanished)
     none = jnp.zeros(zero.shape, jnp.int32)
     return Descent(
-        guess, normal, zero, zero + damping, none, none + 1, cosine, cosine > tolerance
+        guess, normal, zero, zero + damping, none, none + 1, cosine, cosine <= tolerance,
+        cosine > tolerance,
     )  # fmt: skip
 
 
@@ -147,7 +150,7 @@ def step(
     stuck = (idle >= IDLE) | (damping > 1e12) | (iterations >= max_steps)
     after = Descent(
         *found, damping, jnp.where(accept, idle, state.idle), iterations, cosine,
-        (cosine > tolerance) & jnp.logical_not(stuck),
+        (cosine <= 10 * tolerance) | (idle >= IDLE), (cosine > tolerance) & jnp.logical_not(stuck),
     )  # fmt: skip
     return choose(state.active, after, state)
 
