@@ -113,7 +113,7 @@ class SingularValues(eqx.Module):
     """
 
     scaled_left: Float[Array, "m p *lanes"]
-    values: Float[Array, p * lanes]
+    values: Float[Array, " p *lanes"]
     right: Float[Array, "p p *lanes"]
 
 

@@ -225,16 +225,21 @@ class Circle(Belief):
         prior = (1 / (self.offset_sd * self.offset_sd))[:, None]
         limit = jnp.minimum(self.bound, LARGEST_ELEVATION * jnp.abs(images.distance))
         y = jnp.clip(across * q[1] / (across + prior), -limit, limit)
-        for step in range(self.steps + 1):
+
+        def at(y: Array) -> tuple[Array, ...]:
             inverse = jax.lax.rsqrt(images.distance**2 - y * y)
             slope = -y * inverse
             error = q[2] - (images.distance**2 - y * y) * inverse
             gradient = across * (y - q[1]) - axial * error * slope + prior * y
             plain = across + axial * slope * slope + prior
             exact = plain + axial * error * images.distance**2 * inverse**3
-            if step < self.steps:
-                newton = gradient / jnp.where(exact > 0.1 * plain, exact, plain)
-                y = jnp.clip(y - newton, -limit, limit)
+            return gradient, plain, exact, slope, error
+
+        for _ in range(self.steps):
+            gradient, plain, exact, _, _ = at(y)
+            newton = gradient / jnp.where(exact > 0.1 * plain, exact, plain)
+            y = jnp.clip(y - newton, -limit, limit)
+        gradient, plain, exact, slope, error = at(y)
         held = ((y >= limit) & (gradient < 0)) | ((y <= -limit) & (gradient > 0))
         return y, gradient, plain, exact, slope, error, held
 

@@ -74,7 +74,11 @@ def _moments(images: Images) -> _Moments:
     sums = unrolled.rows_of(apart(jnp.stack(total(planes))))
     parts = [sums[3 + 12 * k : 15 + 12 * k] for k in range(3)]
     matrices = [[part[3 * i : 3 * i + 3] for i in range(3)] for part in parts]
-    return _Moments(count, mean, centre, *sums[:3], *matrices, [part[9:] for part in parts])
+    lateral, axial, rotation = matrices
+    pulled = [part[9:] for part in parts]
+    return _Moments(
+        count, mean, centre, sums[0], sums[1], sums[2], lateral, axial, rotation, pulled
+    )
 
 
 def _rest(rotation: Matrix, moments: _Moments) -> Guess:

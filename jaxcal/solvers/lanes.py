@@ -143,13 +143,14 @@ def step(
     raised = jnp.maximum(10 * state.damping, 1e-8)
     idle = jnp.where(decrease > noise, 0, state.idle + 1)
 
-    found = choose(accept, (guess, normal, gate), (state.guess, state.normal, state.gate))
-    cosine = gradient_cosine(found[1], rounding.vanished)
+    before = (state.guess, state.normal, state.gate)
+    guess, normal, gate = choose(accept, (guess, normal, gate), before)
+    cosine = gradient_cosine(normal, rounding.vanished)
     iterations = state.iterations + 1
     damping = jnp.where(accept & ~(lost & (state.gate == 0)), factor * state.damping, raised)
     stuck = (idle >= IDLE) | (damping > 1e12) | (iterations >= max_steps)
     after = Descent(
-        *found, damping, jnp.where(accept, idle, state.idle), iterations, cosine,
+        guess, normal, gate, damping, jnp.where(accept, idle, state.idle), iterations, cosine,
         (cosine <= 10 * tolerance) | (idle >= IDLE), (cosine > tolerance) & jnp.logical_not(stuck),
     )  # fmt: skip
     return choose(state.active, after, state)
