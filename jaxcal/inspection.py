@@ -32,7 +32,7 @@ from jaxcal.model.priors import AbstractPrior, Gaussian
 from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.problem import Problem
 from jaxcal.solvers import arrow as arrows
-from jaxcal.solvers.consensus import CUT, FEWEST_IMAGES, departures, rigid_model
+from jaxcal.solvers.consensus import FEWEST_IMAGES, departures, rigid_model, stands_out
 from jaxcal.solvers.least_squares import linearise
 from jaxcal.uncertainty import unit_scale
 
@@ -104,7 +104,7 @@ def inspect(
         outlier = used * (1 - problem.mask)
     else:
         judged = (jnp.sum(used) >= FEWEST_IMAGES) & jnp.all(jnp.isfinite(departure))
-        outlier = used * judged * jnp.any(jnp.abs(departure) > CUT, axis=1)
+        outlier = used * judged * stands_out(departure, problem.mask)
     kurtosis, misfit = check_noise_model(parameters, offset, prior, problem, blocks)
     gain = gains(parameters, problem, blocks, sigma, weakest)
     return Inspection(outlier, departure, kurtosis, misfit, gain)

@@ -29,7 +29,7 @@ from jaxcal.model.residuals import circle_residual
 from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES
 from jaxcal.solvers import dense
-from jaxcal.solvers.consensus import CUT, FEWEST_IMAGES, Model, departures, find_consensus
+from jaxcal.solvers.consensus import FEWEST_IMAGES, Model, departures, find_consensus, stands_out
 from jaxcal.solvers.least_squares import minimise
 from jaxcal.uncertainty import LARGEST_SD, assess
 
@@ -165,7 +165,7 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
     outlier = mask * (1 - keep)
     if not robust:
         judged = jnp.sum(mask) >= FEWEST_IMAGES
-        outlier = mask * judged * jnp.any(jnp.abs(departure) > CUT, axis=1)
+        outlier = mask * judged * stands_out(departure, keep)
     residual = circle_residual(parameters, jnp.zeros_like(mask), problem)
     used = jnp.sum(keep)
     variance = jnp.sum(residual**2) / jnp.maximum(3 * used - 6, 1.0)

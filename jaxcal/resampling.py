@@ -52,6 +52,7 @@ class CrossValidation(eqx.Module):
             covariance.
         image_to_probe: (folds, 4, 4) X of each fold.
         converged: (folds,) whether its solve converged.
+        fold_cost: (n,) minimised objective of the calibration that held the image out.
         mask: (n,) 1 for used images.
     """
 
@@ -64,6 +65,7 @@ class CrossValidation(eqx.Module):
     influence: Float[Array, " n"]
     image_to_probe: Float[Array, "folds 4 4"]
     converged: Float[Array, " folds"]
+    fold_cost: Float[Array, " n"]
     mask: Float[Array, " n"]
 
 
@@ -138,6 +140,7 @@ def cross_validate(
         influence=_in_sds(moved, jnp.asarray(result.covariance)),
         image_to_probe=fits.image_to_probe,
         converged=fits.converged.astype(mask.dtype),
+        fold_cost=held.cost,
         mask=mask,
     )
 

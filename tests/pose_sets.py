@@ -56,7 +56,7 @@ def make(kind: str, seed: int, elevation: float, noise: float) -> PoseSet:
     offset = elevation * rng.normal(size=count)
     rotations = _turned(rng, count, largest)
     if kind == "parallel":
-        rotations = np.tile(Rotation.random(random_state=rng).as_matrix(), (count, 1, 1))
+        rotations = np.tile(Rotation.from_quat(rng.normal(size=4)).as_matrix(), (count, 1, 1))
     elif kind == "one-axis":
         rotations = _turned(rng, count, largest, rng.normal(size=3))
     elif kind in ("one-pose", "two-poses"):
@@ -74,7 +74,10 @@ def make(kind: str, seed: int, elevation: float, noise: float) -> PoseSet:
         sides = np.array([rng.choice([-25.0, 20.0]), rng.choice([15.0, 75.0])])
         lateral, depth = sides[:, None] + rng.uniform(0, 8, (2, count))
     x = np.eye(4)
-    x[:3, :3], x[:3, 3] = Rotation.random(random_state=rng).as_matrix(), 50 * rng.normal(size=3)
+    x[:3, :3], x[:3, 3] = (
+        Rotation.from_quat(rng.normal(size=4)).as_matrix(),
+        50 * rng.normal(size=3),
+    )
     target = 100 * rng.normal(size=3)
     q = np.stack([lateral, offset, depth], axis=1)
     poses = np.tile(np.eye(4), (IMAGES, 1, 1))

@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pose_sets import DEGENERATE, WEAK, PoseSet, make
+from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal.model.parameters import RIGID
-from jaxcal.resampling import _parameters
-from jaxcal.uncertainty import unit_scale
 
 KNOWN = 0.25
 """Relative SD of the weakest direction (to the lever arm) below which a set must be solved; the
@@ -25,24 +23,16 @@ elevations = st.one_of(st.just(0.0), st.floats(0.05, 5.0))
 noises = st.one_of(st.just(0.0), st.floats(0.02, 2.0))
 
 
-def solve(posed: PoseSet, method: str = "joint") -> tuple[jaxcal.Calibration, jaxcal.Problem]:
+def solve(posed: PoseSet) -> jaxcal.Calibration:
     data = jaxcal.Problem.from_arrays(posed.poses, posed.points, mask=posed.mask)
-    return jaxcal.calibrate(data, method), data
+    return jaxcal.calibrate(data)
 
 
-def in_true_frame(result: jaxcal.Calibration, data: jaxcal.Problem) -> np.ndarray:
-    """The weakest direction in the solution's units, which the truth's are but for noise."""
-    scale = np.asarray(unit_scale(_parameters(result, data), data, RIGID))
-    direction = np.asarray(result.weakest) / scale
-    lever = scale[3]
-    return direction * np.array([1, 1, 1, lever, lever, lever, 1, 1, 1])
-
-
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=50, deadline=None, derandomize=True)
 @given(kinds, st.integers(0, 10**6), elevations, noises)
 def test_no_set_is_misjudged(kind, seed, elevation, noise):
     posed = make(kind, seed, elevation, noise)
-    result, _ = solve(posed)
+    result = solve(posed)
     assert posed.deficient == (kind in DEGENERATE)
     if posed.deficient:
         assert result.status == "unobservable"
@@ -62,7 +52,7 @@ def test_no_set_is_misjudged(kind, seed, elevation, noise):
 def test_the_named_direction_is_one_that_the_images_do_not_see(kind):
     for seed in range(5):
         posed = make(kind, seed, 0.5, 0.1)
-        result, _ = solve(posed)
+        result = solve(posed)
         words = str(result.observability["weakest_direction"])
         if kind == "line-in-plane":
             assert words.startswith("rotation about the lateral axis") or "translation" in words
@@ -78,9 +68,9 @@ def test_the_named_direction_is_one_that_the_images_do_not_see(kind):
 
 def test_weak_sets_tell_their_sd_and_what_to_add():
     cone = make("cone", 3, 1.0, 0.3)
-    result, _ = solve(cone)
+    result = solve(cone)
     assert result.status == "converged"
-    told = float(result.observability["weakest_sd_mm"])
+    told = float(result.weakest_sd)
     lever = np.sqrt((cone.points[cone.mask] ** 2).sum() / cone.mask.sum())
     assert told == pytest.approx(cone.relative_sd * lever, rel=0.6)
     advice = str(result.observability["advice"])
@@ -93,14 +83,12 @@ def test_weak_sets_tell_their_sd_and_what_to_add():
 def test_following_the_advice_helps():
     """One image of the kind that is advised lowers the weakest SD more than one that is not."""
     cone = make("cone", 5, 1.0, 0.3)
-    result, _ = solve(cone)
+    result = solve(cone)
     gain = np.asarray(result.inspection.gain)
     best, worst = int(np.argmax(gain[:3])), int(np.argmin(gain[:3]))
     assert gain[best] > 2 * gain[worst]
 
     def with_tilt(axis: int) -> float:
-        from scipy.spatial.transform import Rotation
-
         x, point = np.asarray(result.image_to_probe), np.asarray(result.point)
         poses, points = cone.poses.copy(), cone.points.copy()
         for row, angle in ((38, 25), (39, -25)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +15,7 @@ import jaxcal
 from jaxcal.cli.main import main
 from jaxcal.resampling import bootstrap, cross_validate, relative_twist
 
-CONVENTIONAL = {"method": "conventional"}
+CONVENTIONAL: dict[str, Any] = {"method": "conventional"}
 
 
 @pytest.fixture(scope="module")

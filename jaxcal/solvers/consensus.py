@@ -48,6 +48,8 @@ CONCENTRATION_STEPS = 6
 REJECTION_STEPS = 10
 CUT = 6.0
 """SDs beyond which an image stands out. Heavy tails (Student's t4) put 0.3 % of images there."""
+FEW_WIDEN = 60.0
+"""With n images in use the limit is CUT (1 + 60 / n^2): 8.5 SDs for 12, 6.1 for 50."""
 SEED = 20261121
 FEWEST_IMAGES = 8
 """With fewer used images nothing is left out: they cannot outvote one another."""
@@ -159,7 +161,7 @@ def _reject(parameters: Parameters, problem: Problem, model: Model) -> Consensus
         parameters, weight = state
         errors, jacobian = _linearise(parameters, problem, model)
         sigma, departure = _depart(errors, jacobian, weight, model)
-        fits = used * jnp.all(jnp.abs(departure) <= CUT, axis=1)
+        fits = used * (1 - stands_out(departure, weight))
         # A consensus of less than half is none.
         fits = jnp.where(jnp.sum(fits) >= fewest, fits, weight)
         return _step(parameters, errors, jacobian, sigma, fits, model), fits
@@ -187,6 +189,15 @@ def departures(
     """
     errors, jacobian = _linearise(parameters, problem, model)
     return _depart(errors, jacobian, keep, model)
+
+
+def stands_out(departure: Float[Array, "n 3"], keep: Float[Array, " n"]) -> Float[Array, " n"]:
+    """1 where an image departs by more than the images in use can explain.
+
+    A median of a dozen images is itself uncertain: with few of them the limit is wider.
+    """
+    limit = CUT * (1 + FEW_WIDEN / jnp.sum(keep) ** 2)
+    return jnp.any(jnp.abs(departure) > limit, axis=1).astype(keep.dtype)
 
 
 def _depart(
