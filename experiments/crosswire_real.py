@@ -1,11 +1,11 @@
 """The real cross-wire recording: how large its errors are, of what kind, and what to make of it.
 
 54 hand-picked points with unknown pixel size (a public recording, not part of this repository:
-``../../shared/data/crosswire`` or the folder that is named). Conventional least squares takes all
-three errors for equal; the joint method estimates an SD for each. Which of the two predicts an image
-that it has not seen better is told by the leave-one-out log density, image by image; the kurtosis
-of the standardised residuals tells of heavy tails. The pivot recordings that lie beside it (the same
-tool with and without about 30 % outliers) follow.
+the folder ``shared/data/crosswire`` beside it, or the one that is named). Conventional least
+squares takes all three errors for equal; the joint method estimates an SD for each. Which of the
+two predicts an image that it has not seen better is told by the leave-one-out log density, image by
+image; the kurtosis of the standardised residuals tells of heavy tails. The pivot recordings that
+lie beside it (the same tool with and without about 30 % outliers) follow.
 
 There is nothing random in it.
 """

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal import diagnosis
 from jaxcal.errors import CalibrationError
+from jaxcal.geometry import AnyArray
 from jaxcal.inspection import Inspection
 from jaxcal.model.parameters import Blocks
 from jaxcal.problem import is_traced
@@ -146,12 +147,12 @@ class Calibration(eqx.Module):
         return str(chosen) if chosen.ndim == 0 else chosen
 
     @property
-    def outlier(self) -> Float[Array, "*batch n"]:
+    def outlier(self) -> Float[AnyArray, "*batch n"]:
         """1 where an image does not fit the rest; a robust solve leaves it out."""
         return self.inspection.outlier
 
     @property
-    def departure(self) -> Float[Array, "*batch n 3"]:
+    def departure(self) -> Float[AnyArray, "*batch n 3"]:
         """Each image's lateral, range and elevational errors in robust SDs of those in use."""
         return self.inspection.departure
 

@@ -48,8 +48,8 @@ CONCENTRATION_STEPS = 6
 REJECTION_STEPS = 10
 CUT = 6.0
 """SDs beyond which an image stands out. Heavy tails (Student's t4) put 0.3 % of images there."""
-FEW_WIDEN = 60.0
-"""With n images in use the limit is CUT (1 + 60 / n^2): 8.5 SDs for 12, 6.1 for 50."""
+FEW_IMAGES = 30
+"""With fewer images in use, n, the limit is wider by sqrt(30 / n): 9.5 SDs for a dozen."""
 SEED = 20261121
 FEWEST_IMAGES = 8
 """With fewer used images nothing is left out: they cannot outvote one another."""
@@ -196,7 +196,7 @@ def stands_out(departure: Float[Array, "n 3"], keep: Float[Array, " n"]) -> Floa
 
     A median of a dozen images is itself uncertain: with few of them the limit is wider.
     """
-    limit = CUT * (1 + FEW_WIDEN / jnp.sum(keep) ** 2)
+    limit = CUT * jnp.sqrt(jnp.maximum(FEW_IMAGES / jnp.maximum(jnp.sum(keep), 1.0), 1.0))
     return jnp.any(jnp.abs(departure) > limit, axis=1).astype(keep.dtype)
 
 
