@@ -13,8 +13,8 @@ their SD does, heavy tails must not pull it, and a mean that is denied bends it.
    more probable are.
 3. *Laws* (:mod:`jaxcal.model.shapes`). Linearised there, everything is Gaussian but the offsets'
    law. Expectation propagation gives X under each law of :data:`SHAPES` and how probable the data
-   are under it: uniform, a bell with edges, Gaussian, Student's t4, each with a few SDs about
-   REML's, for REML knows the edges to a few per cent only, and it is they that matter. Where an
+   are under it: uniform, a bell with edges, Gaussian, Student's t4; the uniform one with three SDs
+   about REML's, which knows the edges to a few per cent only, and it is they that matter. Where an
    image came with a bound on its offset, its law is cut there.
 4. *Average*. X, target and mean are the laws' averages, weighted by their probability; so is the
    covariance, with the spread between the laws added. A law under which the propagation does not
@@ -51,24 +51,22 @@ from jaxcal.solvers.expectation_propagation import propagate
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING
 
 UNIFORM: tuple[Shape, ...] = tuple(
-    Shape("uniform", stretch, 1 / 16) for stretch in (0.90, 0.96, 1.03, 1.12)
+    Shape("uniform", stretch, 1 / 12) for stretch in (0.96, 1.03, 1.12)
 )
 """Flat between edges that are a little uncertain."""
 
 SHAPES: tuple[Shape, ...] = (
     *UNIFORM,
-    Shape("bell", 0.95, 1 / 8),
-    Shape("bell", 1.05, 1 / 8),
+    Shape("bell", 1.05, 1 / 4),
     Shape("gaussian", 1.0, 1 / 4),
-    Shape("student", 0.92, 1 / 8),
-    Shape("student", 1.10, 1 / 8),
+    Shape("student", 1.10, 1 / 4),
 )
-"""The laws that are weighed, a quarter for each family."""
+"""The laws that are weighed, a quarter for each family. More of them gain nothing."""
 
 LOG_ODDS_OF_MEAN = float(np.log(9.0))
 """How much more probable the data must be with a mean: it is one more thing to be wrong about."""
 
-LARGEST_CHANGE = 0.05
+LARGEST_CHANGE = 0.1
 """A law counts where the last sweep moved no unknown by more than this many SDs."""
 
 

@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 from jaxcal.model.shapes import Family, Moments, tilted
 from jaxcal.solvers import dense
 
-SWEEPS = 10
+SWEEPS = 8
 DAMPING = 0.7
 
 

@@ -1,0 +1,199 @@
+"""Prior auto: the laws' moments, expectation propagation, evidence, intervals, and the whole."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import problem
+from scipy.integrate import quad
+from scipy.stats import multivariate_normal, norm, t, uniform
+
+import jaxcal
+from jaxcal import InputError
+from jaxcal.intervals import degrees_of_freedom
+from jaxcal.model.shapes import FAMILIES, tilted
+from jaxcal.solvers.dense import inverse_positive
+from jaxcal.solvers.expectation_propagation import Linear, propagate
+
+DENSITY = {
+    "uniform": uniform(-(3**0.5), 2 * 3**0.5).pdf,
+    "bell": lambda u: np.where(u**2 < 7, 15 / (16 * 7**0.5) * (1 - u**2 / 7) ** 2, 0.0),
+    "gaussian": norm.pdf,
+    "student": t(4, scale=0.5**0.5).pdf,
+}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("cut", [None, (-0.4, 0.9)])
+def test_moments_are_those_of_the_product(family, cut):
+    sd = 2.0
+    low, high = (-30.0, 30.0) if cut is None else cut
+    edges = [-(7**0.5) * sd, -(3**0.5) * sd, 3**0.5 * sd, 7**0.5 * sd]
+    for mean, variance in ((0.3, 0.2), (3.0, 0.3), (-4.2, 0.5), (1.0, 4.0)):
+
+        def product(u: float, power: int, mean=mean, variance=variance) -> float:
+            gauss = norm.pdf(u, mean, np.sqrt(variance))
+            return u**power * DENSITY[family](u / sd) / sd * gauss
+
+        points = [p for p in (*edges, mean) if low < p < high]
+        moment = [quad(product, low, high, args=(k,), points=points, limit=200, epsabs=0)[0]
+                  for k in range(3)]  # fmt: skip
+        bounds = (None, None) if cut is None else tuple(jnp.full(1, end) for end in cut)
+        one = jnp.ones((1, 1))
+        found = tilted(family, jnp.full(1, sd), mean * one, variance * one, *bounds)
+        true_mean = moment[1] / moment[0]
+        true_variance = moment[2] / moment[0] - true_mean**2
+        assert float(found.log_mass[0, 0]) == pytest.approx(np.log(moment[0]), abs=3e-3)
+        assert float(found.mean[0, 0]) == pytest.approx(true_mean, abs=2e-3)
+        assert float(found.variance[0, 0]) == pytest.approx(true_variance, rel=0.02)
+
+
+def test_inverse_and_determinant_of_a_positive_matrix():
+    rng = np.random.default_rng(0)
+    design = rng.normal(size=(20, 10)) * np.logspace(-3, 3, 10)
+    matrix = design.T @ design
+    inverse, log_determinant = inverse_positive(jnp.asarray(matrix))
+    sd = np.sqrt(np.diag(matrix))
+    np.testing.assert_allclose(
+        inverse * np.outer(sd, sd), np.linalg.inv(matrix / np.outer(sd, sd)), rtol=1e-9, atol=1e-12
+    )
+    assert float(log_determinant) == pytest.approx(np.linalg.slogdet(matrix)[1], rel=1e-12)
+    assert np.isnan(np.asarray(inverse_positive(-jnp.eye(3))[0])).all()
+
+
+def linear_problem(n: int = 12) -> Linear:
+    """Two unknowns, n offsets, one image left out."""
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(2, 2))
+    used = np.ones(n)
+    used[3] = 0
+    return Linear(
+        information=jnp.asarray(root @ root.T + 0.5 * np.eye(2)),
+        gradient=jnp.asarray(rng.normal(size=2)),
+        direction=jnp.asarray(rng.normal(size=(n, 2)) * used[:, None]),
+        offset=jnp.asarray(rng.uniform(-1, 1, n) * used),
+        used=jnp.asarray(used),
+    )
+
+
+def test_expectation_propagation_against_integration():
+    linear = linear_problem()
+    sd = jnp.asarray([1.1, 1.0, 0.8, 0.9])
+    found = jax.jit(lambda linear: propagate(linear, FAMILIES, sd))(linear)
+    axis = np.linspace(-6, 6, 1201)
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    base = -0.5 * np.einsum("kp,pq,kq->k", grid, linear.information, grid)
+    base = base + grid @ np.asarray(linear.gradient)
+    used = np.asarray(linear.used) > 0
+    offsets = (np.asarray(linear.offset) + grid @ np.asarray(linear.direction).T)[:, used]
+    evidence = []
+    for k, family in enumerate(FAMILIES):
+        with np.errstate(divide="ignore"):
+            laws = np.log(DENSITY[family](offsets / float(sd[k])) / float(sd[k]))
+        weight = np.exp(base + laws.sum(axis=1))
+        mean = weight @ grid / weight.sum()
+        apart = grid - mean
+        covariance = np.einsum("k,kp,kq->pq", weight, apart, apart) / weight.sum()
+        evidence.append(np.log(weight.sum() * 1e-4 / (2 * np.pi)))
+        size = np.sqrt(np.diag(covariance))
+        exact = family == "gaussian"
+        np.testing.assert_allclose(found.mean[k] / size, mean / size, atol=1e-3 if exact else 0.06)
+        np.testing.assert_allclose(
+            found.covariance[k] / np.outer(size, size), covariance / np.outer(size, size),
+            atol=2e-3 if exact else 0.08,
+        )  # fmt: skip
+    np.testing.assert_allclose(found.log_evidence, evidence, atol=0.05)
+    assert float(jnp.max(found.change)) < 0.1
+
+
+def test_a_one_sided_law_is_found_and_mended():
+    lanes = [problem(k, images=50, elevation_distribution="one-sided", elevation_mm=5.0,
+                     noise_mm=0.5) for k in range(8)]  # fmt: skip
+    problems = jaxcal.stack(lanes)
+    auto = jaxcal.calibrate_batch(problems)
+    plain = jaxcal.calibrate_batch(problems, prior="gaussian")
+    truth = [jaxcal.simulate_recording(
+        jaxcal.Protocol(images=50, elevation_distribution="one-sided", elevation_mm=5.0,
+                        noise_mm=0.5), k).test for k in range(8)]  # fmt: skip
+
+    def precision(result: jaxcal.Calibration) -> float:
+        return np.mean([
+            jaxcal.reconstruction_precision(x, test.poses, test.measurements)
+            for x, test in zip(result.image_to_probe, truth, strict=True)
+        ])  # fmt: skip
+
+    law = auto.offset_law
+    assert law is not None
+    assert plain.offset_law is None
+    assert (auto.prior, plain.prior) == ("auto", "gaussian")
+    assert np.asarray(law.weighed).all()
+    assert np.mean(law.has_mean) > 0.7
+    assert precision(auto) < 0.5 * precision(plain)
+    np.testing.assert_allclose(np.sum(law.probability, axis=1), 1, rtol=1e-9)
+    one = jax.tree.map(lambda leaf: leaf[int(np.argmax(law.has_mean))], auto)
+    said = jaxcal.diagnosis.offset_law(one.numpy())
+    assert said is not None
+    assert "about a mean of" in str(said["words"])
+    # The offsets are 0 to 5 mm: their mean is 2.5 mm on the side that the image frame tells.
+    assert abs(abs(float(one.offset_law.mean)) - 2.5) < 1.0
+
+
+def test_bounds_are_respected():
+    data = problem(3, images=20, elevation_mm=2.0, noise_mm=2.0)
+    free = jaxcal.calibrate(data)
+    largest = int(np.argmax(np.abs(free.elevation)))
+    bound = np.full(20, 10.0)
+    bound[largest] = 0.2
+    cut = jaxcal.calibrate(data, max_elevation=bound)
+    assert abs(float(cut.elevation[largest])) < 0.3 < abs(float(free.elevation[largest]))
+    assert float(cut.elevation_sd[largest]) < float(free.elevation_sd[largest])
+
+
+def test_what_does_not_go_together_is_refused():
+    data = problem(3, images=20)
+    for arguments, said in (
+        ({"prior": "gaussian", "max_elevation": 1.0}, "max_elevation belongs"),
+        ({"sigma": (1.0, 1.0, 1.0), "max_elevation": 1.0}, "max_elevation belongs"),
+        ({"sigma": (1.0, 1.0, 1.0), "prior": "uniform"}, "tunes its SDs"),
+        ({"prior": "flat"}, "auto, gaussian, uniform or bounded"),
+    ):
+        with pytest.raises(InputError, match=said):
+            jaxcal.calibrate(data, **arguments)
+
+
+def test_predicted_tre_and_intervals_follow_from_the_covariance():
+    data = problem(5, images=20, elevation_mm=2.0, noise_mm=2.0)
+    result = jaxcal.calibrate(data)
+    left = float(degrees_of_freedom(result))
+    assert left == pytest.approx(17)
+    sd = np.sqrt(np.diag(result.covariance))
+    np.testing.assert_allclose(
+        jaxcal.transform_intervals(result, 0.9), t(17).ppf(0.95) * sd, rtol=1e-9
+    )
+    points = np.array([[[10.0, 30.0], [-20.0, 70.0]], [[0.0, 50.0], [5.0, 1.0]]])
+    draws = multivariate_normal(np.zeros(6), result.covariance).rvs(40_000, random_state=0)
+    there = np.stack([points[..., 0], 0 * points[..., 0], points[..., 1]], axis=-1)
+    moved = draws[:, None, None, :3] + np.cross(draws[:, None, None, 3:], there)
+    expected = np.sqrt(np.mean(np.sum(moved**2, axis=-1), axis=0) * left / (left - 2))
+    found = jaxcal.predicted_tre(result, points)
+    assert found.shape == (2, 2)
+    np.testing.assert_allclose(found, expected, rtol=0.02)
+    with pytest.raises(InputError, match="between 0 and 1"):
+        jaxcal.transform_intervals(result, 95)
+
+
+def test_own_covariances_are_used_where_they_are_right():
+    recording = jaxcal.simulate_recording(
+        jaxcal.Protocol(images=50, elevation_mm=2.0, noise_mm=2.0), 4
+    )
+    right = jaxcal.Problem.from_recording(recording)
+    assert right.covariance is not None
+    # The same covariances, handed to the wrong images.
+    wrong = replace(right, covariance=jnp.roll(right.covariance, 17, axis=0))
+    both = jaxcal.calibrate_batch(jaxcal.stack([right, wrong]))
+    assert both.offset_law is not None
+    assert both.offset_law.own_covariances.tolist() == [True, False]
