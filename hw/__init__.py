@@ -1,11 +1,22 @@
 """Hardware side of jaxcal: what a bench measures becomes arrays for the engine, live or in files.
 
-Drivers (robot, active-echo electronics, ultrasound stream) will live here; ``hw`` imports
-``jaxcal``, never the other way round.
+``hw`` imports ``jaxcal``, never the other way round. The small processes that talk to devices
+import parts of ``hw`` too; so the engine is loaded only when something of it is asked for.
 """
 
 from __future__ import annotations
 
-from hw.live import LiveCalibration
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hw.live import LiveCalibration
 
 __all__ = ["LiveCalibration"]
+
+
+def __getattr__(name: str) -> object:
+    if name == "LiveCalibration":
+        from hw.live import LiveCalibration
+
+        return LiveCalibration
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,50 @@
+"""What a device of the bench does wrong, as one clear line and the device it came from.
+
+These errors stay apart from :class:`jaxcal.CalibrationError` so that the small processes that talk
+to devices start without importing JAX.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+Device = Literal["robot", "active echo", "ultrasound"]
+
+
+class DeviceError(Exception):
+    """Base of every error of a device; its text is one line meant for a person.
+
+    Args:
+        message: what was wrong and what to do.
+        device: the device that it came from.
+    """
+
+    def __init__(self, message: str, *, device: Device) -> None:
+        super().__init__(" ".join(message.split()))
+        self.device: Device = device
+
+    def __str__(self) -> str:
+        return f"{self.device}: {super().__str__()}"
+
+    def __reduce__(self) -> tuple:
+        return _rebuild, (type(self), self.args[0], self.device)
+
+
+class StaleError(DeviceError):
+    """Nothing new came in time; the connection may still be there."""
+
+
+class LostError(DeviceError):
+    """The connection is gone, or the device stopped answering."""
+
+
+class RefusedError(DeviceError):
+    """The safety gate, or the device, refused what was asked; nothing moved."""
+
+
+class StoppedError(DeviceError):
+    """A motion was stopped before it arrived; the text says why."""
+
+
+def _rebuild(kind: type[DeviceError], message: str, device: Device) -> DeviceError:
+    return kind(message, device=device)
