@@ -150,7 +150,10 @@ def _check_header(root: Node) -> None:
             f"{VERSION}: update jaxcal"
         )
     if flag(root, "complete") is False:
-        raise FormatError("is marked incomplete (complete = false): its writer did not finish")
+        raise FormatError(
+            "is marked incomplete (complete = false), its writer did not finish: "
+            "resume it (jaxcal-hw acquire --resume)"
+        )
     _check_units(root, "mm")
 
 

@@ -1,0 +1,389 @@
+"""The recorder: rows go into a bounded queue, a process of its own writes them to the file.
+
+Acquisition hands over what it measured and goes on; a slow disk, an interpreter lock held by a
+client library or a solve in between cost nothing but room in the queue. Continuous data (poses,
+frames, echo) that find the queue full are dropped and counted; selected images, events and
+estimates never are: they wait, and an image has been taken only once the writer says that it is on
+the disk. When the acquisition dies, however it dies, its writer notices the closed pipe, closes the
+file in order, and leaves it incomplete, to be resumed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+
+from hw.recording_check import check_resumable
+from hw.recording_file import utc_now
+from hw.recording_layout import Header
+from jaxcal.errors import CalibrationError, FormatError, OutputError
+
+if TYPE_CHECKING:
+    from hw.active_echo.device import EchoFrame
+    from hw.robot.pose import PoseSample
+    from hw.ultrasound.receiver import Image
+
+QUEUE_BYTES = 2**26
+"""What may wait to be written: 64 MiB, seven seconds of frames of 640 x 480 at 30 a second."""
+
+_PATIENCE_S = 30.0
+_ENDING_S = 30.0
+
+
+class Recorder:
+    """Writes one recording through a process of its own; a context manager.
+
+    Args:
+        path: the file to make, or with ``header`` None the incomplete one to go on with.
+        header: what a new file is told (see :class:`hw.recording_layout.Header`).
+        queue_bytes: most that may wait; continuous data beyond are dropped and counted.
+        patience_s: how long a selected image or the end may take, in wall-clock seconds, before
+            the disk is given up.
+
+    Raises:
+        OutputError: the file is there already or cannot be written.
+        FormatError: a file that cannot be resumed.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        header: Header | None = None,
+        *,
+        queue_bytes: int = QUEUE_BYTES,
+        patience_s: float = _PATIENCE_S,
+    ) -> None:
+        if header is None:
+            check_resumable(path)
+        self.path = os.fspath(path)
+        self.dropped: dict[str, int] = {}
+        """Rows of continuous data that found the queue full, by group."""
+        self._capacity, self._patience = queue_bytes, patience_s
+        self._queue: deque[tuple[bytes, ...]] = deque()
+        self._waiting = 0
+        self._changed = threading.Condition()
+        self._answers: dict[str, Any] = {}
+        self._error: CalibrationError | None = None
+        self._ending = self._ended = False
+        self._marks = 0
+        # In a session of its own: Ctrl-C, or a signal to the whole group, must not stop the writer.
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "hw.recorder_process", self.path],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
+        )  # fmt: skip
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._listener = threading.Thread(
+            target=self._listen, args=(self._process.stdout,), daemon=True, name="recorder answers"
+        )
+        self._feeder = threading.Thread(
+            target=self._feed, args=(self._process.stdin,), daemon=True, name="recorder queue"
+        )
+        self._listener.start()
+        self._feeder.start()
+        self._put({"do": "open", "header": None if header is None else asdict(header)})
+        try:
+            self.rows: dict[str, int] = self._answer("open", _ENDING_S)["rows"]
+            """Rows of every group when the file was opened: what a resumed one holds already."""
+        except BaseException:
+            self._stop()
+            raise
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self.close()
+        except CalibrationError:
+            if kind is None:
+                raise
+
+    def add_poses(self, samples: Sequence[PoseSample]) -> None:
+        """Append tracked poses."""
+        if not samples:
+            return
+        self._stream("tracker", {
+            "t_host": _column(samples, "t_host"),
+            "t_device": _column(samples, "t_device"),
+            "pose": _column(samples, "pose"),
+            "raw_pose": _column(samples, "raw"),
+            "safety_bits": _column(samples, "safety_bits", int),
+            "status": _column(samples, "robot_mode", int),
+            "runtime_state": _column(samples, "runtime_state", int),
+        })  # fmt: skip
+
+    def add_images(self, images: Sequence[Image]) -> None:
+        """Append ultrasound frames; all frames of a recording have one size and type."""
+        for image in images:
+            self._stream("us", {
+                "t_host": _column([image], "t_host"),
+                "t_device": _column([image], "t_device"),
+                "frame_id": _column([image], "frame_id", int),
+                "frames": np.asarray(image.array)[None],
+            })  # fmt: skip
+
+    def add_echo(self, frames: Sequence[EchoFrame]) -> None:
+        """Append frames of the active echo element: ticks as they came, 65535 = no response."""
+        if not frames:
+            return
+        self._stream("ae", {
+            "t_host": _column(frames, "t_host"),
+            "frame_id": _column(frames, "frame", int),
+            "clock_ticks": np.array([frame.ticks for frame in frames], np.uint64),
+            "tof_ticks": np.array([frame.tof_ticks for frame in frames], np.uint16),
+            "amplitude": np.array([frame.amplitude for frame in frames], np.uint16),
+            "threshold": _column(frames, "threshold", int),
+        })  # fmt: skip
+
+    def add_event(self, kind: str, text: str, t_host: float) -> None:
+        """Append a line of the acquisition's diary; text beyond 480 bytes is cut."""
+        self._rows("events", {
+            "t_host": np.array([t_host]),
+            "utc": np.array([utc_now().encode()]),
+            "kind": np.array([kind.encode()[:32]]),
+            "text": np.array([text.encode()[:480].decode(errors="ignore").encode()]),
+        })  # fmt: skip
+
+    def add_clock(self, device: str, offset: float, drift: float, residual: float, t_host: float):
+        """Append the fit of a device's clock: t_host = offset + (1 + drift) t_device."""
+        self._rows("clock", {
+            "t_host": np.array([t_host]), "device": np.array([device.encode()[:32]]),
+            "offset": np.array([offset]), "drift": np.array([drift]),
+            "residual": np.array([residual]),
+        })  # fmt: skip
+
+    def add_selected(
+        self,
+        pose: np.ndarray,
+        measurement: np.ndarray,
+        *,
+        kind: str,
+        max_elevation: float,
+        amplitude: float,
+        t_host: float,
+        target: int,
+        bracket: tuple[float, float, float, float],
+        seconds: float = 0.0,
+    ) -> None:
+        """Take an image: when this returns it is on the disk.
+
+        Args:
+            pose: (4, 4) probe -> tracker, mm.
+            measurement: (elements,) times of flight, s, or (2,) point, mm.
+            kind: ``time_of_flight`` or ``point``, the recording's.
+            max_elevation: bound on |elevational offset|, mm.
+            amplitude: received.
+            t_host: s.
+            target: row of the plan.
+            bracket: centre, low, high, sd of the offset about the pose, mm.
+            seconds: how long the image took, in the bench's time.
+
+        Raises:
+            OutputError: the writer failed, or did not answer in time.
+        """
+        self._rows("calibration", {
+            "pose": pose[None], kind: measurement[None],
+            "max_elevation": np.array([max_elevation]), "amplitude": np.array([amplitude]),
+            "mask": np.array([True]), "time": np.array([t_host]), "target": np.array([target]),
+        })  # fmt: skip
+        centre, low, high, sd = bracket
+        self._rows("placement", {
+            "centre": np.array([centre]), "low": np.array([low]), "high": np.array([high]),
+            "sd": np.array([sd]), "seconds": np.array([seconds]),
+        })  # fmt: skip
+        self.sync()
+
+    def add_estimate(self, columns: Mapping[str, np.ndarray]) -> None:
+        """Append a row to /estimate (see the layout): the calibration so far."""
+        self._rows("estimate", columns)
+
+    def put(self, group: str, name: str, values: np.ndarray, unit: str) -> None:
+        """Write one array of /plan, /test or /truth."""
+        self._put({"do": "put", "group": group, "name": name, "unit": unit}, {name: values})
+
+    def attributes(self, group: str, values: Mapping[str, Any]) -> None:
+        """Set attributes of a group."""
+        self._put({"do": "attributes", "group": group, "values": dict(values)})
+
+    def sync(self) -> None:
+        """Wait until everything handed over so far is on the disk.
+
+        Raises:
+            OutputError: the writer failed, or did not answer in time.
+        """
+        self._note_drops()
+        self._marks += 1
+        mark = f"sync {self._marks}"
+        self._put({"do": "sync", "mark": mark})
+        self._answer(mark)
+
+    def finish(self) -> str:
+        """Mark the recording complete, as the last thing; the SHA-256 digest of the file.
+
+        Raises:
+            OutputError: the writer failed; the file is incomplete then.
+        """
+        self._note_drops()
+        self._put({"do": "finish"})
+        digest = self._answer("finish")["sha256"]
+        self._stop()
+        return digest
+
+    def close(self) -> None:
+        """Write what waits and close the file; it stays incomplete unless it was finished.
+
+        Raises:
+            OutputError: the writer failed.
+        """
+        if self._ended:
+            return
+        if self._error is None:
+            self._note_drops()
+        self._stop()
+        if self._error is not None:
+            raise self._error
+
+    def _note_drops(self) -> None:
+        for group, count in self.dropped.items():
+            self._put({"do": "attributes", "group": group, "values": {"dropped": count}})
+
+    def _stream(self, group: str, columns: Mapping[str, np.ndarray]) -> None:
+        """Continuous rows: dropped and counted where there is no room."""
+        if not self._put({"do": "rows", "group": group}, columns, wait=False):
+            count = len(next(iter(columns.values())))
+            self.dropped[group] = self.dropped.get(group, 0) + count
+
+    def _rows(self, group: str, columns: Mapping[str, np.ndarray]) -> None:
+        self._put({"do": "rows", "group": group}, columns)
+
+    def _put(
+        self,
+        message: dict[str, Any],
+        columns: Mapping[str, np.ndarray] | None = None,
+        *,
+        wait: bool = True,
+    ) -> bool:
+        parts = encode(message, columns or {})
+        size = sum(map(len, parts))
+        deadline = time.monotonic() + self._patience
+        with self._changed:
+            while self._waiting and self._waiting + size > self._capacity:
+                self._raise_error()
+                if not wait:
+                    return False
+                if not self._changed.wait(deadline - time.monotonic()):
+                    raise OutputError(
+                        f"{self.path}: the disk took no data for {self._patience:g} s"
+                    )
+            self._raise_error()
+            self._queue.append(parts)
+            self._waiting += size
+            self._changed.notify_all()
+        return True
+
+    def _answer(self, mark: str, patience_s: float | None = None) -> Any:
+        patience = self._patience if patience_s is None else patience_s
+        deadline = time.monotonic() + patience
+        with self._changed:
+            while mark not in self._answers:
+                self._raise_error()
+                if not self._changed.wait(deadline - time.monotonic()):
+                    raise OutputError(
+                        f"{self.path}: the disk did not confirm within {patience:g} s"
+                    )
+            return self._answers.pop(mark)
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise self._error
+        if self._ended:
+            raise OutputError(f"{self.path}: the recording is closed")
+
+    def _stop(self) -> None:
+        """Let the queue run empty, close the pipe, and wait for the writer's end."""
+        with self._changed:
+            self._ending = self._ended = True
+            self._changed.notify_all()
+        self._feeder.join(_ENDING_S)
+        try:
+            self._process.wait(_ENDING_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+            self._fail(OutputError(f"{self.path}: the writer did not end and was stopped"))
+        self._listener.join(_ENDING_S)
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    def _feed(self, pipe: BinaryIO) -> None:
+        try:
+            while True:
+                with self._changed:
+                    while not self._queue:
+                        if self._ending:
+                            return
+                        self._changed.wait()
+                    parts = self._queue.popleft()
+                for part in parts:
+                    pipe.write(part)
+                pipe.flush()
+                with self._changed:
+                    self._waiting -= sum(map(len, parts))
+                    self._changed.notify_all()
+        except OSError:
+            # The writer is gone; the listener knows why.
+            with self._changed:
+                self._queue.clear()
+        finally:
+            with suppress(OSError):
+                pipe.close()
+
+    def _listen(self, pipe: BinaryIO) -> None:
+        for line in pipe:
+            answer = json.loads(line)
+            if "error" in answer:
+                kinds = {"FormatError": FormatError}
+                self._fail(kinds.get(answer["kind"], OutputError)(answer["error"]))
+                continue
+            with self._changed:
+                self._answers[answer["mark"]] = answer
+                self._changed.notify_all()
+        if not self._ending:
+            self._fail(OutputError(f"{self.path}: the writer ended; resume the recording"))
+
+    def _fail(self, error: CalibrationError) -> None:
+        with self._changed:
+            # What went wrong first is what matters.
+            self._error = self._error or error
+            self._changed.notify_all()
+
+
+def encode(message: Mapping[str, Any], columns: Mapping[str, np.ndarray]) -> tuple[bytes, ...]:
+    """A message to the writer: length and text of a JSON header, then the arrays' bytes."""
+    arrays = {key: np.ascontiguousarray(values) for key, values in columns.items()}
+    described = [[key, values.dtype.str, list(values.shape)] for key, values in arrays.items()]
+    header = json.dumps({**message, "columns": described}).encode()
+    body = (values.tobytes() for values in arrays.values())
+    return (len(header).to_bytes(4, "big") + header, *body)
+
+
+def _column(items: Sequence[Any], name: str, kind: type = float) -> np.ndarray:
+    return np.array([getattr(item, name) for item in items], kind)

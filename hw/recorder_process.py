@@ -1,0 +1,141 @@
+"""The process that writes a recording: messages on standard input, answers on standard output.
+
+Started by :class:`hw.recorder.Recorder` and by nobody else. It flushes the file at least once a
+second, and closes it in order when its standard input ends: that is how it learns that the
+acquisition is gone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import sys
+import time
+from contextlib import suppress
+from io import RawIOBase
+from typing import Any
+
+import numpy as np
+
+from hw.recording_file import RecordingWriter
+from hw.recording_layout import Header
+from jaxcal.errors import CalibrationError
+from jaxcal.io.readable import one_line
+
+FLUSH_S = 1.0
+_LARGEST = 2**28
+
+
+def main(path: str) -> int:
+    """Write until standard input ends; 0 if all went well."""
+    for name in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(name, signal.SIG_IGN)
+    # h5py or a library may print; only answers may go where the acquisition listens.
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+
+    def answer(**content: Any) -> None:
+        # Where nobody listens any more the file is closed in order all the same.
+        with suppress(OSError):
+            answers.write(json.dumps(content).encode() + b"\n")
+            answers.flush()
+
+    writer = None
+    try:
+        with os.fdopen(os.dup(0), "rb", buffering=0) as source:
+            writer = _serve(path, source, answer)
+        if writer is not None:
+            writer.close()
+    except CalibrationError as error:
+        answer(error=str(error), kind=type(error).__name__)
+        return 1
+    except Exception as error:
+        # A full or vanished disk: h5py has many exceptions for it.
+        answer(error=f"{path}: cannot be written: {one_line(error)}", kind="OutputError")
+        # HDF5 would try again, and complain on the person's screen, while Python clears up.
+        os._exit(1)
+    return 0
+
+
+def _serve(path: str, source: RawIOBase, answer) -> RecordingWriter | None:
+    """Handle messages until the pipe ends; the writer that is still open then."""
+    first = _read(source)
+    if first is None:
+        return None
+    given = first[0]["header"]
+    if given is None:
+        writer = RecordingWriter.resume(path)
+    else:
+        writer = RecordingWriter.create(path, Header(**given))
+    answer(mark="open", rows=writer.rows)
+    # When the file on the disk has to be brought up to date; None while it is.
+    due: float | None = None
+    while True:
+        left = None if due is None else max(due - time.monotonic(), 0.0)
+        waiting = select.select([source], [], [], left)[0]
+        if due is not None and time.monotonic() >= due:
+            writer.flush()
+            due = None
+        if not waiting:
+            continue
+        received = _read(source)
+        if received is None:
+            return writer
+        message, columns = received
+        due = time.monotonic() + FLUSH_S if due is None else due
+        match message["do"]:
+            case "rows":
+                writer.append(message["group"], columns)
+            case "put":
+                name = message["name"]
+                writer.put(message["group"], name, columns[name], message["unit"])
+            case "attributes":
+                writer.attributes(message["group"], message["values"])
+            case "sync":
+                writer.flush(durable=True)
+                due = None
+                answer(mark=message["mark"])
+            case "finish":
+                answer(mark="finish", sha256=writer.finish())
+                return None
+
+
+def _exactly(source: RawIOBase, size: int) -> bytes:
+    """``size`` bytes, or fewer where the pipe ends."""
+    parts, missing = [], size
+    while missing:
+        part = source.read(min(missing, 2**20))
+        if not part:
+            break
+        parts.append(part)
+        missing -= len(part)
+    return b"".join(parts)
+
+
+def _read(source: RawIOBase) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
+    """The next message; None at the end, also in the middle of a message cut off by a death."""
+    start = _exactly(source, 4)
+    if len(start) < 4:
+        return None
+    text = _exactly(source, int.from_bytes(start, "big"))
+    try:
+        message = json.loads(text)
+    except ValueError:
+        return None
+    columns = {}
+    for name, dtype, shape in message.pop("columns"):
+        kind = np.dtype(dtype)
+        size = int(np.prod(shape, dtype=object)) * kind.itemsize
+        if size > _LARGEST:
+            raise CalibrationError(f"{name}: {size} bytes in one message")
+        body = _exactly(source, size)
+        if len(body) < size:
+            return None
+        columns[name] = np.frombuffer(body, kind).reshape(shape)
+    return message, columns
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

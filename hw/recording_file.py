@@ -1,0 +1,310 @@
+"""Writing the file of an acquisition so that it survives the death of its writer.
+
+How it stays readable: default file format (no SWMR, which plain readers refuse), one frame a chunk,
+poses in chunks of 256, a checksum on every chunk, and a flush at least once a second. Between
+flushes HDF5 is kept from writing its own structures (evictions are off), so what is on the disk is
+what the last flush left. ``complete`` is set last, then a SHA-256 sidecar is written.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+from collections.abc import Mapping
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from hw.recording_check import check_resumable
+from hw.recording_layout import (
+    FORMAT,
+    FRAME_TYPES,
+    LARGEST_SETTINGS,
+    LAYOUT,
+    STATIC,
+    VERSION,
+    Column,
+    Header,
+)
+from jaxcal import __version__
+from jaxcal.errors import FormatError, OutputError
+from jaxcal.io.atomic import write_text
+from jaxcal.io.readable import one_line
+
+RESERVE_BYTES = 2**27
+"""The writer ends in order while this much of the disk is free: 128 MiB, many seconds of data."""
+
+
+class RecordingWriter:
+    """Appends rows to a recording and keeps it readable; one process at a time.
+
+    Made by :meth:`create` or :meth:`resume`.
+
+    Attributes:
+        path: of the file.
+        reserve_bytes: of the disk that stay free.
+        rows: how many every group has (those without datasets yet are left out).
+    """
+
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        self.path = path
+        self.reserve_bytes = RESERVE_BYTES
+        self._file = file
+        members = {name: _columns(file, name) for name in LAYOUT}
+        self.rows = {
+            name: len(next(iter(found.values()))) for name, found in members.items() if found
+        }
+
+    @classmethod
+    def create(cls, path: str | os.PathLike[str], header: Header) -> RecordingWriter:
+        """A new recording; the file appears with its skeleton whole, so that it always opens.
+
+        Args:
+            path: the file to make.
+            header: what is known from the start.
+
+        Raises:
+            OutputError: the file is there already, or cannot be written.
+        """
+        final = Path(path)
+        if final.exists():
+            raise OutputError(f"{final}: exists already: resume it, or give another name")
+        temporary = final.parent / f".partial-{secrets.token_hex(8)}{final.suffix}"
+        try:
+            with h5py.File(temporary, "w") as file:
+                _write_skeleton(file, header)
+            # Not os.replace: somebody may have made the file in the meantime.
+            os.link(temporary, final)
+        except FileExistsError:
+            raise OutputError(f"{final}: exists already: resume it, or give another name") from None
+        except OSError as error:
+            raise OutputError(f"{final}: cannot be written: {one_line(error)}") from None
+        finally:
+            with suppress(OSError):
+                temporary.unlink()
+        return cls(final, _open_for_writing(final))
+
+    @classmethod
+    def resume(cls, path: str | os.PathLike[str]) -> RecordingWriter:
+        """Go on with a recording whose writer ended early, cut back to its last whole rows.
+
+        Raises:
+            FormatError: not a recording of an acquisition, damaged, or complete already.
+            OutputError: it cannot be opened for writing.
+        """
+        check_resumable(path)
+        file = _open_for_writing(Path(path))
+        try:
+            for name in LAYOUT:
+                _cut_back(list(_columns(file, name).values()))
+        except FormatError:
+            file.close()
+            raise
+        except Exception as error:
+            file.close()
+            raise FormatError(f"{path}: is truncated or damaged: {one_line(error)}") from None
+        return cls(Path(path), file)
+
+    def append(self, name: str, columns: Mapping[str, np.ndarray]) -> None:
+        """Append rows to a group.
+
+        Args:
+            name: the group.
+            columns: an array for each of its datasets, with rows along the first axis; frames
+                after the first must have the first one's size and type.
+
+        Raises:
+            FormatError: columns that do not fit the layout; nothing is appended.
+        """
+        target = self._prepare(name, columns)
+        counts = {len(values) for values in columns.values()}
+        if len(counts) != 1 or set(columns) != set(target):
+            raise FormatError(f"/{name}: needs one row in each of {', '.join(target)}")
+        arrays = {key: _fitting(name, key, values, target[key]) for key, values in columns.items()}
+        start = self.rows.get(name, 0)
+        stop = start + counts.pop()
+        for key, values in arrays.items():
+            dataset = target[key]
+            dataset.resize(stop, axis=0)
+            dataset[start:stop] = values
+        self.rows[name] = stop
+
+    def put(self, name: str, key: str, values: np.ndarray, unit: str) -> None:
+        """Write an array of /plan, /test or /truth, once; the same name again replaces it."""
+        if name not in STATIC:
+            raise FormatError(f"/{name} is not among {', '.join(STATIC)}")
+        target = self._file.require_group(name)
+        if key in target:
+            del target[key]
+        target.create_dataset(key, data=values).attrs["units"] = unit
+
+    def attributes(self, name: str, values: Mapping[str, object]) -> None:
+        """Set attributes of a group of the layout."""
+        for key, value in values.items():
+            self._file.require_group(name).attrs[key] = _plain(value)
+
+    def flush(self, *, durable: bool = False) -> None:
+        """Bring the file on the disk up to date; ``durable``: also past the system's cache.
+
+        Raises:
+            OutputError: the disk is nearly full; the file has been closed and can be resumed.
+        """
+        self._file.flush()
+        disk = os.statvfs(self.path)
+        if disk.f_bavail * disk.f_frsize < self.reserve_bytes:
+            self._file.close()
+            raise OutputError(f"{self.path}: the disk is nearly full; make room, then resume")
+        if durable:
+            os.fsync(self._file.id.get_vfd_handle())
+
+    def close(self) -> None:
+        """Flush and close; the recording stays marked incomplete and can be resumed."""
+        if self._file.id.valid:
+            self._file.flush()
+            os.fsync(self._file.id.get_vfd_handle())
+            self._file.close()
+
+    def finish(self) -> str:
+        """Mark the recording complete, close it, and write its SHA-256 beside it.
+
+        Returns:
+            The digest, hexadecimal; the sidecar ``<file>.sha256`` is what ``sha256sum -c`` reads.
+        """
+        self.flush(durable=True)
+        self._file.attrs["complete"] = True
+        self.close()
+        return write_sidecar(self.path)
+
+    def _prepare(self, name: str, columns: Mapping[str, np.ndarray]) -> dict[str, h5py.Dataset]:
+        if name not in LAYOUT:
+            raise FormatError(f"/{name} cannot be appended to")
+        target = self._file.require_group(name)
+        if name == "us" and "frames" not in target and "frames" in columns:
+            shape, dtype = columns["frames"].shape, columns["frames"].dtype
+            if len(shape) != 3 or dtype.name not in FRAME_TYPES:
+                raise FormatError(f"/us/frames: {dtype.name} of shape {shape} is not (n, H, W)")
+            sizes = {"height": shape[1], "width": shape[2], "frame": dtype.name}
+            _make_columns(target, LAYOUT["us"], sizes)
+        return _columns(self._file, name)
+
+
+def write_sidecar(path: Path) -> str:
+    """Write ``<file>.sha256``; returns the hexadecimal digest.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with open(path, "rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    write_text(path.with_name(path.name + ".sha256"), f"{digest}  {path.name}\n")
+    return digest
+
+
+def utc_now() -> str:
+    """The time of day for a file's reader: ISO 8601, UTC, milliseconds."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def _write_skeleton(file: h5py.File, header: Header) -> None:
+    file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
+    file.attrs["complete"] = False
+    file.attrs["created_utc"] = utc_now()
+    file.attrs["software"] = f"jaxcal {__version__}"
+    file.attrs["transform_convention"] = (
+        "4x4, row-major, mm; pose maps the probe (the robot's tool centre point) to the robot base"
+    )
+    probe = file.create_group("probe")
+    for key, value in header.probe.items():
+        probe.attrs[key] = value
+    sizes = {"lines": header.lines, "elements": int(header.probe["elements"])}
+    other = {"time_of_flight": "point", "point": "time_of_flight"}[header.kind]
+    for name, columns in LAYOUT.items():
+        target = file.create_group(name)
+        wanted = {k: v for k, v in columns.items() if (name, k) != ("calibration", other)}
+        if name != "us":
+            _make_columns(target, wanted, sizes)
+    file["us"].attrs["orientation"] = "MF"
+    for name, values in (header.attributes or {}).items():
+        for key, value in values.items():
+            file.require_group(name).attrs[key] = _plain(value)
+    settings = header.settings.encode()
+    if len(settings) > LARGEST_SETTINGS:
+        raise OutputError(f"the settings are too long: {len(settings)} bytes")
+    plan = file.require_group("plan")
+    plan.create_dataset("settings", data=np.frombuffer(settings, np.uint8)).attrs["units"] = "1"
+
+
+def _make_columns(
+    target: h5py.Group, columns: Mapping[str, Column], sizes: Mapping[str, int | str]
+) -> None:
+    for key, column in columns.items():
+        tail = tuple(int(sizes[n]) if isinstance(n, str) else n for n in column.tail)
+        dtype = np.dtype(str(sizes["frame"])) if column.dtype == "frame" else np.dtype(column.dtype)
+        dataset = target.create_dataset(
+            key, shape=(0, *tail), maxshape=(None, *tail), dtype=dtype,
+            chunks=(column.chunk, *tail), fletcher32=True,
+        )  # fmt: skip
+        dataset.attrs["units"] = column.unit
+
+
+def _open_for_writing(path: Path) -> h5py.File:
+    try:
+        file = h5py.File(path, "r+")
+        # Without this HDF5 writes its own structures when it likes, half of a change at a time.
+        cache = file.id.get_mdc_config()
+        cache.set_initial_size, cache.initial_size = True, 2**23
+        cache.incr_mode, cache.flash_incr_mode, cache.decr_mode = 0, 0, 0
+        cache.evictions_enabled = False
+        file.id.set_mdc_config(cache)
+    except BlockingIOError:
+        raise OutputError(f"{path}: is being written by another program") from None
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be opened for writing: {one_line(error)}") from None
+    return file
+
+
+def _columns(file: h5py.File, name: str) -> dict[str, h5py.Dataset]:
+    """The datasets of a group that grow, in the layout's order; none where it has none yet."""
+    target = file.require_group(name)
+    found = {key: target[key] for key in LAYOUT[name] if key in target}
+    return {key: member for key, member in found.items() if isinstance(member, h5py.Dataset)}
+
+
+def _cut_back(datasets: list[h5py.Dataset]) -> None:
+    """Drop rows that not every column has, or that cannot be read: those of the last moment."""
+    if not datasets:
+        return
+    rows = whole = min(len(dataset) for dataset in datasets)
+    for dataset in datasets:
+        step = (dataset.chunks or (1,))[0]
+        start = max(0, (rows - 1) // step * step - step)
+        while start < whole:
+            stop = min(start + step, whole)
+            try:
+                dataset[start:stop]
+            except OSError:
+                whole = start
+                break
+            start = stop
+    for dataset in datasets:
+        if len(dataset) != whole:
+            dataset.resize(whole, axis=0)
+
+
+def _fitting(name: str, key: str, values: np.ndarray, dataset: h5py.Dataset) -> np.ndarray:
+    if values.shape[1:] != dataset.shape[1:]:
+        raise FormatError(
+            f"/{name}/{key}: a row of shape {values.shape[1:]} does not fit {dataset.shape[1:]}"
+        )
+    if key == "frames" and values.dtype != dataset.dtype:
+        raise FormatError(f"/us/frames: {values.dtype} does not fit {dataset.dtype}")
+    return values.astype(dataset.dtype)
+
+
+def _plain(value: object) -> Any:
+    return np.asarray(value, dtype=np.float64) if isinstance(value, list | tuple) else value

@@ -1,0 +1,347 @@
+"""The recorder: what it writes is what calibrate takes, and what a kill leaves can be resumed."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import h5py
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import jaxcal
+from hw.recorder import Recorder
+from hw.recording_check import check_resumable, settings_of
+from hw.recording_file import RecordingWriter
+from hw.recording_layout import Header
+from jaxcal.cli.main import main
+
+PROBE = {"kind": "linear", "elements": 128, "pitch_mm": 58.5 / 128, "sound_speed_m_s": 1490.0}
+HEADER = Header(kind="time_of_flight", probe=PROBE, settings='{"placement": "none"}')
+
+
+def simulated(images: int = 12) -> SimpleNamespace:
+    """Poses and times of flight of one target, slightly out of the plane (no JAX: children too)."""
+    rng = np.random.default_rng(3)
+    image_to_probe = np.eye(4)
+    image_to_probe[:3, :3] = Rotation.from_rotvec([0.1, 0.2, -0.1]).as_matrix()
+    image_to_probe[:3, 3] = 5.0, -8.0, 40.0
+    place = np.stack([
+        rng.uniform(-20, 20, images), rng.uniform(-0.3, 0.3, images), rng.uniform(30, 80, images),
+    ], axis=-1)  # fmt: skip
+    poses = np.tile(np.eye(4), (images, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(rng.uniform(-0.4, 0.4, (images, 3))).as_matrix()
+    seen = place @ image_to_probe[:3, :3].T + image_to_probe[:3, 3]
+    poses[:, :3, 3] = [400.0, 100.0, 50.0] - np.einsum("nij,nj->ni", poses[:, :3, :3], seen)
+    element = (np.arange(128) - 63.5) * PROBE["pitch_mm"]
+    distance = np.linalg.norm(
+        place[:, None] - element[:, None] * np.array([1.0, 0.0, 0.0]), axis=-1
+    ) + rng.normal(0, 0.05, (images, 128))
+    return SimpleNamespace(poses=poses, times=distance / 1490e3)
+
+
+def poses(start: int, count: int) -> list[SimpleNamespace]:
+    return [
+        SimpleNamespace(
+            t_host=k * 0.008, t_device=5 + k * 0.008, pose=np.eye(4) * k, raw=np.full(6, k),
+            safety_bits=1, robot_mode=7, runtime_state=2,
+        )
+        for k in range(start, start + count)
+    ]  # fmt: skip
+
+
+def frames(start: int, count: int) -> list[SimpleNamespace]:
+    return [
+        SimpleNamespace(
+            t_host=k / 30, t_device=k / 30, frame_id=k, array=np.full((48, 64), k % 256, np.uint8)
+        )
+        for k in range(start, start + count)
+    ]
+
+
+def echo(start: int, count: int) -> list[SimpleNamespace]:
+    return [
+        SimpleNamespace(
+            t_host=k / 30, frame=k, ticks=2**40 + k, threshold=100,
+            tof_ticks=np.full(128, 65535), amplitude=np.arange(128),
+        )
+        for k in range(start, start + count)
+    ]  # fmt: skip
+
+
+def take(recorder: Recorder, images: SimpleNamespace, index: int) -> None:
+    recorder.add_selected(
+        images.poses[index], images.times[index], kind="time_of_flight",
+        max_elevation=0.5, amplitude=900.0, t_host=float(index), target=index,
+        bracket=(0.0, -0.5, 0.5, 0.2), seconds=4.0,
+    )  # fmt: skip
+
+
+def wait_until_closed(path) -> None:
+    """The writer of a killed acquisition closes the file by itself; then it can be opened."""
+    deadline = time.monotonic() + 60
+    while True:
+        try:
+            with h5py.File(path, "r+"):
+                return
+        except BlockingIOError:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+
+def test_a_finished_recording_is_what_calibrate_takes(tmp_path, capsys):
+    path, recording = tmp_path / "rec.h5", simulated()
+    with Recorder(path, HEADER) as recorder:
+        recorder.add_event("started", "by a test", 0.0)
+        for k in range(12):
+            recorder.add_poses(poses(10 * k, 10))
+            recorder.add_images(frames(k, 1))
+            recorder.add_echo(echo(k, 1))
+            take(recorder, recording, k)
+        recorder.add_clock("robot", 0.1, 1e-5, 1e-4, 1.0)
+        recorder.put("truth", "point", np.zeros(3), "mm")
+        recorder.put("truth", "elevation", np.zeros(12), "mm")
+        recorder.put("truth", "image_to_probe", np.eye(4), "mm")
+        recorder.attributes("tracker", {"serial_number": "1", "tcp_offset": [0.0] * 6})
+        digest = recorder.finish()
+    assert digest == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert (tmp_path / "rec.h5.sha256").read_text() == f"{digest}  rec.h5\n"
+
+    loaded = jaxcal.load(path)
+    np.testing.assert_array_equal(loaded.calibration.measurements, recording.times)
+    np.testing.assert_allclose(loaded.calibration.poses, recording.poses, atol=1e-12)
+    np.testing.assert_array_equal(loaded.calibration.max_elevation, np.full(12, 0.5))
+    assert main(["calibrate", str(path), "--json"]) == 0
+    assert '"images_used": 12' in capsys.readouterr().out
+    with h5py.File(path) as file:
+        assert file.attrs["complete"]
+        assert file["tracker/pose"].shape == (120, 4, 4)
+        assert file["tracker/raw_pose"][119, 0] == 119
+        assert file["us/frames"][11, 0, 0] == 11
+        assert file["ae/clock_ticks"][5] == 2**40 + 5
+        assert file["ae/tof_ticks"].attrs["units"] == "1"
+        assert file["events/text"][0] == b"by a test"
+        assert all(
+            "units" in dataset.attrs
+            for name in ("tracker", "us", "ae", "events", "clock", "calibration", "estimate")
+            for dataset in file[name].values()
+        )
+
+
+ENDLESS = """
+import sys, itertools
+sys.path[:0] = {paths!r}
+import test_recorder as t
+recording = t.simulated()
+with t.Recorder({path!r}, t.HEADER) as recorder:
+    print("ready", recorder._process.pid, flush=True)
+    for k in itertools.count():
+        recorder.add_poses(t.poses(100 * k, 100))
+        recorder.add_images(t.frames(k, 1))
+        recorder.add_event("again", str(k), float(k))
+        if k < 8:
+            t.take(recorder, recording, k)
+            print(k, flush=True)
+"""
+
+
+def acquisition(path) -> tuple[subprocess.Popen, int]:
+    here = os.path.dirname(os.path.abspath(__file__))
+    paths = [here, os.path.dirname(here), os.path.dirname(os.path.dirname(here))]
+    process = subprocess.Popen(
+        [sys.executable, "-c", ENDLESS.format(paths=paths, path=str(path))],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert process.stdout is not None
+    writer = int(process.stdout.readline().split()[1])
+    while process.stdout.readline() != "7\n":
+        assert process.poll() is None
+    return process, writer
+
+
+@pytest.mark.parametrize("victim", ["acquisition", "writer"])
+def test_killed_opened_resumed_finished_calibrated(tmp_path, capsys, victim):
+    path = tmp_path / "rec.h5"
+    process, writer = acquisition(path)
+    time.sleep(1.3)
+    os.kill(process.pid if victim == "acquisition" else writer, signal.SIGKILL)
+    if victim == "writer":
+        assert process.wait(60) == 1  # the acquisition notices
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    wait_until_closed(path)
+
+    with h5py.File(path) as file:
+        assert not file.attrs["complete"]
+        assert len(file["calibration/pose"]) == 8
+        assert len(file["tracker/pose"]) >= 800
+    assert main(["calibrate", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "incomplete" in error
+    assert "--resume" in error
+    assert settings_of(path) == {"placement": "none"}
+
+    recording = simulated()
+    with Recorder(path) as recorder:
+        assert recorder.rows["calibration"] == 8
+        start = recorder.rows["tracker"]
+        recorder.add_poses(poses(start, 10))
+        for k in range(8, 12):
+            take(recorder, recording, k)
+        recorder.finish()
+    loaded = jaxcal.load(path)
+    np.testing.assert_array_equal(loaded.calibration.measurements, recording.times)
+    with h5py.File(path) as file:
+        k = np.arange(start + 10)
+        np.testing.assert_array_equal(file["tracker/raw_pose"][:, 0], k)
+        assert len(file["us/t_host"]) == len(file["us/frames"])
+    assert main(["calibrate", str(path)]) == 0
+
+
+@pytest.mark.slow
+def test_thirty_kills_of_the_writer_at_any_moment(tmp_path):
+    """Not only between flushes: the writer has no moment at which a kill loses an image."""
+    rng = np.random.default_rng(0)
+    for k in range(30):
+        path = tmp_path / f"{k}.h5"
+        process, writer = acquisition(path)
+        time.sleep(rng.uniform(0.0, 2.2))
+        os.kill(writer, signal.SIGKILL)
+        process.wait(60)
+        process.stdout.close()
+        with Recorder(path) as recorder:
+            assert recorder.rows["calibration"] == 8
+            assert recorder.rows["tracker"] >= 100
+            recorder.finish()
+        assert len(jaxcal.load(path)) == 8
+        path.unlink()
+
+
+def test_what_finds_no_room_is_dropped_and_counted_but_no_image_is(tmp_path):
+    path, recording = tmp_path / "rec.h5", simulated()
+    with Recorder(path, HEADER, queue_bytes=2**20) as recorder:
+        os.kill(recorder._process.pid, signal.SIGSTOP)
+        for k in range(1000):
+            recorder.add_images(frames(k, 1))
+        dropped = recorder.dropped["us"]
+        assert 500 < dropped < 1000
+        os.kill(recorder._process.pid, signal.SIGCONT)
+        take(recorder, recording, 0)
+        recorder.sync()
+    with h5py.File(path) as file:
+        assert len(file["us/frames"]) == 1000 - dropped
+        assert file["us"].attrs["dropped"] == dropped
+        assert len(file["calibration/pose"]) == 1
+
+
+def test_a_disk_that_does_not_answer_or_is_full_is_one_line(tmp_path):
+    with Recorder(tmp_path / "slow.h5", HEADER, patience_s=0.3) as recorder:
+        os.kill(recorder._process.pid, signal.SIGSTOP)
+        with pytest.raises(jaxcal.OutputError, match="did not confirm"):
+            recorder.sync()
+        os.kill(recorder._process.pid, signal.SIGCONT)
+
+    path, recording = tmp_path / "full.h5", simulated()
+    recorder = Recorder(path, HEADER)
+    take(recorder, recording, 0)
+    limit = path.stat().st_size + 100_000
+    resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (limit, limit))
+
+    def fill() -> None:
+        for k in range(400):
+            recorder.add_images(frames(k, 1))
+            recorder.sync()
+
+    with pytest.raises(jaxcal.OutputError, match="cannot be written"):
+        fill()
+    with pytest.raises(jaxcal.OutputError):
+        recorder.close()
+    with Recorder(path) as recorder:
+        assert recorder.rows["calibration"] == 1
+
+    writer = RecordingWriter.create(tmp_path / "nearly.h5", HEADER)
+    writer.flush()
+    writer.reserve_bytes = 2**62
+    with pytest.raises(jaxcal.OutputError, match="nearly full"):
+        writer.flush()
+    RecordingWriter.resume(tmp_path / "nearly.h5").close()
+
+
+def test_files_that_are_not_resumed(tmp_path):
+    path = tmp_path / "rec.h5"
+    with pytest.raises(jaxcal.FormatError, match="no such file"):
+        Recorder(path)
+    RecordingWriter.create(path, HEADER).finish()
+    with pytest.raises(jaxcal.FormatError, match="is complete"):
+        Recorder(path)
+    with pytest.raises(jaxcal.OutputError, match="exists already"):
+        Recorder(path, HEADER)
+    with pytest.raises(jaxcal.OutputError, match="cannot be written"):
+        Recorder(tmp_path / "no" / "rec.h5", HEADER)
+
+    def spoil(change) -> None:
+        path.unlink()
+        RecordingWriter.create(path, HEADER).close()
+        with h5py.File(path, "r+") as file:
+            change(file)
+        before = path.read_bytes()
+        with pytest.raises(jaxcal.FormatError, match=r"rec\.h5"):
+            check_resumable(path)
+        with pytest.raises(jaxcal.FormatError, match=r"rec\.h5"):
+            Recorder(path)
+        assert path.read_bytes() == before
+
+    def elsewhere(file) -> None:
+        del file["calibration/pose"]
+        file["calibration/pose"] = h5py.ExternalLink("other.h5", "/pose")
+
+    def fixed(file) -> None:
+        del file["tracker/pose"]
+        file["tracker/pose"] = np.zeros((3, 4, 4))
+
+    def virtual(file) -> None:
+        del file["events/t_host"]
+        layout = h5py.VirtualLayout((4,), "f8")
+        layout[:] = h5py.VirtualSource("other.h5", "x", (4,))
+        file["events"].create_virtual_dataset("t_host", layout)
+
+    def type_changed(file) -> None:
+        del file["calibration/time"]
+        file["calibration"].create_dataset("time", (0,), "S8", maxshape=(None,))
+
+    for change in (
+        elsewhere,
+        fixed,
+        virtual,
+        type_changed,
+        lambda file: file.__delitem__("ae"),
+        lambda file: file.attrs.__setitem__("format", "other"),
+    ):
+        spoil(change)
+
+
+def test_rows_fit_the_layout_or_are_refused_whole(tmp_path):
+    writer = RecordingWriter.create(tmp_path / "rec.h5", HEADER)
+    with pytest.raises(jaxcal.FormatError, match="one row in each"):
+        writer.append("clock", {"t_host": np.zeros(1)})
+    with pytest.raises(jaxcal.FormatError, match="cannot be appended"):
+        writer.append("plan", {"t_host": np.zeros(1)})
+    good = {"t_host": np.zeros(1), "t_device": np.zeros(1), "frame_id": np.zeros(1)}
+    writer.append("us", {**good, "frames": np.zeros((1, 4, 5), np.int16)})
+    with pytest.raises(jaxcal.FormatError, match="does not fit"):
+        writer.append("us", {**good, "frames": np.zeros((1, 5, 5), np.int16)})
+    with pytest.raises(jaxcal.FormatError, match="does not fit"):
+        writer.append("us", {**good, "frames": np.zeros((1, 4, 5), np.uint8)})
+    assert writer.rows["us"] == 1
+    writer.close()
