@@ -13,8 +13,10 @@ import numpy as np
 from jaxcal.calibration import Calibration
 from jaxcal.errors import InputError
 from jaxcal.geometry import check_poses
+from jaxcal.probe import Probe
 from jaxcal.problem import Problem
-from jaxcal.recording import MINIMUM_IMAGES, Kind, make_images
+from jaxcal.recording import MINIMUM_IMAGES, Kind, Recording, make_images
+from jaxcal.segmentation.segment import MINIMUM_LINES, check_times_of_flight
 from jaxcal.solve import calibrate
 
 
@@ -23,12 +25,13 @@ class LiveCalibration:
 
     Args:
         capacity: most images; twice as much room costs twice the time of a solve.
-        kind: ``point`` (mm) or ``pixel`` measurements.
+        kind: ``point`` (mm), ``pixel`` or ``time_of_flight`` (s) measurements.
         spacing_mm: [lateral, axial] mm/px for pixels.
+        probe: the transducer, for times of flight.
         arguments: passed on to :func:`jaxcal.calibrate`, e.g. ``method="joint"``.
 
     Raises:
-        InputError: capacity below 4.
+        InputError: capacity below 4; times of flight without a probe.
     """
 
     def __init__(
@@ -37,15 +40,21 @@ class LiveCalibration:
         *,
         kind: Kind = "point",
         spacing_mm: tuple[float, float] | None = None,
+        probe: Probe | None = None,
         **arguments,
     ) -> None:
         if capacity < MINIMUM_IMAGES:
             raise InputError(f"capacity must be at least {MINIMUM_IMAGES}, not {capacity}")
+        if kind == "time_of_flight" and probe is None:
+            raise InputError("times of flight need a probe")
+        self._probe = probe
         self._kind: Kind = kind
         self._spacing = spacing_mm
         self._arguments = arguments
         self._poses = np.tile(np.eye(4), (capacity, 1, 1))
-        self._measurements = np.ones((capacity, 2))
+        columns = probe.elements if probe is not None and kind == "time_of_flight" else 2
+        self._measurements = np.ones((capacity, columns))
+        self._bound = np.full(capacity, np.inf)
         self._mask = np.zeros(capacity, bool)
         self._count = 0
 
@@ -57,12 +66,17 @@ class LiveCalibration:
         """Most images."""
         return len(self._mask)
 
-    def add(self, pose: np.ndarray, measurement: np.ndarray) -> Calibration | None:
+    def add(
+        self, pose: np.ndarray, measurement: np.ndarray, max_elevation: float = np.inf
+    ) -> Calibration | None:
         """Take one image and solve again.
 
         Args:
             pose: (4, 4) probe -> tracker, mm.
-            measurement: [lateral, range] mm, or [u, v] px.
+            measurement: [lateral, range] mm, [u, v] px, or (elements,) times of flight, s, with NaN
+                where there was no answer.
+            max_elevation: bound on the image's |elevational offset|, mm, where a placement gave
+                one; the bounded methods use it.
 
         Returns:
             The calibration from all images so far; None with fewer than 4.
@@ -74,9 +88,14 @@ class LiveCalibration:
             raise InputError(f"the buffer is full at {self.capacity} images")
         pose = check_poses(np.asarray(pose)[None], what="pose of the new image")[0]
         values = np.asarray(measurement, dtype=float)
-        if values.shape != (2,) or not np.isfinite(values).all():
+        if self._kind == "time_of_flight":
+            self._check_times(values)
+        elif values.shape != (2,) or not np.isfinite(values).all():
             raise InputError("a measurement must be two finite numbers")
+        if not max_elevation >= 0:
+            raise InputError(f"max_elevation must not be negative or NaN, it is {max_elevation}")
         self._poses[self._count], self._measurements[self._count] = pose, values
+        self._bound[self._count] = max_elevation
         self._mask[self._count] = True
         self._count += 1
         if self._count < MINIMUM_IMAGES:
@@ -87,6 +106,19 @@ class LiveCalibration:
             self._count -= 1
             self._mask[self._count] = False
             raise
+
+    def _check_times(self, times: np.ndarray) -> None:
+        assert self._probe is not None
+        if times.shape != (self._probe.elements,):
+            raise InputError(
+                f"{self._probe.elements} times of flight are needed, not shape {times.shape}"
+            )
+        answers = int(np.isfinite(times).sum())
+        if answers < MINIMUM_LINES:
+            raise InputError(
+                f"only {answers} lines were answered: at least {MINIMUM_LINES} are needed"
+            )
+        check_times_of_flight(times[None], self._probe)
 
     def leave_out(self, index: int) -> None:
         """Mask an image taken earlier.
@@ -104,12 +136,12 @@ class LiveCalibration:
         Raises:
             InputError: with fewer than 4 used images, or data in the wrong units.
         """
-        return Problem.from_recording(
-            make_images(
-                self._poses, self._measurements, self._kind, mask=self._mask,
-                spacing_mm=self._spacing,
-            )
+        bound = self._bound if np.isfinite(self._bound[self._mask]).all() else None
+        images = make_images(
+            self._poses, self._measurements, self._kind, mask=self._mask,
+            max_elevation=bound, spacing_mm=self._spacing,
         )  # fmt: skip
+        return Problem.from_recording(Recording(images, probe=self._probe))
 
     def solve(self) -> Calibration:
         """Calibrate from the images so far; per-image arrays hold those taken, in order.

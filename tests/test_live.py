@@ -41,3 +41,45 @@ def test_bad_images_are_refused_and_not_kept():
         live.leave_out(0)
     with pytest.raises(jaxcal.InputError, match="capacity"):
         LiveCalibration(capacity=3)
+
+
+def test_times_of_flight_come_to_what_the_file_comes_to():
+    protocol = jaxcal.Protocol(images=9, noise_mm=0.1, elevation_mm=0.5, raw=True)
+    recording = jaxcal.simulate_recording(protocol, 1)
+    images = recording.calibration
+    live = LiveCalibration(9, kind="time_of_flight", probe=recording.probe, method="conventional")
+    result = None
+    for pose, times in zip(images.poses, images.measurements, strict=True):
+        times = times.copy()
+        times[:3] = np.nan
+        result = live.add(pose, times, max_elevation=0.5)
+    whole = images.measurements.copy()
+    whole[:, :3] = np.nan
+    from_file = jaxcal.calibrate(
+        jaxcal.Recording(
+            jaxcal.make_images(images.poses, whole, "time_of_flight", max_elevation=0.5),
+            probe=recording.probe,
+        ),
+        method="conventional",
+    )
+    np.testing.assert_allclose(result.image_to_probe, from_file.image_to_probe, atol=1e-9)
+    assert live.problem().max_elevation is not None
+    with pytest.raises(jaxcal.InputError, match="full"):
+        live.add(images.poses[0], images.measurements[0])
+
+
+def test_frames_that_cannot_be_times_of_flight_are_refused():
+    with pytest.raises(jaxcal.InputError, match="probe"):
+        LiveCalibration(4, kind="time_of_flight")
+    live = LiveCalibration(4, kind="time_of_flight", probe=jaxcal.LinearProbe())
+    for times, what in (
+        (np.zeros(3), "128 times"),
+        (np.full(128, np.nan), "only 0 lines"),
+        (np.full(128, -1e-5), "negative"),
+        (np.full(128, 40.0), "microseconds"),
+    ):
+        with pytest.raises(jaxcal.InputError, match=what):
+            live.add(np.eye(4), times)
+    with pytest.raises(jaxcal.InputError, match="max_elevation"):
+        live.add(np.eye(4), np.full(128, 4e-5), max_elevation=-1.0)
+    assert len(live) == 0
