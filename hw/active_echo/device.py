@@ -1,0 +1,405 @@
+"""Driver of the active-echo electronics: commands, and a stream of frames that never lies.
+
+A thread reads the line and decodes; frames wait in a bounded queue. Nothing is made up: a gap in
+the device's frame counter is counted as lost, a damaged frame is dropped and counted, a frame
+with fewer lines than the probe fires (a missed line trigger: nothing tells which) is counted and
+not handed on, and when the queue is full the oldest frame goes and is counted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import zlib
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt16
+
+from hw.active_echo.codec import (
+    MAXIMUM_LINES,
+    MAXIMUM_THRESHOLD,
+    NO_RESPONSE,
+    Decoder,
+    EchoPacket,
+    Mode,
+    Reply,
+    encode_line,
+)
+from hw.active_echo.transport import BAUD, DEVICE, open_transport
+from hw.clock import REAL, Clock
+from hw.errors import DeviceError, LostError, RefusedError, StaleError
+
+COMMAND_TIMEOUT_S = 1.0
+"""A command that is not answered for so long (bench time) has failed."""
+
+_LARGEST_GAP = 2**31
+_MAXIMUM_DELAY_TICKS = 0xFFFF
+
+
+@dataclass(frozen=True)
+class EchoFrame:
+    """What the element heard of one frame of the ultrasound machine.
+
+    Attributes:
+        t_host: arrival of the frame's last byte, s of the bench's clock.
+        frame: the device's count of frame triggers.
+        ticks: the device's clock at the frame trigger.
+        threshold: in force during the frame, counts.
+        tof_s: (lines,) one-way time of flight, s; NaN where nothing was heard.
+        tof_ticks: (lines,) the same as it came, 0xFFFF where nothing was heard.
+        amplitude: (lines,) peak amplitude, counts.
+    """
+
+    t_host: float
+    frame: int
+    ticks: int
+    threshold: int
+    tof_s: Float[np.ndarray, " lines"]
+    tof_ticks: UInt16[np.ndarray, " lines"]
+    amplitude: UInt16[np.ndarray, " lines"]
+
+    @property
+    def responses(self) -> int:
+        """Lines on which something was heard."""
+        return int(np.count_nonzero(self.tof_ticks != NO_RESPONSE))
+
+
+@dataclass(frozen=True)
+class EchoStatistics:
+    """Counts since the port was opened.
+
+    Attributes:
+        received: frames accepted into the queue.
+        lost: frames missing in the device's counter (missed frame triggers, or damaged on the way).
+        crc_errors: frames or replies that arrived damaged.
+        resynchronised: how often something was accepted after something damaged.
+        dropped: frames that the full queue had no room for.
+        short: frames with fewer or more lines than the probe fires; not handed on.
+        restarts: how often the counter went back (the device was restarted).
+    """
+
+    received: int = 0
+    lost: int = 0
+    crc_errors: int = 0
+    resynchronised: int = 0
+    dropped: int = 0
+    short: int = 0
+    restarts: int = 0
+
+
+class ActiveEcho:
+    """The electronics behind a port, from opening to :meth:`close`; a context manager.
+
+    Args:
+        url: serial port, pty or ``socket://host:port``.
+        clock: of the bench; time-outs and time stamps are in its seconds.
+        lines: lines per frame that the probe fires.
+        queue: most frames that wait to be read.
+        baud: of a serial port.
+
+    Raises:
+        DeviceError: the port cannot be opened, or nothing behind it answers as this device would.
+    """
+
+    def __init__(
+        self, url: str, *, clock: Clock = REAL, lines: int = 128, queue: int = 512, baud: int = BAUD
+    ) -> None:
+        if not 1 <= lines <= MAXIMUM_LINES:
+            raise DeviceError(f"lines must be 1 to {MAXIMUM_LINES}, not {lines}", device=DEVICE)
+        if queue < 1:
+            raise DeviceError(f"the queue must hold a frame at least, not {queue}", device=DEVICE)
+        self.url, self.lines, self._clock = url, lines, clock
+        self._decoder = Decoder(Mode.UNKNOWN)
+        self._changed = threading.Condition()
+        self._asking = threading.Lock()
+        self._frames: deque[EchoFrame] = deque(maxlen=queue)
+        self._replies: deque[Reply] = deque(maxlen=64)
+        self._received = self._lost = self._dropped = self._short = self._restarts = 0
+        self._last_frame: int | None = None
+        self._tick_s = 0.0
+        self._failure: LostError | None = None
+        self._stopping = False
+        self._transport = open_transport(url, baud=baud)
+        self._reader = threading.Thread(target=self._read_on, name="active echo", daemon=True)
+        self._reader.start()
+        try:
+            self._greet()
+        except BaseException:
+            self.close()
+            raise
+
+    def _greet(self) -> None:
+        """Whatever state the device was left in: silent, and its clock known."""
+        self._ask("STRM", "OFF", expected="OFF")
+        self._tick_s = 1.0 / self.clock_hz()
+        with self._changed:
+            self._frames.clear()
+            self._received = self._lost = self._dropped = self._short = self._restarts = 0
+            self._last_frame = None
+
+    # Commands
+
+    def identify(self) -> str:
+        """Maker, model, serial number and firmware, as the device puts them."""
+        return self._query("*IDN?")
+
+    def clock_hz(self) -> float:
+        """Frequency of the device's counter, Hz.
+
+        Raises:
+            DeviceError: an answer that cannot be one.
+        """
+        text = self._query("CLK?")
+        value = float(text) if text.replace(".", "", 1).isdigit() else 0.0
+        if not 1e3 <= value <= 1e12:
+            raise DeviceError(f"{self.url} has a clock of {text!r} Hz", device=DEVICE)
+        return value
+
+    def set_threshold(self, threshold: int) -> None:
+        """Set the threshold of detection, counts.
+
+        Raises:
+            DeviceError: not 0 to 4095, or not taken by the device.
+        """
+        if not 0 <= threshold <= MAXIMUM_THRESHOLD:
+            raise DeviceError(
+                f"threshold must be 0 to {MAXIMUM_THRESHOLD}, not {threshold}", device=DEVICE
+            )
+        self._ask("THR", str(threshold), expected=str(threshold))
+
+    def threshold(self) -> int:
+        """Threshold in force, counts."""
+        return self._integer("THR?", self._query("THR?"))
+
+    def load_pattern(self, pattern: bytes) -> None:
+        """Load the pattern to answer with: a level (0 to 255) for each line.
+
+        Raises:
+            DeviceError: not one level a line.
+        """
+        if len(pattern) != self.lines:
+            raise DeviceError(
+                f"a pattern has a level for each of {self.lines} lines, not {len(pattern)}",
+                device=DEVICE,
+            )
+        self._ask("PATT:LOAD", pattern.hex(), expected=f"{zlib.crc32(pattern):08x}")
+
+    def inject(self, on: bool, delay_ticks: int = 0) -> None:
+        """Answer each received pulse with the pattern, or only listen (as at power-up).
+
+        Args:
+            on: answer or not.
+            delay_ticks: between the received pulse and the answer, 0 to 65535.
+        """
+        if not 0 <= delay_ticks <= _MAXIMUM_DELAY_TICKS:
+            raise DeviceError(
+                f"delay must be 0 to {_MAXIMUM_DELAY_TICKS} ticks, not {delay_ticks}",
+                device=DEVICE,
+            )
+        if on:
+            self._ask("INJ:DEL", str(delay_ticks), expected=str(delay_ticks))
+        state = "ON" if on else "OFF"
+        self._ask("PATT:STAT", state, expected=state)
+
+    def trigger_count(self) -> tuple[int, int]:
+        """Line triggers and frame triggers that the device has counted since power-up."""
+        text = self._query("TRIG:COUN?")
+        lines, comma, frames = text.partition(",")
+        if not comma:
+            raise DeviceError(f"{self.url} answered TRIG:COUN? by {text!r}", device=DEVICE)
+        return self._integer("TRIG:COUN?", lines), self._integer("TRIG:COUN?", frames)
+
+    def device_error(self) -> str | None:
+        """The oldest error that the device has kept and nobody has asked for; None without one."""
+        text = self._ask("SYST:ERR?", attempts=1)
+        return None if text.startswith("0,") else text
+
+    def stream(self, on: bool) -> None:
+        """Have frames sent, or not."""
+        state = "ON" if on else "OFF"
+        with self._changed:
+            self._last_frame = None
+        self._ask("STRM", state, expected=state)
+
+    # Frames
+
+    def read(self, timeout_s: float) -> EchoFrame:
+        """The oldest frame that waits, or the next that comes.
+
+        Args:
+            timeout_s: longest wait, s of the bench's clock.
+
+        Raises:
+            StaleError: no frame in time.
+            LostError: the device is gone; frames that came before are handed out first.
+        """
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._frames or self._failure, self._clock.wall(timeout_s)
+            )
+            if self._frames:
+                return self._frames.popleft()
+            if self._failure is not None:
+                raise self._failure
+        raise StaleError(
+            f"no frame from {self.url} for {timeout_s:g} s: is the ultrasound machine frozen, or "
+            "its frame trigger unplugged?",
+            device=DEVICE,
+        )
+
+    def drain(self) -> list[EchoFrame]:
+        """All frames that wait, oldest first; may be none.
+
+        Raises:
+            LostError: the device is gone and no frame waits.
+        """
+        with self._changed:
+            frames = list(self._frames)
+            self._frames.clear()
+            if not frames and self._failure is not None:
+                raise self._failure
+        return frames
+
+    def statistics(self) -> EchoStatistics:
+        """Counts since the port was opened."""
+        with self._changed:
+            counts = self._decoder.counts
+            return EchoStatistics(
+                received=self._received,
+                lost=self._lost,
+                crc_errors=counts.crc_errors + counts.malformed,
+                resynchronised=counts.resynchronised,
+                dropped=self._dropped,
+                short=self._short,
+                restarts=self._restarts,
+            )
+
+    def close(self) -> None:
+        """Silence the device if it still listens, and close the port; safe to repeat."""
+        if self._stopping:
+            return
+        self._stopping = True
+        if self._failure is None:
+            with contextlib.suppress(LostError):
+                self._transport.write(encode_line("PATT:STAT OFF") + encode_line("STRM OFF"))
+        self._reader.join()
+        self._transport.close()
+
+    def __enter__(self) -> ActiveEcho:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # Asking
+
+    def _query(self, word: str) -> str:
+        return self._ask(word)
+
+    def _integer(self, word: str, text: str) -> int:
+        if not (text.isdigit() and len(text) < 20):
+            raise DeviceError(f"{self.url} answered {word} by {text!r}", device=DEVICE)
+        return int(text)
+
+    def _ask(
+        self, word: str, argument: str = "", *, expected: str | None = None, attempts: int = 3
+    ) -> str:
+        """Send a command and wait for its own reply.
+
+        Settings are absolute, so that repeating one changes nothing; what does change something
+        (reading an error takes it from the device's list) must come with ``attempts=1``.
+        """
+        with self._asking:
+            for _ in range(attempts):
+                with self._changed:
+                    self._replies.clear()
+                self._transport.write(encode_line(f"{word} {argument}" if argument else word))
+                answer = self._await_reply(word, expected)
+                if answer is not None:
+                    break
+            else:
+                raise StaleError(
+                    f"{self.url} did not answer {word} within {COMMAND_TIMEOUT_S:g} s: is it "
+                    f"switched on, at {BAUD} baud, and the right port?",
+                    device=DEVICE,
+                )
+        if answer.startswith("ERR "):
+            raise RefusedError(f"{self.url} refused {word}: {answer[4:]}", device=DEVICE)
+        if expected is not None and answer != expected:
+            raise DeviceError(
+                f"{self.url} was told {word} {argument} and says {answer}", device=DEVICE
+            )
+        return answer
+
+    def _await_reply(self, word: str, expected: str | None) -> str | None:
+        """The reply's value; another than ``expected`` only when the right one does not come."""
+        other: str | None = None
+        deadline = self._clock.now() + COMMAND_TIMEOUT_S
+        with self._changed:
+            while True:
+                while self._replies:
+                    reply = self._replies.popleft()
+                    if reply.word != word:
+                        continue
+                    if expected in (None, reply.value) or reply.value.startswith("ERR "):
+                        return reply.value
+                    other = reply.value
+                if self._failure is not None:
+                    raise self._failure
+                left = deadline - self._clock.now()
+                if left <= 0:
+                    return other
+                self._changed.wait(self._clock.wall(left))
+
+    # Reading
+
+    def _read_on(self) -> None:
+        """The reader's thread: bytes to frames and replies, until closed or unplugged."""
+        while not self._stopping:
+            try:
+                data = self._transport.read()
+            except LostError as error:
+                with self._changed:
+                    self._failure = error
+                    self._changed.notify_all()
+                return
+            if not data:
+                continue
+            now = self._clock.now()
+            with self._changed:
+                for item in self._decoder.feed(data):
+                    if isinstance(item, Reply):
+                        self._replies.append(item)
+                    else:
+                        self._take(item, now)
+                self._changed.notify_all()
+
+    def _take(self, packet: EchoPacket, now: float) -> None:
+        if self._last_frame is not None:
+            gap = (packet.frame - self._last_frame - 1) % 2**32
+            if gap < _LARGEST_GAP:
+                self._lost += gap
+            else:
+                self._restarts += 1
+        self._last_frame = packet.frame
+        if len(packet.tof_ticks) != self.lines:
+            self._short += 1
+            return
+        if len(self._frames) == self._frames.maxlen:
+            self._dropped += 1
+        self._received += 1
+        silent = packet.tof_ticks == NO_RESPONSE
+        seconds = np.where(silent, np.nan, packet.tof_ticks * self._tick_s)
+        self._frames.append(
+            EchoFrame(
+                t_host=now,
+                frame=packet.frame,
+                ticks=packet.ticks,
+                threshold=packet.threshold,
+                tof_s=seconds,
+                tof_ticks=packet.tof_ticks,
+                amplitude=packet.amplitude,
+            )
+        )

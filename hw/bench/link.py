@@ -1,0 +1,160 @@
+"""The emulated device's end of a line: the master of a pty, or a TCP port for ``socket://``.
+
+Both read and write without ever waiting; what the other end does not take is kept up to a bound, as
+a bridge's buffer would, and refused beyond it.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from pathlib import Path
+from typing import Protocol
+
+_MOST_PENDING = 1 << 16
+
+
+class Link(Protocol):
+    """One end of a line."""
+
+    url: str
+
+    def fileno(self) -> int:
+        """What to wait on for reading."""
+        ...
+
+    def read(self) -> bytes:
+        """Whatever has come; may be empty."""
+        ...
+
+    def write(self, data: bytes) -> bool:
+        """Send; False when there is no room, and then nothing of it is sent."""
+        ...
+
+    def close(self) -> None:
+        """Vanish from the other end, as an unplugged cable does."""
+        ...
+
+
+class PtyLink:
+    """The master of a pty; its slave is reached by a link in the file system that stays the same.
+
+    Args:
+        path: of that link, such as a rule of udev would make.
+    """
+
+    def __init__(self, path: Path) -> None:
+        import tty
+
+        self._path = path
+        # The slave stays open here too: reading a master whose slave nobody has open is an error.
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._path.unlink(missing_ok=True)
+        self._path.symlink_to(os.ttyname(self._slave))
+        self._pending = bytearray()
+        self.url = str(path)
+
+    def fileno(self) -> int:
+        """The master."""
+        return self._master
+
+    def read(self) -> bytes:
+        """See :class:`Link`."""
+        try:
+            return os.read(self._master, 4096)
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EIO):
+                return b""
+            raise
+
+    def write(self, data: bytes) -> bool:
+        """See :class:`Link`."""
+        if len(self._pending) + len(data) > _MOST_PENDING:
+            self._flush()
+            if len(self._pending) + len(data) > _MOST_PENDING:
+                return False
+        self._pending += data
+        self._flush()
+        return True
+
+    def _flush(self) -> None:
+        try:
+            sent = os.write(self._master, self._pending)
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EIO):
+                return
+            raise
+        del self._pending[:sent]
+
+    def close(self) -> None:
+        """See :class:`Link`."""
+        self._path.unlink(missing_ok=True)
+        os.close(self._master)
+        os.close(self._slave)
+
+
+class TcpLink:
+    """A TCP port that one peer at a time is connected to, like a serial-to-TCP bridge."""
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._listener = socket.create_server((host, port))
+        self._listener.setblocking(False)
+        self._peer: socket.socket | None = None
+        self._pending = bytearray()
+        self.url = f"socket://{host}:{self._listener.getsockname()[1]}"
+
+    def fileno(self) -> int:
+        """The peer, or the listener while there is none."""
+        return (self._peer or self._listener).fileno()
+
+    def read(self) -> bytes:
+        """See :class:`Link`."""
+        if self._peer is None:
+            try:
+                self._peer, _ = self._listener.accept()
+            except BlockingIOError:
+                return b""
+            self._peer.setblocking(False)
+            self._peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._pending.clear()
+        try:
+            data = self._peer.recv(4096)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            data = b""
+        if not data:
+            self._hang_up()
+        return data
+
+    def write(self, data: bytes) -> bool:
+        """See :class:`Link`."""
+        if self._peer is None:
+            return True
+        self._pending += data
+        try:
+            sent = self._peer.send(self._pending)
+        except BlockingIOError:
+            sent = 0
+        except OSError:
+            self._hang_up()
+            return True
+        del self._pending[:sent]
+        if len(self._pending) > _MOST_PENDING:
+            del self._pending[len(self._pending) - len(data) :]
+            return False
+        return True
+
+    def _hang_up(self) -> None:
+        if self._peer is not None:
+            self._peer.close()
+            self._peer = None
+        self._pending.clear()
+
+    def close(self) -> None:
+        """See :class:`Link`."""
+        self._hang_up()
+        self._listener.close()

@@ -1,0 +1,271 @@
+"""The ultrasound machine that is not there: an OpenIGTLink server with images of its own making.
+
+``pyigtl`` is the independent server in the tests; this one sends what that cannot: message ids, RF
+channel data, TDATA and STATUS, and on request the faults that streams have. A client that does not
+keep up loses whole images, never parts of them.
+"""
+
+from __future__ import annotations
+
+import selectors
+import socket
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hw.clock import REAL, Clock
+from hw.ultrasound.openigtlink import (
+    HEADER_SIZE,
+    RF_DEVICE,
+    Content,
+    Message,
+    Picture,
+    Status,
+    Tracked,
+    encode,
+)
+
+_MOST_CLIENTS = 8
+_MOST_PENDING = 16 << 20
+_SEND_BUFFER = 1 << 20
+_LARGEST_SLIP_S = 0.25
+
+
+@dataclass(frozen=True)
+class _Faults:
+    stale: bool = False
+    frozen: bool = False
+    corrupt: float = 0.0
+
+
+@dataclass
+class _Client:
+    """A connection and what it has not taken yet."""
+
+    connection: socket.socket
+    pending: deque[memoryview] = field(default_factory=deque)
+    size: int = 0
+
+
+class ImageServer:
+    """An emulated machine; :meth:`start` it, and connect the real receiver to ``host``, ``port``.
+
+    Args:
+        render: time s -> (height, width) uint8 image; called from the server's thread.
+        clock: of the bench.
+        rate_hz: images per second of the bench's time.
+        port: 0: any that is free.
+        host: loopback address.
+        spacing_mm: [lateral, axial] mm per pixel.
+        device: name under which the images are sent.
+        rf: time s -> (samples, lines) int16, sent after each image as an image of device ``RF``.
+        transforms: time s -> {name: (4, 4) mm}, sent before each image: one as TRANSFORM, more of
+            them as one TDATA.
+        device_clock: bench time s -> time stamp s of the machine's own clock.
+        seed: of the faults that come by chance.
+
+    Attributes:
+        port: to connect to.
+        sent: images sent to the client that has got most of them.
+        refused: images that a slow client had no room for.
+    """
+
+    def __init__(
+        self,
+        render: Callable[[float], np.ndarray],
+        *,
+        clock: Clock = REAL,
+        rate_hz: float = 30.0,
+        port: int = 0,
+        host: str = "127.0.0.1",
+        spacing_mm: tuple[float, float] = (0.1, 0.1),
+        device: str = "Image",
+        rf: Callable[[float], np.ndarray] | None = None,
+        transforms: Callable[[float], Mapping[str, np.ndarray]] | None = None,
+        device_clock: Callable[[float], float] = lambda t: 1_000_000.0 + t,
+        seed: int = 0,
+    ) -> None:
+        self._render, self._rf, self._transforms = render, rf, transforms
+        self._clock, self._period_s, self._device_clock = clock, 1.0 / rate_hz, device_clock
+        self._spacing, self._device = spacing_mm, device
+        self._random = np.random.default_rng(seed)
+        self._faults = _Faults()
+        self._stopping = self._dropping = False
+        self._clients: dict[int, _Client] = {}
+        self._selector = selectors.DefaultSelector()
+        self._listener = socket.create_server((host, port), backlog=_MOST_CLIENTS)
+        self._listener.setblocking(False)
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._thread = threading.Thread(target=self._run, name="emulated ultrasound", daemon=True)
+        self._image: Message | None = None
+        self.host, self.port = host, int(self._listener.getsockname()[1])
+        self.sent = self.refused = 0
+        self.messages: dict[str, int] = {}
+
+    def start(self) -> ImageServer:
+        """Begin to listen and to send."""
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """Close all connections and vanish; safe to repeat."""
+        self._stopping = True
+        if self._thread.is_alive():
+            self._thread.join()
+        for client in list(self._clients.values()):
+            self._leave(client)
+        self._listener.close()
+        self._selector.close()
+
+    def __enter__(self) -> ImageServer:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    # Faults
+
+    def stale(self, on: bool = True) -> None:
+        """Send nothing, connections open."""
+        self._faults = replace(self._faults, stale=on)
+
+    def freeze(self, on: bool = True) -> None:
+        """Send the last image again and again, its time stamp too."""
+        self._faults = replace(self._faults, frozen=on)
+
+    def corrupt(self, rate: float) -> None:
+        """Flip a bit anywhere in this share of the images, header included."""
+        self._faults = replace(self._faults, corrupt=rate)
+
+    def drop(self) -> None:
+        """Close all connections once; new ones are taken."""
+        self._dropping = True
+
+    def recover(self) -> None:
+        """No fault any more."""
+        self._faults = _Faults()
+
+    # The machine
+
+    def _run(self) -> None:
+        due = self._clock.now()
+        while not self._stopping:
+            wait = self._clock.wall(due - self._clock.now())
+            # Wakes often enough to notice that it is to stop.
+            for key, _ in self._selector.select(min(max(wait, 0.0), 0.05)):
+                if key.fileobj is self._listener:
+                    self._welcome()
+                else:
+                    self._serve(self._clients[key.fd])
+            if self._dropping:
+                self._dropping = False
+                for client in list(self._clients.values()):
+                    self._leave(client)
+            now = self._clock.now()
+            if now < due:
+                continue
+            # A bench that is too slow for its own clock slips: fewer images, none missing.
+            if self._clock.wall(now - due) > _LARGEST_SLIP_S:
+                due = now
+            if self._clients and not self._faults.stale:
+                self._send_all(due)
+            due += self._period_s
+
+    def _send_all(self, t: float) -> None:
+        if self._transforms is not None and not self._faults.frozen:
+            content = tuple(
+                Tracked(name, np.asarray(matrix)) for name, matrix in self._transforms(t).items()
+            )
+            kind = "TRANSFORM" if len(content) == 1 else "TDATA"
+            device = content[0].name if len(content) == 1 else "Tracker"
+            self._broadcast([encode(self._message(kind, device, t, content))])
+        if self._image is None or not self._faults.frozen:
+            picture = Picture(np.ascontiguousarray(self._render(t)), self._spacing)
+            self._image = self._message("IMAGE", self._device, t, picture)
+        data = encode(self._image)
+        if self._random.random() < self._faults.corrupt:
+            data = self._spoil(data)
+        batch = [data]
+        if self._rf is not None:
+            picture = Picture(np.ascontiguousarray(self._rf(t)), self._spacing)
+            batch.append(encode(self._message("IMAGE", RF_DEVICE, t, picture)))
+        self.sent += 1
+        self._broadcast(batch)
+
+    def _message(self, kind: str, device: str, t: float, content: Content) -> Message:
+        number = self.messages.get(device, 0) + 1
+        self.messages[device] = number
+        return Message(kind, device, self._device_clock(t), content, message_id=number)
+
+    def _spoil(self, data: bytes) -> bytes:
+        spoilt = bytearray(data)
+        # Every other one in the header, which would be hit once in 5000 images otherwise.
+        end = HEADER_SIZE if self._random.random() < 0.5 else len(data)
+        spoilt[int(self._random.integers(end))] ^= 1 << int(self._random.integers(8))
+        return bytes(spoilt)
+
+    def _broadcast(self, batch: list[bytes]) -> None:
+        size = sum(map(len, batch))
+        for client in list(self._clients.values()):
+            if client.size + size > _MOST_PENDING:
+                self.refused += 1
+                continue
+            client.pending.extend(map(memoryview, batch))
+            client.size += size
+            self._serve(client)
+
+    # Connections
+
+    def _welcome(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:
+            return
+        if len(self._clients) == _MOST_CLIENTS:
+            connection.close()
+            return
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+        client = _Client(connection)
+        self._clients[connection.fileno()] = client
+        self._selector.register(connection, selectors.EVENT_READ)
+        hello = self._message("STATUS", self._device, self._clock.now(), Status(1, 0, "", "ready"))
+        client.pending.append(memoryview(encode(hello)))
+        client.size += len(client.pending[-1])
+        self._serve(client)
+
+    def _serve(self, client: _Client) -> None:
+        """Send what goes, and throw away what the client says: nothing of it matters here."""
+        try:
+            while client.pending:
+                sent = client.connection.send(client.pending[0])
+                client.size -= sent
+                if sent < len(client.pending[0]):
+                    client.pending[0] = client.pending[0][sent:]
+                else:
+                    client.pending.popleft()
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._leave(client)
+            return
+        try:
+            if not client.connection.recv(4096):
+                self._leave(client)
+                return
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._leave(client)
+            return
+        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.pending else 0)
+        self._selector.modify(client.connection, events)
+
+    def _leave(self, client: _Client) -> None:
+        self._clients.pop(client.connection.fileno(), None)
+        self._selector.unregister(client.connection)
+        client.connection.close()

@@ -1,0 +1,172 @@
+"""Bytes in any portions to OpenIGTLink messages; what is broken is counted, and the next one found.
+
+The protocol has no mark between messages: after a broken header only the next bytes that can be a
+header tell where to go on. A body whose CRC is wrong is left out as a whole where a header
+follows it; otherwise its size was wrong, and a header is looked for within it, as long as the
+bytes so looked at more than once are not many times those received.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from hw.ultrasound.crc64 import crc64
+from hw.ultrasound.openigtlink import (
+    HEADER_SIZE,
+    MAXIMUM_BODY,
+    ContentError,
+    Header,
+    Message,
+    decode_body,
+    parse_header,
+)
+
+_VERSIONS = (b"\x00\x01", b"\x00\x02")
+_CHECKS_PER_BYTE = 4
+
+
+@dataclass(frozen=True)
+class FramingCounts:
+    """What a decoder has seen.
+
+    Attributes:
+        messages: accepted.
+        crc_errors: bodies whose CRC was wrong.
+        broken_headers: times that no header stood where one had to.
+        unsupported: messages in order that hold what is not read here.
+        resynchronised: how often a message was accepted after something broken.
+    """
+
+    messages: int = 0
+    crc_errors: int = 0
+    broken_headers: int = 0
+    unsupported: int = 0
+    resynchronised: int = 0
+
+
+class MessageDecoder:
+    """Incremental decoder; never waits, and never raises on what it is fed.
+
+    It holds at most one message and what came with it: bodies are bounded by
+    :data:`~hw.ultrasound.openigtlink.MAXIMUM_BODY`, and nothing is allocated before it arrives.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        # Arrival of the buffer's first byte, and where in it the bytes of the latest portion begin.
+        self._began, self._now, self._fresh = math.nan, math.nan, 0
+        self._header: Header | None = None
+        self._wrong_crc = False
+        self._hunting = False
+        self._damaged = False
+        self._budget = 0
+        self.messages = self.crc_errors = self.broken_headers = self.unsupported = 0
+        self.resynchronised = 0
+        self.reason = ""
+
+    @property
+    def counts(self) -> FramingCounts:
+        """What was seen so far."""
+        return FramingCounts(
+            self.messages, self.crc_errors, self.broken_headers, self.unsupported,
+            self.resynchronised,
+        )  # fmt: skip
+
+    @property
+    def held(self) -> int:
+        """Bytes that wait for the rest of their message."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes | bytearray | memoryview, now: float) -> list[Message]:
+        """The messages that ``data`` completes, in order.
+
+        Args:
+            data: any portion of the stream.
+            now: its time of arrival, which messages that begin in it are given.
+        """
+        if not self._buffer:
+            self._began = now
+        self._now, self._fresh = now, len(self._buffer)
+        self._buffer += data
+        self._budget = min(
+            self._budget + _CHECKS_PER_BYTE * len(data), _CHECKS_PER_BYTE * MAXIMUM_BODY
+        )
+        found: list[Message] = []
+        while self._step(found):
+            pass
+        return found
+
+    def _step(self, found: list[Message]) -> bool:
+        """Take one message or one piece of rubbish off the buffer; False when more must come."""
+        if self._header is None:
+            if len(self._buffer) < HEADER_SIZE:
+                return False
+            self._header = parse_header(memoryview(self._buffer)[:HEADER_SIZE])
+            if self._header is None:
+                return self._hunt()
+            self._hunting = False
+        end = HEADER_SIZE + self._header.size
+        if len(self._buffer) < end:
+            return False
+        if not self._wrong_crc:
+            body = bytes(memoryview(self._buffer)[HEADER_SIZE:end])
+            self._budget -= len(body)
+            if crc64(body) == self._header.crc:
+                self._accept(self._header, body, found)
+                self._drop(end)
+                return True
+            self.crc_errors += 1
+            self._wrong_crc = self._damaged = True
+        # Whether the size can be trusted is seen from what follows.
+        if len(self._buffer) < end + HEADER_SIZE:
+            return False
+        follows = parse_header(memoryview(self._buffer)[end : end + HEADER_SIZE])
+        if follows is not None or self._budget < 0:
+            self._drop(end)
+            return True
+        # Of what is found within, the time of arrival is not known: late is better than early.
+        self._fresh = 0
+        self._began = self._now
+        return self._hunt()
+
+    def _accept(self, header: Header, body: bytes, found: list[Message]) -> None:
+        if self._damaged:
+            self.resynchronised += 1
+            self._damaged = False
+        try:
+            found.append(decode_body(header, body, self._began))
+        except ContentError as error:
+            self.unsupported += 1
+            self.reason = f"{header.device}: {error}"
+            return
+        self.messages += 1
+
+    def _hunt(self) -> bool:
+        """Drop bytes up to the next that may begin a header."""
+        if not self._hunting:
+            self._hunting = self._damaged = True
+            self.broken_headers += 1
+        # Where fewer than a header's bytes are left they may begin one.
+        last = len(self._buffer) - HEADER_SIZE
+        place = 1
+        while True:
+            places = [self._buffer.find(version, place) for version in _VERSIONS]
+            place = min((found for found in places if found >= 0), default=-1)
+            if place < 0:
+                # The last byte may be the first of a version.
+                self._drop(max(1, len(self._buffer) - 1))
+                return False
+            if place > last or parse_header(
+                memoryview(self._buffer)[place : place + HEADER_SIZE]
+            ):  # fmt: skip
+                self._drop(place)
+                return place <= last
+            place += 1
+
+    def _drop(self, count: int) -> None:
+        del self._buffer[:count]
+        self._header, self._wrong_crc = None, False
+        self._fresh -= count
+        if self._fresh <= 0:
+            self._began = self._now

@@ -1,0 +1,306 @@
+"""OpenIGTLink messages: header, CRC-64, and the contents IMAGE, TRANSFORM, TDATA and STATUS.
+
+Written from the public protocol (versions 1 to 3, header versions 1 and 2): a header of 58 bytes,
+big-endian ``version u16, type char[12], device char[20], time stamp u32 s + u32 of 2^-32 s, body
+size u64, CRC-64 of the body u64``; in header version 2 the body begins with an extended header
+that holds a message id, and ends with metadata. What is read here comes from a socket and is not
+trusted: sizes are bounded, counts must agree with sizes, and nothing is allocated for what has
+not arrived. The protocol's CRC is the body's: a wrong bit in a header's name or time stamp
+passes, since nothing tells.
+
+Units: translations are mm; an image's spacing is mm per pixel. Only plane images of one
+component, uint8 (B-mode) or int16, are taken. No wire format for RF channel data is public; that
+such data come as an int16 IMAGE of the device ``RF``, samples down and lines across, is **an
+assumption**.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int16, UInt8
+
+from hw.ultrasound.crc64 import crc64
+
+HEADER_SIZE = 58
+RF_DEVICE = "RF"
+"""Device name under which RF channel data are assumed to come."""
+
+MAXIMUM_BODY = 32 << 20
+"""Largest body taken, bytes; every size beyond is a broken header."""
+
+_HEADER = struct.Struct(">H12s20sIIQQ")
+_EXTENDED = struct.Struct(">HHII")
+_IMAGE = struct.Struct(">HBBBB3H12f6H")
+_TRANSFORM = struct.Struct(">12f")
+_TRACKED = struct.Struct(">20sBB12f")
+_STATUS = struct.Struct(">Hq20s")
+_SMALL = 1 << 16
+_MOST_TRACKED = 256
+_LARGEST = {
+    "TRANSFORM": _TRANSFORM.size + _SMALL,
+    "TDATA": _MOST_TRACKED * _TRACKED.size + _SMALL,
+    "STATUS": _SMALL,
+}
+_SCALARS = {3: np.dtype(np.uint8), 4: np.dtype(np.int16)}
+_BIG_ENDIAN, _LITTLE_ENDIAN = 1, 2
+_LPS = 2
+_TYPE_LETTERS = frozenset(b"ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_")
+
+Pixels = UInt8[np.ndarray, "height width"] | Int16[np.ndarray, "height width"]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Content of an IMAGE: a plane of pixels.
+
+    Attributes:
+        array: (height, width), rows downwards; not writable.
+        spacing_mm: [lateral, axial] mm per pixel.
+    """
+
+    array: Pixels
+    spacing_mm: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A TRANSFORM, or one element of a TDATA.
+
+    Attributes:
+        name: by the convention ``<From>To<To>``, e.g. ``ProbeToTracker``.
+        matrix: (4, 4), mm, as sent: nothing says that it is rigid.
+    """
+
+    name: str
+    matrix: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True)
+class Status:
+    """Content of a STATUS: code 1 is well, the rest are listed in the protocol."""
+
+    code: int
+    subcode: int
+    name: str
+    text: str
+
+
+Content = Picture | tuple[Tracked, ...] | Status | None
+
+
+@dataclass(frozen=True)
+class Header:
+    """What stands in front of a message.
+
+    Attributes:
+        version: 1 or 2.
+        kind: message type, e.g. ``IMAGE``.
+        device: name of the sender's device.
+        t_device: time stamp, s of the sender's clock; NaN where it is not set.
+        size: of the body, bytes.
+        crc: CRC-64 of the body.
+    """
+
+    version: int
+    kind: str
+    device: str
+    t_device: float
+    size: int
+    crc: int
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message, its CRC checked.
+
+    Attributes:
+        kind: message type.
+        device: name of the sender's device.
+        t_device: s of the sender's clock, NaN where it is not set.
+        message_id: of header version 2; 0 where there is none.
+        content: None of types that are not read here.
+        t_host: arrival of the message's first bytes, as the receiver was told.
+    """
+
+    kind: str
+    device: str
+    t_device: float
+    content: Content
+    message_id: int = 0
+    t_host: float = math.nan
+
+
+class ContentError(ValueError):
+    """A body whose CRC is right and whose content cannot be used; says why."""
+
+
+def parse_header(data: bytes | bytearray | memoryview) -> Header | None:
+    """A header, or None where these 58 bytes cannot be one."""
+    version, kind, device, seconds, fraction, size, crc = _HEADER.unpack(data)
+    kind = kind.rstrip(b"\0")
+    device = device.partition(b"\0")[0]
+    if version not in (1, 2) or not kind or not _TYPE_LETTERS.issuperset(kind):
+        return None
+    if not all(32 <= letter != 127 for letter in device):
+        return None
+    text = kind.decode("ascii")
+    if size > _LARGEST.get(text, MAXIMUM_BODY):
+        return None
+    stamp = seconds + fraction * 2.0**-32
+    return Header(
+        version, text, device.decode("utf-8", "replace"), stamp or math.nan, size, crc
+    )  # fmt: skip
+
+
+def decode_body(header: Header, body: bytes, t_host: float = math.nan) -> Message:
+    """The message of a body whose CRC has been checked.
+
+    Raises:
+        ContentError: sizes that do not agree, or an image of a kind that is not taken.
+    """
+    content, message_id = _content_bytes(header, body)
+    read = {"IMAGE": _image, "TRANSFORM": _transform, "TDATA": _tdata, "STATUS": _status}
+    found = read[header.kind](content, header) if header.kind in read else None
+    return Message(header.kind, header.device, header.t_device, found, message_id, t_host)
+
+
+def _content_bytes(header: Header, body: bytes) -> tuple[memoryview, int]:
+    view = memoryview(body)
+    if header.version == 1:
+        return view, 0
+    if len(view) < _EXTENDED.size:
+        raise ContentError("an extended header that is cut off")
+    size, names, metadata, message_id = _EXTENDED.unpack_from(view)
+    end = len(view) - names - metadata
+    if not _EXTENDED.size <= size <= end:
+        raise ContentError("an extended header whose sizes do not agree")
+    return view[size:end], message_id
+
+
+def _image(content: memoryview, _: Header) -> Picture:
+    if len(content) < _IMAGE.size:
+        raise ContentError("an image that is cut off")
+    version, components, scalar, endian, _axes, *numbers = _IMAGE.unpack_from(content)
+    width, height, depth = numbers[:3]
+    if version != 1 or endian not in (_BIG_ENDIAN, _LITTLE_ENDIAN):
+        raise ContentError("an image header of unknown form")
+    if components != 1 or scalar not in _SCALARS:
+        raise ContentError(
+            f"an image of {components} components of scalar type {scalar}; one of uint8 or int16 "
+            "is taken"
+        )
+    if depth != 1 or not (width and height):
+        raise ContentError(f"a volume of {width} x {height} x {depth} voxels is no plane image")
+    if numbers[15:18] != [0, 0, 0] or numbers[18:21] != [width, height, depth]:
+        raise ContentError("a part of an image; only whole ones are taken")
+    kind = _SCALARS[scalar].newbyteorder(">" if endian == _BIG_ENDIAN else "<")
+    if len(content) != _IMAGE.size + width * height * kind.itemsize:
+        raise ContentError(f"{len(content)} bytes are not an image of {width} x {height} pixels")
+    across, down = np.array(numbers[3:9], float).reshape(2, 3)
+    # The wire has float32: 0.1 mm, not 0.10000000149.
+    spacing = (float(f"{np.linalg.norm(across):.7g}"), float(f"{np.linalg.norm(down):.7g}"))
+    if not all(math.isfinite(step) and step > 0 for step in spacing):
+        raise ContentError(f"an image spacing of {spacing} mm")
+    pixels = np.frombuffer(content, kind, offset=_IMAGE.size).reshape(height, width)
+    pixels = pixels.astype(_SCALARS[scalar], copy=False)
+    pixels.setflags(write=False)
+    return Picture(pixels, spacing)
+
+
+def _matrix(numbers: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
+    matrix = np.eye(4)
+    matrix[:3] = np.reshape(numbers, (4, 3)).T
+    return matrix
+
+
+def _transform(content: memoryview, header: Header) -> tuple[Tracked, ...]:
+    if len(content) != _TRANSFORM.size:
+        raise ContentError(f"{len(content)} bytes are not a transform")
+    return (Tracked(header.device, _matrix(_TRANSFORM.unpack(content))),)
+
+
+def _tdata(content: memoryview, _: Header) -> tuple[Tracked, ...]:
+    if len(content) % _TRACKED.size or len(content) > _MOST_TRACKED * _TRACKED.size:
+        raise ContentError(f"{len(content)} bytes are not tracking data")
+    return tuple(
+        Tracked(_text(name), _matrix(tuple(numbers)))
+        for name, _type, _reserved, *numbers in _TRACKED.iter_unpack(content)
+    )
+
+
+def _status(content: memoryview, _: Header) -> Status:
+    if len(content) < _STATUS.size:
+        raise ContentError("a status that is cut off")
+    code, subcode, name = _STATUS.unpack_from(content)
+    return Status(code, subcode, _text(name), _text(bytes(content[_STATUS.size :])))
+
+
+def _text(data: bytes) -> str:
+    text = data.partition(b"\0")[0].decode("utf-8", "replace")
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def encode(message: Message) -> bytes:
+    """A whole message; of header version 2 where it has an id, of version 1 otherwise.
+
+    Raises:
+        ValueError: a content that does not go with the kind, or a name that is too long.
+    """
+    match message.content:
+        case Picture() if message.kind == "IMAGE":
+            content = _encode_image(message.content)
+        case (Tracked(),) if message.kind == "TRANSFORM":
+            content = _encode_matrix(message.content[0].matrix)
+        case tuple() if message.kind == "TDATA":
+            content = b"".join(_encode_tracked(each) for each in message.content)
+        case Status(code, subcode, name, text) if message.kind == "STATUS":
+            content = _STATUS.pack(code, subcode, name.encode()) + text.encode() + b"\0"
+        case None:
+            content = b""
+        case _:
+            raise ValueError(f"{message.kind} cannot hold {type(message.content).__name__}")
+    version = 1
+    if message.message_id:
+        version = 2
+        content = _EXTENDED.pack(_EXTENDED.size, 0, 0, message.message_id) + content
+    return encode_header(version, message, content) + content
+
+
+def encode_header(version: int, message: Message, body: bytes) -> bytes:
+    """The header of a message with this body."""
+    kind, device = message.kind.encode("ascii"), message.device.encode("utf-8")
+    if len(kind) > 12 or len(device) > 20:
+        raise ValueError(f"{message.kind} {message.device!r}: a type has 12 bytes, a device 20")
+    stamp = 0.0 if math.isnan(message.t_device) else message.t_device
+    seconds = int(stamp)
+    fraction = min(int((stamp - seconds) * 2.0**32), 0xFFFFFFFF)
+    return _HEADER.pack(version, kind, device, seconds, fraction, len(body), crc64(body))
+
+
+def _encode_image(picture: Picture) -> bytes:
+    height, width = picture.array.shape
+    scalar = {kind: code for code, kind in _SCALARS.items()}[picture.array.dtype]
+    lateral, axial = picture.spacing_mm
+    # Position is that of the image's centre; the first pixel is put at the origin.
+    centre = ((width - 1) / 2 * lateral, (height - 1) / 2 * axial, 0.0)
+    head = _IMAGE.pack(
+        1, 1, scalar, _LITTLE_ENDIAN, _LPS, width, height, 1,
+        lateral, 0.0, 0.0, 0.0, axial, 0.0, 0.0, 0.0, 1.0, *centre,
+        0, 0, 0, width, height, 1,
+    )  # fmt: skip
+    return head + picture.array.astype(picture.array.dtype.newbyteorder("<"), copy=False).tobytes()
+
+
+def _encode_matrix(matrix: Float[np.ndarray, "4 4"]) -> bytes:
+    return _TRANSFORM.pack(*np.asarray(matrix, float)[:3].T.ravel())
+
+
+def _encode_tracked(tracked: Tracked) -> bytes:
+    name = tracked.name.encode("utf-8")
+    if len(name) > 20:
+        raise ValueError(f"{tracked.name!r} is longer than 20 bytes")
+    return struct.pack(">20sBB", name, 2, 0) + _encode_matrix(tracked.matrix)

@@ -1,0 +1,348 @@
+"""The ultrasound machine's stream: images and transforms from an OpenIGTLink server.
+
+A thread receives, checks and decodes; what is good waits in bounded queues, and what had no room
+is counted. An image that comes again with the same time stamp is no new image (a frozen machine):
+it is counted and not handed on.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import socket
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from hw.clock import REAL, Clock
+from hw.errors import Device, DeviceError, LostError, StaleError
+from hw.ultrasound.framing import MessageDecoder
+from hw.ultrasound.openigtlink import RF_DEVICE, Message, Picture, Pixels, Status, Tracked
+
+DEVICE: Device = "ultrasound"
+PORT = 18944
+"""OpenIGTLink's registered port."""
+
+_CONNECT_TIMEOUT_S = 5.0
+_POLL_S = 0.05
+_CHUNK = 1 << 18
+# As jaxcal.geometry takes it; that module would bring JAX into a process that only receives.
+_ROTATION_TOLERANCE = 1e-2
+_QUEUE_BYTES = 256 << 20
+_FRAMES = re.compile(r"(?P<source>.+)To(?P<target>[A-Z].*)")
+
+
+@dataclass(frozen=True)
+class Image:
+    """One image of the ultrasound machine.
+
+    Attributes:
+        t_host: arrival of its first bytes, s of the bench's clock.
+        t_device: the machine's time stamp, s of its own clock; NaN where it sends none.
+        frame_id: the message's id, or a count of images where the sender numbers none.
+        array: (height, width) uint8 B-mode, or int16; rows downwards; not writable.
+        spacing_mm: [lateral, axial] mm per pixel.
+        device: name of the sender's device.
+    """
+
+    t_host: float
+    t_device: float
+    frame_id: int
+    array: Pixels
+    spacing_mm: tuple[float, float]
+    device: str
+
+    @property
+    def is_rf(self) -> bool:
+        """Whether this is assumed to be RF channel data: int16 from the device ``RF``."""
+        return self.device == RF_DEVICE and self.array.dtype == np.int16
+
+
+@dataclass(frozen=True)
+class Transform:
+    """One pose from the stream.
+
+    Attributes:
+        t_host: arrival, s of the bench's clock.
+        t_device: the sender's time stamp, s; NaN where it sends none.
+        name: ``<From>To<To>``, e.g. ``ProbeToTracker``.
+        matrix: (4, 4), mm, From -> To, as sent.
+        valid: finite, and within 1e-2 of a rigid transform (trackers round).
+    """
+
+    t_host: float
+    t_device: float
+    name: str
+    matrix: Float[np.ndarray, "4 4"]
+    valid: bool
+
+    @property
+    def frames(self) -> tuple[str, str]:
+        """(From, To) by the naming convention of PLUS; (name, "") where it is not followed."""
+        match = _FRAMES.fullmatch(self.name)
+        return (match["source"], match["target"]) if match else (self.name, "")
+
+
+@dataclass(frozen=True)
+class UltrasoundStatistics:
+    """Counts since the connection was made.
+
+    Attributes:
+        received: images accepted into the queue.
+        lost: images missing in the message ids, where the sender numbers each device's images.
+        crc_errors: messages whose CRC was wrong; not handed on.
+        resynchronised: how often a message was accepted after something broken.
+        dropped: images and transforms that a full queue had no room for.
+        repeated: images that came again with the same time stamp; not handed on.
+        unsupported: messages in order that hold what is not taken (:attr:`reason` of the last).
+        other: messages of other types or devices; skipped.
+        transforms: accepted.
+        reason: why the last unsupported message was not taken.
+    """
+
+    received: int = 0
+    lost: int = 0
+    crc_errors: int = 0
+    resynchronised: int = 0
+    dropped: int = 0
+    repeated: int = 0
+    unsupported: int = 0
+    other: int = 0
+    transforms: int = 0
+    reason: str = ""
+
+
+class UltrasoundStream:
+    """A client of an OpenIGTLink server, from :meth:`start` to :meth:`close`; a context manager.
+
+    Args:
+        host: of the server.
+        port: 18944 by convention.
+        clock: of the bench; time-outs and time stamps are in its seconds.
+        queue: most images that wait to be read (and at most 256 MB of them).
+        device: only images of this device; None: of all, RF channel data among them.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int = PORT,
+        *,
+        clock: Clock = REAL,
+        queue: int = 64,
+        device: str | None = None,
+    ) -> None:
+        if queue < 1:
+            raise DeviceError(f"the queue must hold an image at least, not {queue}", device=DEVICE)
+        self.host, self.port = host, port
+        self._clock, self._capacity, self._device = clock, queue, device
+        self._decoder = MessageDecoder()
+        self._changed = threading.Condition()
+        self._images: deque[Image] = deque()
+        self._bytes = 0
+        self._transforms: deque[Transform] = deque(maxlen=4096)
+        self._status: Status | None = None
+        self._counts = dict.fromkeys(
+            ("received", "lost", "dropped", "repeated", "other", "transforms"), 0
+        )
+        self._last: dict[str, tuple[int, float]] = {}
+        self._failure: LostError | None = None
+        self._stopping = False
+        self._socket: socket.socket | None = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def address(self) -> str:
+        """``host:port``."""
+        return f"{self.host}:{self.port}"
+
+    def start(self) -> UltrasoundStream:
+        """Connect and begin to receive.
+
+        Raises:
+            DeviceError: no server there.
+        """
+        if self._thread is not None:
+            raise DeviceError(f"{self.address} was started before", device=DEVICE)
+        try:
+            self._socket = socket.create_connection((self.host, self.port), _CONNECT_TIMEOUT_S)
+        except OSError as error:
+            raise DeviceError(
+                f"no OpenIGTLink server at {self.address} ({error.strerror or error})",
+                device=DEVICE,
+            ) from None
+        self._socket.settimeout(_POLL_S)
+        self._thread = threading.Thread(target=self._receive, name="ultrasound", daemon=True)
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Leave the server; safe to repeat."""
+        self._stopping = True
+        if self._thread is not None:
+            self._thread.join()
+        if self._socket is not None:
+            self._socket.close()
+
+    def __enter__(self) -> UltrasoundStream:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def read(self, timeout_s: float) -> Image:
+        """The oldest image that waits, or the next that comes.
+
+        Args:
+            timeout_s: longest wait, s of the bench's clock.
+
+        Raises:
+            StaleError: no new image in time.
+            LostError: the connection is gone; images that came before are handed out first.
+        """
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._images or self._failure, self._clock.wall(timeout_s)
+            )
+            if self._images:
+                image = self._images.popleft()
+                self._bytes -= image.array.nbytes
+                return image
+            if self._failure is not None:
+                raise self._failure
+        raise StaleError(
+            f"no new image from {self.address} for {timeout_s:g} s: is the machine frozen?",
+            device=DEVICE,
+        )
+
+    def drain(self) -> list[Image]:
+        """All images that wait, oldest first; may be none.
+
+        Raises:
+            LostError: the connection is gone and no image waits.
+        """
+        with self._changed:
+            images = list(self._images)
+            self._images.clear()
+            self._bytes = 0
+            if not images and self._failure is not None:
+                raise self._failure
+        return images
+
+    def transforms(self) -> list[Transform]:
+        """All transforms since the last call, oldest first; may be none."""
+        with self._changed:
+            transforms = list(self._transforms)
+            self._transforms.clear()
+        return transforms
+
+    def status(self) -> Status | None:
+        """The last status that the server sent."""
+        return self._status
+
+    def statistics(self) -> UltrasoundStatistics:
+        """Counts since the connection was made."""
+        with self._changed:
+            counts = self._decoder.counts
+            return UltrasoundStatistics(
+                crc_errors=counts.crc_errors,
+                resynchronised=counts.resynchronised,
+                unsupported=counts.unsupported,
+                reason=self._decoder.reason,
+                **self._counts,
+            )
+
+    def _receive(self) -> None:
+        """The receiver's thread: bytes to images, until closed or left by the server."""
+        connection = self._socket
+        assert connection is not None
+        chunk = memoryview(bytearray(_CHUNK))
+        while not self._stopping:
+            try:
+                count = connection.recv_into(chunk)
+            except TimeoutError:
+                continue
+            except OSError:
+                count = 0
+            if not count:
+                with self._changed:
+                    self._failure = LostError(
+                        f"{self.address} has closed the connection", device=DEVICE
+                    )
+                    self._changed.notify_all()
+                return
+            now = self._clock.now()
+            messages = self._decoder.feed(chunk[:count], now)
+            if not messages:
+                continue
+            with self._changed:
+                for message in messages:
+                    self._take(message)
+                self._changed.notify_all()
+
+    def _take(self, message: Message) -> None:
+        match message.content:
+            case Picture() if self._device in (None, message.device):
+                self._take_image(message, message.content)
+            case tuple():
+                for tracked in message.content:
+                    self._take_transform(message, tracked)
+            case Status():
+                self._status = message.content
+            case _:
+                self._counts["other"] += 1
+
+    def _take_image(self, message: Message, picture: Picture) -> None:
+        counts = self._counts
+        number, stamp = self._last.get(message.device, (0, math.nan))
+        if message.t_device == stamp:
+            counts["repeated"] += 1
+            return
+        if message.message_id and 0 < number < message.message_id:
+            counts["lost"] += message.message_id - number - 1
+        self._remember(message)
+        counts["received"] += 1
+        image = Image(
+            t_host=message.t_host,
+            t_device=message.t_device,
+            frame_id=message.message_id or counts["received"],
+            array=picture.array,
+            spacing_mm=picture.spacing_mm,
+            device=message.device,
+        )
+        self._images.append(image)
+        self._bytes += image.array.nbytes
+        while len(self._images) > self._capacity or (
+            self._bytes > _QUEUE_BYTES and len(self._images) > 1
+        ):
+            self._bytes -= self._images.popleft().array.nbytes
+            counts["dropped"] += 1
+
+    def _remember(self, message: Message) -> None:
+        """Number and time stamp of a device's last image; a peer may invent devices without end."""
+        self._last.pop(message.device, None)
+        self._last[message.device] = (message.message_id, message.t_device)
+        if len(self._last) > 64:
+            del self._last[next(iter(self._last))]
+
+    def _take_transform(self, message: Message, tracked: Tracked) -> None:
+        if len(self._transforms) == self._transforms.maxlen:
+            self._counts["dropped"] += 1
+        self._counts["transforms"] += 1
+        self._transforms.append(
+            Transform(
+                message.t_host, message.t_device, tracked.name, tracked.matrix,
+                _is_rigid(tracked.matrix),
+            )
+        )  # fmt: skip
+
+
+def _is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:
+    rotation = matrix[:3, :3]
+    if not np.isfinite(matrix).all() or np.abs(rotation).max() > 2 or np.linalg.det(rotation) <= 0:
+        return False
+    # |R^T R - 1| is twice the distance from the nearest rotation, to first order.
+    return bool(np.linalg.norm(rotation.T @ rotation - np.eye(3)) <= 2 * _ROTATION_TOLERANCE)
