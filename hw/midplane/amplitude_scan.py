@@ -1,0 +1,262 @@
+"""Procedure 1: scan across the beam and go where the response is loudest.
+
+Across the beam the amplitude is nearly Gaussian, so its logarithm is a parabola near the maximum.
+A weighted straight-forward fit gives the maximum between the steps, and from its residuals the
+SD; stops err, too (the robot's repeatability), and that is in the residuals as well.
+
+The same fit serves a free-hand sweep, whose places are the tracker's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from hw.midplane.bracket import Bracket, Placement, widened
+from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
+
+LEAST_FRACTION = 0.4
+"""Samples below this part of the loudest say more of the beam's skirts than of its middle."""
+_LEAST_SAMPLES = 5
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A maximum between the samples.
+
+    Attributes:
+        place_mm: where it is.
+        sd_mm: its standard deviation.
+        amplitude: fitted, counts.
+        width_mm: SD of the Gaussian across the beam.
+        used: samples in the fit.
+    """
+
+    place_mm: float
+    sd_mm: float
+    amplitude: float
+    width_mm: float
+    used: int
+
+
+def fit_peak(
+    offsets_mm: Float[np.ndarray, " n"],
+    amplitudes: Float[np.ndarray, " n"],
+    full_scale: float = 4095.0,
+) -> Peak:
+    """The maximum of a Gaussian profile, by a parabola through the logarithm.
+
+    Args:
+        offsets_mm: where the samples were taken, in any order.
+        amplitudes: counts; 0: not heard. Those near ``full_scale`` are clipped and not used.
+        full_scale: of the converter, counts.
+
+    Raises:
+        PlacementError: too few samples, none on one of the sides, or no maximum among them.
+    """
+    where, loud = np.asarray(offsets_mm, float), np.asarray(amplitudes, float)
+    clipped = loud >= 0.98 * full_scale
+    usable = (loud > LEAST_FRACTION * loud.max(initial=0.0)) & ~clipped & (loud > 0)
+    where, loud = where[usable], loud[usable]
+    if len(where) < _LEAST_SAMPLES:
+        why = "the amplitude saturates: turn the gain down" if clipped.any() else "scan finer"
+        raise PlacementError(f"only {len(where)} usable samples near the maximum: {why}")
+    middle = float(np.average(where, weights=loud))
+    x, y = where - middle, np.log(loud)
+    # Errors of the amplitude are nearly equal in counts, so that those of its logarithm go as 1/A.
+    design = np.stack([np.ones_like(x), x, x**2], axis=1) * loud[:, None]
+    coefficients, *_ = np.linalg.lstsq(design, y * loud, rcond=None)
+    top, slope, curvature = coefficients
+    if not curvature < 0:
+        raise PlacementError("the response has no maximum inside the scan")
+    x_peak = -slope / (2 * curvature)
+    if not x.min() <= x_peak <= x.max():
+        raise PlacementError(
+            f"the maximum lies outside the scan, near {middle + x_peak:+.2f} mm: widen it"
+        )
+    residual = design @ coefficients - y * loud
+    variance = residual @ residual / max(len(x) - 3, 1)
+    covariance = variance * np.linalg.inv(design.T @ design)
+    gradient = np.array([0.0, -1 / (2 * curvature), slope / (2 * curvature**2)])
+    return Peak(
+        place_mm=middle + float(x_peak),
+        sd_mm=float(np.sqrt(gradient @ covariance @ gradient)),
+        amplitude=float(np.exp(top - slope**2 / (4 * curvature))),
+        width_mm=float(np.sqrt(-0.5 / curvature)),
+        used=len(x),
+    )
+
+
+def scan_up(walker: Walker, start_mm: float, step_mm: float) -> Peak:
+    """Cross the beam upwards, from skirt to skirt, and fit the maximum.
+
+    Coarse steps say first where the beam is and how thick, so that the fine ones cover no more than
+    its middle; a thin beam is scanned in finer steps.
+
+    Args:
+        walker: at the low threshold.
+        start_mm: where the element is heard first, coming from below.
+        step_mm: largest step of the scan.
+
+    Raises:
+        PlacementError: caps, saturation, or no maximum.
+    """
+    settings = walker.settings
+    middle, width = _overview(walker, start_mm)
+    step = float(np.clip(0.35 * width, settings.finest_mm, step_mm))
+    offset = middle - 1.4 * width
+    where, echoes = walker.stop_at(offset)
+    # Coarse steps may have misjudged: the scan begins on the lower skirt.
+    loudest = max(echoes.peak, max(amplitude for _, amplitude, _ in walker.samples))
+    while echoes.peak > LEAST_FRACTION * loudest:
+        offset -= width
+        where, echoes = walker.stop_at(offset)
+        loudest = max(loudest, echoes.peak)
+    offsets: list[float] = []
+    loud: list[float] = []
+    while True:
+        clipped = echoes.saturated(settings.full_scale)
+        offsets.append(where)
+        # A clipped sample tells its place only; the fit leaves it out.
+        loud.append(settings.full_scale if clipped else echoes.peak)
+        best = max(loud)
+        if loud[-1] < LEAST_FRACTION * best and best >= 0.7 * loudest:
+            break
+        if not echoes.heard and offset > middle + settings.span_mm:
+            walker.recover()
+            break
+        offset += step
+        where, echoes = walker.stop_at(offset)
+    return fit_peak(np.array(offsets), np.array(loud), settings.full_scale)
+
+
+def _overview(walker: Walker, start_mm: float) -> tuple[float, float]:
+    """Middle and SD (mm) of the beam, roughly, from half coarse steps up until it fades."""
+    settings = walker.settings
+    places: list[float] = []
+    loud: list[float] = []
+    offset = start_mm
+    while True:
+        where, echoes = walker.stop_at(offset)
+        places.append(where)
+        loud.append(echoes.peak)
+        faded = echoes.peak < LEAST_FRACTION * max(loud)
+        if (faded and max(loud) > 0) or offset > start_mm + settings.span_mm:
+            break
+        offset += 0.5 * settings.coarse_mm
+    x, level = np.array(places), np.array(loud)
+    best = int(np.argmax(level))
+    if level[best] == 0:
+        walker.recover()
+        return start_mm, 0.5 * settings.coarse_mm
+    heard = (level > 0) & (np.abs(np.arange(len(level)) - best) <= 2)
+    if heard.sum() >= 3:
+        curvature, slope, _ = np.polyfit(x[heard] - x[best], np.log(level[heard]), 2)
+        if curvature < 0:
+            width = float(np.sqrt(-0.5 / curvature))
+            middle = float(np.clip(-slope / (2 * curvature), -settings.coarse_mm, width))
+            return x[best] + middle, min(width, settings.coarse_mm)
+    return float(x[best]), 0.5 * settings.coarse_mm
+
+
+def go_to_peak(walker: Walker, peak: Peak) -> tuple[float, float]:
+    """Go to a fitted maximum from below and find it there again, or give up.
+
+    Returns:
+        Where the probe stands (mm, tracked) and the amplitude there.
+
+    Raises:
+        PlacementError: the amplitude says that the maximum is elsewhere: the motion has hysteresis,
+            or the target moved.
+    """
+    where, echoes = walker.stop_at(peak.place_mm)
+    if not echoes.heard:
+        walker.recover()
+        where, echoes = walker.stop_at(peak.place_mm)
+    amplitude = echoes.peak
+    if not echoes.saturated(walker.settings.full_scale):
+        ratio = max(peak.amplitude / max(amplitude, 1e-9), 1.0)
+        off = peak.width_mm * float(np.sqrt(2 * np.log(ratio)))
+        if off > walker.settings.hysteresis_mm:
+            raise PlacementError(
+                f"back at the maximum the amplitude is that of {off:.2f} mm beside it: the motion "
+                "has hysteresis, or the target moved"
+            )
+    return where, amplitude
+
+
+def amplitude_scan(
+    bench: Bench,
+    settings: Settings | None = None,
+    start_mm: float = 0.0,
+    watch: Callable[[float, float, int], None] | None = None,
+) -> Placement:
+    """Scan with the robot, fit the maximum, go there.
+
+    Args:
+        bench: what to move and listen to.
+        settings: see there.
+        start_mm: where the mid-plane is expected, as an offset from the plan's pose.
+        watch: told of every stop.
+
+    Returns:
+        A placement with the probe at the maximum.
+
+    Raises:
+        PlacementError: given up; the probe is at the last good place.
+    """
+    settings = Settings() if settings is None else settings
+
+    def run(walker: Walker) -> Placement:
+        heard_at = coarse(walker, start_mm)
+        peak = scan_up(walker, heard_at, settings.fine_mm)
+        try:
+            where, amplitude = go_to_peak(walker, peak)
+        except PlacementError:
+            walker.notes.append("the maximum was not found again; scanned once more")
+            again = peak.place_mm - settings.coarse_mm
+            peak = scan_up(walker, again, settings.fine_mm)
+            where, amplitude = go_to_peak(walker, peak)
+        half = settings.factor * peak.sd_mm
+        edges = (peak.place_mm - half, peak.place_mm + half)
+        return walker.placement("amplitude-scan", where, edges, peak.sd_mm, amplitude)
+
+    return guarded(Walker(bench, settings, watch), run)
+
+
+def free_hand(
+    offsets_mm: Float[np.ndarray, " n"],
+    amplitudes: Float[np.ndarray, " n"],
+    settings: Settings | None = None,
+) -> tuple[int, Bracket]:
+    """The best image of a free-hand sweep, and where the target's offset lies in it.
+
+    Args:
+        offsets_mm: tracked place of the probe along its elevational axis at every frame.
+        amplitudes: of the response in the same frames, counts; 0: not heard.
+        settings: stated accuracies; ``position_sd_mm`` is then the tracker's.
+
+    Returns:
+        Index of the loudest frame, as the paper takes it, and its bracket, whose centre says how
+        far beside the fitted maximum it was taken.
+
+    Raises:
+        PlacementError: the sweep did not cross the mid-plane.
+    """
+    settings = Settings() if settings is None else settings
+    loud = np.asarray(amplitudes, float)
+    peak = fit_peak(offsets_mm, loud, settings.full_scale)
+    usable = np.where(loud >= 0.98 * settings.full_scale, 0.0, loud)
+    # Saturated frames tell nothing apart; the one nearest the fitted maximum is as good as any.
+    best = int(np.argmax(loud))
+    if usable[best] == 0.0:
+        best = int(np.argmin(np.abs(np.asarray(offsets_mm) - peak.place_mm)))
+    centre = peak.place_mm - float(offsets_mm[best])
+    half = settings.factor * peak.sd_mm
+    bracket = widened(
+        centre, centre - half, centre + half, peak.sd_mm, settings.hidden_sd_mm, settings.factor
+    )
+    return best, bracket

@@ -1,0 +1,110 @@
+"""What a placement ends in: where the target's elevational offset lies, and how it was found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.errors import InputError
+
+
+@dataclass(frozen=True)
+class Bracket:
+    """An interval for the target's elevational offset in one image, mm.
+
+    The offset counts along the image's elevational axis, with the probe standing where it was left:
+    0 is the mid-plane.
+
+    Attributes:
+        centre_mm: the best guess.
+        low_mm: the offset is not below this,
+        high_mm: nor above this, in 99 of 100 images if the stated accuracies hold.
+        sd_mm: standard deviation of the guess.
+    """
+
+    centre_mm: float
+    low_mm: float
+    high_mm: float
+    sd_mm: float
+
+    def __post_init__(self) -> None:
+        values = (self.low_mm, self.centre_mm, self.high_mm, self.sd_mm)
+        if not (np.isfinite(values).all() and self.sd_mm >= 0):
+            raise InputError(f"a bracket needs finite mm and an SD that is not negative: {values}")
+        if not self.low_mm <= self.centre_mm <= self.high_mm:
+            raise InputError(f"a bracket's centre must lie between its ends: {values[:3]}")
+
+    @property
+    def width_mm(self) -> float:
+        """From end to end, mm."""
+        return self.high_mm - self.low_mm
+
+    @property
+    def max_elevation_mm(self) -> float:
+        """Bound m on |y|: what the engine takes as this image's ``max_elevation``."""
+        return max(abs(self.low_mm), abs(self.high_mm))
+
+    def contains(self, elevation_mm: float) -> bool:
+        """Whether an elevational offset lies inside."""
+        return bool(self.low_mm <= elevation_mm <= self.high_mm)
+
+    def agrees(self, other: Bracket) -> bool:
+        """Whether both may be true: the intervals overlap."""
+        return bool(self.low_mm <= other.high_mm and other.low_mm <= self.high_mm)
+
+
+def widened(
+    centre_mm: float, low_mm: float, high_mm: float, sd_mm: float, other_sd_mm: float, factor: float
+) -> Bracket:
+    """A bracket from seen edges and independent errors that no search sees.
+
+    Args:
+        centre_mm: best guess of the offset.
+        low_mm: lower edge as seen.
+        high_mm: upper edge as seen.
+        sd_mm: SD of the guess itself.
+        other_sd_mm: SD of what the search cannot see (the response's own shift, the last move).
+        factor: SDs that the bracket reaches.
+
+    Returns:
+        Edges as far away as seen distance and ``factor`` SDs together (root of squares).
+    """
+    hidden = factor * other_sd_mm
+    return Bracket(
+        centre_mm=centre_mm,
+        low_mm=centre_mm - float(np.hypot(centre_mm - low_mm, hidden)),
+        high_mm=centre_mm + float(np.hypot(high_mm - centre_mm, hidden)),
+        sd_mm=float(np.hypot(sd_mm, other_sd_mm)),
+    )
+
+
+@dataclass(frozen=True)
+class Placement:
+    """One finished placement; the probe stands at ``offset_mm``.
+
+    Attributes:
+        procedure: ``amplitude-scan``, ``pattern-injection``, ``threshold-climb``, ``free-hand`` or
+            ``first-seen``.
+        bracket: where the target's offset lies.
+        offset_mm: how far the probe was moved along its elevational axis from the plan's pose.
+        amplitude: of the response where it stands, counts.
+        threshold: response threshold in force at the end.
+        moves: single moves made.
+        travel_mm: elevational way travelled.
+        frames: active-echo frames listened to.
+        samples: (k, 3) offset (mm), amplitude (counts; 0: not heard) and threshold of every stop.
+        notes: what a person should know.
+    """
+
+    procedure: str
+    bracket: Bracket
+    offset_mm: float
+    amplitude: float
+    threshold: int
+    moves: int
+    travel_mm: float
+    frames: int
+    samples: Float[np.ndarray, "k 3"]
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,239 @@
+"""Procedure 2: the element draws what it hears into the image, and a person follows it.
+
+The injected pattern is a bar beside the echo. Its length and brightness follow the received
+amplitude, so that in the image itself the operator sees how near the mid-plane is: the bar is
+longest there. The operator moves the probe in steps, looks at both sides, goes back to the middle
+and accepts. Whoever accepts without having seen the bar shrink on *both* sides is asked to look
+again, because only then is there a bracket.
+
+The operator is a callable: a person before a live view (:mod:`hw.midplane.live_view`) or
+:class:`SteadyOperator`, who does by rule what the instructions tell a person to do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from hw.midplane.bracket import Placement
+from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
+from jaxcal.errors import InputError
+
+LONGEST = 31
+"""Lines that the longest bar covers; also the number of lengths an operator can tell apart."""
+_DARKEST = 64
+_MOST_LOOKS = 150
+_VISIBLE_DROP = 4
+# Shown on a scale that begins here, so that a few per cent near the maximum can be seen.
+_SCALE_FROM = 0.4
+
+
+@runtime_checkable
+class Injector(Protocol):
+    """The electronics' part that answers with a pattern (see the active echo's driver)."""
+
+    def load_pattern(self, pattern: bytes) -> object:
+        """Brightness (0 to 255) of the lines about the loudest one."""
+        ...
+
+    def inject(self, on: bool, delay_ticks: int = 0) -> object:
+        """Switch injection on or off; the delay puts the pattern below the echo."""
+        ...
+
+
+def bar_length(amplitude: float, loudest: float) -> int:
+    """How many lines the bar covers, 0 to 31, when ``loudest`` is what the longest bar means."""
+    if loudest <= 0 or amplitude <= 0:
+        return 0
+    level = (amplitude / loudest - _SCALE_FROM) / (1 - _SCALE_FROM)
+    return int(np.clip(round(level * LONGEST), 1, LONGEST))
+
+
+def bar(length: int) -> bytes:
+    """The pattern of a bar: ``length`` bright lines in the middle of 31, brighter if longer."""
+    if not 0 <= length <= LONGEST:
+        raise InputError(f"a bar has 0 to {LONGEST} lines, not {length}")
+    pattern = np.zeros(LONGEST, np.uint8)
+    first = (LONGEST - length) // 2
+    pattern[first : first + length] = _DARKEST + (255 - _DARKEST) * length // LONGEST
+    return pattern.tobytes()
+
+
+@dataclass(frozen=True)
+class View:
+    """What the operator has before the eyes.
+
+    Attributes:
+        length: of the bar, lines.
+        longest: the longest bar seen so far.
+        offset_mm: where the probe is.
+        step_mm: of the next move.
+        amplitude: counts.
+        seen: (offset, length) of every look so far, this one last.
+        frame: the newest B-mode frame, or None.
+        message: what the procedure has to say.
+    """
+
+    length: int
+    longest: int
+    offset_mm: float
+    step_mm: float
+    amplitude: float
+    seen: tuple[tuple[float, int], ...]
+    frame: UInt8[np.ndarray, "rows columns"] | None = None
+    message: str = ""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the operator wants: go to an offset, accept the place, or give up."""
+
+    what: Literal["go", "accept", "give-up"]
+    offset_mm: float = 0.0
+
+
+Operator = Callable[[View], Decision]
+
+
+class SteadyOperator:
+    """Does what the instructions say: sweep up through the longest bar, then back to the middle.
+
+    Args:
+        step_mm: of the sweep.
+    """
+
+    def __init__(self, step_mm: float = 0.25) -> None:
+        self._step = step_mm
+        self._stage: Literal["down", "up", "check"] = "down"
+        self._from = 0
+
+    def __call__(self, view: View) -> Decision:
+        """Decide."""
+        if self._stage == "down":
+            if view.length > max(view.longest - 2 * _VISIBLE_DROP, 0):
+                return Decision("go", view.offset_mm - 4 * self._step)
+            self._stage, self._from = "up", len(view.seen) - 1
+        if self._stage == "check" and view.message:
+            self._stage, self._from = "up", len(view.seen) - 1
+        if self._stage == "up":
+            sweep = view.seen[self._from :]
+            longest = max(length for _, length in sweep)
+            # One short bar on the way up may be a stop that fell short; two are the other side.
+            passed = len(sweep) > 2 and all(
+                length <= longest - 2 * _VISIBLE_DROP for _, length in sweep[-2:]
+            )
+            if not (passed and longest >= view.longest - _VISIBLE_DROP):
+                return Decision("go", view.offset_mm + self._step)
+            self._stage = "check"
+            return Decision("go", _middle(sweep))
+        return Decision("accept")
+
+
+def _middle(sweep: tuple[tuple[float, int], ...]) -> float:
+    """Half way between the places on both flanks where the bar becomes visibly shorter."""
+    places = np.array([place for place, _ in sweep])
+    lengths = np.array([length for _, length in sweep], float)
+    level = lengths.max() - _VISIBLE_DROP
+
+    def crossing(short: int, long: int) -> float:
+        part = (level - lengths[short]) / (lengths[long] - lengths[short])
+        return float(places[short] + part * (places[long] - places[short]))
+
+    above = np.flatnonzero(lengths > level)
+    first, last = int(above[0]), int(above[-1])
+    rising = crossing(first - 1, first) if first > 0 else places[first]
+    falling = crossing(last + 1, last) if last + 1 < len(lengths) else places[last]
+    return 0.5 * float(rising + falling)
+
+
+def _flanks(
+    seen: list[tuple[float, int]], place: float
+) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
+    """On either side of a place, the nearest stop with a visibly shorter bar and the one before."""
+    longest = max(length for _, length in seen)
+    short = sorted(at for at, length in seen if length <= longest - _VISIBLE_DROP)
+    long = sorted(at for at, length in seen if length > longest - _VISIBLE_DROP)
+    below = [at for at in short if at < place]
+    above = [at for at in short if at > place]
+    low = high = None
+    if below:
+        inner = [at for at in long if at > below[-1]]
+        low = (below[-1], inner[0] if inner else place)
+    if above:
+        inner = [at for at in long if at < above[0]]
+        high = (inner[-1] if inner else place, above[0])
+    return low, high
+
+
+def pattern_injection(
+    bench: Bench,
+    injector: Injector,
+    operator: Operator,
+    settings: Settings | None = None,
+    start_mm: float = 0.0,
+    *,
+    frame: Callable[[], UInt8[np.ndarray, "rows columns"] | None] | None = None,
+    delay_ticks: int = 400,
+    watch: Callable[[float, float, int], None] | None = None,
+) -> Placement:
+    """Let an operator find the mid-plane by the injected bar.
+
+    Args:
+        bench: what to move and listen to.
+        injector: what draws the bar.
+        operator: looks and decides.
+        settings: see there; every move, the operator's too, is within its caps and from below.
+        start_mm: where the mid-plane is expected, as an offset from the plan's pose.
+        frame: gives the newest B-mode frame for the view.
+        delay_ticks: how long after the echo the bar is sent, clock ticks.
+        watch: told of every stop.
+
+    Returns:
+        A placement whose bracket lies between the places on both sides where the bar was visibly
+        shorter, widened by what nobody sees. Injection is off again.
+
+    Raises:
+        PlacementError: given up by the operator or by a guard; the probe is at the last good place.
+    """
+    settings = Settings() if settings is None else settings
+
+    def run(walker: Walker) -> Placement:
+        coarse(walker, start_mm)
+        loudest, message = 0.0, ""
+        heard: list[tuple[float, float]] = []
+        where, echoes = walker.where, walker.listen()
+        for _ in range(_MOST_LOOKS):
+            if echoes.saturated(settings.full_scale):
+                raise PlacementError("the amplitude saturates: turn the gain down")
+            loudest = max(loudest, echoes.peak)
+            heard.append((where, echoes.peak))
+            seen = [(at, bar_length(amplitude, loudest)) for at, amplitude in heard]
+            injector.load_pattern(bar(seen[-1][1]))
+            injector.inject(True, delay_ticks)
+            decision = operator(View(
+                seen[-1][1], max(length for _, length in seen), where, settings.fine_mm,
+                echoes.peak, tuple(seen), None if frame is None else frame(), message,
+            ))  # fmt: skip
+            message = ""
+            if decision.what == "give-up":
+                raise PlacementError("the operator gave up")
+            if decision.what == "accept":
+                low, high = _flanks(seen, where)
+                if low is not None and high is not None and echoes.heard:
+                    edges = (0.5 * sum(low), 0.5 * sum(high))
+                    spread = np.hypot(low[1] - low[0], high[1] - high[0]) / np.sqrt(48.0)
+                    spread = float(np.hypot(spread, settings.position_sd_mm / np.sqrt(2.0)))
+                    return walker.placement("pattern-injection", where, edges, spread, echoes.peak)
+                message = "look at both sides first: the bar must be seen to shrink on each"
+                continue
+            where, echoes = walker.stop_at(decision.offset_mm)
+        raise PlacementError(f"not accepted after {_MOST_LOOKS} looks")
+
+    try:
+        return guarded(Walker(bench, settings, watch), run)
+    finally:
+        injector.inject(False)

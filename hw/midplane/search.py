@@ -1,0 +1,329 @@
+"""What the placement procedures share: the bench they need, guards, coarse search.
+
+Offsets are mm along the probe's elevational axis from the plan's pose; moving the probe by +1 mm
+moves the target by -1 mm in the image.
+
+Guards: every stop is approached from the same side, so that lost motion of the arm does not enter;
+moves, travel and reach are capped; amplitudes at the converter's full scale are not used; when the
+response is lost the probe goes back to the last place where it was heard, and if it is not heard
+there either the placement is given up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hw.errors import Device, DeviceError
+from hw.midplane.bracket import Placement, widened
+from jaxcal.errors import InputError
+
+_TOP_LINES = 8
+_ANSWERING_LINES = 4
+_LISTEN_AGAIN = 3
+
+
+class PlacementError(DeviceError):
+    """A placement was given up: one line that says why. The probe is at the last good place."""
+
+    def __init__(self, message: str, *, device: Device = "active echo") -> None:
+        super().__init__(message, device=device)
+
+
+@dataclass(frozen=True)
+class Echoes:
+    """Some frames of the active echo.
+
+    Attributes:
+        amplitude: (frames, lines) counts, 0 where a line was not answered.
+        answered: (frames, lines) whether it was.
+    """
+
+    amplitude: Float[np.ndarray, "frames lines"]
+    answered: Bool[np.ndarray, "frames lines"]
+
+    @property
+    def heard(self) -> bool:
+        """Whether at least four lines were answered in more than half of the frames."""
+        if not len(self.answered):
+            return False
+        return bool(np.median(self.answered.sum(axis=1)) >= _ANSWERING_LINES)
+
+    @property
+    def peak(self) -> float:
+        """Median over the frames of the mean of the eight loudest lines, counts; 0 if not heard."""
+        if not self.heard:
+            return 0.0
+        loudest = np.sort(self.amplitude, axis=1)[:, -_TOP_LINES:]
+        return float(np.median(loudest.mean(axis=1)))
+
+    def saturated(self, full_scale: float) -> bool:
+        """Whether any line reached the converter's full scale in more than half of the frames."""
+        return bool(len(self.amplitude) and np.median(self.amplitude.max(axis=1)) >= full_scale)
+
+
+@runtime_checkable
+class Bench(Protocol):
+    """What a procedure needs; :mod:`hw.midplane.devices` makes it of the real clients."""
+
+    def move(self, offset_mm: float) -> float:
+        """Go there, arrive, settle; returns the offset as tracked, mm."""
+        ...
+
+    def read(self, frames: int) -> Echoes:
+        """Listen to whole frames that began after the last move."""
+        ...
+
+    def set_threshold(self, threshold: int) -> None:
+        """Set the amplitude (counts) from which the element answers."""
+        ...
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to search, and what accuracies to state.
+
+    Attributes:
+        low_threshold: counts; the element then answers far from the mid-plane.
+        span_mm: the coarse raster reaches this far either side of where it starts.
+        coarse_mm: its step.
+        fine_mm: step of the fine scan.
+        finest_mm: least step of the threshold climb.
+        frames: active-echo frames to listen to at every stop.
+        backlash_mm: every stop is approached from this far below.
+        hysteresis_mm: coming back to the maximum must find it within this.
+        epsilon_mm: the climb is done when this far either way the response is lost.
+        top_fraction: the climb's highest threshold, of the amplitude at the maximum.
+        most_moves: cap on single moves.
+        most_travel_mm: cap on the way.
+        reach_mm: cap on the offset either way.
+        full_scale: amplitude at which the converter saturates, counts.
+        response_sd_mm: stated accuracy of the response's mid-plane; no search sees this error.
+        position_sd_mm: stated repeatability of a stop.
+        beam_half_mm: how far off the mid-plane the target may be and still be heard at all.
+        factor: SDs that a bracket reaches: 2.58 holds 99 of 100.
+    """
+
+    low_threshold: int = 100
+    span_mm: float = 9.0
+    coarse_mm: float = 2.0
+    fine_mm: float = 0.25
+    finest_mm: float = 0.05
+    frames: int = 3
+    backlash_mm: float = 0.5
+    hysteresis_mm: float = 0.6
+    epsilon_mm: float = 0.7
+    top_fraction: float = 0.96
+    most_moves: int = 200
+    most_travel_mm: float = 150.0
+    reach_mm: float = 20.0
+    full_scale: float = 4095.0
+    response_sd_mm: float = 0.3
+    position_sd_mm: float = 0.1
+    beam_half_mm: float = 5.0
+    factor: float = 2.58
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise InputError(f"search: {name} must be a number that is not negative: {value}")
+        for name in ("coarse_mm", "fine_mm", "finest_mm", "frames", "epsilon_mm", "factor"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"search: {name} must be positive")
+        if not 0 < self.top_fraction < 1:
+            raise InputError("search: top_fraction must be between 0 and 1")
+
+    @property
+    def hidden_sd_mm(self) -> float:
+        """SD of what no search sees: the response's shift and the last stop's repeatability, mm."""
+        return float(np.hypot(self.response_sd_mm, self.position_sd_mm))
+
+
+class Walker:
+    """Moves and listens on behalf of one placement, and keeps its guards.
+
+    Args:
+        bench: what to move and listen to.
+        settings: caps and steps.
+        watch: told of every stop: offset (mm), amplitude (counts), threshold.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        settings: Settings,
+        watch: Callable[[float, float, int], None] | None = None,
+    ) -> None:
+        self._bench, self.settings, self._watch = bench, settings, watch
+        self._at: float | None = None
+        self.where = 0.0
+        self.good: float | None = None
+        self._good_amplitude = 0.0
+        self.threshold = -1
+        self.moves, self.frames, self.travel_mm = 0, 0, 0.0
+        self.samples: list[tuple[float, float, int]] = []
+        self.notes: list[str] = []
+
+    def _move(self, offset: float) -> None:
+        settings = self.settings
+        if abs(offset) > settings.reach_mm:
+            raise PlacementError(
+                f"the search wanted to go {offset:.1f} mm off the plan's pose; it may go "
+                f"{settings.reach_mm:g} mm"
+            )
+        if self.moves >= settings.most_moves:
+            raise PlacementError(f"the mid-plane was not found within {self.moves} moves")
+        step = abs(offset - (self._at if self._at is not None else 0.0))
+        if self.travel_mm + step > settings.most_travel_mm:
+            raise PlacementError(
+                f"the mid-plane was not found within {settings.most_travel_mm:g} mm of travel"
+            )
+        self.where = self._bench.move(offset)
+        self._at = offset
+        self.moves += 1
+        self.travel_mm += step
+
+    def go(self, offset: float) -> float:
+        """Go to an offset (mm) from below; returns where the probe is as tracked."""
+        if self._at is None or offset <= self._at:
+            self._move(offset - self.settings.backlash_mm)
+        self._move(offset)
+        return self.where
+
+    def set_threshold(self, threshold: int | float) -> None:
+        """Set the response threshold, counts."""
+        threshold = int(np.clip(round(threshold), 0, self.settings.full_scale))
+        if threshold != self.threshold:
+            self._bench.set_threshold(threshold)
+            self.threshold = threshold
+
+    def listen(self) -> Echoes:
+        """Listen where the probe stands; remembers the place if it is heard."""
+        echoes = self._bench.read(self.settings.frames)
+        self.frames += len(echoes.amplitude)
+        # A place where it is only just heard is no place to come back to.
+        if echoes.heard and (self.good is None or echoes.peak >= 0.5 * self._good_amplitude):
+            self.good, self._good_amplitude = self._at, echoes.peak
+        self.samples.append((self.where, echoes.peak, self.threshold))
+        if self._watch is not None:
+            self._watch(*self.samples[-1])
+        return echoes
+
+    def stop_at(self, offset: float) -> tuple[float, Echoes]:
+        """Go there and listen: offset as tracked (mm), and what was heard."""
+        where = self.go(offset)
+        return where, self.listen()
+
+    def recover(self) -> None:
+        """Back to the last good place after the response was lost.
+
+        Raises:
+            PlacementError: when it is not heard there either, or was never heard.
+        """
+        self.set_threshold(self.settings.low_threshold)
+        if self.good is None:
+            raise PlacementError("the element was not heard anywhere")
+        place = self.good
+        for _ in range(_LISTEN_AGAIN):
+            self.go(place)
+            if self.listen().heard:
+                return
+        raise PlacementError(
+            f"the response was lost, and is not heard at {place:+.2f} mm any more, where it "
+            "was: look at the element, its threshold and the coupling"
+        )
+
+    def leave(self) -> None:
+        """Put the low threshold back and, if there is one, go to the last good place."""
+        self.set_threshold(self.settings.low_threshold)
+        if self.good is not None and self._at is not None and self._at != self.good:
+            self.moves, self.travel_mm = 0, 0.0
+            self.go(self.good)
+
+    def placement(
+        self, procedure: str, offset: float, edges: tuple[float, float], sd_mm: float,
+        amplitude: float,
+    ) -> Placement:  # fmt: skip
+        """The result, the probe standing at ``offset``: edges are of the mid-plane's offset, mm."""
+        # The target's offset in the image is the mid-plane's place less the probe's.
+        low, high = edges[0] - offset, edges[1] - offset
+        bracket = widened(
+            0.5 * (low + high), low, high, sd_mm, self.settings.hidden_sd_mm, self.settings.factor
+        )
+        return Placement(
+            procedure, bracket, self.where, amplitude, self.threshold, self.moves, self.travel_mm,
+            self.frames, np.array(self.samples, float).reshape(-1, 3), tuple(self.notes),
+        )  # fmt: skip
+
+
+def guarded(walker: Walker, run: Callable[[Walker], Placement]) -> Placement:
+    """Run a procedure; if it gives up, leave the probe at the last good place.
+
+    Raises:
+        PlacementError: the procedure's own. Errors of a device pass through untouched: then
+            nothing may move any more.
+    """
+    try:
+        return run(walker)
+    except PlacementError:
+        walker.leave()
+        raise
+
+
+def coarse(walker: Walker, start_mm: float = 0.0) -> float:
+    """Step 1: an elevational raster at the low threshold until the element is heard.
+
+    A narrow raster about ``start_mm`` comes first: plans are mostly nearly right.
+
+    Returns:
+        An offset at which it is heard, mm.
+
+    Raises:
+        PlacementError: nowhere.
+    """
+    settings = walker.settings
+    walker.set_threshold(settings.low_threshold)
+    tried = 0.0
+    for half in (2 * settings.coarse_mm, settings.span_mm):
+        half = min(half, settings.span_mm)
+        for offset in np.arange(-half, half + 1e-9, settings.coarse_mm):
+            if tried and abs(offset) < tried:
+                continue
+            _, echoes = walker.stop_at(start_mm + float(offset))
+            if echoes.heard:
+                return start_mm + float(offset)
+        tried = half
+    raise PlacementError(
+        f"the element was not heard within {settings.span_mm:g} mm either side: is it on, is the "
+        "probe coupled, is the plan's pose right?"
+    )
+
+
+def first_seen(
+    bench: Bench, settings: Settings | None = None, start_mm: float = 0.0,
+    watch: Callable[[float, float, int], None] | None = None,
+) -> Placement:  # fmt: skip
+    """No placement: stop as soon as the element is heard, as conventional practice would.
+
+    Returns:
+        A placement whose bracket is the beam's own reach.
+
+    Raises:
+        PlacementError: it is heard nowhere.
+    """
+    settings = Settings() if settings is None else settings
+
+    def run(walker: Walker) -> Placement:
+        offset = coarse(walker, start_mm)
+        half = settings.beam_half_mm
+        return walker.placement(
+            "first-seen", offset, (offset - half, offset + half), half / np.sqrt(3.0),
+            walker.samples[-1][1],
+        )  # fmt: skip
+
+    return guarded(Walker(bench, settings, watch), run)

@@ -1,0 +1,248 @@
+"""Plan of poses: where the probe looks at the target from (section 3.3 of the paper).
+
+Orientations cover a cone about the direction in which the probe looks, with turns about it; the
+target is spread over the image. All five numbers of a pose run through one Sobol sequence, turned
+round by the seed. A pose whose tip leaves the box, or whose tool centre point is out of the arm's
+reach, is passed over for the next of the sequence.
+
+The planner knows a drawing of the probe's mount and roughly where the target is, not the truth: the
+target will stand off the mid-plane by some millimetres, which the search of :mod:`hw.midplane`
+takes up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from hw.rigid import looking_rotation, rotation
+from hw.scene import Scene
+from jaxcal.errors import InputError
+from jaxcal.geometry import check_poses
+from jaxcal.io.atomic import atomic_path
+
+MOST_POSES = 10_000
+_TRIES_PER_POSE = 50
+# A turn of one degree takes the arm about as long as this many mm.
+_MM_PER_DEGREE = 1.0
+
+
+@dataclass(frozen=True)
+class Extent:
+    """What the plan shall cover, and what it must not leave.
+
+    Attributes:
+        cone_deg: half angle of the cone of axial directions.
+        turn_deg: turns about the axial direction, up to this either way.
+        lateral_mm: the target's lateral position, up to this either way.
+        depth_mm: least and largest range of the target.
+        box_mm: ((3,), (3,)) least and largest corner, in the base frame, that the tip must stay
+            within; None: anywhere.
+        reach_mm: least and largest distance of the tool centre point from the base's origin.
+    """
+
+    cone_deg: float = 35.0
+    turn_deg: float = 90.0
+    lateral_mm: float = 22.0
+    depth_mm: tuple[float, float] = (20.0, 75.0)
+    box_mm: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    reach_mm: tuple[float, float] = (150.0, 850.0)
+
+    def __post_init__(self) -> None:
+        for name, least, largest, unit in (
+            ("cone_deg", 0, 85, "degrees"), ("turn_deg", 0, 180, "degrees"),
+            ("lateral_mm", 0, 500, "mm"),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not (np.isfinite(value) and least <= value <= largest):
+                raise InputError(f"{name} must be {least} to {largest} {unit}, not {value}")
+        for name in ("depth_mm", "reach_mm"):
+            low, high = getattr(self, name)
+            if not (np.isfinite([low, high]).all() and 0 < low <= high <= 5000):
+                raise InputError(f"{name} must be two positive mm in order, not {(low, high)}")
+        if self.box_mm is not None:
+            box = np.asarray(self.box_mm, float)
+            if box.shape != (2, 3) or not np.isfinite(box).all() or (box[0] >= box[1]).any():
+                raise InputError("box_mm must be two corners in mm, the lower one first")
+
+
+@dataclass(frozen=True)
+class PosePlan:
+    """A plan in the order of travel.
+
+    Attributes:
+        poses: (n, 4, 4) tool centre point -> base, mm.
+        expected: (n, 2) where the target should then be in the image: [lateral, range], mm.
+        scene: what it was made from.
+        extent: likewise.
+        passed_over: poses of the sequence that left the box or the reach.
+    """
+
+    poses: Float[np.ndarray, "n 4 4"]
+    expected: Float[np.ndarray, "n 2"]
+    scene: Scene
+    extent: Extent
+    passed_over: int = 0
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    @property
+    def tips_mm(self) -> Float[np.ndarray, "n 3"]:
+        """The probe's tip in the base frame, mm."""
+        return self.poses[:, :3, :3] @ self.scene.tip_mm + self.poses[:, :3, 3]
+
+    @property
+    def travel_mm(self) -> float:
+        """Length of the tip's way from the first pose to the last, mm."""
+        return float(np.linalg.norm(np.diff(self.tips_mm, axis=0), axis=1).sum())
+
+
+def plan_poses(count: int, scene: Scene, extent: Extent | None = None, seed: int = 0) -> PosePlan:
+    """A plan of ``count`` poses.
+
+    Args:
+        count: 1 to 10000.
+        scene: what is known of probe and target.
+        extent: what to cover; the default covers 35 degrees and +-90 degrees of turn.
+        seed: another one gives another plan of the same quality.
+
+    Raises:
+        InputError: a scene that is no scene, or a box or reach that leaves too few poses.
+    """
+    extent = Extent() if extent is None else extent
+    if not 1 <= count <= MOST_POSES:
+        raise InputError(f"a plan has 1 to {MOST_POSES} poses, not {count}")
+    nominal = check_poses(np.asarray(scene.image_to_probe)[None], what="nominal image_to_probe")[0]
+    point = np.asarray(scene.point_mm, float)
+    looking = np.asarray(scene.looking, float)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise InputError("the target's nominal position must be three finite mm")
+    if looking.shape != (3,) or not np.linalg.norm(looking) > 0:
+        raise InputError("the looking direction must be three numbers, not all zero")
+
+    from scipy.stats import qmc
+
+    # Sobol points are balanced in powers of two; turned round in the unit cube, they stay even.
+    sequence = qmc.Sobol(5, scramble=False)
+    draws = sequence.random_base2(int(np.ceil(np.log2(_TRIES_PER_POSE * count))))
+    draws = (draws + np.random.default_rng(seed).random(5)) % 1.0
+    poses, expected, passed = [], [], 0
+    for fraction in draws:
+        rotation = _orientation(fraction[:3], looking, nominal, extent)
+        lateral = extent.lateral_mm * (2 * fraction[3] - 1)
+        shallow, deep = extent.depth_mm
+        depth = shallow + (deep - shallow) * fraction[4]
+        pose = np.eye(4)
+        pose[:3, :3] = rotation
+        place = nominal[:3, :3] @ [lateral, 0.0, depth] + nominal[:3, 3]
+        pose[:3, 3] = point - rotation @ place
+        if not _allowed(pose, nominal[:3, 3], extent):
+            passed += 1
+            continue
+        poses.append(pose)
+        expected.append([lateral, depth])
+        if len(poses) == count:
+            break
+    else:
+        raise InputError(
+            f"only {len(poses)} of {count} poses stay inside the box and the reach: widen them, or "
+            "narrow the cone"
+        )
+    tour = _short_tour(np.array(poses), nominal[:3, 3])
+    return PosePlan(np.array(poses)[tour], np.array(expected)[tour], scene, extent, passed)
+
+
+def _orientation(
+    fraction: np.ndarray, looking: np.ndarray, nominal: np.ndarray, extent: Extent
+) -> Float[np.ndarray, "3 3"]:
+    """Rotation tool centre point -> base: uniform over the cone's cap, then a turn."""
+    image = looking_rotation(looking)
+    tilt = np.arccos(1 - fraction[0] * (1 - np.cos(np.radians(extent.cone_deg))))
+    azimuth = 2 * np.pi * fraction[1]
+    turn = np.radians(extent.turn_deg) * (2 * fraction[2] - 1)
+    tilted = rotation(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
+    return image @ tilted @ rotation(np.array([0.0, 0.0, turn])) @ nominal[:3, :3].T
+
+
+def _allowed(pose: np.ndarray, tip: np.ndarray, extent: Extent) -> bool:
+    distance = np.linalg.norm(pose[:3, 3])
+    if not extent.reach_mm[0] <= distance <= extent.reach_mm[1]:
+        return False
+    if extent.box_mm is None:
+        return True
+    place = pose[:3, :3] @ tip + pose[:3, 3]
+    low, high = np.asarray(extent.box_mm, float)
+    return bool((place >= low).all() and (place <= high).all())
+
+
+def _short_tour(poses: np.ndarray, tip: np.ndarray) -> np.ndarray:
+    """Order of short travel: nearest neighbour, then 2-opt; moves and turns both count."""
+    tips = poses[:, :3, :3] @ tip + poses[:, :3, 3]
+    apart = np.linalg.norm(tips[:, None] - tips[None], axis=-1)
+    trace = np.einsum("aij,bij->ab", poses[:, :3, :3], poses[:, :3, :3])
+    turn = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    cost = apart + _MM_PER_DEGREE * turn
+    left = np.ones(len(poses), bool)
+    tour = [0]
+    left[0] = False
+    for _ in range(len(poses) - 1):
+        following = int(np.argmin(np.where(left, cost[tour[-1]], np.inf)))
+        tour.append(following)
+        left[following] = False
+    return _two_opt(np.array(tour), cost)
+
+
+def _two_opt(tour: np.ndarray, cost: np.ndarray, rounds: int = 20) -> np.ndarray:
+    """Turn pieces of an open tour round as long as that shortens it."""
+    if len(tour) > 500:
+        return tour
+    for _ in range(rounds):
+        better = False
+        for first in range(1, len(tour) - 2):
+            ends = tour[first + 1 :]
+            after = np.append(tour[first + 2 :], -1)
+            before, here = tour[first - 1], tour[first]
+            now = cost[before, here] + np.where(after >= 0, cost[ends, after], 0.0)
+            then = cost[before, ends] + np.where(after >= 0, cost[here, after], 0.0)
+            gain = now - then
+            best = int(np.argmax(gain))
+            if gain[best] > 1e-9:
+                last = first + 1 + best
+                tour[first : last + 1] = tour[first : last + 1][::-1].copy()
+                better = True
+        if not better:
+            break
+    return tour
+
+
+def preview(plan: PosePlan, path: Path) -> None:
+    """Write a figure of the plan: tips and axes in the base frame, cone, target over the image."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 4), layout="constrained")
+    room = figure.add_subplot(1, 3, 1, projection="3d")
+    tips = plan.tips_mm
+    axial = plan.poses[:, :3, :3] @ plan.scene.image_to_probe[:3, 2]
+    room.plot(*tips.T, "-", color="0.7", linewidth=0.8)
+    room.quiver(*tips.T, *(12.0 * axial.T), color="tab:blue", linewidth=0.8)
+    room.plot(*np.asarray(plan.scene.point_mm)[:, None], "r*", markersize=12)
+    room.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)",
+             title=f"{len(plan)} poses, tip travels {plan.travel_mm:.0f} mm")  # fmt: skip
+
+    cone = figure.add_subplot(1, 3, 2, projection="polar")
+    first, second, along = (axial @ looking_rotation(plan.scene.looking)).T
+    tilt = np.degrees(np.arccos(np.clip(along, -1, 1)))
+    cone.scatter(np.arctan2(second, first), tilt, c=np.arange(len(plan)), s=16)
+    cone.set_title("axial direction: tilt (degrees)")
+
+    image = figure.add_subplot(1, 3, 3)
+    image.scatter(*plan.expected.T, c=np.arange(len(plan)), s=16)
+    image.set(xlabel="lateral (mm)", ylabel="range (mm)", title="target in the image",
+              aspect="equal")  # fmt: skip
+    image.invert_yaxis()
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=130, format=path.suffix.lstrip(".") or "png")
