@@ -48,6 +48,7 @@ class Recorder:
     Args:
         path: the file to make, or with ``header`` None the incomplete one to go on with.
         header: what a new file is told (see :class:`hw.recording_layout.Header`).
+        time_offset_s: added to host times, so that they go on where a resumed recording ended.
         queue_bytes: most that may wait; continuous data beyond are dropped and counted.
         patience_s: how long a selected image or the end may take, in wall-clock seconds, before
             the disk is given up.
@@ -62,6 +63,7 @@ class Recorder:
         path: str | os.PathLike[str],
         header: Header | None = None,
         *,
+        time_offset_s: float = 0.0,
         queue_bytes: int = QUEUE_BYTES,
         patience_s: float = _PATIENCE_S,
     ) -> None:
@@ -71,6 +73,7 @@ class Recorder:
         self.dropped: dict[str, int] = {}
         """Rows of continuous data that found the queue full, by group."""
         self._capacity, self._patience = queue_bytes, patience_s
+        self._time_offset = time_offset_s
         self._queue: deque[tuple[bytes, ...]] = deque()
         self._waiting = 0
         self._changed = threading.Condition()
@@ -181,6 +184,8 @@ class Recorder:
         t_host: float,
         target: int,
         bracket: tuple[float, float, float, float],
+        offset: float = 0.0,
+        true_elevation: float = float("nan"),
         seconds: float = 0.0,
     ) -> None:
         """Take an image: when this returns it is on the disk.
@@ -193,7 +198,9 @@ class Recorder:
             amplitude: received.
             t_host: s.
             target: row of the plan.
-            bracket: centre, low, high, sd of the offset about the pose, mm.
+            bracket: centre, low, high, sd of the target's elevational offset, mm.
+            offset: of the probe from the plan's pose along its elevational axis, mm.
+            true_elevation: the emulated bench's truth, mm.
             seconds: how long the image took, in the bench's time.
 
         Raises:
@@ -205,10 +212,11 @@ class Recorder:
             "mask": np.array([True]), "time": np.array([t_host]), "target": np.array([target]),
         })  # fmt: skip
         centre, low, high, sd = bracket
-        self._rows("placement", {
-            "centre": np.array([centre]), "low": np.array([low]), "high": np.array([high]),
-            "sd": np.array([sd]), "seconds": np.array([seconds]),
-        })  # fmt: skip
+        values = {
+            "centre": centre, "low": low, "high": high, "sd": sd, "offset": offset,
+            "true_elevation": true_elevation, "seconds": seconds,
+        }  # fmt: skip
+        self._rows("placement", {name: np.array([value]) for name, value in values.items()})
         self.sync()
 
     def add_estimate(self, columns: Mapping[str, np.ndarray]) -> None:
@@ -281,7 +289,11 @@ class Recorder:
         *,
         wait: bool = True,
     ) -> bool:
-        parts = encode(message, columns or {})
+        columns = dict(columns or {})
+        for name in ("t_host", "time"):
+            if name in columns:
+                columns[name] = columns[name] + self._time_offset
+        parts = encode(message, columns)
         size = sum(map(len, parts))
         deadline = time.monotonic() + self._patience
         with self._changed:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import dataclass
 
 import h5py
 import numpy as np
@@ -19,9 +20,9 @@ from hw.recording_layout import (
     VERSION,
     Column,
 )
-from jaxcal.errors import FormatError
+from jaxcal.errors import FormatError, InputError
 from jaxcal.io.readable import check_readable
-from jaxcal.io.untrusted import Node, child, flag, group, number, open_root, text
+from jaxcal.io.untrusted import Node, UpTo, array, child, flag, group, number, open_root, text
 
 
 def check_resumable(path: str | os.PathLike[str]) -> None:
@@ -55,6 +56,67 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
         raise FormatError(f"{path}: {error}") from None
 
 
+@dataclass(frozen=True)
+class Progress:
+    """What an interrupted acquisition has, checked.
+
+    Attributes:
+        settings: how it was asked for.
+        targets: (n, 4, 4) plan of poses, mm.
+        poses: (k, 4, 4) of the selected images.
+        measurements: (k, elements) times of flight, s.
+        max_elevation: (k,) mm.
+        taken: (k,) row of the plan of every image.
+        true_elevation: (k,) mm, NaN on a real bench.
+        last_s: latest host time in the file.
+    """
+
+    settings: dict[str, object]
+    targets: np.ndarray
+    poses: np.ndarray
+    measurements: np.ndarray
+    max_elevation: np.ndarray
+    taken: np.ndarray
+    true_elevation: np.ndarray
+    last_s: float
+
+
+def read_progress(path: str | os.PathLike[str]) -> Progress:
+    """What an acquisition's recording holds so far; the file is not trusted.
+
+    Raises:
+        FormatError: not such a file; one line that starts with the path.
+    """
+    from jaxcal.geometry import check_poses  # needs JAX, which the writer's process does not
+
+    check_readable(path)
+    try:
+        with open_root(path) as root:
+            images = UpTo(100_000, "images")
+            taken = _read(root, "calibration", "target", (images,), "i")
+            last = [0.0]
+            for name in ("tracker", "ae", "events"):
+                times = _read(root, name, "t_host", (UpTo(2**27, "rows"),))
+                last.append(float(np.nanmax(times, initial=0.0)))
+            progress = Progress(
+                settings=_settings(root),
+                targets=check_poses(_read(root, "plan", "targets", (images, 4, 4))),
+                poses=_read(root, "calibration", "pose", (images, 4, 4)),
+                measurements=_read(
+                    root, "calibration", "time_of_flight", (images, UpTo(4096, "elements"))
+                ),
+                max_elevation=_read(root, "calibration", "max_elevation", (images,)),
+                taken=taken,
+                true_elevation=_read(root, "placement", "true_elevation", (images,)),
+                last_s=max(last),
+            )
+    except InputError as error:
+        raise FormatError(f"{path}: {error}") from None
+    if taken.size and not (0 <= taken.min() and taken.max() < len(progress.targets)):
+        raise FormatError(f"{path}: /calibration/target names a pose that the plan does not have")
+    return progress
+
+
 def settings_of(path: str | os.PathLike[str]) -> dict[str, object]:
     """How the acquisition of a recording was asked for; of a file that is not trusted.
 
@@ -64,21 +126,30 @@ def settings_of(path: str | os.PathLike[str]) -> dict[str, object]:
     check_readable(path)
     try:
         with open_root(path) as root:
-            node = group(root, "plan")
-            dataset = None if node is None else child(node, "settings")
-            if dataset is None or not isinstance(dataset.item, h5py.Dataset):
-                raise FormatError("has no /plan/settings: it was not made by an acquisition")
-            _check_place(dataset)
-            if dataset.item.dtype != np.uint8 or (dataset.item.size or 0) > LARGEST_SETTINGS:
-                raise FormatError("has settings that cannot be read")
-            found = json.loads(bytes(np.asarray(dataset.item[()])).decode())
-            if not isinstance(found, dict):
-                raise FormatError("has settings that are not a JSON object")
-            return found
+            return _settings(root)
     except FormatError as error:
         raise FormatError(f"{path}: {error}") from None
-    except (ValueError, RecursionError, UnicodeDecodeError):
-        raise FormatError(f"{path}: has settings that are not JSON") from None
+
+
+def _settings(root: Node) -> dict[str, object]:
+    values = _read(root, "plan", "settings", (UpTo(LARGEST_SETTINGS, "bytes"),), "u")
+    try:
+        found = json.loads(values.astype(np.uint8).tobytes().decode())
+    except (ValueError, RecursionError):
+        raise FormatError("has settings that are not JSON") from None
+    if not isinstance(found, dict):
+        raise FormatError("has settings that are not a JSON object")
+    return found
+
+
+def _read(
+    root: Node, name: str, key: str, shape: tuple[int | UpTo, ...], kinds: str = "iuf"
+) -> np.ndarray:
+    node = group(root, name)
+    dataset = None if node is None else child(node, key)
+    if dataset is None:
+        raise FormatError(f"has no /{name}/{key}: it was not made by an acquisition")
+    return array(dataset, shape, kinds)
 
 
 def _mend_length(path: str | os.PathLike[str]) -> None:

@@ -14,8 +14,11 @@ A superset of the smallest valid recording (:mod:`jaxcal.io.hdf5`): once ``compl
     /clock       t_host [s], device, offset [s], drift, residual [s]: fits of a device's clock
     /calibration the selected images: pose, time_of_flight or point, max_elevation, amplitude, mask,
                  time; target: the row of /plan that the image belongs to
-    /placement   one row for each selected image: bracket low, high, centre, sd [mm] about the pose
-    /estimate    one row for each solve: images, image_to_probe, covariance, sigma, rms, status
+    /placement   one row for each selected image: the target's elevational offset lies in [low,
+                 high], centre, sd; offset of the probe from the plan's pose; true_elevation
+                 (emulated bench, else NaN) [mm]; seconds that the placement took
+    /estimate    the calibration so far, after every image: t_host, images, image_to_probe,
+                 covariance, point, sigma, rms, status
     /plan        targets (n,4,4) [mm] tool centre point -> robot base; settings (JSON text, bytes)
     /test /truth optional (emulated bench), as in jaxcal.io.hdf5
 """
@@ -105,9 +108,12 @@ LAYOUT: dict[str, dict[str, Column]] = {
         "low": _MM,
         "high": _MM,
         "sd": _MM,
+        "offset": _MM,
+        "true_elevation": _MM,
         "seconds": Column((), "f8", "s", 1),
     },
     "estimate": {
+        "t_host": Column((), "f8", "s", 1),
         "images": Column((), "i8", "1", 1),
         "image_to_probe": _POSE,
         "covariance": Column((6, 6), "f8", "mm^2, mm rad, rad^2", 1),
@@ -115,7 +121,6 @@ LAYOUT: dict[str, dict[str, Column]] = {
         "sigma": Column((3,), "f8", "mm", 1),
         "rms": _MM,
         "status": Column((), "i8", "1", 1),
-        "seconds": Column((), "f8", "s", 1),
     },
 }
 """What may be appended to; a row is appended to all columns of its group, or to none."""

@@ -1,0 +1,287 @@
+"""The open devices of an acquisition: what they send goes to the file, and is watched meanwhile.
+
+One thread empties every device's queue into the recorder and keeps the newest echo frames at hand
+for whoever listens. :meth:`Session.trouble` is asked at every tick of a motion, and stops it: a
+reason is a line for a person. A short hesitation of a device stops the robot and is noted; the
+acquisition goes on when the device does (:meth:`Session.wait_until_clear`), and ends when it does
+not.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from hw.active_echo.device import ActiveEcho, EchoFrame
+from hw.clock import Clock
+from hw.errors import Device, DeviceError, LostError, StaleError
+from hw.recorder import Recorder
+from hw.robot.stream import PoseStream
+from hw.setup import Setup
+from hw.ultrasound.receiver import Image, UltrasoundStream
+
+_PERIOD_WALL_S = 0.005
+_KEPT_FRAMES = 256
+
+
+@dataclass(frozen=True)
+class Watch:
+    """When a device counts as in trouble; times in bench seconds.
+
+    Attributes:
+        echo_age_s: no active-echo frame for so long.
+        image_age_s: no ultrasound frame for so long.
+        burst: damaged or missing frames within ``burst_s`` that are more than bad luck.
+        burst_s: see there.
+        grace_s: how long trouble may last before the acquisition gives up.
+        clear_s: how long it must have been gone before anything moves.
+    """
+
+    echo_age_s: float = 0.12
+    image_age_s: float = 1.0
+    burst: int = 3
+    burst_s: float = 0.5
+    grace_s: float = 3.0
+    clear_s: float = 0.3
+
+
+class Session:
+    """Poses, active echo and images of one acquisition; a context manager.
+
+    Args:
+        setup: where the devices are.
+        recorder: where everything goes.
+        watch: what counts as trouble.
+        frames: whether every ultrasound frame is recorded, or only those that are asked for.
+
+    Raises:
+        DeviceError: a device that is not there; those already open are closed again.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        recorder: Recorder,
+        *,
+        watch: Watch | None = None,
+        every_frame: bool = False,
+    ) -> None:
+        self.setup, self.clock = setup, setup.clock
+        self.watch = Watch() if watch is None else watch
+        self._recorder, self._every_frame = recorder, every_frame
+        self._changed = threading.Condition()
+        self._echo_frames: deque[EchoFrame] = deque(maxlen=_KEPT_FRAMES)
+        self._image: Image | None = None
+        self._failure: Exception | None = None
+        self._bad: deque[tuple[float, Device, str]] = deque(maxlen=_KEPT_FRAMES)
+        self._stopping = False
+        self.last_trouble: str | None = None
+        """What :meth:`trouble` said last when it said something."""
+        self._began = self.clock.now()
+        self._echo_seen = self._image_seen = self._began
+        opened = []
+        try:
+            self.poses = PoseStream(
+                setup.robot_host, clock=self.clock, frequency_hz=setup.frequency_hz
+            )
+            self.poses.start()
+            opened.append(self.poses)
+            self.echo = ActiveEcho(
+                setup.active_echo_url, clock=self.clock, lines=setup.probe.elements
+            )
+            opened.append(self.echo)
+            self.images: UltrasoundStream | None = None
+            if setup.ultrasound is not None:
+                self.images = UltrasoundStream(*setup.ultrasound, clock=self.clock)
+                self.images.start()
+                opened.append(self.images)
+            self.echo.stream(True)
+        except BaseException:
+            for device in reversed(opened):
+                device.close()
+            raise
+        self._counts = self.echo.statistics()
+        self._echo_seen = self._image_seen = self.clock.now()
+        self._thread = threading.Thread(target=self._pump, daemon=True, name="session")
+        self._thread.start()
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Record what still waits and close every device; safe to repeat."""
+        if self._stopping:
+            return
+        self._stopping = True
+        self._thread.join()
+        for device in (self.images, self.echo, self.poses):
+            if device is not None:
+                device.close()
+
+    # Trouble
+
+    def trouble(self) -> str | None:
+        """What is wrong with a device now, as one line; None if nothing is."""
+        error = self._trouble()
+        if error is not None:
+            self.last_trouble = str(error)
+        return None if error is None else str(error)
+
+    def check(self) -> None:
+        """Raise what is wrong.
+
+        Raises:
+            DeviceError: trouble of a device.
+            OutputError: the recorder's.
+        """
+        error = self._trouble()
+        if error is not None:
+            raise error
+
+    def wait_until_clear(self) -> None:
+        """Wait for the end of a hesitation.
+
+        Raises:
+            DeviceError: it lasts longer than ``watch.grace_s``, or the device is gone.
+        """
+        deadline = self.clock.now() + self.watch.grace_s
+        clear_since: float | None = None
+        while True:
+            error, now = self._trouble(), self.clock.now()
+            if error is None:
+                clear_since = now if clear_since is None else clear_since
+                if now - clear_since >= self.watch.clear_s:
+                    return
+            else:
+                clear_since = None
+                if now > deadline or not isinstance(error, StaleError):
+                    raise error
+            time.sleep(_PERIOD_WALL_S)
+
+    def _trouble(self) -> Exception | None:
+        with self._changed:
+            if self._failure is not None:
+                return self._failure
+            now, watch = self.clock.now(), self.watch
+            recent = [(device, what) for t, device, what in self._bad if now - t <= watch.burst_s]
+            for what in {what for _, what in recent}:
+                count = sum(other == what for _, other in recent)
+                if count > watch.burst:
+                    device = next(device for device, other in recent if other == what)
+                    return StaleError(
+                        f"{count} frames {what} within {watch.burst_s:g} s: look at its cable",
+                        device=device,
+                    )
+            if now - self._echo_seen > watch.echo_age_s:
+                return StaleError(
+                    f"no frame for {now - self._echo_seen:.2f} s: is the ultrasound machine "
+                    "frozen, or its frame trigger unplugged?",
+                    device="active echo",
+                )
+            if self.images is not None and now - self._image_seen > watch.image_age_s:
+                return StaleError(
+                    f"no image for {now - self._image_seen:.1f} s: is the machine frozen?",
+                    device="ultrasound",
+                )
+        return None
+
+    # Data
+
+    def listen(self, frames: int, since: float) -> list[EchoFrame]:
+        """Whole echo frames that began after a moment.
+
+        Args:
+            frames: how many.
+            since: bench time; a frame is taken to have begun a frame's period before it arrived.
+
+        Raises:
+            DeviceError: trouble while waiting.
+        """
+        period = 1 / 30
+        deadline = self.clock.now() + 2 * frames * period + self.watch.grace_s
+        with self._changed:
+            while True:
+                found = [f for f in self._echo_frames if f.t_host - period > since]
+                if len(found) >= frames:
+                    return found[:frames]
+                if self._failure is not None:
+                    raise self._failure
+                if self.clock.now() > deadline:
+                    break
+                self._changed.wait(self.clock.wall(0.1))
+        self.check()
+        raise StaleError(
+            f"only {len(found)} of {frames} frames came in time", device="active echo"
+        )
+
+    def latest_image(self) -> Image | None:
+        """The newest ultrasound frame, or None before the first."""
+        with self._changed:
+            return self._image
+
+    def record_image(self) -> None:
+        """Put the newest ultrasound frame into the recording, where not all of them go there."""
+        image = self.latest_image()
+        if image is not None and not self._every_frame:
+            self._recorder.add_images([image])
+
+    def _pump(self) -> None:
+        try:
+            while True:
+                ending = self._stopping
+                self._empty()
+                if ending:
+                    return
+                time.sleep(_PERIOD_WALL_S)
+        except Exception as error:
+            with self._changed:
+                self._failure = error
+                self._changed.notify_all()
+
+    def _empty(self) -> None:
+        frames = self.echo.drain()
+        images = [] if self.images is None else self.images.drain()
+        poses = self.poses.drain()
+        now, counts = self.clock.now(), self.echo.statistics()
+        with self._changed:
+            for what in ("crc_errors", "lost", "short"):
+                more = getattr(counts, what) - getattr(self._counts, what)
+                text = {
+                    "crc_errors": "arrived damaged (CRC)",
+                    "lost": "were lost (missed triggers, or damaged on the way)",
+                    "short": "came with lines missing (missed line triggers)",
+                }[what]
+                self._bad.extend((now, "active echo", text) for _ in range(min(more, 16)))
+            self._counts = counts
+            if frames:
+                self._echo_frames.extend(frames)
+                self._echo_seen = frames[-1].t_host
+            if images:
+                self._image, self._image_seen = images[-1], images[-1].t_host
+            self._changed.notify_all()
+        self._recorder.add_poses(poses)
+        self._recorder.add_echo(frames)
+        if self._every_frame:
+            self._recorder.add_images(images)
+
+
+def median_times(frames: list[EchoFrame]) -> tuple[np.ndarray, float]:
+    """One frame from several of the same place.
+
+    Returns:
+        (lines,) median time of flight, s, NaN where fewer than half of the frames have one; and
+        the median over the frames of the loudest amplitude, counts.
+    """
+    times = np.array([frame.tof_s for frame in frames])
+    answered = 2 * np.isfinite(times).sum(axis=0) >= len(frames)
+    middle = np.full(times.shape[1], np.nan)
+    middle[answered] = np.nanmedian(times[:, answered], axis=0)
+    loudest = float(np.median([frame.amplitude.max() for frame in frames]))
+    return middle, loudest

@@ -1,0 +1,107 @@
+"""The probe at one pose of the plan: the procedures' view of the real clients.
+
+Moves go through the motion process and its gate; a hesitation of a device stops the robot, and the
+move is asked for again when the device is back, a few times at most. Everything else ends the
+acquisition.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from hw.errors import DeviceError, StaleError, StoppedError
+from hw.midplane.search import Echoes
+from hw.robot.motion import Motion
+from hw.session import Session
+
+FINE_SPEED_MM_S = 10.0
+_MOST_HESITATIONS = 5
+
+
+class ProbeStage:
+    """A probe that can be moved along its nominal elevational axis and listened to.
+
+    Args:
+        session: devices.
+        motion: of the robot.
+        note: told of what belongs into the diary: kind, text.
+    """
+
+    def __init__(
+        self, session: Session, motion: Motion, note: Callable[[str, str], None]
+    ) -> None:
+        self._session, self._motion, self._note = session, motion, note
+        self._axis = np.asarray(session.setup.scene.elevational, float)
+        self.plan_pose = np.eye(4)
+        self._arrived = session.clock.now()
+
+    def go_to(self, pose: np.ndarray) -> None:
+        """Travel to a pose of the plan; offsets count from there.
+
+        Raises:
+            DeviceError: stopped, refused, lost, or a device in lasting trouble.
+        """
+        self.plan_pose = np.array(pose, float)
+        self._move(self.plan_pose, self._session.setup.speed_mm_s)
+
+    def move(self, offset_mm: float) -> float:
+        """Go to an offset (mm) along the elevational axis; the offset as tracked."""
+        pose = self.plan_pose.copy()
+        direction = pose[:3, :3] @ self._axis
+        pose[:3, 3] += offset_mm * direction
+        self._move(pose, FINE_SPEED_MM_S)
+        tracked = self._session.poses.latest().pose
+        return float((tracked[:3, 3] - self.plan_pose[:3, 3]) @ direction)
+
+    def read(self, frames: int) -> Echoes:
+        """Whole frames that began after the last move."""
+        heard = self._session.listen(frames, self._arrived)
+        answered = np.array([np.isfinite(frame.tof_s) for frame in heard])
+        amplitude = np.array([frame.amplitude for frame in heard], float)
+        return Echoes(np.where(answered, amplitude, 0.0), answered)
+
+    def set_threshold(self, threshold: int) -> None:
+        """Counts; frames that began under another threshold are not read any more."""
+        self._session.echo.set_threshold(threshold)
+        self._arrived = self._session.clock.now()
+
+    def load_pattern(self, pattern: bytes) -> None:
+        """Lay a pattern over the lines about the loudest one."""
+        heard = self._session.listen(1, self._arrived)[0]
+        lines = self._session.setup.probe.elements
+        level = np.zeros(lines, np.uint8)
+        values = np.frombuffer(pattern, np.uint8)
+        first = int(np.argmax(heard.amplitude)) - len(values) // 2
+        keep = (np.arange(len(values)) + first >= 0) & (np.arange(len(values)) + first < lines)
+        level[np.arange(len(values))[keep] + first] = values[keep]
+        self._session.echo.load_pattern(level.tobytes())
+
+    def inject(self, on: bool, delay_ticks: int = 0) -> None:
+        """Switch injection."""
+        self._session.echo.inject(on, delay_ticks)
+
+    @property
+    def arrived_s(self) -> float:
+        """Bench time since which nothing has moved and the threshold is what it is."""
+        return self._arrived
+
+    def _move(self, pose: np.ndarray, speed_mm_s: float) -> None:
+        for hesitation in range(_MOST_HESITATIONS + 1):
+            self._session.wait_until_clear()
+            try:
+                self._motion.move_to(pose, speed_mm_s)
+            except (StoppedError, StaleError) as error:
+                if not self._hesitated(error) or hesitation == _MOST_HESITATIONS:
+                    raise
+                self._note("hesitation", str(error))
+                continue
+            self._arrived = self._session.clock.now()
+            return
+
+    def _hesitated(self, error: DeviceError) -> bool:
+        """Whether a stop was ours, because of a device that may come back by itself."""
+        if isinstance(error, StaleError):
+            return True
+        return self._session.last_trouble is not None and self._session.last_trouble in str(error)
