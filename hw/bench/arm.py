@@ -1,0 +1,231 @@
+"""An arm that moves its tool along straight lines: pure kinematics in bench time.
+
+A motion is a path (position along a line, orientation along a great circle, both with the same
+parameter) and a profile over it (trapezoid of speed, or a brake). The state at any bench time
+follows from the last motion alone, so reading it has no side effects and any thread may do so.
+
+The tool is where the commands put it only to within the arm's repeatability: :meth:`Arm.raw` is
+what the joint encoders say, :meth:`Arm.true_raw` is where the tool is. The difference is redrawn
+with travel (its correlation falls as exp(-travel / ``correlation_mm``)), as a fine step hardly
+changes the gears' error while a long move changes all of it.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+Vector = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Motion:
+    start: float
+    """Bench time (s) at which the profile starts."""
+    position: Vector
+    quaternion: Vector
+    travel: Vector
+    """Displacement (m) from the path's start to its end."""
+    turn: Vector
+    """Rotation vector (rad), in the base frame, from the path's start to its end."""
+    length: float
+    """Path length: metres, or radians where that is more."""
+    speed: float
+    acceleration: float
+    first: float = 0.0
+    """Path parameter (m or rad) at which the profile starts."""
+    brake: bool = False
+    error: tuple[Vector, Vector] = ((0.0,) * 6, (0.0,) * 6)
+
+    def duration(self) -> float:
+        if self.brake:
+            return self.speed / self.acceleration
+        if self.length <= 0:
+            return 0.0
+        if self.speed**2 >= self.length * self.acceleration:
+            return 2 * math.sqrt(self.length / self.acceleration)
+        return self.length / self.speed + self.speed / self.acceleration
+
+    def at(self, t: float) -> tuple[float, float]:
+        """Path parameter and its rate at bench time t."""
+        passed, total = t - self.start, self.duration()
+        if passed <= 0:
+            return self.first, 0.0
+        if self.brake:
+            passed = min(passed, total)
+            rate = max(0.0, self.speed - self.acceleration * passed)
+            return self.first + passed * (self.speed + rate) / 2, rate
+        if passed >= total:
+            return self.length, 0.0
+        peak = min(self.speed, math.sqrt(self.length * self.acceleration))
+        ramp = peak / self.acceleration
+        if passed < ramp:
+            return self.acceleration * passed**2 / 2, self.acceleration * passed
+        if passed > total - ramp:
+            left = total - passed
+            return self.length - self.acceleration * left**2 / 2, self.acceleration * left
+        return peak * (passed - ramp / 2), peak
+
+
+class Arm:
+    """The emulated arm.
+
+    Args:
+        raw: where the tool starts, [x, y, z] m and rotation vector rad, in the base frame.
+        tcp_offset: the tool centre point in the flange's frame, as ``raw``; recorded, not used.
+        repeatability_mm: SD of the tool's position error per axis.
+        repeatability_deg: SD of its orientation error per axis.
+        correlation_mm: travel over which the error is forgotten.
+        seed: of the errors.
+        halt_acceleration: m/s^2 of a protective stop, and of a program that is stopped.
+        reach_m: smallest and largest distance of the tool from the base that counts as safe.
+    """
+
+    def __init__(
+        self,
+        raw: Sequence[float],
+        *,
+        tcp_offset: Sequence[float] = (0.0,) * 6,
+        repeatability_mm: float = 0.0,
+        repeatability_deg: float = 0.0,
+        correlation_mm: float = 20.0,
+        seed: int = 0,
+        halt_acceleration: float = 2.0,
+        reach_m: tuple[float, float] = (0.15, 0.85),
+    ) -> None:
+        self.tcp_offset: Vector = _six(tcp_offset)
+        self.halt_acceleration = halt_acceleration
+        self.reach_m = reach_m
+        self._sd = (repeatability_mm / 1000.0,) * 3 + (math.radians(repeatability_deg),) * 3
+        self._correlation = correlation_mm / 1000.0
+        self._random = random.Random(seed)
+        first = tuple(self._random.gauss(0.0, sd) for sd in self._sd)
+        start = _six(raw)
+        self._motion = _Motion(
+            -math.inf, start[:3], _quaternion(start[3:]), (0.0,) * 3, (0.0,) * 3, 0.0, 1.0, 1.0,
+            error=(first, first),
+        )  # fmt: skip
+
+    def move_linear(
+        self, t: float, target: Sequence[float], speed: float, acceleration: float
+    ) -> float:
+        """Move to a pose in a straight line; returns the bench time (s) of arrival.
+
+        Args:
+            t: bench time now, s.
+            target: [x, y, z] m and rotation vector rad.
+            speed: m/s of the tool; where the turn in rad is more than the travel in m, rad/s.
+            acceleration: m/s^2, likewise.
+        """
+        position, quaternion, error = self._where(t)
+        goal = _six(target)
+        travel = tuple(b - a for a, b in zip(position, goal[:3], strict=True))
+        turn = _rotation_vector(_multiply(_quaternion(goal[3:]), _conjugate(quaternion)))
+        distance = math.hypot(*travel)
+        length = max(distance, math.hypot(*turn))
+        keep = math.exp(-distance / self._correlation)
+        fresh = math.sqrt(1 - keep**2)
+        drawn = tuple(
+            keep * e + fresh * self._random.gauss(0.0, sd)
+            for e, sd in zip(error, self._sd, strict=True)
+        )
+        motion = _Motion(
+            t, position, quaternion, travel, turn, length, speed, acceleration,
+            error=(error, drawn),
+        )  # fmt: skip
+        self._motion = motion
+        return t + motion.duration()
+
+    def servo(self, t: float, target: Sequence[float], duration: float) -> None:
+        """Be at a pose after ``duration`` s, at a constant speed."""
+        self.move_linear(t, target, 1.0, 1e9)
+        length = self._motion.length
+        self._motion = replace(self._motion, speed=max(length / max(duration, 1e-3), 1e-9))
+
+    def stop(self, t: float, acceleration: float | None = None) -> float:
+        """Brake on the path (m/s^2); returns the bench time (s) at which the arm rests."""
+        moving = self._motion
+        first, rate = moving.at(t)
+        if rate == 0.0 and t >= moving.start + moving.duration():
+            return t
+        brake = replace(
+            moving, start=t, first=first, speed=rate, brake=True,
+            acceleration=acceleration or self.halt_acceleration,
+        )  # fmt: skip
+        self._motion = brake
+        return t + brake.duration()
+
+    def raw(self, t: float) -> Vector:
+        """Pose by the encoders at bench time t: m and rotation vector (rad)."""
+        position, quaternion, _ = self._where(t)
+        return position + _rotation_vector(quaternion)
+
+    def true_raw(self, t: float) -> Vector:
+        """Where the tool really is at bench time t: m and rotation vector (rad)."""
+        position, quaternion, error = self._where(t)
+        moved = tuple(p + e for p, e in zip(position, error, strict=False))
+        return moved + _rotation_vector(_multiply(_quaternion(error[3:]), quaternion))
+
+    def velocity(self, t: float) -> Vector:
+        """Speed of the tool at bench time t: m/s and rad/s."""
+        moving = self._motion
+        _, rate = moving.at(t)
+        if rate == 0.0 or moving.length == 0.0:
+            return (0.0,) * 6
+        return tuple(v * rate / moving.length for v in moving.travel + moving.turn)
+
+    def rest_since(self, t: float) -> float | None:
+        """Bench time (s) since which the arm rests; None while it moves."""
+        end = self._motion.start + self._motion.duration()
+        return None if t < end else end
+
+    def within_reach(self, raw: Sequence[float]) -> bool:
+        """Whether a pose (m, rad) counts as within the arm's safety limits."""
+        low, high = self.reach_m
+        return all(math.isfinite(v) for v in raw) and low <= math.hypot(*raw[:3]) <= high
+
+    def _where(self, t: float) -> tuple[Vector, Vector, Vector]:
+        moving = self._motion
+        part = 0.0 if moving.length == 0.0 else moving.at(t)[0] / moving.length
+        position = tuple(p + part * d for p, d in zip(moving.position, moving.travel, strict=True))
+        step = _quaternion(tuple(part * w for w in moving.turn))
+        first, last = moving.error
+        error = tuple(a + part * (b - a) for a, b in zip(first, last, strict=True))
+        return position, _multiply(step, moving.quaternion), error
+
+
+def _six(values: Sequence[float]) -> Vector:
+    result = tuple(float(v) for v in values)
+    if len(result) != 6 or not all(math.isfinite(v) for v in result):
+        raise ValueError(f"a pose is six finite numbers (m, rad), not {result}")
+    return result
+
+
+def _quaternion(vector: Sequence[float]) -> Vector:
+    angle = math.hypot(*vector)
+    scale = 0.5 - angle**2 / 48 if angle < 1e-6 else math.sin(angle / 2) / angle
+    return (math.cos(angle / 2), *(scale * v for v in vector))
+
+
+def _rotation_vector(quaternion: Sequence[float]) -> Vector:
+    w, *vector = quaternion if quaternion[0] >= 0 else [-v for v in quaternion]
+    sine = math.hypot(*vector)
+    scale = 2.0 if sine < 1e-12 else 2 * math.atan2(sine, w) / sine
+    return tuple(scale * v for v in vector)
+
+
+def _conjugate(q: Sequence[float]) -> Vector:
+    return (q[0], -q[1], -q[2], -q[3])
+
+
+def _multiply(p: Sequence[float], q: Sequence[float]) -> Vector:
+    a, b, c, d = p
+    e, f, g, h = q
+    return (
+        a * e - b * f - c * g - d * h,
+        a * f + b * e + c * h - d * g,
+        a * g - b * h + c * e + d * f,
+        a * h + b * g - c * f + d * e,
+    )

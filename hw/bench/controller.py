@@ -1,0 +1,194 @@
+"""The program on the emulated controller: what ur_rtde's control script does with its registers.
+
+The client writes a command into input_int_register_0 and its numbers into the double registers. The
+program answers in output_int_register_0: 1 ready, 2 done; it goes back to 1 when the client has
+written 0. Commands of real time are taken as they come and leave the register at 1. While a
+synchronous motion runs, the program reads nothing, as on the real controller.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from hw.bench.arm import Arm
+
+READY, DONE = 1, 2
+STOPPED, PLAYING, PAUSED = 1, 2, 4
+"""Values of runtime_state."""
+
+NORMAL_BIT, PROTECTIVE_BIT = 1 << 0, 1 << 2
+"""Bits of safety_status_bits."""
+
+_REAL_TIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71})
+_START_S = 0.05
+"""From the end of the script's upload to its first line."""
+STEADY_S = 0.5
+"""How long the arm must have rested to count as steady (URScript manual, is_steady)."""
+
+
+@dataclass
+class Controller:
+    """State of the controller; every method takes bench time (s)."""
+
+    arm: Arm
+    int_in: list[int] = field(default_factory=lambda: [0] * 48)
+    double_in: list[float] = field(default_factory=lambda: [0.0] * 48)
+    int_out: list[int] = field(default_factory=lambda: [0] * 48)
+    double_out: list[float] = field(default_factory=lambda: [0.0] * 48)
+    running: bool = False
+    protective: bool = False
+    log: list[tuple[float, int, tuple[float, ...]]] = field(default_factory=list)
+    """Commands taken: bench time, code, double registers 0-8. The last 10,000."""
+    reason: str = ""
+    """Why the program last stopped."""
+
+    _starts: float | None = None
+    _latched: bool = False
+    _waits_for: float | None = None
+    _finishes: float | None = None
+    _watchdog_s: float | None = None
+    _kicked: float = 0.0
+    _operation: int = 0
+    _writes: int = 0
+
+    @property
+    def runtime_state(self) -> int:
+        """1 stopped, 2 playing, 4 paused."""
+        if self.protective:
+            return PAUSED
+        return PLAYING if self.running else STOPPED
+
+    @property
+    def robot_status_bits(self) -> int:
+        """Bit 0 power, bit 1 program running."""
+        return 1 | (2 if self.running else 0)
+
+    @property
+    def safety_status_bits(self) -> int:
+        """Bit 0 normal, bit 2 protective stop."""
+        return PROTECTIVE_BIT if self.protective else NORMAL_BIT
+
+    def upload(self, t: float) -> None:
+        """A script has come: it replaces the one that runs."""
+        self.halt(t, "another script was sent")
+        self._starts = t + _START_S
+
+    def halt(self, t: float, reason: str) -> None:
+        """Stop the program, and the arm with it."""
+        if self.running:
+            self.reason = reason
+        self.running = self._latched = False
+        self._waits_for = self._finishes = self._watchdog_s = self._starts = None
+        self.arm.stop(t)
+
+    def protect(self, t: float) -> None:
+        """A protective stop."""
+        self.protective = True
+        self.halt(t, "protective stop")
+
+    def kick(self, t: float) -> None:
+        """input_int_register_0 was written."""
+        self._kicked = t
+
+    def step(self, t: float) -> None:
+        """Do what the program would do by bench time t."""
+        if self._starts is not None and t >= self._starts and not self.protective:
+            self._start(t)
+        if not self.running:
+            return
+        if self._watchdog_s is not None and t - self._kicked > self._watchdog_s:
+            self.halt(t, f"watchdog: nothing written for {t - self._kicked:.3f} s")
+            return
+        if self._finishes is not None and t >= self._finishes:
+            self._finish()
+        if self._waits_for is not None:
+            if t < self._waits_for:
+                return
+            self._waits_for = None
+            self.int_out[0] = DONE
+        command = self.int_in[0]
+        if command == 0:
+            self._latched = False
+            self.int_out[0] = READY
+        elif command in _REAL_TIME:
+            self._execute(t, command)
+            self.int_out[0] = READY
+        elif not self._latched:
+            self._latched = True
+            self._execute(t, command)
+            if self.running and self._waits_for is None:
+                self.int_out[0] = DONE
+
+    def _start(self, t: float) -> None:
+        self._starts = None
+        self.running, self._latched, self._kicked = True, False, t
+        self._operation = self._writes = 0
+        self.int_in[0] = 0
+        self.int_out[0] = READY
+        self._progress(-1)
+
+    def _execute(self, t: float, command: int) -> None:
+        d = self.double_in
+        self.log.append((t, command, tuple(d[:9])))
+        del self.log[:-10_000]
+        match command:
+            case 3:
+                self._move(t)
+            case 24:
+                self.arm.servo(t, d[:6], d[8])
+            case 15 | 16 | 33 | 34:
+                self._stop(t, d[0])
+            case 29:
+                self.arm.tcp_offset = tuple(d[:6])
+            case 31:
+                self.protect(t)
+            case 35:
+                self._watchdog_s = 1.0 / d[0] if d[0] > 0 else None
+                self._kicked = t
+            case 36:
+                self.int_out[1] = int(self.arm.within_reach(d[:6]))
+            case 40:
+                self.double_out[:6] = self.arm.tcp_offset
+            case 47:
+                since = self.arm.rest_since(t)
+                self.int_out[1] = int(since is not None and t - since >= STEADY_S)
+            case 255:
+                self.halt(t, "the client stopped the script")
+            case _:
+                self.halt(t, f"command {command} is not emulated")
+
+    def _move(self, t: float) -> None:
+        d = self.double_in
+        if not self.arm.within_reach(d[:6]) or not (d[6] > 0 and d[7] > 0):
+            self.halt(t, "moveL to a pose out of reach, or without speed")
+            return
+        if self._finishes is not None:
+            self._finish()
+        arrival = self.arm.move_linear(t, d[:6], d[6], d[7])
+        if self.int_in[1]:
+            self._progress(0)
+            self._finishes = arrival
+        else:
+            self._waits_for = arrival
+
+    def _stop(self, t: float, deceleration: float) -> None:
+        rests = self.arm.stop(t, max(deceleration, 1e-3))
+        if self._finishes is not None:
+            self._finish()
+        if self.int_in[1]:
+            self._progress(0)
+            self._finishes = rests
+        else:
+            self._waits_for = rests
+
+    def _finish(self) -> None:
+        self._finishes = None
+        self._progress(-1)
+
+    def _progress(self, value: int) -> None:
+        """Bits 24-30 operation, 16-22 writes, 15 running, 0-14 progress."""
+        self._writes = (self._writes + 1) % 128
+        if value == 0:
+            self._operation = (self._operation + 1) % 128
+        running = 0 if value < 0 else 0x8000 | value
+        self.int_out[2] = self._operation << 24 | self._writes << 16 | running

@@ -1,0 +1,463 @@
+"""A Universal Robots controller on loopback that the real ur_rtde accepts.
+
+Ports are fixed: 29999 dashboard, 30003 scripts, 30004 real-time data (RTDE); several robots live at
+several loopback addresses. Run it in another process than its client, whose constructors hold the
+interpreter's lock. Two versions are known to be taken: 5.11.0 (500 Hz) and 3.15.8 (125 Hz).
+
+Source: the RTDE guide of Universal Robots, and what ur_rtde 1.6.5 sends and expects.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import selectors
+import socket
+import struct
+import threading
+from collections.abc import Callable
+
+from hw.bench.arm import Arm
+from hw.bench.controller import Controller
+from hw.bench.rtde_fields import INPUTS, OUTPUTS, STRUCT, output_type
+from hw.clock import REAL, Clock
+
+__all__ = ["Arm", "RtdeServer"]
+
+DASHBOARD, SCRIPT, RTDE = 29999, 30003, 30004
+_MAX_WAITING = 1 << 16
+"""Bytes that may wait for a client that does not read; further packets are left out for it."""
+_MAX_INPUT = 1 << 20
+"""Bytes that a client may send without completing a message or script."""
+
+
+class _Connection:
+    def __init__(self, sock: socket.socket, port: int) -> None:
+        self.socket, self.port = sock, port
+        self.received = bytearray()
+        self.waiting = bytearray()
+        self.outputs: list[tuple[str, int, str]] = []
+        self.packet = bytearray()
+        self.inputs: list[list[str]] = []
+        self.started = False
+
+
+class RtdeServer:
+    """Serves one arm at one loopback address.
+
+    Args:
+        arm: what moves.
+        host: 127.0.0.x.
+        version: (major, minor, bugfix, build) of the controller.
+        clock: bench time; the controller's own time is this plus an offset and a drift.
+        frequency_hz: packets per bench second; by default 500 from version 5 on, else 125.
+        max_rate_hz: packets per wall second, whatever the clock's speed asks for.
+        serial: what the dashboard says.
+        offset_s: controller time at bench time zero.
+        drift_ppm: of the controller's time against bench time.
+
+    Faults: :meth:`mute`, :meth:`drop`, :meth:`protective_stop`; each acts before it returns.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        host: str = "127.0.0.2",
+        *,
+        version: tuple[int, int, int, int] = (5, 11, 0, 108249),
+        clock: Clock = REAL,
+        frequency_hz: float | None = None,
+        max_rate_hz: float = 1000.0,
+        serial: str = "20195500042",
+        offset_s: float = 1000.0,
+        drift_ppm: float = 0.0,
+    ) -> None:
+        self.arm, self.host, self.version, self.clock = arm, host, version, clock
+        self.serial = serial
+        nominal = frequency_hz or (500.0 if version[0] >= 5 else 125.0)
+        self.frequency_hz = min(nominal, max_rate_hz / clock.speed)
+        self.controller = Controller(arm)
+        self.unlock_requests = 0
+        self.packets = 0
+        self.skipped = 0
+        self._offset, self._rate = offset_s, 1.0 + drift_ppm * 1e-6
+        self._selector = selectors.SelectSelector()
+        self._connections: set[_Connection] = set()
+        self._listeners: list[socket.socket] = []
+        self._calls: queue.SimpleQueue[tuple[Callable[[], None], threading.Event]] = (
+            queue.SimpleQueue()
+        )
+        self._wake, self._woken = socket.socketpair()
+        self._muted = False
+        self._running = False
+        self._thread: threading.Thread | None = None
+
+    # Life
+
+    def start(self) -> RtdeServer:
+        """Listen and serve in a thread.
+
+        Raises:
+            OSError: an address is taken.
+        """
+        try:
+            for port in (DASHBOARD, SCRIPT, RTDE):
+                listener = socket.create_server((self.host, port))
+                listener.setblocking(False)
+                self._listeners.append(listener)
+                self._selector.register(listener, selectors.EVENT_READ, port)
+        except OSError:
+            self._close()
+            raise
+        self._woken.setblocking(False)
+        self._selector.register(self._woken, selectors.EVENT_READ, None)
+        self._running = True
+        self._thread = threading.Thread(target=self._serve, name=f"rtde {self.host}", daemon=True)
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """Close every connection and end the thread."""
+        if self._thread is None:
+            return
+        self._running = False
+        self._wake.send(b"x")
+        self._thread.join()
+        self._thread = None
+
+    def __enter__(self) -> RtdeServer:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    # Faults
+
+    def mute(self, on: bool = True) -> None:
+        """Neither read nor write; connections stay, and new ones are taken but not answered."""
+
+        def act() -> None:
+            self._muted = on
+
+        self._call(act)
+
+    def drop(self, *, reset: bool = True, port: int | None = None) -> None:
+        """Close the clients' connections (of one port, or all), by a reset or in order."""
+
+        def act() -> None:
+            for connection in [c for c in self._connections if port in (None, c.port)]:
+                if reset:
+                    linger = struct.pack("ii", 1, 0)
+                    connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+                self._forget(connection)
+
+        self._call(act)
+
+    def protective_stop(self) -> None:
+        """As if the arm had met an obstacle."""
+        self._call(lambda: self.controller.protect(self.clock.now()))
+
+    def unlock(self) -> None:
+        """What a person does at the pendant after a protective stop."""
+
+        def act() -> None:
+            self.controller.protective = False
+
+        self._call(act)
+
+    def set_tcp_offset(self, offset: tuple[float, ...]) -> None:
+        """What a person does at the pendant: another tool."""
+
+        def act() -> None:
+            self.arm.tcp_offset = tuple(offset)
+
+        self._call(act)
+
+    def _call(self, act: Callable[[], None]) -> None:
+        if self._thread is None or threading.current_thread() is self._thread:
+            act()
+            return
+        done = threading.Event()
+        self._calls.put((act, done))
+        self._wake.send(b"x")
+        if not done.wait(5.0):
+            raise TimeoutError("the emulated controller does not answer")
+
+    # The loop
+
+    def _serve(self) -> None:
+        period = 1.0 / self.frequency_hz
+        due = self.clock.now()
+        try:
+            while self._running:
+                wait = self.clock.wall(max(0.0, due - self.clock.now()))
+                for key, _ in self._selector.select(wait):
+                    self._ready(key.fileobj, key.data)
+                while not self._calls.empty():
+                    act, done = self._calls.get()
+                    act()
+                    done.set()
+                now = self.clock.now()
+                if not self._muted:
+                    self.controller.step(now)
+                    self._flush()
+                else:
+                    # The program goes on though nobody can talk to it.
+                    self.controller.step(now)
+                if now >= due:
+                    if not self._muted:
+                        self._publish(due)
+                    due += period * math.ceil((now - due) / period) or period
+        finally:
+            self._close()
+
+    def _ready(self, source: object, data: int | _Connection | None) -> None:
+        if data is None:
+            self._woken.recv(4096)
+        elif isinstance(data, int):
+            assert isinstance(source, socket.socket)
+            try:
+                sock, _ = source.accept()
+            except OSError:
+                return
+            sock.setblocking(False)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection = _Connection(sock, data)
+            self._connections.add(connection)
+            self._selector.register(sock, selectors.EVENT_READ, connection)
+            if data == DASHBOARD:
+                connection.waiting += b"Connected: Universal Robots Dashboard Server\n"
+        else:
+            self._read(data)
+
+    def _read(self, connection: _Connection) -> None:
+        if self._muted:
+            # Unread data would wake the loop again and again.
+            self._selector.unregister(connection.socket)
+            return
+        try:
+            data = connection.socket.recv(65536)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._forget(connection)
+            return
+        connection.received += data
+        if len(connection.received) > _MAX_INPUT:
+            self._forget(connection)
+            return
+        if connection.port == RTDE:
+            self._messages(connection)
+        elif connection.port == SCRIPT:
+            self._script(connection)
+        else:
+            self._dashboard(connection)
+
+    def _flush(self) -> None:
+        for connection in list(self._connections):
+            if connection.waiting:
+                self._send(connection, b"")
+
+    def _send(self, connection: _Connection, data: bytes | bytearray) -> None:
+        connection.waiting += data
+        try:
+            sent = connection.socket.send(connection.waiting)
+            del connection.waiting[:sent]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._forget(connection)
+
+    def _forget(self, connection: _Connection) -> None:
+        if connection in self._connections:
+            self._connections.discard(connection)
+            if connection.socket in self._selector.get_map():
+                self._selector.unregister(connection.socket)
+            connection.socket.close()
+
+    def _close(self) -> None:
+        for connection in list(self._connections):
+            self._forget(connection)
+        for listener in self._listeners:
+            listener.close()
+        self._selector.close()
+        self._wake.close()
+        self._woken.close()
+
+    # RTDE
+
+    def _publish(self, t: float) -> None:
+        self.packets += 1
+        listeners = [c for c in self._connections if c.started]
+        if not listeners:
+            return
+        values = self._values(t)
+        for connection in listeners:
+            if len(connection.waiting) > _MAX_WAITING:
+                self.skipped += 1
+                continue
+            for name, offset, code in connection.outputs:
+                value = values[name]
+                if isinstance(value, tuple):
+                    struct.pack_into(code, connection.packet, offset, *value)
+                else:
+                    struct.pack_into(code, connection.packet, offset, value)
+            self._send(connection, connection.packet)
+
+    def _values(self, t: float) -> dict[str, tuple[float, ...] | float | int]:
+        """The variables that change; all others stay zero."""
+        program, arm = self.controller, self.arm
+        raw, velocity = arm.raw(t), arm.velocity(t)
+        values: dict[str, tuple[float, ...] | float | int] = {
+            "timestamp": self._offset + self._rate * t,
+            "actual_TCP_pose": raw,
+            "target_TCP_pose": raw,
+            "actual_TCP_speed": velocity,
+            "target_TCP_speed": velocity,
+            "tcp_offset": arm.tcp_offset,
+            "robot_mode": 7,
+            "safety_mode": 3 if program.protective else 1,
+            "runtime_state": program.runtime_state,
+            "robot_status_bits": program.robot_status_bits,
+            "safety_status_bits": program.safety_status_bits,
+            "speed_scaling": 1.0,
+            "target_speed_fraction": 1.0,
+        }
+        for k in range(3):
+            values[f"output_int_register_{k}"] = program.int_out[k]
+        for k in range(6):
+            values[f"output_double_register_{k}"] = program.double_out[k]
+        return values
+
+    def _messages(self, connection: _Connection) -> None:
+        data = connection.received
+        while len(data) >= 3 and connection in self._connections:
+            size, kind = struct.unpack_from(">HB", data)
+            if size < 3:
+                self._forget(connection)
+                return
+            if len(data) < size:
+                return
+            payload = bytes(data[3:size])
+            del data[:size]
+            try:
+                answer = self._answer(connection, kind, payload)
+            except (struct.error, IndexError, UnicodeDecodeError):
+                self._forget(connection)
+                return
+            if answer is not None:
+                self._send(connection, struct.pack(">HB", 3 + len(answer), kind) + answer)
+
+    def _answer(self, connection: _Connection, kind: int, payload: bytes) -> bytes | None:
+        match chr(kind):
+            case "V":
+                return b"\x01" if struct.unpack(">H", payload)[0] == 2 else b"\x00"
+            case "v":
+                return struct.pack(">4I", *self.version)
+            case "O":
+                return self._set_outputs(connection, payload)
+            case "I":
+                names = _names(payload)
+                connection.inputs.append(names)
+                types = ",".join(INPUTS.get(name, "NOT_FOUND") for name in names)
+                return bytes([len(connection.inputs)]) + types.encode()
+            case "S" | "P":
+                connection.started = chr(kind) == "S"
+                return b"\x01"
+            case "U":
+                self._take(connection, payload)
+                return None
+            case _:
+                return None
+
+    def _set_outputs(self, connection: _Connection, payload: bytes) -> bytes:
+        names = _names(payload[8:])
+        types = [output_type(name, self.version) for name in names]
+        if "NOT_FOUND" not in types:
+            codes = [">" + STRUCT[kind] for kind in types]
+            offsets = [4]
+            for code in codes:
+                offsets.append(offsets[-1] + struct.calcsize(code))
+            connection.packet = bytearray(offsets[-1])
+            struct.pack_into(">HBB", connection.packet, 0, offsets[-1], ord("U"), 1)
+            changing = self._values(self.clock.now())
+            connection.outputs = [
+                (name, offset, code)
+                for name, offset, code in zip(names, offsets, codes, strict=False)
+                if name in changing and name in OUTPUTS
+            ]
+        return b"\x01" + ",".join(types).encode()
+
+    def _take(self, connection: _Connection, payload: bytes) -> None:
+        names = connection.inputs[payload[0] - 1]
+        offset = 1
+        program = self.controller
+        now = self.clock.now()
+        for name in names:
+            code = ">" + STRUCT[INPUTS[name]]
+            value = struct.unpack_from(code, payload, offset)
+            offset += struct.calcsize(code)
+            kind, _, number = name.rpartition("_")
+            if kind == "input_int_register":
+                program.int_in[int(number)] = value[0]
+            elif kind == "input_double_register":
+                program.double_in[int(number)] = value[0]
+        if "input_int_register_0" in names:
+            program.kick(now)
+        program.step(now)
+
+    # Scripts and dashboard
+
+    def _script(self, connection: _Connection) -> None:
+        text = connection.received
+        if text.lstrip().startswith(b"def rtde_control") and text.rstrip().endswith(b"end"):
+            self.controller.upload(self.clock.now())
+            text.clear()
+
+    def _dashboard(self, connection: _Connection) -> None:
+        data = connection.received
+        while (end := data.find(b"\n")) >= 0 and connection in self._connections:
+            line = bytes(data[:end]).decode("ascii", "replace").strip()
+            del data[: end + 1]
+            if line.lower() == "quit":
+                self._send(connection, b"Disconnected\n")
+                self._forget(connection)
+                return
+            self._send(connection, (self._say(line) + "\n").encode())
+
+    def _say(self, line: str) -> str:
+        program, new = self.controller, self.version[0] >= 5
+        match line.lower():
+            case "polyscopeversion":
+                return f"URSoftware {'.'.join(map(str, self.version))} (Jan 01 2022)"
+            case "get serial number" if new:
+                return self.serial
+            case "get robot model":
+                return "UR5"
+            case "is in remote control" if new:
+                return "true"
+            case "robotmode":
+                return "Robotmode: RUNNING"
+            case "safetystatus" if new:
+                return f"Safetystatus: {'PROTECTIVE_STOP' if program.protective else 'NORMAL'}"
+            case "safetymode":
+                return f"Safetymode: {'PROTECTIVE_STOP' if program.protective else 'NORMAL'}"
+            case "programstate":
+                return f"{'PLAYING' if program.running else 'STOPPED'} rtde_control"
+            case "running":
+                return f"Program running: {'true' if program.running else 'false'}"
+            case "stop":
+                program.halt(self.clock.now(), "the dashboard stopped it")
+                return "Stopped"
+            case "unlock protective stop":
+                self.unlock_requests += 1
+                return "Protective stop releasing"
+            case _:
+                return f"could not understand: '{line}'"
+
+
+def _names(text: bytes) -> list[str]:
+    """A recipe's names; ur_rtde ends its lists with a comma."""
+    return text.decode("ascii").rstrip(",").split(",")

@@ -1,0 +1,97 @@
+"""The emulated arm's kinematics: profiles against their closed forms, stops, repeatability."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from hw.bench.arm import Arm
+
+START = (0.4, 0.0, 0.3, 0.0, 3.0, 0.0)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    target=st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6),
+    speed=st.floats(0.001, 0.5),
+    acceleration=st.floats(0.05, 5.0),
+)
+def test_a_linear_move_keeps_its_speed_acceleration_and_line(target, speed, acceleration):
+    arm = Arm(START)
+    arrival = arm.move_linear(2.0, target, speed, acceleration)
+    times = np.linspace(2.0, arrival, 400)
+    raw = np.array([arm.raw(t) for t in times])
+    np.testing.assert_allclose(raw[0, :3], START[:3])
+    np.testing.assert_allclose(raw[-1, :3], target[:3], atol=1e-12)
+    last = Rotation.from_rotvec(raw[-1, 3:]).inv() * Rotation.from_rotvec(target[3:])
+    assert last.magnitude() < 1e-7
+    step = times[1] - times[0]
+    if step > 1e-6:
+        velocity = np.linalg.norm(np.diff(raw[:, :3], axis=0), axis=1) / step
+        assert velocity.max() <= speed * (1 + 1e-6)
+        assert np.abs(np.diff(velocity)).max() / step <= acceleration * (1 + 1e-3) + 1e-6
+    travel = np.asarray(target[:3]) - START[:3]
+    across = np.cross(raw[:, :3] - np.asarray(START[:3]), travel)
+    assert np.abs(across).max() < 1e-12
+    assert arm.rest_since(arrival - 1e-4) is None or arrival - 2.0 < 1e-4
+    assert arm.rest_since(arrival + 0.2) == pytest.approx(arrival)
+
+
+def test_a_turn_counts_in_radians():
+    arm = Arm(START)
+    turned = Rotation.from_rotvec([0.2, 0.0, 0.0]) * Rotation.from_rotvec(START[3:])
+    arrival = arm.move_linear(0.0, (*START[:3], *turned.as_rotvec()), 0.1, 1.0)
+    assert arrival == pytest.approx(0.2 / 0.1 + 0.1 / 1.0)
+    assert arm.velocity(1.0)[3:] == pytest.approx((0.1, 0.0, 0.0))
+
+
+def test_a_stop_brakes_at_its_deceleration():
+    arm = Arm(START)
+    arm.move_linear(0.0, (0.6, *START[1:]), 0.1, 1.0)
+    rests = arm.stop(1.0, 2.0)
+    assert rests == pytest.approx(1.0 + 0.1 / 2.0)
+    before, after = arm.raw(1.0)[0], arm.raw(5.0)[0]
+    assert after - before == pytest.approx(0.1**2 / (2 * 2.0))
+    assert arm.velocity(rests + 1e-9) == (0.0,) * 6
+    assert arm.stop(6.0) == 6.0
+
+
+def test_a_move_may_replace_another():
+    arm = Arm(START)
+    arm.move_linear(0.0, (0.6, *START[1:]), 0.1, 1.0)
+    here = arm.raw(1.0)
+    arrival = arm.move_linear(1.0, START, 0.1, 1.0)
+    assert arm.raw(1.0) == pytest.approx(here)
+    assert arm.raw(arrival) == pytest.approx(START)
+
+
+def test_servo_arrives_in_its_time():
+    arm = Arm(START)
+    arm.servo(0.0, (0.41, *START[1:]), 0.1)
+    assert arm.raw(0.05)[0] == pytest.approx(0.405, abs=1e-5)
+    assert arm.raw(0.101)[0] == pytest.approx(0.41)
+
+
+def test_repeatability_is_redrawn_with_travel_and_is_seeded():
+    def errors(travel: float) -> np.ndarray:
+        arm = Arm(START, repeatability_mm=0.1, seed=3)
+        t, found = 0.0, []
+        for k in range(400):
+            t = arm.move_linear(t, (0.4 + travel * (k % 2), *START[1:]), 0.5, 5.0) + 1.0
+            found.append(np.subtract(arm.true_raw(t)[:3], arm.raw(t)[:3]) * 1000)
+        return np.array(found)
+
+    far, near = errors(0.2), errors(0.0001)
+    assert far.std() == pytest.approx(0.1, rel=0.1)
+    assert np.abs(np.diff(near, axis=0)).std() < 0.02
+    np.testing.assert_array_equal(far, errors(0.2))
+    assert Arm(START).true_raw(0.0) == Arm(START).raw(0.0)
+
+
+@pytest.mark.parametrize("raw", [(0.1,) * 5, (0.1,) * 7, (float("nan"),) * 6])
+def test_poses_of_another_shape_are_refused(raw):
+    with pytest.raises(ValueError, match="six finite"):
+        Arm(raw)
