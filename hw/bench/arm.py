@@ -98,6 +98,8 @@ class Arm:
         self.tcp_offset: Vector = _six(tcp_offset)
         self.halt_acceleration = halt_acceleration
         self.reach_m = reach_m
+        self.force: Vector = (0.0,) * 6
+        """What the tool meets: N and N m."""
         self._sd = (repeatability_mm / 1000.0,) * 3 + (math.radians(repeatability_deg),) * 3
         self._correlation = correlation_mm / 1000.0
         self._random = random.Random(seed)

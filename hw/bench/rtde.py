@@ -27,6 +27,7 @@ __all__ = ["Arm", "RtdeServer"]
 DASHBOARD, SCRIPT, RTDE = 29999, 30003, 30004
 _MAX_WAITING = 1 << 16
 """Bytes that may wait for a client that does not read; further packets are left out for it."""
+_LATE_S = 1.0
 _MAX_INPUT = 1 << 20
 """Bytes that a client may send without completing a message or script."""
 
@@ -80,6 +81,8 @@ class RtdeServer:
         self.unlock_requests = 0
         self.packets = 0
         self.skipped = 0
+        self.late = 0
+        """Packets never made because this process was held up for more than a second."""
         self._offset, self._rate = offset_s, 1.0 + drift_ppm * 1e-6
         self._selector = selectors.SelectSelector()
         self._connections: set[_Connection] = set()
@@ -138,6 +141,13 @@ class RtdeServer:
 
         def act() -> None:
             self._muted = on
+            for connection in self._connections:
+                known = connection.socket in self._selector.get_map()
+                if on and known:
+                    # Unread data would wake the loop again and again.
+                    self._selector.unregister(connection.socket)
+                elif not on and not known:
+                    self._selector.register(connection.socket, selectors.EVENT_READ, connection)
 
         self._call(act)
 
@@ -198,16 +208,17 @@ class RtdeServer:
                     act()
                     done.set()
                 now = self.clock.now()
+                # Muted or not, the program goes on.
+                self.controller.step(now)
                 if not self._muted:
-                    self.controller.step(now)
                     self._flush()
-                else:
-                    # The program goes on though nobody can talk to it.
-                    self.controller.step(now)
-                if now >= due:
+                while now >= due:
                     if not self._muted:
                         self._publish(due)
-                    due += period * math.ceil((now - due) / period) or period
+                    due += period
+                    if now - due > _LATE_S:
+                        self.late += math.ceil((now - due) / period)
+                        due = now
         finally:
             self._close()
 
@@ -224,17 +235,14 @@ class RtdeServer:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection = _Connection(sock, data)
             self._connections.add(connection)
-            self._selector.register(sock, selectors.EVENT_READ, connection)
+            if not self._muted:
+                self._selector.register(sock, selectors.EVENT_READ, connection)
             if data == DASHBOARD:
                 connection.waiting += b"Connected: Universal Robots Dashboard Server\n"
         else:
             self._read(data)
 
     def _read(self, connection: _Connection) -> None:
-        if self._muted:
-            # Unread data would wake the loop again and again.
-            self._selector.unregister(connection.socket)
-            return
         try:
             data = connection.socket.recv(65536)
         except BlockingIOError:
@@ -316,6 +324,7 @@ class RtdeServer:
             "target_TCP_pose": raw,
             "actual_TCP_speed": velocity,
             "target_TCP_speed": velocity,
+            "actual_TCP_force": arm.force,
             "tcp_offset": arm.tcp_offset,
             "robot_mode": 7,
             "safety_mode": 3 if program.protective else 1,

@@ -78,6 +78,7 @@ _SINCE: dict[str, tuple[tuple[int, int], ...]] = {
     "payload": ((3, 11), (5, 5)),
     "payload_cog": ((3, 11), (5, 5)),
     "payload_inertia": ((3, 15), (5, 11)),
+    "tcp_offset": ((5, 0),),
 }
 
 

@@ -1,0 +1,26 @@
+"""Starting the small processes that talk to the robot."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+
+def spawn(module: str, *arguments: str, stdin: bool = False) -> subprocess.Popen[bytes]:
+    """Start ``python -m module`` with this process's import path; its output is a pipe.
+
+    A fresh interpreter rather than a fork: a fork of a process with threads (JAX has many) may
+    deadlock. It leads its own process group, so that Ctrl-C reaches only the parent, which then
+    stops it in order.
+    """
+    environment = dict(os.environ)
+    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+    return subprocess.Popen(
+        [sys.executable, "-m", module, *arguments],
+        stdin=subprocess.PIPE if stdin else subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env=environment,
+        start_new_session=True,
+    )

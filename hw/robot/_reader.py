@@ -1,0 +1,93 @@
+"""The process that reads poses for :class:`hw.robot.stream.PoseStream`, and writes them out.
+
+Started as ``python -m hw.robot._reader HOST CLIENT FREQUENCY TIMEOUT``. One record per pose, or a
+last one that says why there are no more. It ends when nobody reads its output.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import struct
+import sys
+import time
+
+from hw.errors import DeviceError, LostError
+from hw.extras import require
+from hw.robot.rtde import Packet, PacketReader
+
+RECORD = struct.Struct("<8dIiII6d")
+"""Host and device s, pose (6), safety bits, mode, runtime state, whether an offset, offset (6)."""
+POSE, ERROR = b"P", b"E"
+_NO_OFFSET = (0.0,) * 6
+
+
+def _packets(output: int, host: str, frequency_hz: float | None, timeout_s: float) -> None:
+    reader = PacketReader(host, frequency_hz=frequency_hz, timeout_s=timeout_s)
+    while True:
+        if not select.select([reader], [], [], timeout_s)[0]:
+            raise LostError(f"the controller was silent for {timeout_s:g} s", device="robot")
+        records = [POSE + _pack(packet) for packet in reader.read()]
+        _write(output, b"".join(records))
+
+
+def _pack(packet: Packet) -> bytes:
+    offset = packet.tcp_offset
+    return RECORD.pack(
+        packet.monotonic_s, packet.timestamp_s, *packet.tcp_pose, packet.safety_bits,
+        packet.robot_mode, packet.runtime_state, offset is not None, *(offset or _NO_OFFSET),
+    )  # fmt: skip
+
+
+def _ur_rtde(output: int, host: str, frequency_hz: float | None) -> None:
+    """The same through ur_rtde: the newest pose only, and getters that may tear."""
+    names = ["timestamp", "actual_TCP_pose", "safety_status_bits", "robot_mode", "runtime_state"]
+    module = require("rtde_receive", extra="robot")
+    robot = module.RTDEReceiveInterface(host, frequency_hz or -1.0, names)
+    last = float("nan")
+    while robot.isConnected():
+        before = robot.getTimestamp()
+        if before == last:
+            time.sleep(0.0002)
+            continue
+        record = (
+            *robot.getActualTCPPose(), robot.getSafetyStatusBits(), robot.getRobotMode(),
+            robot.getRuntimeState(), 0, *_NO_OFFSET,
+        )  # fmt: skip
+        if robot.getTimestamp() != before:
+            continue
+        last = before
+        _write(output, POSE + RECORD.pack(time.monotonic(), before, *record))
+    raise LostError("ur_rtde lost the connection", device="robot")
+
+
+def _write(output: int, data: bytes) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[os.write(output, view) :]
+
+
+def main(arguments: list[str]) -> int:
+    """Read until the connection or the reader of the records is gone."""
+    host, client, frequency, timeout = arguments
+    # What a library prints must not get between the records.
+    output = os.dup(1)
+    os.dup2(2, 1)
+    frequency_hz = float(frequency) or None
+    try:
+        if client == "ur_rtde":
+            _ur_rtde(output, host, frequency_hz)
+        else:
+            _packets(output, host, frequency_hz, float(timeout))
+    except BrokenPipeError:
+        return 0
+    except (DeviceError, RuntimeError) as error:
+        text = error.args[0].encode()[:1000]
+        _write(output, ERROR + struct.pack("<H", len(text)) + text)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    # ur_rtde's destructor takes half a second, and nothing is left to be done.
+    os._exit(main(sys.argv[1:]))

@@ -1,0 +1,329 @@
+"""The robot as a tracker: every pose with host and device time, and never an old one as new.
+
+A process of its own reads the controller, so that neither the parent's interpreter lock nor a mute
+controller delays or freezes anything; the parent can always give it up. :meth:`PoseStream.latest`
+raises rather than hand out a pose older than the limit. Age counts from arrival, plus what the pose
+was late on its way: the controller's clock against the host's, above the smallest difference of the
+last minute or so (drift is far slower).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from hw.clock import REAL, Clock
+from hw.errors import LostError, RefusedError, StaleError
+from hw.robot._process import spawn
+from hw.robot._reader import ERROR, POSE, RECORD
+from hw.robot.pose import rotation_vector, ur_to_pose
+from hw.robot.rtde import Identity, read_identity
+
+_OFFSET_TOLERANCE = 1e-6
+_LAG_BLOCK_S = 30.0
+
+
+@dataclass(frozen=True)
+class PoseSample:
+    """One pose of the tool centre point."""
+
+    t_host: float
+    """Bench time (s) at which it arrived."""
+    t_device: float
+    """The controller's own time (s)."""
+    raw: tuple[float, ...]
+    """[x, y, z, rx, ry, rz] in metres and a rotation vector (rad), as the controller sent it."""
+    safety_bits: int
+    robot_mode: int
+    runtime_state: int
+    lag_s: float = 0.0
+    """Bench seconds by which it came later than the promptest poses before it."""
+
+    @cached_property
+    def pose(self) -> Float[np.ndarray, "4 4"]:
+        """(4, 4) mm: tool centre point -> robot base."""
+        return ur_to_pose(np.asarray(self.raw))
+
+    def age_s(self, now: float) -> float:
+        """Bench seconds since the controller measured it, as far as that can be known."""
+        return now - self.t_host + self.lag_s
+
+
+@dataclass(frozen=True)
+class SteadyPose:
+    """An average over poses at rest."""
+
+    sample: PoseSample
+    """The last pose, with ``raw`` the average (m and rad)."""
+    count: int
+    scatter_mm: float
+    """Root mean square distance from the average position."""
+    scatter_deg: float
+    """Root mean square angle from the average orientation."""
+
+
+class Lag:
+    """How much later than the promptest ones a pose came (bench s)."""
+
+    def __init__(self) -> None:
+        self._floor = self._previous = float("inf")
+        self._until = float("-inf")
+
+    def of(self, t_host: float, t_device: float) -> float:
+        """Take a pose's times; returns its lag."""
+        difference = t_host - t_device
+        if t_host > self._until:
+            self._previous, self._floor = self._floor, difference
+            self._until = t_host + _LAG_BLOCK_S
+        self._floor = min(self._floor, difference)
+        return difference - min(self._floor, self._previous)
+
+
+class PoseStream:
+    """Poses from a controller at ``host``, through a process of its own.
+
+    Args:
+        host: the controller's address.
+        clock: bench time.
+        frequency_hz: poses per second; by default all the controller makes.
+        max_age_s: bench seconds after which :meth:`latest` refuses a pose.
+        queue: most poses kept for :meth:`drain`; older ones go and are counted in ``dropped``.
+        client: ``packets`` reads every packet; ``ur_rtde`` goes through that library, which keeps
+            only the newest and so loses some on a busy machine.
+        timeout_s: wall seconds for the connection, and of silence before it counts as lost.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        *,
+        clock: Clock = REAL,
+        frequency_hz: float | None = None,
+        max_age_s: float = 0.1,
+        queue: int = 60_000,
+        client: Literal["packets", "ur_rtde"] = "packets",
+        timeout_s: float = 3.0,
+    ) -> None:
+        self.host, self.clock, self.max_age_s = host, clock, max_age_s
+        self.received = 0
+        """Poses since the start."""
+        self.dropped = 0
+        """Poses that nobody drained in time."""
+        self.tcp_offset: tuple[float, ...] | None = None
+        """[m, rad] of the tool centre point in the flange's frame; None if it is not told."""
+        self._client, self._frequency, self._timeout = client, frequency_hz, timeout_s
+        self._samples: deque[PoseSample] = deque(maxlen=queue)
+        self._latest: PoseSample | None = None
+        self._error: str | None = None
+        self._changed: str | None = None
+        self._lag = Lag()
+        self._condition = threading.Condition()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> PoseStream:
+        """Connect, and wait for the first pose.
+
+        Raises:
+            LostError: nothing came in time; the text says what the controller did.
+        """
+        if self._process is not None:
+            raise LostError("the stream was already started", device="robot")
+        self._process = spawn(
+            "hw.robot._reader", self.host, self._client, str(self._frequency or 0.0),
+            str(self._timeout),
+        )  # fmt: skip
+        self._thread = threading.Thread(target=self._receive, name="robot poses", daemon=True)
+        self._thread.start()
+        # A fresh interpreter on a busy machine takes seconds; that is no fault of the robot's.
+        patience = self._timeout + 20.0
+        with self._condition:
+            come = self._condition.wait_for(lambda: self._latest or self._error, patience)
+        if not come or self._error:
+            self.close()
+            error = self._error or f"no pose from {self.host} within {patience:g} s"
+            raise LostError(error, device="robot")
+        return self
+
+    def close(self) -> None:
+        """End the process; poses already read can still be drained."""
+        if self._process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.kill()
+            self._process.wait()
+        if self._thread is not None:
+            self._thread.join()
+
+    def __enter__(self) -> PoseStream:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def latest(self) -> PoseSample:
+        """The newest pose.
+
+        Raises:
+            LostError: the connection is gone.
+            StaleError: it is older than ``max_age_s``.
+            RefusedError: the controller's TCP offset changed since the start.
+        """
+        with self._condition:
+            sample, error = self._latest, self._error
+        self._check(error)
+        if sample is None:
+            raise StaleError("no pose yet", device="robot")
+        age = sample.age_s(self.clock.now())
+        if age > self.max_age_s:
+            raise StaleError(
+                f"the newest pose is {age * 1000:.0f} ms old (at most "
+                f"{self.max_age_s * 1000:.0f} ms)",
+                device="robot",
+            )
+        return sample
+
+    def drain(self) -> list[PoseSample]:
+        """Every pose since the last drain, in order; also after the connection was lost."""
+        with self._condition:
+            samples = list(self._samples)
+            self._samples.clear()
+        return samples
+
+    def steady(self, seconds: float = 0.2) -> SteadyPose:
+        """Average the poses of the next bench seconds; does not touch :meth:`drain`.
+
+        Raises:
+            LostError: the connection went.
+            StaleError: too few poses came.
+        """
+        start = self.clock.now()
+        seen: list[PoseSample] = []
+        give_up = time.monotonic() + self.clock.wall(seconds) + 1.0 + self.max_age_s
+        with self._condition:
+            while not seen or seen[-1].t_host < start + seconds:
+                if self._error or not self._condition.wait(give_up - time.monotonic()):
+                    break
+                new = self._latest
+                if new is not None and new.t_host >= start and (not seen or new is not seen[-1]):
+                    seen.append(new)
+            error = self._error
+        self._check(error)
+        if not seen or seen[-1].t_host < start + seconds:
+            raise StaleError(f"no pose for {seconds:g} s while averaging", device="robot")
+        return average(seen)
+
+    def identity(self) -> Identity:
+        """Who the robot is, by its dashboard.
+
+        Raises:
+            LostError: it does not answer.
+        """
+        return read_identity(self.host, timeout_s=self._timeout)
+
+    def _check(self, error: str | None) -> None:
+        if error:
+            raise LostError(error, device="robot")
+        if self._changed:
+            raise RefusedError(self._changed, device="robot")
+
+    def _receive(self) -> None:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        output = self._process.stdout
+        data = b""
+        error = None
+        try:
+            while error is None:
+                new = os.read(output.fileno(), 1 << 18)
+                if not new:
+                    error = "the process that reads poses ended"
+                    break
+                data, error = self._take(data + new)
+        except OSError as problem:
+            error = f"the process that reads poses: {problem}"
+        finally:
+            output.close()
+            with self._condition:
+                self._error = error
+                self._condition.notify_all()
+
+    def _take(self, data: bytes) -> tuple[bytes, str | None]:
+        start, size = 0, RECORD.size
+        new: list[PoseSample] = []
+        error = None
+        while len(data) - start >= 1 + size and data[start : start + 1] == POSE:
+            record = RECORD.unpack_from(data, start + 1)
+            start += 1 + size
+            t_host, t_device = self.clock.at(record[0]), record[1]
+            lag = self._lag.of(t_host, t_device)
+            new.append(PoseSample(t_host, t_device, record[2:8], *record[8:11], lag_s=lag))
+            if record[11]:
+                self._compare(record[12:])
+        if data[start : start + 1] == ERROR and len(data) - start >= 3:
+            (length,) = struct.unpack_from("<H", data, start + 1)
+            if len(data) - start >= 3 + length:
+                error = data[start + 3 : start + 3 + length].decode("utf-8", "replace")
+        if new:
+            with self._condition:
+                room = (self._samples.maxlen or 0) - len(self._samples)
+                self.dropped += max(0, len(new) - room)
+                self._samples.extend(new)
+                self.received += len(new)
+                self._latest = new[-1]
+                self._condition.notify_all()
+        return data[start:], error
+
+    def _compare(self, offset: tuple[float, ...]) -> None:
+        if self.tcp_offset is None:
+            self.tcp_offset = offset
+        elif self._changed is None and offset_changed(self.tcp_offset, offset):
+            self._changed = (
+                f"the controller's TCP offset changed from {_numbers(self.tcp_offset)} to "
+                f"{_numbers(offset)}: every pose now means something else; start a new recording"
+            )
+
+
+def offset_changed(first: Sequence[float], second: Sequence[float]) -> bool:
+    """Whether two TCP offsets (m, rad) differ by more than rounding."""
+    return any(abs(a - b) > _OFFSET_TOLERANCE for a, b in zip(first, second, strict=True))
+
+
+def average(samples: Sequence[PoseSample]) -> SteadyPose:
+    """Mean position and orientation of poses that are near each other.
+
+    The orientation's mean is the rotation nearest to the mean matrix.
+    """
+    poses = ur_to_pose(np.array([sample.raw for sample in samples]))
+    position = poses[:, :3, 3].mean(axis=0)
+    u, _, vt = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    turns = rotation_vector(rotation.T @ poses[:, :3, :3])
+    last = samples[-1]
+    raw = (*(position / 1000.0), *rotation_vector(rotation))
+    mean = PoseSample(
+        last.t_host, last.t_device, tuple(float(v) for v in raw), last.safety_bits,
+        last.robot_mode, last.runtime_state, last.lag_s,
+    )  # fmt: skip
+    distances = np.sum((poses[:, :3, 3] - position) ** 2, axis=1)
+    return SteadyPose(
+        sample=mean,
+        count=len(samples),
+        scatter_mm=float(np.sqrt(distances.mean())),
+        scatter_deg=float(np.degrees(np.sqrt(np.sum(turns**2, axis=1).mean()))),
+    )
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return "[" + ", ".join(f"{v:.6g}" for v in values) + "]"

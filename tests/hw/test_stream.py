@@ -1,0 +1,211 @@
+"""Poses through real sockets: nothing lost, nothing old handed out as new, no hang."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from robots import START, EmulatedRobot, address
+
+from hw.clock import Clock
+from hw.errors import LostError, RefusedError, StaleError
+from hw.robot.pose import ur_to_pose
+from hw.robot.rtde import PacketReader, read_identity, safety_text
+from hw.robot.stream import Lag, PoseSample, PoseStream, average
+
+CB = (3, 15, 8, 106339)
+E_SERIES = (5, 11, 0, 108249)
+
+
+@pytest.mark.parametrize("seconds", [3.0, pytest.param(60.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("version", "frequency"), [(E_SERIES, 500.0), (CB, 125.0)])
+def test_no_pose_is_lost(version, frequency, seconds):
+    with (
+        EmulatedRobot(version=version) as robot,
+        PoseStream(robot.host, clock=robot.clock) as poses,
+    ):
+        time.sleep(seconds)
+        samples = poses.drain()
+        assert robot.state()["late"] == robot.state()["skipped"] == 0
+    steps = np.diff([sample.t_device for sample in samples])
+    np.testing.assert_allclose(steps, 1 / frequency, atol=1e-6)
+    assert len(samples) >= 0.8 * seconds * frequency
+    assert poses.dropped == 0
+    assert samples[0].raw == pytest.approx(START)
+    np.testing.assert_allclose(samples[0].pose, ur_to_pose(np.array(START)))
+    assert samples[0].robot_mode == 7
+    assert samples[0].safety_bits == 1
+
+
+def again_and_again(call: Callable[[], object], seconds: float = 5.0) -> None:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        call()
+        time.sleep(0.002)
+
+
+def test_ur_rtde_gives_the_same_poses():
+    pytest.importorskip("rtde_receive", reason="ur_rtde has no wheel for this platform")
+    with EmulatedRobot(version=CB) as robot:
+        with PoseStream(robot.host, clock=robot.clock, client="ur_rtde") as poses:
+            sample = poses.latest()
+            assert poses.tcp_offset is None
+        assert sample.raw == pytest.approx(START)
+        assert sample.t_device > 1000.0
+
+
+def test_identity_and_tcp_offset():
+    with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
+        identity = poses.identity()
+        assert (identity.serial, identity.model) == ("20195500042", "UR5")
+        assert identity.version == "5.11.0.108249"
+        assert poses.tcp_offset == (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
+        robot.ask("set_tcp_offset", [0.0, 0.0, 0.101, 0.0, 0.0, 0.0])
+        with pytest.raises(RefusedError, match="TCP offset changed"):
+            again_and_again(poses.latest)
+    with EmulatedRobot(version=CB) as robot, PoseStream(robot.host, clock=robot.clock) as poses:
+        assert poses.identity().serial == f"UR5@{robot.host}"
+        assert poses.tcp_offset is None
+
+
+def test_a_mute_controller_makes_poses_stale_and_then_lost():
+    with EmulatedRobot() as robot:
+        with PoseStream(robot.host, clock=robot.clock, timeout_s=1.0) as poses:
+            poses.latest()
+            robot.ask("mute")
+            time.sleep(0.15)
+            with pytest.raises(StaleError, match=r"ms old \(at most 100 ms\)"):
+                poses.latest()
+            with pytest.raises((StaleError, LostError)):
+                poses.steady(0.1)
+            time.sleep(2.0)
+            with pytest.raises(LostError, match="silent for 1 s"):
+                poses.latest()
+            assert poses.drain()[-1].raw == pytest.approx(START)
+        start = time.monotonic()
+        with pytest.raises(LostError, match="does not answer"):
+            PoseStream(robot.host, clock=robot.clock, timeout_s=0.5).start()
+        with pytest.raises(LostError, match="dashboard"):
+            read_identity(robot.host, timeout_s=0.5)
+        assert time.monotonic() - start < 15.0
+
+
+def test_a_dropped_connection_is_lost_at_once():
+    with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
+        robot.ask("drop")
+        with pytest.raises(LostError, match="connection"):
+            again_and_again(poses.latest)
+
+
+def test_nobody_there():
+    with pytest.raises(LostError, match="no connection"):
+        PoseStream("127.250.250.1", timeout_s=0.5).start()
+
+
+def test_averages_of_steady_poses():
+    with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
+        poses.drain()
+        steady = poses.steady(0.1)
+        assert steady.count >= 5
+        assert steady.scatter_mm == pytest.approx(0.0, abs=1e-6)
+        assert steady.sample.raw == pytest.approx(START)
+        assert len(poses.drain()) >= steady.count
+    rng = np.random.default_rng(0)
+    raws = np.array(START) + rng.normal(scale=[1e-4] * 3 + [1e-3] * 3, size=(2000, 6))
+    mean = average([PoseSample(0.0, 0.0, tuple(raw), 1, 7, 2) for raw in raws])
+    assert mean.scatter_mm == pytest.approx(0.1 * np.sqrt(3), rel=0.05)
+    np.testing.assert_allclose(mean.sample.raw, START, atol=1e-4)
+
+
+def test_lag_finds_late_poses_in_spite_of_drift():
+    rng = np.random.default_rng(2)
+    lag = Lag()
+    late = []
+    for t in np.arange(0.0, 600.0, 0.05):
+        jitter = rng.exponential(0.0005)
+        held = 0.2 if 300.0 < t < 300.5 else 0.0
+        late.append((lag.of(t + jitter + held, (t + 12.0) * (1 + 50e-6)), held))
+    values, truth = np.array(late).T
+    assert values[truth > 0].min() > 0.19
+    assert values[truth == 0].max() < 0.02
+    sample = PoseSample(5.0, 0.0, START, 1, 7, 2, lag_s=0.2)
+    assert sample.age_s(5.01) == pytest.approx(0.21)
+
+
+def test_safety_bits_are_named():
+    assert safety_text(0b01) == safety_text(0b11) == ""
+    assert safety_text(0b101) == "protective stop"
+    assert "emergency" in safety_text(1 << 6)
+    assert "0x80000000" in safety_text(1 << 31)
+
+
+def answers(*messages: bytes) -> str:
+    """A server that answers each request with the next message; its address."""
+    host = address()
+    listener = socket.create_server((host, 30004))
+
+    def serve() -> None:
+        with listener, listener.accept()[0] as client:
+            client.settimeout(5.0)
+            for message in messages:
+                client.recv(65536)
+                client.sendall(message)
+            client.recv(65536)
+
+    threading.Thread(target=serve, daemon=True).start()
+    return host
+
+
+def rtde(kind: bytes, payload: bytes) -> bytes:
+    return struct.pack(">H", 3 + len(payload)) + kind + payload
+
+
+VERSION = rtde(b"v", struct.pack(">4I", 5, 11, 0, 0))
+TYPES = b"\x01" + b",".join(
+    b"DOUBLE VECTOR6D VECTOR6D VECTOR6D INT32 UINT32 UINT32 UINT32 VECTOR6D".split()
+)
+
+
+@pytest.mark.parametrize(
+    ("messages", "text"),
+    [
+        ([b"\x00\x00V"], "no RTDE data"),
+        ([rtde(b"V", b"\x00")], "version 2"),
+        ([rtde(b"V", b"\x01"), rtde(b"v", b"123")], "did not tell its version"),
+        ([rtde(b"V", b"\x01"), VERSION, rtde(b"O", b"\x01NOT_FOUND,DOUBLE")], "has no"),
+        ([rtde(b"V", b"\x01"), VERSION, rtde(b"O", b"")], "has no"),
+        ([rtde(b"V", b"\x01"), VERSION, rtde(b"O", TYPES), rtde(b"S", b"\x00")], "start sending"),
+        ([b"GET / HTTP/1.1\r\n\r\n" * 4000], r"no RTDE data|does not answer"),
+    ],
+)
+def test_what_is_no_controller_is_refused(messages, text):
+    host = answers(*messages)
+    with pytest.raises((LostError, RefusedError), match=text):
+        PacketReader(host, timeout_s=0.5)
+
+
+@pytest.mark.parametrize("payload", [b"\x01" + b"\0" * 8, b"\x01" + b"\xff" * 216])
+def test_packets_that_do_not_fit_the_recipe_end_the_connection(payload):
+    opening = [rtde(b"V", b"\x01"), VERSION, rtde(b"O", TYPES), rtde(b"S", b"\x01")]
+    host = answers(*opening[:-1], opening[-1] + rtde(b"M", b"text") + rtde(b"U", payload))
+    with (
+        contextlib.closing(PacketReader(host, timeout_s=0.5)) as reader,
+        pytest.raises(LostError, match=r"bytes came instead|NaN"),
+    ):
+        again_and_again(reader.read)
+
+
+def test_a_faster_bench_counts_age_in_its_own_time():
+    clock = Clock(speed=4.0)
+    stream = PoseStream("127.0.0.1", clock=clock)
+    stream._latest = PoseSample(clock.now(), 0.0, START, 1, 7, 2)
+    stream.latest()
+    clock.sleep(0.11)
+    with pytest.raises(StaleError, match="ms old"):
+        stream.latest()
