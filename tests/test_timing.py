@@ -1,0 +1,218 @@
+"""Time alignment against known motions, clocks and lags, and against scipy's linear programme."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+from scipy.spatial.transform import Rotation
+
+from jaxcal.errors import InputError
+from jaxcal.timing import (
+    can_interpolate,
+    estimate_latency,
+    fit_clock,
+    interpolate_poses,
+    motion_along_main_axis,
+)
+
+
+def screw(t: np.ndarray, turn: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """Poses that turn at a constant rate about a fixed axis and move at a constant speed."""
+    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    start = Rotation.from_rotvec([0.3, -0.2, 2.9])
+    poses[:, :3, :3] = (start * Rotation.from_rotvec(t[:, None] * turn)).as_matrix()
+    poses[:, :3, 3] = [100, -50, 400] + t[:, None] * speed
+    return poses
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.tuples(*[st.floats(-3, 3)] * 3),
+    st.tuples(*[st.floats(-80, 80)] * 3),
+    st.lists(st.floats(0, 1.99), min_size=1, max_size=20),
+)
+def test_constant_motion_is_interpolated_exactly(turn, speed, query) -> None:
+    t = np.linspace(0, 2, 23)
+    found = interpolate_poses(
+        t, screw(t, np.array(turn), np.array(speed)), np.array(query), max_gap_s=1.0
+    )
+    expected = screw(np.array(query), np.array(turn), np.array(speed))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_smooth_motion_at_125_hz() -> None:
+    """A to and fro at up to 50 mm/s: microns off, where the nearest sample is 0.2 mm off."""
+
+    def path(t: np.ndarray) -> np.ndarray:
+        poses = np.tile(np.eye(4), (len(t), 1, 1))
+        poses[:, 0, 3] = 20 * np.sin(2.5 * t)
+        poses[:, :3, :3] = Rotation.from_rotvec(
+            np.sin(t)[:, None] * [0.1, 0.2, -0.1]
+        ).as_matrix()  # fmt: skip
+        return poses
+
+    t = np.arange(0, 4, 0.008)
+    query = np.random.default_rng(3).uniform(0, 3.99, 200)
+    found = interpolate_poses(t, path(t), query, max_gap_s=0.02)
+    error = np.linalg.norm((found - path(query))[:, :3, 3], axis=1)
+    assert error.max() < 2e-3
+    nearest = path(t)[np.abs(t[:, None] - query).argmin(axis=0)]
+    assert np.linalg.norm((nearest - path(query))[:, :3, 3], axis=1).max() > 0.15
+
+
+def test_no_pose_is_guessed() -> None:
+    t = np.array([0.0, 0.1, 0.2, 0.9, 1.0, 1.1])
+    poses = screw(t, np.ones(3), np.ones(3))
+    poses[4] = np.nan
+    valid = np.array([1, 1, 1, 1, 0, 1], bool)
+    query = np.array([-0.01, 0.0, 0.15, 0.2, 0.5, 0.9, 0.95, 1.0, 1.05, 1.1, 1.2, np.nan])
+    can = can_interpolate(t, query, max_gap_s=0.3, valid=valid)
+    assert (
+        can.tolist() == [False, True, True, True, False, True] + [False] * 3 + [True] + [False] * 2
+    )
+    found = interpolate_poses(t, poses, query[can], max_gap_s=0.3, valid=valid)
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found[[0, -1]], poses[[0, -1]], atol=1e-12)
+    for time in query[~can]:
+        with pytest.raises(InputError, match="no pose for time 1"):
+            interpolate_poses(t, poses, np.array([0.05, time]), max_gap_s=0.3, valid=valid)
+    with pytest.raises(InputError, match="NaN"):
+        interpolate_poses(t, poses, np.array([0.05]), max_gap_s=0.3)
+
+
+def test_times_out_of_order_are_named() -> None:
+    poses = screw(np.arange(4.0), np.ones(3), np.ones(3))
+    with pytest.raises(InputError, match="time of pose 2 is not later"):
+        interpolate_poses(np.array([0.0, 2.0, 1.0, 3.0]), poses, np.array([0.5]), max_gap_s=9.0)
+    with pytest.raises(InputError, match="4 poses and 3 times"):
+        interpolate_poses(np.arange(3.0), poses, np.array([0.5]), max_gap_s=9.0)
+
+
+@pytest.mark.parametrize("origin", [0.0, 1.7e9])
+@pytest.mark.parametrize("drift", [0.0, 4e-5, -2e-4])
+def test_clock_under_delays_that_only_add(origin: float, drift: float) -> None:
+    """Delays of 2 ms on average, one in ten of up to 300 ms (a busy host): microseconds remain."""
+    rng = np.random.default_rng(5)
+    device = origin + np.arange(0, 60, 0.008)
+    late = rng.exponential(2e-3, len(device))
+    late += np.where(rng.random(len(device)) < 0.1, rng.uniform(0, 0.3, len(device)), 0)
+    true = 12.5 + (1 + drift) * (device - origin)
+    fit = fit_clock(device, true + late)
+    # The stamps themselves have 0.24 us at 1.7e9 s.
+    assert abs(fit.drift - drift) < 1e-6
+    assert np.abs(fit.to_host(device) - true).max() < 5e-5
+    assert fit.delay_s.min() > -1e-6
+    np.testing.assert_allclose(fit.to_host(device) + fit.delay_s, true + late, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_envelope_is_the_linear_programme(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    device = np.cumsum(rng.uniform(0.01, 1.0, 60))
+    host = device * (1 + rng.normal(0, 0.01)) + rng.gamma(0.7, 0.1, 60)
+    fit = fit_clock(device, host)
+    x, y = device - device[0], host - device
+    # Least sum of y - s x - l with none below zero, in (s, l).
+    answer = linprog(
+        [-x.sum(), -len(x)], A_ub=np.stack([x, np.ones_like(x)], 1), b_ub=y,
+        bounds=[(None, None)] * 2,
+    )  # fmt: skip
+    slope, level = answer.x
+    assert fit.drift == pytest.approx(slope, abs=1e-9)
+    assert fit.offset_s == pytest.approx(level, abs=1e-9)
+
+
+def test_regression_for_stamps_with_jitter_both_ways() -> None:
+    """As of frames with a constant period: outliers of either sign change nothing."""
+    rng = np.random.default_rng(6)
+    device = np.arange(3000) / 30
+    host = 3 + 1.0001 * device + rng.normal(0, 0.004, 3000)
+    host[::50] += rng.choice([-1.0, 1.0], 60) * 0.5
+    fit = fit_clock(device, host, method="regression")
+    assert fit.method == "regression"
+    assert abs(fit.drift - 1e-4) < 1e-5
+    assert np.abs(fit.to_host(device) - 3 - 1.0001 * device).max() < 1e-3
+    with pytest.raises(InputError, match="envelope or regression"):
+        fit_clock(device, host, method="mean")
+
+
+def test_clock_refuses_what_is_no_clock() -> None:
+    with pytest.raises(InputError, match="device time 2 is not later"):
+        fit_clock(np.array([0.0, 1.0, 1.0]), np.arange(3.0))
+    with pytest.raises(InputError, match="2 times or more"):
+        fit_clock(np.zeros(1), np.zeros(1))
+    with pytest.raises(InputError, match="3 numbers"):
+        fit_clock(np.arange(3.0), np.array([0.0, np.nan, 1.0]))
+
+
+def motion(t: np.ndarray) -> np.ndarray:
+    """Irregular to and fro over 40 mm."""
+    return 15 * np.sin(1.95 * t) + 7 * np.sin(5.2 * t + 1) + 3 * np.sin(10.7 * t)
+
+
+@pytest.mark.parametrize("lag", [-0.31, -0.0507, 0.0, 0.0833, 0.42])
+@pytest.mark.parametrize("scale", [1.0, -13.7])
+def test_known_lags(lag: float, scale: float) -> None:
+    """Within four of its own standard deviations, and within a millisecond."""
+    rng = np.random.default_rng(7)
+    t_tracker = np.arange(0, 12, 0.008)
+    t_video = np.arange(0.2, 11.8, 1 / 30)
+    tracker = motion(t_tracker) + rng.normal(0, 0.05, len(t_tracker))
+    video = scale * (motion(t_video - lag) + rng.normal(0, 0.2, len(t_video))) + 200
+    found = estimate_latency(t_video, video, t_tracker, tracker)
+    assert abs(found.lag_s - lag) < 4 * found.sd_s + 1e-5
+    assert abs(found.lag_s - lag) < 1e-3
+    assert np.sign(found.correlation) == np.sign(scale)
+
+
+def test_standard_deviation_of_the_lag() -> None:
+    """The scatter of many estimates is what each says of itself."""
+    rng = np.random.default_rng(8)
+    t_tracker, t_video = np.arange(0, 9, 0.008), np.arange(0.2, 8.8, 1 / 30)
+    error, said = [], []
+    for _ in range(40):
+        lag = rng.uniform(-0.2, 0.2)
+        video = motion(t_video - lag) + rng.normal(0, 0.5, len(t_video))
+        found = estimate_latency(
+            t_video, video, t_tracker, motion(t_tracker), max_lag_s=0.3, step_s=0.002
+        )
+        error.append(found.lag_s - lag)
+        said.append(found.sd_s)
+    assert 0.7 < np.std(error) / np.mean(said) < 1.4
+    assert abs(np.mean(error)) < 3 * np.mean(said) / np.sqrt(40)
+
+
+def test_motion_signal_of_poses() -> None:
+    t = np.arange(0, 12, 0.008)
+    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    axis = np.array([0.6, -0.48, 0.64])
+    poses[:, :3, 3] = motion(t)[:, None] * axis + [10, 20, 30]
+    signal = motion_along_main_axis(poses)
+    centred = motion(t) - motion(t).mean()
+    np.testing.assert_allclose(signal * np.sign(signal @ centred), centred, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("video", "tracker", "message"),
+    [
+        (lambda t: motion(t) / 10, lambda t: motion(t) / 10, "moved by"),
+        (lambda t: 0 * t, motion, "show no motion"),
+        (lambda t: np.random.default_rng(1).normal(size=len(t)), motion, "same motion"),
+        (lambda t: motion(t - 0.53), motion, "larger ones"),
+        (lambda t: 20 * np.sin(20 * t), lambda t: 20 * np.sin(20 * t), "fit alike"),
+        (lambda t: np.where(t > 5, np.nan, t), motion, "NaN"),
+    ],
+)
+def test_lags_that_cannot_be_told(video, tracker, message: str) -> None:
+    t_tracker, t_video = np.arange(0, 12, 0.008), np.arange(0.2, 11.8, 1 / 30)
+    with pytest.raises(InputError, match=message):
+        estimate_latency(t_video, video(t_video), t_tracker, tracker(t_tracker))
+
+
+def test_too_short_an_overlap() -> None:
+    t = np.arange(0, 1.5, 0.008)
+    with pytest.raises(InputError, match="overlap"):
+        estimate_latency(t, motion(t), t, motion(t))
