@@ -44,10 +44,10 @@ class Extent:
         reach_mm: least and largest distance of the tool centre point from the base's origin.
     """
 
-    cone_deg: float = 35.0
+    cone_deg: float = 40.0
     turn_deg: float = 90.0
-    lateral_mm: float = 22.0
-    depth_mm: tuple[float, float] = (20.0, 75.0)
+    lateral_mm: float = 24.0
+    depth_mm: tuple[float, float] = (15.0, 82.0)
     box_mm: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     reach_mm: tuple[float, float] = (150.0, 850.0)
 
@@ -107,7 +107,7 @@ def plan_poses(count: int, scene: Scene, extent: Extent | None = None, seed: int
     Args:
         count: 1 to 10000.
         scene: what is known of probe and target.
-        extent: what to cover; the default covers 35 degrees and +-90 degrees of turn.
+        extent: what to cover; the default covers 40 degrees and +-90 degrees of turn.
         seed: another one gives another plan of the same quality.
 
     Raises:
