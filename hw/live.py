@@ -84,6 +84,18 @@ class LiveCalibration:
         Raises:
             InputError: a full buffer, or an image that cannot be used; it is then not kept.
         """
+        self.put(pose, measurement, max_elevation)
+        if self._count < MINIMUM_IMAGES:
+            return None
+        try:
+            return self.solve()
+        except InputError:
+            self._count -= 1
+            self._mask[self._count] = False
+            raise
+
+    def put(self, pose: np.ndarray, measurement: np.ndarray, max_elevation: float = np.inf) -> None:
+        """Take one image without solving; arguments and errors as for :meth:`add`."""
         if self._count == self.capacity:
             raise InputError(f"the buffer is full at {self.capacity} images")
         pose = check_poses(np.asarray(pose)[None], what="pose of the new image")[0]
@@ -98,14 +110,6 @@ class LiveCalibration:
         self._bound[self._count] = max_elevation
         self._mask[self._count] = True
         self._count += 1
-        if self._count < MINIMUM_IMAGES:
-            return None
-        try:
-            return self.solve()
-        except InputError:
-            self._count -= 1
-            self._mask[self._count] = False
-            raise
 
     def _check_times(self, times: np.ndarray) -> None:
         assert self._probe is not None

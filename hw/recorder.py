@@ -227,6 +227,10 @@ class Recorder:
         """Write one array of /plan, /test or /truth."""
         self._put({"do": "put", "group": group, "name": name, "unit": unit}, {name: values})
 
+    def copy(self, group: str, name: str, to_group: str, to_name: str) -> None:
+        """Copy a whole column into an array of /plan, /test or /truth."""
+        self._put({"do": "copy", "from": [group, name], "to": [to_group, to_name]})
+
     def attributes(self, group: str, values: Mapping[str, Any]) -> None:
         """Set attributes of a group."""
         self._put({"do": "attributes", "group": group, "values": dict(values)})

@@ -91,6 +91,8 @@ def _serve(path: str, source: RawIOBase, answer) -> RecordingWriter | None:
             case "put":
                 name = message["name"]
                 writer.put(message["group"], name, columns[name], message["unit"])
+            case "copy":
+                writer.copy(*message["from"], *message["to"])
             case "attributes":
                 writer.attributes(message["group"], message["values"])
             case "sync":

@@ -112,7 +112,7 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
             )
     except InputError as error:
         raise FormatError(f"{path}: {error}") from None
-    if taken.size and not (0 <= taken.min() and taken.max() < len(progress.targets)):
+    if taken.size and not (taken.min() >= 0 and taken.max() < len(progress.targets)):
         raise FormatError(f"{path}: /calibration/target names a pose that the plan does not have")
     return progress
 

@@ -143,6 +143,11 @@ class RecordingWriter:
             del target[key]
         target.create_dataset(key, data=values).attrs["units"] = unit
 
+    def copy(self, name: str, key: str, to_name: str, to_key: str) -> None:
+        """Copy a whole column into an array of /plan, /test or /truth."""
+        column = _columns(self._file, name)[key]
+        self.put(to_name, to_key, column[()], str(column.attrs["units"]))
+
     def attributes(self, name: str, values: Mapping[str, object]) -> None:
         """Set attributes of a group of the layout."""
         for key, value in values.items():

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.active_echo.device import ActiveEcho, EchoFrame
-from hw.clock import Clock
-from hw.errors import Device, DeviceError, LostError, StaleError
+from hw.errors import Device, StaleError
 from hw.recorder import Recorder
 from hw.robot.stream import PoseStream
 from hw.setup import Setup
@@ -217,9 +216,7 @@ class Session:
                     break
                 self._changed.wait(self.clock.wall(0.1))
         self.check()
-        raise StaleError(
-            f"only {len(found)} of {frames} frames came in time", device="active echo"
-        )
+        raise StaleError(f"only {len(found)} of {frames} frames came in time", device="active echo")
 
     def latest_image(self) -> Image | None:
         """The newest ultrasound frame, or None before the first."""

@@ -6,7 +6,6 @@ A TOML file, units in the names; a key that is not known is refused:
     host = "192.168.1.10"
     frequency_hz = 125              # optional: the controller's own rate otherwise
     settle_s = 0.3                  # poses are averaged for so long after a move
-    speed_mm_s = 50                 # between poses
     [active_echo]
     url = "/dev/ttyUSB0"
     [ultrasound]                    # optional
@@ -62,7 +61,6 @@ class Setup:
         clock: of the bench.
         frequency_hz: of the poses; None: the controller's own.
         settle_s: poses are averaged for so long.
-        speed_mm_s: between poses.
         frames: active-echo frames of an image.
     """
 
@@ -77,7 +75,6 @@ class Setup:
     clock: Clock = REAL
     frequency_hz: float | None = None
     settle_s: float = 0.3
-    speed_mm_s: float = 50.0
     frames: int = 9
 
 
@@ -100,7 +97,7 @@ def load_setup(path: str | os.PathLike[str]) -> Setup:
 
 
 _TABLES = {
-    "robot": {"host": str, "frequency_hz": float, "settle_s": float, "speed_mm_s": float},
+    "robot": {"host": str, "frequency_hz": float, "settle_s": float},
     "active_echo": {"url": str, "frames": int},
     "ultrasound": {"host": str, "port": int},
     "probe": {"elements": int, "pitch_mm": float, "sound_speed_m_s": float, "delay_s": float},
@@ -132,16 +129,14 @@ def _setup(tables: dict[str, Any]) -> Setup:
         ultrasound = (found["ultrasound"]["host"], found["ultrasound"].get("port", 18944))
     if not found["limits"]:
         raise InputError("[limits] is missing: without it nothing may move")
-    robot = {
-        {"host": "robot_host"}.get(key, key): value for key, value in found["robot"].items()
-    }
-    for key in ("settle_s", "speed_mm_s", "frequency_hz"):
+    robot = {{"host": "robot_host"}.get(key, key): value for key, value in found["robot"].items()}
+    for key in ("settle_s", "frequency_hz"):
         if key in robot and not (np.isfinite(robot[key]) and robot[key] > 0):
             raise InputError(f"[robot] {key} must be a positive number")
     echo = found["active_echo"]
     if not 1 <= echo.get("frames", 9) <= 1000:
         raise InputError("[active_echo] frames must be 1 to 1000")
-    plan = {
+    plan: dict[str, Any] = {
         key: tuple(tuple(row) if isinstance(row, list) else row for row in value)
         if isinstance(value, list) else value
         for key, value in found["plan"].items()

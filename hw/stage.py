@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Float
 
-from hw.errors import DeviceError, StaleError, StoppedError
+from hw.errors import DeviceError, RefusedError, StaleError, StoppedError
 from hw.midplane.search import Echoes
 from hw.robot.motion import Motion
+from hw.robot.pose import turn_deg
 from hw.session import Session
 
-FINE_SPEED_MM_S = 10.0
 _MOST_HESITATIONS = 5
 
 
@@ -26,32 +27,53 @@ class ProbeStage:
     Args:
         session: devices.
         motion: of the robot.
+        targets: (n, 4, 4) poses of the plan, mm.
         note: told of what belongs into the diary: kind, text.
     """
 
     def __init__(
-        self, session: Session, motion: Motion, note: Callable[[str, str], None]
+        self,
+        session: Session,
+        motion: Motion,
+        targets: Float[np.ndarray, "n 4 4"],
+        note: Callable[[str, str], None],
     ) -> None:
+        self._targets = targets
         self._session, self._motion, self._note = session, motion, note
         self._axis = np.asarray(session.setup.scene.elevational, float)
         self.plan_pose = np.eye(4)
         self._arrived = session.clock.now()
 
-    def go_to(self, pose: np.ndarray) -> None:
+    def go_to(self, row: int) -> None:
         """Travel to a pose of the plan; offsets count from there.
+
+        The plan was checked from each pose to the next. Where a run begins elsewhere (a resumed
+        one, or after poses that were given up) and the straight way is refused, it goes from the
+        nearest pose of the plan through those in between.
 
         Raises:
             DeviceError: stopped, refused, lost, or a device in lasting trouble.
         """
-        self.plan_pose = np.array(pose, float)
-        self._move(self.plan_pose, self._session.setup.speed_mm_s)
+        self.plan_pose = self._targets[row].copy()
+        try:
+            self._move(self.plan_pose, None)
+            return
+        except RefusedError as error:
+            here = self._session.poses.latest().pose
+            near = int(np.argmin([_apart(here, pose) for pose in self._targets]))
+            if near == row:
+                raise
+            self._note("detour", f"{error}; through poses {near + 1} to {row + 1} of the plan")
+        step = 1 if row > near else -1
+        for passing in range(near, row + step, step):
+            self._move(self._targets[passing], None)
 
     def move(self, offset_mm: float) -> float:
         """Go to an offset (mm) along the elevational axis; the offset as tracked."""
         pose = self.plan_pose.copy()
         direction = pose[:3, :3] @ self._axis
         pose[:3, 3] += offset_mm * direction
-        self._move(pose, FINE_SPEED_MM_S)
+        self._move(pose, None)
         tracked = self._session.poses.latest().pose
         return float((tracked[:3, 3] - self.plan_pose[:3, 3]) @ direction)
 
@@ -87,7 +109,7 @@ class ProbeStage:
         """Bench time since which nothing has moved and the threshold is what it is."""
         return self._arrived
 
-    def _move(self, pose: np.ndarray, speed_mm_s: float) -> None:
+    def _move(self, pose: np.ndarray, speed_mm_s: float | None) -> None:
         for hesitation in range(_MOST_HESITATIONS + 1):
             self._session.wait_until_clear()
             try:
@@ -105,3 +127,8 @@ class ProbeStage:
         if isinstance(error, StaleError):
             return True
         return self._session.last_trouble is not None and self._session.last_trouble in str(error)
+
+
+def _apart(first: np.ndarray, second: np.ndarray) -> float:
+    """How far two poses are apart, a degree counted as a mm."""
+    return float(np.linalg.norm(first[:3, 3] - second[:3, 3])) + turn_deg(first, second)

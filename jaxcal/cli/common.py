@@ -22,12 +22,16 @@ if TYPE_CHECKING:
 
 
 class ExitCode(enum.IntEnum):
-    """How the process ends; the last two are the shell's names for signals 2 and 13."""
+    """How the process ends; the last two are the shell's names for signals 2 and 13.
+
+    Only an acquisition ends with 4: stopped early, by a device or a person, and to be resumed.
+    """
 
     CONVERGED = 0
     INTERNAL_ERROR = 1
     BAD_INPUT = 2
     NOT_CONVERGED = 3
+    STOPPED = 4
     INTERRUPTED = 130
     BROKEN_PIPE = 141
 

@@ -1,9 +1,7 @@
-"""The entry point ``jaxcal``: commands, and what becomes of everything that can go wrong."""
+"""The entry point ``jaxcal``."""
 
 from __future__ import annotations
 
-import errno
-import os
 import sys
 from collections.abc import Sequence
 
@@ -11,14 +9,13 @@ import click
 
 from jaxcal import __version__
 from jaxcal.cli.calibrate import calibrate
-from jaxcal.cli.common import ExitCode
 from jaxcal.cli.demo import demo
 from jaxcal.cli.import_ import import_
 from jaxcal.cli.pivot import pivot
+from jaxcal.cli.run import run
 from jaxcal.cli.segment import segment
 from jaxcal.cli.simulate import simulate
 from jaxcal.cli.study import study
-from jaxcal.errors import CalibrationError
 
 
 @click.group(
@@ -37,81 +34,8 @@ for _command in (demo, simulate, import_, segment, calibrate, pivot, study):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        arguments: without the program's name; ``sys.argv``'s by default.
-
-    Returns:
-        The exit status. Errors have been reported on standard error by then, in one line.
-    """
-    try:
-        code = _run(sys.argv[1:] if arguments is None else arguments)
-        if sys.stdout is not None:
-            sys.stdout.flush()
-        return code
-    except (KeyboardInterrupt, click.Abort) as interruption:
-        _report(str(interruption) or "interrupted", ExitCode.INTERRUPTED)
-        if arguments is None:
-            # Under the threads of an interrupted compilation an orderly exit may crash.
-            os._exit(ExitCode.INTERRUPTED)
-        return ExitCode.INTERRUPTED
-    except click.ClickException as error:
-        return _report(f"error: {error.format_message()}{_hint(error)}", ExitCode.BAD_INPUT)
-    except CalibrationError as error:
-        return _report(f"error: {error}", ExitCode.BAD_INPUT)
-    except OSError as error:
-        # A pipe that was closed early (| head) or a full disk; Python would flush once more.
-        _drop(sys.stdout)
-        if error.errno == errno.EPIPE:
-            return ExitCode.BROKEN_PIPE
-        return _report(f"error: {error.strerror or error}", ExitCode.BAD_INPUT)
-    except Exception as error:
-        if os.environ.get("JAXCAL_TRACEBACK"):
-            raise
-        return _report(
-            f"internal error: {type(error).__name__}: {str(error)[:300]} (please report it; "
-            "JAXCAL_TRACEBACK=1 shows where)",
-            ExitCode.INTERNAL_ERROR,
-        )
-
-
-def _run(arguments: Sequence[str]) -> int:
-    # Not click's own main(): it would print usage over several lines.
-    try:
-        with commands.make_context("jaxcal", list(arguments)) as context:
-            return commands.invoke(context) or 0
-    except click.exceptions.Exit as done:
-        return done.exit_code
-
-
-def _hint(error: click.ClickException) -> str:
-    context = error.ctx if isinstance(error, click.UsageError) else None
-    return "" if context is None else f" (see '{context.command_path} --help')"
-
-
-def _report(message: str, code: ExitCode) -> ExitCode:
-    """One line on standard error, whatever a file's name may hold."""
-    line = " ".join(f"jaxcal: {message}".split())
-    shown = "".join(
-        char if char.isprintable() else char.encode("unicode_escape").decode() for char in line
-    )
-    try:
-        click.echo(shown, err=True)
-    except OSError:
-        _drop(sys.stderr)
-    return code
-
-
-def _drop(stream: object) -> None:
-    """Send what is still buffered nowhere."""
-    try:
-        descriptor = stream.fileno()  # type: ignore[attr-defined]
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, descriptor)
-        os.close(nowhere)
-    except (AttributeError, OSError, ValueError):
-        pass
+    """Run ``jaxcal``; see :func:`jaxcal.cli.run.run`."""
+    return run(commands, "jaxcal", arguments)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,379 @@
+"""The experiment: for each pose of the plan move, place, record, and say what is known so far.
+
+What was taken stays taken: every image is on the disk before the next move, whatever happens then.
+A device that fails ends the run with the robot at rest and one line; the recording is resumed with
+the images that are still missing, after a new confirmation.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Protocol
+
+import numpy as np
+
+from hw.acquire_live import Estimator
+from hw.errors import DeviceError, RefusedError
+from hw.midplane.amplitude_scan import amplitude_scan
+from hw.midplane.bracket import Placement
+from hw.midplane.pattern_injection import Operator, SteadyOperator, pattern_injection
+from hw.midplane.search import PlacementError, first_seen
+from hw.midplane.threshold_climb import threshold_climb
+from hw.poses import plan_poses
+from hw.recorder import Recorder
+from hw.recording_check import Progress, read_progress
+from hw.recording_file import RecordingWriter
+from hw.recording_layout import Header
+from hw.robot.motion import Motion
+from hw.robot.safety import Confirmation, Limits, MotionPlan
+from hw.session import Session, Watch, median_times
+from hw.setup import Setup
+from hw.stage import ProbeStage
+from jaxcal.cli.common import ExitCode
+from jaxcal.errors import CalibrationError, InputError
+
+PLACEMENTS = ("threshold-climb", "amplitude-scan", "pattern-injection", "none")
+MOST_IMAGES = 1000
+_MOST_GIVEN_UP = 3
+_FURTHEST_START_MM = 3.0
+_IMAGES_FOR_PREDICTION = 8
+
+
+class AcquisitionStopped(CalibrationError):
+    """A run that ended early; one line with what happened and what to do next."""
+
+    def __init__(self, message: str, *, interrupted: bool = False) -> None:
+        super().__init__(message)
+        self.exit_code = ExitCode.INTERRUPTED if interrupted else ExitCode.STOPPED
+
+
+class Oracle(Protocol):
+    """What an emulated bench knows of the truth."""
+
+    def elevation_mm(self) -> float:
+        """The target's true elevational offset, now."""
+        ...
+
+    def truth(self) -> tuple[np.ndarray, np.ndarray]:
+        """The true X (4, 4) and target (3,), mm."""
+        ...
+
+    def test_set(self) -> tuple[np.ndarray, np.ndarray]:
+        """Noise-free test images: poses (n, 4, 4) and [lateral, range] (n, 2), mm."""
+        ...
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to acquire.
+
+    Attributes:
+        images: poses of the plan.
+        placement: one of :data:`PLACEMENTS`.
+        seed: of the plan.
+        every_frame: record every ultrasound frame, not one an image.
+        bench: seed of the emulated bench; None for a real one.
+    """
+
+    images: int = 60
+    placement: str = "threshold-climb"
+    seed: int = 0
+    every_frame: bool = False
+    bench: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.placement not in PLACEMENTS:
+            raise InputError(f"placement must be one of {', '.join(PLACEMENTS)}")
+        if not 4 <= self.images <= MOST_IMAGES:
+            raise InputError(f"images must be 4 to {MOST_IMAGES}, not {self.images}")
+
+
+class Pause:
+    """Lets a person hold the acquisition between two images."""
+
+    def __init__(self) -> None:
+        self._free = threading.Event()
+        self._free.set()
+
+    def hold(self) -> None:
+        """Stop before the next image."""
+        self._free.clear()
+
+    def go_on(self) -> None:
+        """Take the next image."""
+        self._free.set()
+
+    @property
+    def held(self) -> bool:
+        """Whether the acquisition is, or will be, held."""
+        return not self._free.is_set()
+
+    def wait(self) -> None:
+        """Return when nobody holds the acquisition."""
+        self._free.wait()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended that came to its end.
+
+    Attributes:
+        images: selected.
+        given_up: rows of the plan for which no mid-plane was found.
+        sha256: of the finished file.
+        seconds: bench seconds that this run took.
+    """
+
+    images: int
+    given_up: tuple[int, ...]
+    sha256: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class _Job:
+    setup: Setup
+    request: Request
+    targets: np.ndarray
+    progress: Progress | None
+
+    @property
+    def missing(self) -> list[int]:
+        taken = set() if self.progress is None else set(self.progress.taken.tolist())
+        return [row for row in range(len(self.targets)) if row not in taken]
+
+
+Confirm = Callable[[MotionPlan], Confirmation]
+
+
+def acquire(
+    setup: Setup,
+    path: str | os.PathLike[str],
+    request: Request | None,
+    confirm: Confirm,
+    *,
+    say: Callable[[str], None] = lambda line: None,
+    oracle: Oracle | None = None,
+    operator: Callable[[], Operator] = SteadyOperator,
+    pause: Pause | None = None,
+    watch: Watch | None = None,
+) -> Outcome:
+    """Run the experiment to its end, or go on with one that ended early.
+
+    Args:
+        setup: the bench.
+        path: the recording: to make, or with ``request`` None to resume.
+        request: what to acquire; None resumes the recording at ``path``.
+        confirm: asked once before anything moves, with the plan of motion; resuming asks again.
+        say: told one line after every image, and of everything that a person should know.
+        oracle: of an emulated bench; its truth goes into the recording.
+        operator: makes who follows the injected pattern.
+        pause: to hold the run between images.
+        watch: limits of the devices' silence.
+
+    Returns:
+        The outcome; the file is complete then.
+
+    Raises:
+        AcquisitionStopped: a device failed, the person interrupted or refused: one line, the file
+            closed and resumable.
+        InputError: a plan or a recording that cannot be used; nothing moved.
+        OutputError: the recording cannot be written.
+    """
+    job = _prepare(setup, path, request)
+    estimator = Estimator(len(job.targets), setup, job.progress)
+    say(f"plan: {len(job.targets)} poses, {len(job.missing)} to go; compiling the estimate")
+    estimator.warm_up(job.targets)
+    recorder = _open_recorder(path, job)
+    with recorder:
+        try:
+            return _run(job, recorder, estimator, confirm, say, oracle, operator, pause, watch)
+        except KeyboardInterrupt:
+            reason, interrupted = "interrupted", True
+        except (DeviceError, CalibrationError) as error:
+            reason, interrupted = str(error), False
+        count = estimator.count
+        line = f"{reason}; {count} of {len(job.targets)} images are in {os.fspath(path)}"
+        # Where the recorder is what failed, it has said so.
+        with suppress(CalibrationError):
+            recorder.add_event("stopped", reason, setup.clock.now())
+    raise AcquisitionStopped(
+        f"{line}; put it right, then: jaxcal-hw acquire --resume {os.fspath(path)}",
+        interrupted=interrupted,
+    )
+
+
+def _prepare(setup: Setup, path: str | os.PathLike[str], request: Request | None) -> _Job:
+    if request is not None:
+        plan = plan_poses(request.images, setup.scene, setup.extent, request.seed)
+        return _Job(setup, request, plan.poses, None)
+    # Cut back to whole rows first, so that what is read is what is there.
+    RecordingWriter.resume(path).close()
+    progress = read_progress(path)
+    asked = progress.settings.get("request")
+    try:
+        if not isinstance(asked, dict):
+            raise TypeError
+        request = Request(**asked)
+    except TypeError:
+        raise InputError(f"{path}: has no settings of an acquisition to resume") from None
+    if progress.measurements.shape[1:] != (setup.probe.elements,):
+        raise InputError(
+            f"{path}: was recorded with {progress.measurements.shape[1]} elements, this bench's "
+            f"probe has {setup.probe.elements}"
+        )
+    return _Job(setup, request, progress.targets, progress)
+
+
+def _open_recorder(path: str | os.PathLike[str], job: _Job) -> Recorder:
+    if job.progress is not None:
+        gap = job.progress.last_s + 1.0 - job.setup.clock.now()
+        return Recorder(path, time_offset_s=max(gap, 0.0))
+    probe = job.setup.probe
+    header = Header(
+        kind="time_of_flight",
+        probe={
+            "kind": probe.kind, "elements": probe.elements, "pitch_mm": probe.pitch_mm,
+            "sound_speed_m_s": probe.sound_speed_m_s, "delay_s": probe.delay_s,
+        },
+        lines=probe.elements,
+        settings=json.dumps({"request": asdict(job.request)}),
+    )  # fmt: skip
+    recorder = Recorder(path, header)
+    recorder.put("plan", "targets", job.targets, "mm")
+    return recorder
+
+
+def _run(
+    job: _Job, recorder: Recorder, estimator: Estimator, confirm: Confirm,
+    say: Callable[[str], None], oracle: Oracle | None, operator: Callable[[], Operator],
+    pause: Pause | None, watch: Watch | None,
+) -> Outcome:  # fmt: skip
+    setup, clock = job.setup, job.setup.clock
+    started = clock.now()
+
+    def note(kind: str, text: str) -> None:
+        recorder.add_event(kind, text, clock.now())
+        if kind != "command":
+            say(f"{kind}: {text}")
+
+    note("resumed" if job.progress else "started", f"{len(job.missing)} images to take")
+    session = Session(setup, recorder, watch=watch, every_frame=job.request.every_frame)
+    with session:
+        plan = _motion_plan(job, session, recorder)
+        confirmation = confirm(plan)
+        note("confirmed", f"plan {plan.digest[:12]} for robot {plan.serial}")
+        motion = Motion(
+            setup.robot_host, plan, confirmation, clock=clock, dry_run=False,
+            log=lambda line: note("command", str(line)), guard=session.trouble,
+        )  # fmt: skip
+        try:
+            stage = ProbeStage(session, motion, job.targets, note)
+            given_up: list[int] = []
+            for row in job.missing:
+                if pause is not None and pause.held:
+                    note("paused", "before the next image")
+                    pause.wait()
+                    note("continued", "by the operator")
+                began = clock.now()
+                try:
+                    placement = _place(job, row, stage, estimator, operator)
+                except PlacementError as error:
+                    given_up.append(row)
+                    note("given up", f"pose {row + 1}: {error}")
+                    session.check()
+                    if len(given_up) >= _MOST_GIVEN_UP and given_up[-_MOST_GIVEN_UP:] == list(
+                        range(row - _MOST_GIVEN_UP + 1, row + 1)
+                    ):
+                        raise
+                    continue
+                _take(job, row, stage, session, recorder, estimator, placement, oracle, began)
+                say(estimator.line(len(job.targets), placement))
+        finally:
+            motion.close()
+    if oracle is not None:
+        _write_truth(recorder, oracle)
+    note("finished", f"{estimator.count} images")
+    digest = recorder.finish()
+    return Outcome(estimator.count, tuple(given_up), digest, clock.now() - started)
+
+
+def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
+    """The plan that the confirmation is bound to; on resume the robot must be the same one."""
+    identity = session.poses.identity()
+    offset = session.poses.tcp_offset
+    known = {"serial_number": identity.serial, "tcp_offset": list(offset or ())}
+    if job.progress is not None:
+        before = job.progress.settings.get("robot")
+        if before is not None and json.loads(json.dumps(known)) != before:
+            raise RefusedError(
+                f"the recording was begun with robot {before}, this one is {known}: its images "
+                "would not fit together",
+                device="robot",
+            )
+    settings = {"request": asdict(job.request), "robot": known}
+    recorder.put("plan", "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8), "1")
+    recorder.attributes("tracker", {"serial_number": identity.serial, "tcp_offset": offset or ()})
+    recorder.attributes("ae", {"clock_hz": session.echo.clock_hz(), "trigger_delay_s": 0.0})
+    recorder.sync()
+    tip = job.setup.scene.tip_mm.tolist()
+    limits = Limits.from_mapping({"tip_mm": tip, **job.setup.limits})
+    return MotionPlan(job.targets, limits, offset, identity.serial)
+
+
+def _place(
+    job: _Job, row: int, stage: ProbeStage, estimator: Estimator, operator: Callable[[], Operator]
+) -> Placement:
+    pose, settings = job.targets[row], job.setup.search
+    start = estimator.expected_offset_mm(pose) if estimator.count >= _IMAGES_FOR_PREDICTION else 0.0
+    start = float(np.clip(start, -_FURTHEST_START_MM, _FURTHEST_START_MM))
+    stage.go_to(row)
+    match job.request.placement:
+        case "threshold-climb":
+            return threshold_climb(stage, settings, start)
+        case "amplitude-scan":
+            return amplitude_scan(stage, settings, start)
+        case "pattern-injection":
+            return pattern_injection(stage, stage, operator(), settings, start)
+    return first_seen(stage, settings, 0.0)
+
+
+def _take(
+    job: _Job, row: int, stage: ProbeStage, session: Session, recorder: Recorder,
+    estimator: Estimator, placement: Placement, oracle: Oracle | None, began: float,
+) -> None:  # fmt: skip
+    """Average the pose, listen, select the image, and solve again."""
+    setup, clock = job.setup, job.setup.clock
+    steady = session.poses.steady(setup.settle_s)
+    times, amplitude = median_times(session.listen(setup.frames, stage.arrived_s))
+    session.check()
+    session.record_image()
+    bracket = placement.bracket
+    recorder.add_selected(
+        steady.sample.pose, times, kind="time_of_flight",
+        max_elevation=bracket.max_elevation_mm, amplitude=amplitude, t_host=clock.now(),
+        target=row,
+        bracket=(bracket.centre_mm, bracket.low_mm, bracket.high_mm, bracket.sd_mm),
+        offset=placement.offset_mm,
+        true_elevation=float("nan") if oracle is None else oracle.elevation_mm(),
+        seconds=clock.now() - began,
+    )  # fmt: skip
+    estimate = estimator.add(steady.sample.pose, times, bracket.max_elevation_mm)
+    if estimate is not None:
+        recorder.add_estimate({"t_host": np.array([clock.now()]), **estimate})
+
+
+def _write_truth(recorder: Recorder, oracle: Oracle) -> None:
+    recorder.sync()
+    transform, point = oracle.truth()
+    poses, points = oracle.test_set()
+    recorder.put("truth", "image_to_probe", transform, "mm")
+    recorder.put("truth", "point", point, "mm")
+    recorder.put("test", "pose", poses, "mm")
+    recorder.put("test", "point", points, "mm")
+    recorder.copy("placement", "true_elevation", "truth", "elevation")

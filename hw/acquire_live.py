@@ -1,0 +1,123 @@
+"""The running estimate of an acquisition: solved after every image, in words and for the file."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hw.live import LiveCalibration
+from hw.midplane.bracket import Placement
+from hw.recording_check import Progress
+from hw.setup import Setup
+from jaxcal.calibration import Calibration
+from jaxcal.errors import InputError
+
+
+class Estimator:
+    """Images so far and the calibration from them.
+
+    Args:
+        capacity: images of the plan.
+        setup: probe and scene.
+        progress: of a recording that is resumed; its images are taken over.
+
+    Raises:
+        InputError: images of the recording that cannot be used.
+    """
+
+    def __init__(self, capacity: int, setup: Setup, progress: Progress | None) -> None:
+        self._setup, self._capacity = setup, capacity
+        self._live = self._empty()
+        self._result: Calibration | None = None
+        self._left_out = 0
+        if progress is not None:
+            rows = zip(progress.poses, progress.measurements, progress.max_elevation, strict=True)
+            for pose, times, bound in rows:
+                self._add(pose, times, bound, last=False)
+            self._result = self._solve()
+
+    def _empty(self) -> LiveCalibration:
+        return LiveCalibration(
+            self._capacity, kind="time_of_flight", probe=self._setup.probe, method="joint"
+        )
+
+    @property
+    def count(self) -> int:
+        """Images taken."""
+        return len(self._live) + self._left_out
+
+    def warm_up(self, targets: np.ndarray) -> None:
+        """Compile before anything moves, on what the drawing says that the plan will measure."""
+        live, probe, scene = self._empty(), self._setup.probe, self._setup.scene
+        seen = np.linalg.inv(targets @ scene.image_to_probe) @ np.append(scene.point_mm, 1.0)
+        # Somewhat off the plane, as real images are: an exact fit is a degenerate problem.
+        rng = np.random.default_rng(0)
+        seen = seen[:, :3] + rng.normal(0, 0.2, (len(targets), 3))
+        distance = np.linalg.norm(seen[:, None] - probe.element_positions(), axis=-1)
+        distance += rng.normal(0, 0.05, distance.shape)
+        for pose, row in zip(targets, probe.time_of_flight_s(distance), strict=True):
+            live.put(pose, row, 1.0)
+        live.solve()
+
+    def add(
+        self, pose: np.ndarray, times: np.ndarray, bound: float
+    ) -> dict[str, np.ndarray] | None:
+        """Take an image and solve; a row of /estimate, or None with too few images."""
+        self._add(pose, times, bound, last=True)
+        result = self._result
+        if result is None:
+            return None
+        answer = result.numpy()
+        return {
+            "images": np.array([int(answer.mask.sum())]),
+            "image_to_probe": answer.image_to_probe[None],
+            "covariance": answer.covariance[None],
+            "point": answer.point[None],
+            "sigma": answer.sigma[None],
+            "rms": np.array([float(answer.rms)]),
+            "status": np.array([int(answer.status_code)]),
+        }
+
+    def expected_offset_mm(self, pose: np.ndarray) -> float:
+        """How far along its elevational axis the probe must go from a pose to meet the target.
+
+        0 where nothing is known yet.
+        """
+        if self._result is None or self._result.status != "converged":
+            return 0.0
+        answer = self._result.numpy()
+        seen = np.linalg.inv(pose @ answer.image_to_probe) @ np.append(answer.point, 1.0)
+        return float(seen[1])
+
+    def line(self, total: int, placement: Placement) -> str:
+        """The state of things after an image, for a person."""
+        bracket = placement.bracket
+        head = (
+            f"image {self.count}/{total}: offset {bracket.centre_mm:+.2f} mm in "
+            f"[{bracket.low_mm:+.2f}, {bracket.high_mm:+.2f}], {placement.moves} moves"
+        )
+        if self._result is None:
+            return f"{head}; no estimate yet"
+        answer = self._result.numpy()
+        x, y, z = answer.image_to_probe[:3, 3]
+        head += f"; X at ({x:.2f}, {y:.2f}, {z:.2f}) mm"
+        if np.isfinite(answer.covariance).all():
+            mm = float(np.sqrt(np.trace(answer.covariance[:3, :3])))
+            degrees = float(np.degrees(np.sqrt(np.trace(answer.covariance[3:, 3:]))))
+            head += f" +- {mm:.2f} mm, {degrees:.2f} deg (SD)"
+        return f"{head}; RMS {float(answer.rms):.2f} mm; {self._result.status}"
+
+    def _add(self, pose: np.ndarray, times: np.ndarray, bound: float, *, last: bool) -> None:
+        try:
+            self._live.put(pose, times, bound)
+        except InputError:
+            # In the file it is all the same; calibrate will say what is wrong with it.
+            self._left_out += 1
+            return
+        if last:
+            self._result = self._solve()
+
+    def _solve(self) -> Calibration | None:
+        try:
+            return self._live.solve()
+        except InputError:
+            return None
