@@ -96,14 +96,14 @@ class Camera:
             pose: true pose of the tool centre point, tool -> base, mm.
             rng: of this frame's speckle and ghosts.
             threshold: of the response, counts.
-            pattern: brightness (0 to 255) of the lines about the loudest one; None: no injection.
+            pattern: brightness (0 to 255) of each line; None: no injection.
             pattern_delay_s: how long after the line's pulse was heard the pattern is sent.
 
         Returns:
             (480, 640) uint8, 60 dB over 255 levels; row 0 is at the element line.
 
         Raises:
-            InputError: a pattern longer than the probe has lines.
+            InputError: a pattern for another number of lines.
         """
         down, right = rng.integers(0, _MARGIN, size=2)
         place = (slice(down, down + ROWS), slice(right, right + COLUMNS))
@@ -125,7 +125,7 @@ class Camera:
         self._draw(levels, envelope, patches)
         if pattern and loud[best] >= max(threshold, 1):
             below = 0.5e3 * world.sound_speed_m_s * pattern_delay_s
-            self._inject(levels, pattern, lateral, distance + below)
+            self._inject(levels, pattern, distance + below)
         return levels
 
     def _wires(self, pose: np.ndarray) -> list[tuple[float, float, float]]:
@@ -170,23 +170,17 @@ class Camera:
             part = levels[top:bottom, left:right]
             np.maximum(part, _compress(spot), out=part)
 
-    def _inject(self, levels: np.ndarray, pattern: bytes, lateral: float, distance: float) -> None:
+    def _inject(self, levels: np.ndarray, pattern: bytes, distance: float) -> None:
         """Draw the bar: one column of lines each byte, as thick as two pulses."""
         lines = np.frombuffer(pattern, np.uint8)
-        if len(lines) > self.world.probe.elements:
-            raise InputError(f"a pattern has at most {self.world.probe.elements} lines")
-        u, v = self.pixel(lateral, distance)
+        if len(lines) != self.world.probe.elements:
+            raise InputError(f"a pattern has a level for each of {self.world.probe.elements} lines")
+        v = self.pixel(0.0, distance)[1]
         tall = self._sizes_px()[0]
         top, bottom = max(int(v - tall), 0), min(int(v + tall) + 1, ROWS)
-        per_line = COLUMNS / self.world.probe.elements
-        columns = np.arange(COLUMNS)
-        index = np.floor((columns - u) / per_line + len(lines) / 2).astype(int)
-        inside = (index >= 0) & (index < len(lines))
-        if top < bottom and inside.any():
-            bar = lines[index[inside]]
-            levels[top:bottom, columns[inside]] = np.maximum(
-                levels[top:bottom, columns[inside]], bar
-            )
+        if top < bottom:
+            bar = lines[np.arange(COLUMNS) * len(lines) // COLUMNS]
+            np.maximum(levels[top:bottom], bar, out=levels[top:bottom])
 
 
 def _speckle(rng: np.random.Generator, size_px: tuple[float, float]) -> Float[np.ndarray, "r c"]:

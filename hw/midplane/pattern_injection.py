@@ -37,7 +37,7 @@ class Injector(Protocol):
     """The electronics' part that answers with a pattern (see the active echo's driver)."""
 
     def load_pattern(self, pattern: bytes) -> object:
-        """Brightness (0 to 255) of the lines about the loudest one."""
+        """A level (0 to 255) for each line."""
         ...
 
     def inject(self, on: bool, delay_ticks: int = 0) -> object:
@@ -53,13 +53,23 @@ def bar_length(amplitude: float, loudest: float) -> int:
     return int(np.clip(round(level * LONGEST), 1, LONGEST))
 
 
-def bar(length: int) -> bytes:
-    """The pattern of a bar: ``length`` bright lines in the middle of 31, brighter if longer."""
-    if not 0 <= length <= LONGEST:
-        raise InputError(f"a bar has 0 to {LONGEST} lines, not {length}")
-    pattern = np.zeros(LONGEST, np.uint8)
-    first = (LONGEST - length) // 2
-    pattern[first : first + length] = _DARKEST + (255 - _DARKEST) * length // LONGEST
+def bar(length: int, line: int, lines: int) -> bytes:
+    """The pattern of a bar: a level for each line, brighter the longer it is.
+
+    Args:
+        length: lines that are bright, 0 to 31.
+        line: in whose middle it lies; a bar beyond the first or last line is cut off.
+        lines: of the probe.
+
+    Raises:
+        InputError: a length or a line that cannot be.
+    """
+    if not (0 <= length <= LONGEST and 0 <= line < lines):
+        raise InputError(f"a bar has 0 to {LONGEST} lines about one of {lines}: {length}, {line}")
+    pattern = np.zeros(lines, np.uint8)
+    first = line - length // 2
+    level = _DARKEST + (255 - _DARKEST) * length // LONGEST
+    pattern[max(first, 0) : max(first + length, 0)] = level
     return pattern.tobytes()
 
 
@@ -212,7 +222,8 @@ def pattern_injection(
             loudest = max(loudest, echoes.peak)
             heard.append((where, echoes.peak))
             seen = [(at, bar_length(amplitude, loudest)) for at, amplitude in heard]
-            injector.load_pattern(bar(seen[-1][1]))
+            lines = echoes.amplitude.shape[1]
+            injector.load_pattern(bar(seen[-1][1], echoes.loudest_line, lines))
             injector.inject(True, delay_ticks)
             decision = operator(View(
                 seen[-1][1], max(length for _, length in seen), where, settings.fine_mm,

@@ -61,6 +61,11 @@ class Echoes:
         loudest = np.sort(self.amplitude, axis=1)[:, -_TOP_LINES:]
         return float(np.median(loudest.mean(axis=1)))
 
+    @property
+    def loudest_line(self) -> int:
+        """The line that was heard best."""
+        return int(np.argmax(self.amplitude.sum(axis=0))) if len(self.amplitude) else 0
+
     def saturated(self, full_scale: float) -> bool:
         """Whether any line reached the converter's full scale in more than half of the frames."""
         return bool(len(self.amplitude) and np.median(self.amplitude.max(axis=1)) >= full_scale)

@@ -237,11 +237,12 @@ def test_bar_follows_the_amplitude():
     assert lengths == sorted(lengths)
     assert lengths[0] == 0
     assert lengths[-1] == LONGEST
-    patterns = [np.frombuffer(bar(length), np.uint8) for length in range(LONGEST + 1)]
+    patterns = [np.frombuffer(bar(length, 60, 128), np.uint8) for length in range(LONGEST + 1)]
     assert [int((pattern > 0).sum()) for pattern in patterns] == list(range(LONGEST + 1))
     assert all(a.max() <= b.max() for a, b in itertools.pairwise(patterns))
     with pytest.raises(InputError, match="lines"):
-        bar(40)
+        bar(40, 60, 128)
+    assert sum(level > 0 for level in bar(31, 0, 128)) == 16
 
 
 def test_peak_of_a_gaussian_between_the_samples_and_its_sd():

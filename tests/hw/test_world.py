@@ -146,9 +146,12 @@ def test_frame_without_response_has_no_echo_and_the_bar_follows_the_pattern():
     below = camera.pixel(0.0, 40.0 + 0.5e3 * world.sound_speed_m_s * delay)[1]
     lengths = []
     for length in (9, 31):
-        bright = draw(pattern=bar(length), pattern_delay_s=delay)[round(below)] - echo[round(below)]
+        bright = (
+            draw(pattern=bar(length, 64, 128), pattern_delay_s=delay)[round(below)]
+            - echo[round(below)]
+        )
         lengths.append(int((bright > 0).sum()))
     assert lengths[1] > 2.5 * lengths[0] > 0
-    assert (draw(pattern=bar(31), threshold=FULL_SCALE) == silent).all()
+    assert (draw(pattern=bar(31, 64, 128), threshold=FULL_SCALE) == silent).all()
     with pytest.raises(InputError, match="lines"):
         draw(pattern=bytes(200))

@@ -1,0 +1,284 @@
+"""World, arm, electronics and ultrasound machine of one emulated bench, put together."""
+
+from __future__ import annotations
+
+import math
+import os
+import queue
+import random
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from hw.bench.active_echo import AuspisEmulator
+from hw.bench.arm import Arm
+from hw.bench.control import ControlServer
+from hw.bench.frames import Camera
+from hw.bench.rtde import RtdeServer
+from hw.bench.ultrasound import ImageServer
+from hw.bench.world import World, make_world
+from hw.clock import Clock
+from hw.rigid import looking_rotation
+from hw.robot.pose import pose_to_ur, ur_to_pose
+from hw.scene import Scene
+from jaxcal.errors import InputError
+
+VERSIONS = {125: (3, 15, 8, 106339), 500: (5, 11, 0, 108249)}
+"""Controllers that the real client accepts, by their rate: a CB-series and an e-Series."""
+
+_ADDRESS_TRIES = 40
+_HOVER_MM = 110.0
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to run a bench.
+
+    Attributes:
+        speed: bench seconds per wall second.
+        seed: of the world, and of all chance.
+        pose_hz: of the robot's stream in bench time, 125 or 500: which controller it is.
+        echo_hz: active-echo frames per bench second.
+        image_hz: ultrasound frames per bench second.
+        most_images_wall_hz: and no more of them than this per wall second.
+        repeatability_mm: SD of the arm's hidden error on each axis.
+        robot_host: loopback address; empty: any free one.
+        link: of the active echo: ``pty`` or ``tcp``.
+        world: further changes of the world, by name (see :func:`hw.bench.world.make_world`).
+    """
+
+    speed: float = 1.0
+    seed: int = 0
+    pose_hz: int = 125
+    echo_hz: float = 30.0
+    image_hz: float = 30.0
+    most_images_wall_hz: float = 60.0
+    repeatability_mm: float = 0.1
+    robot_host: str = ""
+    link: str = "pty"
+    world: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, least, largest in (
+            ("speed", 0.01, 100.0), ("echo_hz", 0.1, 1000.0), ("image_hz", 0.1, 200.0),
+            ("most_images_wall_hz", 0.1, 1000.0), ("repeatability_mm", 0.0, 10.0),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not (math.isfinite(value) and least <= value <= largest):
+                raise InputError(f"bench: {name} must be {least:g} to {largest:g}, not {value}")
+        if self.pose_hz not in VERSIONS:
+            raise InputError(f"bench: pose_hz must be 125 or 500, not {self.pose_hz}")
+        if self.link not in ("pty", "tcp"):
+            raise InputError(f"bench: link must be pty or tcp, not {self.link!r}")
+
+
+class Assembly:
+    """World and devices of one bench, in this process; :meth:`start` them.
+
+    Args:
+        options: see there.
+
+    Attributes:
+        world: what there is.
+        clock: bench time.
+        arm: what moves.
+    """
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+        self.world: World = make_world(options.seed, **options.world)
+        self.clock = Clock(options.speed)
+        start = pose_to_ur(hovering(self.world.scene))
+        self.arm = Arm(
+            start.tolist(),
+            tcp_offset=(0.0, 0.0, 0.12, 0.0, 0.0, 0.0),
+            repeatability_mm=options.repeatability_mm,
+            seed=options.seed,
+        )
+        self.camera = Camera(self.world, seed=options.seed)
+        self._echo_rng = np.random.default_rng([options.seed, 1])
+        self._frame_rng = np.random.default_rng([options.seed, 2])
+        self.echo = AuspisEmulator(
+            self._hear,
+            clock=self.clock,
+            rate_hz=options.echo_hz,
+            lines=self.world.probe.elements,
+            clock_hz=self.world.clock_hz,
+            link="tcp" if options.link == "tcp" else "pty",
+            seed=options.seed,
+        )
+        self.images = ImageServer(
+            self._see,
+            clock=self.clock,
+            rate_hz=min(options.image_hz, options.most_images_wall_hz / options.speed),
+            spacing_mm=self.camera.spacing_mm,
+            seed=options.seed,
+        )
+        self.robot: RtdeServer | None = None
+        self._faults = self._table()
+        self._unplugged = False
+        self._done: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self.control = ControlServer({
+            "fault": self._fault, "recover": self._recover, "truth": self._truth,
+            "true_pose": lambda _: self.true_pose(self.clock.now()).tolist(),
+            "rest_since": lambda _: self._rest_since(),
+            "world": lambda _: self._world(), "test_set": self._test_set,
+            "statistics": lambda _: self._statistics(), "close": lambda _: self._done.put(None),
+        })  # fmt: skip
+
+    # What the devices notice
+
+    def true_pose(self, t: float) -> Float[np.ndarray, "4 4"]:
+        """Where the tool centre point truly is at bench time t, mm."""
+        return ur_to_pose(np.array(self.arm.true_raw(t)))
+
+    def _hear(self, t: float, threshold: int) -> tuple[np.ndarray, np.ndarray]:
+        times, amplitude = self.world.echo(self.true_pose(t), threshold, self._echo_rng)
+        # The world's times are whole ticks already; the counter that cuts off must not take one.
+        return times + 0.25 / self.world.clock_hz, amplitude
+
+    def _see(self, t: float) -> np.ndarray:
+        then = t - self.world.noise.latency_s
+        injection = self.echo.injection
+        return self.camera.frame(
+            self.true_pose(then),
+            self._frame_rng,
+            threshold=self.echo.threshold,
+            pattern=injection.pattern if injection.on and injection.pattern else None,
+            pattern_delay_s=injection.delay_ticks / self.world.clock_hz,
+        )
+
+    # Life
+
+    def start(self) -> dict:
+        """Start every device; what a client must know, as JSON."""
+        self.robot = self._start_robot()
+        self.echo.start()
+        self.images.start()
+        self.control.start()
+        world = self.world
+        return {
+            "speed": self.clock.speed, "origin_s": self.clock.origin_s,
+            "robot_host": self.robot.host, "robot_serial": self.robot.serial,
+            "pose_hz": self.robot.frequency_hz, "active_echo_url": self.echo.path,
+            "ultrasound": [self.images.host, self.images.port], "control": self.control.port,
+            "spacing_mm": list(self.camera.spacing_mm), "clock_hz": world.clock_hz,
+            "scene": {name: np.asarray(part).tolist() for name, part in vars(world.scene).items()},
+            "probe": asdict(world.probe), "seed": self.options.seed,
+        }  # fmt: skip
+
+    def _start_robot(self) -> RtdeServer:
+        chance = random.Random(os.getpid())
+        hosts = [self.options.robot_host] if self.options.robot_host else [
+            f"127.0.{chance.randrange(256)}.{chance.randrange(2, 255)}"
+            for _ in range(_ADDRESS_TRIES)
+        ] + ["127.0.0.1"]  # fmt: skip
+        trouble: OSError | None = None
+        for host in hosts:
+            server = RtdeServer(
+                self.arm, host, version=VERSIONS[self.options.pose_hz], clock=self.clock
+            )
+            try:
+                return server.start()
+            except OSError as error:
+                trouble = error
+        raise InputError(f"bench: the robot's ports are taken at {hosts[-1]}: {trouble}")
+
+    def stop(self) -> None:
+        """Stop every device; safe to repeat."""
+        self.control.stop()
+        self.images.stop()
+        self.echo.stop()
+        if self.robot is not None:
+            self.robot.stop()
+
+    def wait(self) -> None:
+        """Until somebody asks for the end."""
+        self._done.get()
+
+    def end(self) -> None:
+        """Ask for the end."""
+        self._done.put(None)
+
+    # Requests
+
+    def _table(self) -> dict[str, Callable[..., object]]:
+        def robot() -> RtdeServer:
+            assert self.robot is not None
+            return self.robot
+
+        return {
+            "mute": lambda: robot().mute(True),
+            "drop": lambda: robot().drop(),
+            "protective_stop": lambda: robot().protective_stop(),
+            "unlock": lambda: robot().unlock(),
+            "tcp_offset": lambda offset: robot().set_tcp_offset(tuple(map(float, offset))),
+            "crc_errors": lambda rate: self.echo.crc_errors(float(rate)),
+            "miss_triggers": lambda rate: self.echo.miss_triggers(float(rate)),
+            "miss_lines": lambda rate: self.echo.miss_lines(float(rate)),
+            "echo_stale": lambda: self.echo.stale(True),
+            "echo_mute": lambda: self.echo.mute(True),
+            "unplug": lambda: self.echo.unplug(),
+            "replug": lambda: self.echo.replug(),
+            "image_stale": lambda: self.images.stale(True),
+            "image_freeze": lambda: self.images.freeze(True),
+            "image_drop": lambda: self.images.drop(),
+            "image_corrupt": lambda rate: self.images.corrupt(float(rate)),
+        }
+
+    def _fault(self, request: dict) -> float:
+        """Bench time at which the fault was in force."""
+        name = request.pop("name", None)
+        if name not in self._faults:
+            raise InputError(f"no fault {name!r}; there are: {', '.join(self._faults)}")
+        self._faults[name](**request)
+        if name == "unplug":
+            self._unplugged = True
+        return self.clock.now()
+
+    def _recover(self, _: dict) -> None:
+        """All devices as new; a protective stop is a person's, and stays."""
+        if self.robot is not None:
+            self.robot.mute(False)
+        if self._unplugged:
+            self.echo.replug()
+            self._unplugged = False
+        self.echo.recover()
+        self.images.recover()
+
+    def _truth(self, request: dict) -> list:
+        poses = np.asarray(request["pose"], float).reshape(-1, 4, 4)
+        places = [self.world.truth(pose) for pose in poses]
+        return [[place.lateral_mm, place.range_mm, place.elevation_mm] for place in places]
+
+    def _rest_since(self) -> float | None:
+        since = self.arm.rest_since(self.clock.now())
+        return None if since is None else max(since, 0.0)
+
+    def _world(self) -> dict:
+        return {"image_to_probe": self.world.image_to_probe.tolist(),
+                "point_mm": self.world.point_mm.tolist(),
+                "sound_speed_m_s": self.world.sound_speed_m_s,
+                "latency_s": self.world.noise.latency_s}  # fmt: skip
+
+    def _test_set(self, request: dict) -> list:
+        poses, points = self.world.test_set(**request)
+        return [poses.tolist(), points.tolist()]
+
+    def _statistics(self) -> dict:
+        assert self.robot is not None
+        return {"packets": self.robot.packets, "packets_skipped": self.robot.skipped,
+                "echo_frames": self.echo.sent, "images": self.images.sent,
+                "images_refused": self.images.refused}  # fmt: skip
+
+
+def hovering(scene: Scene) -> Float[np.ndarray, "4 4"]:
+    """Where the arm waits: looking at the nominal target from 110 mm, tool -> base, mm."""
+    pose = np.eye(4)
+    pose[:3, :3] = looking_rotation(scene.looking) @ scene.image_to_probe[:3, :3].T
+    looking = np.asarray(scene.looking, float)
+    tip = scene.point_mm - _HOVER_MM * looking / np.linalg.norm(looking)
+    pose[:3, 3] = tip - pose[:3, :3] @ scene.tip_mm
+    return pose

@@ -1,0 +1,231 @@
+"""The emulated bench: one world behind three devices and a control socket, in a process of its own.
+
+    python -m hw.bench.run --speed 5 --seed 1
+
+prints one JSON line with the addresses and serves until its standard input ends, so that a bench
+never outlives whoever started it. :func:`start_bench` is that for programs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from hw.bench.assembly import Assembly, Options
+from hw.bench.control import ControlClient
+from hw.clock import Clock
+from hw.scene import Scene
+from jaxcal.errors import InputError
+from jaxcal.probe import LinearProbe
+
+__all__ = ["Bench", "Options", "main", "serve", "start_bench"]
+
+_START_WALL_S = 60.0
+
+
+class Bench:
+    """A running bench in a process of its own; a context manager.
+
+    Args:
+        process: whose standard input ends it.
+        told: the JSON line that it printed.
+
+    Attributes:
+        clock: shared with the emulators.
+        robot_host: loopback address of the controller.
+        robot_serial: what its dashboard says.
+        active_echo_url: what to open.
+        ultrasound: (host, port).
+        scene: what a person knows.
+        probe: the transducer.
+        spacing_mm: [lateral, axial] of the images.
+        addresses: all of it, as JSON.
+    """
+
+    def __init__(self, process: subprocess.Popen, told: dict) -> None:
+        self._process = process
+        self.addresses = told
+        self.clock = Clock(told["speed"], told["origin_s"])
+        self.robot_host, self.robot_serial = told["robot_host"], told["robot_serial"]
+        self.pose_hz: float = told["pose_hz"]
+        self.active_echo_url = told["active_echo_url"]
+        self.ultrasound: tuple[str, int] = (told["ultrasound"][0], told["ultrasound"][1])
+        self.spacing_mm = tuple(told["spacing_mm"])
+        self.scene = Scene(**{name: np.array(value) for name, value in told["scene"].items()})
+        self.probe = LinearProbe(**told["probe"])
+        self._control = ControlClient(told["control"])
+
+    def __enter__(self) -> Bench:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def pid(self) -> int:
+        """Of the bench's process."""
+        return self._process.pid
+
+    def fault(self, name: str, **arguments: object) -> float:
+        """Have a fault; returns the bench time at which it was in force.
+
+        Args:
+            name: mute, drop, protective_stop, unlock, tcp_offset (offset), crc_errors (rate),
+                miss_triggers (rate), miss_lines (rate), echo_stale, echo_mute, unplug, replug,
+                image_stale, image_freeze, image_drop or image_corrupt (rate).
+            arguments: of the fault.
+
+        Raises:
+            RuntimeError: no such fault, or the bench is gone.
+        """
+        return float(str(self._control.ask("fault", name=name, **arguments)))
+
+    def recover(self) -> None:
+        """No faults any more; a protective stop needs ``fault("unlock")``."""
+        self._control.ask("recover")
+
+    def true_pose(self) -> Float[np.ndarray, "4 4"]:
+        """Where the tool centre point truly is now, mm."""
+        return np.array(self._control.ask("true_pose"))
+
+    def rest_since(self) -> float | None:
+        """Bench time since which the arm rests; None while it moves."""
+        since = self._control.ask("rest_since")
+        return None if since is None else float(str(since))
+
+    def truth(self, pose: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 3"]:
+        """(lateral, range, elevation) mm of the target for true poses."""
+        pose = np.asarray(pose, float)
+        found = np.array(self._control.ask("truth", pose=pose.tolist()))
+        return found.reshape(*pose.shape[:-2], 3)
+
+    def world_truth(self) -> dict[str, np.ndarray]:
+        """``image_to_probe`` (4, 4), ``point_mm`` (3,), ``sound_speed_m_s``, ``latency_s``."""
+        told = self._control.ask("world")
+        assert isinstance(told, dict)
+        return {name: np.array(value) for name, value in told.items()}
+
+    def test_set(
+        self, count: int = 50, seed: int = 1
+    ) -> tuple[Float[np.ndarray, "count 4 4"], Float[np.ndarray, "count 2"]]:
+        """Noise-free in-plane test images: true poses and [lateral, range], mm."""
+        told = self._control.ask("test_set", count=count, seed=seed)
+        assert isinstance(told, list)
+        return np.array(told[0]), np.array(told[1])
+
+    def statistics(self) -> dict[str, int]:
+        """What was sent: packets, packets_skipped, echo_frames, images, images_refused."""
+        told = self._control.ask("statistics")
+        assert isinstance(told, dict)
+        return told
+
+    def close(self) -> None:
+        """End the bench's process; safe to repeat."""
+        self._control.close()
+        if self._process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+        try:
+            self._process.wait(timeout=10.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+
+def start_bench(options: Options | None = None, **changes) -> Bench:
+    """Start a bench in a process of its own.
+
+    Args:
+        options: how.
+        changes: fields of :class:`Options`, instead of them.
+
+    Raises:
+        InputError: options that cannot be, or a bench that does not start; one line.
+    """
+    options = Options(**{**(asdict(options) if options is not None else {}), **changes})
+    root = str(Path(__file__).resolve().parents[2])
+    path = os.pathsep.join(part for part in (root, os.environ.get("PYTHONPATH")) if part)
+    with tempfile.TemporaryFile() as complaints:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "hw.bench.run", "--json", json.dumps(asdict(options))],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=complaints,
+            env={**os.environ, "PYTHONPATH": path}, start_new_session=True,
+        )  # fmt: skip
+        assert process.stdout is not None
+        line = _first_line(process)
+        if not line:
+            process.kill()
+            process.wait()
+            complaints.seek(0)
+            said = complaints.read(1 << 16).decode(errors="replace").strip().splitlines()
+            raise InputError(f"the bench did not start: {said[-1] if said else 'no reason told'}")
+    return Bench(process, json.loads(line))
+
+
+def _first_line(process: subprocess.Popen) -> bytes:
+    """What it prints first; nothing where that takes too long."""
+    lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    stdout = process.stdout
+    assert stdout is not None
+    threading.Thread(target=lambda: lines.put(stdout.readline()), daemon=True).start()
+    try:
+        return lines.get(timeout=_START_WALL_S)
+    except queue.Empty:
+        return b""
+
+
+def serve(options: Options) -> None:
+    """Run a bench here: print its addresses, serve until standard input ends or it is told to."""
+    # A person's Ctrl-C and a parent's death both end standard input's reader.
+    assembly = Assembly(options)
+    try:
+        print(json.dumps(assembly.start()), flush=True)
+        threading.Thread(target=_until_parent_ends, args=(assembly,), daemon=True).start()
+        with contextlib.suppress(KeyboardInterrupt):
+            assembly.wait()
+    finally:
+        assembly.stop()
+
+
+def _until_parent_ends(assembly: Assembly) -> None:
+    while sys.stdin.buffer.read(1024):
+        pass
+    assembly.end()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a bench by ``--json {...}`` or by ``--speed`` and ``--seed``."""
+    import argparse
+
+    parser = argparse.ArgumentParser(description="An emulated bench on loopback.")
+    parser.add_argument("--speed", type=float, default=1.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", default="", help="all options as one JSON object")
+    given = parser.parse_args(arguments)
+    try:
+        if given.json:
+            options = Options(**json.loads(given.json))
+        else:
+            options = Options(speed=given.speed, seed=given.seed)
+        serve(options)
+    except (InputError, TypeError, json.JSONDecodeError) as error:
+        print(" ".join(str(error).split()), file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
