@@ -43,8 +43,8 @@ reply    type u8 = 2, version u8 = 1, text (ASCII), crc u32
 
 ``frame`` counts the frame triggers of the ultrasound machine, ``clock`` is the counter at that
 trigger, ``lines`` the line triggers that followed it. A gap in ``frame`` is a frame that was
-lost; fewer lines than the probe fires are line triggers that were missed. 128 lines take 540
-bytes: 30 frames/s are 162 kbaud, more than 115200 and less than 921600.
+lost; fewer lines than the probe fires are line triggers that were missed. 128 lines take 539
+bytes at most: 30 frames/s are 162 kbaud, more than 115200 and less than 921600.
 """
 
 from __future__ import annotations
