@@ -90,15 +90,8 @@ class ProbeStage:
         self._arrived = self._session.clock.now()
 
     def load_pattern(self, pattern: bytes) -> None:
-        """Lay a pattern over the lines about the loudest one."""
-        heard = self._session.listen(1, self._arrived)[0]
-        lines = self._session.setup.probe.elements
-        level = np.zeros(lines, np.uint8)
-        values = np.frombuffer(pattern, np.uint8)
-        first = int(np.argmax(heard.amplitude)) - len(values) // 2
-        keep = (np.arange(len(values)) + first >= 0) & (np.arange(len(values)) + first < lines)
-        level[np.arange(len(values))[keep] + first] = values[keep]
-        self._session.echo.load_pattern(level.tobytes())
+        """A level (0 to 255) for each line."""
+        self._session.echo.load_pattern(pattern)
 
     def inject(self, on: bool, delay_ticks: int = 0) -> None:
         """Switch injection."""

@@ -1,0 +1,134 @@
+"""A look at each device of a bench: what it is, what it sends, and what is wrong with it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hw.active_echo.device import ActiveEcho
+from hw.errors import DeviceError
+from hw.robot.rtde import safety_text
+from hw.robot.stream import PoseStream
+from hw.setup import Setup
+from hw.ultrasound.receiver import UltrasoundStream
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found of one device.
+
+    Attributes:
+        device: which.
+        facts: what it is and sends, a line.
+        wrong: one line each; empty if all is well.
+    """
+
+    device: str
+    facts: str
+    wrong: tuple[str, ...] = ()
+
+
+def check(setup: Setup, seconds: float = 2.0) -> list[Finding]:
+    """Look at every device of a setup for some bench seconds each; nothing moves.
+
+    Args:
+        setup: where they are.
+        seconds: to watch each stream.
+    """
+    looks: list[tuple[str, Callable[[Setup, float], Finding]]] = [
+        ("robot", _robot),
+        ("active echo", _active_echo),
+    ]
+    if setup.ultrasound is not None:
+        looks.append(("ultrasound", _ultrasound))
+    found = []
+    for name, look in looks:
+        try:
+            found.append(look(setup, seconds))
+        except DeviceError as error:
+            found.append(Finding(name, "not usable", (error.args[0],)))
+    return found
+
+
+def _robot(setup: Setup, seconds: float) -> Finding:
+    wrong = []
+    with PoseStream(setup.robot_host, clock=setup.clock, frequency_hz=setup.frequency_hz) as stream:
+        identity = stream.identity()
+        stream.drain()
+        steady = stream.steady(seconds)
+        samples = stream.drain()
+        times = np.array([sample.t_device for sample in samples])
+        rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
+        trouble = safety_text(steady.sample.safety_bits)
+        if trouble:
+            wrong.append(f"it is in {trouble}: look at the pendant (this is never unlocked here)")
+        if steady.sample.robot_mode != 7:
+            wrong.append(f"it is not running (robot mode {steady.sample.robot_mode}): start it")
+        gaps = np.diff(times)
+        if len(gaps) and gaps.max() > 5 * np.median(gaps):
+            wrong.append(f"poses stopped for {gaps.max():.2f} s: look at the network")
+        if steady.scatter_mm > 0.2:
+            wrong.append(f"it does not rest: poses scatter by {steady.scatter_mm:.2f} mm")
+        if stream.tcp_offset is None:
+            wrong.append("its TCP offset is not told: the controller's software is too old")
+    return Finding("robot", f"serial {identity.serial}, {rate:.0f} poses/s", tuple(wrong))
+
+
+def _active_echo(setup: Setup, seconds: float) -> Finding:
+    wrong = []
+    with ActiveEcho(setup.active_echo_url, clock=setup.clock, lines=setup.probe.elements) as echo:
+        name, hz = echo.identify(), echo.clock_hz()
+        before = echo.trigger_count()
+        echo.stream(True)
+        frames = []
+        end = setup.clock.now() + seconds
+        with contextlib.suppress(DeviceError):
+            while setup.clock.now() < end:
+                frames.append(echo.read(min(1.0, seconds)))
+        counts = echo.statistics()
+        triggers = echo.trigger_count()
+        rate = (triggers[1] - before[1]) / seconds
+        if triggers[1] == before[1]:
+            wrong.append("no frame triggers come: is the ultrasound machine frozen or unplugged?")
+        elif not frames:
+            wrong.append(
+                f"triggers come but no frames of {setup.probe.elements} lines ({counts.short} of "
+                "other lengths): are the line triggers connected, the number of lines right?"
+            )
+        if counts.crc_errors:
+            wrong.append(f"{counts.crc_errors} frames arrived damaged: look at its cable")
+        if counts.lost:
+            wrong.append(f"{counts.lost} frames were lost: look at its trigger")
+        error = echo.device_error()
+        if error is not None:
+            wrong.append(f"it keeps an error: {error}")
+    return Finding("active echo", f"{name}, clock {hz / 1e6:g} MHz, {rate:.0f} frames/s",
+                   tuple(wrong))  # fmt: skip
+
+
+def _ultrasound(setup: Setup, seconds: float) -> Finding:
+    assert setup.ultrasound is not None
+    wrong, images = [], []
+    with UltrasoundStream(*setup.ultrasound, clock=setup.clock) as stream:
+        end = setup.clock.now() + seconds
+        with contextlib.suppress(DeviceError):
+            while setup.clock.now() < end:
+                images.append(stream.read(max(1.0, seconds)))
+        counts = stream.statistics()
+    facts = "no images"
+    if not images:
+        wrong.append(
+            "the server is there and sends no images"
+            + (f" that are understood ({counts.reason})" if counts.unsupported else ": freeze off?")
+        )
+    else:
+        height, width = images[-1].array.shape
+        facts = f"{width} x {height} {images[-1].array.dtype}, {len(images) / seconds:.0f} images/s"
+        if all(np.array_equal(image.array, images[0].array) for image in images[1:]):
+            wrong.append("every image is the same: is the machine frozen?")
+    if counts.crc_errors:
+        wrong.append(f"{counts.crc_errors} messages arrived damaged: look at the network")
+    return Finding("ultrasound", facts, tuple(wrong))

@@ -1,0 +1,256 @@
+"""The entry point ``jaxcal-hw``: acquire, bench, check. Nothing numerical is imported for help."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from datetime import datetime
+from typing import TYPE_CHECKING
+
+import click
+
+from jaxcal import __version__
+from jaxcal.cli.common import POSITIVE, ExitCode, exit_code
+from jaxcal.cli.run import run
+from jaxcal.errors import InputError
+
+if TYPE_CHECKING:
+    from hw.acquire import Confirm, Request
+    from hw.bench.run import Bench
+    from hw.setup import Setup
+
+PLACEMENTS = ("threshold-climb", "amplitude-scan", "pattern-injection", "none")
+
+
+@click.group(
+    no_args_is_help=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="Exit status: 0 done; 2 bad usage or input, with one line that says what; 3 done, but "
+    "the calibration did not converge; 4 a device failed: the robot rests, the recording can be "
+    "resumed; 130 interrupted, likewise.",
+)
+@click.version_option(__version__, prog_name="jaxcal-hw")
+def commands() -> None:
+    """Acquire recordings for jaxcal: robot, active echo element and ultrasound machine.
+
+    The operator is responsible for the robot: its own safety configuration and emergency stop come
+    first, and nothing here replaces them.
+    """
+
+
+_bench = click.option("--bench", is_flag=True, help="The emulated bench: no hardware at all.")
+_setup = click.option(
+    "--setup", "setup_path", type=click.Path(), metavar="TOML", help="The bench's description."
+)
+_speed = click.option(
+    "--speed", type=POSITIVE, metavar="K", help="Emulated bench: times faster than real time."
+)
+_bench_seed = click.option(
+    "--bench-seed", type=click.IntRange(min=0), metavar="N", help="Emulated bench: which world."
+)
+
+
+@commands.command()
+@click.argument("recording", type=click.Path(), required=False)
+@_bench
+@_setup
+@click.option("--images", type=click.IntRange(4, 1000), help="Poses of the plan.  [default: 60]")
+@click.option(
+    "--placement",
+    type=click.Choice(PLACEMENTS),
+    help="How the target is brought into the mid-plane.  [default: threshold-climb]",
+)
+@click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Of the plan.  [default: 0]")
+@click.option("--every-frame", is_flag=True, help="Record every ultrasound frame, not one a pose.")
+@click.option("--resume", is_flag=True, help="Go on with RECORDING, which ended early.")
+@click.option("--move", is_flag=True, help="Move the robot, after a confirmation; else a dry run.")
+@click.option("--confirm", "code", metavar="CODE", help="The plan's code, instead of being asked.")
+@click.option("--preview", type=click.Path(), metavar="PNG", help="Draw the plan.")
+@_speed
+@_bench_seed
+def acquire(
+    recording: str | None,
+    bench: bool,
+    setup_path: str | None,
+    images: int | None,
+    placement: str | None,
+    seed: int | None,
+    every_frame: bool,
+    resume: bool,
+    move: bool,
+    code: str | None,
+    preview: str | None,
+    speed: float | None,
+    bench_seed: int | None,
+) -> int:
+    """Take the images of a plan of poses, and calibrate from them.
+
+    RECORDING is the file to make (by default one named after the time), or to --resume.
+    """
+    if bench == (setup_path is not None):
+        raise InputError("give either --bench or --setup TOML")
+    if not bench and (speed is not None or bench_seed is not None):
+        raise InputError("--speed and --bench-seed need --bench")
+    given = [name for name, value in (
+        ("--images", images), ("--placement", placement), ("--seed", seed),
+        ("--every-frame", every_frame or None), ("--bench-seed", bench_seed),
+    ) if value is not None]  # fmt: skip
+    if resume and given:
+        raise InputError(f"{given[0]} does not go with --resume: the recording knows")
+    if resume and recording is None:
+        raise InputError("--resume needs the RECORDING to go on with")
+    if code is not None and not move:
+        raise InputError("--confirm needs --move")
+    from hw.recording_check import check_resumable, settings_of
+
+    if resume:
+        assert recording is not None
+        check_resumable(recording)
+        bench_seed = _recorded_bench(settings_of(recording), bench)
+    path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
+    from jaxcal.cli.cache import enable_compilation_cache
+
+    enable_compilation_cache()
+    from hw.acquire import Request
+
+    request = None
+    if not resume:
+        request = Request(
+            images or 60, placement or PLACEMENTS[0], seed or 0, every_frame,
+            (bench_seed or 0) if bench else None,
+        )  # fmt: skip
+    with ExitStack() as stack:
+        emulated = _started(stack, bench, bench_seed, speed)
+        setup = _setup_of(setup_path, emulated)
+        if not bench and not move:
+            return _dry_run(setup, path, request, preview)
+        if preview is not None:
+            _preview(setup, request, preview)
+        return _acquire(setup, path, request, emulated, code)
+
+
+@commands.command()
+@_speed
+@click.option("--seed", type=click.IntRange(min=0), default=0, metavar="N", help="Which world.")
+def bench(speed: float | None, seed: int) -> int:
+    """Serve an emulated bench until Ctrl-C; prints one JSON line with its addresses."""
+    from hw.bench.run import Options, serve
+
+    serve(Options(speed=1.0 if speed is None else speed, seed=seed))
+    return ExitCode.CONVERGED
+
+
+@commands.command()
+@_bench
+@_setup
+@_speed
+def check(bench: bool, setup_path: str | None, speed: float | None) -> int:
+    """Look at each device and say what is wrong; nothing moves."""
+    if bench == (setup_path is not None):
+        raise InputError("give either --bench or --setup TOML")
+    if speed is not None and not bench:
+        raise InputError("--speed needs --bench")
+    from hw.check import check as look
+
+    with ExitStack() as stack:
+        found = look(_setup_of(setup_path, _started(stack, bench, None, speed or 1.0)))
+    for finding in found:
+        click.echo(f"{finding.device}: {'wrong' if finding.wrong else 'good'}: {finding.facts}")
+        for line in finding.wrong:
+            click.echo(f"  {line}")
+    return ExitCode.STOPPED if any(finding.wrong for finding in found) else ExitCode.CONVERGED
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``jaxcal-hw``; see :func:`jaxcal.cli.run.run`."""
+    return run(commands, "jaxcal-hw", arguments)
+
+
+def _recorded_bench(settings: dict[str, object], bench: bool) -> int | None:
+    asked = settings.get("request")
+    seed = asked.get("bench") if isinstance(asked, dict) else None
+    if bench != (seed is not None):
+        where = "the emulated bench" if seed is not None else "a real bench"
+        raise InputError(f"the recording was begun on {where}: resume it there")
+    return seed if isinstance(seed, int) else None
+
+
+def _started(stack: ExitStack, bench: bool, seed: int | None, speed: float | None) -> Bench | None:
+    if not bench:
+        return None
+    from hw.emulated import SPEED, start
+
+    return stack.enter_context(start(seed or 0, SPEED if speed is None else speed))
+
+
+def _setup_of(path: str | None, emulated: Bench | None) -> Setup:
+    from hw.emulated import setup_of
+    from hw.setup import load_setup
+
+    if emulated is not None:
+        return setup_of(emulated)
+    assert path is not None
+    return load_setup(path)
+
+
+def _acquire(
+    setup: Setup, path: str, request: Request | None, emulated: Bench | None, code: str | None
+) -> int:
+    from hw.acquire import Pause
+    from hw.acquire import acquire as run_acquisition
+    from hw.emulated import BenchOracle
+    from hw.keys import watch_keys
+    from hw.outcome import calibrate_and_print
+
+    pause = Pause()
+    with watch_keys(pause):
+        outcome = run_acquisition(
+            setup, path, request, _confirming(setup, emulated is not None, code),
+            say=lambda line: click.echo(line, err=True),
+            oracle=None if emulated is None else BenchOracle(emulated),
+            pause=pause,
+        )  # fmt: skip
+    return exit_code([calibrate_and_print(path, outcome, setup.clock.speed)])
+
+
+def _confirming(setup: Setup, emulated: bool, code: str | None) -> Confirm:
+    """Who confirms the plan: the emulated bench's needs nobody's word, a robot's a person's."""
+
+    def ask(plan):
+        from hw.robot.safety import confirm
+
+        if emulated:
+            return confirm(plan, plan.code, clock=setup.clock)
+        if code is not None:
+            return confirm(plan, code, clock=setup.clock)
+        click.echo(
+            f"{len(plan.targets)} poses for robot {plan.serial}; its speed is capped at "
+            f"{plan.limits.max_speed_mm_s:g} mm/s. Clear the tank, keep the emergency stop in "
+            f"reach, then type {plan.code} to let it move.",
+            err=True,
+        )
+        return confirm(plan, click.prompt("code", err=True), clock=setup.clock)
+
+    return ask
+
+
+def _dry_run(setup: Setup, path: str, request: Request | None, preview: str | None) -> int:
+    """Everything but the motion: the plan, and the way from pose to pose, against the limits."""
+    from hw.outcome import dry_run
+
+    for line in dry_run(setup, path, request, preview):
+        click.echo(line)
+    return ExitCode.CONVERGED
+
+
+def _preview(setup: Setup, request: Request | None, preview: str) -> None:
+    from hw.outcome import draw
+
+    if request is None:
+        raise InputError("--preview draws a new plan; it does not go with --resume")
+    draw(setup, request, preview)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

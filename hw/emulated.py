@@ -1,0 +1,67 @@
+"""The emulated bench as a setup and an oracle: what a lab's TOML file says of a real one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hw.bench.run import Bench, start_bench
+from hw.setup import Setup
+
+SPEED = 5.0
+"""Bench seconds per second on the wall, unless asked otherwise."""
+
+_IMAGES_WALL_HZ = 10.0
+
+
+def start(seed: int, speed: float) -> Bench:
+    """Start a bench for an acquisition.
+
+    Raises:
+        InputError: a speed that cannot be.
+    """
+    return start_bench(seed=seed, speed=speed, most_images_wall_hz=_IMAGES_WALL_HZ)
+
+
+def setup_of(bench: Bench) -> Setup:
+    """Addresses, scene and limits of a running bench."""
+    x, y, z = (float(value) for value in bench.scene.point_mm)
+    return Setup(
+        robot_host=bench.robot_host,
+        active_echo_url=bench.active_echo_url,
+        ultrasound=bench.ultrasound,
+        scene=bench.scene,
+        probe=bench.probe,
+        clock=bench.clock,
+        limits={
+            "box_min_mm": [x - 120.0, y - 120.0, z - 15.0],
+            "box_max_mm": [x + 120.0, y + 120.0, z + 140.0],
+            "cone_axis": [0.0, 0.0, -1.0],
+            "cone_deg": 60.0,
+            "max_step_mm": 250.0,
+            "max_turn_deg": 120.0,
+            "max_speed_mm_s": 100.0,
+            "max_acceleration_mm_s2": 1000.0,
+            "search_mm": 25.0,
+            "search_deg": 0.5,
+        },
+    )
+
+
+class BenchOracle:
+    """The truth of an emulated bench (see :class:`hw.acquire.Oracle`)."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+
+    def elevation_mm(self) -> float:
+        """The target's true elevational offset, now."""
+        return float(self._bench.truth(self._bench.true_pose())[2])
+
+    def truth(self) -> tuple[np.ndarray, np.ndarray]:
+        """The true X (4, 4) and target (3,), mm."""
+        world = self._bench.world_truth()
+        return world["image_to_probe"], world["point_mm"]
+
+    def test_set(self) -> tuple[np.ndarray, np.ndarray]:
+        """Noise-free test images: poses and [lateral, range], mm."""
+        return self._bench.test_set()

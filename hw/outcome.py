@@ -1,0 +1,88 @@
+"""Before and after an acquisition: the plan as it would be run, and what came of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from hw.acquire import Outcome, Request
+from hw.poses import plan_poses, preview
+from hw.robot.safety import Limits, MotionPlan, check_plan
+from hw.setup import Setup
+from jaxcal.errors import InputError
+
+
+def dry_run(setup: Setup, path: str, request: Request | None, figure: str | None) -> list[str]:
+    """What an acquisition would do, checked against the limits; nothing is opened.
+
+    Raises:
+        InputError: a plan that cannot be made.
+        RefusedError: a plan that the limits do not allow; the first pose that is not.
+    """
+    if request is None:
+        raise InputError("--resume needs --move: a dry run has nothing to resume")
+    plan = plan_poses(request.images, setup.scene, setup.extent, request.seed)
+    limits = Limits.from_mapping({"tip_mm": setup.scene.tip_mm.tolist(), **setup.limits})
+    check_plan(MotionPlan(plan.poses, limits, (0.0,) * 6, "dry run"))
+    if figure is not None:
+        preview(plan, Path(figure))
+    return [
+        f"dry run: {len(plan)} poses, {request.placement}, the tip travels {plan.travel_mm:.0f} mm "
+        f"({plan.passed_over} poses passed over)",
+        "every pose and every way between two lies within the limits",
+        f"nothing moved and {path} was not made; add --move to acquire",
+    ]
+
+
+def draw(setup: Setup, request: Request, figure: str) -> None:
+    """Write the plan's figure."""
+    preview(plan_poses(request.images, setup.scene, setup.extent, request.seed), Path(figure))
+
+
+def calibrate_and_print(path: str, outcome: Outcome, speed: float) -> dict[str, Any]:
+    """Calibrate from the finished file as ``jaxcal calibrate`` would, and print what came of it.
+
+    Returns:
+        The calibration's record (:func:`jaxcal.report.record.calibration_record`).
+    """
+    from jaxcal.cli.common import print_page
+    from jaxcal.io.hdf5 import load
+    from jaxcal.report.record import calibration_record
+    from jaxcal.report.tables import calibration_table
+    from jaxcal.report.verdict import verdict
+    from jaxcal.segmentation.segment import segment_recording
+    from jaxcal.solve import calibrate
+
+    recording, _ = segment_recording(load(path))
+    record = calibration_record(calibrate(recording), recording)
+    lines = [
+        f"{outcome.images} images in {path}, {outcome.images / outcome.seconds * 60:.1f} a minute "
+        f"of the bench's time ({outcome.seconds:.0f} s"
+        + (f", {outcome.seconds / speed:.0f} s on the wall)" if speed != 1.0 else ")")
+    ]
+    if outcome.given_up:
+        rows = ", ".join(str(row + 1) for row in outcome.given_up)
+        lines.append(f"no mid-plane was found at poses {rows}")
+    share = share_inside(path)
+    if share is not None:
+        lines.append(f"true offsets inside their brackets: {share[0]} of {share[1]}")
+        lines.append(f"SD of the true offsets: {share[2]:.2f} mm")
+    print_page(calibration_table(record), *verdict(record), "", *lines)
+    return record
+
+
+def share_inside(path: str) -> tuple[int, int, float] | None:
+    """Images whose true offset lies inside its bracket, all images, and the offsets' SD (mm).
+
+    None for recordings of a real bench.
+    """
+    with h5py.File(path) as file:
+        low, high, true = (
+            np.asarray(file[f"placement/{name}"]) for name in ("low", "high", "true_elevation")
+        )
+    if not np.isfinite(true).any():
+        return None
+    return int(((low <= true) & (true <= high)).sum()), len(true), float(true.std(ddof=1))
