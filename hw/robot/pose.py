@@ -22,7 +22,7 @@ def ur_to_pose(raw: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 
     """
     raw = np.asarray(raw, dtype=np.float64)
     pose = np.zeros((*raw.shape[:-1], 4, 4))
-    pose[..., :3, :3] = _rotation(raw[..., 3:])
+    pose[..., :3, :3] = rotation_matrix(raw[..., 3:])
     pose[..., :3, 3] = raw[..., :3] * MM_PER_M
     pose[..., 3, 3] = 1.0
     return pose
@@ -42,8 +42,8 @@ def pose_to_ur(pose: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*bat
     return np.concatenate([position, rotation_vector(pose[..., :3, :3])], axis=-1)
 
 
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """Rodrigues' formula, (..., 3) -> (..., 3, 3)."""
+def rotation_matrix(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Orthonormal matrices of rotation vectors (rad), by the formula of Rodrigues."""
     square = np.sum(vector * vector, axis=-1)[..., None, None]
     angle = np.sqrt(square)
     small = square < 1e-12
