@@ -2,17 +2,19 @@
 
 The protocol has no mark between messages: after a broken header only the next bytes that can be a
 header tell where to go on. A body whose CRC is wrong is left out as a whole where a header
-follows it; otherwise its size was wrong, and a header is looked for within it, as long as the
-bytes so looked at more than once are not many times those received.
+follows it; otherwise, or where an image says itself that its size was wrong, a header is looked
+for within it, as long as the bytes so looked at more than once are not many times those received.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 from hw.ultrasound.crc64 import crc64
 from hw.ultrasound.openigtlink import (
+    BEGINNING,
     HEADER_SIZE,
     MAXIMUM_BODY,
     ContentError,
@@ -20,9 +22,11 @@ from hw.ultrasound.openigtlink import (
     Message,
     decode_body,
     parse_header,
+    size_agrees,
 )
 
-_VERSIONS = (b"\x00\x01", b"\x00\x02")
+# Version 1 or 2, and the first letter of a type.
+_BEGIN = re.compile(rb"\x00[\x01\x02][A-Z0-9_]")
 _CHECKS_PER_BYTE = 4
 
 
@@ -57,7 +61,7 @@ class MessageDecoder:
         # Arrival of the buffer's first byte, and where in it the bytes of the latest portion begin.
         self._began, self._now, self._fresh = math.nan, math.nan, 0
         self._header: Header | None = None
-        self._wrong_crc = False
+        self._wrong_crc = self._size_checked = False
         self._hunting = False
         self._damaged = False
         self._budget = 0
@@ -108,7 +112,7 @@ class MessageDecoder:
             self._hunting = False
         end = HEADER_SIZE + self._header.size
         if len(self._buffer) < end:
-            return False
+            return self._size_is_wrong() and self._hunt_within()
         if not self._wrong_crc:
             body = bytes(memoryview(self._buffer)[HEADER_SIZE:end])
             self._budget -= len(body)
@@ -125,7 +129,20 @@ class MessageDecoder:
         if follows is not None or self._budget < 0:
             self._drop(end)
             return True
-        # Of what is found within, the time of arrival is not known: late is better than early.
+        return self._hunt_within()
+
+    def _size_is_wrong(self) -> bool:
+        if self._size_checked or self._header is None:
+            return False
+        if len(self._buffer) < HEADER_SIZE + min(BEGINNING, self._header.size):
+            return False
+        self._size_checked = True
+        body = memoryview(self._buffer)[HEADER_SIZE : HEADER_SIZE + BEGINNING]
+        return not size_agrees(self._header, body)
+
+    def _hunt_within(self) -> bool:
+        """Look for a header in what was taken for a message."""
+        # Of what is found there the time of arrival is not known: late is better than early.
         self._fresh = 0
         self._began = self._now
         return self._hunt()
@@ -150,23 +167,25 @@ class MessageDecoder:
         # Where fewer than a header's bytes are left they may begin one.
         last = len(self._buffer) - HEADER_SIZE
         place = 1
-        while True:
-            places = [self._buffer.find(version, place) for version in _VERSIONS]
-            place = min((found for found in places if found >= 0), default=-1)
-            if place < 0:
-                # The last byte may be the first of a version.
-                self._drop(max(1, len(self._buffer) - 1))
-                return False
-            if place > last or parse_header(
-                memoryview(self._buffer)[place : place + HEADER_SIZE]
-            ):  # fmt: skip
+        while (match := _BEGIN.search(self._buffer, place)) is not None:
+            place = match.start()
+            # A match that is kept would keep the buffer from being cut.
+            del match
+            if place > last:
                 self._drop(place)
-                return place <= last
+                return False
+            if parse_header(memoryview(self._buffer)[place : place + HEADER_SIZE]):
+                self._drop(place)
+                return True
             place += 1
+        # The last two bytes may begin what the next portion goes on with.
+        self._drop(max(1, len(self._buffer) - 2))
+        return False
 
     def _drop(self, count: int) -> None:
         del self._buffer[:count]
-        self._header, self._wrong_crc = None, False
+        self._header = None
+        self._wrong_crc = self._size_checked = False
         self._fresh -= count
         if self._fresh <= 0:
             self._began = self._now

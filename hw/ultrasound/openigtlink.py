@@ -48,6 +48,7 @@ _LARGEST = {
 _SCALARS = {3: np.dtype(np.uint8), 4: np.dtype(np.int16)}
 _BIG_ENDIAN, _LITTLE_ENDIAN = 1, 2
 _LPS = 2
+_BYTES = {2: 1, 3: 1, 4: 2, 5: 2, 6: 4, 7: 4, 10: 4, 11: 8}
 _TYPE_LETTERS = frozenset(b"ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_")
 
 Pixels = UInt8[np.ndarray, "height width"] | Int16[np.ndarray, "height width"]
@@ -154,6 +155,48 @@ def parse_header(data: bytes | bytearray | memoryview) -> Header | None:
     return Header(
         version, text, device.decode("utf-8", "replace"), stamp or math.nan, size, crc
     )  # fmt: skip
+
+
+BEGINNING = _EXTENDED.size + _IMAGE.size
+"""So many bytes of a body tell :func:`size_agrees` all that it asks."""
+
+
+def size_agrees(header: Header, beginning: bytes | bytearray | memoryview) -> bool:
+    """Whether the size in a header is the one that the beginning of the body asks for.
+
+    A wrong bit in the size would have megabytes waited for; an image says itself how large it is.
+
+    Args:
+        header: parsed.
+        beginning: the first :data:`BEGINNING` bytes of the body, or the whole if it is shorter.
+    """
+    around = 0
+    if header.version == 2:
+        if len(beginning) < _EXTENDED.size:
+            return False
+        size, names, metadata, _ = _EXTENDED.unpack_from(beginning)
+        around = size + names + metadata
+        if size != _EXTENDED.size:
+            # Larger ones are allowed; where the content begins is then not in the beginning.
+            return size > _EXTENDED.size and header.size >= around
+    if header.kind == "TRANSFORM":
+        return header.size == around + _TRANSFORM.size
+    if header.kind != "IMAGE":
+        return header.size >= around
+    start = _EXTENDED.size if header.version == 2 else 0
+    if len(beginning) < start + _IMAGE.size:
+        return False
+    _, components, scalar, _, _, width, height, depth, *_ = _IMAGE.unpack_from(beginning, start)
+    voxels = components * width * height * depth * _BYTES.get(scalar, 0)
+    # Of a part of an image fewer voxels come than it has.
+    return header.size <= around + _IMAGE.size + voxels and (
+        header.size == around + _IMAGE.size + voxels or _is_part(beginning, start)
+    )
+
+
+def _is_part(beginning: bytes | bytearray | memoryview, start: int) -> bool:
+    numbers = _IMAGE.unpack_from(beginning, start)
+    return numbers[20:23] != (0, 0, 0) or numbers[23:26] != numbers[5:8]
 
 
 def decode_body(header: Header, body: bytes, t_host: float = math.nan) -> Message:
