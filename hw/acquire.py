@@ -29,8 +29,9 @@ from hw.recorder import Recorder
 from hw.recording_check import Progress, read_progress
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import Header
+from hw.robot.limits import Limits
 from hw.robot.motion import Motion
-from hw.robot.safety import Confirmation, Limits, MotionPlan
+from hw.robot.safety import Confirmation, MotionPlan
 from hw.session import Session, Watch, median_times
 from hw.setup import Setup
 from hw.stage import ProbeStage
@@ -259,8 +260,7 @@ def _run(
 
     def note(kind: str, text: str) -> None:
         recorder.add_event(kind, text, clock.now())
-        if kind != "command":
-            say(f"{kind}: {text}")
+        say(f"{kind}: {text}")
 
     note("resumed" if job.progress else "started", f"{len(job.missing)} images to take")
     session = Session(setup, recorder, watch=watch, every_frame=job.request.every_frame)
@@ -268,11 +268,15 @@ def _run(
         plan = _motion_plan(job, session, recorder)
         confirmation = confirm(plan)
         note("confirmed", f"plan {plan.digest[:12]} for robot {plan.serial}")
+
+        def log(t: float, command: str, numbers: dict[str, object]) -> None:
+            recorder.add_event("command", f"{command} {json.dumps(numbers)}", t)
+
         motion = Motion(
-            setup.robot_host, plan, confirmation, clock=clock, dry_run=False,
-            log=lambda line: note("command", str(line)), guard=session.trouble,
+            setup.robot_host, plan, confirmation, clock=clock, dry_run=False, log=log,
+            guard=session.trouble, caller_s=setup.caller_s,
         )  # fmt: skip
-        try:
+        with motion:
             stage = ProbeStage(session, motion, job.targets, note)
             given_up: list[int] = []
             for row in job.missing:
@@ -294,8 +298,6 @@ def _run(
                     continue
                 _take(job, row, stage, session, recorder, estimator, placement, oracle, began)
                 say(estimator.line(len(job.targets), placement))
-        finally:
-            motion.close()
     if oracle is not None:
         _write_truth(recorder, oracle)
     note("finished", f"{estimator.count} images")
@@ -306,8 +308,14 @@ def _run(
 def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
     """The plan that the confirmation is bound to; on resume the robot must be the same one."""
     identity = session.poses.identity()
-    offset = session.poses.tcp_offset
-    known = {"serial_number": identity.serial, "tcp_offset": list(offset or ())}
+    offset = session.poses.tcp_offset or job.setup.tcp_offset
+    if offset is None:
+        raise RefusedError(
+            "this controller does not tell its TCP offset: put it into the setup as "
+            "[robot] tcp_offset = [x, y, z, rx, ry, rz] (m, rad); it is compared before moving",
+            device="robot",
+        )
+    known = {"serial_number": identity.serial, "tcp_offset": list(offset)}
     if job.progress is not None:
         before = job.progress.settings.get("robot")
         if before is not None and json.loads(json.dumps(known)) != before:
@@ -318,7 +326,7 @@ def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
             )
     settings = {"request": asdict(job.request), "robot": known}
     recorder.put("plan", "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8), "1")
-    recorder.attributes("tracker", {"serial_number": identity.serial, "tcp_offset": offset or ()})
+    recorder.attributes("tracker", {"serial_number": identity.serial, "tcp_offset": list(offset)})
     recorder.attributes("ae", {"clock_hz": session.echo.clock_hz(), "trigger_delay_s": 0.0})
     recorder.sync()
     tip = job.setup.scene.tip_mm.tolist()

@@ -67,7 +67,7 @@ class Estimator:
         if result is None:
             return None
         answer = result.numpy()
-        return {
+        row = {
             "images": np.array([int(answer.mask.sum())]),
             "image_to_probe": answer.image_to_probe[None],
             "covariance": answer.covariance[None],
@@ -76,6 +76,7 @@ class Estimator:
             "rms": np.array([float(answer.rms)]),
             "status": np.array([int(answer.status_code)]),
         }
+        return {name: np.asarray(value) for name, value in row.items()}
 
     def expected_offset_mm(self, pose: np.ndarray) -> float:
         """How far along its elevational axis the probe must go from a pose to meet the target.

@@ -72,8 +72,8 @@ def _robot(setup: Setup, seconds: float) -> Finding:
             wrong.append(f"poses stopped for {gaps.max():.2f} s: look at the network")
         if steady.scatter_mm > 0.2:
             wrong.append(f"it does not rest: poses scatter by {steady.scatter_mm:.2f} mm")
-        if stream.tcp_offset is None:
-            wrong.append("its TCP offset is not told: the controller's software is too old")
+        if stream.tcp_offset is None and setup.tcp_offset is None:
+            wrong.append("it does not tell its TCP offset: put [robot] tcp_offset into the setup")
     return Finding("robot", f"serial {identity.serial}, {rate:.0f} poses/s", tuple(wrong))
 
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from hw.acquire import Outcome, Request
 from hw.poses import plan_poses, preview
-from hw.robot.safety import Limits, MotionPlan, check_plan
+from hw.robot.limits import Limits
+from hw.robot.safety import MotionPlan, check_plan
 from hw.setup import Setup
 from jaxcal.errors import InputError
 

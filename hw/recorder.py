@@ -32,7 +32,7 @@ from jaxcal.errors import CalibrationError, FormatError, OutputError
 
 if TYPE_CHECKING:
     from hw.active_echo.device import EchoFrame
-    from hw.robot.pose import PoseSample
+    from hw.robot.stream import PoseSample
     from hw.ultrasound.receiver import Image
 
 QUEUE_BYTES = 2**26
@@ -165,13 +165,17 @@ class Recorder:
             "text": np.array([text.encode()[:480].decode(errors="ignore").encode()]),
         })  # fmt: skip
 
-    def add_clock(self, device: str, offset: float, drift: float, residual: float, t_host: float):
-        """Append the fit of a device's clock: t_host = offset + (1 + drift) t_device."""
-        self._rows("clock", {
-            "t_host": np.array([t_host]), "device": np.array([device.encode()[:32]]),
-            "offset": np.array([offset]), "drift": np.array([drift]),
-            "residual": np.array([residual]),
-        })  # fmt: skip
+    def add_clock(
+        self, device: str, offset: float, drift: float, reference: float, residual: float,
+        t_host: float,
+    ) -> None:  # fmt: skip
+        """Append the fit of a device's clock (see the layout for its meaning)."""
+        values = {
+            "t_host": t_host, "offset": offset, "drift": drift, "reference": reference,
+            "residual": residual,
+        }  # fmt: skip
+        columns = {name: np.array([value]) for name, value in values.items()}
+        self._rows("clock", {**columns, "device": np.array([device.encode()[:32]])})
 
     def add_selected(
         self,

@@ -11,7 +11,8 @@ A superset of the smallest valid recording (:mod:`jaxcal.io.hdf5`): once ``compl
     /ae          t_host [s], frame_id, clock_ticks, tof_ticks (N,lines), amplitude (N,lines),
                  threshold
     /events      t_host [s], utc, kind, text
-    /clock       t_host [s], device, offset [s], drift, residual [s]: fits of a device's clock
+    /clock       device, offset, drift, reference, residual: t_host = t_device + offset
+                 + drift (t_device - reference) [s]; t_host of the fit
     /calibration the selected images: pose, time_of_flight or point, max_elevation, amplitude, mask,
                  time; target: the row of /plan that the image belongs to
     /placement   one row for each selected image: the target's elevational offset lies in [low,
@@ -91,6 +92,7 @@ LAYOUT: dict[str, dict[str, Column]] = {
         "device": _text(32),
         "offset": Column((), "f8", "s", 1),
         "drift": Column((), "f8", "1", 1),
+        "reference": Column((), "f8", "s", 1),
         "residual": Column((), "f8", "s", 1),
     },
     "calibration": {

@@ -12,19 +12,23 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from hw.active_echo.device import ActiveEcho, EchoFrame
-from hw.errors import Device, StaleError
+from hw.errors import StaleError
 from hw.recorder import Recorder
 from hw.robot.stream import PoseStream
 from hw.setup import Setup
 from hw.ultrasound.receiver import Image, UltrasoundStream
+from jaxcal.errors import CalibrationError
+from jaxcal.timing import fit_clock
 
 _PERIOD_WALL_S = 0.005
 _KEPT_FRAMES = 256
+_LEAST_STAMPS, _MOST_STAMPS = 20, 20_000
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,8 @@ class Session:
         self._echo_frames: deque[EchoFrame] = deque(maxlen=_KEPT_FRAMES)
         self._image: Image | None = None
         self._failure: Exception | None = None
-        self._bad: deque[tuple[float, Device, str]] = deque(maxlen=_KEPT_FRAMES)
+        self._bad: deque[tuple[float, str]] = deque(maxlen=_KEPT_FRAMES)
+        self._stamps: dict[str, list[tuple[float, float]]] = {}
         self._stopping = False
         self.last_trouble: str | None = None
         """What :meth:`trouble` said last when it said something."""
@@ -99,6 +104,7 @@ class Session:
                 self.images.start()
                 opened.append(self.images)
             self.echo.stream(True)
+            self._clock_hz = self.echo.clock_hz()
         except BaseException:
             for device in reversed(opened):
                 device.close()
@@ -120,6 +126,7 @@ class Session:
             return
         self._stopping = True
         self._thread.join()
+        self._record_clocks()
         for device in (self.images, self.echo, self.poses):
             if device is not None:
                 device.close()
@@ -169,14 +176,13 @@ class Session:
             if self._failure is not None:
                 return self._failure
             now, watch = self.clock.now(), self.watch
-            recent = [(device, what) for t, device, what in self._bad if now - t <= watch.burst_s]
-            for what in {what for _, what in recent}:
-                count = sum(other == what for _, other in recent)
+            recent = [what for t, what in self._bad if now - t <= watch.burst_s]
+            for what in set(recent):
+                count = recent.count(what)
                 if count > watch.burst:
-                    device = next(device for device, other in recent if other == what)
                     return StaleError(
                         f"{count} frames {what} within {watch.burst_s:g} s: look at its cable",
-                        device=device,
+                        device="active echo",
                     )
             if now - self._echo_seen > watch.echo_age_s:
                 return StaleError(
@@ -255,7 +261,7 @@ class Session:
                     "lost": "were lost (missed triggers, or damaged on the way)",
                     "short": "came with lines missing (missed line triggers)",
                 }[what]
-                self._bad.extend((now, "active echo", text) for _ in range(min(more, 16)))
+                self._bad.extend((now, text) for _ in range(min(more, 16)))
             self._counts = counts
             if frames:
                 self._echo_frames.extend(frames)
@@ -263,10 +269,35 @@ class Session:
             if images:
                 self._image, self._image_seen = images[-1], images[-1].t_host
             self._changed.notify_all()
+        hz = self._clock_hz
+        self._stamp("robot", [(pose.t_device, pose.t_host) for pose in poses[-1:]])
+        self._stamp("active echo", [(frame.ticks / hz, frame.t_host) for frame in frames[-1:]])
+        self._stamp("ultrasound", [(image.t_device, image.t_host) for image in images[-1:]])
         self._recorder.add_poses(poses)
         self._recorder.add_echo(frames)
         if self._every_frame:
             self._recorder.add_images(images)
+
+    def _stamp(self, device: str, pairs: list[tuple[float, float]]) -> None:
+        stamps = self._stamps.setdefault(device, [])
+        stamps.extend(pairs)
+        if len(stamps) > _MOST_STAMPS:
+            del stamps[::2]
+
+    def _record_clocks(self) -> None:
+        """Fit every device's clock and put the fits into the recording."""
+        now = self.clock.now()
+        for device, stamps in self._stamps.items():
+            pairs = np.array([pair for pair in stamps if np.isfinite(pair).all()])
+            # Stamps must increase; a device that sends none, or was restarted, has no fit.
+            if len(pairs) < _LEAST_STAMPS or (np.diff(pairs[:, 0]) <= 0).any():
+                continue
+            fit = fit_clock(pairs[:, 0], pairs[:, 1])
+            residual = float(np.median(fit.delay_s))
+            with suppress(CalibrationError):
+                self._recorder.add_clock(
+                    device, fit.offset_s, fit.drift, fit.reference_s, residual, now
+                )
 
 
 def median_times(frames: list[EchoFrame]) -> tuple[np.ndarray, float]:

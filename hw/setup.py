@@ -5,6 +5,7 @@ A TOML file, units in the names; a key that is not known is refused:
     [robot]
     host = "192.168.1.10"
     frequency_hz = 125              # optional: the controller's own rate otherwise
+    tcp_offset = [0, 0, 0.12, 0, 0, 0]  # m, rad; only for controllers that do not tell it
     settle_s = 0.3                  # poses are averaged for so long after a move
     [active_echo]
     url = "/dev/ttyUSB0"
@@ -60,7 +61,9 @@ class Setup:
         search: steps and stated accuracies of the placement.
         clock: of the bench.
         frequency_hz: of the poses; None: the controller's own.
+        tcp_offset: (6,) m and rad, of a controller that does not tell it.
         settle_s: poses are averaged for so long.
+        caller_s: bench seconds that this process may be silent while the robot moves.
         frames: active-echo frames of an image.
     """
 
@@ -74,7 +77,9 @@ class Setup:
     search: Settings = field(default_factory=Settings)
     clock: Clock = REAL
     frequency_hz: float | None = None
+    tcp_offset: tuple[float, ...] | None = None
     settle_s: float = 0.3
+    caller_s: float = 0.15
     frames: int = 9
 
 
@@ -97,7 +102,8 @@ def load_setup(path: str | os.PathLike[str]) -> Setup:
 
 
 _TABLES = {
-    "robot": {"host": str, "frequency_hz": float, "settle_s": float},
+    "robot": {"host": str, "frequency_hz": float, "settle_s": float,
+              "tcp_offset": list},
     "active_echo": {"url": str, "frames": int},
     "ultrasound": {"host": str, "port": int},
     "probe": {"elements": int, "pitch_mm": float, "sound_speed_m_s": float, "delay_s": float},
@@ -133,14 +139,13 @@ def _setup(tables: dict[str, Any]) -> Setup:
     for key in ("settle_s", "frequency_hz"):
         if key in robot and not (np.isfinite(robot[key]) and robot[key] > 0):
             raise InputError(f"[robot] {key} must be a positive number")
+    if "tcp_offset" in robot:
+        offset = _numbers("tcp_offset", robot["tcp_offset"], (6,), "robot")
+        robot["tcp_offset"] = tuple(offset.tolist())
     echo = found["active_echo"]
     if not 1 <= echo.get("frames", 9) <= 1000:
         raise InputError("[active_echo] frames must be 1 to 1000")
-    plan: dict[str, Any] = {
-        key: tuple(tuple(row) if isinstance(row, list) else row for row in value)
-        if isinstance(value, list) else value
-        for key, value in found["plan"].items()
-    }  # fmt: skip
+    plan: dict[str, Any] = {key: _tuples(key, value) for key, value in found["plan"].items()}
     return Setup(
         active_echo_url=echo["url"],
         frames=echo.get("frames", 9),
@@ -179,11 +184,25 @@ def _table(tables: dict[str, Any], name: str) -> dict[str, Any]:
     return checked
 
 
-def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _numbers(name: str, value: Any, shape: tuple[int, ...], table: str = "scene") -> np.ndarray:
     try:
         array = np.asarray(value, float)
     except (ValueError, TypeError):
         array = np.empty(0)
     if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"[scene] {name} must be numbers of shape {shape}")
+        raise InputError(f"[{table}] {name} must be numbers of shape {shape}")
     return array
+
+
+def _tuples(name: str, value: Any) -> Any:
+    """Lists of numbers as tuples of floats, at most two deep."""
+    if not isinstance(value, list):
+        return value
+    rows = [_tuples(name, row) if isinstance(row, list) else row for row in value]
+    numbers = [row for row in rows if not isinstance(row, tuple)]
+    if any(isinstance(row, bool) or not isinstance(row, int | float) for row in numbers):
+        raise InputError(f"[plan] {name} must be numbers")
+    lengths = {"depth_mm": 2, "reach_mm": 2, "box_mm": 2}
+    if len(rows) not in (lengths.get(name, 0), 3):
+        raise InputError(f"[plan] {name} has {len(rows)} values")
+    return tuple(row if isinstance(row, tuple) else float(row) for row in rows)

@@ -16,6 +16,7 @@ from hw.errors import DeviceError, RefusedError, StaleError, StoppedError
 from hw.midplane.search import Echoes
 from hw.robot.motion import Motion
 from hw.robot.pose import turn_deg
+from hw.robot.stream import PoseSample
 from hw.session import Session
 
 _MOST_HESITATIONS = 5
@@ -73,8 +74,7 @@ class ProbeStage:
         pose = self.plan_pose.copy()
         direction = pose[:3, :3] @ self._axis
         pose[:3, 3] += offset_mm * direction
-        self._move(pose, None)
-        tracked = self._session.poses.latest().pose
+        tracked = self._move(pose, None).pose
         return float((tracked[:3, 3] - self.plan_pose[:3, 3]) @ direction)
 
     def read(self, frames: int) -> Echoes:
@@ -102,18 +102,19 @@ class ProbeStage:
         """Bench time since which nothing has moved and the threshold is what it is."""
         return self._arrived
 
-    def _move(self, pose: np.ndarray, speed_mm_s: float | None) -> None:
+    def _move(self, pose: np.ndarray, speed_mm_s: float | None) -> PoseSample:
         for hesitation in range(_MOST_HESITATIONS + 1):
             self._session.wait_until_clear()
             try:
-                self._motion.move_to(pose, speed_mm_s)
+                sample = self._motion.move_to(pose, speed_mm_s)
             except (StoppedError, StaleError) as error:
                 if not self._hesitated(error) or hesitation == _MOST_HESITATIONS:
                     raise
                 self._note("hesitation", str(error))
                 continue
             self._arrived = self._session.clock.now()
-            return
+            return sample
+        raise AssertionError
 
     def _hesitated(self, error: DeviceError) -> bool:
         """Whether a stop was ours, because of a device that may come back by itself."""

@@ -105,7 +105,7 @@ def test_a_finished_recording_is_what_calibrate_takes(tmp_path, capsys):
             recorder.add_images(frames(k, 1))
             recorder.add_echo(echo(k, 1))
             take(recorder, recording, k)
-        recorder.add_clock("robot", 0.1, 1e-5, 1e-4, 1.0)
+        recorder.add_clock("robot", 0.1, 1e-5, 0.5, 1e-4, 1.0)
         recorder.put("truth", "point", np.zeros(3), "mm")
         recorder.put("truth", "elevation", np.zeros(12), "mm")
         recorder.put("truth", "image_to_probe", np.eye(4), "mm")

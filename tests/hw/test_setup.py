@@ -1,0 +1,80 @@
+"""A bench's description: what is read, and what is refused with one line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import jaxcal
+from hw.setup import load_setup
+
+GOOD = """
+[robot]
+host = "192.168.1.10"
+settle_s = 1
+[active_echo]
+url = "/dev/ttyUSB0"
+[ultrasound]
+host = "192.168.1.20"
+[probe]
+elements = 64
+pitch_mm = 0.4
+sound_speed_m_s = 1480
+[scene]
+image_to_probe = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 60], [0, 0, 0, 1]]
+point_mm = [350, -250, 80]
+looking = [0, 0, -1]
+[limits]
+cone_deg = 30
+[plan]
+cone_deg = 20
+depth_mm = [20, 60]
+box_mm = [[0, 0, 0], [100, 100, 100]]
+[search]
+fine_mm = 0.2
+frames = 5
+"""
+
+
+def test_a_description_is_read(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(GOOD)
+    setup = load_setup(path)
+    assert setup.robot_host == "192.168.1.10"
+    assert setup.settle_s == 1.0
+    assert setup.ultrasound == ("192.168.1.20", 18944)
+    assert setup.probe == jaxcal.LinearProbe(64, 0.4, 1480.0)
+    assert setup.extent.depth_mm == (20, 60)
+    assert setup.extent.box_mm == ((0, 0, 0), (100, 100, 100))
+    assert (setup.search.fine_mm, setup.search.frames) == (0.2, 5)
+    assert setup.limits == {"cone_deg": 30}
+    np.testing.assert_array_equal(setup.scene.tip_mm, [0, 0, 60])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        ('host = "192.168.1.10"', "", r"\[robot\] needs host"),
+        ('url = "/dev/ttyUSB0"', "", r"\[active_echo\] needs url"),
+        ('url = "/dev/ttyUSB0"', "url = 3", "must be text"),
+        ("settle_s = 1", "settle_s = -1", "positive"),
+        ("settle_s = 1", "settle = 1", "has no 'settle'"),
+        ("elements = 64", "elements = 64.5", "whole number"),
+        ("elements = 64", "elements = 1", "elements"),
+        ("point_mm = [350, -250, 80]", "point_mm = [350, nan, 80]", "point_mm must be numbers"),
+        ("looking = [0, 0, -1]", "", "needs looking"),
+        ("[limits]\ncone_deg = 30", "", "nothing may move"),
+        ("[search]", "[serach]", "is not known"),
+        ("fine_mm = 0.2", "fine_mm = -0.2", "fine_mm"),
+        ("cone_deg = 20", "cone_deg = 200", "cone_deg"),
+        ("[robot]", "[robot", "is not TOML"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(tmp_path, old, new, what):
+    assert old in GOOD
+    path = tmp_path / "bench.toml"
+    path.write_text(GOOD.replace(old, new, 1))
+    with pytest.raises(jaxcal.InputError, match=what) as caught:
+        load_setup(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
