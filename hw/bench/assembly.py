@@ -29,7 +29,7 @@ VERSIONS = {125: (3, 15, 8, 106339), 500: (5, 11, 0, 108249)}
 """Controllers that the real client accepts, by their rate: a CB-series and an e-Series."""
 
 _ADDRESS_TRIES = 40
-_HOVER_MM = 110.0
+_HOVER_MM = 70.0
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ class Assembly:
 
 
 def hovering(scene: Scene) -> Float[np.ndarray, "4 4"]:
-    """Where the arm waits: looking at the nominal target from 110 mm, tool -> base, mm."""
+    """Where the arm waits: looking at the nominal target from 70 mm, tool -> base, mm."""
     pose = np.eye(4)
     pose[:3, :3] = looking_rotation(scene.looking) @ scene.image_to_probe[:3, :3].T
     looking = np.asarray(scene.looking, float)

@@ -168,7 +168,7 @@ def start_bench(options: Options | None = None, **changes) -> Bench:
         line = _first_line(process)
         if not line:
             process.kill()
-            process.wait()
+            process.communicate()
             complaints.seek(0)
             said = complaints.read(1 << 16).decode(errors="replace").strip().splitlines()
             raise InputError(f"the bench did not start: {said[-1] if said else 'no reason told'}")

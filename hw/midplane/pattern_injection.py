@@ -139,14 +139,19 @@ class SteadyOperator:
             if not (passed and longest >= view.longest - _VISIBLE_DROP):
                 return Decision("go", view.offset_mm + self._step)
             self._stage = "check"
-            return Decision("go", _middle(sweep))
+            return Decision("go", middle_of(sweep))
         return Decision("accept")
 
 
-def _middle(sweep: tuple[tuple[float, int], ...]) -> float:
-    """Half way between the places on both flanks where the bar becomes visibly shorter."""
-    places = np.array([place for place, _ in sweep])
-    lengths = np.array([length for _, length in sweep], float)
+def middle_of(seen: tuple[tuple[float, int], ...]) -> float:
+    """Half way between the places on both flanks where the bar becomes visibly shorter, mm.
+
+    Args:
+        seen: (offset, length) of every look; in the order of offsets or not.
+    """
+    ordered = sorted(seen)
+    places = np.array([place for place, _ in ordered])
+    lengths = np.array([length for _, length in ordered], float)
     level = lengths.max() - _VISIBLE_DROP
 
     def crossing(short: int, long: int) -> float:
