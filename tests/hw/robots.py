@@ -36,6 +36,7 @@ for line in sys.stdin:
     elif name == "force":
         arm.force = tuple(values[0])
     else:
+        answer = clock.now()
         getattr(robot, name)(*values)
     print(json.dumps(answer), flush=True)
 robot.stop()

@@ -1,0 +1,293 @@
+"""Asking the robot to move: one motion at a time, in a process that can always be killed.
+
+:class:`Motion` starts dry: it checks and logs every motion and sends none. To move, it takes the
+operator's confirmation of the plan, which serves for one connection; after anything that ends it
+(a protective stop, a reset connection, a stopped program) a new one is needed. A protective stop is
+reported and never released from here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import queue
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+
+import numpy as np
+from jaxtyping import Float
+
+from hw.clock import REAL, Clock
+from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
+from hw.robot._process import spawn
+from hw.robot.safety import Confirmation, MotionPlan, check_plan
+from hw.robot.stream import PoseSample
+
+Log = Callable[[float, str, dict[str, object]], None]
+"""Takes bench time (s), the command, and its numbers."""
+Guard = Callable[[], str | None]
+"""Asked at every tick of a motion; a reason stops it."""
+
+_KINDS = {kind.__name__: kind for kind in (LostError, RefusedError, StaleError, StoppedError)}
+_TICK_S = 0.02
+_START_PATIENCE_S = 30.0
+
+
+class Motion:
+    """Moves the robot at ``host`` along one confirmed plan.
+
+    Args:
+        host: the controller's address.
+        plan: what may be done.
+        confirmation: of that plan; used up by :meth:`start`. None only for a dry run.
+        clock: bench time.
+        dry_run: check and log, but send nothing to the robot.
+        log: told every command before it is sent (but for the watchdog's kicks, of which it is told
+            the number), every refusal and every stop.
+        guard: see :data:`Guard`; may be set at any time.
+        caller_s: bench seconds that this process may be silent during a motion, e.g. held up by
+            another thread, before the motion is stopped: no guard is asked meanwhile.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        plan: MotionPlan,
+        confirmation: Confirmation | None,
+        *,
+        clock: Clock = REAL,
+        dry_run: bool = True,
+        log: Log | None = None,
+        guard: Guard | None = None,
+        caller_s: float = 0.15,
+    ) -> None:
+        self.host, self.plan, self.clock, self.dry_run = host, plan, clock, dry_run
+        self.guard = guard
+        self.tcp_offset: tuple[float, ...] | None = None
+        """Of the controller (m, rad), once started; None where a dry run cannot know it."""
+        self.serial: str | None = None
+        self._confirmation = confirmation
+        self._log = log or (lambda t, command, numbers: None)
+        self._caller_s = caller_s
+        self._process: subprocess.Popen[bytes] | None = None
+        self._thread: threading.Thread | None = None
+        self._answers: queue.SimpleQueue[dict] = queue.SimpleQueue()
+        self._sending = threading.Lock()
+        self._one_at_a_time = threading.Lock()
+        self._ended: DeviceError | None = None
+        self._heard = 0.0
+
+    def start(self) -> Motion:
+        """Connect; takes a second or two.
+
+        Raises:
+            RefusedError: no valid, unused confirmation for this plan and robot, or a plan outside
+                its limits, or another TCP offset.
+            LostError: the controller does not answer.
+        """
+        check_plan(self.plan)
+        given = self._confirmation
+        if not self.dry_run:
+            if given is None:
+                raise RefusedError("motion needs the operator's confirmation", device="robot")
+            if given.used.is_set():
+                raise RefusedError(
+                    "this confirmation was used for an earlier connection; confirm the plan again",
+                    device="robot",
+                )
+            given.used.set()
+        self._process = spawn("hw.robot._mover", stdin=True)
+        self._thread = threading.Thread(target=self._receive, name="motion", daemon=True)
+        self._thread.start()
+        self._send(self._setup())
+        try:
+            answer = self._answers.get(timeout=_START_PATIENCE_S)
+        except queue.Empty:
+            answer = {}
+        if answer.get("what") != "ready":
+            error = _error(answer) or LostError(
+                f"the controller at {self.host} did not let us in within {_START_PATIENCE_S:g} s",
+                device="robot",
+            )
+            self._kill(error)
+            raise error
+        self.serial = str(answer["serial"])
+        offset = answer["tcp_offset"]
+        self.tcp_offset = None if offset is None else tuple(offset)
+        return self
+
+    def _setup(self) -> dict:
+        given = self._confirmation
+        return {
+            "host": self.host,
+            "clock": [self.clock.speed, self.clock.origin_s],
+            "dry_run": self.dry_run,
+            "caller_s": self._caller_s,
+            "plan": {
+                "targets": self.plan.targets.tolist(),
+                "limits": asdict(self.plan.limits),
+                "tcp_offset": self.plan.tcp_offset,
+                "serial": self.plan.serial,
+            },
+            "confirmation": None
+            if given is None
+            else {
+                "digest": given.digest,
+                "serial": given.serial,
+                "issued_s": given.issued_s,
+                "expires_s": given.expires_s,
+            },
+        }
+
+    def __enter__(self) -> Motion:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def move_to(
+        self, pose: Float[np.ndarray, "4 4"], speed_mm_s: float | None = None
+    ) -> PoseSample:
+        """Move in a straight line, and wait until the robot has arrived and is steady.
+
+        Args:
+            pose: (4, 4) mm, TCP -> robot base: of the plan, or within its search envelope.
+            speed_mm_s: of TCP and tip; the cap by default.
+
+        Returns:
+            The pose at which it rests; in a dry run, the pose at which it would.
+
+        Raises:
+            RefusedError: the gate or the controller does not allow it; nothing moved.
+            StaleError: poses stopped coming, and so did the robot. It may be tried again.
+            StoppedError: stopped before arrival: by :meth:`stop`, the guard, force, the box, a
+                protective stop, or because it took too long.
+            LostError: the connection is gone; motion needs a new confirmation.
+        """
+        with self._one_at_a_time:
+            self._alive()
+            while not self._answers.empty():
+                self._answers.get()
+            self._send(
+                {"request": "move", "pose": np.asarray(pose).tolist(), "speed_mm_s": speed_mm_s}
+            )
+            try:
+                return self._wait()
+            except DeviceError:
+                raise
+            except BaseException:
+                self._send({"request": "stop", "reason": "interrupted"})
+                raise
+
+    def _wait(self) -> PoseSample:
+        tick = max(0.001, self.clock.wall(_TICK_S))
+        stopping: DeviceError | None = None
+        while True:
+            try:
+                answer = self._answers.get(timeout=tick)
+            except queue.Empty:
+                answer = {}
+            match answer.get("what"):
+                case "arrived":
+                    t_host, t_device, raw, *rest = answer["sample"]
+                    return PoseSample(t_host, t_device, tuple(raw), *rest)
+                case "error":
+                    error = _error(answer)
+                    assert error is not None
+                    if answer["ended"]:
+                        self._kill(error)
+                    raise error
+                case "stopping":
+                    stopping = _error(answer)
+            reason = self.guard() if self.guard is not None and stopping is None else None
+            if reason is not None:
+                stopping = StoppedError(reason, device="robot")
+                self._send({"request": "stop", "reason": reason})
+            self._send({"request": "heard"})
+            silent = time.monotonic() - self._heard
+            if silent > 0.5 + self.clock.wall(0.5):
+                error = stopping or LostError("the motion process hangs", device="robot")
+                self._kill(error)
+                raise type(error)(
+                    f"{error.args[0]}; the controller does not answer, its own watchdog stops the "
+                    "robot. Motion needs a new confirmation",
+                    device="robot",
+                )
+
+    def stop(self, reason: str) -> None:
+        """Stop the robot; a :meth:`move_to` that waits in another thread raises StoppedError."""
+        self._send({"request": "stop", "reason": reason})
+
+    def close(self) -> None:
+        """Stop the robot, end its program, disconnect. Idempotent."""
+        if self._process is None:
+            return
+        if self._process.poll() is None:
+            self._send({"request": "close"})
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(timeout=8.0)
+        self._kill(RefusedError("motion was closed", device="robot"))
+
+    def _alive(self) -> None:
+        if self._process is None:
+            raise RefusedError("motion was not started", device="robot")
+        while not self._answers.empty():
+            answer = self._answers.get()
+            error = _error(answer)
+            if error is not None and answer.get("ended"):
+                self._kill(error)
+                raise error
+        if self._ended is not None:
+            raise RefusedError(
+                f"motion has ended ({self._ended.args[0]}); confirm the plan again and start anew",
+                device="robot",
+            )
+
+    def _kill(self, error: DeviceError) -> None:
+        self._ended = self._ended or error
+        assert self._process is not None
+        with contextlib.suppress(ProcessLookupError):
+            self._process.kill()
+        self._process.wait()
+        with contextlib.suppress(OSError):
+            assert self._process.stdin is not None
+            self._process.stdin.close()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def _send(self, message: dict) -> None:
+        process = self._process
+        if process is None or process.stdin is None:
+            return
+        with self._sending, contextlib.suppress(OSError, ValueError):
+            process.stdin.write(json.dumps(message).encode() + b"\n")
+            process.stdin.flush()
+
+    def _receive(self) -> None:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        with self._process.stdout as lines:
+            for line in lines:
+                self._heard = time.monotonic()
+                message = json.loads(line)
+                match message["what"]:
+                    case "log":
+                        self._log(message["t"], message["command"], message["numbers"])
+                    case "stopping":
+                        self._log(self.clock.now(), "stop", {"why": message["text"]})
+                        self._answers.put(message)
+                    case "alive" | "closed":
+                        pass
+                    case _:
+                        self._answers.put(message)
+        text = "the motion process ended; the robot's own watchdog stops it"
+        self._answers.put({"what": "error", "kind": "LostError", "text": text, "ended": True})
+
+
+def _error(answer: dict) -> DeviceError | None:
+    if "kind" not in answer:
+        return None
+    return _KINDS.get(str(answer["kind"]), LostError)(str(answer["text"]), device="robot")

@@ -1,0 +1,294 @@
+"""Motion by the real ur_rtde on an emulated controller: arrivals, refusals, and every fault."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+
+import numpy as np
+import pytest
+from robots import START, EmulatedRobot
+
+from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
+from hw.robot.limits import Limits
+from hw.robot.motion import Motion
+from hw.robot.pose import ur_to_pose
+from hw.robot.safety import MotionPlan, confirm
+
+pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
+
+HOME = ur_to_pose(np.array(START))
+SERIAL = "20195500042"
+OFFSET = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
+STOP_WITHIN_S = 0.2
+
+
+def beside(*mm: float) -> np.ndarray:
+    pose = HOME.copy()
+    pose[:3, 3] += mm
+    return pose
+
+
+LIMITS = Limits(
+    box_min_mm=(330.0, -170.0, 180.0),
+    box_max_mm=(470.0, -30.0, 320.0),
+    tip_mm=(0.0, 0.0, 50.0),
+    cone_axis=tuple(float(v) for v in HOME[:3, 2]),
+    cone_deg=20.0,
+    max_step_mm=60.0,
+    max_turn_deg=20.0,
+    max_speed_mm_s=50.0,
+    max_acceleration_mm_s2=500.0,
+    search_mm=3.0,
+    search_deg=0.5,
+)
+PLAN = MotionPlan(np.array([HOME, beside(10.0, 5.0, 0.0), beside(50.0, 0.0, 0.0)]), LIMITS,
+                  OFFSET, SERIAL)  # fmt: skip
+
+
+@contextmanager
+def moving(
+    robot: EmulatedRobot, log: list | None = None, plan: MotionPlan = PLAN, **named
+) -> Iterator[Motion]:
+    confirmation = confirm(plan, plan.code, clock=robot.clock)
+    motion = Motion(
+        robot.host, plan, confirmation, clock=robot.clock, dry_run=False,
+        log=None if log is None else lambda *entry: log.append(entry), **named,
+    )  # fmt: skip
+    with motion:
+        yield motion
+
+
+def sent(robot: EmulatedRobot, code: int) -> list[tuple[float, ...]]:
+    return [tuple(values) for _, command, values in robot.state()["log"] if command == code]
+
+
+def test_the_robot_moves_searches_and_is_left_in_order():
+    log: list = []
+    with EmulatedRobot(speed=3.0) as robot:
+        with moving(robot, log, caller_s=2.0) as motion:
+            assert motion.serial == SERIAL
+            assert motion.tcp_offset == OFFSET
+            for target in (PLAN.targets[1], beside(10.0, 5.2, 0.0), HOME):
+                sample = motion.move_to(target)
+                np.testing.assert_allclose(sample.pose, target, atol=1e-6)
+            with pytest.raises(RefusedError, match="neither a planned pose"):
+                motion.move_to(beside(20.0, 0.0, 0.0))
+            with pytest.raises(RefusedError, match="speed of 60"):
+                motion.move_to(PLAN.targets[1], 60.0)
+            with pytest.raises(RefusedError, match="shape"):
+                motion.move_to(np.array(START[:5]))
+            # A refusal changes nothing.
+            motion.move_to(beside(0.0, 0.0, 1.0), 8.0)
+        state = robot.state()
+        moves = sent(robot, 3)
+    assert state["raw"][:3] == pytest.approx([0.4, -0.1, 0.301])
+    assert not state["running"]
+    assert state["reason"] == "the client stopped the script"
+    assert state["unlocks"] == 0
+    assert len(moves) == 4
+    assert [round(move[6] * 1000, 6) for move in moves] == [50.0, 10.0, 50.0, 8.0]
+    names = [entry[1] for entry in log]
+    assert names.count("moveL") == 4
+    assert names.count("isPoseWithinSafetyLimits") == 4
+    assert names.count("refused") == 3
+    assert names[0] == "connect"
+    assert names[-4:] == ["stopL", "kickWatchdog", "stopScript", "disconnect"]
+    times = [entry[0] for entry in log]
+    assert times == sorted(times)
+
+
+def test_a_dry_run_sends_nothing():
+    log: list = []
+    with EmulatedRobot() as robot:
+        motion = Motion(robot.host, PLAN, None, clock=robot.clock, log=lambda *e: log.append(e))
+        with motion:
+            for target in (PLAN.targets[2], PLAN.targets[1], HOME):
+                np.testing.assert_allclose(motion.move_to(target).pose, target, atol=1e-9)
+            with pytest.raises(RefusedError, match="neither"):
+                motion.move_to(beside(0.0, 50.0, 0.0))
+        state = robot.state()
+    assert state["log"] == []
+    assert not state["running"]
+    assert state["raw"] == pytest.approx(START)
+    assert [entry[1] for entry in log] == ["dry run: moveL"] * 3 + ["refused"]
+
+
+def test_motion_needs_its_own_unused_confirmation():
+    with EmulatedRobot() as robot:
+        with pytest.raises(RefusedError, match="needs the operator"):
+            Motion(robot.host, PLAN, None, clock=robot.clock, dry_run=False).start()
+        other = MotionPlan(PLAN.targets[:2], LIMITS, OFFSET, SERIAL)
+        wrong = confirm(other, other.code, clock=robot.clock)
+        for text, plan, given in [
+            ("another plan", PLAN, wrong),
+            ("used for an earlier connection", other, wrong),
+        ]:
+            with pytest.raises(RefusedError, match=text):
+                Motion(robot.host, plan, given, clock=robot.clock, dry_run=False).start()
+        another = MotionPlan(PLAN.targets, LIMITS, OFFSET, "20195500099")
+        with (
+            pytest.raises(RefusedError, match="connected is 20195500042"),
+            moving(robot, plan=another),
+        ):
+            pass
+        offset = MotionPlan(PLAN.targets, LIMITS, (0.0,) * 6, SERIAL)
+        with pytest.raises(RefusedError, match="TCP offset"), moving(robot, plan=offset):
+            pass
+        assert robot.state()["log"] == []
+
+
+def fault_in_motion(
+    robot: EmulatedRobot, motion: Motion, fault: Callable[[], object]
+) -> tuple[DeviceError, float, float]:
+    """What the caller was told, and how long robot and caller took (bench s)."""
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(motion.move_to, PLAN.targets[2])
+        while math.hypot(*robot.state()["velocity"]) < 0.04:
+            time.sleep(0.002)
+        before = robot.state()["t"]
+        fault()
+        error = future.exception(timeout=20.0)
+        told = robot.clock.now() - before
+    assert isinstance(error, DeviceError)
+    deadline = time.monotonic() + 5.0
+    while (state := robot.state())["rest_since"] is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert state["unlocks"] == 0
+    assert "\n" not in str(error)
+    # It stopped on the way, and did not merely arrive.
+    assert state["raw"][0] < START[0] + 0.049
+    return error, state["rest_since"] - before, told
+
+
+def kill_mover(motion: Motion) -> None:
+    assert motion._process is not None
+    os.kill(motion._process.pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "text", "ends"),
+    [
+        ("mute", StaleError, "no fresh pose", True),
+        ("drop", LostError, "new confirmation", True),
+        ("protective_stop", StoppedError, "protective stop: release it at the robot", True),
+        ("guard", StoppedError, "30 echo frames were lost", False),
+        ("stop", StoppedError, "the operator", False),
+        ("kill", LostError, "motion process ended", True),
+        ("silent", StoppedError, "the caller was silent", False),
+        ("force", StoppedError, r"a force of 40.0 N", True),
+        ("set_tcp_offset", RefusedError, "TCP offset was changed", True),
+    ],
+)
+def test_the_robot_rests_within_200_ms_of_a_fault(name, kind, text, ends):
+    reasons: list[str | None] = [None]
+
+    def guard() -> str | None:
+        if reasons[0] == "silent":
+            reasons[0] = None
+            time.sleep(0.6)
+        return reasons[0]
+
+    with EmulatedRobot() as robot, moving(robot, guard=guard, caller_s=0.15) as motion:
+        faults = {
+            "guard": lambda: reasons.__setitem__(0, "30 echo frames were lost"),
+            "silent": lambda: reasons.__setitem__(0, "silent"),
+            "stop": lambda: motion.stop("the operator pressed stop"),
+            "kill": lambda: kill_mover(motion),
+            "force": lambda: robot.ask("force", [0.0, 0.0, -40.0, 0.0, 0.0, 0.0]),
+            "set_tcp_offset": lambda: robot.ask(name, [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]),
+        }
+        fault = faults.get(name, lambda: robot.ask(name))
+        error, rest_s, told_s = fault_in_motion(robot, motion, fault)
+        assert type(error) is kind
+        with pytest.raises(kind, match=text):
+            raise error
+        assert rest_s <= STOP_WITHIN_S
+        assert told_s < 5.0
+        reasons[0] = None
+        moves = len(sent(robot, 3)) if name != "mute" else 0
+        if ends:
+            with pytest.raises(RefusedError, match="confirm the plan again"):
+                motion.move_to(HOME)
+        else:
+            assert motion.move_to(PLAN.targets[1]).pose[0, 3] == pytest.approx(410.0)
+            moves += 1
+        if name != "mute":
+            assert len(sent(robot, 3)) == moves
+
+
+def test_a_reset_control_connection_is_not_used_again():
+    with EmulatedRobot() as robot:
+        with moving(robot) as motion:
+            motion.move_to(PLAN.targets[1])
+            robot.ask(
+                "drop",
+            )
+            time.sleep(0.5)
+            with pytest.raises((LostError, RefusedError)):
+                motion.move_to(HOME)
+            moves = len(sent(robot, 3))
+        with moving(robot) as motion:
+            motion.move_to(HOME)
+        assert len(sent(robot, 3)) == moves + 1
+
+
+_CALLER = """
+import json, sys, time
+import numpy as np
+from hw.clock import Clock
+from hw.robot.limits import Limits
+from hw.robot.motion import Motion
+from hw.robot.safety import MotionPlan, confirm
+host, origin, targets, limits, offset, serial = json.loads(sys.argv[1])
+clock = Clock(1.0, origin)
+plan = MotionPlan.from_poses(targets, Limits.from_mapping(limits), offset, serial)
+with Motion(host, plan, confirm(plan, plan.code, clock=clock), clock=clock, dry_run=False) as motion:
+    print("ready", flush=True)
+    motion.move_to(plan.targets[2])
+"""
+
+
+def test_killing_the_caller_stops_the_robot():
+    import json
+    from dataclasses import asdict
+
+    with EmulatedRobot() as robot:
+        values = [
+            robot.host, robot.clock.origin_s, PLAN.targets.tolist(), asdict(LIMITS), OFFSET, SERIAL
+        ]  # fmt: skip
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        caller = subprocess.Popen(
+            [sys.executable, "-c", _CALLER, json.dumps(values)],
+            stdout=subprocess.PIPE, env=environment,
+        )  # fmt: skip
+        with caller:
+            assert caller.stdout is not None
+            assert caller.stdout.readline() == b"ready\n"
+            while math.hypot(*robot.state()["velocity"]) < 0.04:
+                time.sleep(0.002)
+            before = robot.state()["t"]
+            caller.kill()
+        deadline = time.monotonic() + 5.0
+        while (state := robot.state())["rest_since"] is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert state["rest_since"] - before <= STOP_WITHIN_S
+        assert state["raw"][0] < START[0] + 0.049
+
+
+def test_nobody_answers():
+    with EmulatedRobot() as robot:
+        robot.ask("mute")
+        start = time.monotonic()
+        with pytest.raises(LostError, match="does not answer"), moving(robot):
+            pass
+        assert time.monotonic() - start < 30.0
+    with suppress(RefusedError):
+        Motion("127.0.0.1", PLAN, None).close()
