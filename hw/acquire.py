@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -53,6 +53,7 @@ class AcquisitionStopped(CalibrationError):
         self.exit_code = ExitCode.INTERRUPTED if interrupted else ExitCode.STOPPED
 
 
+@runtime_checkable
 class Oracle(Protocol):
     """What an emulated bench knows of the truth."""
 

@@ -19,6 +19,9 @@ class DeviceError(Exception):
         device: the device that it came from.
     """
 
+    exit_code = 4
+    """Of the command line (``jaxcal.cli.common.ExitCode.STOPPED``)."""
+
     def __init__(self, message: str, *, device: Device) -> None:
         super().__init__(" ".join(message.split()))
         self.device: Device = device

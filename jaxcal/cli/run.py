@@ -38,7 +38,7 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
     except click.ClickException as error:
         return _report(name, f"error: {error.format_message()}{_hint(error)}", ExitCode.BAD_INPUT)
     except CalibrationError as error:
-        return _report(name, f"error: {error}", getattr(error, "exit_code", ExitCode.BAD_INPUT))
+        return _report(name, f"error: {error}", _status(error) or ExitCode.BAD_INPUT)
     except OSError as error:
         # A pipe that was closed early (| head) or a full disk; Python would flush once more.
         _drop(sys.stdout)
@@ -48,6 +48,9 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
     except Exception as error:
         if os.environ.get("JAXCAL_TRACEBACK"):
             raise
+        status = _status(error)
+        if status is not None:
+            return _report(name, f"error: {error}", status)
         return _report(
             name,
             f"internal error: {type(error).__name__}: {str(error)[:300]} (please report it; "
@@ -63,6 +66,12 @@ def _invoke(commands: click.Group, name: str, arguments: Sequence[str]) -> int:
             return commands.invoke(context) or 0
     except click.exceptions.Exit as done:
         return done.exit_code
+
+
+def _status(error: Exception) -> ExitCode | None:
+    """Errors meant for a person may say how the program is to end (those of ``hw`` do)."""
+    status = getattr(error, "exit_code", None)
+    return None if status is None else ExitCode(status)
 
 
 def _hint(error: click.ClickException) -> str:
