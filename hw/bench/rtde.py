@@ -153,11 +153,11 @@ class RtdeServer:
 
         self._call(act)
 
-    def drop(self, *, reset: bool = True, port: int | None = None) -> None:
-        """Close the clients' connections (of one port, or all), by a reset or in order."""
+    def drop(self, *, reset: bool = True, control_only: bool = False) -> None:
+        """Close the clients' connections, or only those that command, by a reset or in order."""
 
         def act() -> None:
-            for connection in [c for c in self._connections if port in (None, c.port)]:
+            for connection in [c for c in self._connections if c.inputs or not control_only]:
                 if reset:
                     linger = struct.pack("ii", 1, 0)
                     connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)

@@ -162,7 +162,11 @@ class Mover:
         sources = [0, self._reader, *([] if self._library is None else [self._library])]
         ready = select.select(sources, [], [], timeout_s)[0]
         if self._reader in ready:
-            for packet in self._reader.read():
+            try:
+                packets = self._reader.read()
+            except LostError as error:
+                raise _Ended(self._lost(error.args[0])) from None
+            for packet in packets:
                 self._packet = packet
                 t_host = self._clock.at(packet.monotonic_s)
                 lag = self._lag.of(t_host, packet.timestamp_s)

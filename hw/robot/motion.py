@@ -18,7 +18,6 @@ from collections.abc import Callable
 from dataclasses import asdict
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.clock import REAL, Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
@@ -148,9 +147,7 @@ class Motion:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def move_to(
-        self, pose: Float[np.ndarray, "4 4"], speed_mm_s: float | None = None
-    ) -> PoseSample:
+    def move_to(self, pose: np.ndarray, speed_mm_s: float | None = None) -> PoseSample:
         """Move in a straight line, and wait until the robot has arrived and is steady.
 
         Args:
@@ -234,17 +231,17 @@ class Motion:
     def _alive(self) -> None:
         if self._process is None:
             raise RefusedError("motion was not started", device="robot")
+        if self._ended is not None:
+            raise RefusedError(
+                f"motion has ended ({self._ended.args[0]}); confirm the plan again and start anew",
+                device="robot",
+            )
         while not self._answers.empty():
             answer = self._answers.get()
             error = _error(answer)
             if error is not None and answer.get("ended"):
                 self._kill(error)
                 raise error
-        if self._ended is not None:
-            raise RefusedError(
-                f"motion has ended ({self._ended.args[0]}); confirm the plan again and start anew",
-                device="robot",
-            )
 
     def _kill(self, error: DeviceError) -> None:
         self._ended = self._ended or error

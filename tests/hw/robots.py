@@ -33,6 +33,8 @@ for line in sys.stdin:
             "running": c.running, "reason": c.reason, "log": c.log, "packets": robot.packets,
             "late": robot.late, "skipped": robot.skipped, "unlocks": robot.unlock_requests,
         }
+    elif name == "drop control":
+        robot.drop(control_only=True)
     elif name == "force":
         arm.force = tuple(values[0])
     else:

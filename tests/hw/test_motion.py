@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
@@ -11,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -250,16 +252,14 @@ from hw.robot.safety import MotionPlan, confirm
 host, origin, targets, limits, offset, serial = json.loads(sys.argv[1])
 clock = Clock(1.0, origin)
 plan = MotionPlan.from_poses(targets, Limits.from_mapping(limits), offset, serial)
-with Motion(host, plan, confirm(plan, plan.code, clock=clock), clock=clock, dry_run=False) as motion:
+given = confirm(plan, plan.code, clock=clock)
+with Motion(host, plan, given, clock=clock, dry_run=False) as motion:
     print("ready", flush=True)
     motion.move_to(plan.targets[2])
 """
 
 
 def test_killing_the_caller_stops_the_robot():
-    import json
-    from dataclasses import asdict
-
     with EmulatedRobot() as robot:
         values = [
             robot.host, robot.clock.origin_s, PLAN.targets.tolist(), asdict(LIMITS), OFFSET, SERIAL
