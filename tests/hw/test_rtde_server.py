@@ -1,0 +1,186 @@
+"""The emulated controller against the real ur_rtde: both interfaces, both series of robots."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import time
+from collections.abc import Callable
+
+import pytest
+from robots import START, EmulatedRobot, address
+
+from hw.bench.arm import Arm
+from hw.bench.controller import DONE, READY, Controller
+from hw.bench.rtde import RtdeServer
+from hw.bench.rtde_fields import output_type
+
+rtde_receive = pytest.importorskip("rtde_receive", reason="no wheel of ur_rtde here")
+rtde_control = pytest.importorskip("rtde_control", reason="no wheel of ur_rtde here")
+
+CB = (3, 15, 8, 106339)
+E_SERIES = (5, 11, 0, 108249)
+
+
+def until(condition: Callable[[], object], seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.005)
+
+
+def beside(mm: float) -> list[float]:
+    return [START[0] + mm / 1000.0, *START[1:]]
+
+
+@pytest.mark.parametrize("version", [E_SERIES, CB])
+def test_ur_rtde_receives_and_controls(version):
+    with EmulatedRobot(version=version, speed=2.0) as robot:
+        receive = rtde_receive.RTDEReceiveInterface(robot.host)
+        control = rtde_control.RTDEControlInterface(robot.host)
+        assert receive.getActualTCPPose() == pytest.approx(START)
+        assert receive.getSafetyStatusBits() == 1
+        assert receive.getRobotMode() == 7
+        assert control.isProgramRunning()
+        assert control.getTCPOffset() == pytest.approx((0.0, 0.0, 0.1, 0.0, 0.0, 0.0))
+        assert control.isPoseWithinSafetyLimits(beside(10.0))
+        assert not control.isPoseWithinSafetyLimits([2.0, 0.0, 0.3, 0.0, 3.0, 0.2])
+
+        # Synchronous: back when there.
+        assert control.moveL(beside(10.0), 0.1, 1.0)
+        assert robot.state()["raw"] == pytest.approx(beside(10.0))
+        until(control.isSteady)
+
+        # Asynchronous, with progress, and stopped on the way.
+        before = control.getAsyncOperationProgressEx().operationId()
+        assert control.moveL(beside(60.0), 0.02, 1.0, True)
+        until(lambda: control.getAsyncOperationProgressEx().isAsyncOperationRunning())
+        assert control.getAsyncOperationProgressEx().operationId() == before + 1
+        assert not control.isSteady()
+        control.stopL(2.0)
+        stopped = robot.state()
+        assert stopped["velocity"] == [0.0] * 6
+        assert START[0] + 0.010 < stopped["raw"][0] < START[0] + 0.060
+        until(lambda: not control.getAsyncOperationProgressEx().isAsyncOperationRunning())
+
+        # In real time.
+        for k in range(20):
+            assert control.servoL(beside(20.0 + 0.1 * k), 0.0, 0.0, 0.008, 0.1, 300.0)
+            time.sleep(0.004)
+        control.servoStop()
+        until(lambda: abs(receive.getActualTCPPose()[0] - beside(21.9)[0]) < 1e-4)
+
+        # The script again, and its end.
+        assert control.reuploadScript()
+        until(control.isProgramRunning)
+        assert control.moveL(START, 0.1, 1.0)
+        assert control.setWatchdog(20.0)
+        until(lambda: not control.isProgramRunning())
+        assert "watchdog" in robot.state()["reason"]
+        assert not control.moveL(beside(10.0), 0.1, 1.0)
+        assert robot.state()["raw"] == pytest.approx(START)
+        control.disconnect()
+        receive.disconnect()
+
+
+def test_a_protective_stop_ends_the_program_until_a_person_releases_it():
+    with EmulatedRobot() as robot:
+        control = rtde_control.RTDEControlInterface(robot.host)
+        assert control.moveL(beside(60.0), 0.05, 1.0, True)
+        robot.ask("protective_stop")
+        until(lambda: robot.state()["rest_since"] is not None)
+        assert not control.isProgramRunning()
+        assert not control.moveL(START, 0.1, 1.0)
+        robot.ask("unlock")
+        assert control.reuploadScript()
+        until(control.isProgramRunning)
+        assert control.moveL(START, 0.1, 1.0)
+        assert robot.state()["unlocks"] == 0
+        control.disconnect()
+
+
+def test_the_program_s_handshake():
+    arm = Arm(START)
+    program = Controller(arm)
+    program.upload(0.0)
+    program.step(0.02)
+    assert not program.running
+    program.step(0.06)
+    assert program.running
+    assert program.int_out[0] == READY
+
+    # A command is taken once, until the client writes 0.
+    program.int_in[0], program.double_in[:8] = 47, [0.0] * 8
+    program.step(0.1)
+    assert (program.int_out[0], program.int_out[1]) == (DONE, 1)
+    program.step(0.2)
+    assert [code for _, code, _ in program.log] == [47]
+    program.int_in[0] = 0
+    program.step(0.3)
+    assert program.int_out[0] == READY
+
+    # While a synchronous motion runs, nothing is read: a stop has to wait.
+    program.int_in[0], program.int_in[1] = 3, 0
+    program.double_in[:8] = [*beside(50.0), 0.05, 1.0]
+    program.step(1.0)
+    assert program.int_out[0] == READY
+    program.int_in[0] = 33
+    program.step(1.5)
+    assert [code for _, code, _ in program.log] == [47, 3]
+    assert arm.velocity(1.5)[0] == pytest.approx(0.05)
+    program.step(2.06)
+    assert program.int_out[0] == DONE
+
+    # What is not emulated ends the program, as an error in the script would.
+    program.int_in[0] = 0
+    program.step(2.1)
+    program.int_in[0] = 45
+    program.step(2.2)
+    assert not program.running
+    assert program.reason == "command 45 is not emulated"
+
+
+def test_variables_depend_on_the_version():
+    assert output_type("ft_raw_wrench", (5, 9)) == "VECTOR6D"
+    assert output_type("ft_raw_wrench", (5, 8)) == "NOT_FOUND"
+    assert output_type("payload_inertia", (3, 15)) == "VECTOR6D"
+    assert output_type("payload_inertia", (3, 14)) == "NOT_FOUND"
+    assert output_type("no_such_thing", (5, 11)) == "NOT_FOUND"
+
+
+@pytest.mark.parametrize(
+    ("port", "data"),
+    [
+        (30004, b"\x00\x00\x00"),
+        (30004, struct.pack(">HB", 5, ord("V")) + b"\x00"),
+        (30004, struct.pack(">HB", 4, ord("U")) + b"\x09"),
+        (30004, struct.pack(">HB", 12, ord("O")) + b"\x00" * 8 + b"\xff"),
+        (30004, b"\xff\xff" + b"x" * 70000),
+        (30003, b"def something_else():\nend\n" * 50000),
+        (29999, b"\xff" * 1_100_000),
+    ],
+)
+def test_junk_ends_its_own_connection_only(port, data):
+    with RtdeServer(Arm(START), address()) as server:
+        with socket.create_connection((server.host, 29999), timeout=5.0) as good:
+            good.recv(200)
+            with socket.create_connection((server.host, port), timeout=5.0) as bad:
+                try:
+                    bad.sendall(data)
+                    bad.settimeout(0.3)
+                    bad.recv(65536)
+                except OSError:
+                    pass
+            good.sendall(b"get serial number\n")
+            assert good.recv(200) == b"20195500042\n"
+        assert not server.controller.running
+
+
+def test_an_address_is_used_once():
+    with RtdeServer(Arm(START), address()) as server:
+        with pytest.raises(OSError, match="in use"):
+            RtdeServer(Arm(START), server.host).start()
+        second = RtdeServer(Arm(START), address())
+        with second:
+            assert second.host != server.host
+    server.stop()
