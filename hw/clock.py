@@ -43,6 +43,14 @@ class Clock:
         """Wall seconds that so many bench seconds take."""
         return seconds / self.speed
 
+    def patience(self, seconds: float) -> float:
+        """A limit on silence in bench seconds, at least as long on the wall as in real time.
+
+        A busy machine holds a process up for as long on the wall however fast the bench runs: on an
+        emulated bench at ten times real time 100 ms would be 10 ms, and every hiccup a fault.
+        """
+        return seconds * max(self.speed, 1.0)
+
     def sleep(self, seconds: float) -> None:
         """Sleep for bench seconds; not at all for zero or less."""
         if seconds > 0:

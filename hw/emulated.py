@@ -32,8 +32,6 @@ def setup_of(bench: Bench) -> Setup:
         scene=bench.scene,
         probe=bench.probe,
         clock=bench.clock,
-        # What a busy machine does to this process takes as long on the wall at any speed.
-        caller_s=0.15 * max(bench.clock.speed, 1.0),
         limits={
             "box_min_mm": [x - 120.0, y - 120.0, z - 15.0],
             "box_max_mm": [x + 120.0, y + 120.0, z + 140.0],

@@ -13,7 +13,7 @@ import threading
 import time
 from collections import deque
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -53,17 +53,6 @@ class Watch:
     grace_s: float = 3.0
     clear_s: float = 0.3
 
-    def at_speed(self, speed: float) -> Watch:
-        """For an emulated bench that runs faster than real time.
-
-        A busy machine holds a process up for as long on the wall, however fast the bench runs:
-        silences are waited for at least as long on the wall as in real time.
-        """
-        factor = max(speed, 1.0)
-        ages = {name: factor * getattr(self, name)
-                for name in ("echo_age_s", "image_age_s", "pose_age_s", "grace_s")}  # fmt: skip
-        return replace(self, **ages)
-
 
 class Session:
     """Poses, active echo and images of one acquisition; a context manager.
@@ -87,7 +76,7 @@ class Session:
         every_frame: bool = False,
     ) -> None:
         self.setup, self.clock = setup, setup.clock
-        self.watch = (Watch() if watch is None else watch).at_speed(self.clock.speed)
+        self.watch = Watch() if watch is None else watch
         self._recorder, self._every_frame = recorder, every_frame
         self._changed = threading.Condition()
         self._echo_frames: deque[EchoFrame] = deque(maxlen=_KEPT_FRAMES)
@@ -104,7 +93,7 @@ class Session:
         try:
             self.poses = PoseStream(
                 setup.robot_host, clock=self.clock, frequency_hz=setup.frequency_hz,
-                max_age_s=self.watch.pose_age_s,
+                max_age_s=self.clock.patience(self.watch.pose_age_s),
             )  # fmt: skip
             self.poses.start()
             opened.append(self.poses)
@@ -171,7 +160,7 @@ class Session:
         Raises:
             DeviceError: it lasts longer than ``watch.grace_s``, or the device is gone.
         """
-        deadline = self.clock.now() + self.watch.grace_s
+        deadline = self.clock.now() + self.clock.patience(self.watch.grace_s)
         clear_since: float | None = None
         while True:
             error, now = self._trouble(), self.clock.now()
@@ -198,13 +187,15 @@ class Session:
                         f"{count} frames {what} within {watch.burst_s:g} s: look at its cable",
                         device="active echo",
                     )
-            if now - self._echo_seen > watch.echo_age_s:
+            if now - self._echo_seen > self.clock.patience(watch.echo_age_s):
                 return StaleError(
                     f"no frame for {now - self._echo_seen:.2f} s: is the ultrasound machine "
                     "frozen, or its frame trigger unplugged?",
                     device="active echo",
                 )
-            if self.images is not None and now - self._image_seen > watch.image_age_s:
+            if self.images is not None and now - self._image_seen > self.clock.patience(
+                watch.image_age_s
+            ):
                 return StaleError(
                     f"no image for {now - self._image_seen:.1f} s: is the machine frozen?",
                     device="ultrasound",
@@ -224,7 +215,7 @@ class Session:
             DeviceError: trouble while waiting.
         """
         period = 1 / 30
-        deadline = self.clock.now() + 2 * frames * period + self.watch.grace_s
+        deadline = self.clock.now() + 2 * frames * period + self.clock.patience(self.watch.grace_s)
         with self._changed:
             while True:
                 found = [f for f in self._echo_frames if f.t_host - period > since]

@@ -232,7 +232,7 @@ class Mover:
         if not self._command("isPoseWithinSafetyLimits", raw):
             text = "the controller says that the pose is outside its safety limits"
             raise RefusedError(text, device="robot")
-        self._command("setWatchdog", WATCHDOG_HZ)
+        self._command("setWatchdog", WATCHDOG_HZ / self._clock.patience(1.0))
         # What was asked took time: look again, at the newest pose.
         self._read(0.0)
         command = self._allow(pose, speed_mm_s)
@@ -305,7 +305,7 @@ class Mover:
             return None
         limits, now = self._plan.limits, self._clock.now()
         age = sample.age_s(now)
-        if age > limits.max_pose_age_s:
+        if age > self._clock.patience(limits.max_pose_age_s):
             text = f"no fresh pose for {age * 1000:.0f} ms: the motion was stopped"
             return StaleError(text, device="robot"), False
         force = math.hypot(*packet.tcp_force[:3])
@@ -317,7 +317,7 @@ class Mover:
         if out > _BOX_MARGIN_MM:
             text = f"the probe's tip is {out:.1f} mm out of the box"
             return StoppedError(text, device="robot"), True
-        if now - self._heard > self._caller_s:
+        if now - self._heard > self._clock.patience(self._caller_s):
             text = f"the caller was silent for {now - self._heard:.2f} s"
             return StoppedError(text, device="robot"), False
         return None

@@ -233,7 +233,7 @@ class Gate:
     def check_geometry(self, target: object, sample: PoseSample, speed_mm_s: object) -> Command:
         """As :meth:`check_move` but for the confirmation: all that a dry run can check."""
         limits = self.plan.limits
-        check_sample(sample, limits, self.clock.now())
+        check_sample(sample, limits, self.clock)
         goal = _pose(target, "the target")
         start = _pose(sample.pose, "the robot's pose")
         near = [k for k, pose in enumerate(self.plan.targets) if _within(pose, goal, limits)]
@@ -281,16 +281,16 @@ def check_plan(plan: MotionPlan) -> None:
         previous = pose
 
 
-def check_sample(sample: PoseSample, limits: Limits, now: float) -> None:
+def check_sample(sample: PoseSample, limits: Limits, clock: Clock) -> None:
     """Whether a pose is new, and the robot fit to move.
 
     Raises:
         RefusedError: too old, from the future, or a robot in another mode than running.
     """
-    age = sample.age_s(now)
-    if not age <= limits.max_pose_age_s:
+    age, oldest = sample.age_s(clock.now()), clock.patience(limits.max_pose_age_s)
+    if not age <= oldest:
         raise _refuse(f"the newest pose is {age * 1000:.0f} ms old")
-    if age < -limits.max_pose_age_s:
+    if age < -oldest:
         raise _refuse("the newest pose is of another clock: it lies in the future")
     problem = safety_text(sample.safety_bits)
     if problem:
