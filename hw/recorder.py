@@ -28,6 +28,7 @@ import numpy as np
 from hw.recording_check import check_resumable
 from hw.recording_file import utc_now
 from hw.recording_layout import Header
+from hw.robot.pose import ur_to_pose
 from jaxcal.errors import CalibrationError, FormatError, OutputError
 
 if TYPE_CHECKING:
@@ -123,11 +124,12 @@ class Recorder:
         """Append tracked poses."""
         if not samples:
             return
+        raw = _column(samples, "raw")
         self._stream("tracker", {
             "t_host": _column(samples, "t_host"),
             "t_device": _column(samples, "t_device"),
-            "pose": _column(samples, "pose"),
-            "raw_pose": _column(samples, "raw"),
+            "pose": ur_to_pose(raw),
+            "raw_pose": raw,
             "safety_bits": _column(samples, "safety_bits", int),
             "status": _column(samples, "robot_mode", int),
             "runtime_state": _column(samples, "runtime_state", int),

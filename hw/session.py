@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.active_echo.device import ActiveEcho, EchoFrame
-from hw.errors import StaleError
+from hw.errors import DeviceError, StaleError
 from hw.recorder import Recorder
 from hw.robot.stream import PoseStream
 from hw.setup import Setup
@@ -155,11 +155,13 @@ class Session:
             raise error
 
     def wait_until_clear(self) -> None:
-        """Wait for the end of a hesitation.
+        """Wait for the end of a hesitation; returns at once where there is none.
 
         Raises:
             DeviceError: it lasts longer than ``watch.grace_s``, or the device is gone.
         """
+        if self._trouble() is None:
+            return
         deadline = self.clock.now() + self.clock.patience(self.watch.grace_s)
         clear_since: float | None = None
         while True:
@@ -200,6 +202,10 @@ class Session:
                     f"no image for {now - self._image_seen:.1f} s: is the machine frozen?",
                     device="ultrasound",
                 )
+        try:
+            self.poses.latest()
+        except DeviceError as error:
+            return error
         return None
 
     # Data

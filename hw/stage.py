@@ -107,7 +107,7 @@ class ProbeStage:
             self._session.wait_until_clear()
             try:
                 sample = self._motion.move_to(pose, speed_mm_s)
-            except (StoppedError, StaleError) as error:
+            except (StoppedError, StaleError, RefusedError) as error:
                 if not self._hesitated(error) or hesitation == _MOST_HESITATIONS:
                     raise
                 self._note("hesitation", str(error))
@@ -118,7 +118,7 @@ class ProbeStage:
 
     def _hesitated(self, error: DeviceError) -> bool:
         """Whether a stop was ours, because of a device that may come back by itself."""
-        if isinstance(error, StaleError):
+        if isinstance(error, StaleError) or "ms old" in str(error):
             return True
         return self._session.last_trouble is not None and self._session.last_trouble in str(error)
 
