@@ -15,16 +15,19 @@ def spawn(module: str, *arguments: str, stdin: bool = False) -> subprocess.Popen
     deadlock. It leads its own process group, so that Ctrl-C reaches only the parent, which then
     stops it in order.
     """
-    environment = dict(os.environ)
-    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
     return subprocess.Popen(
         [sys.executable, "-m", module, *arguments],
         stdin=subprocess.PIPE if stdin else subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env=environment,
+        env=import_path(),
         start_new_session=True,
     )
+
+
+def import_path() -> dict[str, str]:
+    """The environment with which another interpreter imports what this one does."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
 
 def be_prompt() -> None:

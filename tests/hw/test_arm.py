@@ -13,7 +13,7 @@ from hw.bench.arm import Arm
 START = (0.4, 0.0, 0.3, 0.0, 3.0, 0.0)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     target=st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6),
     speed=st.floats(0.001, 0.5),
@@ -22,7 +22,7 @@ START = (0.4, 0.0, 0.3, 0.0, 3.0, 0.0)
 def test_a_linear_move_keeps_its_speed_acceleration_and_line(target, speed, acceleration):
     arm = Arm(START)
     arrival = arm.move_linear(2.0, target, speed, acceleration)
-    times = np.linspace(2.0, arrival, 400)
+    times = np.linspace(2.0, arrival, 200)
     raw = np.array([arm.raw(t) for t in times])
     np.testing.assert_allclose(raw[0, :3], START[:3])
     np.testing.assert_allclose(raw[-1, :3], target[:3], atol=1e-12)
@@ -79,13 +79,13 @@ def test_repeatability_is_redrawn_with_travel_and_is_seeded():
     def errors(travel: float) -> np.ndarray:
         arm = Arm(START, repeatability_mm=0.1, seed=3)
         t, found = 0.0, []
-        for k in range(400):
+        for k in range(300):
             t = arm.move_linear(t, (0.4 + travel * (k % 2), *START[1:]), 0.5, 5.0) + 1.0
             found.append(np.subtract(arm.true_raw(t)[:3], arm.raw(t)[:3]) * 1000)
         return np.array(found)
 
     far, near = errors(0.2), errors(0.0001)
-    assert far.std() == pytest.approx(0.1, rel=0.1)
+    assert far.std() == pytest.approx(0.1, rel=0.15)
     assert np.abs(np.diff(near, axis=0)).std() < 0.02
     np.testing.assert_array_equal(far, errors(0.2))
     assert Arm(START).true_raw(0.0) == Arm(START).raw(0.0)

@@ -19,6 +19,7 @@ import pytest
 from robots import START, EmulatedRobot
 
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
+from hw.robot._process import import_path
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.pose import ur_to_pose
@@ -264,10 +265,9 @@ def test_killing_the_caller_stops_the_robot():
         values = [
             robot.host, robot.clock.origin_s, PLAN.targets.tolist(), asdict(LIMITS), OFFSET, SERIAL
         ]  # fmt: skip
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         caller = subprocess.Popen(
             [sys.executable, "-c", _CALLER, json.dumps(values)],
-            stdout=subprocess.PIPE, env=environment,
+            stdout=subprocess.PIPE, env=import_path(),
         )  # fmt: skip
         with caller:
             assert caller.stdout is not None

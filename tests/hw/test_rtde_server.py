@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 
 import pytest
-from robots import START, EmulatedRobot, address
+from robots import CB_SERIES, E_SERIES, START, EmulatedRobot, address
 
 from hw.bench.arm import Arm
 from hw.bench.controller import DONE, READY, Controller
@@ -17,9 +17,6 @@ from hw.bench.rtde_fields import output_type
 
 rtde_receive = pytest.importorskip("rtde_receive", reason="no wheel of ur_rtde here")
 rtde_control = pytest.importorskip("rtde_control", reason="no wheel of ur_rtde here")
-
-CB = (3, 15, 8, 106339)
-E_SERIES = (5, 11, 0, 108249)
 
 
 def until(condition: Callable[[], object], seconds: float = 10.0) -> None:
@@ -33,7 +30,7 @@ def beside(mm: float) -> list[float]:
     return [START[0] + mm / 1000.0, *START[1:]]
 
 
-@pytest.mark.parametrize("version", [E_SERIES, CB])
+@pytest.mark.parametrize("version", [E_SERIES, CB_SERIES])
 def test_ur_rtde_receives_and_controls(version):
     with EmulatedRobot(version=version, speed=2.0) as robot:
         receive = rtde_receive.RTDEReceiveInterface(robot.host)
