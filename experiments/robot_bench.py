@@ -1,4 +1,4 @@
-"""The robot's side of the bench: how soon it rests after a fault, what is lost, how fast it may run.
+"""The robot of the bench: how soon it rests after a fault, what is lost, how fast it may run.
 
 Everything goes through real sockets to an emulated controller in a process of its own; motions go
 through ur_rtde. Three tables:
@@ -206,12 +206,12 @@ def speeds(moves: int) -> list[list[object]]:
 
 def main() -> None:
     """Make the tables and the figure."""
-    quick = arguments(__doc__.splitlines()[0]).quick
+    quick = arguments("faults, rates and speeds of the emulated robot").quick
     folder = results_folder(quick)
     privileged = real_time()
     end = "" if privileged else "_unprivileged"
     print(f"{machine()}; real-time scheduling: {privileged}; seed {SEED}")
-    fault_rows = faults(2 if quick else 10)
+    fault_rows = faults(2 if quick else 8)
     write_table(
         folder / f"robot_faults{end}.csv",
         ["fault", "repeats", "rest_median_ms", "rest_max_ms", "told_median_ms", "told_max_ms",
@@ -224,7 +224,7 @@ def main() -> None:
          "largest_lag_ms"],
         rates(3.0 if quick else 60.0),
     )  # fmt: skip
-    speed_rows = speeds(12 if quick else 80)
+    speed_rows = speeds(12 if quick else 60)
     write_table(
         folder / f"robot_speeds{end}.csv",
         ["speed", "moves", "done", "stale", "stopped", "lost", "restarts", "wall_s", "bench_s",

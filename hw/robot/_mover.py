@@ -192,7 +192,7 @@ class Mover:
             return
         if self._offset is not None and offset_changed(self._offset, offset):
             error = RefusedError("the controller's TCP offset was changed", device="robot")
-            raise _Ended(error)
+            self._halt(error, True)
         self._offset = offset
 
     def _take(self, request: dict) -> bool:

@@ -87,7 +87,7 @@ def test_a_mute_controller_makes_poses_stale_and_then_lost():
             with pytest.raises((StaleError, LostError)):
                 poses.steady(0.1)
             time.sleep(1.0)
-            with pytest.raises(LostError, match="silent for 0.6 s"):
+            with pytest.raises(LostError, match=r"silent for 0\.6 s"):
                 poses.latest()
             assert poses.drain()[-1].raw == pytest.approx(START)
         start = time.monotonic()
