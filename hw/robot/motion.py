@@ -12,6 +12,7 @@ import contextlib
 import json
 import queue
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -78,6 +79,7 @@ class Motion:
         self._one_at_a_time = threading.Lock()
         self._ended: DeviceError | None = None
         self._heard = 0.0
+        self._in_motion = False
 
     def start(self) -> Motion:
         """Connect; takes a second or two.
@@ -87,6 +89,8 @@ class Motion:
                 its limits, or another TCP offset.
             LostError: the controller does not answer.
         """
+        if sys.platform == "win32":
+            raise RefusedError("the robot can be moved from Linux only", device="robot")
         check_plan(self.plan)
         given = self._confirmation
         if not self.dry_run:
@@ -171,13 +175,23 @@ class Motion:
             self._send(
                 {"request": "move", "pose": np.asarray(pose).tolist(), "speed_mm_s": speed_mm_s}
             )
+            self._in_motion = True
             try:
                 return self._wait()
-            except DeviceError:
-                raise
-            except BaseException:
-                self._send({"request": "stop", "reason": "interrupted"})
-                raise
+            finally:
+                if self._in_motion:
+                    self._stop_and_wait()
+
+    def _stop_and_wait(self) -> None:
+        """After an interrupt, or a guard that failed: the robot must rest before that goes on."""
+        self._send({"request": "stop", "reason": "interrupted"})
+        deadline = time.monotonic() + 0.5 + self.clock.wall(0.5)
+        with contextlib.suppress(queue.Empty):
+            while self._answers.get(timeout=max(0.0, deadline - time.monotonic()))["what"] not in (
+                "arrived", "error",
+            ):  # fmt: skip
+                pass
+        self._in_motion = False
 
     def _wait(self) -> PoseSample:
         tick = max(0.001, self.clock.wall(_TICK_S))
@@ -189,9 +203,11 @@ class Motion:
                 answer = {}
             match answer.get("what"):
                 case "arrived":
+                    self._in_motion = False
                     t_host, t_device, raw, *rest = answer["sample"]
                     return PoseSample(t_host, t_device, tuple(raw), *rest)
                 case "error":
+                    self._in_motion = False
                     error = _error(answer)
                     assert error is not None
                     if answer["ended"]:
@@ -207,6 +223,7 @@ class Motion:
             silent = time.monotonic() - self._heard
             if silent > 0.5 + self.clock.wall(0.5):
                 error = stopping or LostError("the motion process hangs", device="robot")
+                self._in_motion = False
                 self._kill(error)
                 raise type(error)(
                     f"{error.args[0]}; the controller does not answer, its own watchdog stops the "
@@ -266,22 +283,26 @@ class Motion:
     def _receive(self) -> None:
         assert self._process is not None
         assert self._process.stdout is not None
-        with self._process.stdout as lines:
-            for line in lines:
-                self._heard = time.monotonic()
-                message = json.loads(line)
-                match message["what"]:
-                    case "log":
-                        self._log(message["t"], message["command"], message["numbers"])
-                    case "stopping":
-                        self._log(self.clock.now(), "stop", {"why": message["text"]})
-                        self._answers.put(message)
-                    case "alive" | "closed":
-                        pass
-                    case _:
-                        self._answers.put(message)
-        text = "the motion process ended; the robot's own watchdog stops it"
-        self._answers.put({"what": "error", "kind": "LostError", "text": text, "ended": True})
+        try:
+            with self._process.stdout as lines:
+                for line in lines:
+                    self._heard = time.monotonic()
+                    self._hear(json.loads(line))
+        finally:
+            text = "the motion process ended; the robot's own watchdog stops it"
+            self._answers.put({"what": "error", "kind": "LostError", "text": text, "ended": True})
+
+    def _hear(self, message: dict) -> None:
+        match message["what"]:
+            case "log":
+                self._log(message["t"], message["command"], message["numbers"])
+            case "stopping":
+                self._log(self.clock.now(), "stop", {"why": message["text"]})
+                self._answers.put(message)
+            case "alive" | "closed":
+                pass
+            case _:
+                self._answers.put(message)
 
 
 def _error(answer: dict) -> DeviceError | None:

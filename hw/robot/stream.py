@@ -126,6 +126,7 @@ class PoseStream:
         self._client, self._frequency, self._timeout = client, frequency_hz, timeout_s
         self._samples: deque[PoseSample] = deque(maxlen=queue)
         self._latest: PoseSample | None = None
+        self._listeners: list[list[PoseSample]] = []
         self._error: str | None = None
         self._changed: str | None = None
         self._lag = Lag()
@@ -209,17 +210,17 @@ class PoseStream:
             StaleError: too few poses came.
         """
         start = self.clock.now()
-        seen: list[PoseSample] = []
+        come: list[PoseSample] = []
         give_up = time.monotonic() + self.clock.wall(seconds) + 1.0 + self.max_age_s
         with self._condition:
-            while not seen or seen[-1].t_host < start + seconds:
+            self._listeners.append(come)
+            while not come or come[-1].t_host < start + seconds:
                 if self._error or not self._condition.wait(give_up - time.monotonic()):
                     break
-                new = self._latest
-                if new is not None and new.t_host >= start and (not seen or new is not seen[-1]):
-                    seen.append(new)
+            self._listeners = [other for other in self._listeners if other is not come]
             error = self._error
         self._check(error)
+        seen = [sample for sample in come if sample.t_host >= start]
         if not seen or seen[-1].t_host < start + seconds:
             raise StaleError(f"no pose for {seconds:g} s while averaging", device="robot")
         return average(seen)
@@ -280,6 +281,8 @@ class PoseStream:
                 room = (self._samples.maxlen or 0) - len(self._samples)
                 self.dropped += max(0, len(new) - room)
                 self._samples.extend(new)
+                for listener in self._listeners:
+                    listener.extend(new)
                 self.received += len(new)
                 self._latest = new[-1]
                 self._condition.notify_all()

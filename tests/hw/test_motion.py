@@ -13,11 +13,13 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
 from robots import START, EmulatedRobot
 
+import hw
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 from hw.robot._process import import_path
 from hw.robot.limits import Limits
@@ -106,6 +108,67 @@ def test_the_robot_moves_searches_and_is_left_in_order():
     assert names[-4:] == ["stopL", "kickWatchdog", "stopScript", "disconnect"]
     times = [entry[0] for entry in log]
     assert times == sorted(times)
+
+
+def test_whatever_is_asked_for_only_allowed_motions_are_sent():
+    rng = np.random.default_rng(5)
+    home = PLAN.targets[0]
+    asked = []
+    for _ in range(60):
+        kind = rng.integers(6)
+        pose = beside(*rng.uniform(-6.0, 6.0, 3)) if kind else home + 0.0
+        if kind == 1:
+            pose[rng.integers(4), rng.integers(4)] = rng.choice([math.nan, math.inf, 0.0, 1e9])
+        elif kind == 2:
+            pose = beside(*rng.uniform(-200.0, 200.0, 3))
+        elif kind == 3:
+            pose = pose[:, [1, 0, 2, 3]]
+        asked.append((pose, rng.choice([0.0, -1.0, 5.0, 10.0, 11.0, 1000.0, math.nan])))
+    asked += [(beside(0.0, 2.0, 1.0), 10.0), (home, 5.0), (home, None)]
+    plan = MotionPlan(home[None], LIMITS, OFFSET, SERIAL)
+    arrived = []
+    with EmulatedRobot(speed=3.0) as robot:
+        with moving(robot, plan=plan, caller_s=2.0) as motion:
+            for pose, speed in asked:
+                with suppress(RefusedError):
+                    arrived.append(motion.move_to(pose, speed).pose)
+        moves = sent(robot, 3)
+    assert 3 <= len(arrived) == len(moves) < len(asked)
+    for values, pose in zip(moves, arrived, strict=True):
+        target = ur_to_pose(np.array(values[:6]))
+        np.testing.assert_allclose(target, pose, atol=1e-6)
+        assert np.linalg.norm(target[:3, 3] - home[:3, 3]) <= LIMITS.search_mm + 1e-6
+        assert 0.0 < values[6] <= LIMITS.search_speed_mm_s / 1000.0 + 1e-12
+        assert values[7] <= LIMITS.max_acceleration_mm_s2 / 1000.0
+
+
+def test_nothing_but_the_mover_commands_a_robot():
+    package = Path(hw.__file__).parent
+    for path in package.rglob("*.py"):
+        text = path.read_text()
+        if path.name != "_mover.py":
+            assert "RTDEControlInterface" not in text, path
+        for forbidden in ("moveJ(", "speedL(", "servoL(", "setTcp", "unlockProtective"):
+            assert forbidden not in text, path
+        if "bench" not in path.parts:
+            assert "unlock protective" not in text, path
+    assert (package / "robot" / "_mover.py").read_text().count('"moveL"') == 1
+
+
+def test_a_guard_that_fails_stops_the_robot():
+    def guard() -> str | None:
+        if robot.state()["velocity"][0] > 0.04:
+            raise ZeroDivisionError
+        return None
+
+    with EmulatedRobot() as robot, moving(robot, guard=guard, caller_s=2.0) as motion:
+        with pytest.raises(ZeroDivisionError):
+            motion.move_to(PLAN.targets[2])
+        state = robot.state()
+        assert state["rest_since"] is not None
+        assert state["raw"][0] < START[0] + 0.049
+        motion.guard = None
+        assert motion.move_to(HOME).pose[0, 3] == pytest.approx(400.0)
 
 
 def test_a_dry_run_sends_nothing():
