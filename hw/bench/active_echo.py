@@ -73,10 +73,14 @@ class AuspisEmulator:
         lines: that the probe fires a frame; ``echo`` must return as many.
         clock_hz: of the device's counter.
         link: ``pty``, or ``tcp`` for ``socket://``.
+        first_frame: frame counter at power-up.
         seed: of the faults that come by chance.
 
     Attributes:
         path: what to open, a path or ``socket://host:port``.
+        injection: what the element answers with; replaced as a whole.
+        sent: frames put on the line.
+        refused: frames that the line had no room for.
     """
 
     def __init__(
@@ -88,6 +92,7 @@ class AuspisEmulator:
         lines: int = 128,
         clock_hz: float = 100e6,
         link: Literal["pty", "tcp"] = "pty",
+        first_frame: int = 0,
         seed: int = 0,
     ) -> None:
         self._echo, self._clock, self._lines = echo, clock, lines
@@ -104,7 +109,8 @@ class AuspisEmulator:
         self._faults = _Faults()
         self._threshold = 0
         self._streaming = False
-        self._frames = self._line_triggers = 0
+        self._first_frame = first_frame
+        self._frames, self._line_triggers = first_frame, 0
         self._unplug = False
         self._plugged = True
         self._thread = self._new_thread()
@@ -162,6 +168,10 @@ class AuspisEmulator:
         """Say nothing at all, port open."""
         self._faults = replace(self._faults, mute=on)
 
+    def restart_counter(self) -> None:
+        """Count frame triggers from zero again."""
+        self._frames = 0
+
     def unplug(self) -> None:
         """Vanish, in the middle of whatever it is."""
         self._unplug = True
@@ -177,7 +187,7 @@ class AuspisEmulator:
             self._link = TcpLink(host, int(port))
         self._faults, self.injection = _Faults(), Injection()
         self._threshold, self._streaming = 0, False
-        self._frames = self._line_triggers = 0
+        self._frames, self._line_triggers = self._first_frame, 0
         self._inbox.clear()
         self._unplug, self._plugged = False, True
         self._thread = self._new_thread()

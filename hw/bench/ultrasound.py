@@ -103,7 +103,7 @@ class ImageServer:
         self._image: Message | None = None
         self.host, self.port = host, int(self._listener.getsockname()[1])
         self.sent = self.refused = 0
-        self.messages: dict[str, int] = {}
+        self._numbers: dict[tuple[str, str], int] = {}
 
     def start(self) -> ImageServer:
         """Begin to listen and to send."""
@@ -196,8 +196,8 @@ class ImageServer:
         self._broadcast(batch)
 
     def _message(self, kind: str, device: str, t: float, content: Content) -> Message:
-        number = self.messages.get(device, 0) + 1
-        self.messages[device] = number
+        number = self._numbers.get((kind, device), 0) + 1
+        self._numbers[kind, device] = number
         return Message(kind, device, self._device_clock(t), content, message_id=number)
 
     def _spoil(self, data: bytes) -> bytes:
