@@ -212,6 +212,10 @@ class Decoder:
         self._skipping = self._damaged = False
         self.mode = mode
 
+    def forget_counts(self) -> None:
+        """Count from zero."""
+        self.frames = self.replies = self.crc_errors = self.malformed = self.resynchronised = 0
+
     def feed(self, data: bytes) -> list[EchoPacket | Reply]:
         """What ``data`` completes, in order."""
         self._buffer += data
@@ -276,6 +280,9 @@ class Decoder:
             text, checked = decode_line(bytes(self._buffer[start:feed]))
             self._scanned = feed + 1
             if not checked:
+                if checked is False:
+                    self.crc_errors += 1
+                    self._damaged = True
                 return None, True
             del self._buffer[: feed + 1]
             self._scanned = 0

@@ -140,6 +140,7 @@ class ActiveEcho:
         self._tick_s = 1.0 / self.clock_hz()
         with self._changed:
             self._frames.clear()
+            self._decoder.forget_counts()
             self._received = self._lost = self._dropped = self._short = self._restarts = 0
             self._last_frame = None
 
@@ -316,9 +317,12 @@ class ActiveEcho:
         (reading an error takes it from the device's list) must come with ``attempts=1``.
         """
         with self._asking:
-            for _ in range(attempts):
+            for attempt in range(attempts):
                 with self._changed:
                     self._replies.clear()
+                    if attempt:
+                        # The reply that was missed may have been the one that changes the mode.
+                        self._decoder.reset(Mode.UNKNOWN)
                 self._transport.write(encode_line(f"{word} {argument}" if argument else word))
                 answer = self._await_reply(word, expected)
                 if answer is not None:

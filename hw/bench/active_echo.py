@@ -215,7 +215,7 @@ class AuspisEmulator:
                 continue
             # The ultrasound machine triggers on, whether frames are sent or not. A bench that is
             # too slow for its own clock slips rather than pretend that triggers were missed.
-            if self._clock.wall(now - due) > _LARGEST_SLIP_S:
+            if now - due > _LARGEST_SLIP_S:
                 due = now
             self._trigger(due)
             due += self._period_s

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hw.active_echo import ActiveEcho, EchoFrame
-from hw.active_echo.codec import EchoPacket, decode_line, encode_echo, encode_line
+from hw.active_echo import ActiveEcho, EchoFrame, EchoStatistics
+from hw.active_echo.codec import EchoPacket, decode_line, encode_echo, encode_line, encode_reply
 from hw.active_echo.transport import open_transport
 from hw.bench.active_echo import AuspisEmulator
 from hw.clock import Clock
@@ -277,6 +277,7 @@ def test_left_streaming(emulator: AuspisEmulator) -> None:
     until(lambda: emulator.sent > sent + 5 or emulator.path.startswith("socket"))
     with opened(emulator) as device:
         assert device.threshold() == 9
+        assert device.statistics() == EchoStatistics()
         device.stream(True)
         frames_of(device, 3)
         assert device.statistics().lost == 0
@@ -359,6 +360,21 @@ def test_queries_are_repeated_when_the_answer_is_spoilt() -> None:
     with scripted(answer) as path, ActiveEcho(path, clock=Clock(speed=10.0)) as device:
         assert device.threshold() == 12
         assert device.statistics().crc_errors == 2
+
+
+def test_a_spoilt_change_of_mode() -> None:
+    """The device is silent again, and its frame that said so was damaged."""
+
+    def answer(text: str, count: int) -> bytes:
+        if text == "STRM OFF" and count == 2:
+            return encode_reply(text).replace(b"OFF", b"OFG")
+        return usual(text)
+
+    with scripted(answer) as path, ActiveEcho(path, clock=Clock(speed=10.0)) as device:
+        device.stream(True)
+        device.stream(False)
+        assert device.identify() == ""
+        assert device.statistics().crc_errors == 1
 
 
 def test_what_changes_something_is_asked_once() -> None:
