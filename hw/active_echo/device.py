@@ -287,7 +287,7 @@ class ActiveEcho:
             return
         self._stopping = True
         if self._failure is None:
-            with contextlib.suppress(LostError):
+            with contextlib.suppress(LostError, StaleError):
                 self._transport.write(encode_line("PATT:STAT OFF") + encode_line("STRM OFF"))
         self._reader.join()
         self._transport.close()

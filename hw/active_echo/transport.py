@@ -11,7 +11,7 @@ import contextlib
 import threading
 from typing import Any
 
-from hw.errors import Device, DeviceError, LostError
+from hw.errors import Device, DeviceError, LostError, StaleError
 from hw.extras import require
 
 BAUD = 921_600
@@ -46,8 +46,8 @@ class Transport:
                 return self._read_socket()
             return self._port.read(max(1, self._port.in_waiting))
         # pyserial has TypeError and AttributeError for a port that another thread has closed.
-        except (OSError, TypeError, AttributeError, ValueError):
-            raise self._lost() from None
+        except (OSError, TypeError, AttributeError, ValueError) as error:
+            raise self._lost() from error
 
     def _read_socket(self) -> bytes:
         # Over socket:// pyserial knows only that there is something, and waits for all it was
@@ -63,13 +63,19 @@ class Transport:
         """Send all of ``data``.
 
         Raises:
-            LostError: as :meth:`read`; or the device takes nothing for a second.
+            LostError: as :meth:`read`.
+            StaleError: the other end takes nothing for a second.
         """
+        stuck = require("serial", extra="serial").SerialTimeoutException
         try:
             with self._writing:
                 self._port.write(data)
-        except (OSError, TypeError, AttributeError, ValueError):
-            raise self._lost() from None
+        except stuck as error:
+            raise StaleError(
+                f"{self.url} takes no commands: is it switched on?", device=DEVICE
+            ) from error
+        except (OSError, TypeError, AttributeError, ValueError) as error:
+            raise self._lost() from error
 
     def _lost(self) -> LostError:
         what = "is closed" if self._closed else "is gone: was it unplugged?"

@@ -428,7 +428,7 @@ def test_a_device_that_does_something_else() -> None:
 
 
 def test_another_device_on_the_port() -> None:
-    """Something that talks all the time, and not our protocol."""
+    """Something that talks as fast as the line goes, and not our protocol."""
     master, slave = os.openpty()
     tty.setraw(slave)
     stop = threading.Event()
@@ -436,7 +436,7 @@ def test_another_device_on_the_port() -> None:
 
     def talk() -> None:
         os.set_blocking(master, False)
-        while not stop.wait(0.001):
+        while not stop.wait(0.01):
             with contextlib.suppress(BlockingIOError):
                 os.write(master, noise)
 
@@ -448,6 +448,20 @@ def test_another_device_on_the_port() -> None:
     finally:
         stop.set()
         thread.join()
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_device_that_takes_nothing() -> None:
+    """Its line is full: commands fail in time, and so does closing."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    transport = open_transport(os.ttyname(slave))
+    try:
+        with pytest.raises(StaleError, match="takes no commands"):
+            transport.write(bytes(1_000_000))
+    finally:
+        transport.close()
         os.close(master)
         os.close(slave)
 
