@@ -31,3 +31,11 @@ class Scene:
     def elevational(self) -> Float[np.ndarray, 3]:
         """Unit vector of the image's elevational axis in the tool centre point's frame."""
         return self.image_to_probe[:3, 1]
+
+    def expected(self, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, 3]:
+        """Where the target should be in the image of a probe at ``pose``, as far as is known, mm.
+
+        The elevational one, with its sign turned, is the probe's place along a free-hand sweep.
+        """
+        in_tool = (self.point_mm - pose[:3, 3]) @ pose[:3, :3]
+        return (in_tool - self.tip_mm) @ self.image_to_probe[:3, :3]

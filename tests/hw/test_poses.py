@@ -28,6 +28,7 @@ def test_every_pose_has_the_nominal_target_where_it_says(count, cone, turn, seed
     target = (to_image @ np.append(SCENE.point_mm, 1.0))[:, :3]
     np.testing.assert_allclose(target[:, [0, 2]], plan.expected, atol=1e-8)
     np.testing.assert_allclose(target[:, 1], 0.0, atol=1e-8)
+    np.testing.assert_allclose(SCENE.expected(plan.poses[0]), target[0], atol=1e-8)
     assert (np.abs(plan.expected[:, 0]) <= extent.lateral_mm).all()
     assert (plan.expected[:, 1] >= extent.depth_mm[0]).all()
     assert (plan.expected[:, 1] <= extent.depth_mm[1]).all()
