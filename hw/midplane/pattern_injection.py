@@ -12,6 +12,7 @@ The operator is a callable: a person before a live view (:mod:`hw.midplane.live_
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
@@ -19,6 +20,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
+from hw.errors import DeviceError
 from hw.midplane.bracket import Placement
 from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
 from jaxcal.errors import InputError
@@ -250,6 +252,11 @@ def pattern_injection(
         raise PlacementError(f"not accepted after {_MOST_LOOKS} looks")
 
     try:
-        return guarded(Walker(bench, settings, watch), run)
-    finally:
-        injector.inject(False)
+        placement = guarded(Walker(bench, settings, watch), run)
+    except BaseException:
+        # What went wrong first is what a person must read.
+        with contextlib.suppress(DeviceError):
+            injector.inject(False)
+        raise
+    injector.inject(False)
+    return placement

@@ -11,6 +11,7 @@ there either the placement is given up.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -248,7 +249,9 @@ class Walker:
         self.set_threshold(self.settings.low_threshold)
         if self.good is not None and self._at is not None and self._at != self.good:
             self.moves, self.travel_mm = 0, 0.0
-            self.go(self.good)
+            # It was there before; only a reach that the approach from below would leave can object.
+            with contextlib.suppress(PlacementError):
+                self.go(self.good)
 
     def placement(
         self, procedure: str, offset: float, edges: tuple[float, float], sd_mm: float,

@@ -10,6 +10,7 @@ import pytest
 
 from hw.bench.stage import WorldStage
 from hw.bench.world import make_world
+from hw.errors import LostError
 from hw.midplane.amplitude_scan import amplitude_scan, fit_peak, free_hand
 from hw.midplane.bracket import Bracket, widened
 from hw.midplane.pattern_injection import (
@@ -230,6 +231,37 @@ def test_operator_must_look_at_both_sides():
         pattern_injection(stage, stage, hasty)
     assert "both sides" in looks[1].message
     assert stage.pattern is None
+
+
+class Unplugged(WorldStage):
+    """The port is gone after some reads; nothing may move after that."""
+
+    reads = 0
+    moves_after = 0
+
+    def read(self, frames):
+        self.reads += 1
+        if self.reads > 8:
+            raise LostError("the port is gone", device="active echo")
+        return super().read(frames)
+
+    def move(self, offset_mm):
+        self.moves_after += self.reads > 8
+        return super().move(offset_mm)
+
+    def inject(self, on, delay_ticks=0):
+        if self.reads > 8:
+            raise LostError("the port is still gone", device="active echo")
+        super().inject(on, delay_ticks)
+
+
+@each
+def test_a_devices_own_error_passes_through_and_nothing_moves_any_more(name):
+    world = make_world(0)
+    stage = Unplugged(world, plan_poses(1, world.scene).poses[0], np.random.default_rng(0))
+    with pytest.raises(LostError, match="the port is gone"):
+        PROCEDURES[name](stage)
+    assert stage.moves_after == 0
 
 
 def test_bar_follows_the_amplitude():
