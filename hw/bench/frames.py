@@ -26,9 +26,8 @@ DECIBELS = 60.0
 
 _MARGIN = 160
 _SPECKLE = 10 ** (-34.0 / 20)
-# Points along a wire in the beam's thickness, -2 to 2 SDs.
-_ALONG = np.linspace(-2.0, 2.0, 9)
-_WIRE_LENGTH_MM = 30.0
+_WIRE_HALF_MM = 30.0
+_MOST_SPOTS = 48
 _CUT = 3.5
 
 
@@ -137,15 +136,14 @@ class Camera:
         for direction in ((0.8, 0.6, 0.0), (-0.6, 0.8, 0.0)):
             along = np.asarray(direction) @ pose[:3, :3] @ x[:3, :3]
             width = float(world.beam.width_mm(crossing[2]))
-            if abs(along[1]) < 1e-3:
-                continue
-            way = (width * _ALONG - crossing[1]) / along[1]
-            for step, sd in zip(way, _ALONG, strict=True):
-                if abs(step) > _WIRE_LENGTH_MM:
-                    continue
-                at = crossing + step * along
-                if at[2] > 0:
-                    strength = look.wire * float(np.exp(-0.5 * sd**2))
+            steep = max(abs(along[1]), 2 * width / _WIRE_HALF_MM)
+            reach = 2 * width / steep
+            middle = float(np.clip(-crossing[1] / along[1], -_WIRE_HALF_MM, _WIRE_HALF_MM))
+            count = min(int(2 * reach / look.lateral_mm) + 2, _MOST_SPOTS)
+            for way in middle + reach * np.linspace(-1.0, 1.0, count):
+                at = crossing + way * along
+                if at[2] > 0 and abs(way) <= _WIRE_HALF_MM:
+                    strength = look.wire * float(np.exp(-0.5 * (at[1] / width) ** 2))
                     shown.append((at[0], float(np.hypot(at[1], at[2])), strength))
         return shown
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from hw.bench.frames import COLUMNS, ROWS, Camera
+from hw.bench.frames import COLUMNS, ROWS, Camera, Look
 from hw.bench.world import FULL_SCALE, make_world
 from hw.midplane.pattern_injection import bar
 from hw.poses import plan_poses
@@ -155,3 +155,26 @@ def test_frame_without_response_has_no_echo_and_the_bar_follows_the_pattern():
     assert (draw(pattern=bar(31, 64, 128), threshold=FULL_SCALE) == silent).all()
     with pytest.raises(InputError, match="lines"):
         draw(pattern=bytes(200))
+
+
+def test_wires_cross_in_the_plane_and_part_beside_it():
+    world = make_world(0)
+    look = Look()
+    camera, rng = Camera(world, look), np.random.default_rng(0)
+    beside = np.asarray(look.beside_mm)
+    turned = np.diag([1.0, -1.0, -1.0]) @ rotation(np.array([0.0, 0.0, 0.3]))
+    x = world.image_to_probe
+
+    def draw(elevation: float):
+        pose = np.eye(4)
+        pose[:3, :3] = turned @ x[:3, :3].T
+        place = x[:3, :3] @ [5.0, elevation, 45.0] + x[:3, 3]
+        pose[:3, 3] = world.point_mm + beside - pose[:3, :3] @ place
+        return camera.frame(pose, rng)
+
+    together = localise(draw(0.0), target="cross")
+    assert together.found[0]
+    assert np.abs(together.position[0] - camera.pixel(5.0, 45.0)).max() < 2.5
+    apart = localise(draw(4.0), target="cross")
+    assert not apart.found[0]
+    assert "ambiguous" in apart.reason[0]
