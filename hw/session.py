@@ -85,8 +85,6 @@ class Session:
         self._bad: deque[tuple[float, str]] = deque(maxlen=_KEPT_FRAMES)
         self._stamps: dict[str, list[tuple[float, float]]] = {}
         self._stopping = False
-        self.last_trouble: str | None = None
-        """What :meth:`trouble` said last when it said something."""
         self._began = self.clock.now()
         self._echo_seen = self._image_seen = self._began
         opened = []
@@ -139,8 +137,6 @@ class Session:
     def trouble(self) -> str | None:
         """What is wrong with a device now, as one line; None if nothing is."""
         error = self._trouble()
-        if error is not None:
-            self.last_trouble = str(error)
         return None if error is None else str(error)
 
     def check(self) -> None:

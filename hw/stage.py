@@ -19,7 +19,7 @@ from hw.robot.pose import turn_deg
 from hw.robot.stream import PoseSample
 from hw.session import Session
 
-_MOST_HESITATIONS = 5
+_MOST_HESITATIONS = 10
 
 
 class ProbeStage:
@@ -117,10 +117,13 @@ class ProbeStage:
         raise AssertionError
 
     def _hesitated(self, error: DeviceError) -> bool:
-        """Whether a stop was ours, because of a device that may come back by itself."""
-        if isinstance(error, StaleError) or "ms old" in str(error):
-            return True
-        return self._session.last_trouble is not None and self._session.last_trouble in str(error)
+        """Whether it was our own stop, or an old pose, after which motion may go on.
+
+        A protective stop, a force, a lost connection end motion for good.
+        """
+        if isinstance(error, RefusedError):
+            return "ms old" in str(error)
+        return not self._motion.ended
 
 
 def _apart(first: np.ndarray, second: np.ndarray) -> float:

@@ -231,6 +231,11 @@ class Motion:
                     device="robot",
                 )
 
+    @property
+    def ended(self) -> bool:
+        """Whether motion is over for good, so that the plan must be confirmed again."""
+        return self._ended is not None
+
     def stop(self, reason: str) -> None:
         """Stop the robot; a :meth:`move_to` that waits in another thread raises StoppedError."""
         self._send({"request": "stop", "reason": reason})
