@@ -16,10 +16,11 @@ from jaxcal.cli.run import run
 from jaxcal.errors import InputError
 
 if TYPE_CHECKING:
-    from hw.acquire import Confirm, Request
+    from hw.acquire import Confirm, Outcome, Request
     from hw.bench.run import Bench
     from hw.setup import Setup
 
+_RESUMED_BY_ITSELF = 30
 PLACEMENTS = ("threshold-climb", "amplitude-scan", "pattern-injection", "none")
 
 
@@ -197,20 +198,37 @@ def _setup_of(path: str | None, emulated: Bench | None) -> Setup:
 def _acquire(
     setup: Setup, path: str, request: Request | None, emulated: Bench | None, code: str | None
 ) -> int:
-    from hw.acquire import Pause
+    from hw.acquire import AcquisitionStopped, Pause
     from hw.acquire import acquire as run_acquisition
     from hw.emulated import BenchOracle
     from hw.keys import watch_keys
-    from hw.outcome import calibrate_and_print
 
     pause = Pause()
-    with watch_keys(pause):
-        outcome = run_acquisition(
+
+    def attempt(request: Request | None) -> Outcome:
+        return run_acquisition(
             setup, path, request, _confirming(setup, emulated is not None, code),
             say=lambda line: click.echo(line, err=True),
             oracle=None if emulated is None else BenchOracle(emulated),
             pause=pause,
         )  # fmt: skip
+
+    with watch_keys(pause):
+        for _ in range(_RESUMED_BY_ITSELF if emulated is not None else 0):
+            try:
+                return _finished(path, attempt(request), setup)
+            except AcquisitionStopped as error:
+                if error.exit_code == ExitCode.INTERRUPTED:
+                    raise
+                # A busy machine trips the emulated controller's watchdog; nobody has to look.
+                click.echo(f"stopped: {error}", err=True)
+                request = None
+        return _finished(path, attempt(request), setup)
+
+
+def _finished(path: str, outcome: Outcome, setup: Setup) -> int:
+    from hw.outcome import calibrate_and_print
+
     return exit_code([calibrate_and_print(path, outcome, setup.clock.speed)])
 
 

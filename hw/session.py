@@ -20,13 +20,15 @@ import numpy as np
 from hw.active_echo.device import ActiveEcho, EchoFrame
 from hw.errors import DeviceError, StaleError
 from hw.recorder import Recorder
-from hw.robot.stream import PoseStream
+from hw.robot.stream import PoseSample, PoseStream
 from hw.setup import Setup
 from hw.ultrasound.receiver import Image, UltrasoundStream
 from jaxcal.errors import CalibrationError
 from jaxcal.timing import fit_clock
 
 _PERIOD_WALL_S = 0.005
+# Rows are written in batches: a write costs a millisecond, however many rows it has.
+_BATCH_WALL_S = 0.25
 _KEPT_FRAMES = 256
 _LEAST_STAMPS, _MOST_STAMPS = 20, 20_000
 
@@ -84,6 +86,9 @@ class Session:
         self._failure: Exception | None = None
         self._bad: deque[tuple[float, str]] = deque(maxlen=_KEPT_FRAMES)
         self._stamps: dict[str, list[tuple[float, float]]] = {}
+        self._waiting_poses: list[PoseSample] = []
+        self._waiting_echo: list[EchoFrame] = []
+        self._handed_over = time.monotonic()
         self._stopping = False
         self._began = self.clock.now()
         self._echo_seen = self._image_seen = self._began
@@ -248,12 +253,15 @@ class Session:
                 ending = self._stopping
                 self._empty()
                 if ending:
-                    return
+                    break
                 time.sleep(_PERIOD_WALL_S)
         except Exception as error:
             with self._changed:
                 self._failure = error
                 self._changed.notify_all()
+        # What came before a device was lost belongs into the file all the same.
+        with suppress(CalibrationError):
+            self._hand_over()
 
     def _empty(self) -> None:
         frames = self.echo.drain()
@@ -280,10 +288,19 @@ class Session:
         self._stamp("robot", [(pose.t_device, pose.t_host) for pose in poses[-1:]])
         self._stamp("active echo", [(frame.ticks / hz, frame.t_host) for frame in frames[-1:]])
         self._stamp("ultrasound", [(image.t_device, image.t_host) for image in images[-1:]])
-        self._recorder.add_poses(poses)
-        self._recorder.add_echo(frames)
+        self._waiting_poses += poses
+        self._waiting_echo += frames
         if self._every_frame:
             self._recorder.add_images(images)
+        if time.monotonic() - self._handed_over > _BATCH_WALL_S:
+            self._hand_over()
+
+    def _hand_over(self) -> None:
+        self._handed_over = time.monotonic()
+        poses, self._waiting_poses = self._waiting_poses, []
+        frames, self._waiting_echo = self._waiting_echo, []
+        self._recorder.add_poses(poses)
+        self._recorder.add_echo(frames)
 
     def _stamp(self, device: str, pairs: list[tuple[float, float]]) -> None:
         stamps = self._stamps.setdefault(device, [])

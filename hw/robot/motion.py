@@ -34,6 +34,8 @@ Guard = Callable[[], str | None]
 _KINDS = {kind.__name__: kind for kind in (LostError, RefusedError, StaleError, StoppedError)}
 _TICK_S = 0.02
 _START_PATIENCE_S = 30.0
+# The controller has stopped the robot by itself long before; a busy machine gets its chance.
+_HANGS_WALL_S = 2.0
 
 
 class Motion:
@@ -221,7 +223,7 @@ class Motion:
                 self._send({"request": "stop", "reason": reason})
             self._send({"request": "heard"})
             silent = time.monotonic() - self._heard
-            if silent > 0.5 + self.clock.wall(0.5):
+            if silent > _HANGS_WALL_S + self.clock.wall(0.5):
                 error = stopping or LostError("the motion process hangs", device="robot")
                 self._in_motion = False
                 self._kill(error)
