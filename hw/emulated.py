@@ -7,7 +7,7 @@ import numpy as np
 from hw.bench.run import Bench, start_bench
 from hw.setup import Setup
 
-SPEED = 8.0
+SPEED = 6.0
 """Bench seconds per second on the wall, unless asked otherwise."""
 
 _IMAGES_WALL_HZ = 10.0
@@ -19,7 +19,10 @@ def start(seed: int, speed: float) -> Bench:
     Raises:
         InputError: a speed that cannot be.
     """
-    return start_bench(seed=seed, speed=speed, pose_hz=500, most_images_wall_hz=_IMAGES_WALL_HZ)
+    return start_bench(
+        seed=seed, speed=speed, pose_hz=500, most_images_wall_hz=_IMAGES_WALL_HZ,
+        most_poses_wall_hz=min(max(62.5 * speed, 125.0), 1000.0),
+    )  # fmt: skip
 
 
 def setup_of(bench: Bench) -> Setup:

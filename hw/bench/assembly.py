@@ -43,6 +43,7 @@ class Options:
         echo_hz: active-echo frames per bench second.
         image_hz: ultrasound frames per bench second.
         most_images_wall_hz: and no more of them than this per wall second.
+        most_poses_wall_hz: likewise of the robot's stream.
         repeatability_mm: SD of the arm's hidden error on each axis.
         robot_host: loopback address; empty: any free one.
         link: of the active echo: ``pty`` or ``tcp``.
@@ -55,6 +56,7 @@ class Options:
     echo_hz: float = 30.0
     image_hz: float = 30.0
     most_images_wall_hz: float = 60.0
+    most_poses_wall_hz: float = 1000.0
     repeatability_mm: float = 0.1
     robot_host: str = ""
     link: str = "pty"
@@ -63,7 +65,7 @@ class Options:
     def __post_init__(self) -> None:
         for name, least, largest in (
             ("speed", 0.01, 100.0), ("echo_hz", 0.1, 1000.0), ("image_hz", 0.1, 200.0),
-            ("most_images_wall_hz", 0.1, 1000.0), ("repeatability_mm", 0.0, 10.0),
+            ("most_images_wall_hz", 0.1, 1000.0), ("most_poses_wall_hz", 50.0, 1000.0), ("repeatability_mm", 0.0, 10.0),
         ):  # fmt: skip
             value = getattr(self, name)
             if not (math.isfinite(value) and least <= value <= largest):
@@ -178,7 +180,11 @@ class Assembly:
         trouble: OSError | None = None
         for host in hosts:
             server = RtdeServer(
-                self.arm, host, version=VERSIONS[self.options.pose_hz], clock=self.clock
+                self.arm,
+                host,
+                version=VERSIONS[self.options.pose_hz],
+                clock=self.clock,
+                max_rate_hz=self.options.most_poses_wall_hz,
             )
             try:
                 return server.start()

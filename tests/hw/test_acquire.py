@@ -1,0 +1,207 @@
+"""The experiment on the emulated bench: real clients, faults in the middle, kill -9, resumed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+pytest.importorskip("rtde_control", reason="ur_rtde is not installed (jaxcal[robot])")
+pytest.importorskip("serial", reason="pyserial is not installed (jaxcal[serial])")
+
+from test_recorder import wait_until_closed
+
+import jaxcal
+from hw.acquire import AcquisitionStopped, Outcome, Pause, Request, acquire
+from hw.bench.run import Bench, start_bench
+from hw.emulated import BenchOracle, setup_of
+from hw.outcome import share_inside
+from hw.robot.safety import MotionPlan, confirm
+from jaxcal.cli.main import main
+
+IMAGES = 5
+# What a busy machine does to the processes in between: stopped, and resumed as a person would.
+ATTEMPTS = 12
+
+
+def a_bench(speed: float = 2.0) -> Bench:
+    return start_bench(seed=3, speed=speed, pose_hz=500, most_images_wall_hz=10.0)
+
+
+def run(
+    bench: Bench,
+    path: Path,
+    request: Request | None,
+    say: Callable[[str], None] = lambda line: None,
+    pause: Pause | None = None,
+) -> Outcome:
+    setup = setup_of(bench)
+
+    def agree(plan: MotionPlan):
+        return confirm(plan, plan.code, clock=setup.clock)
+
+    return acquire(setup, path, request, agree, say=say, oracle=BenchOracle(bench), pause=pause)
+
+
+def finish(bench: Bench, path: Path) -> Outcome:
+    """Resume until it is done; every resumption keeps what is there."""
+    for _ in range(ATTEMPTS):
+        before = taken(path)
+        try:
+            return run(bench, path, None)
+        except AcquisitionStopped as error:
+            print(error)
+            np.testing.assert_array_equal(taken(path)[: len(before)], before)
+    raise AssertionError("the bench cannot keep up with itself")
+
+
+def taken(path: Path) -> np.ndarray:
+    with h5py.File(path) as file:
+        return np.asarray(file["calibration/pose"])
+
+
+def test_a_short_run_ends_in_a_recording_that_calibrate_takes(tmp_path, capsys):
+    path, lines, pause = tmp_path / "rec.h5", [], Pause()
+
+    def say(line: str) -> None:
+        lines.append(line)
+        if line.startswith("image 2/"):
+            pause.hold()
+            threading.Timer(0.3, pause.go_on).start()
+
+    with a_bench() as bench:
+        try:
+            run(bench, path, Request(IMAGES, "amplitude-scan", 1, bench=3), say, pause)
+        except AcquisitionStopped as error:
+            print(error)
+            finish(bench, path)
+        truth = bench.world_truth()
+    assert any(line.startswith("paused") for line in lines)
+    assert sum(line.startswith(f"image {IMAGES}/{IMAGES}: ") for line in lines) <= 1
+    assert main(["calibrate", str(path), "--json"]) in (0, 3)
+    assert '"truth_error"' in capsys.readouterr().out
+    recording = jaxcal.load(path)
+    assert len(recording) == IMAGES
+    np.testing.assert_allclose(recording.truth.image_to_probe, truth["image_to_probe"])
+    inside, images, _ = share_inside(str(path))
+    assert (inside, images) == (IMAGES, IMAGES)
+    with h5py.File(path) as file:
+        assert file.attrs["complete"]
+        assert sorted(file["calibration/target"]) == list(range(IMAGES))
+        assert len(file["estimate/images"]) >= 1
+        assert np.isfinite(file["estimate/covariance"][-1]).all()
+        assert {b"robot", b"active echo", b"ultrasound"} <= set(file["clock/device"][()])
+        assert len(file["us/frames"]) == IMAGES
+        assert len(file["tracker/pose"]) > 500
+        assert (np.diff(file["tracker/t_host"]) > 0).all()
+        kinds = set(file["events/kind"][()])
+        assert {b"started", b"confirmed", b"command", b"finished"} <= kinds
+    assert (tmp_path / "rec.h5.sha256").exists()
+
+
+FAULTS = {
+    "mute": ({}, "robot", None),
+    "drop": ({}, "robot", None),
+    "protective_stop": ({}, "protective stop", "unlock"),
+    "crc_errors": ({"rate": 1.0}, "active echo", None),
+    "miss_triggers": ({"rate": 1.0}, "active echo", None),
+    "echo_stale": ({}, "active echo", None),
+    "unplug": ({}, "active echo", "replug"),
+    "image_stale": ({}, "ultrasound", None),
+    "image_drop": ({}, "ultrasound", None),
+}
+
+
+def fault_in_the_middle(tmp_path, name: str, speed: float, rest_s: float | None) -> None:
+    arguments, what, cure = FAULTS[name]
+    path = tmp_path / "rec.h5"
+    at: list[float] = []
+    with a_bench(speed) as bench:
+
+        def strike() -> None:
+            # While the arm moves: within a run it does so every second.
+            while bench.rest_since() is not None:
+                time.sleep(0.002)
+            at.append(bench.fault(name, **arguments))
+
+        def say(line: str) -> None:
+            if line.startswith("image 2/"):
+                threading.Thread(target=strike, daemon=True).start()
+
+        request: Request | None = Request(IMAGES, "none", 1, bench=3)
+        for _ in range(ATTEMPTS):
+            with pytest.raises(AcquisitionStopped) as caught:
+                run(bench, path, request, say)
+            request = None
+            if at:
+                break
+        line = str(caught.value)
+        assert what in line
+        assert "\n" not in line
+        assert f"--resume {path}" in line
+        deadline = time.monotonic() + 30
+        while (rest := bench.rest_since()) is None:
+            assert time.monotonic() < deadline
+        if rest_s is not None:
+            assert rest - at[0] <= rest_s
+        before = taken(path)
+        assert len(before) >= 2
+        with h5py.File(path) as file:
+            assert not file.attrs["complete"]
+            assert file["events/kind"][-1] == b"stopped"
+        assert main(["calibrate", str(path)]) == 2
+        bench.recover()
+        if cure is not None:
+            bench.fault(cure)
+        finish(bench, path)
+    assert len(jaxcal.load(path)) == IMAGES
+    np.testing.assert_array_equal(taken(path)[: len(before)], before)
+
+
+def test_an_unplugged_port_stops_the_run_and_it_is_resumed(tmp_path):
+    fault_in_the_middle(tmp_path, "unplug", 3.0, None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FAULTS)
+def test_every_fault_stops_the_robot_and_the_run_is_resumed(tmp_path, name):
+    """In real time; images may be silent for a second before that counts."""
+    fault_in_the_middle(tmp_path, name, 1.0, None if name.startswith("image") else 0.2)
+
+
+@pytest.mark.slow
+def test_killed_and_resumed(tmp_path, capfd):
+    path = tmp_path / "rec.h5"
+    code = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
+    arguments = ["acquire", str(path), "--bench", "--images", str(IMAGES), "--placement", "none",
+                 "--speed", "3", "--bench-seed", "3"]  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("image 2/"):
+            break
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    process.stderr.close()
+    wait_until_closed(path)
+    before = taken(path)
+    assert len(before) >= 2
+    done = subprocess.run(
+        [sys.executable, "-c", code, "acquire", str(path), "--bench", "--resume", "--speed", "3"],
+        capture_output=True, text=True, timeout=500,
+    )  # fmt: skip
+    assert done.returncode in (0, 3), done.stderr
+    assert "reconstruction precision" in done.stdout
+    assert len(jaxcal.load(path)) == IMAGES
+    np.testing.assert_array_equal(taken(path)[: len(before)], before)
