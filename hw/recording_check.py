@@ -98,9 +98,12 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
             for name in ("tracker", "ae", "events"):
                 times = _read(root, name, "t_host", (UpTo(2**27, "rows"),))
                 last.append(float(np.nanmax(times, initial=0.0)))
+            targets = _read(root, "plan", "targets", (images, 4, 4))
+            # Checked, but kept to the last digit: the plan's digest must be the same again.
+            check_poses(targets)
             progress = Progress(
                 settings=_settings(root),
-                targets=check_poses(_read(root, "plan", "targets", (images, 4, 4))),
+                targets=targets,
                 poses=_read(root, "calibration", "pose", (images, 4, 4)),
                 measurements=_read(
                     root, "calibration", "time_of_flight", (images, UpTo(4096, "elements"))
