@@ -14,14 +14,16 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 Vector = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class _Motion:
+class Motion:
+    """A path and the profile over it; the arm's state at any time follows from it."""
+
     start: float
     """Bench time (s) at which the profile starts."""
     position: Vector
@@ -40,6 +42,7 @@ class _Motion:
     error: tuple[Vector, Vector] = ((0.0,) * 6, (0.0,) * 6)
 
     def duration(self) -> float:
+        """Bench seconds from its start until the arm rests."""
         if self.brake:
             return self.speed / self.acceleration
         if self.length <= 0:
@@ -95,6 +98,14 @@ class Arm:
         halt_acceleration: float = 2.0,
         reach_m: tuple[float, float] = (0.15, 0.85),
     ) -> None:
+        self.settings = {
+            "raw": _six(raw), "tcp_offset": _six(tcp_offset), "repeatability_mm": repeatability_mm,
+            "repeatability_deg": repeatability_deg, "correlation_mm": correlation_mm, "seed": seed,
+            "halt_acceleration": halt_acceleration, "reach_m": tuple(reach_m),
+        }  # fmt: skip
+        """What it was made of: another process can make the same arm."""
+        self.watcher: Callable[[Motion], None] | None = None
+        """Told of every new motion, in the thread that commands it."""
         self.tcp_offset: Vector = _six(tcp_offset)
         self.halt_acceleration = halt_acceleration
         self.reach_m = reach_m
@@ -105,7 +116,7 @@ class Arm:
         self._random = random.Random(seed)
         first = tuple(self._random.gauss(0.0, sd) for sd in self._sd)
         start = _six(raw)
-        self._motion = _Motion(
+        self._motion = Motion(
             -math.inf, start[:3], _quaternion(start[3:]), (0.0,) * 3, (0.0,) * 3, 0.0, 1.0, 1.0,
             error=(first, first),
         )  # fmt: skip
@@ -121,6 +132,17 @@ class Arm:
             speed: m/s of the tool; where the turn in rad is more than the travel in m, rad/s.
             acceleration: m/s^2, likewise.
         """
+        motion = self._plan(t, target, speed, acceleration)
+        self.follow(motion)
+        return t + motion.duration()
+
+    def follow(self, motion: Motion) -> None:
+        """Do this from now on; an arm in another process may be made to follow this one."""
+        self._motion = motion
+        if self.watcher is not None:
+            self.watcher(motion)
+
+    def _plan(self, t: float, target: Sequence[float], speed: float, acceleration: float) -> Motion:
         position, quaternion, error = self._where(t)
         goal = _six(target)
         travel = tuple(b - a for a, b in zip(position, goal[:3], strict=True))
@@ -133,18 +155,16 @@ class Arm:
             keep * e + fresh * self._random.gauss(0.0, sd)
             for e, sd in zip(error, self._sd, strict=True)
         )
-        motion = _Motion(
+        return Motion(
             t, position, quaternion, travel, turn, length, speed, acceleration,
             error=(error, drawn),
         )  # fmt: skip
-        self._motion = motion
-        return t + motion.duration()
 
     def servo(self, t: float, target: Sequence[float], duration: float) -> None:
         """Be at a pose after ``duration`` s, at a constant speed."""
-        self.move_linear(t, target, 1.0, 1e9)
-        length = self._motion.length
-        self._motion = replace(self._motion, speed=max(length / max(duration, 1e-3), 1e-9))
+        motion = self._plan(t, target, 1.0, 1e9)
+        speed = max(motion.length / max(duration, 1e-3), 1e-9)
+        self.follow(replace(motion, speed=speed))
 
     def stop(self, t: float, acceleration: float | None = None) -> float:
         """Brake on the path (m/s^2); returns the bench time (s) at which the arm rests."""
@@ -156,7 +176,7 @@ class Arm:
             moving, start=t, first=first, speed=rate, brake=True,
             acceleration=acceleration or self.halt_acceleration,
         )  # fmt: skip
-        self._motion = brake
+        self.follow(brake)
         return t + brake.duration()
 
     def raw(self, t: float) -> Vector:

@@ -1,20 +1,27 @@
-"""An emulated robot alone, in a process of its own: for tests, and for a look at the real clients.
+"""An emulated robot in a process of its own, so that nothing else holds its controller up.
 
-``python -m hw.bench.robot '{"host": "127.0.0.2"}'`` serves until its input ends. It prints one line
-with the origin of its clock, then takes requests as JSON lines ``[name, values...]``.
+A controller works in real time; one that shares its interpreter with, say, the rendering of images
+answers whenever it gets the lock. So the server runs alone, and tells each new motion of its arm to
+the process that started it, where a mirror of the arm follows: the state at any bench time follows
+from the last motion alone. :class:`RobotProcess` stands for an :class:`hw.bench.rtde.RtdeServer`.
+
+``python -m hw.bench.robot '{"host": "127.0.0.2"}'`` serves until its input ends.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import queue
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
-from types import TracebackType
+from dataclasses import asdict
 
-from hw.bench.arm import Arm
+from hw.bench.arm import Arm, Motion
 from hw.bench.rtde import RtdeServer
-from hw.clock import Clock
+from hw.clock import REAL, Clock
 from hw.robot._process import import_path
 
 START = (0.4, -0.1, 0.3, 0.0, 3.0, 0.2)
@@ -23,9 +30,152 @@ START = (0.4, -0.1, 0.3, 0.0, 3.0, 0.2)
 E_SERIES, CB_SERIES = (5, 11, 0, 108249), (3, 15, 8, 106339)
 """Controller versions of the two series of robots."""
 
+_PATIENCE_S = 30.0
 
-class EmulatedRobot:
-    """A robot in a child process; :meth:`ask` and :meth:`state` tell and change its truth.
+
+class RobotProcess:
+    """An arm and its controller in a child process.
+
+    Args:
+        arm: made here; it follows the child's arm and must not be commanded.
+        host: loopback address.
+        version: of the controller.
+        clock: bench time, shared with the child.
+        settings: further arguments of :class:`hw.bench.rtde.RtdeServer`.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        host: str = "127.0.0.2",
+        *,
+        version: tuple[int, ...] = E_SERIES,
+        clock: Clock = REAL,
+        **settings: object,
+    ) -> None:
+        self.arm, self.host, self.clock = arm, host, clock
+        self.serial = ""
+        self.frequency_hz = 0.0
+        self._setup = {
+            "host": host, "version": version, "arm": arm.settings,
+            "clock": [clock.speed, clock.origin_s], "server": settings,
+        }  # fmt: skip
+        self._asking = threading.Lock()
+        self._answers: queue.SimpleQueue[dict] = queue.SimpleQueue()
+        self.process: subprocess.Popen[str] | None = None
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> RobotProcess:
+        """Start the child and wait until it serves.
+
+        Raises:
+            OSError: its address is taken.
+        """
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "hw.bench.robot", json.dumps(self._setup)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=import_path(),
+        )  # fmt: skip
+        self._thread = threading.Thread(target=self._receive, name="robot's process", daemon=True)
+        self._thread.start()
+        told = self._answer()
+        if "trouble" in told:
+            self.stop()
+            raise OSError(told["trouble"])
+        self.serial, self.frequency_hz = str(told["serial"]), float(told["frequency_hz"])
+        return self
+
+    def stop(self) -> None:
+        """End the child; safe to repeat."""
+        if self.process is None:
+            return
+        self.process.kill()
+        self.process.wait()
+        if self._thread is not None:
+            self._thread.join()
+        if self.process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self.process.stdin.close()
+
+    def __enter__(self) -> RobotProcess:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def mute(self, on: bool = True) -> None:
+        """As :meth:`hw.bench.rtde.RtdeServer.mute`."""
+        self.ask("mute", on)
+
+    def drop(self, *, control_only: bool = False) -> None:
+        """Reset the clients' connections, or only those that command."""
+        self.ask("drop control" if control_only else "drop")
+
+    def protective_stop(self) -> None:
+        """As if the arm had met an obstacle."""
+        self.ask("protective_stop")
+
+    def unlock(self) -> None:
+        """What a person does at the pendant after a protective stop."""
+        self.ask("unlock")
+
+    def set_tcp_offset(self, offset: Sequence[float]) -> None:
+        """What a person does at the pendant: another tool (m, rad)."""
+        self.ask("set_tcp_offset", tuple(offset))
+
+    def state(self) -> dict:
+        """Where the arm is, what the program does, and every command so far."""
+        state = self.ask("state")
+        assert isinstance(state, dict)
+        return state
+
+    @property
+    def packets(self) -> int:
+        """Real-time packets made so far."""
+        return self.state()["packets"]
+
+    @property
+    def skipped(self) -> int:
+        """Packets left out for a client that did not read."""
+        return self.state()["skipped"]
+
+    def ask(self, name: str, *values: object) -> object:
+        """One request: a fault (answered by the bench time at which it came), ``force``, ``state``.
+
+        Raises:
+            RuntimeError: the child is gone, or does not know the request.
+        """
+        with self._asking:
+            assert self.process is not None
+            assert self.process.stdin is not None
+            with contextlib.suppress(OSError, ValueError):
+                self.process.stdin.write(json.dumps([name, *values]) + "\n")
+                self.process.stdin.flush()
+            told = self._answer()
+        if "trouble" in told:
+            raise RuntimeError(told["trouble"])
+        return told["answer"]
+
+    def _answer(self) -> dict:
+        try:
+            return self._answers.get(timeout=_PATIENCE_S)
+        except queue.Empty:
+            return {"trouble": "the emulated robot does not answer"}
+
+    def _receive(self) -> None:
+        assert self.process is not None
+        assert self.process.stdout is not None
+        with self.process.stdout as lines:
+            for line in lines:
+                told = json.loads(line)
+                if "motion" in told:
+                    self.arm.follow(_motion(told["motion"]))
+                else:
+                    self._answers.put(told)
+        self._answers.put({"trouble": "the emulated robot's process ended"})
+
+
+class EmulatedRobot(RobotProcess):
+    """A robot with a clock of its own that serves at once: for tests of the clients.
 
     Args:
         host: its loopback address.
@@ -44,50 +194,17 @@ class EmulatedRobot:
         raw: Sequence[float] = START,
         tcp_offset: Sequence[float] = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0),
     ) -> None:
-        self.host = host
-        setup = {
-            "host": host, "speed": speed, "version": version, "raw": tuple(raw),
-            "tcp_offset": tuple(tcp_offset),
-        }  # fmt: skip
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "hw.bench.robot", json.dumps(setup)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=import_path(),
-        )  # fmt: skip
-        assert self.process.stdout is not None
-        self.clock = Clock(speed, json.loads(self.process.stdout.readline()))
-
-    def ask(self, name: str, *values: object) -> object:
-        """Call a method of the server (a fault), or set ``force``; returns its answer."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.write(json.dumps([name, *values]) + "\n")
-        self.process.stdin.flush()
-        return json.loads(self.process.stdout.readline())
-
-    def state(self) -> dict:
-        """Where the arm is, what the program does, and every command so far."""
-        state = self.ask("state")
-        assert isinstance(state, dict)
-        return state
-
-    def close(self) -> None:
-        """End the process."""
-        self.process.kill()
-        self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout):
-            if pipe is not None:
-                pipe.close()
+        super().__init__(Arm(raw, tcp_offset=tcp_offset), host, version=version, clock=Clock(speed))
+        self.start()
 
     def __enter__(self) -> EmulatedRobot:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
+
+def _motion(told: dict) -> Motion:
+    plain = {name: tuple(v) if isinstance(v, list) else v for name, v in told.items()}
+    first, last = told["error"]
+    return Motion(**{**plain, "error": (tuple(first), tuple(last))})
 
 
 def _state(robot: RtdeServer) -> dict:
@@ -100,28 +217,52 @@ def _state(robot: RtdeServer) -> dict:
     }  # fmt: skip
 
 
+def _do(robot: RtdeServer, name: str, values: list) -> dict:
+    match name:
+        case "state":
+            return {"answer": _state(robot)}
+        case "force":
+            robot.arm.force = tuple(values[0])
+        case "drop control":
+            robot.drop(control_only=True)
+        case "mute" | "drop" | "protective_stop" | "unlock" | "set_tcp_offset":
+            getattr(robot, name)(*values)
+        case _:
+            return {"trouble": f"unknown request {name}"}
+    return {"answer": robot.clock.now()}
+
+
 def main() -> None:
     """Serve until the input ends."""
     setup = json.loads(sys.argv[1])
-    arm = Arm(setup.get("raw", START), tcp_offset=setup.get("tcp_offset", (0.0,) * 6))
-    version, clock = tuple(setup.get("version", E_SERIES)), Clock(setup.get("speed", 1.0))
-    with RtdeServer(arm, setup["host"], version=version, clock=clock) as robot:
-        print(json.dumps(clock.origin_s), flush=True)
-        for line in sys.stdin:
-            name, *values = json.loads(line)
-            answer: object = None
-            match name:
-                case "state":
-                    answer = _state(robot)
-                case "force":
-                    arm.force = tuple(values[0])
-                case "drop control":
-                    robot.drop(control_only=True)
-                case "mute" | "drop" | "protective_stop" | "unlock" | "set_tcp_offset":
-                    getattr(robot, name)(*values)
-                case _:
-                    answer = f"unknown request {name}"
-            print(json.dumps(answer), flush=True)
+    lines: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
+
+    def write() -> None:
+        # Whoever does not read must not hold the controller up.
+        with contextlib.suppress(BrokenPipeError):
+            while (message := lines.get()) is not None:
+                print(json.dumps(message), flush=True)
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    arm = Arm(**setup.get("arm", {"raw": START}))
+    arm.watcher = lambda motion: lines.put({"motion": asdict(motion)})
+    clock = Clock(*setup.get("clock", []))
+    version = tuple(setup.get("version", E_SERIES))
+    try:
+        robot = RtdeServer(
+            arm, setup["host"], version=version, clock=clock, **setup.get("server", {})
+        ).start()
+    except OSError as error:
+        lines.put({"trouble": str(error)})
+        lines.put(None)
+        writer.join()
+        return
+    lines.put({"serial": robot.serial, "frequency_hz": robot.frequency_hz})
+    for line in sys.stdin:
+        name, *values = json.loads(line)
+        lines.put(_do(robot, name, values))
+    robot.stop()
 
 
 if __name__ == "__main__":

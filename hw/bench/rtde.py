@@ -9,6 +9,7 @@ Source: the RTDE guide of Universal Robots, and what ur_rtde 1.6.5 sends and exp
 
 from __future__ import annotations
 
+import contextlib
 import math
 import queue
 import selectors
@@ -126,7 +127,9 @@ class RtdeServer:
         if self._thread is None:
             return
         self._running = False
-        self._wake.send(b"x")
+        # It may have seen that already, and be gone.
+        with contextlib.suppress(OSError):
+            self._wake.send(b"x")
         self._thread.join()
         self._thread = None
 
@@ -237,7 +240,8 @@ class RtdeServer:
             except OSError:
                 return
             sock.setblocking(False)
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            with contextlib.suppress(OSError):
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection = _Connection(sock, data)
             self._connections.add(connection)
             if not self._muted:

@@ -217,7 +217,7 @@ class Mover:
         if self._control is not None and now - self._kicked > _KICK_S:
             self._kicked = now
             self._kicks += 1
-            if not self._control.kickWatchdog():
+            if not self._call("kickWatchdog"):
                 raise _Ended(self._lost("the controller's program stopped"))
 
     # Motion
@@ -354,7 +354,16 @@ class Mover:
     def _command(self, name: str, *values: object) -> object:
         """One command to the controller; every one is logged before it is sent."""
         self._log(name, values=values)
-        return getattr(self._control, name)(*values)
+        return self._call(name, *values)
+
+    def _call(self, name: str, *values: object) -> object:
+        # ur_rtde spins while it waits for the controller; in real time that would take a core away
+        # from everybody, the controller's emulator included.
+        be_prompt(False)
+        try:
+            return getattr(self._control, name)(*values)
+        finally:
+            be_prompt()
 
     def _log(self, command: str, **numbers: object) -> None:
         self._tell("log", t=self._clock.now(), command=command, numbers=numbers)

@@ -30,13 +30,14 @@ def import_path() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
 
-def be_prompt() -> None:
-    """Ask for real-time scheduling of the calling thread and those that it starts.
+def be_prompt(on: bool = True) -> None:
+    """Ask for real-time scheduling of the calling thread and those that it starts, or give it up.
 
     On a busy machine a process waits for milliseconds before it may run; these here need little
     time but need it at once. Only a privileged user gets it (on Linux: CAP_SYS_NICE, or an rtprio
-    limit); for others all stays as it is.
+    limit); for others all stays as it is. A thread that may spin must not have it.
     """
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+            policy = os.SCHED_FIFO if on else os.SCHED_OTHER
+            os.sched_setscheduler(0, policy, os.sched_param(1 if on else 0))

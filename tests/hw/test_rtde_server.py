@@ -12,8 +12,10 @@ from robots import CB_SERIES, E_SERIES, START, EmulatedRobot, address
 
 from hw.bench.arm import Arm
 from hw.bench.controller import DONE, READY, Controller
+from hw.bench.robot import RobotProcess
 from hw.bench.rtde import RtdeServer
 from hw.bench.rtde_fields import output_type
+from hw.clock import Clock
 
 rtde_receive = pytest.importorskip("rtde_receive", reason="no wheel of ur_rtde here")
 rtde_control = pytest.importorskip("rtde_control", reason="no wheel of ur_rtde here")
@@ -86,7 +88,7 @@ def test_a_protective_stop_ends_the_program_until_a_person_releases_it():
         assert control.moveL(beside(60.0), 0.05, 1.0, True)
         robot.ask("protective_stop")
         until(lambda: robot.state()["rest_since"] is not None)
-        assert not control.isProgramRunning()
+        until(lambda: not control.isProgramRunning())
         assert not control.moveL(START, 0.1, 1.0)
         robot.ask("unlock")
         assert control.reuploadScript()
@@ -181,3 +183,34 @@ def test_an_address_is_used_once():
         with second:
             assert second.host != server.host
     server.stop()
+
+
+def test_a_mirror_of_the_arm_follows_the_one_in_the_robot_s_process():
+    clock = Clock(speed=2.0)
+    arm = Arm(START, repeatability_mm=0.1, repeatability_deg=0.05, seed=4)
+    first = arm.true_raw(0.0)
+    with RobotProcess(arm, address(), clock=clock) as robot:
+        assert (robot.serial, robot.frequency_hz) == ("20195500042", 500.0)
+        with pytest.raises(OSError, match="in use"):
+            RobotProcess(Arm(START), robot.host, clock=clock).start()
+        control = rtde_control.RTDEControlInterface(robot.host)
+        assert control.moveL(beside(30.0), 0.1, 1.0)
+        state = robot.state()
+        assert state["raw"] == pytest.approx(beside(30.0))
+        assert arm.raw(clock.now()) == pytest.approx(state["raw"])
+        assert arm.rest_since(clock.now()) == pytest.approx(state["rest_since"])
+        # The hidden error is the child's own.
+        error = [t - r for t, r in zip(arm.true_raw(state["t"]), state["raw"], strict=True)]
+        assert 1e-6 < max(map(abs, error[:3])) < 1e-3
+        assert arm.true_raw(0.0) == pytest.approx(first)
+        assert control.moveL(beside(-60.0), 0.05, 1.0, True)
+        robot.protective_stop()
+        until(lambda: arm.rest_since(clock.now()) is not None)
+        assert arm.raw(clock.now()) == pytest.approx(robot.state()["raw"])
+        assert robot.packets > 0
+        assert robot.skipped == 0
+        with pytest.raises(RuntimeError, match="unknown request"):
+            robot.ask("explode")
+        control.disconnect()
+    with pytest.raises(RuntimeError, match="ended"):
+        robot.ask("state")
