@@ -23,7 +23,7 @@ from hw.bench.arm import Arm
 from hw.bench.controller import Controller
 from hw.bench.rtde_fields import INPUTS, OUTPUTS, STRUCT, output_type
 from hw.clock import REAL, Clock
-from hw.robot._process import be_prompt
+from hw.robot._process import ANSWERS, be_prompt
 
 __all__ = ["Arm", "RtdeServer"]
 
@@ -202,7 +202,7 @@ class RtdeServer:
 
     def _serve(self) -> None:
         # A controller is never late; other threads of this process must hand over soon.
-        be_prompt()
+        be_prompt(ANSWERS)
         sys.setswitchinterval(min(sys.getswitchinterval(), 0.0005))
         period = 1.0 / self.frequency_hz
         due = self.clock.now()

@@ -28,7 +28,7 @@ import numpy as np
 from hw.clock import Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 from hw.extras import require
-from hw.robot._process import be_prompt
+from hw.robot._process import ASKS, RECEIVES, be_prompt
 from hw.robot.limits import Limits, numbers
 from hw.robot.pose import turn_deg
 from hw.robot.rtde import Packet, PacketReader, read_identity, safety_text
@@ -102,9 +102,13 @@ class Mover:
         module = require("rtde_control", extra="robot")
         self._log("connect", host=self._host, serial=self._serial)
         try:
+            # The thread that it starts inherits this.
+            be_prompt(RECEIVES)
             self._control = module.RTDEControlInterface(self._host)
         except RuntimeError as error:
             raise LostError(f"ur_rtde: {error}", device="robot") from None
+        finally:
+            be_prompt(ASKS)
         self._command("setWatchdog", IDLE_WATCHDOG_HZ)
         self._kicked = self._clock.now()
         if self._offset is None:
@@ -357,13 +361,15 @@ class Mover:
         return self._call(name, *values)
 
     def _call(self, name: str, *values: object) -> object:
-        # ur_rtde spins while it waits for the controller; in real time that would take a core away
-        # from everybody, the controller's emulator included.
-        be_prompt(False)
+        assert self._sample is not None
+        age = self._sample.age_s(self._clock.now())
+        if age > self._plan.limits.max_pose_age_s:
+            # A mute controller: ur_rtde would spin for seconds, and keep a core from everybody.
+            be_prompt(0)
         try:
             return getattr(self._control, name)(*values)
         finally:
-            be_prompt()
+            be_prompt(ASKS)
 
     def _log(self, command: str, **numbers: object) -> None:
         self._tell("log", t=self._clock.now(), command=command, numbers=numbers)
@@ -400,7 +406,7 @@ def main() -> NoReturn:
     os.dup2(end, 1)
     os.dup2(end, 2)
     setup = json.loads(sys.stdin.buffer.readline())
-    be_prompt()
+    be_prompt(ASKS)
     try:
         mover = Mover(setup, output, library)
         try:

@@ -30,14 +30,19 @@ def import_path() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
 
-def be_prompt(on: bool = True) -> None:
-    """Ask for real-time scheduling of the calling thread and those that it starts, or give it up.
+def be_prompt(priority: int) -> None:
+    """Ask for real-time scheduling of the calling thread and those that it starts; 0 gives it up.
 
     On a busy machine a process waits for milliseconds before it may run; these here need little
     time but need it at once. Only a privileged user gets it (on Linux: CAP_SYS_NICE, or an rtprio
-    limit); for others all stays as it is. A thread that may spin must not have it.
+    limit); for others all stays as it is. ur_rtde's commands spin while they wait for an answer, so
+    whoever helps with that answer needs a higher priority than the one who asks.
     """
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
-            policy = os.SCHED_FIFO if on else os.SCHED_OTHER
-            os.sched_setscheduler(0, policy, os.sched_param(1 if on else 0))
+            policy = os.SCHED_FIFO if priority else os.SCHED_OTHER
+            os.sched_setscheduler(0, policy, os.sched_param(priority))
+
+
+ASKS, RECEIVES, ANSWERS = 1, 2, 3
+"""Priorities: who commands, who reads the controller, and the controller's emulator."""

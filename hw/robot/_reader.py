@@ -14,7 +14,7 @@ import time
 
 from hw.errors import DeviceError, LostError
 from hw.extras import require
-from hw.robot._process import be_prompt
+from hw.robot._process import RECEIVES, be_prompt
 from hw.robot.rtde import Packet, PacketReader
 
 RECORD = struct.Struct("<8dIiII6d")
@@ -74,7 +74,7 @@ def main(arguments: list[str]) -> int:
     # What a library prints must not get between the records.
     output = os.dup(1)
     os.dup2(2, 1)
-    be_prompt()
+    be_prompt(RECEIVES)
     frequency_hz = float(frequency) or None
     try:
         if client == "ur_rtde":
