@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 
+import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -206,7 +207,13 @@ def damage(data: bytes, kind: int, rng: np.random.Generator) -> bytes:
     return bytes(spoilt)
 
 
-def test_fuzz() -> None:
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without run-time type checks, which take most of the time of so many calls."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+def test_fuzz(unchecked: None) -> None:
     """10^5 frames, two of five damaged, in pieces of any size: nothing wrong is taken for right.
 
     Each accepted frame is one that was sent, to the bit, and none is accepted twice; of two intact

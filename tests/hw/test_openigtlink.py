@@ -6,6 +6,7 @@ import math
 import struct
 import time
 
+import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -330,8 +331,14 @@ def body(message: Message) -> bytes:
     return encode(message)[HEADER_SIZE:]
 
 
+@pytest.fixture
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without run-time type checks, which take most of the time of so many calls."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
 @pytest.mark.parametrize("count", [4000, pytest.param(100_000, marks=pytest.mark.slow)])
-def test_fuzz(count: int) -> None:
+def test_fuzz(unchecked: None, count: int) -> None:
     """One message of five damaged, in pieces of any size: what is accepted was sent so.
 
     The header is under no CRC, so a wrong bit in a name or a time stamp passes; a content never.
