@@ -16,7 +16,7 @@ from hw.bench.active_echo import AuspisEmulator
 from hw.bench.arm import Arm
 from hw.bench.control import ControlServer
 from hw.bench.frames import Camera
-from hw.bench.rtde import RtdeServer
+from hw.bench.robot import CB_SERIES, E_SERIES, RobotProcess
 from hw.bench.ultrasound import ImageServer
 from hw.bench.world import World, make_world
 from hw.clock import Clock
@@ -25,10 +25,10 @@ from hw.robot.pose import pose_to_ur, ur_to_pose
 from hw.scene import Scene
 from jaxcal.errors import InputError
 
-VERSIONS = {125: (3, 15, 8, 106339), 500: (5, 11, 0, 108249)}
+VERSIONS = {125: CB_SERIES, 500: E_SERIES}
 """Controllers that the real client accepts, by their rate: a CB-series and an e-Series."""
 
-_ADDRESS_TRIES = 40
+_ADDRESS_TRIES = 8
 _HOVER_MM = 70.0
 
 
@@ -85,7 +85,7 @@ class Assembly:
     Attributes:
         world: what there is.
         clock: bench time.
-        arm: what moves.
+        arm: where the robot's arm is; it follows the one in the robot's own process.
     """
 
     def __init__(self, options: Options) -> None:
@@ -118,7 +118,7 @@ class Assembly:
             spacing_mm=self.camera.spacing_mm,
             seed=options.seed,
         )
-        self.robot: RtdeServer | None = None
+        self.robot: RobotProcess | None = None
         self._faults = self._table()
         self._unplugged = False
         self._done: queue.SimpleQueue[None] = queue.SimpleQueue()
@@ -171,7 +171,7 @@ class Assembly:
             "probe": asdict(world.probe), "seed": self.options.seed,
         }  # fmt: skip
 
-    def _start_robot(self) -> RtdeServer:
+    def _start_robot(self) -> RobotProcess:
         chance = random.Random(os.getpid())
         hosts = [self.options.robot_host] if self.options.robot_host else [
             f"127.0.{chance.randrange(256)}.{chance.randrange(2, 255)}"
@@ -179,7 +179,7 @@ class Assembly:
         ] + ["127.0.0.1"]  # fmt: skip
         trouble: OSError | None = None
         for host in hosts:
-            server = RtdeServer(
+            server = RobotProcess(
                 self.arm,
                 host,
                 version=VERSIONS[self.options.pose_hz],
@@ -211,7 +211,7 @@ class Assembly:
     # Requests
 
     def _table(self) -> dict[str, Callable[..., object]]:
-        def robot() -> RtdeServer:
+        def robot() -> RobotProcess:
             assert self.robot is not None
             return self.robot
 
