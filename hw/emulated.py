@@ -7,7 +7,7 @@ import numpy as np
 from hw.bench.run import Bench, start_bench
 from hw.setup import Setup
 
-SPEED = 6.0
+SPEED = 5.0
 """Bench seconds per second on the wall, unless asked otherwise."""
 
 _IMAGES_WALL_HZ = 10.0
