@@ -65,7 +65,8 @@ class Options:
     def __post_init__(self) -> None:
         for name, least, largest in (
             ("speed", 0.01, 100.0), ("echo_hz", 0.1, 1000.0), ("image_hz", 0.1, 200.0),
-            ("most_images_wall_hz", 0.1, 1000.0), ("most_poses_wall_hz", 50.0, 1000.0), ("repeatability_mm", 0.0, 10.0),
+            ("most_images_wall_hz", 0.1, 1000.0), ("most_poses_wall_hz", 50.0, 1000.0),
+            ("repeatability_mm", 0.0, 10.0),
         ):  # fmt: skip
             value = getattr(self, name)
             if not (math.isfinite(value) and least <= value <= largest):
