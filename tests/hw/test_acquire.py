@@ -22,8 +22,8 @@ from test_recorder import wait_until_closed
 
 import jaxcal
 from hw.acquire import AcquisitionStopped, Outcome, Pause, Request, acquire
-from hw.bench.run import Bench, start_bench
-from hw.emulated import BenchOracle, setup_of
+from hw.bench.run import Bench
+from hw.emulated import BenchOracle, setup_of, start
 from hw.outcome import share_inside
 from hw.robot.safety import MotionPlan, confirm
 from jaxcal.cli.main import main
@@ -33,8 +33,8 @@ IMAGES = 5
 ATTEMPTS = 12
 
 
-def a_bench(speed: float = 2.0) -> Bench:
-    return start_bench(seed=3, speed=speed, pose_hz=500, most_images_wall_hz=10.0)
+def a_bench(speed: float = 5.0) -> Bench:
+    return start(3, speed)
 
 
 def run(
@@ -80,7 +80,7 @@ def test_a_short_run_ends_in_a_recording_that_calibrate_takes(tmp_path, capsys):
 
     with a_bench() as bench:
         try:
-            run(bench, path, Request(IMAGES, "amplitude-scan", 1, bench=3), say, pause)
+            run(bench, path, Request(IMAGES, "none", 1, bench=3), say, pause)
         except AcquisitionStopped as error:
             print(error)
             finish(bench, path)
@@ -102,10 +102,28 @@ def test_a_short_run_ends_in_a_recording_that_calibrate_takes(tmp_path, capsys):
         assert {b"robot", b"active echo", b"ultrasound"} <= set(file["clock/device"][()])
         assert len(file["us/frames"]) == IMAGES
         assert len(file["tracker/pose"]) > 500
-        assert (np.diff(file["tracker/t_host"]) > 0).all()
+        # Poses that waited in one socket arrive together; the controller's own time goes on.
+        assert (np.diff(file["tracker/t_host"]) >= 0).all()
+        assert (np.diff(file["tracker/t_device"]) > 0).all()
         kinds = set(file["events/kind"][()])
         assert {b"started", b"confirmed", b"command", b"finished"} <= kinds
     assert (tmp_path / "rec.h5.sha256").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("placement", ["threshold-climb", "amplitude-scan", "pattern-injection"])
+def test_every_placement_brackets_the_truth(tmp_path, placement):
+    path = tmp_path / "rec.h5"
+    with a_bench() as bench:
+        try:
+            run(bench, path, Request(12, placement, 2, bench=3))
+        except AcquisitionStopped as error:
+            print(error)
+            finish(bench, path)
+    inside, images, spread = share_inside(str(path))
+    assert images >= 11
+    assert inside >= images - 1
+    assert spread < 0.6
 
 
 FAULTS = {
@@ -168,7 +186,7 @@ def fault_in_the_middle(tmp_path, name: str, speed: float, rest_s: float | None)
 
 
 def test_an_unplugged_port_stops_the_run_and_it_is_resumed(tmp_path):
-    fault_in_the_middle(tmp_path, "unplug", 3.0, None)
+    fault_in_the_middle(tmp_path, "unplug", 5.0, None)
 
 
 @pytest.mark.slow
