@@ -137,7 +137,8 @@ def main() -> None:
         if elevation or law == OFFSET_LAWS[0]:
             cells.append((law, 50, elevation, noise))
     for images, law in itertools.product((12,) if quick else (12, 20, 200), OFFSET_LAWS):
-        cells += [(law, images, *pair) for pair in (SUBSET[:2] if quick else SUBSET)]
+        subset = SUBSET[:2] if quick else SUBSET
+        cells += [(law, images, elevation, noise) for elevation, noise in subset]
     folder, rows = results_folder(quick), []
     for cell, (law, images, elevation, noise) in enumerate(cells):
         row = run_cell(law, images, elevation, noise, cell * 1_000_000 + jnp.arange(trials))
