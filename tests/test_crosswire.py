@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +34,23 @@ def test_self_tuned(recording):
     assert result.status == "converged"
     np.testing.assert_allclose(result.sigma, [0.347, 0.438, 0.883], rtol=0.05)
     assert result.sigma_tuned
+    # Heavy tails, not a bound: Gaussian offsets have 3, uniform ones 1.8.
+    assert float(result.inspection.kurtosis[2]) == pytest.approx(4.0, abs=0.1)
+    assert not np.asarray(result.outlier).any()
+
+
+@pytest.mark.slow
+def test_three_sizes_of_error_predict_better_than_one(recording):
+    """Leave-one-out log density, more than two of its standard errors above one size's."""
+    scale: dict[str, Any] = {"estimate": ("scale",)}
+    joint = jaxcal.cross_validate(recording, prior="gaussian", **scale)
+    equal = jaxcal.cross_validate(recording, method="conventional", **scale)
+    variance = np.asarray(equal.fold_cost)[:, None] / (3 * 53 - 11)
+    squared = np.asarray(equal.residual) ** 2 / variance
+    one_size = -0.5 * (squared + np.log(2 * np.pi * variance)).sum(axis=1)
+    gained = np.asarray(joint.log_density) - one_size
+    assert np.asarray(joint.converged).all()
+    assert gained.sum() > 2 * gained.std(ddof=1) * np.sqrt(len(gained))
 
 
 def test_without_spacing_the_scale_must_be_estimated(recording):
