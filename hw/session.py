@@ -142,6 +142,8 @@ class Session:
     def trouble(self) -> str | None:
         """What is wrong with a device now, as one line; None if nothing is."""
         error = self._trouble()
+        if isinstance(error, DeviceError) and error.device == "robot":
+            return str(error.args[0])  # whoever stops the robot for it names the robot
         return None if error is None else str(error)
 
     def check(self) -> None:
