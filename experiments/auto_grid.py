@@ -138,7 +138,8 @@ def main() -> None:
             cells.append((law, 50, elevation, noise))
     for images, law in itertools.product((12,) if quick else (12, 20, 200), OFFSET_LAWS):
         subset = SUBSET[:2] if quick else SUBSET
-        cells += [(law, images, elevation, noise) for elevation, noise in subset]
+        for elevation, noise in subset:
+            cells.append((law, images, elevation, noise))
     folder, rows = results_folder(quick), []
     for cell, (law, images, elevation, noise) in enumerate(cells):
         row = run_cell(law, images, elevation, noise, cell * 1_000_000 + jnp.arange(trials))
