@@ -38,7 +38,7 @@ from hw.stage import ProbeStage
 from jaxcal.cli.common import ExitCode
 from jaxcal.errors import CalibrationError, InputError
 
-PLACEMENTS = ("threshold-climb", "amplitude-scan", "pattern-injection", "none")
+PLACEMENTS = ("amplitude-scan", "threshold-climb", "pattern-injection", "none")
 MOST_IMAGES = 1000
 _MOST_GIVEN_UP = 3
 _FURTHEST_START_MM = 3.0
@@ -83,7 +83,7 @@ class Request:
     """
 
     images: int = 60
-    placement: str = "threshold-climb"
+    placement: str = "amplitude-scan"
     seed: int = 0
     every_frame: bool = False
     bench: int | None = None

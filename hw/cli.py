@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hw.setup import Setup
 
 _RESUMED_BY_ITSELF = 30
-PLACEMENTS = ("threshold-climb", "amplitude-scan", "pattern-injection", "none")
+PLACEMENTS = ("amplitude-scan", "threshold-climb", "pattern-injection", "none")
 
 
 @click.group(
@@ -60,7 +60,7 @@ _bench_seed = click.option(
 @click.option(
     "--placement",
     type=click.Choice(PLACEMENTS),
-    help="How the target is brought into the mid-plane.  [default: threshold-climb]",
+    help="How the target is brought into the mid-plane.  [default: amplitude-scan]",
 )
 @click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Of the plan.  [default: 0]")
 @click.option("--every-frame", is_flag=True, help="Record every ultrasound frame, not one a pose.")
