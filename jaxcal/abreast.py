@@ -1,4 +1,4 @@
-"""The road of plain problems: many abreast, on the fused pass over their images.
+"""The road of batches of plain problems: many abreast, on the fused pass over their images.
 
 Plain is what most problems are: points whose common SDs are given or self-tuned, a rigid X, no
 further unknowns. They are solved lane by lane by :mod:`jaxcal.solvers.lanes` and what builds on it,

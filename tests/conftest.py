@@ -15,6 +15,11 @@ os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_opti
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# The cache of compiled programs is the command line's; here it would outlive the test that runs it.
+os.environ.setdefault("JAXCAL_NO_CACHE", "1")
+
+import gc
+
 import jax
 import numpy as np
 import pytest
@@ -22,6 +27,14 @@ import pytest
 import jaxcal
 
 REAL_DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _programs_of_one_module():
+    """Compiled programs take memory, and mappings of it, which are limited: forget them."""
+    yield
+    jax.clear_caches()
+    gc.collect()
 
 
 @pytest.fixture(scope="session")

@@ -110,6 +110,7 @@ def test_expectation_propagation_against_integration():
     assert float(jnp.max(found.change)) < 0.1
 
 
+@pytest.mark.slow
 def test_a_one_sided_law_is_found_and_mended():
     lanes = [problem(k, images=50, elevation_distribution="one-sided", elevation_mm=5.0,
                      noise_mm=0.5) for k in range(8)]  # fmt: skip
@@ -142,6 +143,7 @@ def test_a_one_sided_law_is_found_and_mended():
     assert abs(abs(float(one.offset_law.mean)) - 2.5) < 1.0
 
 
+@pytest.mark.slow
 def test_bounds_are_respected():
     data = problem(3, images=20, elevation_mm=2.0, noise_mm=2.0)
     free = jaxcal.calibrate(data)
@@ -159,7 +161,6 @@ def test_what_does_not_go_together_is_refused():
         ({"prior": "gaussian", "max_elevation": 1.0}, "max_elevation belongs"),
         ({"sigma": (1.0, 1.0, 1.0), "max_elevation": 1.0}, "max_elevation belongs"),
         ({"sigma": (1.0, 1.0, 1.0), "prior": "uniform"}, "tunes its SDs"),
-        ({"prior": "flat"}, "auto, gaussian, uniform or bounded"),
     ):
         with pytest.raises(InputError, match=said):
             jaxcal.calibrate(data, **arguments)
@@ -183,9 +184,10 @@ def test_predicted_tre_and_intervals_follow_from_the_covariance():
     assert found.shape == (2, 2)
     np.testing.assert_allclose(found, expected, rtol=0.02)
     with pytest.raises(InputError, match="between 0 and 1"):
-        jaxcal.transform_intervals(result, 95)
+        jaxcal.transform_intervals(result, 95.0)
 
 
+@pytest.mark.slow
 def test_own_covariances_are_used_where_they_are_right():
     recording = jaxcal.simulate_recording(
         jaxcal.Protocol(images=50, elevation_mm=2.0, noise_mm=2.0), 4

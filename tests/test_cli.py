@@ -323,7 +323,6 @@ def test_refused_without_a_recording(arguments, said, capfd, tmp_path, monkeypat
         (["--prior", "gaussian", "--max-elevation", "1"], "--max-elevation needs"),
         (["--prior", "gaussian", "--method", "alternating"], "does not go with"),
         (["--prior", "bounded", "--method", "conventional"], "does not go with"),
-        (["--max-elevation", "1"], "--max-elevation needs"),
         (["--max-elevation", "1", "--method", "conventional"], "--max-elevation needs"),
         (["--max-elevation", "0", "--prior", "bounded"], "'0' is not a positive number"),
         (["--max-elevation", "-1", "--prior", "bounded"], "'-1' is not a positive number"),

@@ -85,7 +85,10 @@ def test_sums_are_the_derivatives_of_the_cost(drawn, name):
     np.testing.assert_allclose(expected, bent, atol=1e-12 * np.abs(bent).max())
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    ["measured", "circle", *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES[2:])],
+)
 def test_same_optimum_as_the_reference(drawn, name):
     problems, guess = drawn
     belief, prior = beliefs(name)

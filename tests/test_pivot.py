@@ -65,6 +65,7 @@ def test_a_third_of_the_poses_may_be_anything():
     assert np.linalg.norm(plain.tip - TIP) > 20 * np.linalg.norm(robust.tip - TIP)
 
 
+@pytest.mark.slow
 def test_batches_and_masks():
     poses = np.stack([swung(random_rotations(12, seed), 0.1, seed) for seed in range(3)])
     together = jaxcal.calibrate_pivot(poses)

@@ -90,7 +90,7 @@ def test_record_holds_what_the_result_holds(record, result, recording):
     assert record["reconstruction_precision_set"] == "test"
     assert record["jaxcal_version"] == jaxcal.__version__
     assert set(record["observability"]) == {
-        "condition", "weakest_direction", "weakest_sd_mm", "known_only_from_prior",
+        "condition", "weakest_direction", "weakest_sd_mm", "known_only_from_prior", "advice",
     }  # fmt: skip
 
 

@@ -48,6 +48,7 @@ def test_a_bad_image_has_the_most_influence(data):
     assert float(found.influence[4]) > 3 * float(np.median(found.influence))
 
 
+@pytest.mark.slow
 def test_folds_and_masked_images(data):
     masked = replace(data, mask=data.mask.at[3].set(0.0))
     found = cross_validate(masked, folds=5, **CONVENTIONAL)
@@ -61,6 +62,7 @@ def test_folds_and_masked_images(data):
         cross_validate(few, **CONVENTIONAL)
 
 
+@pytest.mark.slow
 def test_bootstrap_scatters_as_the_covariance_says(data):
     whole = jaxcal.calibrate(data, **CONVENTIONAL)
     found = bootstrap(data, 200, 5, result=whole, **CONVENTIONAL)
@@ -74,6 +76,7 @@ def test_bootstrap_scatters_as_the_covariance_says(data):
     assert float(found.reproducibility[4]) < float(np.max(found.reproducibility))
 
 
+@pytest.mark.slow
 def test_bootstrap_draws_used_images_only(data):
     half = replace(data, mask=data.mask.at[10:].set(0.0))
     wild = replace(half, measurements=half.measurements.at[10:].set(1e4))

@@ -89,6 +89,7 @@ def test_robust_solve_is_that_of_the_good_images():
     assert any("left out 15 of 50 images" in text for text in first.warnings)
 
 
+@pytest.mark.slow
 def test_a_wrong_echo_is_told_by_its_range():
     data = problem(0, images=20, elevation_mm=0.5, noise_mm=0.5)
     spoilt = replace(data, measurements=data.measurements.at[7, 1].add(40.0))

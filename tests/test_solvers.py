@@ -41,7 +41,7 @@ SOLVERS = [
     Solver("bounded", {"method": "joint", "prior": "bounded"}),
     Solver("gaussian", {"method": "joint", "sigma": (0.3, 0.15, 1.0)}),
     Solver("gaussian-tracker", {"method": "joint", "sigma": (0.3, 0.15, 1.0), "tracker_sd": 0.1}),
-    Solver("self-tuned", {"method": "joint"}, self_tuning=True),
+    Solver("self-tuned", {"method": "joint", "prior": "gaussian"}, self_tuning=True),
 ]
 
 

@@ -185,6 +185,7 @@ def fault_in_the_middle(tmp_path, name: str, speed: float, rest_s: float | None)
     np.testing.assert_array_equal(taken(path)[: len(before)], before)
 
 
+@pytest.mark.slow
 def test_an_unplugged_port_stops_the_run_and_it_is_resumed(tmp_path):
     fault_in_the_middle(tmp_path, "unplug", 5.0, None)
 
