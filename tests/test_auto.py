@@ -166,6 +166,7 @@ def test_what_does_not_go_together_is_refused():
             jaxcal.calibrate(data, **arguments)
 
 
+@pytest.mark.slow
 def test_predicted_tre_and_intervals_follow_from_the_covariance():
     data = problem(5, images=20, elevation_mm=2.0, noise_mm=2.0)
     result = jaxcal.calibrate(data)

@@ -66,6 +66,7 @@ def test_the_named_direction_is_one_that_the_images_do_not_see(kind):
             assert "translation along" in words
 
 
+@pytest.mark.slow
 def test_weak_sets_tell_their_sd_and_what_to_add():
     cone = make("cone", 3, 1.0, 0.3)
     result = solve(cone)

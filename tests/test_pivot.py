@@ -54,6 +54,7 @@ def test_rotation_about_one_axis_leaves_the_tip_open_along_it():
     assert still.status == "unobservable"
 
 
+@pytest.mark.slow
 def test_a_third_of_the_poses_may_be_anything():
     poses = swung(random_rotations(60), noise=0.4)
     poses[40:, :3, 3] += np.random.default_rng(2).uniform(20, 100, (20, 3))

@@ -87,6 +87,7 @@ def test_bootstrap_draws_used_images_only(data):
         bootstrap(data, 1)
 
 
+@pytest.mark.slow
 def test_command_line_shows_both(tmp_path, capsys):
     path = tmp_path / "rec.h5"
     jaxcal.save(jaxcal.simulate_recording(jaxcal.Protocol(images=20), 3), path)

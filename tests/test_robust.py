@@ -104,6 +104,7 @@ def test_a_wrong_echo_is_told_by_its_range():
     assert any("--robust" in text for text in plain.warnings)
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path, capsys):
     recording = jaxcal.simulate_recording(jaxcal.Protocol(images=20), 3)
     points = recording.calibration.measurements.copy()
