@@ -10,6 +10,7 @@ from which objective and gradient cosine are computed alike for all.
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 import shutil
@@ -178,7 +179,8 @@ def scipy_solver(method: str) -> Callable[[Batch], Solved]:
 
 def pyceres_solver(batch: Batch) -> Solved:
     """Ceres through Python: one cost function a problem, written in numpy."""
-    import pyceres
+    # Not among the dependencies: a peer that is there or is not.
+    pyceres: Any = importlib.import_module("pyceres")
 
     class Cost(pyceres.CostFunction):
         def __init__(self, problem: _Flat) -> None:
