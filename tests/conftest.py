@@ -82,8 +82,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             continue
         solver = parameters.params["solver"].name
         large = parameters.params.get("images") == 1000
-        costly = large or getattr(item, "originalname", "") == "test_float32"
+        name = getattr(item, "originalname", "")
+        costly = large or name == "test_float32"
+        # Self-tuning compiles longest by far.
+        longest = solver == "self-tuned" and (
+            costly or name.startswith(("test_batches", "test_images_left_out", "test_any_number"))
+        )
         if solver in ("gauss-newton", "gradient", "gaussian", "gaussian-tracker") or (
-            costly and solver in ("alternating", "bounded")
+            longest or (costly and solver in ("alternating", "bounded"))
         ):
             item.add_marker(pytest.mark.slow)

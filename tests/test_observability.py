@@ -91,6 +91,7 @@ def test_points_on_a_line_leave_a_rotation_open():
     assert "rotation about the lateral axis" in result.observability["weakest_direction"]
 
 
+@pytest.mark.slow
 def test_a_start_drowned_in_noise_is_searched_for():
     data = problem(6, images=4, elevation_mm=5.0, noise_mm=10.0)
     result = jaxcal.calibrate(data, method="conventional")
@@ -144,6 +145,7 @@ def test_an_offset_at_the_edge_of_its_bound_is_flagged():
     assert not kink.differentiable
 
 
+@pytest.mark.slow
 def test_predicted_covariance_is_the_scatter_of_repeats():
     count = 200
     base = problem(0, images=20, elevation_mm=1.0, noise_mm=2.0, elevation_distribution="normal")

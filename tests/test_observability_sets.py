@@ -81,6 +81,7 @@ def test_weak_sets_tell_their_sd_and_what_to_add():
     assert "translation along" in warning
 
 
+@pytest.mark.slow
 def test_following_the_advice_helps():
     """One image of the kind that is advised lowers the weakest SD more than one that is not."""
     cone = make("cone", 5, 1.0, 0.3)

@@ -63,6 +63,7 @@ def test_images_masked_by_the_caller_stay_out(consensus):
     np.testing.assert_array_equal(found.keep, mask * (1 - outlier))
 
 
+@pytest.mark.slow
 def test_few_or_hopeless_images_are_all_kept(consensus):
     _, spoilt, _ = batch(2, 0.2, "mixed")
     few = jnp.zeros_like(spoilt.mask).at[:, :7].set(1.0)
