@@ -58,9 +58,9 @@ def run_cell(cell: int, kind: str, noise: float, trials: int) -> dict[str, np.nd
 
     experiments, known, measured = draw(indices)
     results = {
-        "estimated": calibrate_batch(measured, estimate=MEDIUM, data="channels"),
-        "known": calibrate_batch(known, data="channels"),
-        "wrong": calibrate_batch(measured, data="channels"),
+        "estimated": calibrate_batch(measured, prior="gaussian", estimate=MEDIUM, data="channels"),
+        "known": calibrate_batch(known, prior="gaussian", data="channels"),
+        "wrong": calibrate_batch(measured, prior="gaussian", data="channels"),
     }
     precision = jax.jit(jax.vmap(reconstruction_precision))
     out = {

@@ -57,6 +57,7 @@ max_elevation_mm = 1
 [[methods]]
 name = "joint self-tuned"
 method = "joint"
+prior = "gaussian"
 """
 
 
