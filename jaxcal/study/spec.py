@@ -135,7 +135,7 @@ class MethodSpec:
     Attributes:
         name: how results call it.
         method: ``conventional``, ``alternating`` or ``joint``.
-        prior: of the joint method: ``auto``, ``gaussian`` or ``uniform`` (self-tuned), or ``bounded``.
+        prior: of the joint method: ``auto``, ``gaussian``, ``uniform`` or ``bounded``.
         max_elevation_mm: bound on |y| of alternating and bounded; None where there is none, or
             where the factor says it. Without either it is the paper's 1 mm.
         max_elevation_factor: the bound as a multiple of the true one.
