@@ -8,9 +8,6 @@ reference for these. Either way :func:`jaxcal.pipeline.finish` makes a calibrati
 
 from __future__ import annotations
 
-import os
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -25,26 +22,6 @@ from jaxcal.solvers.fused_methods import Begun, alternate, from_scratch
 from jaxcal.solvers.fused_variance import self_tuned
 from jaxcal.solvers.lanes import minimise
 from jaxcal.solvers.variance import RELATIVE_FLOOR
-
-SWITCH = "JAXCAL_FAST_MATH"
-"""Environment variable; 0 leaves the compiler its default flags."""
-
-
-def compiler_options(platform: str) -> dict[str, Any] | None:
-    """Flags for the fused programs on a CPU, or None.
-
-    Sums over images vectorise only where their order is free, and that is what fast math allows;
-    NaN and Inf keep their meaning. Reruns are bitwise equal, and answers within 1e-12 mm of those
-    with default flags.
-    """
-    if platform != "cpu" or os.environ.get(SWITCH, "1") == "0":
-        return None
-    return {
-        "xla_cpu_enable_fast_math": True,
-        "xla_cpu_fast_math_honor_nans": True,
-        "xla_cpu_fast_math_honor_infs": True,
-        "xla_cpu_prefer_vector_width": 512,
-    }
 
 
 def plain(problem: Problem, given: Given, plan: Plan) -> bool:

@@ -10,7 +10,7 @@ The errors of the three axes share one SD, so this is plain least squares on the
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal import diagnosis
+from jaxcal import compiler, diagnosis
 from jaxcal.calibration import Status
 from jaxcal.errors import InputError
 from jaxcal.geometry import check_poses
@@ -130,10 +130,16 @@ def calibrate_pivot(
     array = jnp.asarray(poses, jnp.result_type(float))
     weight = jnp.ones(array.shape[:-2]) if mask is None else jnp.asarray(mask)
     weight = jnp.broadcast_to(weight.astype(array.dtype), array.shape[:-2])
-    return _solve_all(array, weight, robust)
+    alone = compiler.is_whole_program(array, weight)
+    return _program(jax.default_backend() if alone else None)(array, weight, robust)
 
 
-@partial(jax.jit, static_argnums=2)
+@cache
+def _program(platform: str | None):
+    flags = None if platform is None else compiler.for_one_problem(platform)
+    return jax.jit(_solve_all, static_argnums=2, compiler_options=flags)
+
+
 def _solve_all(
     poses: Float[Array, "*batch n 4 4"], mask: Float[Array, "*batch n"], robust: bool
 ) -> Pivot:

@@ -23,6 +23,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from jaxcal.compiler import for_one_problem
 from jaxcal.errors import InputError
 from jaxcal.geometry import matrix_from_rotation
 from jaxcal.offsets import OffsetLaw, check_law, standard_offsets
@@ -293,7 +294,9 @@ def simulate_recording(
     curved = isinstance(protocol.probe, CurvilinearProbe)
     if clock_hz is not None and not (protocol.raw or curved):
         raise InputError("a clock rounds times of flight: it needs a raw simulation")
-    experiment = jax.jit(simulate, static_argnums=1)(jax.random.key(seed), protocol)
+    flags = for_one_problem(jax.default_backend())
+    program = jax.jit(simulate, static_argnums=1, compiler_options=flags)
+    experiment = program(jax.random.key(seed), protocol)
     array = {name: np.asarray(value) for name, value in vars(experiment).items()}
     if experiment.distances is None:
         calibration = make_images(

@@ -7,14 +7,14 @@ shapes and options, and mapped over batches.
 
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxcal import abreast
+from jaxcal import abreast, compiler
 from jaxcal.calibration import Calibration
 from jaxcal.errors import InputError
 from jaxcal.options import (
@@ -32,7 +32,7 @@ from jaxcal.options import (
     with_bound,
 )
 from jaxcal.pipeline import solve_problem
-from jaxcal.problem import Problem, is_traced
+from jaxcal.problem import Problem
 from jaxcal.recording import Recording
 
 BATCH_CHUNK = 64
@@ -102,7 +102,10 @@ def calibrate(
     if problem.batch_shape:
         return _solve_batch(problem, given, plan, None)
     check_values(problem)
-    return _solve_jit(with_bound(problem, given), given, plan)
+    problem = with_bound(problem, given)
+    # One problem alone gains nothing on the fused pass, and the general road compiles faster.
+    alone = compiler.is_whole_program(problem, given)
+    return _one_problem(jax.default_backend() if alone else None)(problem, given, plan)
 
 
 def calibrate_batch(
@@ -172,10 +175,11 @@ def _solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None)
     return jax.tree.map(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
 
 
-@partial(jax.jit, static_argnums=2)
-def _solve_jit(problem: Problem, given: Given, plan: Plan) -> Calibration:
-    # One problem alone gains nothing on the fused pass, and the general road compiles faster.
-    return solve_problem(problem, given, plan)
+@cache
+def _one_problem(platform: str | None):
+    """The compiled solve of one problem, a program of its own on that platform."""
+    flags = None if platform is None else compiler.for_one_problem(platform)
+    return jax.jit(solve_problem, static_argnums=2, compiler_options=flags)
 
 
 def solve_chunks(problems: Problem, given: Given, plan: Plan, chunk: int) -> Calibration:
@@ -192,21 +196,13 @@ def solve_chunks(problems: Problem, given: Given, plan: Plan, chunk: int) -> Cal
     return jax.tree.map(lambda leaf: leaf.reshape((count, *leaf.shape[2:])), result)
 
 
-_solve_chunks = partial(jax.jit, static_argnums=(2, 3))(solve_chunks)
-
-
 @cache
-def _solve_chunks_fast(platform: str):
-    return jax.jit(
-        solve_chunks, static_argnums=(2, 3), compiler_options=abreast.compiler_options(platform)
-    )
+def _chunks(platform: str | None):
+    """The compiled solve of chunks; with a platform, a program of its own on the fused pass."""
+    flags = None if platform is None else compiler.for_batches(platform)
+    return jax.jit(solve_chunks, static_argnums=(2, 3), compiler_options=flags)
 
 
 def _chunks_program(problems: Problem, given: Given, plan: Plan):
-    """The compiled form: with its own compiler flags where JAX lets a program have some."""
-    leaves = jax.tree.leaves((problems, given))
-    # Flags belong to a whole program: none inside somebody else's jit, grad or vmap.
-    inside = any(is_traced(leaf) for leaf in (*leaves, jnp.zeros(())))
-    if inside or not abreast.plain(problems, given, plan):
-        return _solve_chunks
-    return _solve_chunks_fast(jax.default_backend())
+    fused = abreast.plain(problems, given, plan) and compiler.is_whole_program(problems, given)
+    return _chunks(jax.default_backend() if fused else None)

@@ -8,7 +8,7 @@ import pytest
 from conftest import problem
 
 import jaxcal
-from jaxcal import abreast
+from jaxcal import abreast, compiler
 
 METHODS = {
     "conventional": {"method": "conventional"},
@@ -44,9 +44,9 @@ def test_compiler_flags_change_rounding_only(monkeypatch):
     assert np.array_equal(fast.image_to_probe, again.image_to_probe)
     from jaxcal import solve
 
-    solve._solve_chunks_fast.cache_clear()
-    monkeypatch.setenv(abreast.SWITCH, "0")
-    assert abreast.compiler_options("cpu") is None
+    solve._chunks.cache_clear()
+    monkeypatch.setenv(compiler.SWITCH, "0")
+    assert compiler.for_batches("cpu") is None
     plain = jaxcal.calibrate_batch(problems, method="conventional")
-    solve._solve_chunks_fast.cache_clear()
+    solve._chunks.cache_clear()
     np.testing.assert_allclose(fast.image_to_probe, plain.image_to_probe, rtol=0, atol=1e-12)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxcal.compiler import for_batches
 from jaxcal.errors import InputError
 from jaxcal.geometry import AnyArray
 from jaxcal.probe import CurvilinearProbe, Probe
@@ -329,16 +330,9 @@ def _out_of_plane(position: np.ndarray, covariance: np.ndarray, kept: np.ndarray
 def compiled_fit(curved: bool, robust: bool):
     """The fit as a compiled function of (distances, element positions); any leading axes.
 
-    On a CPU a sum over the elements is only vectorised where its order is free, which the flag
-    allows; NaN and Inf keep their meaning, and they are turned into weights before any arithmetic.
-    It changes results by rounding only (about 1e-12 mm).
+    Sums over the elements vectorise by the batches' flags; NaN and Inf are turned into weights
+    before any arithmetic.
     """
-    flags = {
-        "xla_cpu_enable_fast_math": True,
-        "xla_cpu_fast_math_honor_nans": True,
-        "xla_cpu_fast_math_honor_infs": True,
-        "xla_cpu_prefer_vector_width": 512,
-    }
 
     def fit(distances: AnyArray, positions: AnyArray) -> Fit | tuple[Fit, Fit]:
         if curved:
@@ -348,7 +342,7 @@ def compiled_fit(curved: bool, robust: bool):
         line = jnp.stack([jnp.asarray(positions)[:, 0], zero, zero], axis=-1)
         return fit_in_plane(distances, line, robust=robust)
 
-    return jax.jit(fit, compiler_options=flags if jax.default_backend() == "cpu" else None)
+    return jax.jit(fit, compiler_options=for_batches(jax.default_backend()))
 
 
 def _warnings(used, failed, missing, rejected, elements: int) -> tuple[str, ...]:
