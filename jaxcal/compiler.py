@@ -1,8 +1,8 @@
 """Flags that XLA compiles our programs with, on a CPU; elsewhere its defaults stand.
 
-Two wishes contradict each other. A batch is solved again and again, and its inner loops should run
-as fast as the hardware allows: :func:`for_batches`. One problem is solved once, and what a person
-waits for is the compiler, not the answer: :func:`for_one_problem`.
+Two wishes contradict each other. Plain batches are solved by the million, and their inner loops
+should run as fast as the hardware allows: :func:`fast_to_run`. Of one problem, a person waits for
+the compiler and not for the answer: :func:`quick_to_compile`.
 
 Flags belong to a whole program, so none are given inside somebody else's jit, vmap or grad:
 :func:`is_whole_program`.
@@ -23,7 +23,7 @@ SWITCH = "JAXCAL_FAST_MATH"
 Flags = dict[str, Any]
 
 
-def for_batches(platform: str) -> Flags | None:
+def fast_to_run(platform: str) -> Flags | None:
     """Flags for the fused programs, or None.
 
     Sums over images vectorise only where their order is free, and that is what fast math allows;
@@ -40,11 +40,11 @@ def for_batches(platform: str) -> Flags | None:
     }
 
 
-def for_one_problem(platform: str) -> Flags | None:
-    """Flags for a program that runs about as often as it is compiled, or None.
+def quick_to_compile(platform: str) -> Flags | None:
+    """Flags for the general road, or None.
 
-    Building every fusion with MLIR is half of the compiler's work (jax 0.10), and a problem of some
-    dozens of images gains nothing by it.
+    Building every fusion with MLIR is half of the compiler's work (jax 0.10); there it makes
+    nothing faster that could be measured.
     """
     return {"xla_cpu_use_fusion_emitters": False} if platform == "cpu" else None
 

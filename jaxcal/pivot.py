@@ -136,7 +136,7 @@ def calibrate_pivot(
 
 @cache
 def _program(platform: str | None):
-    flags = None if platform is None else compiler.for_one_problem(platform)
+    flags = None if platform is None else compiler.quick_to_compile(platform)
     return jax.jit(_solve_all, static_argnums=2, compiler_options=flags)
 
 

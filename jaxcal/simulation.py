@@ -23,7 +23,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from jaxcal.compiler import for_one_problem
+from jaxcal.compiler import quick_to_compile
 from jaxcal.errors import InputError
 from jaxcal.geometry import matrix_from_rotation
 from jaxcal.offsets import OffsetLaw, check_law, standard_offsets
@@ -294,7 +294,7 @@ def simulate_recording(
     curved = isinstance(protocol.probe, CurvilinearProbe)
     if clock_hz is not None and not (protocol.raw or curved):
         raise InputError("a clock rounds times of flight: it needs a raw simulation")
-    flags = for_one_problem(jax.default_backend())
+    flags = quick_to_compile(jax.default_backend())
     program = jax.jit(simulate, static_argnums=1, compiler_options=flags)
     experiment = program(jax.random.key(seed), protocol)
     array = {name: np.asarray(value) for name, value in vars(experiment).items()}

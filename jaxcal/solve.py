@@ -177,8 +177,8 @@ def _solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None)
 
 @cache
 def _one_problem(platform: str | None):
-    """The compiled solve of one problem, a program of its own on that platform."""
-    flags = None if platform is None else compiler.for_one_problem(platform)
+    """The compiled solve of one problem; with a platform, as a program of its own."""
+    flags = None if platform is None else compiler.quick_to_compile(platform)
     return jax.jit(solve_problem, static_argnums=2, compiler_options=flags)
 
 
@@ -197,12 +197,17 @@ def solve_chunks(problems: Problem, given: Given, plan: Plan, chunk: int) -> Cal
 
 
 @cache
-def _chunks(platform: str | None):
-    """The compiled solve of chunks; with a platform, a program of its own on the fused pass."""
-    flags = None if platform is None else compiler.for_batches(platform)
-    return jax.jit(solve_chunks, static_argnums=(2, 3), compiler_options=flags)
+def _chunks(platform: str | None, fused: bool):
+    """The compiled solve of chunks; with a platform, as a program of its own."""
+    flags = compiler.fast_to_run if fused else compiler.quick_to_compile
+    return jax.jit(
+        solve_chunks,
+        static_argnums=(2, 3),
+        compiler_options=None if platform is None else flags(platform),
+    )
 
 
 def _chunks_program(problems: Problem, given: Given, plan: Plan):
-    fused = abreast.plain(problems, given, plan) and compiler.is_whole_program(problems, given)
-    return _chunks(jax.default_backend() if fused else None)
+    alone = compiler.is_whole_program(problems, given)
+    platform = jax.default_backend() if alone else None
+    return _chunks(platform, abreast.plain(problems, given, plan))

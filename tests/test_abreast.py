@@ -46,7 +46,7 @@ def test_compiler_flags_change_rounding_only(monkeypatch):
 
     solve._chunks.cache_clear()
     monkeypatch.setenv(compiler.SWITCH, "0")
-    assert compiler.for_batches("cpu") is None
+    assert compiler.fast_to_run("cpu") is None
     plain = jaxcal.calibrate_batch(problems, method="conventional")
     solve._chunks.cache_clear()
     np.testing.assert_allclose(fast.image_to_probe, plain.image_to_probe, rtol=0, atol=1e-12)

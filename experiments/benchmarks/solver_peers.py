@@ -35,7 +35,7 @@ import peer_solvers as peers  # noqa: E402
 from common import arguments, machine, results_folder, write_table  # noqa: E402
 from peer_solvers import Batch, Solved  # noqa: E402
 
-from jaxcal.compiler import for_batches  # noqa: E402
+from jaxcal.compiler import fast_to_run  # noqa: E402
 from jaxcal.io.atomic import atomic_path  # noqa: E402
 from jaxcal.model.parameters import Parameters  # noqa: E402
 from jaxcal.simulation import Protocol, simulate  # noqa: E402
@@ -127,7 +127,7 @@ def fused_solver(
         ]
 
     parts = device(batch)
-    options = for_batches(jax.default_backend()) if options is None else options
+    options = fast_to_run(jax.default_backend()) if options is None else options
     program = jax.jit(whole).lower(*parts).compile(compiler_options=options)
     jax.block_until_ready(program(*parts))
 

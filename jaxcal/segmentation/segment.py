@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxcal.compiler import for_batches
+from jaxcal.compiler import fast_to_run
 from jaxcal.errors import InputError
 from jaxcal.geometry import AnyArray
 from jaxcal.probe import CurvilinearProbe, Probe
@@ -342,7 +342,7 @@ def compiled_fit(curved: bool, robust: bool):
         line = jnp.stack([jnp.asarray(positions)[:, 0], zero, zero], axis=-1)
         return fit_in_plane(distances, line, robust=robust)
 
-    return jax.jit(fit, compiler_options=for_batches(jax.default_backend()))
+    return jax.jit(fit, compiler_options=fast_to_run(jax.default_backend()))
 
 
 def _warnings(used, failed, missing, rejected, elements: int) -> tuple[str, ...]:

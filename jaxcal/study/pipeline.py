@@ -25,7 +25,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-from jaxcal.compiler import for_batches
+from jaxcal.compiler import fast_to_run
 from jaxcal.metrics import reconstruction_precision
 from jaxcal.offsets import OffsetLaw, nominal_bound
 from jaxcal.probe import LinearProbe
@@ -40,7 +40,7 @@ OTHER_LANES = 4096
 """And on whatever else: enough to fill it."""
 
 _ONE_THREAD: dict[str, Any] = {"xla_cpu_multi_thread_eigen": False}
-"""Beside :func:`jaxcal.compiler.for_batches`."""
+"""Beside :func:`jaxcal.compiler.fast_to_run`."""
 
 Devices = tuple[Any, ...]
 """jax.Device, which is no type to the type checker."""
@@ -187,7 +187,7 @@ def _static(method: MethodSpec) -> tuple[str, Options]:
 def _compile(function: Any, devices: Devices, *, fast: bool = True) -> Any:
     """Compile a function whose first argument is cut by trial where there are several devices."""
     platform = devices[0].platform
-    options = (for_batches(platform) or {}) if fast else {}
+    options = (fast_to_run(platform) or {}) if fast else {}
     options = options | _ONE_THREAD if platform == "cpu" else None
     if len(devices) == 1:
         return jax.jit(function, compiler_options=options)
