@@ -33,6 +33,7 @@ they are held by the tests, is :mod:`jaxcal.solvers.least_squares`.
 from __future__ import annotations
 
 import abc
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -82,10 +83,25 @@ class Images(eqx.Module):
             mask=problems.mask,
         )
 
+    def padded(self) -> Images:
+        """With unused images up to whole vectors of 64 bytes: a loop over them leaves no rest."""
+        unit = [whole(self.rotation[k], float(k % 4 == 0)) for k in range(9)]
+        return Images(
+            jnp.stack(unit), whole(self.origin, 0.0), whole(self.lateral, 0.0),
+            whole(self.distance, 1.0), whole(self.mask, 0.0),
+        )  # fmt: skip
+
     @property
     def used(self) -> Float[Array, " lanes"]:
         """Number of used images."""
         return jnp.sum(self.mask, axis=1)
+
+
+def whole(planes: Float[Array, "*planes n"], value: float) -> Float[Array, "*planes padded"]:
+    """Planes with their images continued by a value, up to whole vectors of 64 bytes."""
+    extra = -planes.shape[-1] % (64 // planes.dtype.itemsize)
+    widths = [(0, 0)] * (planes.ndim - 1) + [(0, extra)]
+    return jnp.pad(planes, widths, constant_values=value) if extra else planes
 
 
 class Guess(eqx.Module):
@@ -150,6 +166,10 @@ class Belief(eqx.Module):
     def term(self, q: Vector, images: Images, gate: Float[Array, "lanes 1"]) -> Term:
         """phi_i; exact second derivatives where the gate is 1, else Gauss-Newton's."""
 
+    def padded(self) -> Belief:
+        """For images that are padded."""
+        return self
+
     def largest_weight(self) -> Float[Array, " lanes"] | float:
         """How much a mm of error can be in a whitened residual."""
         return 1.0
@@ -195,6 +215,9 @@ class Held(Belief):
 
     elevation: Float[Array, "lanes n"]
 
+    def padded(self) -> Held:
+        return Held(whole(self.elevation, 0.0))
+
     def term(self, q: Vector, images: Images, gate: Float[Array, "lanes 1"]) -> Term:
         axial = jnp.sqrt(images.distance**2 - self.elevation**2)
         errors = [q[0] - images.lateral, q[1] - self.elevation, q[2] - axial]
@@ -204,70 +227,109 @@ class Held(Belief):
         return Term(cost, pull, curvature)
 
 
+class _OnCircle(NamedTuple):
+    """Where on its circle an image's point is: r, sin and cos of theta, and F there."""
+
+    radius: Array
+    sine: Array
+    cosine: Array
+    slope: Array
+    plain: Array
+    exact: Array
+    held: Array
+
+
 class Circle(Belief):
     """q_i - p_i(y_i), with y_i unknown: the explicit joint problem.
+
+    In the angle theta along the circle, y = r sin(theta), half the terms of an image with y_i are r
+    F(theta) and what does not depend on theta: with weights w (across, axial) and u (prior),
+
+        F = -a s - b c + k s^2 / 2,    a = w_y q_y,  b = w_z q_z,  k = (w_y + u - w_z) r,
+
+    s and c sine and cosine. A step of Halley's from tan(theta) = a / (b + k) needs one root, two
+    divisions and no trigonometry; where it leaves a slope, eliminating theta takes the rest to
+    first order. The Schur complement of theta is that of y.
 
     Attributes:
         sigma: SDs of the lateral, elevational and axial components, mm.
         offset_sd: SD of y_i, mm; inf for none.
         bound: of |y_i|, mm; it is kept below 0.95 of the range in any case.
-        steps: Newton steps on y_i.
+        steps: Halley's, on theta_i.
     """
 
     sigma: Float[Array, "3 lanes"]
     offset_sd: Float[Array, " lanes"]
     bound: Float[Array, "lanes n"]
-    steps: int = eqx.field(static=True, default=3)
+    steps: int = eqx.field(static=True, default=1)
 
-    def _solve(self, q: Vector, images: Images) -> tuple[Array, ...]:
-        """y_i, and the gradient, Gauss-Newton's and the exact curvature along it there."""
+    def padded(self) -> Circle:
+        return Circle(self.sigma, self.offset_sd, whole(self.bound, 0.0), self.steps)
+
+    def _solve(self, q: Vector, images: Images, steps: int | None = None) -> _OnCircle:
+        """The point of every image's circle that belongs to q."""
         across, axial = (1 / (sd * sd)[:, None] for sd in self.sigma[1:])
         prior = (1 / (self.offset_sd * self.offset_sd))[:, None]
-        limit = jnp.minimum(self.bound, LARGEST_ELEVATION * jnp.abs(images.distance))
-        y = jnp.clip(across * q[1] / (across + prior), -limit, limit)
+        radius = jnp.abs(images.distance)
+        a, b, k = across * q[1], axial * q[2], (across + prior - axial) * radius
 
-        def at(y: Array) -> tuple[Array, ...]:
-            inverse = jax.lax.rsqrt(images.distance**2 - y * y)
-            slope = -y * inverse
-            error = q[2] - (images.distance**2 - y * y) * inverse
-            gradient = across * (y - q[1]) - axial * error * slope + prior * y
-            plain = across + axial * slope * slope + prior
-            exact = plain + axial * error * images.distance**2 * inverse**3
-            return gradient, plain, exact, slope, error
+        def at(s: Array, c: Array) -> tuple[Array, Array, Array]:
+            slope = (b + k * c) * s - a * c
+            exact = a * s + b * c + k * (c * c - s * s)
+            plain = radius * ((across + prior) * (c * c) + axial * (s * s))
+            return slope, plain, exact
 
-        for _ in range(self.steps):
-            gradient, plain, exact, _, _ = at(y)
-            newton = gradient / jnp.where(exact > 0.1 * plain, exact, plain)
-            y = jnp.clip(y - newton, -limit, limit)
-        gradient, plain, exact, slope, error = at(y)
-        held = ((y >= limit) & (gradient < 0)) | ((y <= -limit) & (gradient > 0))
-        return y, gradient, plain, exact, slope, error, held
+        # Exact where k = 0, and nearly where theta is small; at 90 degrees behind the probe.
+        ahead = jnp.maximum(b + k, jnp.finfo(a.dtype).tiny ** 0.25)
+        inverse = jax.lax.rsqrt(a * a + ahead * ahead)
+        s, c = a * inverse, ahead * inverse
+        for _ in range(self.steps if steps is None else steps):
+            slope, plain, exact = at(s, c)
+            third = a * c - (b + 4 * k * c) * s
+            convex = exact > 0.1 * plain
+            up = slope * jnp.where(convex, exact, 1)
+            down = 2 * jnp.where(convex, exact * exact, plain) - jnp.where(convex, slope * third, 0)
+            # tan(half the turn) = -up / down, by the half-angle formulae.
+            square = up * up
+            inverse = 1 / (down * down + square)
+            keep, turn = (down * down - square) * inverse, -2 * up * down * inverse
+            s, c = s * keep + c * turn, c * keep - s * turn
+        limit = jnp.minimum(self.bound / radius, LARGEST_ELEVATION)
+        s = jnp.clip(s, -limit, limit)
+        c = jnp.sqrt(1 - s * s)
+        slope, plain, exact = at(s, c)
+        held = ((s >= limit) & (slope < 0)) | ((s <= -limit) & (slope > 0))
+        return _OnCircle(radius, s, c, slope, plain, exact, held)
 
     def offset(self, q: Vector, images: Images) -> Float[Array, "lanes n"]:
         """y_i, mm."""
-        return images.mask * self._solve(q, images)[0]
+        there = self._solve(q, images, steps=3)
+        return images.mask * there.radius * there.sine
 
     def term(self, q: Vector, images: Images, gate: Float[Array, "lanes 1"]) -> Term:
-        y, along, plain, exact, slope, error, held = self._solve(q, images)
+        there = self._solve(q, images)
         w = [images.mask * (1 / (sd * sd))[:, None] for sd in self.sigma]
+        across, axial = (1 / (sd * sd)[:, None] for sd in self.sigma[1:])
         prior = images.mask * (1 / (self.offset_sd * self.offset_sd))[:, None]
-        errors = [q[0] - images.lateral, q[1] - y, error]
+        y, slope = there.radius * there.sine, there.slope
+        errors = [q[0] - images.lateral, q[1] - y, q[2] - there.radius * there.cosine]
         pull = [a * b for a, b in zip(w, errors, strict=True)]
-        # Eliminate y_i with what is left of its gradient: one more Newton step, to first order.
-        own = jnp.where((gate > 0) & (exact > 0), exact, plain)
-        give = jnp.where(held, 0.0, 1.0 / own)
-        meets = [-w[1], -w[2] * slope]
+        # Eliminate theta_i with what is left of its slope: one more Newton step, to first order.
+        own = jnp.where((gate > 0) & (there.exact > 0), there.exact, there.plain)
+        give = jnp.where(there.held, 0.0, images.mask * there.radius / own)
+        meets = [-across * there.cosine, axial * there.sine]
         eliminated = [give * b for b in meets]
-        cost = unrolled.dot(pull, errors) + prior * y * y - images.mask * give * along * along
+        cost = unrolled.dot(pull, errors) + prior * y * y - give * slope * slope
+        mixed = -eliminated[0] * meets[1]
         return Term(
             cost=cost,
             gradient=[
-                pull[0], pull[1] - eliminated[0] * along, pull[2] - eliminated[1] * along
+                pull[0], pull[1] - eliminated[0] * slope, pull[2] - eliminated[1] * slope
             ],
             curvature=[
                 [w[0], 0, 0],
-                [0, w[1] - eliminated[0] * meets[0], -eliminated[0] * meets[1]],
-                [0, -eliminated[1] * meets[0], w[2] - eliminated[1] * meets[1]],
+                [0, w[1] - eliminated[0] * meets[0], mixed],
+                [0, mixed, w[2] - eliminated[1] * meets[1]],
             ],
         )  # fmt: skip
 
@@ -280,33 +342,32 @@ def contributions(
 ) -> tuple[Vector, Vector]:
     """An image's part of the 45 curvatures and the 9 gradients, as planes (or structural 0).
 
-    The gate says how much of the second derivatives of q there is to be; 0 for none.
+    The gate says how much of the second derivatives of q there is to be; 0 for none. They come
+    with A = [q]x' K + [g]x in the place of [q]x' K: A M has all of (w, d), and A [q]x has (w, w) but
+    for an antisymmetric part that :func:`with_twist` takes from the summed gradient.
     """
     g, k = term.gradient, term.curvature
     lever = unrolled.cross(q)
     across, forth = unrolled.product(k, lever), unrolled.product(k, turned)
-    back, inverse = unrolled.transpose(lever), unrolled.transpose(turned)
-    about, mixed = unrolled.product(back, across), unrolled.product(back, forth)
+    inverse = unrolled.transpose(turned)
+    bent = unrolled.cross([unrolled.times(gate, value) for value in g])
+    back = [
+        [unrolled.add(a, b) for a, b in zip(*rows, strict=True)]
+        for rows in zip(unrolled.transpose(across), bent, strict=True)
+    ]
+    about, mixed = unrolled.product(back, lever), unrolled.product(back, turned)
     point = unrolled.product(inverse, forth)
-    gated = [unrolled.times(gate, value) for value in g]
-    inner = unrolled.dot(gated, q)
-    twist = unrolled.product(unrolled.cross(gated), turned)
     full: Matrix = [[0] * UNKNOWNS for _ in range(UNKNOWNS)]
     for i in range(3):
         for j in range(3):
-            bent = unrolled.add(
-                unrolled.times(gated[i], 0.5 * q[j]), unrolled.times(gated[j], 0.5 * q[i])
-            )
-            if i == j:
-                bent = unrolled.add(bent, unrolled.times(-1, inner))
             full[i][j] = k[i][j]
             full[i][3 + j] = unrolled.times(-1, across[i][j])
             full[i][6 + j] = unrolled.times(-1, forth[i][j])
-            full[3 + i][3 + j] = unrolled.add(about[i][j], bent)
-            full[3 + i][6 + j] = unrolled.add(mixed[i][j], twist[i][j])
+            full[3 + i][3 + j] = about[i][j]
+            full[3 + i][6 + j] = mixed[i][j]
             full[6 + i][6 + j] = point[i][j]
     gradient = [unrolled.times(-1, value) for value in g]
-    gradient += unrolled.apply(back, g) + unrolled.apply(inverse, g)
+    gradient += unrolled.apply(unrolled.transpose(lever), g) + unrolled.apply(inverse, g)
     return [full[i][j] for i, j in PAIRS], gradient
 
 
@@ -362,19 +423,27 @@ def accumulate(
     curvature, gradient = contributions(q, turned, term, wide)
     sums = total([*curvature, *gradient, term.cost])
     gradient = sums[45:54]
-    flat = with_twist(sums[:45], [gate * value for value in gradient[:3]])
+    flat = with_twist(sums[:45], [gate * value for value in gradient[:6]])
     return Normal(jnp.stack(flat), jnp.stack(gradient), sums[54])
 
 
 def with_twist(flat: Vector, gradient: Vector) -> Vector:
-    """A flat curvature with the (v, w) block of q's second derivatives, [sum g]x, added.
+    """A flat curvature completed by what the summed gradient knows of q's second derivatives.
 
-    It needs nothing but the summed gradient along v, which is -sum g.
+    Args:
+        flat: sums of :func:`contributions`.
+        gradient: summed along v and w, times the gate. The first is -sum g: (v, w) gets [sum g]x. The
+            second is sum g x q: the upper half of A [q]x has q_i g_j where (w, w) has the mean of
+            that and q_j g_i.
     """
-    twist = unrolled.cross([-value for value in gradient])
+    twist = unrolled.cross([-value for value in gradient[:3]])
+    lean = unrolled.cross([0.5 * value for value in gradient[3:6]])
     flat = list(flat)
     for i in range(3):
         for j in range(3):
             place = PAIRS.index((i, 3 + j))
             flat[place] = unrolled.add(flat[place], twist[i][j])
+            if j > i:
+                place = PAIRS.index((3 + i, 3 + j))
+                flat[place] = unrolled.add(flat[place], unrolled.times(-1, lean[i][j]))
     return flat

@@ -133,8 +133,8 @@ def components(guess: Guess, images: Images, sigma: Float[Array, "3 lanes"] | No
     if sigma is None:
         curvature = [jnp.zeros_like(squares[0])] * len(PAIRS)
     else:
-        along_v = _weighted([row[:3] for row in gradient], 1 / sigma**2)
-        curvature = with_twist(sums[COMPONENTS * each :], along_v)
+        along = _weighted([row[:6] for row in gradient], 1 / sigma**2)
+        curvature = with_twist(sums[COMPONENTS * each :], along)
     return Sums(
         jnp.stack(squares),
         jnp.stack([jnp.stack(row) for row in gradient]),

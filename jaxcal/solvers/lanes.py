@@ -184,6 +184,7 @@ def minimise(
     def iterate(state: Descent) -> Descent:
         return step(state, belief, images, rounding, tolerance, max_steps)
 
+    images, belief = apart((images.padded(), belief.padded()))
     rounding = apart(Rounding.of(start, belief, images))
     state = begin(start, belief, images, rounding, damping, tolerance)
     return jax.lax.while_loop(lambda state: jnp.any(state.active), iterate, state)
