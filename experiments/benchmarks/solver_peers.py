@@ -40,7 +40,7 @@ from jaxcal.io.atomic import atomic_path  # noqa: E402
 from jaxcal.model.parameters import Parameters  # noqa: E402
 from jaxcal.simulation import Protocol, simulate  # noqa: E402
 from jaxcal.solvers import lanes  # noqa: E402
-from jaxcal.solvers.fused import Circle, Guess, Images, targets  # noqa: E402
+from jaxcal.solvers.fused import Circle, Guess, Images  # noqa: E402
 
 SEED = 20261125
 SIGMA_MM, OFFSET_SD_MM = 0.5, 2 / np.sqrt(3)
@@ -106,12 +106,11 @@ def fused_solver(
             jnp.full(points.shape[:2], jnp.inf, points.dtype),
         )  # fmt: skip
         done = lanes.minimise(guess, belief, images)
-        q, _ = targets(done.guess, images)
         found = done.guess.parameters()
         return (
             jax.vmap(Parameters.matrix)(found),
             found.point,
-            belief.offset(q, images),
+            belief.offset(done.guess, images),
             done.iterations,
         )
 

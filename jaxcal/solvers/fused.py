@@ -301,10 +301,12 @@ class Circle(Belief):
         held = ((s >= limit) & (slope < 0)) | ((s <= -limit) & (slope > 0))
         return _OnCircle(radius, s, c, slope, plain, exact, held)
 
-    def offset(self, q: Vector, images: Images) -> Float[Array, "lanes n"]:
-        """y_i, mm."""
-        there = self._solve(q, images, steps=3)
-        return images.mask * there.radius * there.sine
+    def offset(self, guess: Guess, images: Images) -> Float[Array, "lanes n"]:
+        """y_i at a guess, mm."""
+        count, images = images.mask.shape[1], images.padded()
+        q, _ = targets(guess, images)
+        there = self.padded()._solve(q, images, steps=3)
+        return (images.mask * there.radius * there.sine)[:, :count]
 
     def term(self, q: Vector, images: Images, gate: Float[Array, "lanes 1"]) -> Term:
         there = self._solve(q, images)
@@ -343,8 +345,8 @@ def contributions(
     """An image's part of the 45 curvatures and the 9 gradients, as planes (or structural 0).
 
     The gate says how much of the second derivatives of q there is to be; 0 for none. They come
-    with A = [q]x' K + [g]x in the place of [q]x' K: A M has all of (w, d), and A [q]x has (w, w) but
-    for an antisymmetric part that :func:`with_twist` takes from the summed gradient.
+    with A = [q]x' K + [g]x in the place of [q]x' K: A M has all of (w, d), and A [q]x has (w, w)
+    but for an antisymmetric part that :func:`with_twist` takes from the summed gradient.
     """
     g, k = term.gradient, term.curvature
     lever = unrolled.cross(q)
@@ -432,9 +434,9 @@ def with_twist(flat: Vector, gradient: Vector) -> Vector:
 
     Args:
         flat: sums of :func:`contributions`.
-        gradient: summed along v and w, times the gate. The first is -sum g: (v, w) gets [sum g]x. The
-            second is sum g x q: the upper half of A [q]x has q_i g_j where (w, w) has the mean of
-            that and q_j g_i.
+        gradient: summed along v and w, times the gate. The first is -sum g: (v, w) gets [sum g]x.
+            The second is sum g x q: the upper half of A [q]x has q_i g_j where (w, w) has the mean
+            of that and q_j g_i.
     """
     twist = unrolled.cross([-value for value in gradient[:3]])
     lean = unrolled.cross([0.5 * value for value in gradient[3:6]])

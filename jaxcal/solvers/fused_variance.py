@@ -36,9 +36,12 @@ from jaxcal.solvers.fused import (
     total,
     with_twist,
 )
-from jaxcal.solvers.lanes import GATE, IDLE, apart, choose, default_tolerance
+from jaxcal.solvers.lanes import IDLE, apart, choose, default_tolerance
 from jaxcal.solvers.unrolled import Matrix, Vector, symmetric
 from jaxcal.solvers.variance import ABSOLUTE_FLOOR_MM, MINIMUM_SELF_TUNING, RELATIVE_FLOOR
+
+GATE = 0.03
+"""Gradient cosine below which second derivatives are exact."""
 
 UPDATES = 3
 """Updates of the SDs on the sums of one pass."""

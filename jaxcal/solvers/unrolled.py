@@ -5,7 +5,7 @@ A matrix is a list of rows of arrays that all have the same shape, one entry for
 few vectorised loops over the lanes: 0.07 us a lane, where the same by loops over rows and columns
 takes 2 us. Structural zeros are the number 0 and cost nothing.
 
-A matrix that is not positive definite gives NaN, in its own lane only.
+A matrix that is not positive definite gives NaN or Inf, in its own lane only.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def cholesky(matrix: Matrix) -> tuple[Matrix, Vector]:
     inverse: Vector = []
     for j in range(size):
         pivot = add(matrix[j][j], *(-factor[j][k] * factor[j][k] for k in range(j)))
-        inverse.append(jnp.where(pivot > 0, jax.lax.rsqrt(pivot), jnp.nan))
+        inverse.append(jax.lax.rsqrt(pivot))
         for i in range(j + 1, size):
             rest = add(matrix[i][j], *(-factor[i][k] * factor[j][k] for k in range(j)))
             factor[i][j] = times(rest, inverse[j])
