@@ -25,7 +25,7 @@ from jaxtyping import Float
 from jaxcal.offsets import DEGREES_OF_FREEDOM, OffsetLaw, standard_deviation
 
 UNKNOWNS = 9
-ADAPTING, DRAWS, ROUNDS = 768, 1024, 6
+ADAPTING, DRAWS, ROUNDS = 768, 1024, 20
 ENOUGH, MOST_BLOCKS = 400.0, 24
 TAIL = 10.0
 """Degrees of freedom of the draws: heavier tails than the posterior's keep the weights bounded."""
@@ -81,7 +81,9 @@ class Target:
     points: Float[np.ndarray, "n 2"]
     whitening: Float[np.ndarray, "n 2 2"]
 
-    def log_density(self, tangents: Float[np.ndarray, "draws 9"], soft: bool = False):
+    def log_density(
+        self, tangents: Float[np.ndarray, "draws 9"], soft: bool = False
+    ) -> Float[np.ndarray, " draws"]:
         """Exact log posterior of every tangent, up to a constant."""
         count, draws = len(self.position), len(tangents)
         rotation = rotations(tangents[:, 3:6])
@@ -198,10 +200,14 @@ def posterior_mean(
         draws.append(z)
         logs.append(target.log_density(centre + z @ root.T) + proposed)
         log_weight = np.concatenate(logs)
-        weight = np.exp(log_weight - np.max(log_weight))
-        weight /= np.sum(weight)
+        if np.max(log_weight) == -np.inf:
+            continue
+        weight = weights(log_weight, 1.0)
         if effective(weight) > ENOUGH:
             break
+    else:
+        if np.max(log_weight) == -np.inf:
+            raise RuntimeError("no draw has all offsets within the edges of their law")
     z = np.concatenate(draws)
     middle = weight @ z
     apart = (z - middle) ** 2
@@ -228,20 +234,23 @@ def moved(x: np.ndarray, tangent: np.ndarray) -> np.ndarray:
 
 def effective(weight: np.ndarray) -> float:
     """How many independent draws weighted ones are worth."""
-    return float(np.sum(weight) ** 2 / np.sum(weight**2))
+    return float(1 / np.sum(weight**2))
+
+
+def weights(log_weight: np.ndarray, power: float) -> np.ndarray:
+    """Weights to a power, normalised."""
+    weight = np.exp(power * (log_weight - np.max(log_weight)))
+    return weight / np.sum(weight)
 
 
 def tempered(log_weight: np.ndarray, enough: float) -> tuple[np.ndarray, float]:
     """Normalised weights to the largest power up to 1 that leaves them worth ``enough`` draws."""
-
-    def weights(power: float) -> np.ndarray:
-        weight = np.exp(power * (log_weight - np.max(log_weight)))
-        return weight / np.sum(weight)
-
-    if effective(weights(1.0)) >= enough:
-        return weights(1.0), 1.0
+    weight = weights(log_weight, 1.0)
+    if effective(weight) >= enough:
+        return weight, 1.0
     low, high = 0.0, 1.0
     for _ in range(20):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if effective(weights(middle)) >= enough else (low, middle)
-    return weights(low), low
+        enough_left = effective(weights(log_weight, middle)) >= enough
+        low, high = (middle, high) if enough_left else (low, middle)
+    return weights(log_weight, low), low
