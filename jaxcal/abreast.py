@@ -8,15 +8,19 @@ reference for these. Either way :func:`jaxcal.pipeline.finish` makes a calibrati
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
 from jaxcal.calibration import Calibration
+from jaxcal.fused_findings import find
 from jaxcal.model.parameters import RIGID
 from jaxcal.model.priors import Bounded, Gaussian
 from jaxcal.options import Given, Plan
-from jaxcal.pipeline import Solution, agreeing, belief, finish
+from jaxcal.pipeline import Solution, agreeing, assemble, belief, finish
 from jaxcal.problem import Problem
+from jaxcal.solvers.auto import average_over_laws
 from jaxcal.solvers.fused import Images, Measured
 from jaxcal.solvers.fused_methods import Begun, alternate, from_scratch
 from jaxcal.solvers.fused_variance import self_tuned
@@ -45,11 +49,47 @@ def solve_problems(problems: Problem, given: Given, plan: Plan) -> Calibration:
     images = Images.of(frozen)
     begun = from_scratch(images, max_steps=plan.options.max_iterations)
     solution = run_method(begun, images, frozen, numbers, plan)
+    return finish_batch(plan, solution, problems, everything, given)
 
-    def one(solution: Solution, problem: Problem, whole: Problem) -> Calibration:
-        return finish(solution, problem, whole, given, plan)
 
-    return jax.vmap(one)(solution, problems, everything)
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def finish_batch(
+    plan: Plan, solution: Solution, problems: Problem, everything: Problem, given: Given
+) -> Calibration:
+    """:func:`jaxcal.pipeline.finish` for a batch; where it is differentiated, that function itself.
+
+    Args:
+        plan: what is static about the request.
+        solution: where the method stopped, with a leading axis, and so are the following.
+        problems: the images in use.
+        everything: with those that were left out because they do not agree.
+        given: numbers that came with the request (without that axis).
+    """
+    parameters, prior, averaged = solution.parameters, solution.prior, None
+    if plan.laws and isinstance(prior, Gaussian):
+        averaged = jax.vmap(
+            lambda parameters, prior, problem: average_over_laws(
+                parameters, prior, problem, plan.blocks, plan.laws
+            )
+        )(parameters, prior, problems)
+        parameters, prior = averaged.parameters, averaged.belief
+    found = find(solution, parameters, solution.offset, prior, averaged, problems, everything, plan)
+    law = None if averaged is None else averaged.law
+
+    def one(solution, parameters, prior, found, law, problem) -> Calibration:
+        return assemble(solution, parameters, prior, found, law, problem, given, plan)
+
+    return jax.vmap(one)(solution, parameters, prior, found, law, problems)
+
+
+@finish_batch.defjvp
+def _finish_batch_jvp(plan: Plan, primals: tuple, tangents: tuple) -> tuple:
+    def reference(solution, problems, everything, given) -> Calibration:
+        return jax.vmap(lambda s, p, e: finish(s, p, e, given, plan))(
+            solution, problems, everything
+        )
+
+    return jax.jvp(reference, primals, tangents)
 
 
 def run_method(

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxcal.calibration import Calibration, Status
-from jaxcal.inspection import Inspection, inspect
-from jaxcal.metrics import root_mean_square
+from jaxcal.findings import Findings, Solution, find
 from jaxcal.model.parameters import Parameters, block_slice, retract
 from jaxcal.model.priors import (
     AbstractPrior,
@@ -25,46 +23,24 @@ from jaxcal.model.priors import (
     ChannelGaussian,
     Gaussian,
     InPlane,
-    channels_of,
     covariance_shape,
 )
-from jaxcal.model.residuals import circle_residual, measurement_residual, target_in_image
 from jaxcal.options import DEFAULT_MAX_ELEVATION_MM, Given, Plan
 from jaxcal.problem import Problem
-from jaxcal.recording import MINIMUM_IMAGES
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import alternate
-from jaxcal.solvers.auto import Averaged, OffsetLaw, average_over_laws
+from jaxcal.solvers.auto import OffsetLaw, average_over_laws
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.solvers.conventional import from_scratch, pairwise_gradient
 from jaxcal.solvers.joint import joint
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING, self_tuned
 from jaxcal.sound import WATER_M_S
-from jaxcal.uncertainty import LARGEST_SD, Uncertainty, assess, lever_arm
 
 HELD_SIGMA = (0.5, 0.5, 1.0)
 """SDs of lateral position, range and offset (mm), where too few images leave them unknown."""
 
 HELD_CHANNEL_SIGMA = (0.5, 1.0)
 """SDs of an element's distance and of the offset (mm), likewise."""
-
-
-class Solution(eqx.Module):
-    """What the methods have in common when they are done."""
-
-    parameters: Parameters
-    offset: Float[Array, " k"]
-    prior: AbstractPrior
-    sigma_floored: Bool[Array, " components"]
-    cost: Float[Array, ""]
-    stationarity: Float[Array, ""]
-    arrived: Bool[Array, ""]
-    iterations: Array
-    variance_rounds: Array
-    rotation_change: Float[Array, ""]
-    translation_change: Float[Array, ""]
-    trace: Float[Array, " trace"] | None
-    searched_start: Bool[Array, ""]
 
 
 def solve_problem(problem: Problem, given: Given, plan: Plan) -> Calibration:
@@ -101,40 +77,9 @@ def finish(
     if plan.laws and isinstance(prior, AbstractSelfTuned):
         averaged = average_over_laws(parameters, prior, problem, plan.blocks, plan.laws)
         parameters, prior = averaged.parameters, averaged.belief
-    uncertainty = assess(
-        parameters, offset, prior, problem, plan.blocks,
-        whitened=plan.prior == "gaussian", uses_prior=plan.prior != "none",
-    )  # fmt: skip
-    if averaged is not None:
-        uncertainty = _of_the_laws(uncertainty, averaged)
+    found = find(solution, parameters, offset, prior, averaged, problem, everything, plan)
     law = None if averaged is None else averaged.law
-    elevation = prior.elevation(parameters, offset, problem)
-    sigma = _three_sigmas(prior, parameters, elevation, uncertainty, problem)
-    inspection = inspect(
-        parameters, offset, prior, problem, everything, plan.blocks, sigma=sigma,
-        weakest=uncertainty.weakest, left_out=plan.robust,
-    )  # fmt: skip
-    return _assemble(
-        solution, parameters, offset, prior, uncertainty, inspection, law, problem, given, plan
-    )
-
-
-def _of_the_laws(uncertainty: Uncertainty, averaged: Averaged) -> Uncertainty:
-    """The Gaussian solution's uncertainty with the covariances of the average over the laws."""
-    weighed = averaged.law.weighed
-
-    def either(new: Array, old: Array) -> Array:
-        # What the Gaussian solution cannot tell at all stays unknown.
-        return jnp.where(weighed & jnp.isfinite(old), new, old)
-
-    return eqx.tree_at(
-        lambda u: (u.covariance, u.elevation_sd),
-        uncertainty,
-        (
-            either(averaged.covariance, uncertainty.covariance),
-            either(averaged.elevation_sd, uncertainty.elevation_sd),
-        ),
-    )
+    return assemble(solution, parameters, prior, found, law, problem, given, plan)
 
 
 def belief(problem: Problem, given: Given, plan: Plan) -> AbstractPrior:
@@ -243,45 +188,40 @@ def _attach(
     return retract(reference, tangent, plan.blocks), offset, prior
 
 
-def _assemble(
+def assemble(
     solution: Solution,
     parameters: Parameters,
-    offset: Float[Array, " k"],
     prior: AbstractPrior,
-    uncertainty: Uncertainty,
-    inspection: Inspection,
+    found: Findings,
     law: OffsetLaw | None,
     problem: Problem,
     given: Given,
     plan: Plan,
 ) -> Calibration:
-    matrix = parameters.matrix()
-    residual = circle_residual(parameters, jnp.zeros_like(problem.mask), problem)
-    used = jnp.sum(problem.mask)
-    elevation = prior.elevation(parameters, offset, problem)
-    status = _status(solution, matrix, uncertainty, parameters, problem, plan)
-    usable = status != Status.UNOBSERVABLE
+    """All that was found, as a calibration: nothing is computed any more."""
+    uncertainty = found.uncertainty
+    usable = found.status != Status.UNOBSERVABLE
     covariance = jnp.where(usable, uncertainty.covariance, jnp.nan)
     point = block_slice(plan.blocks, "point")
     floored = solution.sigma_floored
-    medium = _medium(parameters, covariance, problem, given, plan)
+    enough = jnp.sum(problem.mask) >= MINIMUM_SELF_TUNING
     return Calibration(
-        image_to_probe=matrix,
+        image_to_probe=parameters.matrix(),
         point=parameters.point,
-        elevation=elevation,
+        elevation=found.elevation,
         elevation_sd=uncertainty.elevation_sd,
-        sigma=_three_sigmas(prior, parameters, elevation, uncertainty, problem),
+        sigma=found.sigma,
         offset_law=law,
         channel_sigma=prior.sigma[0] if isinstance(prior, ChannelGaussian) else None,
         covariance=covariance[:6, :6],
         point_covariance=covariance[point, point],
         scale_mm_per_px=problem.spacing * parameters.scale if problem.pixels else None,
-        **medium,
-        residual=residual,
-        rms=root_mean_square(residual, problem.mask),
+        **_medium(parameters, covariance, problem, given, plan),
+        residual=found.residual,
+        rms=found.rms,
         mask=problem.mask,
         at_bound=uncertainty.at_bound,
-        status_code=status,
+        status_code=found.status,
         iterations=solution.iterations,
         variance_rounds=solution.variance_rounds,
         cost=solution.cost,
@@ -291,11 +231,11 @@ def _assemble(
         weakest_sd=uncertainty.weakest_sd,
         prior_direction=uncertainty.prior_direction,
         searched_start=solution.searched_start,
-        inspection=inspection,
-        sigma_tuned=jnp.asarray(plan.self_tuning) & (used >= MINIMUM_SELF_TUNING),
+        inspection=found.inspection,
+        sigma_tuned=jnp.asarray(plan.self_tuning) & enough,
         sigma_floored=floored[jnp.asarray([0, 0, 1])] if plan.channels else floored,
         tolerance_met=solution.arrived,
-        differentiable=_differentiable(solution, uncertainty, prior, offset, problem, status),
+        differentiable=found.differentiable,
         rotation_change=solution.rotation_change,
         translation_change=solution.translation_change,
         trace=solution.trace,
@@ -333,89 +273,3 @@ def _medium(
         found["delay_sd_s"] = jnp.sqrt(covariance[at, at]) / (1e3 * speed)
         found["delay_prior_s"] = None if given.medium_sd is None else given.medium_sd[1]
     return found
-
-
-def _three_sigmas(
-    prior: AbstractPrior,
-    parameters: Parameters,
-    elevation: Float[Array, " n"],
-    uncertainty: Uncertainty,
-    problem: Problem,
-) -> Float[Array, 3]:
-    """SDs of lateral position, range and offset, mm: the belief's own or those of the residuals."""
-    if isinstance(prior, Gaussian):
-        return prior.sigma
-    if isinstance(prior, ChannelGaussian):
-        point_sd = prior.sigma[0] * _point_sd(parameters, problem)
-        return jnp.concatenate([point_sd, prior.sigma[1:]])
-    used = jnp.sum(problem.mask)
-    errors = measurement_residual(parameters, problem).at[:, 2].set(elevation)
-    # The unknowns' degrees of freedom are shared equally by the three components.
-    freedom = jnp.maximum(used - uncertainty.weakest.shape[0] / 3, 1.0)
-    mean_square = jnp.sum(errors**2, axis=0) / freedom
-    if isinstance(prior, Bounded):
-        # Offsets within a bound have a root mean square within it, too.
-        mean_square = mean_square.at[2].set(jnp.sum(elevation**2) / used)
-    return jnp.sqrt(mean_square)
-
-
-def _point_sd(parameters: Parameters, problem: Problem) -> Float[Array, 2]:
-    """Root mean square SD of (lateral, axial) from an image's elements alone, per unit of theirs.
-
-    The inverse of the 2x2 information of Eq. 5 (or 6) with the offset held.
-    """
-    channels = channels_of(problem)
-    apart = target_in_image(parameters, problem)[:, None, :] - channels.elements
-    distance = jnp.sqrt(jnp.sum(apart**2, axis=-1))
-    weight = problem.mask[:, None] * channels.heard
-    slope = weight[..., None] * apart[..., jnp.asarray([0, 2])] / distance[..., None]
-    a, c = jnp.sum(slope[..., 0] ** 2, axis=1), jnp.sum(slope[..., 1] ** 2, axis=1)
-    b = jnp.sum(slope[..., 0] * slope[..., 1], axis=1)
-    determinant = a * c - b**2
-    known = determinant > 0
-    variance = jnp.stack([c, a], axis=1) / jnp.where(known, determinant, 1.0)[:, None]
-    known = known[:, None] & (problem.mask[:, None] > 0)
-    return jnp.sqrt(jnp.sum(jnp.where(known, variance, 0.0), axis=0) / jnp.sum(known, axis=0))
-
-
-def _status(
-    solution: Solution,
-    matrix: Float[Array, "4 4"],
-    uncertainty: Uncertainty,
-    parameters: Parameters,
-    problem: Problem,
-    plan: Plan,
-) -> Array:
-    finite = jnp.all(jnp.isfinite(matrix)) & jnp.all(jnp.isfinite(parameters.point))
-    finite = finite & jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(parameters.scale))
-    failed = jnp.logical_not(finite) | (jnp.sum(problem.mask) < MINIMUM_IMAGES)
-    unobservable = uncertainty.degenerate
-    if plan.prior != "bounded":
-        # Within bounds a direction that nothing determines is still confined to an interval: that
-        # is a warning. Without bounds nothing confines it.
-        lever = lever_arm(parameters, problem)
-        unobservable = unobservable | (uncertainty.weakest_sd > LARGEST_SD * lever)
-    status = jnp.where(solution.arrived, Status.CONVERGED, Status.MAX_ITERATIONS)
-    status = jnp.where(unobservable, Status.UNOBSERVABLE, status)
-    return jnp.where(failed, Status.FAILED, status).astype(jnp.int32)
-
-
-def _differentiable(
-    solution: Solution,
-    uncertainty: Uncertainty,
-    prior: AbstractPrior,
-    offset: Float[Array, " k"],
-    problem: Problem,
-    status: Array,
-) -> Bool[Array, ""]:
-    """Whether the implicit function theorem's conditions hold at the solution."""
-    still = 1e-6 if float(jnp.finfo(problem.mask.dtype).eps) < 1e-10 else 1e-3
-    good = (status == Status.CONVERGED) & (solution.stationarity <= still)
-    good = good & jnp.logical_not(jnp.any(solution.sigma_floored))
-    if isinstance(prior, Bounded):
-        # An offset about to reach its bound, or to leave it, makes the answer's kink.
-        gap = jnp.abs(prior.limit(solution.parameters, problem) - jnp.abs(offset))
-        closest = jnp.where((uncertainty.at_bound > 0) | (problem.mask == 0), jnp.inf, gap)
-        good = good & (jnp.min(closest) > 1e-6) & (uncertainty.weakest_hold > 1e-6)
-        good = good & jnp.logical_not(uncertainty.singular)
-    return good

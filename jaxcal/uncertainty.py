@@ -32,7 +32,7 @@ LARGEST_SD = 0.5
 
 
 class Uncertainty(eqx.Module):
-    """Covariances and observability at a solution.
+    """Covariances and observability at a solution (of a batch: with leading axes).
 
     Attributes:
         covariance: (p, p) of the shared unknowns' tangent; NaN where singular.
@@ -48,16 +48,16 @@ class Uncertainty(eqx.Module):
             inf where no bound is active.
     """
 
-    covariance: Float[Array, "p p"]
-    elevation_sd: Float[Array, " n"]
-    condition: Float[Array, ""]
-    weakest: Float[Array, " p"]
-    weakest_sd: Float[Array, ""]
-    prior_direction: Float[Array, " p"]
-    degenerate: Bool[Array, ""]
-    singular: Bool[Array, ""]
-    at_bound: Float[Array, " n"]
-    weakest_hold: Float[Array, ""]
+    covariance: Float[Array, "*batch p p"]
+    elevation_sd: Float[Array, "*batch n"]
+    condition: Float[Array, "*batch"]
+    weakest: Float[Array, "*batch p"]
+    weakest_sd: Float[Array, "*batch"]
+    prior_direction: Float[Array, "*batch p"]
+    degenerate: Bool[Array, "*batch"]
+    singular: Bool[Array, "*batch"]
+    at_bound: Float[Array, "*batch n"]
+    weakest_hold: Float[Array, "*batch"]
 
 
 def assess(
@@ -110,7 +110,7 @@ def assess(
     degenerate = design_values[0] < threshold * design_values[-1]
 
     weakest_sd = jnp.sqrt(variance / smallest)
-    unseen = _one_of_many(design_vectors, design_values < threshold * design_values[-1])
+    unseen = one_of_many(design_vectors, design_values < threshold * design_values[-1])
     weakest = jnp.where(degenerate, unseen, vectors[:, 0])
     inverse = arrows.inverse_symmetric(information, jnp.diagonal(arrow.shared))
     unknown = degenerate | (singular & jnp.logical_not(whitened))
@@ -174,7 +174,7 @@ def _spectrum(
     return found.values, found.right
 
 
-def _one_of_many(vectors: Float[Array, "p p"], null: Bool[Array, " p"]) -> Float[Array, " p"]:
+def one_of_many(vectors: Float[Array, "p p"], null: Bool[Array, " p"]) -> Float[Array, " p"]:
     """The unit vector of a null space that lies closest to one single unknown, X's shift first.
 
     Where the space has several dimensions its eigenvectors are any mixture; this one has a name.

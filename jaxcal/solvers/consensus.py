@@ -53,8 +53,11 @@ FEW_IMAGES = 30
 SEED = 20261121
 FEWEST_IMAGES = 8
 """With fewer used images nothing is left out: they cannot outvote one another."""
-_MAD = 1.4826
-_RELATIVE_FLOOR = 0.02
+MAD = 1.4826
+"""SD of a normal law over the median of its magnitude."""
+RELATIVE_FLOOR = 0.02
+HALVINGS = 24
+"""Of the bracket about a median: a ten-millionth of the largest value."""
 
 Errors = Callable[[Parameters, Problem], Float[Array, "n 3"]]
 Propose = Callable[[Problem, Float[Array, "k n"]], Parameters]
@@ -110,7 +113,7 @@ def steadied_errors(parameters: Parameters, problem: Problem) -> Float[Array, "n
     errors = measurement_residual(parameters, problem)
     # The unknowns' own effect on the range is beside the point, and it must not be differentiated.
     distance = measured_points(_nominal(problem), problem)[:, 1]
-    beyond = jnp.maximum(distance / _quantile(distance, problem.mask, 0.5), 1.0)
+    beyond = jnp.maximum(distance / quantile(distance, problem.mask, 0.5), 1.0)
     return errors.at[:, 0].divide(jnp.where(problem.mask > 0, beyond, 1.0))
 
 
@@ -136,9 +139,9 @@ def find_consensus(problem: Problem, model: Model) -> Consensus:
 
     def concentrate(_: Array, parameters: Parameters) -> Parameters:
         errors, jacobian = _linearise(parameters, problem, model)
-        sigma = _with_floor(_MAD * _medians(errors, used, model))
+        sigma = _with_floor(MAD * _medians(errors, used, model))
         squared = jnp.sum((errors / sigma) ** 2, axis=1)
-        nearest = _quantile(squared, used, CONCENTRATION)
+        nearest = quantile(squared, used, CONCENTRATION)
         weight = used * (squared <= nearest)
         return _step(parameters, errors, jacobian, sigma, weight, model)
 
@@ -208,7 +211,7 @@ def _depart(
 ) -> tuple[Float[Array, 3], Float[Array, "n 3"]]:
     # The unknowns' degrees of freedom are shared equally by the three components.
     freedom = jnp.maximum(1 - size(model.blocks) / (3 * jnp.sum(weight)), 0.1)
-    sigma = _with_floor(_MAD * _medians(errors, weight, model) / jnp.sqrt(freedom))
+    sigma = _with_floor(MAD * _medians(errors, weight, model) / jnp.sqrt(freedom))
     leverage = _leverage(jacobian, sigma, weight)
     # An image in use pulls the fit towards itself; one that is not, is predicted by the fit.
     inside = errors / jnp.sqrt(jnp.maximum(1 - leverage, 0.05))
@@ -356,11 +359,11 @@ def _medians(
     """Median magnitude of each component over the weighted images, mm."""
     if model.isotropic:
         three = jnp.repeat(weight, 3)
-        return jnp.full(3, _quantile(jnp.abs(errors).ravel(), three, 0.5))
-    return jax.vmap(_quantile, (1, None, None))(jnp.abs(errors), weight, 0.5)
+        return jnp.full(3, quantile(jnp.abs(errors).ravel(), three, 0.5))
+    return jax.vmap(quantile, (1, None, None))(jnp.abs(errors), weight, 0.5)
 
 
-def _quantile(
+def quantile(
     values: Float[Array, " n"], weight: Float[Array, " n"], share: float
 ) -> Float[Array, ""]:
     """The least value that at least ``share`` of the weight does not exceed, by bisection.
@@ -379,10 +382,10 @@ def _quantile(
         enough = jnp.sum(weight * (values <= middle)) >= wanted
         return jnp.where(enough, low, middle), jnp.where(enough, middle, high)
 
-    found = jax.lax.fori_loop(0, 24, halve, (jnp.zeros_like(high), high))[1]
+    found = jax.lax.fori_loop(0, HALVINGS, halve, (jnp.zeros_like(high), high))[1]
     return jnp.where(jnp.sum(weight * (values <= high)) >= wanted, found, jnp.inf)
 
 
 def _with_floor(sigma: Float[Array, 3]) -> Float[Array, 3]:
     """No SD below a fiftieth of the largest: what departs by less is no gross error."""
-    return jnp.maximum(sigma, jnp.maximum(_RELATIVE_FLOOR * jnp.max(sigma), 1e-6))
+    return jnp.maximum(sigma, jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma), 1e-6))
