@@ -20,8 +20,8 @@ from jaxcal.model.priors import Bounded, Gaussian
 from jaxcal.options import Given, Plan
 from jaxcal.pipeline import Solution, agreeing, assemble, belief, finish
 from jaxcal.problem import Problem
-from jaxcal.solvers.auto import average_over_laws
 from jaxcal.solvers.fused import Images, Measured
+from jaxcal.solvers.fused_auto import average_abreast
 from jaxcal.solvers.fused_methods import Begun, alternate, from_scratch
 from jaxcal.solvers.fused_variance import self_tuned
 from jaxcal.solvers.lanes import minimise
@@ -67,11 +67,7 @@ def finish_batch(
     """
     parameters, prior, averaged = solution.parameters, solution.prior, None
     if plan.laws and isinstance(prior, Gaussian):
-        averaged = jax.vmap(
-            lambda parameters, prior, problem: average_over_laws(
-                parameters, prior, problem, plan.blocks, plan.laws
-            )
-        )(parameters, prior, problems)
+        averaged = average_abreast(parameters, prior, problems, plan.laws)
         parameters, prior = averaged.parameters, averaged.belief
     found = find(solution, parameters, solution.offset, prior, averaged, problems, everything, plan)
     law = None if averaged is None else averaged.law

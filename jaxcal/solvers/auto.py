@@ -145,12 +145,7 @@ def average_over_laws(
     prior = jnp.asarray([shape.prior for shape in shapes], problem.mask.dtype)
     families: tuple[Family, ...] = tuple(shape.family for shape in shapes)
     found = propagate(best.linear, families, stretch * best.sigma[-1])
-    good = jnp.isfinite(found.log_evidence) & (found.change < LARGEST_CHANGE)
-    score = jnp.where(good, found.log_evidence, 0.0) + jnp.log(prior)
-    score = jnp.where(good, score, -jnp.inf)
-    # Where no law is good the weights must still be numbers: a lane's NaN poisons its gradient.
-    some = jnp.any(good)
-    weight = jax.nn.softmax(jnp.where(some, score, 0.0)) * good
+    weight, good = weights(found.log_evidence, found.change, prior)
     means = jnp.where(good[:, None], found.mean, 0.0)
     mean = weight @ means
     apart = jnp.where(good[:, None], means - mean, 0.0)
@@ -158,7 +153,7 @@ def average_over_laws(
     covariance = jnp.einsum("k,kpq->pq", weight, within)
     covariance = covariance + jnp.einsum("k,kp,kq->pq", weight, apart, apart)
 
-    enough = (used >= MINIMUM_SELF_TUNING) & some
+    enough = (used >= MINIMUM_SELF_TUNING) & jnp.any(good)
     enough = enough & jnp.all(jnp.isfinite(mean))
     shared = covariance[:-1, :-1]
     along = best.linear.direction[:, :-1]
@@ -192,6 +187,20 @@ def average_over_laws(
         elevation_sd=jnp.sqrt(jnp.where(problem.mask > 0, variance, jnp.nan)),
         law=law,
     )
+
+
+def weights(
+    log_evidence: Float[Array, k * lanes],
+    change: Float[Array, k * lanes],
+    prior: Float[Array, " k"],
+) -> tuple[Float[Array, k * lanes], Bool[Array, k * lanes]]:
+    """The laws' probabilities, and which of them count at all."""
+    good = jnp.isfinite(log_evidence) & (change < LARGEST_CHANGE)
+    prior = prior.reshape(-1, *(1,) * (log_evidence.ndim - 1))
+    score = jnp.where(good, jnp.where(good, log_evidence, 0.0) + jnp.log(prior), -jnp.inf)
+    # Where no law is good the weights must still be numbers: a lane's NaN poisons its gradient.
+    score = jnp.where(jnp.any(good, axis=0), score, 0.0)
+    return jax.nn.softmax(score, axis=0) * good, good
 
 
 class Candidates(eqx.Module):

@@ -4,7 +4,7 @@ Two questions are put to the data before any law of the offsets is: do the covar
 with the measurements describe their errors better than common SDs do, and do the offsets have a
 mean other than zero? Own covariances fix the ratios of all measurements' SDs, so one factor is
 tuned for them, and one SD for the offsets; common SDs are tuned separately. Each combination is
-tuned by a few rounds of Gauss-Newton and Helmert's variance update (:mod:`jaxcal.solvers.variance`)
+tuned by a few rounds of Gauss-Newton with Helmert's variance updates (:mod:`jaxcal.solvers.variance`)
 from the plain self-tuned fit, and judged by its Laplace evidence
 
     ln Z = -1/2 sum r' W r - 1/2 sum (q_y - b)^2 / sigma_y^2 + 1/2 sum ln |W| - n ln sigma_y
@@ -29,7 +29,12 @@ from jaxcal.solvers.expectation_propagation import Linear
 from jaxcal.solvers.least_squares import linearise
 from jaxcal.solvers.variance import with_floor
 
-ROUNDS = 6
+ROUNDS = 3
+"""Linearisations."""
+
+UPDATES = 2
+"""Updates of the SDs on each of them."""
+
 MEAN_SD = 2.0
 """SD of the offsets' mean before the data are seen, in SDs of the offsets."""
 
@@ -82,38 +87,54 @@ def tune(
         _, jacobian, residual = linearise(parameters, none, prior, problem, blocks)
         residual = residual.at[:, at].add(-problem.mask * mean / sigma[-1])
         along = jnp.zeros_like(residual).at[:, at].set(-with_mean * problem.mask / sigma[-1])
-        jacobian = jnp.concatenate([jacobian, along[None]])
+        return jnp.concatenate([jacobian, along[None]]), residual
+
+    def mean_precision(sigma: Array) -> Array:
         # Without a mean its unknown is held at zero.
-        precision = jnp.where(with_mean > 0, (MEAN_SD * sigma[-1]) ** -2.0, 1.0)
-        return jacobian, residual, precision
+        return jnp.where(with_mean > 0, (MEAN_SD * sigma[-1]) ** -2.0, 1.0)
 
     def curvature(jacobian: Array, precision: Array) -> Array:
         return jnp.einsum("anm,bnm->ab", jacobian, jacobian).at[-1, -1].add(precision)
 
     def one_round(_: Array, state: tuple) -> tuple:
         parameters, mean, sigma = state
-        jacobian, residual, precision = system(parameters, mean, sigma)
-        inverse, _ = dense.inverse_positive(curvature(jacobian, precision))
-        gradient = jnp.einsum("anm,nm->a", jacobian, residual).at[-1].add(precision * mean)
-        step = -inverse @ gradient
-        residual = residual + jnp.einsum("a,anm->nm", step, jacobian)
-        leverage = jnp.einsum("anm,ab,bnm->nm", jacobian, inverse, jacobian)
-        freedom = jnp.maximum(count - _sums(leverage, columns), 0.05 * count)
-        squares = _sums(residual**2, columns)
-        factor = squares / freedom
-        pooled = jnp.sum(squares[:-1]) / jnp.sum(freedom[:-1])
-        factor = factor.at[:-1].set(jnp.where(tied > 0, pooled, factor[:-1]))
-        sigma = with_floor(sigma * jnp.sqrt(factor))
+        here = system(parameters, mean, sigma)
+
+        def update(_: Array, state: tuple) -> tuple:
+            now, _ = state
+            ratio = jnp.ones_like(here[1][0])
+            for k, part in enumerate(columns):
+                ratio = ratio.at[part].set(sigma[k] / now[k])
+            jacobian, residual = ratio * here[0], ratio * here[1]
+            precision = mean_precision(now)
+            inverse, _ = dense.inverse_positive(curvature(jacobian, precision))
+            gradient = jnp.einsum("anm,nm->a", jacobian, residual).at[-1].add(precision * mean)
+            step = -inverse @ gradient
+            residual = residual + jnp.einsum("a,anm->nm", step, jacobian)
+            leverage = jnp.einsum("anm,ab,bnm->nm", jacobian, inverse, jacobian)
+            freedom = jnp.maximum(count - _sums(leverage, columns), 0.05 * count)
+            squares = _sums(residual**2, columns)
+            factor = squares / freedom
+            pooled = jnp.sum(squares[:-1]) / jnp.sum(freedom[:-1])
+            factor = factor.at[:-1].set(jnp.where(tied > 0, pooled, factor[:-1]))
+            return with_floor(now * jnp.sqrt(factor)), step
+
+        none = jnp.zeros(here[0].shape[0], sigma.dtype)
+        sigma, step = jax.lax.fori_loop(0, UPDATES, update, (sigma, none))
         return retract(parameters, step[:-1], blocks), mean + step[-1], sigma
 
     zero = jnp.zeros((), problem.mask.dtype)
     state = (parameters, zero, belief.sigma)
     parameters, mean, sigma = jax.lax.fori_loop(0, rounds, one_round, state)
 
-    jacobian, residual, precision = system(parameters, mean, sigma)
-    _, log_determinant = dense.inverse_positive(curvature(jacobian, precision))
-    evidence = -0.5 * (jnp.sum(residual**2) + precision * mean**2 + log_determinant)
-    evidence = evidence + 0.5 * jnp.log(precision) - jnp.sum(count * jnp.log(sigma))
+    jacobian, residual = system(parameters, mean, sigma)
+    precision = mean_precision(sigma)
+    inverse, log_determinant = dense.inverse_positive(curvature(jacobian, precision))
+    gradient = jnp.einsum("anm,nm->a", jacobian, residual).at[-1].add(precision * mean)
+    # The minimum is still a small step away.
+    cost = jnp.sum(residual**2) + precision * mean**2 - gradient @ inverse @ gradient
+    evidence = 0.5 * (jnp.log(precision) - cost - log_determinant)
+    evidence = evidence - jnp.sum(count * jnp.log(sigma))
     evidence = evidence - 0.5 * _log_shape(belief, problem)
     # The measurements' part, and the offsets in mm.
     direction = sigma[-1] * jacobian[:, :, at].T

@@ -63,7 +63,8 @@ class Posterior(eqx.Module):
         mean: of x.
         covariance: of x.
         log_evidence: up to a constant that the laws share.
-        change: how much the last sweep moved the mean, in SDs.
+        change: how far the last sweep moved the mean, in SDs (the length (d' S d)^1/2, S the
+            information).
     """
 
     mean: Float[Array, "k p"]
@@ -125,10 +126,7 @@ def propagate(
         covariance, mean, _, _ = belief(tau, nu)
         centre, without = cavity(tau, nu, covariance, mean)
         found = moments(centre, without)
-        new_tau = 1 / found.variance - 1 / without
-        # Beyond a heavy tail's bend a site is negative; a little of that is all that EP bears.
-        new_tau = jnp.maximum(new_tau, -0.2 / without)
-        new_nu = (new_tau + 1 / without) * found.mean - centre / without
+        new_tau, new_nu = refreshed(found, centre, without)
         tau = tau + DAMPING * used * (new_tau - tau)
         nu = nu + DAMPING * used * (new_nu - nu)
         return tau, nu, mean
@@ -142,6 +140,15 @@ def propagate(
     site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
     site = site + nu * linear.offset - 0.5 * tau * linear.offset**2
     evidence = jnp.sum(used * site, axis=1) + 0.5 * jnp.sum(rhs * mean, axis=1)
-    sds = jnp.sqrt(jnp.diagonal(covariance, axis1=1, axis2=2))
-    change = jnp.max(jnp.abs(mean - before) / sds, axis=1)
+    information = linear.information + (tau @ squares)[:, place]
+    step = mean - before
+    change = jnp.sqrt(jnp.maximum(jnp.einsum("kp,kpq,kq->k", step, information, step), 0.0))
     return Posterior(mean, covariance, evidence - 0.5 * log_determinant, change)
+
+
+def refreshed(found: Moments, centre: Array, without: Array) -> tuple[Array, Array]:
+    """The sites (tau, nu) that reproduce moments found, beside the Gaussian without them."""
+    tau = 1 / found.variance - 1 / without
+    # Beyond a heavy tail's bend a site is negative; a little of that is all that EP bears.
+    tau = jnp.maximum(tau, -0.2 / without)
+    return tau, (tau + 1 / without) * found.mean - centre / without

@@ -1,0 +1,208 @@
+"""The average over noise models and laws of the offsets, many problems side by side.
+
+It is :func:`jaxcal.solvers.auto.average_over_laws`, which is the reference and explains it, for
+plain problems: a rigid X and common SDs or own covariances. Evidence and laws have their own
+modules, :mod:`jaxcal.solvers.fused_evidence` and :mod:`jaxcal.solvers.fused_laws`. Derivatives are
+the reference's.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxcal.model.parameters import RIGID, Parameters
+from jaxcal.model.priors import Gaussian, covariance_shape
+from jaxcal.model.shapes import FAMILIES, Shape
+from jaxcal.problem import Problem
+from jaxcal.solvers import unrolled
+from jaxcal.solvers.auto import (
+    LOG_ODDS_OF_MEAN,
+    Averaged,
+    OffsetLaw,
+    average_over_laws,
+    weights,
+)
+from jaxcal.solvers.fused import UNKNOWNS, Guess, Images, targets
+from jaxcal.solvers.fused_evidence import Belief, common, judged, mean_precision, own, tune
+from jaxcal.solvers.fused_laws import SEEN, Sites, marginal, propagate
+from jaxcal.solvers.lanes import apart, choose
+from jaxcal.solvers.variance import MINIMUM_SELF_TUNING
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(3,))
+def average_abreast(
+    parameters: Parameters, belief: Gaussian, problems: Problem, shapes: tuple[Shape, ...]
+) -> Averaged:
+    """:func:`jaxcal.solvers.auto.average_over_laws` for a batch (one leading axis).
+
+    Args:
+        parameters: the self-tuned Gaussian solutions.
+        belief: their beliefs with common SDs.
+        problems: plain ones.
+        shapes: the laws to weigh.
+    """
+    images, guess, used = Images.of(problems), Guess.of(parameters), jnp.sum(problems.mask, axis=1)
+    models, shape = candidates(guess, belief.sigma.T, images, problems)
+    pairs = jnp.stack([model.log_evidence for model in models])
+    pairs = jnp.where(jnp.isfinite(pairs), pairs, -jnp.inf).reshape(-1, 2, len(used))
+    wanted = pairs - jnp.asarray([0.0, LOG_ODDS_OF_MEAN])[:, None]
+    chosen = jnp.argmax(wanted.reshape(-1, len(used)), axis=0)
+    best = models[0]
+    for k, model in enumerate(models[1:], 1):
+        best = choose(chosen == k, model, best)
+    best = apart(best)
+
+    q, turned = targets(best.guess, images)
+    bound = problems.max_elevation
+    sites = apart(Sites.of(q, turned, images.mask, best.mean, bound))
+    precision = mean_precision(best.sigma[2], best.with_mean)
+    known = marginal(best.information, best.gradient, precision, best.mean, best.with_mean)
+    stretch = jnp.asarray([shape.stretch for shape in shapes], problems.mask.dtype)
+    families = [shape.family for shape in shapes]
+    found = propagate(
+        known, sites, best.squares, best.pull, families, stretch[:, None] * best.sigma[2]
+    )
+    prior = jnp.asarray([shape.prior for shape in shapes], problems.mask.dtype)
+    weight, good = weights(found.log_evidence, found.change, prior)
+    means = jnp.where(good, found.mean, 0.0)
+    mean = jnp.sum(weight * means, axis=1)
+    off = unrolled.rows_of(jnp.where(good, means - mean[:, None], 0.0))
+    within = unrolled.rows_of(jnp.where(good, found.covariance, 0.0))
+    spread = [off[i] * off[j] for i in range(len(off)) for j in range(i, len(off))]
+    flat = [jnp.sum(weight * (a + b), axis=0) for a, b in zip(within, spread, strict=True)]
+    mean, flat = apart((mean, jnp.stack(flat)))
+    step, covariance = known.lifted(
+        unrolled.rows_of(mean), unrolled.symmetric(unrolled.rows_of(flat))
+    )
+    step, variance_of_mean = apart((jnp.stack(step), covariance[-1][-1]))
+    shared = apart(jnp.stack([jnp.stack(row[:UNKNOWNS]) for row in covariance[:UNKNOWNS]]))
+
+    enough = (used >= MINIMUM_SELF_TUNING) & jnp.any(good, axis=0)
+    enough = enough & jnp.all(jnp.isfinite(step), axis=0)
+    along = [[shared[i, j][:, None] for j in SEEN] for i in SEEN]
+    variance = unrolled.dot(sites.direction, unrolled.apply(along, sites.direction))
+    moved = best.guess.moved(unrolled.rows_of(step[:UNKNOWNS]))
+    member = jnp.asarray([[family == name for family in families] for name in FAMILIES])
+    has_mean = enough & (chosen % 2 == 1)
+    own_covariances = jnp.zeros_like(enough)
+    log_odds_own = jnp.zeros_like(variance_of_mean)
+    covariances = None
+    if shape is not None:
+        own_covariances = enough & (chosen >= 2)
+        log_odds_own = jnp.max(pairs[1], axis=0) - jnp.max(pairs[0], axis=0)
+        covariances = jnp.where(
+            (chosen >= 2)[:, None, None, None], shape, jnp.eye(2, dtype=shape.dtype)
+        )
+    both = jnp.where(chosen >= 2, pairs[-1], pairs[0])
+    law = OffsetLaw(
+        probability=(member @ weight).T,
+        mean=jnp.where(has_mean, best.mean + step[-1], 0.0),
+        mean_sd=jnp.where(has_mean, jnp.sqrt(jnp.maximum(variance_of_mean, 0.0)), 0.0),
+        has_mean=has_mean,
+        own_covariances=own_covariances,
+        log_odds_mean=both[1] - both[0],
+        log_odds_own=log_odds_own,
+        weighed=enough,
+    )
+    moved, sigma = choose(enough, (moved, best.sigma), (guess, belief.sigma.T))
+    return Averaged(
+        parameters=moved.parameters(),
+        belief=Gaussian(sigma.T, covariances),
+        covariance=jnp.moveaxis(shared, -1, 0),
+        elevation_sd=jnp.sqrt(jnp.where(problems.mask > 0, variance, jnp.nan)),
+        law=law,
+    )
+
+
+class Candidate(eqx.Module):
+    """A noise model, with or without a mean, tuned and linearised; lanes last.
+
+    Attributes:
+        guess: X and c. mean: b, mm. with_mean: 1 where there may be one. sigma: SDs of lateral
+            position, range and offset, mm. log_evidence: ln Z, up to a constant that all share.
+            information, gradient: of X and c in the measurements. squares, pull: sums of h_i h_i'
+            and of h_i (q_iy - b).
+    """
+
+    guess: Guess
+    mean: Float[Array, " lanes"]
+    with_mean: Float[Array, " lanes"]
+    sigma: Float[Array, "3 lanes"]
+    log_evidence: Float[Array, " lanes"]
+    information: Float[Array, "45 lanes"]
+    gradient: Float[Array, "9 lanes"]
+    squares: Float[Array, "45 lanes"]
+    pull: Float[Array, "9 lanes"]
+
+    @classmethod
+    def of(cls, tuned: Belief, sigma: Array, log_evidence: Array) -> Candidate:
+        """From a tuned belief."""
+        sums, weight = tuned.sums, 1 / tuned.scale[:-1, None] ** 2
+        # h_i has -1 at v_y, so the sum of h_i is what v_y has in common with the others.
+        along = jnp.stack(unrolled.symmetric(unrolled.rows_of(sums.matrix[-1]))[1])
+        return cls(
+            tuned.guess, tuned.mean, tuned.with_mean, sigma, log_evidence,
+            jnp.sum(weight * sums.matrix[:-1], axis=0),
+            jnp.sum(weight * sums.gradient[:-1], axis=0),
+            sums.matrix[-1],
+            sums.gradient[-1] + tuned.mean * along,
+        )  # fmt: skip
+
+
+def candidates(
+    guess: Guess, sigma: Float[Array, "3 lanes"], images: Images, problems: Problem
+) -> tuple[list[Candidate], Float[Array, "lanes n 2 2"] | None]:
+    """Common SDs and, where there are some, own covariances; each without and with a mean.
+
+    Also the shape of the own covariances, mean diagonal (1, 1), or None.
+    """
+    used = images.used
+    zero, one = jnp.zeros_like(used), jnp.ones_like(used)
+    pass_over, count = common(images), jnp.stack([used] * 3)
+    plain = judged(pass_over(guess), guess, sigma, zero, zero, count)
+    shifted = tune(pass_over, guess, sigma, one, count)
+    found = [Candidate.of(each, each.scale, each.log_evidence) for each in (plain, shifted)]
+    if problems.covariance is None:
+        return found, None
+    shape = jax.vmap(covariance_shape)(problems)
+    assert shape is not None
+    variances = jnp.diagonal(problems.covariance, axis1=-2, axis2=-1)
+    mean = jnp.einsum("ln,lnk->kl", images.mask, variances) / used
+    mean = jnp.where(jnp.all(mean > 0, axis=0), mean, 1.0)
+    middle = jnp.mean(mean, axis=0)
+    ratio = jnp.sqrt(mean / middle)
+    a, b, c = (
+        jnp.where(images.mask > 0, shape[..., i, j] * (ratio[i] * ratio[j])[:, None], float(i == j))
+        for i, j in ((0, 0), (0, 1), (1, 1))
+    )
+    determinant = a * c - b * b
+    weight = jnp.stack([c, -b, a]) / determinant
+    start = jnp.sqrt(0.5 * jnp.sum((sigma[:2] / ratio) ** 2, axis=0))
+    # Both at once, as so many lanes more.
+    twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf], axis=-1), (guess, used))
+    wide = jax.tree.map(lambda plane: jnp.concatenate([plane, plane], axis=-2), (images, weight))
+    scale = jnp.stack([jnp.tile(start, 2), jnp.tile(sigma[2], 2)])
+    tied = tune(
+        own(*wide), twice[0], scale, jnp.concatenate([zero, one]),
+        jnp.stack([2 * twice[1], twice[1]]),
+    )  # fmt: skip
+    # One more SD that is tuned costs half the log of the number of images.
+    shapes = 0.5 * jnp.sum(images.mask * jnp.log(determinant), axis=1) - 0.5 * jnp.log(used)
+    for half in (slice(None, len(used)), slice(len(used), None)):
+        each = jax.tree.map(lambda leaf, half=half: leaf[..., half], tied)
+        three = jnp.concatenate([ratio * each.scale[0], each.scale[1:]])
+        found.append(Candidate.of(each, three, each.log_evidence - shapes))
+    return found, shape
+
+
+@average_abreast.defjvp
+def _average_jvp(shapes: tuple[Shape, ...], primals: tuple, tangents: tuple) -> tuple:
+    def one(parameters: Parameters, belief: Gaussian, problem: Problem) -> Averaged:
+        return average_over_laws(parameters, belief, problem, RIGID, shapes)
+
+    return jax.jvp(jax.vmap(one), primals, tangents)

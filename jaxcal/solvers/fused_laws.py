@@ -1,0 +1,304 @@
+"""Expectation propagation on the fused pass: many problems side by side, one pass a sweep.
+
+It is :func:`jaxcal.solvers.expectation_propagation.propagate`, sweep for sweep, which is the
+reference; what is particular here is that six unknowns suffice. An image's offset q_iy - b is, to
+first order in the step (v, w, d) of X and the target,
+
+    u_i = o_i - s + q_iz w_x - q_ix w_z + (row y of M_i) d,      s = v_y + b,
+
+so the sites never see v_x, v_z, w_y, and see v_y and the mean b only together. These four are
+eliminated once, exactly, from what the measurements say (:func:`marginal`); the sweeps run on
+z = (s, w_x, w_z, d), 21 + 6 sums over the images and a 6x6 inverse each; and what comes out, after
+the average over the laws, is carried back to all unknowns (:meth:`Marginal.lifted`).
+
+The laws of one family stand beside each other as further lanes. The Gaussian law needs no sweep:
+its sites are the sums that the evidence step left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxcal.model.shapes import Family, tilted
+from jaxcal.solvers import unrolled
+from jaxcal.solvers.expectation_propagation import DAMPING, SWEEPS, refreshed
+from jaxcal.solvers.fused import PAIRS, total
+from jaxcal.solvers.fused_variance import together
+from jaxcal.solvers.lanes import apart
+from jaxcal.solvers.unrolled import Matrix, Vector
+
+HIDDEN = (0, 2, 4)
+"""v_x, v_z and w_y: the sites do not see them."""
+
+SEEN = (1, 3, 5, 6, 7, 8)
+"""v_y (as s), w_x, w_z and d."""
+
+ELEVATION = SEEN[0]
+
+
+class Sites(eqx.Module):
+    """The offsets as the sites see them, one plane (lanes, n) for every number.
+
+    Attributes:
+        direction: h_i, in the order of z. offset: o_i, mm. used: 1 for used images. lower, upper:
+            least and largest u_i that are allowed, mm, or None.
+    """
+
+    direction: Vector
+    offset: Float[Array, "lanes n"]
+    used: Float[Array, "lanes n"]
+    lower: Float[Array, "lanes n"] | None
+    upper: Float[Array, "lanes n"] | None
+
+    @classmethod
+    def of(
+        cls,
+        q: Vector,
+        turned: Matrix,
+        used: Float[Array, "lanes n"],
+        mean: Float[Array, " lanes"],
+        bound: Float[Array, "lanes n"] | None,
+    ) -> Sites:
+        """From q_i and M_i, about a mean b of the offsets, within bounds on |q_iy|."""
+        about = mean[:, None]
+        lower, upper = (None, None) if bound is None else (-bound - about, bound - about)
+        direction = [jnp.full_like(q[1], -1.0), q[2], -q[0], *turned[1]]
+        return cls(direction, q[1] - about, used, lower, upper)
+
+
+class Marginal(eqx.Module):
+    """What the measurements say of z, and how the other unknowns follow from it; lanes last.
+
+    Attributes:
+        information: of z, upper triangle. gradient: of the log likelihood at z = 0. shift: the
+            four others at z = 0. slope: rows B of others = shift + B z. spread: their covariance
+            for given z, upper triangle. with_mean: 1 where there is a mean.
+    """
+
+    information: Float[Array, "21 lanes"]
+    gradient: Float[Array, "6 lanes"]
+    shift: Float[Array, "4 lanes"]
+    slope: Float[Array, "4 6 lanes"]
+    spread: Float[Array, "10 lanes"]
+    with_mean: Float[Array, " lanes"]
+
+    def lifted(self, mean: Vector, covariance: Matrix) -> tuple[Vector, Matrix]:
+        """Mean and covariance of all ten unknowns, b last, from those of z."""
+        slope = [unrolled.rows_of(row) for row in self.slope]
+        others = unrolled.apply(slope, mean)
+        others = [a + b for a, b in zip(others, unrolled.rows_of(self.shift), strict=True)]
+        across = unrolled.product(slope, covariance)
+        own = unrolled.product(across, unrolled.transpose(slope))
+        spread = unrolled.symmetric(unrolled.rows_of(self.spread))
+        order = [*HIDDEN, 9, *SEEN]
+        whole: Vector = [0] * 10
+        matrix: Matrix = [[0] * 10 for _ in range(10)]
+        for i, a in enumerate(order):
+            whole[a] = [*others, *mean][i]
+            for j, b in enumerate(order):
+                if i < 4 and j < 4:
+                    matrix[a][b] = own[i][j] + spread[i][j]
+                elif i < 4:
+                    matrix[a][b] = matrix[b][a] = across[i][j - 4]
+                elif j >= 4:
+                    matrix[a][b] = covariance[i - 4][j - 4]
+        # From s back to v_y = s - b.
+        keep = self.with_mean
+        whole[ELEVATION] = whole[ELEVATION] - keep * whole[9]
+        row = [a - keep * b for a, b in zip(matrix[ELEVATION], matrix[9], strict=True)]
+        row[ELEVATION] = row[ELEVATION] - keep * row[9]
+        for j, entry in enumerate(row):
+            matrix[ELEVATION][j] = matrix[j][ELEVATION] = entry
+        return whole, matrix
+
+
+def marginal(
+    information: Float[Array, "45 lanes"],
+    gradient: Float[Array, "9 lanes"],
+    precision: Float[Array, " lanes"],
+    mean: Float[Array, " lanes"],
+    with_mean: Float[Array, " lanes"],
+) -> Marginal:
+    """Eliminate what the sites do not see.
+
+    Args:
+        information: of X and the target in the measurements, upper triangle.
+        gradient: of half the measurements' cost.
+        precision: of b before the data are seen.
+        mean: b here, mm.
+        with_mean: 1 where there is a mean; without one its deviation is held at zero.
+    """
+    full = unrolled.symmetric(unrolled.rows_of(information))
+    pull = [-value for value in unrolled.rows_of(gradient)]
+    # b moves q_iy against s - v_y: in (s, b), b takes v_y's information along.
+    meets = [-with_mean * entry for entry in full[ELEVATION]]
+    own = with_mean * full[ELEVATION][ELEVATION] + precision
+    hidden = [[full[i][j] for j in HIDDEN] + [meets[i]] for i in HIDDEN]
+    hidden.append([meets[j] for j in HIDDEN] + [own])
+    mixed = [[full[i][j] for j in SEEN] for i in HIDDEN] + [[meets[j] for j in SEEN]]
+    force = [pull[i] for i in HIDDEN] + [-with_mean * pull[ELEVATION] - precision * mean]
+    factor, inverse = unrolled.cholesky(hidden)
+    inverse = together(inverse)
+    columns = [unrolled.forward(factor, inverse, column) for column in unrolled.transpose(mixed)]
+    half = unrolled.forward(factor, inverse, force)
+    slope = [unrolled.backward(factor, inverse, column) for column in columns]
+    left = [
+        full[SEEN[i]][SEEN[j]] - unrolled.dot(columns[i], columns[j])
+        for i in range(6) for j in range(i, 6)
+    ]  # fmt: skip
+    spread, _ = unrolled.inverse(hidden)
+    return apart(
+        Marginal(
+            jnp.stack(left),
+            jnp.stack([pull[j] - unrolled.dot(columns[i], half) for i, j in enumerate(SEEN)]),
+            jnp.stack(unrolled.backward(factor, inverse, half)),
+            -jnp.stack([jnp.stack(row) for row in unrolled.transpose(slope)]),
+            jnp.stack(spread),
+            with_mean,
+        )
+    )
+
+
+class Posterior(eqx.Module):
+    """The belief about z under each law.
+
+    Attributes:
+        mean: of z. covariance: upper triangle. log_evidence: up to a constant that the laws share.
+            change: length of the last sweep's move of the mean, in SDs.
+    """
+
+    mean: Float[Array, "6 k lanes"]
+    covariance: Float[Array, "21 k lanes"]
+    log_evidence: Float[Array, "k lanes"]
+    change: Float[Array, "k lanes"]
+
+
+def propagate(
+    known: Marginal,
+    sites: Sites,
+    squares: Float[Array, "45 lanes"],
+    pull: Float[Array, "9 lanes"],
+    families: Sequence[Family],
+    sd: Float[Array, "k lanes"],
+    sweeps: int = SWEEPS,
+) -> Posterior:
+    """Belief and evidence under every law.
+
+    Args:
+        known: what the measurements say.
+        sites: the offsets.
+        squares: sum of h_i h_i' over the used images, all nine unknowns, upper triangle.
+        pull: sum of h_i o_i, likewise.
+        families: of the laws.
+        sd: their SDs, mm.
+        sweeps: how many.
+    """
+    lanes = sd.shape[1]
+    triangle = [(SEEN[i], SEEN[j]) for i in range(6) for j in range(i, 6)]
+    squares = jnp.stack([squares[PAIRS.index(pair)] for pair in triangle])
+    pull = jnp.stack([pull[k] for k in SEEN])
+    parts, order = [], []
+    for family in dict.fromkeys(families):
+        at = [k for k, name in enumerate(families) if name == family]
+        count = len(at)
+
+        def beside(values: Array, count: int = count) -> Array:
+            return jnp.tile(values, (1,) * (values.ndim - 1) + (count,))
+
+        wide = jax.tree.map(lambda plane, count=count: jnp.tile(plane, (count, 1)), sites)
+        scale = jnp.concatenate([sd[k] for k in at])
+        start = _solved(
+            beside(known.information) + beside(squares) / scale**2,
+            beside(known.gradient) - beside(pull) / scale**2,
+        )
+        exact = family == "gaussian" and sites.lower is None
+        found = _sweep_all(
+            family, scale, wide, beside(known.information), beside(known.gradient), start,
+            0 if exact else sweeps,
+        )  # fmt: skip
+        parts.append(jax.tree.map(lambda x, n=count: x.reshape(*x.shape[:-1], n, lanes), found))
+        order += at
+    back = [order.index(k) for k in range(len(order))]
+    mean, covariance, evidence, change = (
+        jnp.concatenate([part[k] for part in parts], axis=-2)[..., jnp.asarray(back), :]
+        for k in range(4)
+    )
+    return Posterior(mean, covariance, evidence, change)
+
+
+class _Belief(eqx.Module):
+    covariance: Float[Array, "21 lanes"]
+    mean: Float[Array, "6 lanes"]
+    information: Float[Array, "21 lanes"]
+    rhs: Float[Array, "6 lanes"]
+    log_determinant: Float[Array, " lanes"]
+
+
+def _solved(information: Float[Array, "21 lanes"], rhs: Float[Array, "6 lanes"]) -> _Belief:
+    """The Gaussian of an information matrix and a right-hand side."""
+    information, rhs = apart((information, rhs))
+    flat, log_determinant = unrolled.inverse(unrolled.symmetric(unrolled.rows_of(information)))
+    flat = together(flat)
+    mean = unrolled.apply(unrolled.symmetric(flat), unrolled.rows_of(rhs))
+    return apart(_Belief(jnp.stack(flat), jnp.stack(mean), information, rhs, log_determinant))
+
+
+def _sweep_all(
+    family: Family,
+    sd: Float[Array, " lanes"],
+    sites: Sites,
+    information: Float[Array, "21 lanes"],
+    gradient: Float[Array, "6 lanes"],
+    start: _Belief,
+    sweeps: int,
+) -> tuple[Array, Array, Array, Array]:
+    """Mean, covariance, log evidence and last change under laws of one family."""
+    h, offset, used = sites.direction, sites.offset, sites.used
+    tau = used / (sd * sd)[:, None]
+    state = (tau, jnp.zeros_like(tau), start, jnp.zeros_like(sd))
+
+    def cavity(tau: Array, nu: Array, belief: _Belief) -> tuple[Array, Array]:
+        full = unrolled.symmetric([row[:, None] for row in belief.covariance])
+        doubled = [
+            unrolled.add(*(h[j] * (full[i][j] if i == j else 2 * full[i][j]) for j in range(i, 6)))
+            for i in range(6)
+        ]
+        variance = unrolled.dot(h, doubled)
+        at = offset + unrolled.dot(h, [row[:, None] for row in belief.mean])
+        shrink = 1 / jnp.maximum(1 - tau * variance, 1e-3)
+        centre = shrink * (at - variance * nu)
+        return centre, jnp.where(used > 0, variance * shrink, 1.0)
+
+    def sweep(_: Array, state: tuple) -> tuple:
+        tau, nu, before, _ = state
+        centre, without = cavity(tau, nu, before)
+        found = tilted(family, sd, centre, without, sites.lower, sites.upper)
+        new_tau, new_nu = refreshed(found, centre, without)
+        tau = tau + DAMPING * used * (new_tau - tau)
+        nu = nu + DAMPING * used * (new_nu - nu)
+        tau, nu = apart((tau, nu))
+        weighted = [tau * row for row in h]
+        force = nu - tau * offset
+        planes = [weighted[i] * h[j] for i in range(6) for j in range(i, 6)]
+        sums = total([*planes, *(force * row for row in h)])
+        after = _solved(information + jnp.stack(sums[:21]), gradient + jnp.stack(sums[21:]))
+        step = unrolled.rows_of(after.mean - before.mean)
+        inner = unrolled.symmetric(unrolled.rows_of(after.information))
+        length = unrolled.dot(step, unrolled.apply(inner, step))
+        return tau, nu, after, jnp.sqrt(jnp.maximum(length, 0.0))
+
+    tau, nu, belief, change = jax.lax.fori_loop(0, sweeps, sweep, state)
+    centre, without = cavity(tau, nu, belief)
+    mass = tilted(family, sd, centre, without, sites.lower, sites.upper).log_mass
+    joined = 1 + tau * without
+    site = mass + 0.5 * jnp.log(joined)
+    site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
+    site = site + nu * offset - 0.5 * tau * offset**2
+    gained = unrolled.dot(unrolled.rows_of(belief.rhs), unrolled.rows_of(belief.mean))
+    evidence = total([used * site])[0] + 0.5 * gained - 0.5 * belief.log_determinant
+    return belief.mean, belief.covariance, evidence, change
