@@ -14,6 +14,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 MAX_SWEEPS = 30
@@ -221,3 +222,36 @@ def inverse_positive(matrix: Float[Array, "p p"]) -> tuple[Float[Array, "p p"], 
     zero = jnp.zeros((), matrix.dtype)
     inverse, log_determinant = jax.lax.fori_loop(0, size, eliminate, (scaled, zero))
     return inverse * scale[:, None] * scale[None, :], log_determinant - 2 * jnp.sum(jnp.log(scale))
+
+
+def inverse_abreast(
+    matrix: Float[Array, "p p lanes"],
+) -> tuple[Float[Array, "p p lanes"], Float[Array, " lanes"]]:
+    """:func:`inverse_positive` of many matrices, lanes last, its loop written out.
+
+    Written out scalar by scalar (:mod:`jaxcal.solvers.unrolled`) ten rows take XLA a hundred times
+    longer to compile; so each step is one array operation, kept from being fused with the next.
+    """
+    size = matrix.shape[0]
+    scale = jax.lax.rsqrt(jnp.stack([matrix[k, k] for k in range(size)]))
+    work = jax.lax.optimization_barrier(matrix * scale[:, None] * scale[None, :])
+    pivots = []
+    for k in range(size):
+        here = np.arange(size) == k
+        pivot = jnp.where(work[k, k] > 0, work[k, k], jnp.nan)
+        pivots.append(pivot)
+        # In place: the eliminated column makes room for the inverse's.
+        row = jnp.where(here[:, None], 1.0, work[k]) / pivot
+        rest = jnp.where(here[None, :, None], 0.0, work) - work[:, k, None] * row[None]
+        work = jax.lax.optimization_barrier(jnp.where(here[:, None, None], row[None], rest))
+    log_determinant = jnp.sum(jnp.log(jnp.stack(pivots)) - 2 * jnp.log(scale), axis=0)
+    return work * scale[:, None] * scale[None, :], log_determinant
+
+
+def product_abreast(
+    first: Float[Array, "p q lanes"], second: Float[Array, "q *r lanes"]
+) -> Float[Array, "p *r lanes"]:
+    """Products of many matrices (or of matrices and vectors), lanes last."""
+    if second.ndim == 2:
+        return jnp.sum(first * second, axis=1)
+    return jnp.sum(first[:, :, None] * second, axis=1)

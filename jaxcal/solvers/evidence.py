@@ -4,7 +4,7 @@ Two questions are put to the data before any law of the offsets is: do the covar
 with the measurements describe their errors better than common SDs do, and do the offsets have a
 mean other than zero? Own covariances fix the ratios of all measurements' SDs, so one factor is
 tuned for them, and one SD for the offsets; common SDs are tuned separately. Each combination is
-tuned by a few rounds of Gauss-Newton with Helmert's variance updates (:mod:`jaxcal.solvers.variance`)
+tuned by a few rounds of Gauss-Newton with Helmert variance updates (:mod:`jaxcal.solvers.variance`)
 from the plain self-tuned fit, and judged by its Laplace evidence
 
     ln Z = -1/2 sum r' W r - 1/2 sum (q_y - b)^2 / sigma_y^2 + 1/2 sum ln |W| - n ln sigma_y

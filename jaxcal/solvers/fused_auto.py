@@ -27,8 +27,8 @@ from jaxcal.solvers.auto import (
     average_over_laws,
     weights,
 )
-from jaxcal.solvers.fused import UNKNOWNS, Guess, Images, targets
-from jaxcal.solvers.fused_evidence import Belief, common, judged, mean_precision, own, tune
+from jaxcal.solvers.fused import PAIRS, UNKNOWNS, Guess, Images, targets
+from jaxcal.solvers.fused_evidence import V_Y, Belief, common, judged, mean_precision, own, tune
 from jaxcal.solvers.fused_laws import SEEN, Sites, marginal, propagate
 from jaxcal.solvers.lanes import apart, choose
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING
@@ -71,22 +71,18 @@ def average_abreast(
     weight, good = weights(found.log_evidence, found.change, prior)
     means = jnp.where(good, found.mean, 0.0)
     mean = jnp.sum(weight * means, axis=1)
-    off = unrolled.rows_of(jnp.where(good, means - mean[:, None], 0.0))
-    within = unrolled.rows_of(jnp.where(good, found.covariance, 0.0))
-    spread = [off[i] * off[j] for i in range(len(off)) for j in range(i, len(off))]
-    flat = [jnp.sum(weight * (a + b), axis=0) for a, b in zip(within, spread, strict=True)]
-    mean, flat = apart((mean, jnp.stack(flat)))
-    step, covariance = known.lifted(
-        unrolled.rows_of(mean), unrolled.symmetric(unrolled.rows_of(flat))
-    )
-    step, variance_of_mean = apart((jnp.stack(step), covariance[-1][-1]))
-    shared = apart(jnp.stack([jnp.stack(row[:UNKNOWNS]) for row in covariance[:UNKNOWNS]]))
+    off = jnp.where(good, means - mean[:, None], 0.0)
+    within = jnp.where(good, found.covariance, 0.0)
+    spread = jnp.sum(weight * (within + off[:, None] * off[None]), axis=2)
+    step, covariance = known.lifted(*apart((mean, spread)))
+    step, covariance = apart((step, covariance))
+    shared, variance_of_mean = covariance[:UNKNOWNS, :UNKNOWNS], covariance[-1, -1]
 
     enough = (used >= MINIMUM_SELF_TUNING) & jnp.any(good, axis=0)
     enough = enough & jnp.all(jnp.isfinite(step), axis=0)
     along = [[shared[i, j][:, None] for j in SEEN] for i in SEEN]
     variance = unrolled.dot(sites.direction, unrolled.apply(along, sites.direction))
-    moved = best.guess.moved(unrolled.rows_of(step[:UNKNOWNS]))
+    moved = best.guess.moved(list(step[:UNKNOWNS]))
     member = jnp.asarray([[family == name for family in families] for name in FAMILIES])
     has_mean = enough & (chosen % 2 == 1)
     own_covariances = jnp.zeros_like(enough)
@@ -144,7 +140,8 @@ class Candidate(eqx.Module):
         """From a tuned belief."""
         sums, weight = tuned.sums, 1 / tuned.scale[:-1, None] ** 2
         # h_i has -1 at v_y, so the sum of h_i is what v_y has in common with the others.
-        along = jnp.stack(unrolled.symmetric(unrolled.rows_of(sums.matrix[-1]))[1])
+        places = [PAIRS.index((min(V_Y, j), max(V_Y, j))) for j in range(UNKNOWNS)]
+        along = jnp.stack([sums.matrix[-1, place] for place in places])
         return cls(
             tuned.guess, tuned.mean, tuned.with_mean, sigma, log_evidence,
             jnp.sum(weight * sums.matrix[:-1], axis=0),
@@ -164,7 +161,7 @@ def candidates(
     used = images.used
     zero, one = jnp.zeros_like(used), jnp.ones_like(used)
     pass_over, count = common(images), jnp.stack([used] * 3)
-    plain = judged(pass_over(guess), guess, sigma, zero, zero, count)
+    plain = judged(pass_over, guess, sigma, zero, zero, count)
     shifted = tune(pass_over, guess, sigma, one, count)
     found = [Candidate.of(each, each.scale, each.log_evidence) for each in (plain, shifted)]
     if problems.covariance is None:

@@ -20,18 +20,17 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxcal.solvers import unrolled
+from jaxcal.solvers import dense, unrolled
 from jaxcal.solvers.evidence import MEAN_SD, ROUNDS, UPDATES
-from jaxcal.solvers.fused import UNKNOWNS, Guess, Images, Term, contributions, targets, total
-from jaxcal.solvers.fused_variance import components, together, with_floor
+from jaxcal.solvers.fused import PAIRS, UNKNOWNS, Guess, Images, Term, contributions, targets, total
+from jaxcal.solvers.fused_variance import components, with_floor
 from jaxcal.solvers.lanes import apart
-from jaxcal.solvers.unrolled import Vector
 
 V_Y = 1
-BORDERED = [(i, j) for i in range(UNKNOWNS + 1) for j in range(i, UNKNOWNS + 1)]
-"""Places of the upper triangle with b as the last unknown."""
+"""The unknown that moves every q_iy by -1."""
 
 
 class Sums(eqx.Module):
@@ -118,54 +117,52 @@ def own(images: Images, weight: Float[Array, "3 lanes n"]) -> Pass:
 
 
 class _System(eqx.Module):
-    """The normal equations with b as the last unknown, as rows of lanes."""
+    """Every component's normal equations about a mean b, which is the last unknown."""
 
-    matrix: list[Vector]
-    gradient: list[Vector]
-    squares: Vector
+    matrix: Float[Array, "k 10 10 lanes"]
+    gradient: Float[Array, "k 10 lanes"]
+    squares: Float[Array, "k lanes"]
 
     @classmethod
     def of(cls, sums: Sums, mean: Array, with_mean: Array) -> _System:
-        """About a mean."""
-        matrix = [unrolled.rows_of(row) for row in sums.matrix]
-        gradient = [unrolled.rows_of(row) for row in sums.gradient]
-        squares = unrolled.rows_of(sums.squares)
-        offsets = unrolled.symmetric(matrix[-1])
-        count = offsets[V_Y][V_Y]
-        squares[-1] = squares[-1] + mean * (2 * gradient[-1][V_Y] + mean * count)
-        pull = [g + mean * n for g, n in zip(gradient[-1], offsets[V_Y], strict=True)]
-        gradient[-1] = pull
-        border = [with_mean * entry for entry in offsets[V_Y]]
-        wide: list[Vector] = []
-        for k, flat in enumerate(matrix):
-            full = unrolled.symmetric(flat)
-            last = k == len(matrix) - 1
-            wide.append(
-                [
-                    full[i][j] if j < UNKNOWNS
-                    else (border[i] if i < UNKNOWNS else border[V_Y]) if last
-                    else 0
-                    for i, j in BORDERED
-                ]
-            )  # fmt: skip
-            gradient[k] = [*gradient[k], with_mean * pull[V_Y] if last else 0]
-        return cls(wide, gradient, squares)
-
-    def weighted(self, scale: Array, precision: Array, mean: Array) -> tuple[Vector, Vector]:
-        """Matrix (upper triangle) and gradient with given SDs and the belief about b."""
-        weight = unrolled.rows_of(1 / scale**2)
-        matrix, gradient = (
-            [
-                unrolled.add(
-                    *(unrolled.times(w, row[k]) for w, row in zip(weight, rows, strict=True))
-                )
-                for k in range(len(rows[0]))
-            ]
-            for rows in (self.matrix, self.gradient)
+        """From what a pass left."""
+        flat, offsets = sums.matrix, sums.matrix.shape[0] - 1
+        place = [[PAIRS.index((min(i, j), max(i, j))) for j in range(9)] for i in range(9)]
+        # Of the offsets alone: their sums with -1 are those of v_y.
+        only = (jnp.arange(offsets + 1) == offsets).astype(flat.dtype)[:, None]
+        along = jnp.stack([flat[-1, place[V_Y][j]] for j in range(9)])
+        border = [only * with_mean * row for row in along]
+        full = [
+            (flat[:, place[i][j]] if j < 9 else border[i]) if i < 9
+            else (border[j] if j < 9 else border[V_Y])
+            for i in range(10) for j in range(10)
+        ]  # fmt: skip
+        squares = mean * (2 * sums.gradient[-1, V_Y] + mean * along[V_Y])
+        gradient = sums.gradient + only[:, None] * mean * along
+        last = only * with_mean * gradient[:, V_Y]
+        return apart(
+            cls(
+                jnp.stack(full, axis=1).reshape(-1, 10, 10, mean.shape[0]),
+                jnp.concatenate([gradient, last[:, None]], axis=1),
+                sums.squares + only * squares,
+            )
         )
-        matrix[-1] = matrix[-1] + precision
-        gradient[-1] = gradient[-1] + precision * mean
-        return together(matrix), together(gradient)
+
+    def solved(self, scale: Array, precision: Array, mean: Array) -> tuple[Array, ...]:
+        """Inverse, ln det and step with given SDs and belief about b, and ln Z but for the SDs."""
+        weight = 1 / scale**2
+        last = (np.arange(10) == 9)[:, None]
+        matrix = jnp.sum(weight[:, None, None] * self.matrix, axis=0)
+        matrix = matrix + jnp.where(last[:, None] & last[None], precision, 0.0)
+        gradient = jnp.sum(weight[:, None] * self.gradient, axis=0)
+        gradient = gradient + jnp.where(last, precision * mean, 0.0)
+        matrix, gradient = apart((matrix, gradient))
+        inverse, log_determinant = dense.inverse_abreast(matrix)
+        step = -dense.product_abreast(inverse, gradient)
+        # At the minimum, which is a small step away.
+        cost = jnp.sum(weight * self.squares, axis=0) + precision * mean**2
+        cost = cost + jnp.sum(gradient * step, axis=0)
+        return inverse, step, 0.5 * (jnp.log(precision) - cost - log_determinant)
 
 
 def mean_precision(offset_sd: Array, with_mean: Array) -> Array:
@@ -192,48 +189,31 @@ def tune(
         rounds: passes before the last.
     """
 
-    def update(_: Array, state: tuple, sums: Sums, mean: Array) -> tuple:
-        scale, _ = state
-        system = _System.of(sums, mean, with_mean)
-        precision = mean_precision(scale[-1], with_mean)
-        matrix, gradient = system.weighted(scale, precision, mean)
-        flat, _ = unrolled.inverse(unrolled.symmetric(matrix))
-        flat = together(flat)
-        step = together([-x for x in unrolled.apply(unrolled.symmetric(flat), gradient)])
-        factors = []
-        for k, part in enumerate(system.matrix):
-            twice = [1.0 if i == j else 2.0 for i, j in BORDERED]
-            leverage = unrolled.add(
-                *(unrolled.times(t * c, n) for t, c, n in zip(twice, flat, part, strict=True))
-            )
-            bent = unrolled.add(
-                *(
-                    unrolled.times(t * step[i] * step[j], n)
-                    for t, (i, j), n in zip(twice, BORDERED, part, strict=True)
-                )
-            )
-            left = system.squares[k] + 2 * unrolled.dot(system.gradient[k], step) + bent
-            freedom = jnp.maximum(count[k] - leverage / scale[k] ** 2, 0.05 * count[k])
-            factors.append(jnp.sqrt(jnp.maximum(left, 0.0) / freedom))
-        return with_floor(jnp.stack(factors)), jnp.stack(step)
-
     def one_round(_: Array, state: tuple) -> tuple:
         guess, mean, scale = state
-        sums = apart(pass_over(guess))
+        system = _System.of(apart(pass_over(guess)), mean, with_mean)
+
+        def update(_: Array, state: tuple) -> tuple:
+            scale, _ = state
+            precision = mean_precision(scale[-1], with_mean)
+            inverse, step, _ = apart(system.solved(scale, precision, mean))
+            leverage = jnp.sum(inverse * system.matrix, axis=(1, 2)) / scale**2
+            bent = jnp.sum(step[:, None] * step * system.matrix, axis=(1, 2))
+            left = system.squares + 2 * jnp.sum(system.gradient * step, axis=1) + bent
+            freedom = jnp.maximum(count - leverage, 0.05 * count)
+            return with_floor(jnp.sqrt(jnp.maximum(left, 0.0) / freedom)), step
+
         none = jnp.zeros((UNKNOWNS + 1, mean.shape[0]), mean.dtype)
-        scale, step = jax.lax.fori_loop(
-            0, UPDATES, lambda k, state: update(k, state, sums, mean), (scale, none)
-        )
-        step = unrolled.rows_of(step)
-        return apart((guess.moved(step[:UNKNOWNS]), mean + step[-1], scale))
+        scale, step = jax.lax.fori_loop(0, UPDATES, update, (scale, none))
+        return apart((guess.moved(list(step[:UNKNOWNS])), mean + step[-1], scale))
 
     state = (guess, jnp.zeros_like(with_mean), scale)
     guess, mean, scale = jax.lax.fori_loop(0, rounds, one_round, state)
-    return judged(pass_over(guess), guess, scale, mean, with_mean, count)
+    return judged(pass_over, guess, scale, mean, with_mean, count)
 
 
 def judged(
-    sums: Sums,
+    pass_over: Pass,
     guess: Guess,
     scale: Float[Array, "k lanes"],
     mean: Float[Array, " lanes"],
@@ -241,17 +221,8 @@ def judged(
     count: Float[Array, "k lanes"],
 ) -> Belief:
     """A belief with its Laplace evidence, but for the covariances' determinants."""
-    sums = apart(sums)
+    sums = apart(pass_over(guess))
     system = _System.of(sums, mean, with_mean)
-    precision = mean_precision(scale[-1], with_mean)
-    matrix, gradient = system.weighted(scale, precision, mean)
-    factor, inverse = unrolled.cholesky(unrolled.symmetric(matrix))
-    inverse = together(inverse)
-    half = unrolled.forward(factor, inverse, gradient)
-    cost = jnp.sum(jnp.stack(system.squares) / scale**2, axis=0) + precision * mean**2
-    # The minimum is still a small step away.
-    cost = cost - unrolled.dot(half, half)
-    log_determinant = -2 * jnp.sum(jnp.log(jnp.stack(inverse)), axis=0)
-    evidence = 0.5 * (jnp.log(precision) - cost - log_determinant)
+    _, _, evidence = system.solved(scale, mean_precision(scale[-1], with_mean), mean)
     evidence = evidence - jnp.sum(count * jnp.log(scale), axis=0)
     return Belief(guess, mean, scale, sums, with_mean, evidence)

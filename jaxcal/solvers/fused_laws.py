@@ -22,13 +22,13 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.model.shapes import Family, tilted
-from jaxcal.solvers import unrolled
+from jaxcal.solvers import dense, unrolled
 from jaxcal.solvers.expectation_propagation import DAMPING, SWEEPS, refreshed
 from jaxcal.solvers.fused import PAIRS, total
-from jaxcal.solvers.fused_variance import together
 from jaxcal.solvers.lanes import apart
 from jaxcal.solvers.unrolled import Matrix, Vector
 
@@ -39,6 +39,8 @@ SEEN = (1, 3, 5, 6, 7, 8)
 """v_y (as s), w_x, w_z and d."""
 
 ELEVATION = SEEN[0]
+
+TRIANGLE = [(i, j) for i in range(6) for j in range(i, 6)]
 
 
 class Sites(eqx.Module):
@@ -75,46 +77,37 @@ class Marginal(eqx.Module):
     """What the measurements say of z, and how the other unknowns follow from it; lanes last.
 
     Attributes:
-        information: of z, upper triangle. gradient: of the log likelihood at z = 0. shift: the
+        information: of z. gradient: of the log likelihood at z = 0. shift: the
             four others at z = 0. slope: rows B of others = shift + B z. spread: their covariance
-            for given z, upper triangle. with_mean: 1 where there is a mean.
+            for given z. with_mean: 1 where there is a mean.
     """
 
-    information: Float[Array, "21 lanes"]
+    information: Float[Array, "6 6 lanes"]
     gradient: Float[Array, "6 lanes"]
     shift: Float[Array, "4 lanes"]
     slope: Float[Array, "4 6 lanes"]
-    spread: Float[Array, "10 lanes"]
+    spread: Float[Array, "4 4 lanes"]
     with_mean: Float[Array, " lanes"]
 
-    def lifted(self, mean: Vector, covariance: Matrix) -> tuple[Vector, Matrix]:
+    def lifted(
+        self, mean: Float[Array, "6 lanes"], covariance: Float[Array, "6 6 lanes"]
+    ) -> tuple[Float[Array, "10 lanes"], Float[Array, "10 10 lanes"]]:
         """Mean and covariance of all ten unknowns, b last, from those of z."""
-        slope = [unrolled.rows_of(row) for row in self.slope]
-        others = unrolled.apply(slope, mean)
-        others = [a + b for a, b in zip(others, unrolled.rows_of(self.shift), strict=True)]
-        across = unrolled.product(slope, covariance)
-        own = unrolled.product(across, unrolled.transpose(slope))
-        spread = unrolled.symmetric(unrolled.rows_of(self.spread))
+        others = self.shift + dense.product_abreast(self.slope, mean)
+        across = dense.product_abreast(self.slope, covariance)
+        own = self.spread + dense.product_abreast(across, jnp.swapaxes(self.slope, 0, 1))
+        upper = jnp.concatenate([own, across], axis=1)
+        lower = jnp.concatenate([jnp.swapaxes(across, 0, 1), covariance], axis=1)
+        whole, matrix = jnp.concatenate([others, mean]), jnp.concatenate([upper, lower])
         order = [*HIDDEN, 9, *SEEN]
-        whole: Vector = [0] * 10
-        matrix: Matrix = [[0] * 10 for _ in range(10)]
-        for i, a in enumerate(order):
-            whole[a] = [*others, *mean][i]
-            for j, b in enumerate(order):
-                if i < 4 and j < 4:
-                    matrix[a][b] = own[i][j] + spread[i][j]
-                elif i < 4:
-                    matrix[a][b] = matrix[b][a] = across[i][j - 4]
-                elif j >= 4:
-                    matrix[a][b] = covariance[i - 4][j - 4]
+        back = [order.index(k) for k in range(10)]
+        whole = jnp.stack([whole[k] for k in back])
+        matrix = jnp.stack([jnp.stack([matrix[i, j] for j in back]) for i in back])
         # From s back to v_y = s - b.
-        keep = self.with_mean
-        whole[ELEVATION] = whole[ELEVATION] - keep * whole[9]
-        row = [a - keep * b for a, b in zip(matrix[ELEVATION], matrix[9], strict=True)]
-        row[ELEVATION] = row[ELEVATION] - keep * row[9]
-        for j, entry in enumerate(row):
-            matrix[ELEVATION][j] = matrix[j][ELEVATION] = entry
-        return whole, matrix
+        shear = jnp.where(np.arange(10)[:, None] == ELEVATION, self.with_mean, 0.0)
+        whole = whole - shear * whole[9]
+        matrix = matrix - shear[:, None] * matrix[9]
+        return whole, matrix - shear[None] * matrix[:, 9, None]
 
 
 def marginal(
@@ -133,32 +126,30 @@ def marginal(
         mean: b here, mm.
         with_mean: 1 where there is a mean; without one its deviation is held at zero.
     """
-    full = unrolled.symmetric(unrolled.rows_of(information))
-    pull = [-value for value in unrolled.rows_of(gradient)]
+    full = [[information[PAIRS.index((min(i, j), max(i, j)))] for j in range(9)] for i in range(9)]
     # b moves q_iy against s - v_y: in (s, b), b takes v_y's information along.
-    meets = [-with_mean * entry for entry in full[ELEVATION]]
-    own = with_mean * full[ELEVATION][ELEVATION] + precision
-    hidden = [[full[i][j] for j in HIDDEN] + [meets[i]] for i in HIDDEN]
-    hidden.append([meets[j] for j in HIDDEN] + [own])
-    mixed = [[full[i][j] for j in SEEN] for i in HIDDEN] + [[meets[j] for j in SEEN]]
-    force = [pull[i] for i in HIDDEN] + [-with_mean * pull[ELEVATION] - precision * mean]
-    factor, inverse = unrolled.cholesky(hidden)
-    inverse = together(inverse)
-    columns = [unrolled.forward(factor, inverse, column) for column in unrolled.transpose(mixed)]
-    half = unrolled.forward(factor, inverse, force)
-    slope = [unrolled.backward(factor, inverse, column) for column in columns]
-    left = [
-        full[SEEN[i]][SEEN[j]] - unrolled.dot(columns[i], columns[j])
-        for i in range(6) for j in range(i, 6)
-    ]  # fmt: skip
-    spread, _ = unrolled.inverse(hidden)
+    for i in range(9):
+        full[i].append(-with_mean * full[i][ELEVATION])
+    full.append([full[j][9] for j in range(9)])
+    full[9].append(with_mean * full[ELEVATION][ELEVATION] + precision)
+    force = jnp.concatenate([-gradient, (with_mean * gradient[ELEVATION] - precision * mean)[None]])
+    hidden, seen = [*HIDDEN, 9], [*SEEN]
+
+    def block(rows: list[int], columns: list[int]) -> Array:
+        return jnp.stack([jnp.stack([full[i][j] for j in columns]) for i in rows])
+
+    own, mixed, left = apart((block(hidden, hidden), block(hidden, seen), block(seen, seen)))
+    spread, _ = dense.inverse_abreast(own)
+    slope = apart(-dense.product_abreast(spread, mixed))
+    pull = jnp.stack([force[k] for k in hidden])
     return apart(
         Marginal(
-            jnp.stack(left),
-            jnp.stack([pull[j] - unrolled.dot(columns[i], half) for i, j in enumerate(SEEN)]),
-            jnp.stack(unrolled.backward(factor, inverse, half)),
-            -jnp.stack([jnp.stack(row) for row in unrolled.transpose(slope)]),
-            jnp.stack(spread),
+            left + dense.product_abreast(jnp.swapaxes(mixed, 0, 1), slope),
+            jnp.stack([force[k] for k in seen])
+            + dense.product_abreast(jnp.swapaxes(slope, 0, 1), pull),
+            dense.product_abreast(spread, pull),
+            slope,
+            spread,
             with_mean,
         )
     )
@@ -168,12 +159,12 @@ class Posterior(eqx.Module):
     """The belief about z under each law.
 
     Attributes:
-        mean: of z. covariance: upper triangle. log_evidence: up to a constant that the laws share.
+        mean, covariance: of z. log_evidence: up to a constant that the laws share.
             change: length of the last sweep's move of the mean, in SDs.
     """
 
     mean: Float[Array, "6 k lanes"]
-    covariance: Float[Array, "21 k lanes"]
+    covariance: Float[Array, "6 6 k lanes"]
     log_evidence: Float[Array, "k lanes"]
     change: Float[Array, "k lanes"]
 
@@ -199,8 +190,7 @@ def propagate(
         sweeps: how many.
     """
     lanes = sd.shape[1]
-    triangle = [(SEEN[i], SEEN[j]) for i in range(6) for j in range(i, 6)]
-    squares = jnp.stack([squares[PAIRS.index(pair)] for pair in triangle])
+    squares = _full([squares[PAIRS.index((SEEN[i], SEEN[j]))] for i, j in TRIANGLE])
     pull = jnp.stack([pull[k] for k in SEEN])
     parts, order = [], []
     for family in dict.fromkeys(families):
@@ -232,27 +222,31 @@ def propagate(
 
 
 class _Belief(eqx.Module):
-    covariance: Float[Array, "21 lanes"]
+    covariance: Float[Array, "6 6 lanes"]
     mean: Float[Array, "6 lanes"]
-    information: Float[Array, "21 lanes"]
+    information: Float[Array, "6 6 lanes"]
     rhs: Float[Array, "6 lanes"]
     log_determinant: Float[Array, " lanes"]
 
 
-def _solved(information: Float[Array, "21 lanes"], rhs: Float[Array, "6 lanes"]) -> _Belief:
+def _full(flat: Vector) -> Array:
+    """A symmetric 6x6 matrix from its upper triangle."""
+    return jnp.stack([jnp.stack(row) for row in unrolled.symmetric(flat)])
+
+
+def _solved(information: Float[Array, "6 6 lanes"], rhs: Float[Array, "6 lanes"]) -> _Belief:
     """The Gaussian of an information matrix and a right-hand side."""
     information, rhs = apart((information, rhs))
-    flat, log_determinant = unrolled.inverse(unrolled.symmetric(unrolled.rows_of(information)))
-    flat = together(flat)
-    mean = unrolled.apply(unrolled.symmetric(flat), unrolled.rows_of(rhs))
-    return apart(_Belief(jnp.stack(flat), jnp.stack(mean), information, rhs, log_determinant))
+    covariance, log_determinant = apart(dense.inverse_abreast(information))
+    mean = dense.product_abreast(covariance, rhs)
+    return apart(_Belief(covariance, mean, information, rhs, log_determinant))
 
 
 def _sweep_all(
     family: Family,
     sd: Float[Array, " lanes"],
     sites: Sites,
-    information: Float[Array, "21 lanes"],
+    information: Float[Array, "6 6 lanes"],
     gradient: Float[Array, "6 lanes"],
     start: _Belief,
     sweeps: int,
@@ -263,9 +257,9 @@ def _sweep_all(
     state = (tau, jnp.zeros_like(tau), start, jnp.zeros_like(sd))
 
     def cavity(tau: Array, nu: Array, belief: _Belief) -> tuple[Array, Array]:
-        full = unrolled.symmetric([row[:, None] for row in belief.covariance])
+        entry = belief.covariance[..., None]
         doubled = [
-            unrolled.add(*(h[j] * (full[i][j] if i == j else 2 * full[i][j]) for j in range(i, 6)))
+            unrolled.add(*((1 if i == j else 2) * entry[i, j] * h[j] for j in range(i, 6)))
             for i in range(6)
         ]
         variance = unrolled.dot(h, doubled)
@@ -284,12 +278,11 @@ def _sweep_all(
         tau, nu = apart((tau, nu))
         weighted = [tau * row for row in h]
         force = nu - tau * offset
-        planes = [weighted[i] * h[j] for i in range(6) for j in range(i, 6)]
+        planes = [weighted[i] * h[j] for i, j in TRIANGLE]
         sums = total([*planes, *(force * row for row in h)])
-        after = _solved(information + jnp.stack(sums[:21]), gradient + jnp.stack(sums[21:]))
-        step = unrolled.rows_of(after.mean - before.mean)
-        inner = unrolled.symmetric(unrolled.rows_of(after.information))
-        length = unrolled.dot(step, unrolled.apply(inner, step))
+        after = _solved(information + _full(sums[:21]), gradient + jnp.stack(sums[21:]))
+        step = after.mean - before.mean
+        length = jnp.sum(step * dense.product_abreast(after.information, step), axis=0)
         return tau, nu, after, jnp.sqrt(jnp.maximum(length, 0.0))
 
     tau, nu, belief, change = jax.lax.fori_loop(0, sweeps, sweep, state)
@@ -299,6 +292,6 @@ def _sweep_all(
     site = mass + 0.5 * jnp.log(joined)
     site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
     site = site + nu * offset - 0.5 * tau * offset**2
-    gained = unrolled.dot(unrolled.rows_of(belief.rhs), unrolled.rows_of(belief.mean))
+    gained = jnp.sum(belief.rhs * belief.mean, axis=0)
     evidence = total([used * site])[0] + 0.5 * gained - 0.5 * belief.log_determinant
     return belief.mean, belief.covariance, evidence, change

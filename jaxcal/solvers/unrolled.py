@@ -158,20 +158,3 @@ def rotation(vector: Vector) -> Matrix:
 def rows_of(stacked: Array) -> Vector:
     """The entries of an array whose first axis counts them."""
     return [stacked[k] for k in range(stacked.shape[0])]
-
-
-def inverse(matrix: Matrix) -> tuple[Vector, Array]:
-    """Upper triangle of S^-1 and ln det S, S symmetric positive definite."""
-    size = len(matrix)
-    factor, diagonal = cholesky(matrix)
-    # Column j of L^-1, from row j on.
-    columns: Matrix = []
-    for j in range(size):
-        column: Vector = [0] * j + [diagonal[j]]
-        for i in range(j + 1, size):
-            rest = add(*(times(factor[i][k], column[k]) for k in range(j, i)))
-            column.append(times(times(-1, rest), diagonal[i]))
-        columns.append(column)
-    flat = [dot(columns[i][j:], columns[j][j:]) for i in range(size) for j in range(i, size)]
-    logarithms = [jnp.log(entry) for entry in diagonal]
-    return flat, -2 * sum(logarithms[1:], logarithms[0])
