@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from jaxcal import draws
 from jaxcal.errors import InputError
 
 OffsetLaw = Literal["uniform", "normal", "one-sided", "heavy-tailed", "triangular"]
@@ -53,17 +54,20 @@ def standard_offsets(key: Key[Array, ""], law: OffsetLaw, count: int) -> Float[A
     """
     check_law(law)
     if law == "normal":
-        return jax.random.normal(key, (count,))
+        return draws.normals(key, 0, count)
     if law == "heavy-tailed":
-        # The variance of Student's t is nu / (nu - 2).
-        unit = np.sqrt((DEGREES_OF_FREEDOM - 2) / DEGREES_OF_FREEDOM)
-        return unit * jax.random.t(key, DEGREES_OF_FREEDOM, (count,))
+        # Student's t: a normal over the root of chi squared / 4, which for four degrees of freedom
+        # is -2 ln of a product of two uniforms. Its variance is nu / (nu - 2).
+        one, other = draws.uniforms(key, 1, 2 * count).reshape(2, count)
+        chi_square = -2 * jnp.log(one * other)
+        unit = np.sqrt(DEGREES_OF_FREEDOM - 2)
+        return unit * draws.normals(key, 0, count) * jax.lax.rsqrt(chi_square)
     if law == "one-sided":
-        return jax.random.uniform(key, (count,))
+        return draws.uniforms(key, 0, count)
     if law == "triangular":
-        pair = jax.random.uniform(key, (2, count))
+        pair = draws.uniforms(key, 0, 2 * count).reshape(2, count)
         return pair[0] - pair[1]
-    return jax.random.uniform(key, (count,), minval=-1.0, maxval=1.0)
+    return 2 * draws.uniforms(key, 0, count) - 1
 
 
 def nominal_bound(law: OffsetLaw, size: float) -> float:

@@ -14,15 +14,15 @@ fit, which is what an image would show.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Complex64, Float, Key
 
+from jaxcal import draws
 from jaxcal.compiler import quick_to_compile
 from jaxcal.errors import InputError
 from jaxcal.geometry import matrix_from_rotation
@@ -30,7 +30,9 @@ from jaxcal.offsets import OffsetLaw, check_law, standard_offsets
 from jaxcal.probe import L14_5, CurvilinearProbe, Probe
 from jaxcal.problem import Channels, Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES, Recording, Truth, make_images
-from jaxcal.segmentation.time_of_flight import fit_distances, fit_in_plane
+from jaxcal.segmentation.deviations import fit_deviations, halves
+from jaxcal.segmentation.time_of_flight import fit_in_plane
+from jaxcal.solvers import unrolled
 
 Scalar = float | Float[Array, ""]
 """A number of a protocol: a plain one, or one that is traced and so shared by a compiled program
@@ -142,6 +144,57 @@ class Experiment(eqx.Module):
         )
 
 
+class Numbers(eqx.Module):
+    """The random numbers of one experiment: functions of its key and counts alone.
+
+    Attributes:
+        axis: of every rotation: of X, of the images', of the test images' poses.
+        turn: how far about it, as a part of the largest angle.
+        place: X's origin and the target, in their SDs.
+        position: of images and test images in their fields, each way between -1 and 1.
+        offset: of the law's size 1.
+        noise: standard normals of the elements: of the first half as real parts, of the others as
+            imaginary ones.
+        tracker: likewise of the tracker's six errors, or None.
+    """
+
+    axis: Float[Array, "3 images"]
+    turn: Float[Array, " images"]
+    place: Float[Array, " 6"]
+    position: Float[Array, "2 others"]
+    offset: Float[Array, " n"]
+    noise: Complex64[Array, "n half"]
+    tracker: Float[Array, "6 n"] | None
+
+
+_AXIS, _TURN, _PLACE, _POSITION, _NOISE, _TRACKER = range(6)
+"""Streams of :mod:`jaxcal.draws`; the offsets' key is folded in, for their law has several."""
+
+
+class Planes(eqx.Module):
+    """One simulated experiment with its images as the minor axis, as the fused solvers read it.
+
+    Attributes:
+        rotation: R_i by rows. origin: b_i, mm. point: segmented lateral position and range, mm.
+        exact: true lateral position and range, mm. elevation: y_i, mm.
+        true_rotation: of X. true_translation: of X, mm. target: c, mm.
+        test_rotation: of the test images. test_origin: theirs, mm. test_point: exact lateral
+            position and range, mm.
+    """
+
+    rotation: Float[Array, "9 n"]
+    origin: Float[Array, "3 n"]
+    point: Float[Array, "2 n"]
+    exact: Float[Array, "2 n"]
+    elevation: Float[Array, " n"]
+    true_rotation: Float[Array, "3 3"]
+    true_translation: Float[Array, " 3"]
+    target: Float[Array, " 3"]
+    test_rotation: Float[Array, "9 m"]
+    test_origin: Float[Array, "3 m"]
+    test_point: Float[Array, "2 m"]
+
+
 def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
     """Draw one experiment; vmap over keys for a batch.
 
@@ -150,56 +203,150 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
             depend on chunks or devices.
         protocol: the distributions.
     """
-    keys = jax.random.split(key, 9)
-    probe = protocol.probe
+    numbers = draw(key, protocol)
+    planes = arrange(numbers, protocol)
+    elements = jnp.asarray(protocol.probe.element_positions())
+    if isinstance(protocol.probe, CurvilinearProbe):
+        inverse = fit_in_plane(_distances(planes, numbers, protocol), elements).inverse_normal
+        kept = True
+    else:
+        inverse, kept = _inverse_normal(planes.point, elements[:, 0]), protocol.raw
+    return Experiment(
+        poses=_matrices(planes.rotation, planes.origin),
+        points=planes.point.T,
+        covariance=protocol.noise_mm**2 * inverse,
+        elevation=planes.elevation,
+        image_to_probe=matrix_from_rotation(planes.true_rotation, planes.true_translation),
+        point=planes.target,
+        test_poses=_matrices(planes.test_rotation, planes.test_origin),
+        test_points=planes.test_point.T,
+        distances=_distances(planes, numbers, protocol) if kept else None,
+    )
+
+
+def draw(key: Key[Array, ""], protocol: Protocol) -> Numbers:
+    """All random numbers of one experiment; of the protocol only what is static counts."""
+    n, images = protocol.images, protocol.images + protocol.test_images
+    position = draws.uniforms(key, _POSITION, 2 * images).reshape(2, images)
+    tracker = draws.normals(key, _TRACKER, 6 * n).reshape(6, n) if _tracked(protocol) else None
+    law = protocol.elevation_distribution
+    return Numbers(
+        axis=draws.unit_vectors(key, _AXIS, 1 + images),
+        turn=draws.uniforms(key, _TURN, 1 + images),
+        place=draws.normals(key, _PLACE, 6),
+        position=2 * position - 1,
+        offset=standard_offsets(jax.random.fold_in(key, 0), law, n),
+        noise=draws.normal_pairs(key, _NOISE, (n, -(-protocol.probe.elements // 2))),
+        tracker=tracker,
+    )
+
+
+def arrange(numbers: Numbers, protocol: Protocol) -> Planes:
+    """The experiment that its random numbers say: poses, distances, and the fit to these."""
+    probe, n = protocol.probe, protocol.images
     curved = isinstance(probe, CurvilinearProbe)
     width = protocol.sector * probe.half_angle_rad if curved else protocol.lateral_mm
     shallow, deep = protocol.depth_mm
-    field = jnp.asarray([width, 0.5 * abs(deep - shallow)])
-    middle = jnp.asarray([0.0, 0.5 * (shallow + deep)])
-    truth = jaxlie.SE3.from_rotation_and_translation(
-        _rotation(keys[0], np.pi), 50.0 * jax.random.normal(keys[1], (3,))
-    )
-    point = 100.0 * jax.random.normal(keys[2], (3,))
+    middle, half = 0.5 * (shallow + deep), 0.5 * abs(deep - shallow)
+    truth = _rotation(numbers.axis[:, :1], numbers.turn[:1] * np.pi)
+    truth = jnp.stack(truth).reshape(3, 3)
+    translation, target = 50.0 * numbers.place[:3], 100.0 * numbers.place[3:]
 
-    n = protocol.images
-    lateral, depth = _positions(keys[3], n, field, middle)
-    if curved:
-        lateral, depth = _from_sector(lateral, depth, probe.radius_mm)
-    draw = standard_offsets(keys[4], protocol.elevation_distribution, n)
-    elevation = protocol.elevation_mm * draw
-    poses = _poses(keys[5], truth, point, jnp.stack([lateral, elevation, depth], -1), protocol)
+    def positions(drawn: Array, fraction: Scalar) -> tuple[Array, Array]:
+        across, depth = fraction * width * drawn[0], middle + fraction * half * drawn[1]
+        if not isinstance(probe, CurvilinearProbe):
+            return across, depth
+        return _from_sector(across, depth, probe.radius_mm)
 
-    noise = protocol.noise_mm * jax.random.normal(keys[6], (n, probe.elements))
+    lateral, depth = positions(numbers.position[:, :n], 1.0)
+    across, far = positions(numbers.position[:, n:], protocol.test_fraction)
+    elevation = protocol.elevation_mm * numbers.offset
+    turns = _rotation(numbers.axis[:, 1:], numbers.turn[1:] * protocol.rotation_rad)
+    rotation, test_rotation = [row[:n] for row in turns], [row[n:] for row in turns]
+
+    def origin(rotation: list[Array], in_image: list[Array | int]) -> list[Array]:
+        # Poses put the target where it was drawn: t_i = c - R_i X p_i.
+        in_probe = unrolled.apply([list(row) for row in truth], in_image)
+        in_probe = [a + b for a, b in zip(in_probe, translation, strict=True)]
+        turned = unrolled.apply(_rows(rotation), in_probe)
+        return [c - value for c, value in zip(target, turned, strict=True)]
+
+    tracked, origins = rotation, origin(rotation, [lateral, elevation, depth])
+    if numbers.tracker is not None:
+        slip = unrolled.rotation([protocol.tracker_rad * error for error in numbers.tracker[3:]])
+        tracked = [entry for row in unrolled.product(_rows(rotation), slip) for entry in row]
+        origins = [
+            value + protocol.tracker_mm * error
+            for value, error in zip(origins, numbers.tracker[:3], strict=True)
+        ]
+    exact = jnp.stack([lateral, depth if curved else jnp.hypot(elevation, depth)])
+    planes = Planes(
+        rotation=jnp.stack(tracked), origin=jnp.stack(origins), point=exact, exact=exact,
+        elevation=elevation, true_rotation=truth, true_translation=translation, target=target,
+        test_rotation=jnp.stack(test_rotation),
+        test_origin=jnp.stack(origin(test_rotation, [across, 0, far])),
+        test_point=jnp.stack([across, far]),
+    )  # fmt: skip
     if curved:
         elements = jnp.asarray(probe.element_positions())
-        target = jnp.stack([lateral, elevation, depth], -1)
-        measured = jnp.linalg.norm(target[:, None] - elements, axis=-1) + noise
-        fit = fit_in_plane(measured, elements)
-        points, inverse = fit.position, fit.inverse_normal
+        point = fit_in_plane(_distances(planes, numbers, protocol), elements).position.T
     else:
-        elements = jnp.asarray(probe.element_lateral())
-        exact_range = jnp.hypot(elevation, depth)
-        measured = jnp.hypot(lateral[:, None] - elements, exact_range[:, None]) + noise
-        points, inverse = fit_distances(measured, elements)
+        size, e = jnp.asarray(protocol.noise_mm, exact.dtype), probe.element_lateral()
+        point = jnp.stack(fit_deviations(numbers.noise, size, exact[0], exact[1], e))
+    return replace(planes, point=point)
 
-    m = protocol.test_images
-    across, deep = _positions(keys[7], m, protocol.test_fraction * field, middle)
-    if curved:
-        across, deep = _from_sector(across, deep, probe.radius_mm)
-    test = jnp.stack([across, deep], -1)
-    in_plane = jnp.stack([test[:, 0], jnp.zeros(m), test[:, 1]], -1)
-    return Experiment(
-        poses=_tracked(jax.random.fold_in(keys[5], n), poses, protocol),
-        points=points,
-        covariance=protocol.noise_mm**2 * inverse,
-        elevation=elevation,
-        image_to_probe=matrix_from_rotation(truth.rotation().as_matrix(), truth.translation()),
-        point=point,
-        test_poses=_poses(keys[8], truth, point, in_plane, protocol),
-        test_points=test,
-        distances=measured if protocol.raw or curved else None,
-    )
+
+def _distances(planes: Planes, numbers: Numbers, protocol: Protocol) -> Float[Array, "n elements"]:
+    """What the elements measure, mm."""
+    probe = protocol.probe
+    noise = jnp.concatenate(halves(numbers.noise, probe.elements), axis=1)
+    if isinstance(probe, CurvilinearProbe):
+        target = jnp.stack([planes.exact[0], planes.elevation, planes.exact[1]], -1)
+        elements = jnp.asarray(probe.element_positions())
+        exact = jnp.linalg.norm(target[:, None] - elements, axis=-1)
+    else:
+        along = planes.exact[0][:, None] - jnp.asarray(probe.element_lateral())
+        exact = jnp.hypot(along, planes.exact[1][:, None])
+    return exact + protocol.noise_mm * noise
+
+
+def _inverse_normal(
+    point: Float[Array, "2 n"], elements: Float[Array, " elements"]
+) -> Float[Array, "n 2 2"]:
+    """Inverse of J'J of Eq. 5 at the points."""
+    along = point[0][:, None] - elements
+    far = jnp.hypot(along, point[1][:, None])
+    jx, jr = along / far, point[1][:, None] / far
+    a, b, c = jnp.sum(jx * jx, 1), jnp.sum(jx * jr, 1), jnp.sum(jr * jr, 1)
+    rows = [jnp.stack([c, -b], axis=-1), jnp.stack([-b, a], axis=-1)]
+    return jnp.stack(rows, axis=-2) / (a * c - b * b)[:, None, None]
+
+
+def _rotation(axis: Float[Array, "3 count"], angle: Float[Array, " count"]) -> list[Array]:
+    """Nine planes of rotations by angles (rad) about axes.
+
+    By quaternions: directions and angles are those of float32, but rotations to the last digit.
+    """
+    scalar, sine = (part.astype(jnp.float64) for part in draws.circle(angle / (4 * np.pi)))
+    vector = [sine * component for component in axis]
+    double = 2 / (scalar * scalar + unrolled.dot(vector, vector))
+    lever = unrolled.cross(vector)
+    square = unrolled.product(lever, lever)
+    return [
+        unrolled.add(
+            float(i == j), double * unrolled.add(unrolled.times(scalar, lever[i][j]), square[i][j])
+        )
+        for i in range(3)
+        for j in range(3)
+    ]
+
+
+def _rows(planes: list[Array]) -> list[list[Array]]:
+    return [planes[3 * i : 3 * i + 3] for i in range(3)]
+
+
+def _matrices(rotation: Float[Array, "9 n"], origin: Float[Array, "3 n"]) -> Float[Array, "n 4 4"]:
+    return jax.vmap(matrix_from_rotation)(rotation.T.reshape(-1, 3, 3), origin.T)
 
 
 def _from_sector(
@@ -210,36 +357,10 @@ def _from_sector(
     return lateral, depth * jnp.cos(angle) - 2 * radius * jnp.sin(angle / 2) ** 2
 
 
-def _positions(
-    key: Key[Array, ""], count: int, half: Float[Array, 2], middle: Float[Array, 2]
-) -> tuple[Float[Array, " count"], Float[Array, " count"]]:
-    draw = jax.random.uniform(key, (count, 2), minval=-1.0, maxval=1.0)
-    positions = middle + half * draw
-    return positions[:, 0], positions[:, 1]
-
-
-def _rotation(key: Key[Array, ""], largest: Scalar) -> jaxlie.SO3:
-    axis_key, angle_key = jax.random.split(key)
-    axis = jax.random.normal(axis_key, (3,))
-    angle = jax.random.uniform(angle_key, (), maxval=largest)
-    return jaxlie.SO3.exp(angle * axis / jnp.linalg.norm(axis))
-
-
-def _poses(
-    key: Key[Array, ""],
-    truth: jaxlie.SE3,
-    point: Float[Array, 3],
-    in_image: Float[Array, "n 3"],
-    protocol: Protocol,
-) -> Float[Array, "n 4 4"]:
-    """Poses that put the target where it was drawn: t_i = c - R_i X p_i."""
-
-    def pose(key: Key[Array, ""], position: Float[Array, 3]) -> Float[Array, "4 4"]:
-        rotation = _rotation(key, protocol.rotation_rad)
-        translation = point - rotation.apply(truth.apply(position))
-        return matrix_from_rotation(rotation.as_matrix(), translation)
-
-    return jax.vmap(pose)(jax.random.split(key, in_image.shape[0]), in_image)
+def _tracked(protocol: Protocol) -> bool:
+    """Whether the tracker errs; a traced size may be anything."""
+    sizes = (protocol.tracker_mm, protocol.tracker_rad)
+    return any(is_traced(size) or bool(size > 0) for size in sizes)
 
 
 def times_of_flight(
@@ -261,23 +382,6 @@ def times_of_flight(
     if not (np.isfinite(clock_hz) and clock_hz > 0):
         raise InputError(f"the clock needs a positive frequency in Hz, not {clock_hz}")
     return np.round(times * clock_hz) / clock_hz
-
-
-def _tracked(
-    key: Key[Array, ""], poses: Float[Array, "n 4 4"], protocol: Protocol
-) -> Float[Array, "n 4 4"]:
-    """The poses as the tracker reports them: errors of its position, and of its rotation."""
-    numbers = (protocol.tracker_mm, protocol.tracker_rad)
-    if not any(is_traced(number) or number > 0 for number in numbers):
-        return poses
-    errors = jax.random.normal(key, (poses.shape[0], 6))
-
-    def one(pose: Float[Array, "4 4"], error: Float[Array, " 6"]) -> Float[Array, "4 4"]:
-        turned = jaxlie.SO3.exp(protocol.tracker_rad * error[3:]).as_matrix()
-        moved = pose[:3, 3] + protocol.tracker_mm * error[:3]
-        return matrix_from_rotation(pose[:3, :3] @ turned, moved)
-
-    return jax.vmap(one)(poses, errors)
 
 
 def simulate_recording(

@@ -1,9 +1,13 @@
 """One chunk of a study: draw, segment, solve by every method, compare with the truth.
 
-One compiled program draws (for each law of the offsets and number of images) and one solves (for
-each method and set of static options); elevation, noise, bounds and all other numbers are
-arguments, so that a whole grid runs through the same programs. They take blocks of a fixed number
-of trials, whatever the chunks; a short last block is filled up, and what was filled in dropped.
+One compiled program draws (for each law of the offsets and number of images), one arranges what was
+drawn into experiments, one makes the conventional fits, and one solves for each method and set of
+static options; elevation, noise, bounds and all other numbers are arguments, so that a whole grid
+runs through the same programs. They take blocks of a fixed number of trials, whatever the chunks; a
+short last block is filled up, and what was filled in dropped.
+
+Plain methods are computed by :mod:`jaxcal.study.lean`; the others, and trials whose status it does
+not know, by :func:`jaxcal.calibrate_batch`.
 
 The programs are compiled for one thread each: trials are independent, so that processes, one for
 each group of cores (:mod:`jaxcal.study.cluster`), use several cores better than XLA's thread pool
@@ -18,19 +22,21 @@ import dataclasses
 from functools import cache, partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array
 
 from jaxcal.compiler import fast_to_run
 from jaxcal.metrics import reconstruction_precision
 from jaxcal.offsets import OffsetLaw, nominal_bound
 from jaxcal.probe import LinearProbe
-from jaxcal.simulation import Experiment, Protocol, simulate
+from jaxcal.simulation import Experiment, Numbers, Protocol, draw, simulate
 from jaxcal.solve import Options, calibrate_batch
+from jaxcal.solvers.fused import Guess
+from jaxcal.solvers.fused_methods import Begun
+from jaxcal.study.lean import Experiments, Kind, Measured, begin, experiments, served, solve
 from jaxcal.study.spec import Chunk, Condition, MethodSpec, Spec
 
 LANES = {"cpu": 64}
@@ -49,28 +55,6 @@ COMPONENTS = ("lateral", "range", "elevation")
 """Of the SDs, in their order."""
 
 
-class Measured(eqx.Module):
-    """What one method makes of a batch of experiments.
-
-    Attributes:
-        rp: point reconstruction precision on the test images (Eq. 8), mm.
-        rotation_error: angle between X and the truth, rad.
-        translation_error: distance between their origins, mm.
-        point_error: distance of the target from the truth, mm.
-        sigma: estimated SDs of lateral position, range and elevational offset, mm.
-        status: a :class:`jaxcal.Status`.
-        iterations: linearisations or rounds.
-    """
-
-    rp: Float[Array, " trials"]
-    rotation_error: Float[Array, " trials"]
-    translation_error: Float[Array, " trials"]
-    point_error: Float[Array, " trials"]
-    sigma: Float[Array, "trials 3"]
-    status: Int[Array, " trials"]
-    iterations: Int[Array, " trials"]
-
-
 @dataclasses.dataclass(frozen=True)
 class Shape:
     """All that is static about a draw."""
@@ -79,6 +63,16 @@ class Shape:
     images: int
     test_images: int
     probe: LinearProbe
+    tracked: bool
+
+    def protocol(self, numbers: dict[str, Any]) -> Protocol:
+        """With the numeric fields, which may be traced; a tracker without errors draws none."""
+        if not self.tracked:
+            numbers = numbers | {"tracker_mm": 0.0, "tracker_rad": 0.0}
+        return Protocol(
+            images=self.images, test_images=self.test_images,
+            elevation_distribution=self.law, probe=self.probe, **numbers,
+        )  # fmt: skip
 
 
 def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
@@ -93,20 +87,16 @@ def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
         3), the root mean square errors of lateral position, range and elevational offset that were
         drawn, mm. They are the same whatever was computed before, and on whatever worker.
     """
-    condition = spec.condition(chunk.condition)
-    shape = shape_of(condition, spec.probe)
-    devices = tuple(jax.local_devices())
+    condition, devices = spec.condition(chunk.condition), tuple(jax.local_devices())
     block = len(devices) * LANES.get(devices[0].platform, OTHER_LANES)
-    seed = np.asarray(spec.seed, np.uint64)
-    draw = draw_program(shape, devices)
     blocks = []
     for start in range(chunk.start, chunk.stop, block):
         trials = np.minimum(start + np.arange(block), chunk.stop - 1)
         indices = (chunk.condition * spec.trials + trials).astype(np.uint32)
-        drawn, realised = draw(indices, seed, numbers_of(condition))
-        measured = [solve_one(method, condition, drawn, devices) for method in spec.methods]
+        drawn = Block(spec, condition, indices, devices)
+        measured = [drawn.measured(method) for method in spec.methods]
         results = {name: np.stack([one[name] for one in measured]) for name in measured[0]}
-        blocks.append((results, np.asarray(realised)))
+        blocks.append((results, np.asarray(drawn.realised)))
     count = chunk.stop - chunk.start
     together = {
         name: np.concatenate([results[name] for results, _ in blocks], axis=1)[:, :count]
@@ -116,14 +106,49 @@ def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
     return together
 
 
-def solve_one(
-    method: MethodSpec, condition: Condition, drawn: Experiment, devices: Devices
-) -> dict[str, np.ndarray]:
-    """What one method makes of a block: the arrays of :class:`Measured`."""
-    prior, options = _static(method)
-    bound = jnp.asarray(bound_mm(method, condition)) if method.bounded else None
-    measured = _solve_program(method.method, prior, options, devices)(drawn, bound)
-    return {name: np.asarray(value) for name, value in vars(measured).items()}
+class Block:
+    """Trials drawn side by side, and what methods make of them."""
+
+    def __init__(
+        self, spec: Spec, condition: Condition, indices: np.ndarray, devices: Devices
+    ) -> None:
+        self._condition, self._devices, self._indices = condition, devices, indices
+        self._seed = np.asarray(spec.seed, np.uint64)
+        self._shape = shape_of(condition, spec.probe)
+        self._numbers = numbers_of(condition)
+        drawn = draw_program(self._shape, devices)(indices, self._seed)
+        arranged = arrange_program(self._shape, devices)(drawn, self._numbers)
+        self.batch, self.truth, self.realised = arranged
+        self._begun: dict[int, Begun] = {}
+
+    def begun(self, max_steps: int) -> Begun:
+        """The conventional fits, made once."""
+        if max_steps not in self._begun:
+            program = begin_program(max_steps, self._devices)
+            self._begun[max_steps] = program(self.batch)
+        return self._begun[max_steps]
+
+    def measured(self, method: MethodSpec) -> dict[str, np.ndarray]:
+        """What one method makes of it: the arrays of :class:`Measured`."""
+        bound = np.asarray(bound_mm(method, self._condition)) if method.bounded else None
+        kind: Kind = (method.method, method.prior)
+        options = _options(method)
+        if not served(kind, options):
+            return self._in_full(kind, options, bound)
+        program = lean_program(kind, options, self._devices)
+        begun = self.begun(options.max_iterations)
+        measured, certain = program(self.batch, self.truth, begun, bound)
+        found = _as_numpy(measured)
+        if not np.all(certain):
+            found["status"] = self._in_full(kind, options, bound)["status"]
+        return found
+
+    def _in_full(
+        self, kind: Kind, options: Options, bound: np.ndarray | None
+    ) -> dict[str, np.ndarray]:
+        simulated = simulate_program(self._shape, self._devices)
+        drawn = simulated(self._indices, self._seed, self._numbers)
+        return _as_numpy(full_program(kind, options, self._devices)(drawn, bound))
 
 
 def device_name() -> str:
@@ -144,19 +169,14 @@ def bound_mm(method: MethodSpec, condition: Condition) -> float:
 
 def protocol(condition: Condition, probe: LinearProbe) -> Protocol:
     """The distributions of one condition."""
-    return Protocol(
-        images=condition.images,
-        test_images=condition.test_images,
-        elevation_distribution=condition.elevation_distribution,  # type: ignore[arg-type]
-        probe=probe,
-        **numbers_of(condition),
-    )
+    return shape_of(condition, probe).protocol(numbers_of(condition))
 
 
 def shape_of(condition: Condition, probe: LinearProbe) -> Shape:
     """What is static about a condition's draws."""
     law: OffsetLaw = condition.elevation_distribution  # type: ignore[assignment]
-    return Shape(law, condition.images, condition.test_images, probe)
+    tracked = condition.tracker_mm > 0 or condition.tracker_deg > 0
+    return Shape(law, condition.images, condition.test_images, probe, tracked)
 
 
 def numbers_of(condition: Condition) -> dict[str, Any]:
@@ -173,77 +193,127 @@ def numbers_of(condition: Condition) -> dict[str, Any]:
     }
 
 
-def _static(method: MethodSpec) -> tuple[str, Options]:
-    options = Options(
+def _options(method: MethodSpec) -> Options:
+    return Options(
         tolerance_rad=method.tolerance_rad,
         tolerance_mm=method.tolerance_mm,
         max_rounds=method.max_rounds,
         inner_steps=method.inner_steps,
         max_iterations=method.max_iterations,
     )
-    return method.prior, options
 
 
-def _compile(function: Any, devices: Devices, *, fast: bool = True) -> Any:
-    """Compile a function whose first argument is cut by trial where there are several devices."""
+def _as_numpy(measured: Measured) -> dict[str, np.ndarray]:
+    return {name: np.asarray(value) for name, value in vars(measured).items()}
+
+
+def _compile(
+    function: Any, devices: Devices, axes: tuple[int | None, ...], out: Any, *, fast: bool = True
+) -> Any:
+    """Compile a function of batches, which are cut by trial where there are several devices.
+
+    Args:
+        function: of arrays and nothing static.
+        devices: one, or several that share the trials.
+        axes: for each argument, which axis of all its arrays counts the trials; None: no axis.
+        out: the same for what it returns, an axis or a tuple of them.
+        fast: with the compiler options of :mod:`jaxcal.abreast`.
+    """
     platform = devices[0].platform
     options = (fast_to_run(platform) or {}) if fast else {}
     options = options | _ONE_THREAD if platform == "cpu" else None
     if len(devices) == 1:
         return jax.jit(function, compiler_options=options)
     mesh = Mesh(np.asarray(devices), ("trials",))
-    cut, whole = PartitionSpec("trials"), PartitionSpec()
 
-    def spread(batch: Any, *shared: Any) -> Any:
-        specs = (cut, *(whole for _ in shared))
-        mapped = jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=cut, check_vma=False)
-        return mapped(batch, *shared)
+    def specs(axis: int | None, tree: Any) -> Any:
+        def one(leaf: Any) -> PartitionSpec:
+            names: list[str | None] = [None] * leaf.ndim
+            if axis is not None:
+                names[axis] = "trials"
+            return PartitionSpec(*names)
+
+        return jax.tree.map(one, tree)
+
+    def spread(*given: Any) -> Any:
+        shapes = jax.eval_shape(function, *given)
+        outs = tuple(map(specs, out, shapes)) if isinstance(out, tuple) else specs(out, shapes)
+        ins = tuple(map(specs, axes, given))
+        mapped = jax.shard_map(function, mesh=mesh, in_specs=ins, out_specs=outs, check_vma=False)
+        return mapped(*given)
 
     return jax.jit(spread, compiler_options=options)
 
 
 @cache
 def draw_program(shape: Shape, devices: Devices) -> Any:
-    """From (trial indices, seed, numbers) to experiments and :func:`realised_errors`, compiled."""
+    """From (trial indices, seed) to their random numbers, compiled."""
+    static = shape.protocol({"tracker_mm": 1.0})
 
-    def draw(indices: Array, seed: Array, numbers: dict[str, Any]) -> tuple[Experiment, Array]:
-        numbers = jax.tree.map(jnp.asarray, numbers)
-        given = Protocol(
-            images=shape.images, test_images=shape.test_images,
-            elevation_distribution=shape.law, probe=shape.probe, **numbers,
-        )  # fmt: skip
+    def program(indices: Array, seed: Array) -> Numbers:
         root = jax.random.key(seed)
+        return jax.vmap(lambda index: draw(jax.random.fold_in(root, index), static))(indices)
 
-        def one(index: Array) -> tuple[Experiment, Array]:
-            experiment = simulate(jax.random.fold_in(root, index), given)
-            return experiment, realised_errors(experiment)
-
-        return jax.vmap(one)(indices)
-
-    return _compile(draw, devices)
+    return _compile(program, devices, (0, None), 0)
 
 
 @cache
-def _solve_program(method: str, prior: str, options: Options, devices: Devices) -> Any:
+def arrange_program(shape: Shape, devices: Devices) -> Any:
+    """From random numbers and the condition's to :func:`jaxcal.study.lean.experiments`."""
+
+    def program(drawn: Numbers, numbers: dict[str, Any]) -> Any:
+        return experiments(drawn, shape.protocol(jax.tree.map(jnp.asarray, numbers)))
+
+    # Noise that another program has written is read; in the same one it would be drawn again by
+    # every loop that takes it.
+    return _compile(program, devices, (0, None), (-2, -1, 0))
+
+
+@cache
+def simulate_program(shape: Shape, devices: Devices) -> Any:
+    """From (trial indices, seed, the condition's numbers) to the same experiments in full."""
+
+    def program(indices: Array, seed: Array, numbers: dict[str, Any]) -> Experiment:
+        given = shape.protocol(jax.tree.map(jnp.asarray, numbers))
+        root = jax.random.key(seed)
+        return jax.vmap(lambda index: simulate(jax.random.fold_in(root, index), given))(indices)
+
+    return _compile(program, devices, (0, None, None), 0)
+
+
+@cache
+def begin_program(max_steps: int, devices: Devices) -> Any:
+    """From experiments to their conventional fits, compiled."""
+    return _compile(lambda batch: begin(batch, max_steps), devices, (-2,), -1)
+
+
+@cache
+def lean_program(kind: Kind, options: Options, devices: Devices) -> Any:
+    """From experiments, truth, conventional fits and bound to :func:`jaxcal.study.lean.solve`."""
+
+    def program(batch: Experiments, truth: Guess, begun: Begun, bound: Array | None) -> Any:
+        return solve(batch, truth, begun, kind, options, bound)
+
+    return _compile(program, devices, (-2, -1, -1, None), (0, 0))
+
+
+@cache
+def full_program(kind: Kind, options: Options, devices: Devices) -> Any:
+    """From experiments in full and bound to what whole calibrations say, compiled."""
     # The joint bounded method takes the general road, whose rounding is left as it was tested.
-    fast = not (method == "joint" and prior == "bounded")
-    return _compile(partial(_solve, method, prior, options), devices, fast=fast)
+    fast = kind != ("joint", "bounded")
+    return _compile(partial(_in_full, kind, options), devices, (0, None), 0, fast=fast)
 
 
-def _solve(
-    method: Any, prior: Any, options: Options, drawn: Experiment, bound: Array | None
-) -> Measured:
+def _in_full(kind: Kind, options: Options, drawn: Experiment, bound: Array | None) -> Measured:
     problems = jax.vmap(lambda experiment: experiment.problem())(drawn)
     result = calibrate_batch(
-        problems, method, prior, max_elevation=bound, options=options,
-        chunk=drawn.points.shape[0],
-    )  # fmt: skip
+        problems, *kind, max_elevation=bound, options=options, chunk=drawn.points.shape[0]
+    )
     x, truth = result.image_to_probe, drawn.image_to_probe
-    precision = jax.vmap(reconstruction_precision)(x, drawn.test_poses, drawn.test_points)
     chord = jnp.linalg.norm(x[:, :3, :3] - truth[:, :3, :3], axis=(1, 2))
     return Measured(
-        rp=precision,
-        # 2 asin(|R1 - R2| / sqrt 8), the angle, keeps its digits where acos would lose them.
+        rp=jax.vmap(reconstruction_precision)(x, drawn.test_poses, drawn.test_points),
         rotation_error=2 * jnp.arcsin(jnp.minimum(chord / np.sqrt(8.0), 1.0)),
         translation_error=jnp.linalg.norm(x[:, :3, 3] - truth[:, :3, 3], axis=1),
         point_error=jnp.linalg.norm(result.point - drawn.point, axis=1),
@@ -251,16 +321,3 @@ def _solve(
         status=result.status_code.astype(jnp.int8),
         iterations=result.iterations.astype(jnp.int32),
     )
-
-
-def realised_errors(experiment: Experiment) -> Float[Array, " 3"]:
-    """Root mean square of the drawn lateral, range and elevational errors of one experiment, mm.
-
-    They are what the self-tuned SDs estimate; a tracker's errors are among them.
-    """
-    poses, x = experiment.poses, experiment.image_to_probe
-    in_probe = jnp.einsum("nji,nj->ni", poses[:, :3, :3], experiment.point - poses[:, :3, 3])
-    q = (in_probe - x[:3, 3]) @ x[:3, :3]
-    lateral, distance = experiment.points[:, 0], experiment.points[:, 1]
-    errors = [lateral - q[:, 0], distance - jnp.hypot(q[:, 1], q[:, 2]), q[:, 1]]
-    return jnp.sqrt(jnp.mean(jnp.stack(errors) ** 2, axis=1))

@@ -1,0 +1,285 @@
+"""Plain methods of a study, computed for what a study stores and nothing else.
+
+A study keeps X's errors, SDs, status and iterations of millions of solves. Covariances, intervals
+and the inspection of every image, which a :class:`jaxcal.Calibration` has as well, would take
+longer than the solves. Here experiments stay what :mod:`jaxcal.solvers.fused` reads, planes of
+numbers with the images minor; the conventional fit is made once for all methods; and a status needs
+no spectrum:
+
+- poses are not degenerate where the scaled design D has no eigenvalue below 1e-11 of its largest;
+  that is certain where D - 1e-11 tr(D) 1 has a Cholesky factor, since tr(D) is no less;
+- a direction is known where the scaled information S has no eigenvalue below variance / L^2, L half
+  the lever arm: where S - variance / L^2 1 has a Cholesky factor.
+
+A trial where either factor fails is not certain, and whoever asked has to take the long road
+(:func:`jaxcal.pipeline.finish`), whose verdicts these are wherever they are given.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxcal import abreast
+from jaxcal.calibration import Status
+from jaxcal.errors import InputError
+from jaxcal.model.priors import Bounded, Gaussian, InPlane
+from jaxcal.options import (
+    Given,
+    Method,
+    Options,
+    Plan,
+    PriorName,
+    Request,
+    prepare,
+    with_bound,
+)
+from jaxcal.pipeline import Solution
+from jaxcal.problem import Problem
+from jaxcal.simulation import Numbers, Protocol, arrange
+from jaxcal.solvers import unrolled
+from jaxcal.solvers.fused import UNKNOWNS, Guess, Held, Images, Normal, accumulate, targets, total
+from jaxcal.solvers.fused import Measured as MeasuredBelief
+from jaxcal.solvers.fused_methods import Begun, from_scratch
+from jaxcal.uncertainty import LARGEST_SD, SINGULAR
+
+Kind = tuple[Method, PriorName]
+"""A method and its prior."""
+
+_MARGIN = 1.001
+"""Thresholds are certified with this to spare, against rounding."""
+
+
+class Measured(eqx.Module):
+    """What one method makes of a batch of experiments.
+
+    Attributes:
+        rp: point reconstruction precision on the test images (Eq. 8), mm.
+        rotation_error: angle between X and the truth, rad.
+        translation_error: distance between their origins, mm.
+        point_error: distance of the target from the truth, mm.
+        sigma: estimated SDs of lateral position, range and elevational offset, mm.
+        status: a :class:`jaxcal.Status`.
+        iterations: linearisations or rounds.
+    """
+
+    rp: Float[Array, " trials"]
+    rotation_error: Float[Array, " trials"]
+    translation_error: Float[Array, " trials"]
+    point_error: Float[Array, " trials"]
+    sigma: Float[Array, "trials 3"]
+    status: Int[Array, " trials"]
+    iterations: Int[Array, " trials"]
+
+
+class Experiments(eqx.Module):
+    """A batch of experiments in planes.
+
+    Attributes:
+        images: what is measured.
+        test: poses and exact points of the test images.
+    """
+
+    images: Images
+    test: Images
+
+
+@cache
+def served(kind: Kind, options: Options) -> bool:
+    """Whether a method is computed here."""
+    one = jnp.ones((1, 4))
+    images = Images(jnp.zeros((9, 1, 4)), jnp.zeros((3, 1, 4)), one, one, one)
+    return _plan(problems_of(images), kind, options, None) is not None
+
+
+def _plan(
+    problems: Problem, kind: Kind, options: Options, bound: Array | None
+) -> tuple[Plan, Given] | None:
+    """What a method does, or None where it is not a plain one."""
+    plan, given = prepare(problems, Request(*kind, max_elevation=bound, options=options))
+    plain = abreast.plain(problems, given, plan) and not plan.laws
+    return (plan, given) if plain else None
+
+
+def experiments(
+    numbers: Numbers, protocol: Protocol
+) -> tuple[Experiments, Guess, Float[Array, "trials 3"]]:
+    """From a batch's random numbers to its experiments, their truth, and the errors in them.
+
+    The errors are root mean squares of the lateral, range and elevational errors of each trial, mm,
+    those that a tracker makes among them: what self-tuned SDs estimate.
+    """
+    one = jax.vmap(lambda numbers: arrange(numbers, protocol))(numbers)
+    images = _images(one.rotation, one.origin, one.point)
+    test = _images(one.test_rotation, one.test_origin, one.test_point)
+    truth = Guess(jnp.moveaxis(one.true_rotation, 0, -1), one.true_translation.T, one.target.T)
+    return Experiments(images, test), truth, jnp.sqrt(_mean_squares(truth, images)).T
+
+
+def _images(rotation: Array, origin: Array, point: Array) -> Images:
+    return Images(
+        rotation=jnp.moveaxis(rotation, 1, 0), origin=jnp.moveaxis(origin, 1, 0),
+        lateral=point[:, 0], distance=point[:, 1], mask=jnp.ones_like(point[:, 0]),
+    )  # fmt: skip
+
+
+def problems_of(images: Images) -> Problem:
+    """The same as problems with a leading axis; what nobody reads is not computed."""
+    lanes, count = images.mask.shape
+    rotation = jnp.moveaxis(images.rotation, 0, -1).reshape(lanes, count, 3, 3)
+    top = jnp.concatenate([rotation, jnp.moveaxis(images.origin, 0, -1)[..., None]], axis=-1)
+    bottom = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 0.0, 1.0]), (lanes, count, 1, 4))
+    return Problem(
+        poses=jnp.concatenate([top, bottom], axis=-2),
+        measurements=jnp.stack([images.lateral, images.distance], axis=-1),
+        mask=images.mask,
+        spacing=jnp.ones((lanes, 2)),
+        face_offset=jnp.zeros(lanes),
+    )
+
+
+def begin(batch: Experiments, max_steps: int) -> Begun:
+    """The conventional fits from which every method starts."""
+    return from_scratch(batch.images, max_steps=max_steps)
+
+
+def solve(
+    batch: Experiments,
+    truth: Guess,
+    begun: Begun,
+    kind: Kind,
+    options: Options,
+    bound: Array | None,
+) -> tuple[Measured, Bool[Array, " trials"]]:
+    """One method on a batch.
+
+    Args:
+        batch: the experiments.
+        truth: theirs.
+        begun: their conventional fits.
+        kind: a method that is :func:`served`.
+        options: its options.
+        bound: on the offsets, mm, for methods that take one.
+
+    Returns:
+        What it measures, and where the status is certain; elsewhere it is not to be used.
+    """
+    images = batch.images
+    problems = problems_of(images)
+    planned = _plan(problems, kind, options, bound)
+    if planned is None:
+        raise InputError(f"method {kind[0]} with prior {kind[1]} is no plain one")
+    plan, given = planned
+    problems = with_bound(problems, given)
+    solution = abreast.run_method(begun, images, problems, given, plan)
+    guess = Guess.of(solution.parameters)
+    certain = _certain(solution, guess, images)
+    ended = jnp.where(solution.arrived, Status.CONVERGED, Status.MAX_ITERATIONS)
+    finite = jnp.isfinite(solution.cost) & jnp.isfinite(sum(unrolled.rows_of(guess.point)))
+    chord = jnp.sqrt(jnp.sum((guess.rotation - truth.rotation) ** 2, axis=(0, 1)))
+    apart = [
+        jnp.sqrt(jnp.sum((one - true) ** 2, axis=0))
+        for one, true in (
+            (guess.translation, truth.translation), (guess.point, truth.point),
+        )
+    ]  # fmt: skip
+    measured = Measured(
+        rp=_precision(guess, truth, batch.test),
+        # 2 asin(|R1 - R2| / sqrt 8), the angle, keeps its digits where acos would lose them.
+        rotation_error=2 * jnp.arcsin(jnp.minimum(chord / np.sqrt(8.0), 1.0)),
+        translation_error=apart[0],
+        point_error=apart[1],
+        sigma=_sigma(solution, guess, images),
+        status=ended.astype(jnp.int8),
+        iterations=solution.iterations.astype(jnp.int32),
+    )
+    return measured, certain & finite
+
+
+def _certain(solution: Solution, guess: Guess, images: Images) -> Bool[Array, " trials"]:
+    """Where the solution is observable beyond doubt."""
+    none = jnp.zeros_like(images.used)
+    design = accumulate(guess, Held(jnp.zeros_like(images.mask)), images, none)
+    squares = images.mask * (images.lateral**2 + images.distance**2)
+    lever = jnp.sqrt(jnp.sum(squares, axis=1) / images.used)
+    scaled = _scaled(design, lever)
+    least = _MARGIN * max(SINGULAR, 100 * float(jnp.finfo(lever.dtype).eps))
+    trace = unrolled.add(*(scaled[k][k] for k in range(UNKNOWNS)))
+    certain = _exceeds(scaled, least * trace)
+    prior = solution.prior
+    if isinstance(prior, InPlane):
+        variance = design.cost / jnp.maximum(3 * images.used - UNKNOWNS, 1.0)
+    elif isinstance(prior, Gaussian):
+        information = accumulate(guess, MeasuredBelief(prior.sigma.T), images, none)
+        scaled, variance = _scaled(information, lever), jnp.ones_like(lever)
+    else:
+        # Bounds confine every direction.
+        return certain
+    return certain & _exceeds(scaled, _MARGIN * variance / (LARGEST_SD * lever) ** 2)
+
+
+def _scaled(normal: Normal, lever: Float[Array, " lanes"]) -> unrolled.Matrix:
+    """The curvature with every unknown in mm at the target, as in :mod:`jaxcal.uncertainty`."""
+    matrix, inverse = normal.matrix(), 1 / lever
+    scale = [inverse if 3 <= k < 6 else jnp.ones_like(inverse) for k in range(UNKNOWNS)]
+    return [[matrix[i][j] * scale[i] * scale[j] for j in range(UNKNOWNS)] for i in range(UNKNOWNS)]
+
+
+def _exceeds(matrix: unrolled.Matrix, least: Float[Array, " lanes"]) -> Bool[Array, " lanes"]:
+    """Whether all eigenvalues of a symmetric matrix certainly exceed a number; NaN never do."""
+    shifted = [
+        [value - least if i == j else value for j, value in enumerate(row)]
+        for i, row in enumerate(matrix)
+    ]
+    _, inverse = unrolled.cholesky(shifted)
+    return jnp.isfinite(sum(inverse[1:], inverse[0]))
+
+
+def _mean_squares(guess: Guess, images: Images) -> Float[Array, "3 lanes"]:
+    """Of lateral error, range error and elevational offset at a guess, mm^2."""
+    q, _ = targets(guess, images)
+    far = jnp.sqrt(q[1] * q[1] + q[2] * q[2])
+    errors = [q[0] - images.lateral, far - images.distance, q[1]]
+    return jnp.stack(total([images.mask * error * error for error in errors])) / images.used
+
+
+def _sigma(solution: Solution, guess: Guess, images: Images) -> Float[Array, "lanes 3"]:
+    """SDs of lateral position, range and offset, mm: the belief's own or those of the residuals."""
+    prior = solution.prior
+    if isinstance(prior, Gaussian):
+        return prior.sigma
+    # The unknowns' degrees of freedom are shared equally by the three components.
+    freedom = jnp.maximum(images.used - UNKNOWNS / 3, 1.0) / images.used
+    squares = _mean_squares(guess, images) / freedom
+    if isinstance(prior, Bounded):
+        # Offsets within a bound have a root mean square within it, too.
+        offset = jnp.sum(images.mask * solution.offset**2, axis=1) / images.used
+        squares = squares.at[2].set(offset)
+    return jnp.sqrt(squares).T
+
+
+def _precision(guess: Guess, truth: Guess, test: Images) -> Float[Array, " lanes"]:
+    """Eq. 8, as :func:`jaxcal.metrics.reconstruction_precision`, mm.
+
+    Reconstructed points are taken from the true target, near which they are: their mean and spread
+    then come from one pass without loss of digits.
+    """
+    rows = [[entry[:, None] for entry in row] for row in guess.rotation]
+    flat = [test.lateral, 0, test.distance]
+    in_probe = [
+        value + origin[:, None]
+        for value, origin in zip(unrolled.apply(rows, flat), guess.translation, strict=True)
+    ]
+    poses = [[test.rotation[3 * i + j] for j in range(3)] for i in range(3)]
+    away = [
+        value + (test.origin[k] - truth.point[k][:, None])
+        for k, value in enumerate(unrolled.apply(poses, in_probe))
+    ]
+    *sums, square = total([*away, away[0] ** 2 + away[1] ** 2 + away[2] ** 2])
+    spread = square - sum(value * value for value in sums) / test.used
+    return jnp.sqrt(jnp.maximum(spread, 0.0) / (test.used - 1))
