@@ -142,13 +142,14 @@ class Guess(eqx.Module):
 def targets(guess: Guess, images: Images) -> tuple[Vector, Matrix]:
     """q_i and M_i as planes."""
     inverse = [[guess.rotation[k, a][:, None] for k in range(3)] for a in range(3)]
-    translation = [value[:, None] for value in guess.translation]
-    poses = [[images.rotation[3 * i + j] for j in range(3)] for i in range(3)]
-    turned = unrolled.product(inverse, unrolled.transpose(poses))
+    back = [[images.rotation[3 * j + i] for j in range(3)] for i in range(3)]
     apart = [guess.point[j][:, None] - images.origin[j] for j in range(3)]
-    shift = unrolled.apply(inverse, translation)
-    q = [a - b for a, b in zip(unrolled.apply(turned, apart), shift, strict=True)]
-    return q, turned
+    # Not by M_i: who needs q_i alone shall not have to wait for it in memory.
+    in_probe = [
+        value - shift[:, None]
+        for value, shift in zip(unrolled.apply(back, apart), guess.translation, strict=True)
+    ]
+    return unrolled.apply(inverse, in_probe), unrolled.product(inverse, back)
 
 
 class Term(eqx.Module):
