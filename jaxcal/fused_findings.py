@@ -39,7 +39,7 @@ from jaxcal.solvers.consensus import FEWEST_IMAGES, stands_out
 from jaxcal.solvers.fused import UNKNOWNS, Guess, Images, total
 from jaxcal.solvers.lanes import apart
 from jaxcal.solvers.unrolled import Vector
-from jaxcal.solvers.views import View, square_of, variance
+from jaxcal.solvers.views import View, variance
 from jaxcal.uncertainty import Uncertainty
 
 
@@ -150,32 +150,32 @@ def _gather(
     images = view.images
     mask = images.mask
     lateral, distance, offset = view.errors
-    design = view.information([[mask if i == j else 0 for j in range(3)] for i in range(3)])
     across = mask * (view.q[2] - images.distance)
     in_plane = lateral * lateral + offset * offset + across * across
     free, cost = jnp.zeros_like(mask), in_plane
-    planes = [*design, *whole.information(steadied.weight(whole, mask))]
+    weights = [[[mask if i == j else 0 for j in range(3)] for i in range(3)]]
     if isinstance(prior, Gaussian):
-        planes += view.information(whitened(view, prior)[2])
+        weights.append(whitened(view, prior)[2])
     elif resting is not None:
-        planes += view.information(resting.weight(mask))
+        weights.append(resting.weight(mask))
         free = mask * resting.free
         cost = sum((e * e for e in resting.errors[1:]), resting.errors[0] ** 2)
+    robust = steadied.weight(whole, mask)
+    if whole is view:
+        *matrices, robust = view.information([*weights, robust])
+    else:
+        matrices, [robust] = view.information(weights), whole.information([robust])
     points = [mask * images.lateral, mask * images.distance]
-    planes += [
+    planes = [
         cost, in_plane, lateral * lateral, distance * distance, elevation * elevation,
         points[0] * images.lateral + points[1] * images.distance, *points,
         *(mask * plane for plane in images.rotation), mask, free,
     ]  # fmt: skip
     sums = apart(jnp.stack(total(planes)))
-    count = len(design)
-    matrices = [square_of(sums[k : k + count]) for k in range(0, len(planes) - 19, count)]
-    design, robust, *other = apart(matrices)
-    left = sums[len(planes) - 19 :]
     return _Sums(
-        design=design, information=other[0] if other else design, robust=robust,
-        cost=left[0], in_plane=left[1], squares=left[2:5], reach=left[5], points=left[6:8],
-        rotation=left[8:17], used=left[17], free=left[18],
+        design=matrices[0], information=matrices[-1], robust=robust,
+        cost=sums[0], in_plane=sums[1], squares=sums[2:5], reach=sums[5], points=sums[6:8],
+        rotation=sums[8:17], used=sums[17], free=sums[18],
     )  # fmt: skip
 
 

@@ -165,9 +165,10 @@ def ends(
     quick = Ends(jnp.maximum(1 / top, eps * biggest), biggest, vector, no, no)
 
     def exact() -> Ends:
+        together = jnp.concatenate([information, design], axis=-1)
+        both = jax.vmap(dense.singular_values, in_axes=-1, out_axes=-1)(together)
         spectrum, plain = (
-            jax.vmap(dense.singular_values, in_axes=-1, out_axes=-1)(matrix)
-            for matrix in (information, design)
+            jax.tree.map(lambda leaf, k=k: jnp.split(leaf, 2, axis=-1)[k], both) for k in range(2)
         )
         null = plain.values < threshold * plain.values[-1]
         unseen = jax.vmap(one_of_many, in_axes=-1, out_axes=-1)(plain.right, null)

@@ -375,15 +375,15 @@ def contributions(
 
 
 def total(planes: Vector) -> Vector:
-    """Sum every plane over its images, all in one reduction; structural zeros become zeros."""
+    """Sum every plane over its images (last), all in one reduction; structural zeros are zeros."""
     given = [plane for plane in planes if not unrolled.is_zero(plane)]
     none = [jnp.zeros((), plane.dtype) for plane in given]
 
     def plus(a: tuple, b: tuple) -> tuple:
         return tuple(x + y for x, y in zip(a, b, strict=True))
 
-    sums = iter(jax.lax.reduce(tuple(given), tuple(none), plus, (1,)))
-    zero = jnp.zeros(given[0].shape[0], given[0].dtype)
+    sums = iter(jax.lax.reduce(tuple(given), tuple(none), plus, (given[0].ndim - 1,)))
+    zero = jnp.zeros(given[0].shape[:-1], given[0].dtype)
     return [zero if unrolled.is_zero(plane) else next(sums) for plane in planes]
 
 

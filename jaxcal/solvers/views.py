@@ -10,13 +10,27 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.solvers import unrolled
-from jaxcal.solvers.fused import PAIRS, UNKNOWNS, Guess, Images, Term, contributions, targets
+from jaxcal.solvers.fused import (
+    PAIRS,
+    UNKNOWNS,
+    Guess,
+    Images,
+    Term,
+    contributions,
+    targets,
+    total,
+)
+from jaxcal.solvers.lanes import apart
 from jaxcal.solvers.unrolled import Entry, Matrix, Vector
 
-PLACE = [[PAIRS.index((min(i, j), max(i, j))) for j in range(UNKNOWNS)] for i in range(UNKNOWNS)]
+PLACE = np.array(
+    [[PAIRS.index((min(i, j), max(i, j))) for j in range(UNKNOWNS)] for i in range(UNKNOWNS)]
+)
+"""Where the entries of a full matrix are in its upper triangle."""
 
 
 class View(eqx.Module):
@@ -42,9 +56,8 @@ class View(eqx.Module):
         square = q[1] * q[1] + q[2] * q[2]
         inverse = jax.lax.rsqrt(square)
         errors = [q[0] - images.lateral, square * inverse - images.distance, q[1]]
-        return cls(
-            images, q, turned, [q[1] * inverse, q[2] * inverse], [images.mask * e for e in errors]
-        )
+        errors = [images.mask * error for error in errors]
+        return cls(images, q, turned, [q[1] * inverse, q[2] * inverse], errors)
 
     def rows(self) -> tuple[Vector, Vector, Vector]:
         """Derivatives of lateral position, range and offset."""
@@ -63,10 +76,25 @@ class View(eqx.Module):
         lever = unrolled.cross(self.q)
         return [0, 0, -1, *lever[2], *self.turned[2]]
 
-    def information(self, weight: Matrix) -> Vector:
-        """Each image's part of sum J' K J, upper triangle; K from :func:`curvature` or likewise."""
-        nothing = Term(self.images.mask, [0, 0, 0], weight)
-        return contributions(self.q, self.turned, nothing, 0)[0]
+    def information(self, weights: list[Matrix]) -> list[Float[Array, "9 9 lanes"]]:
+        """J' K J, summed over the images, for several K, of :meth:`curvature` or likewise.
+
+        They share one program, on planes (kinds, lanes, images): half as much to compile.
+        """
+        zero = jnp.zeros_like(self.images.mask)
+
+        def kinds(i: int, j: int) -> Entry:
+            entries = [weight[i][j] for weight in weights]
+            if all(unrolled.is_zero(entry) for entry in entries):
+                return 0
+            full = [zero if unrolled.is_zero(entry) else entry for entry in entries]
+            return apart(jnp.stack(full))
+
+        upper = [[kinds(min(i, j), max(i, j)) for j in range(3)] for i in range(3)]
+        stacked = Term(self.images.mask, [0, 0, 0], upper)
+        flat = contributions(self.q, self.turned, stacked, 0)[0]
+        sums = apart(jnp.stack(total(flat)))[PLACE]
+        return [sums[:, :, k] for k in range(len(weights))]
 
     def curvature(self, lateral: Array, distance: Array, offset: Array, mixed: Entry = 0) -> Matrix:
         """K of weights on lateral position, range (with that between both) and offset."""
@@ -76,11 +104,6 @@ class View(eqx.Module):
             [unrolled.times(mixed, a), distance * a * a + offset, distance * a * b],
             [unrolled.times(mixed, b), distance * a * b, distance * b * b],
         ]
-
-
-def square_of(flat: Float[Array, "45 lanes"]) -> Float[Array, "9 9 lanes"]:
-    """Full matrices from upper triangles."""
-    return jnp.stack([jnp.stack([flat[place] for place in row]) for row in PLACE])
 
 
 def variance(matrix: Float[Array, "9 9 lanes"], row: Vector) -> Float[Array, "lanes n"]:
