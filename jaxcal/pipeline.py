@@ -119,6 +119,7 @@ def _run_method(problem: Problem, given: Given, plan: Plan) -> Solution:
     begun = from_scratch(
         problem, blocks,
         solver=options.solver if conventional and not historical else "lm",
+        exact=conventional and options.solver == "lm",
         max_steps=options.max_iterations,
         trace=options.trace if conventional else 0,
     )  # fmt: skip

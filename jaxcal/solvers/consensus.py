@@ -4,14 +4,20 @@ A wrong echo, a wrong click or a slipped mount moves an image by tens of millime
 the images may be such. Least squares on all of them is then far from the truth and its residuals do
 not tell the good from the bad, so the good ones are found by consensus:
 
-1. *Proposals.* Many small subsets of the images, the same ones every time, are solved in closed
-   form (a linear system of 12 unknowns each, from per-image moments that are formed once), and each
-   is scored on all images by sum_k ln s_k, with s_k the median magnitude of error component k. Up
-   to half of the images may be anything without spoiling a median.
-2. *Concentration.* The best few take weighted Gauss-Newton steps on the 60 % of the images
-   that fit them best, chosen anew each time.
-3. *Rejection with re-inclusion.* From the best of those: SDs from the median of the images in use,
-   a step on them, and a test of *every* image, so that one left out too early returns.
+1. *Proposals.* Hundreds of small subsets of the images, the same ones every time, are solved in
+   closed form (a linear system of 12 unknowns each, from per-image moments that are formed once),
+   and each is scored on all images by sum_k ln s_k, with s_k the median magnitude of error
+   component k. Up to half of the images may be anything without spoiling a median.
+2. *Concentration.* The best of them take Gauss-Newton steps on their own subset, then on the 60 %
+   of the images that fit them best, chosen anew each time.
+3. *Rejection with re-inclusion.* SDs from the median of the images in use, a step on them, and a
+   test of *every* image, so that one left out too early returns.
+4. *Evidence.* What came of every finalist is weighed, and against them all that no image is wrong.
+   Of an image in use each error is Gaussian with the SDs of those in use; an image is wrong with
+   probability ``WRONG``, and then each of its errors is as predicted or may be anything within
+   ``ANYTHING_MM``. Half of a dozen images can be fitted very well with one component of the error
+   next to nothing, which medians take for agreement; and where nothing is gravely wrong, nothing
+   is left out, so that the robust answer is exactly the plain one.
 
 The errors are those of the joint method (lateral position, range, elevational offset), each
 with its own SD. An image stands out where a component is more than ``CUT`` SDs off, its own
@@ -31,26 +37,26 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxcal.model.parameters import Blocks, Parameters, retract, size
 from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.problem import Problem
 from jaxcal.solvers import arrow as arrows
-from jaxcal.solvers import dense
+from jaxcal.solvers.proposals import SUBSET, linear_proposals, nominal, subset_weights
 
-PROPOSALS = 128
-SUBSET = 6
-"""Images in a proposal's subset: four determine the linear system, two more steady it."""
-FINALISTS = 4
+SUBSET_STEPS = 3
 CONCENTRATION = 0.6
 CONCENTRATION_STEPS = 6
-REJECTION_STEPS = 10
+REJECTION_STEPS = 8
 CUT = 6.0
 """SDs beyond which an image stands out. Heavy tails (Student's t4) put 0.3 % of images there."""
 FEW_IMAGES = 30
 """With fewer images in use, n, the limit is wider by sqrt(30 / n): 9.5 SDs for a dozen."""
-SEED = 20261121
+WRONG = 0.05
+"""How probable it is, to begin with, that an image is wrong."""
+ANYTHING_MM = 200.0
+"""Width of the range in which its errors may lie then."""
 FEWEST_IMAGES = 8
 """With fewer used images nothing is left out: they cannot outvote one another."""
 MAD = 1.4826
@@ -88,7 +94,7 @@ class Consensus(eqx.Module):
     Attributes:
         keep: (n,) 1 for used images that agree, 0 otherwise.
         parameters: the unknowns that they agree on, to a few Gauss-Newton steps.
-        sigma: (3,) robust SDs of the components, mm.
+        sigma: (3,) SDs of the components over the images that agree, mm.
         departure: (n, 3) errors in SDs, leverage allowed for; 0 where not used at all.
     """
 
@@ -112,7 +118,7 @@ def steadied_errors(parameters: Parameters, problem: Problem) -> Float[Array, "n
     """
     errors = measurement_residual(parameters, problem)
     # The unknowns' own effect on the range is beside the point, and it must not be differentiated.
-    distance = measured_points(_nominal(problem), problem)[:, 1]
+    distance = measured_points(nominal(problem), problem)[:, 1]
     beyond = jnp.maximum(distance / quantile(distance, problem.mask, 0.5), 1.0)
     return errors.at[:, 0].divide(jnp.where(problem.mask > 0, beyond, 1.0))
 
@@ -126,6 +132,7 @@ def find_consensus(problem: Problem, model: Model) -> Consensus:
     """
     used = problem.mask
     subsets = subset_weights(used, model.subset)
+    subsets = jnp.concatenate([used[None], subsets])
     proposed = model.propose(problem, subsets)
 
     def score(parameters: Parameters) -> Float[Array, ""]:
@@ -133,46 +140,78 @@ def find_consensus(problem: Problem, model: Model) -> Consensus:
         total = jnp.sum(jnp.log(jnp.maximum(scale, 1e-9)))
         return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
-    scores = jax.vmap(score)(proposed)
-    _, best = jax.lax.top_k(-scores, FINALISTS)
-    finalists = jax.tree.map(lambda leaf: leaf[best], proposed)
-
-    def concentrate(_: Array, parameters: Parameters) -> Parameters:
-        errors, jacobian = _linearise(parameters, problem, model)
-        sigma = _with_floor(MAD * _medians(errors, used, model))
-        squared = jnp.sum((errors / sigma) ** 2, axis=1)
-        nearest = quantile(squared, used, CONCENTRATION)
-        weight = used * (squared <= nearest)
-        return _step(parameters, errors, jacobian, sigma, weight, model)
-
-    def finish(parameters: Parameters) -> tuple[Parameters, Array]:
-        done = jax.lax.fori_loop(0, CONCENTRATION_STEPS, concentrate, parameters)
-        return done, score(done)
-
-    finished, scores = jax.vmap(finish)(finalists)
-    winner = jnp.argmin(scores)
-    parameters = jax.tree.map(lambda leaf: leaf[winner], finished)
-    return _reject(parameters, problem, model)
+    count = finalists(used.shape[0])
+    _, best = jax.lax.top_k(-jax.vmap(score)(proposed)[1:], count)
+    # The first lane is that all images are good: it is heard beside those that leave some out.
+    chosen = jnp.concatenate([jnp.zeros(1, best.dtype), best + 1])
+    everything = jnp.arange(count + 1) == 0
+    finished: Consensus
+    finished, cost = jax.vmap(partial(_finish, problem=problem, model=model))(
+        jax.tree.map(lambda leaf: leaf[chosen], proposed), subsets[chosen], everything
+    )
+    winner = jnp.argmin(cost)
+    found: Consensus = jax.tree.map(lambda leaf: leaf[winner], finished)
+    enough = (jnp.sum(used) >= FEWEST_IMAGES) & jnp.isfinite(cost[winner])
+    return Consensus(
+        jnp.where(enough, found.keep, used), found.parameters, found.sigma, found.departure
+    )
 
 
-def _reject(parameters: Parameters, problem: Problem, model: Model) -> Consensus:
-    """Alternate between steps on the images in use and testing all of them."""
+def finalists(images: int) -> int:
+    """How many proposals to go on with: with few images a clean subset need not look the best."""
+    return int(np.clip(800 // images, 8, 64))
+
+
+def _finish(
+    parameters: Parameters,
+    subset: Float[Array, " n"],
+    all_good: Bool[Array, ""],
+    problem: Problem,
+    model: Model,
+) -> tuple[Consensus, Float[Array, ""]]:
+    """Fit the subset, concentrate, reject; and weigh what came of it (the less, the better)."""
     used = problem.mask
+    # A consensus of less than half is none.
     fewest = jnp.maximum(0.5 * jnp.sum(used), FEWEST_IMAGES)
 
-    def one_round(_: Array, state: tuple[Parameters, Array]) -> tuple[Parameters, Array]:
+    def one_round(index: Array, state: tuple[Parameters, Array]) -> tuple[Parameters, Array]:
         parameters, weight = state
         errors, jacobian = _linearise(parameters, problem, model)
-        sigma, departure = _depart(errors, jacobian, weight, model)
-        fits = used * (1 - stands_out(departure, weight))
-        # A consensus of less than half is none.
-        fits = jnp.where(jnp.sum(fits) >= fewest, fits, weight)
-        return _step(parameters, errors, jacobian, sigma, fits, model), fits
+        concentrating = index < SUBSET_STEPS + CONCENTRATION_STEPS
+        basis = jnp.where(index <= SUBSET_STEPS + CONCENTRATION_STEPS, used, weight)
+        sigma = _robust(errors, basis, model)
+        leverage = _leverage(jacobian, sigma, basis)
+        squared = jnp.sum((errors / sigma) ** 2, axis=1)
+        nearest = used * (squared <= quantile(squared, used, CONCENTRATION))
+        departure = _studentised(errors, leverage, sigma, basis)
+        fits = used * (1 - stands_out(departure, basis))
+        # With fewer than that, go on with the images that stand out least.
+        largest = jnp.max(jnp.abs(departure), axis=1)
+        least = used * (largest <= quantile(largest, used, fewest / jnp.sum(used)))
+        fits = jnp.where(jnp.sum(fits) >= fewest, fits, least)
+        weight = jnp.where(concentrating, nearest, fits)
+        weight = jnp.where(index < SUBSET_STEPS, subset, weight)
+        weight = jnp.where(all_good, used, weight)
+        sigma = jnp.where(all_good, _efficient(errors, leverage, used, model)[0], sigma)
+        return _step(parameters, errors, jacobian, sigma, weight, model), weight
 
-    parameters, keep = jax.lax.fori_loop(0, REJECTION_STEPS, one_round, (parameters, used))
-    sigma, departure = departures(parameters, problem, keep, model)
-    enough = (jnp.sum(used) >= FEWEST_IMAGES) & jnp.all(jnp.isfinite(departure))
-    return Consensus(jnp.where(enough, keep, used), parameters, sigma, departure)
+    rounds = SUBSET_STEPS + CONCENTRATION_STEPS + REJECTION_STEPS
+    parameters, keep = jax.lax.fori_loop(0, rounds, one_round, (parameters, used))
+    errors, jacobian = _linearise(parameters, problem, model)
+    leverage = _leverage(jacobian, _robust(errors, keep, model), keep)
+    sigma, freedom = _efficient(errors, leverage, keep, model)
+    departure = _studentised(errors, leverage, sigma, keep)
+    # Of an image in use, what is left of three Gaussian errors once the unknowns are fitted; of one
+    # that is left out, each of its errors is as predicted or may be anything.
+    cost = jnp.sum(freedom * jnp.log(jnp.sqrt(2 * jnp.pi * jnp.e) * sigma))
+    predicted = 0.5 * departure**2 + jnp.log(jnp.sqrt(2 * jnp.pi * (1 + leverage)) * sigma)
+    wrong = jnp.sum(jnp.minimum(predicted, jnp.log(ANYTHING_MM)), axis=1) - jnp.log(WRONG)
+    cost = cost + jnp.sum(jnp.where((used > 0) & (keep == 0), wrong, 0.0))
+    fits = used * (1 - stands_out(departure, keep))
+    fits = jnp.where(all_good, used, fits)
+    sound = (jnp.sum(fits) >= fewest) & jnp.all(jnp.isfinite(departure))
+    cost = jnp.where(sound & jnp.isfinite(cost), cost, jnp.inf)
+    return Consensus(fits, parameters, sigma, departure), cost
 
 
 def departures(
@@ -191,121 +230,60 @@ def departures(
         departure: (n, 3) errors in SDs, leverage allowed for; 0 for images masked out.
     """
     errors, jacobian = _linearise(parameters, problem, model)
-    return _depart(errors, jacobian, keep, model)
+    sigma = _robust(errors, keep, model)
+    return sigma, _studentised(errors, _leverage(jacobian, sigma, keep), sigma, keep)
 
 
 def stands_out(departure: Float[Array, "n 3"], keep: Float[Array, " n"]) -> Float[Array, " n"]:
     """1 where an image departs by more than the images in use can explain.
 
-    A median of a dozen images is itself uncertain: with few of them the limit is wider.
+    A median of a dozen images is itself uncertain: with few of them the limit is wider. To come
+    back an image has to fit better than that: what few images predict is uncertain, too, and an
+    outlier that is let in by such a wide limit draws the others after it.
     """
-    limit = CUT * jnp.sqrt(jnp.maximum(FEW_IMAGES / jnp.maximum(jnp.sum(keep), 1.0), 1.0))
-    return jnp.any(jnp.abs(departure) > limit, axis=1).astype(keep.dtype)
+    few = jnp.sqrt(jnp.maximum(FEW_IMAGES / jnp.maximum(jnp.sum(keep), 1.0), 1.0))
+    limit = CUT * jnp.where(keep > 0, few, 1.0)
+    return jnp.any(jnp.abs(departure) > limit[:, None], axis=1).astype(keep.dtype)
 
 
-def _depart(
-    errors: Float[Array, "n 3"],
-    jacobian: Float[Array, "p n 3"],
-    weight: Float[Array, " n"],
-    model: Model,
-) -> tuple[Float[Array, 3], Float[Array, "n 3"]]:
+def _robust(
+    errors: Float[Array, "n 3"], weight: Float[Array, " n"], model: Model
+) -> Float[Array, 3]:
+    """SDs of the components from the median magnitudes of the weighted images, mm."""
     # The unknowns' degrees of freedom are shared equally by the three components.
     freedom = jnp.maximum(1 - size(model.blocks) / (3 * jnp.sum(weight)), 0.1)
-    sigma = _with_floor(MAD * _medians(errors, weight, model) / jnp.sqrt(freedom))
-    leverage = _leverage(jacobian, sigma, weight)
+    return _with_floor(MAD * _medians(errors, weight, model) / jnp.sqrt(freedom))
+
+
+def _efficient(
+    errors: Float[Array, "n 3"],
+    leverage: Float[Array, "n 3"],
+    weight: Float[Array, " n"],
+    model: Model,
+) -> tuple[Float[Array, 3], Float[Array, 3]]:
+    """SDs of the components from the mean squares of the weighted images, mm, and their freedom.
+
+    A median of few images is itself uncertain; without gross errors these are twice as certain.
+    """
+    squares = jnp.sum(jnp.where(weight[:, None] > 0, errors**2, 0.0), axis=0)
+    freedom = jnp.sum(weight[:, None] * (1 - leverage), axis=0)
+    if model.isotropic:
+        squares, freedom = jnp.full(3, jnp.mean(squares)), jnp.full(3, jnp.mean(freedom))
+    freedom = jnp.maximum(freedom, 0.1 * jnp.sum(weight))
+    return _with_floor(jnp.sqrt(squares / freedom)), freedom
+
+
+def _studentised(
+    errors: Float[Array, "n 3"],
+    leverage: Float[Array, "n 3"],
+    sigma: Float[Array, 3],
+    weight: Float[Array, " n"],
+) -> Float[Array, "n 3"]:
+    """Errors in SDs, leverage allowed for."""
     # An image in use pulls the fit towards itself; one that is not, is predicted by the fit.
     inside = errors / jnp.sqrt(jnp.maximum(1 - leverage, 0.05))
     outside = errors / jnp.sqrt(1 + leverage)
-    return sigma, jnp.where(weight[:, None] > 0, inside, outside) / sigma
-
-
-def subset_weights(used: Float[Array, " n"], count: int) -> Float[Array, "k n"]:
-    """Weights (0 or 1) of the proposals' subsets, each of ``count`` used images.
-
-    The draws are constants of the program: the same problem gives the same answer everywhere.
-    """
-    draws = np.random.default_rng(SEED).random((PROPOSALS, used.shape[0]))
-    order = jnp.where(used > 0, jnp.asarray(draws, used.dtype), 2.0)
-
-    def pick(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        order, chosen = state
-        here = order == jnp.min(order, axis=1, keepdims=True)
-        return jnp.where(here, 3.0, order), jnp.where(here, 1.0, chosen)
-
-    chosen = jax.lax.fori_loop(0, count, pick, (order, jnp.zeros_like(order)))[1]
-    return chosen * used
-
-
-def linear_proposals(problem: Problem, subsets: Float[Array, "k n"], *, scaled: bool) -> Parameters:
-    """Solve the start's linear system (see :mod:`jaxcal.solvers.initial`) for every subset at once.
-
-    Args:
-        problem: one problem.
-        subsets: (k, n) weights.
-        scaled: the pixel scales are unknown and found as well.
-
-    Returns:
-        Parameters with a leading axis k.
-    """
-    rotations, translations = problem.poses[:, :3, :3], problem.poses[:, :3, 3]
-    used = problem.mask
-    total = jnp.sum(used)
-    nominal = _nominal(problem)
-    points = jnp.where(used[:, None] > 0, measured_points(nominal, problem), 0.0)
-    mean = jnp.sum(used[:, None] * points, axis=0) / total
-    length = jnp.sqrt(jnp.sum(used[:, None] * (points - mean) ** 2) / total)
-    length = jnp.where(length > 0, length, 1.0)
-    deviation = (points - mean) / length
-    centre = jnp.sum(used[:, None] * translations, axis=0) / total
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype), rotations.shape)
-    rhs = (centre - translations) / length
-    rows = jnp.concatenate(
-        [deviation[:, :1, None] * rotations, deviation[:, 1:, None] * rotations, rotations, -eye,
-         rhs[..., None]], axis=2,
-    )  # fmt: skip
-    rows = jnp.where(used[:, None, None] > 0, rows, 0.0)
-    # In units of the points' spread all 12 unknowns and all moments are of order one.
-    moments = jnp.einsum("nia,nib->nab", rows, rows).reshape(len(used), -1)
-    systems = (subsets @ moments).reshape(-1, 13, 13)
-
-    def solve(system: Float[Array, "13 13"]) -> Parameters:
-        ridge = 1e3 * jnp.finfo(system.dtype).eps * jnp.trace(system) / 13
-        matrix = system[:12, :12] + ridge * jnp.eye(12, dtype=system.dtype)
-        columns = dense.solve_positive(matrix, system[:12, 12:])[:6, 0]
-        first, third = columns[:3], columns[3:]
-        sizes = jnp.stack([jnp.sqrt(jnp.sum(first**2)), jnp.sqrt(jnp.sum(third**2))])
-        a, b = first / sizes[0], third / sizes[1]
-        plus, minus = a + b, a - b
-        plus = plus / jnp.sqrt(jnp.sum(plus**2))
-        minus = minus / jnp.sqrt(jnp.sum(minus**2))
-        lateral, axial = (plus + minus) / jnp.sqrt(2.0), (plus - minus) / jnp.sqrt(2.0)
-        if scaled:
-            lateral, axial = sizes[0] * lateral, sizes[1] * axial
-        known = jnp.concatenate([lateral, axial])
-        rest = dense.solve_positive(
-            matrix[6:, 6:], (system[6:12, 12] - system[6:12, :6] @ known)[:, None]
-        )[:, 0]
-        rotation = jnp.stack(
-            [lateral / jnp.sqrt(jnp.sum(lateral**2)),
-             jnp.cross(axial, lateral) / jnp.sqrt(jnp.sum(axial**2) * jnp.sum(lateral**2)),
-             axial / jnp.sqrt(jnp.sum(axial**2))], axis=1,
-        )  # fmt: skip
-        translation = length * rest[:3] - mean[0] * lateral - mean[1] * axial
-        scale = sizes if scaled else jnp.ones_like(sizes)
-        # A pixel's row 0 need not be the face: the face's range is not scaled.
-        translation = (
-            translation
-            + jnp.where(jnp.asarray(scaled), (scale[1] - 1) * problem.face_offset, 0.0)
-            * rotation[:, 2]
-        )
-        return Parameters.of(rotation, translation, length * rest[3:] + centre, scale)
-
-    return jax.vmap(solve)(systems)
-
-
-def _nominal(problem: Problem) -> Parameters:
-    zero = jnp.zeros(3, problem.mask.dtype)
-    return Parameters.of(jnp.eye(3, dtype=zero.dtype), zero, zero)
+    return jnp.where(weight[:, None] > 0, inside, outside) / sigma
 
 
 def _linearise(
@@ -364,7 +342,7 @@ def _medians(
 
 
 def quantile(
-    values: Float[Array, " n"], weight: Float[Array, " n"], share: float
+    values: Float[Array, " n"], weight: Float[Array, " n"], share: float | Float[Array, ""]
 ) -> Float[Array, ""]:
     """The least value that at least ``share`` of the weight does not exceed, by bisection.
 

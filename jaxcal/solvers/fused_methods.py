@@ -216,7 +216,7 @@ def alternate(
     *,
     tolerance_rad: float,
     tolerance_mm: float,
-    max_rounds: int,
+    max_rounds: int | Int[Array, ""],
     inner_steps: int,
 ) -> Alternated:
     """Alternate from (conventional) starts; see :func:`jaxcal.solvers.alternating.alternate`."""

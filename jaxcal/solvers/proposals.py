@@ -1,0 +1,119 @@
+"""Proposals for a consensus: closed-form solutions of many small subsets of the images at once.
+
+Every proposal is the start's linear system (:mod:`jaxcal.solvers.initial`) on a few images; each
+image's moments are formed once, and a subset's system is the sum of those of its images.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxcal.model.parameters import Parameters
+from jaxcal.model.residuals import measured_points
+from jaxcal.problem import Problem
+from jaxcal.solvers import dense
+
+MOST_PROPOSALS, FEWEST_PROPOSALS = 512, 256
+"""Of a dozen images with a third of them outliers, one subset in 33 is clean."""
+SUBSET = 6
+"""Images in a proposal's subset: four determine the linear system, two more steady it."""
+SEED = 20261121
+
+
+def proposals(images: int) -> int:
+    """How many subsets to try: the more the fewer images there are, for then few are clean."""
+    return int(np.clip(12_800 // images, FEWEST_PROPOSALS, MOST_PROPOSALS))
+
+
+def subset_weights(used: Float[Array, " n"], size: int) -> Float[Array, "k n"]:
+    """Weights (0 or 1) of the proposals' subsets, each of ``size`` used images.
+
+    The draws are constants of the program: the same problem gives the same answer everywhere.
+    """
+    count = proposals(used.shape[0])
+    draws = np.random.default_rng(SEED).random((count, used.shape[0]))
+    order = jnp.where(used > 0, jnp.asarray(draws, used.dtype), 2.0)
+
+    def pick(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        order, chosen = state
+        here = order == jnp.min(order, axis=1, keepdims=True)
+        return jnp.where(here, 3.0, order), jnp.where(here, 1.0, chosen)
+
+    chosen = jax.lax.fori_loop(0, size, pick, (order, jnp.zeros_like(order)))[1]
+    return chosen * used
+
+
+def linear_proposals(problem: Problem, subsets: Float[Array, "k n"], *, scaled: bool) -> Parameters:
+    """Solve the start's linear system (see :mod:`jaxcal.solvers.initial`) for every subset at once.
+
+    Args:
+        problem: one problem.
+        subsets: (k, n) weights.
+        scaled: the pixel scales are unknown and found as well.
+
+    Returns:
+        Parameters with a leading axis k.
+    """
+    rotations, translations = problem.poses[:, :3, :3], problem.poses[:, :3, 3]
+    used = problem.mask
+    total = jnp.sum(used)
+    points = measured_points(nominal(problem), problem)
+    points = jnp.where(used[:, None] > 0, points, 0.0)
+    mean = jnp.sum(used[:, None] * points, axis=0) / total
+    length = jnp.sqrt(jnp.sum(used[:, None] * (points - mean) ** 2) / total)
+    length = jnp.where(length > 0, length, 1.0)
+    deviation = (points - mean) / length
+    centre = jnp.sum(used[:, None] * translations, axis=0) / total
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype), rotations.shape)
+    rhs = (centre - translations) / length
+    rows = jnp.concatenate(
+        [deviation[:, :1, None] * rotations, deviation[:, 1:, None] * rotations, rotations, -eye,
+         rhs[..., None]], axis=2,
+    )  # fmt: skip
+    rows = jnp.where(used[:, None, None] > 0, rows, 0.0)
+    # In units of the points' spread all 12 unknowns and all moments are of order one.
+    moments = jnp.einsum("nia,nib->nab", rows, rows).reshape(len(used), -1)
+    systems = (subsets @ moments).reshape(-1, 13, 13)
+
+    def solve(system: Float[Array, "13 13"]) -> Parameters:
+        ridge = 1e3 * jnp.finfo(system.dtype).eps * jnp.trace(system) / 13
+        matrix = system[:12, :12] + ridge * jnp.eye(12, dtype=system.dtype)
+        columns = dense.solve_positive(matrix, system[:12, 12:])[:6, 0]
+        first, third = columns[:3], columns[3:]
+        sizes = jnp.stack([jnp.sqrt(jnp.sum(first**2)), jnp.sqrt(jnp.sum(third**2))])
+        a, b = first / sizes[0], third / sizes[1]
+        plus, minus = a + b, a - b
+        plus = plus / jnp.sqrt(jnp.sum(plus**2))
+        minus = minus / jnp.sqrt(jnp.sum(minus**2))
+        lateral, axial = (plus + minus) / jnp.sqrt(2.0), (plus - minus) / jnp.sqrt(2.0)
+        if scaled:
+            lateral, axial = sizes[0] * lateral, sizes[1] * axial
+        known = jnp.concatenate([lateral, axial])
+        rest = dense.solve_positive(
+            matrix[6:, 6:], (system[6:12, 12] - system[6:12, :6] @ known)[:, None]
+        )[:, 0]
+        rotation = jnp.stack(
+            [lateral / jnp.sqrt(jnp.sum(lateral**2)),
+             jnp.cross(axial, lateral) / jnp.sqrt(jnp.sum(axial**2) * jnp.sum(lateral**2)),
+             axial / jnp.sqrt(jnp.sum(axial**2))], axis=1,
+        )  # fmt: skip
+        translation = length * rest[:3] - mean[0] * lateral - mean[1] * axial
+        scale = sizes if scaled else jnp.ones_like(sizes)
+        # A pixel's row 0 need not be the face: the face's range is not scaled.
+        translation = (
+            translation
+            + jnp.where(jnp.asarray(scaled), (scale[1] - 1) * problem.face_offset, 0.0)
+            * rotation[:, 2]
+        )
+        return Parameters.of(rotation, translation, length * rest[3:] + centre, scale)
+
+    return jax.vmap(solve)(systems)
+
+
+def nominal(problem: Problem) -> Parameters:
+    """Nothing turned or moved, scales as given."""
+    zero = jnp.zeros(3, problem.mask.dtype)
+    return Parameters.of(jnp.eye(3, dtype=zero.dtype), zero, zero)
