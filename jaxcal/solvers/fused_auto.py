@@ -27,8 +27,17 @@ from jaxcal.solvers.auto import (
     average_over_laws,
     weights,
 )
-from jaxcal.solvers.fused import PAIRS, UNKNOWNS, Guess, Images, targets
-from jaxcal.solvers.fused_evidence import V_Y, Belief, common, judged, mean_precision, own, tune
+from jaxcal.solvers.fused import UNKNOWNS, Guess, Images, targets
+from jaxcal.solvers.fused_evidence import (
+    V_Y,
+    Belief,
+    common,
+    judged,
+    mean_precision,
+    own,
+    row_of,
+    tune,
+)
 from jaxcal.solvers.fused_laws import SEEN, Sites, marginal, propagate
 from jaxcal.solvers.lanes import apart, choose
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING
@@ -140,8 +149,7 @@ class Candidate(eqx.Module):
         """From a tuned belief."""
         sums, weight = tuned.sums, 1 / tuned.scale[:-1, None] ** 2
         # h_i has -1 at v_y, so the sum of h_i is what v_y has in common with the others.
-        places = [PAIRS.index((min(V_Y, j), max(V_Y, j))) for j in range(UNKNOWNS)]
-        along = jnp.stack([sums.matrix[-1, place] for place in places])
+        along = row_of(sums.matrix[-1], V_Y)
         return cls(
             tuned.guess, tuned.mean, tuned.with_mean, sigma, log_evidence,
             jnp.sum(weight * sums.matrix[:-1], axis=0),

@@ -117,52 +117,59 @@ def own(images: Images, weight: Float[Array, "3 lanes n"]) -> Pass:
 
 
 class _System(eqx.Module):
-    """Every component's normal equations about a mean b, which is the last unknown."""
+    """Every component's normal equations about a mean b, which is the last unknown.
 
-    matrix: Float[Array, "k 10 10 lanes"]
+    Attributes:
+        matrix: of X and c, upper triangles. border: b's row, of the offsets alone. gradient: b's
+            last. squares: rss_k.
+    """
+
+    matrix: Float[Array, "k 45 lanes"]
+    border: Float[Array, "10 lanes"]
     gradient: Float[Array, "k 10 lanes"]
     squares: Float[Array, "k lanes"]
 
     @classmethod
     def of(cls, sums: Sums, mean: Array, with_mean: Array) -> _System:
         """From what a pass left."""
-        flat, offsets = sums.matrix, sums.matrix.shape[0] - 1
-        place = [[PAIRS.index((min(i, j), max(i, j))) for j in range(9)] for i in range(9)]
-        # Of the offsets alone: their sums with -1 are those of v_y.
-        only = (jnp.arange(offsets + 1) == offsets).astype(flat.dtype)[:, None]
-        along = jnp.stack([flat[-1, place[V_Y][j]] for j in range(9)])
-        border = [only * with_mean * row for row in along]
-        full = [
-            (flat[:, place[i][j]] if j < 9 else border[i]) if i < 9
-            else (border[j] if j < 9 else border[V_Y])
-            for i in range(10) for j in range(10)
-        ]  # fmt: skip
+        only = np.eye(len(sums.squares))[-1][:, None]
+        along = row_of(sums.matrix[-1], V_Y)
         squares = mean * (2 * sums.gradient[-1, V_Y] + mean * along[V_Y])
         gradient = sums.gradient + only[:, None] * mean * along
         last = only * with_mean * gradient[:, V_Y]
-        return apart(
-            cls(
-                jnp.stack(full, axis=1).reshape(-1, 10, 10, mean.shape[0]),
-                jnp.concatenate([gradient, last[:, None]], axis=1),
-                sums.squares + only * squares,
-            )
-        )
+        border = with_mean * jnp.concatenate([along, along[V_Y, None]])
+        gradient = jnp.concatenate([gradient, last[:, None]], axis=1)
+        return apart(cls(sums.matrix, border, gradient, sums.squares + only * squares))
 
     def solved(self, scale: Array, precision: Array, mean: Array) -> tuple[Array, ...]:
-        """Inverse, ln det and step with given SDs and belief about b, and ln Z but for the SDs."""
+        """Inverse and step with given SDs and belief about b, and ln Z but for the SDs."""
         weight = 1 / scale**2
         last = (np.arange(10) == 9)[:, None]
-        matrix = jnp.sum(weight[:, None, None] * self.matrix, axis=0)
-        matrix = matrix + jnp.where(last[:, None] & last[None], precision, 0.0)
+        flat = jnp.sum(weight[:, None] * self.matrix, axis=0)
+        border = weight[-1] * self.border + jnp.where(last, precision, 0.0)
         gradient = jnp.sum(weight[:, None] * self.gradient, axis=0)
         gradient = gradient + jnp.where(last, precision * mean, 0.0)
-        matrix, gradient = apart((matrix, gradient))
-        inverse, log_determinant = dense.inverse_abreast(matrix)
+        flat, border, gradient = apart((flat, border, gradient))
+        rows = [jnp.concatenate([row_of(flat, k), border[k, None]]) for k in range(UNKNOWNS)]
+        inverse, log_determinant = dense.inverse_abreast(jnp.stack([*rows, border]))
         step = -dense.product_abreast(inverse, gradient)
         # At the minimum, which is a small step away.
         cost = jnp.sum(weight * self.squares, axis=0) + precision * mean**2
         cost = cost + jnp.sum(gradient * step, axis=0)
         return inverse, step, 0.5 * (jnp.log(precision) - cost - log_determinant)
+
+    def traces(self, matrix: Float[Array, "10 10 lanes"]) -> Float[Array, "k lanes"]:
+        """tr(A N_k) of every component, A symmetric."""
+        twice = [(1 if i == j else 2) * matrix[i, j] for i, j in PAIRS]
+        found = jnp.sum(apart(jnp.stack(twice)) * self.matrix, axis=1)
+        crossed = 2 * matrix[9, :9] * self.border[:9]
+        own = jnp.sum(crossed, axis=0) + matrix[9, 9] * self.border[9]
+        return found + np.eye(len(found))[-1][:, None] * own
+
+
+def row_of(flat: Float[Array, "45 lanes"], k: int) -> Float[Array, "9 lanes"]:
+    """A row of a symmetric matrix from its upper triangle."""
+    return jnp.stack([flat[PAIRS.index((min(k, j), max(k, j)))] for j in range(UNKNOWNS)])
 
 
 def mean_precision(offset_sd: Array, with_mean: Array) -> Array:
@@ -197,8 +204,8 @@ def tune(
             scale, _ = state
             precision = mean_precision(scale[-1], with_mean)
             inverse, step, _ = apart(system.solved(scale, precision, mean))
-            leverage = jnp.sum(inverse * system.matrix, axis=(1, 2)) / scale**2
-            bent = jnp.sum(step[:, None] * step * system.matrix, axis=(1, 2))
+            leverage = system.traces(inverse) / scale**2
+            bent = system.traces(step[:, None] * step)
             left = system.squares + 2 * jnp.sum(system.gradient * step, axis=1) + bent
             freedom = jnp.maximum(count - leverage, 0.05 * count)
             return with_floor(jnp.sqrt(jnp.maximum(left, 0.0) / freedom)), step
