@@ -8,10 +8,12 @@ shapes and options, and mapped over batches.
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
 from jaxcal import abreast, compiler
@@ -143,6 +145,10 @@ def calibrate_batch(
         robust: see there.
         chunk: lanes solved side by side; by default 64, on channels 8.
 
+    Plain problems are shared out among all of JAX's local devices: a processor is one device unless
+    ``jax.config.update("jax_num_cpu_devices", n)`` (or JAX_NUM_CPU_DEVICES=n) says before JAX's
+    first use that it is n, one a core. Results do not depend on it.
+
     Returns:
         A :class:`Calibration` whose arrays have the problems' leading axes.
 
@@ -167,11 +173,16 @@ def _solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None)
     count = flat.mask.shape[0]
     # Chunks of one size, the last one filled up: a remainder would be compiled as a second program.
     pieces = max(-(-count // largest), 1)
+    program, devices = _chunks_program(flat, given, plan)
+    if pieces >= len(devices):
+        pieces = -(-pieces // len(devices)) * len(devices)
+    else:
+        program, devices = _chunks_program(flat, given, plan, spread=False)
     lanes = max(-(-count // pieces), 1)
     if count and pieces * lanes != count:
         rows = jnp.arange(pieces * lanes) % count
         flat = jax.tree.map(lambda leaf: leaf[rows], flat)
-    result = _chunks_program(flat, given, plan)(flat, given, plan, lanes)
+    result = program(flat, given, plan, lanes)
     return jax.tree.map(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
 
 
@@ -197,17 +208,29 @@ def solve_chunks(problems: Problem, given: Given, plan: Plan, chunk: int) -> Cal
 
 
 @cache
-def _chunks(platform: str | None, fused: bool):
-    """The compiled solve of chunks; with a platform, as a program of its own."""
+def _chunks(devices: tuple[Any, ...], alone: bool, fused: bool):
+    """The compiled solve of chunks, which several devices share; alone: a program of its own."""
     flags = compiler.fast_to_run if fused else compiler.quick_to_compile
-    return jax.jit(
-        solve_chunks,
-        static_argnums=(2, 3),
-        compiler_options=None if platform is None else flags(platform),
-    )
+    options = flags(devices[0].platform) if alone else None
+    if len(devices) == 1:
+        return jax.jit(solve_chunks, static_argnums=(2, 3), compiler_options=options)
+    mesh, cut = Mesh(np.asarray(devices), ("problems",)), PartitionSpec("problems")
+
+    def spread(problems: Problem, given: Given, plan: Plan, chunk: int) -> Calibration:
+        def share(problems: Problem, given: Given) -> Calibration:
+            return solve_chunks(problems, given, plan, chunk)
+
+        specs = (cut, PartitionSpec())
+        mapped = jax.shard_map(share, mesh=mesh, in_specs=specs, out_specs=cut, check_vma=False)
+        return mapped(problems, given)
+
+    return jax.jit(spread, static_argnums=(2, 3), compiler_options=options)
 
 
-def _chunks_program(problems: Problem, given: Given, plan: Plan):
+def _chunks_program(problems: Problem, given: Given, plan: Plan, *, spread: bool = True):
+    """The compiled form, and the devices that it runs on."""
     alone = compiler.is_whole_program(problems, given)
-    platform = jax.default_backend() if alone else None
-    return _chunks(platform, abreast.plain(problems, given, plan))
+    fused = abreast.plain(problems, given, plan)
+    devices = tuple(jax.local_devices())
+    devices = devices if alone and fused and spread else devices[:1]
+    return _chunks(devices, alone, fused), devices

@@ -7,32 +7,38 @@ target moved by 20 mm. Everything runs pinned to one core; rounds are interleave
 taking its share of the problems in each, and ratios are medians over the rounds. The table counts
 the problems whose objective is within 1e-8 (relative) of the lowest that any solver found.
 
-Further tables: from how far the optimum is reached (4,096 problems); scaling with images, batch and
-cores; one warm problem; float32. Seed 20261125.
+Further tables: from how far the optimum is reached (4,096 problems); scaling with images and batch,
+memory, float32; cores; one warm problem. ``--part`` runs one of them alone; the figure is drawn
+from the tables that are there. Seed 20261125.
 """
 
 from __future__ import annotations
 
+import argparse
+import csv
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 CORES = sorted(os.sched_getaffinity(0))
-os.sched_setaffinity(0, {CORES[0]})  # before JAX counts them
+if "--devices" not in sys.argv:
+    os.sched_setaffinity(0, {CORES[0]})  # before JAX counts them
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from jax.sharding import Mesh, NamedSharding, PartitionSpec  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import peer_solvers as peers  # noqa: E402
-from common import arguments, machine, results_folder, write_table  # noqa: E402
+from common import machine, results_folder, write_table  # noqa: E402
 from peer_solvers import Batch, Solved  # noqa: E402
 
 from jaxcal.compiler import fast_to_run  # noqa: E402
@@ -41,6 +47,7 @@ from jaxcal.model.parameters import Parameters  # noqa: E402
 from jaxcal.simulation import Protocol, simulate  # noqa: E402
 from jaxcal.solvers import lanes  # noqa: E402
 from jaxcal.solvers.fused import Circle, Guess, Images  # noqa: E402
+from jaxcal.solvers.fused_methods import closed_form  # noqa: E402
 
 SEED = 20261125
 SIGMA_MM, OFFSET_SD_MM = 0.5, 2 / np.sqrt(3)
@@ -74,9 +81,55 @@ def draw(count: int, images: int, degrees: float, millimetres: float, seed: int 
                  1 / OFFSET_SD_MM)  # fmt: skip
 
 
+def images_of(poses, points) -> Images:
+    """What the kernel takes of a batch."""
+    return Images(
+        jnp.stack([poses[..., i, j] for i in range(3) for j in range(3)]),
+        jnp.stack([poses[..., i, 3] for i in range(3)]),
+        points[..., 0], points[..., 1], jnp.ones(points.shape[:2], points.dtype),
+    )  # fmt: skip
+
+
+def to_device(batch: Batch, dtype: type) -> list[jax.Array]:
+    """What the kernel takes, as JAX's arrays."""
+    parts = (batch.poses, batch.points, batch.matrix, batch.point)
+    return [jnp.asarray(part, dtype) for part in parts]
+
+
+@dataclass(frozen=True)
+class FusedSolver:
+    """Jaxcal's kernel, compiled.
+
+    Attributes:
+        program: from four arrays to X, c, y and the numbers of passes. dtype: of them.
+        compile_s: what compiling took, s. temporary_bytes: memory beside arguments and results.
+        placed: the batch where it lies on several devices; then no other one can be solved.
+    """
+
+    program: Any
+    dtype: type
+    compile_s: float
+    temporary_bytes: int
+    placed: list[jax.Array] | None = None
+
+    def __call__(self, batch: Batch) -> Solved:
+        """Solve, timed without the copies to and from JAX."""
+        parts = self.placed or jax.block_until_ready(to_device(batch, self.dtype))
+        begun = time.perf_counter()
+        done = jax.block_until_ready(self.program(*parts))
+        seconds = time.perf_counter() - begun
+        matrix, point, offset, iterations = (np.asarray(part) for part in done)
+        return Solved(matrix, point, offset, iterations, seconds)
+
+
 def fused_solver(
-    batch: Batch, *, dtype: type = np.float64, options: dict | None = None, chunk: int = LANES
-) -> Callable[[Batch], Solved]:
+    batch: Batch,
+    *,
+    dtype: type = np.float64,
+    options: dict | None = None,
+    chunk: int = LANES,
+    devices: int = 1,
+) -> FusedSolver:
     """Jaxcal's kernel, compiled for batches of this size.
 
     Args:
@@ -84,22 +137,19 @@ def fused_solver(
         dtype: precision.
         options: of the compiler; jaxcal's own by default.
         chunk: problems side by side.
+        devices: of JAX's that share the batch.
     """
     count = len(batch)
     chunk = min(chunk, count)
-    if count % chunk:
-        raise ValueError(f"{count} problems are no multiple of {chunk}")
+    if count % (chunk * devices):
+        raise ValueError(f"{count} problems are no multiple of {chunk} on {devices} devices")
 
     def solve(part):
         poses, points, matrix, point = part
         guess = Guess(
             jnp.moveaxis(matrix[:, :3, :3], 0, -1), matrix[:, :3, 3].T, point.T
         )  # fmt: skip
-        images = Images(
-            jnp.stack([poses[..., i, j] for i in range(3) for j in range(3)]),
-            jnp.stack([poses[..., i, 3] for i in range(3)]),
-            points[..., 0], points[..., 1], jnp.ones(points.shape[:2], points.dtype),
-        )  # fmt: skip
+        images = images_of(poses, points)
         sigma = jnp.full((3, points.shape[0]), SIGMA_MM, points.dtype)
         belief = Circle(
             sigma, jnp.full(points.shape[0], OFFSET_SD_MM, points.dtype),
@@ -119,26 +169,27 @@ def fused_solver(
         done = jax.lax.map(solve, split)
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), done)
 
-    def device(batch: Batch):
-        return [
-            jnp.asarray(part, dtype)
-            for part in (batch.poses, batch.points, batch.matrix, batch.point)
-        ]
-
-    parts = device(batch)
+    parts = to_device(batch, dtype)
     options = fast_to_run(jax.default_backend()) if options is None else options
-    program = jax.jit(whole).lower(*parts).compile(compiler_options=options)
-    jax.block_until_ready(program(*parts))
-
-    def run(batch: Batch) -> Solved:
-        parts = jax.block_until_ready(device(batch))
+    function = whole
+    if devices > 1:
+        mesh, cut = (
+            Mesh(np.asarray(jax.devices()[:devices]), ("problems",)),
+            PartitionSpec("problems"),
+        )
+        function = jax.shard_map(whole, mesh=mesh, in_specs=cut, out_specs=cut, check_vma=False)
+        placed = [jax.device_put(part, NamedSharding(mesh, cut)) for part in parts]
         begun = time.perf_counter()
-        done = jax.block_until_ready(program(*parts))
-        seconds = time.perf_counter() - begun
-        matrix, point, offset, iterations = (np.asarray(part) for part in done)
-        return Solved(matrix, point, offset, iterations, seconds)
+        program = jax.jit(function).lower(*placed).compile(compiler_options=options)
+    else:
+        placed, begun = parts, time.perf_counter()
+        program = jax.jit(function).lower(*parts).compile(compiler_options=options)
+    compiling = time.perf_counter() - begun
+    jax.block_until_ready(program(*placed))
 
-    return run
+    memory = program.memory_analysis()
+    temporary = int(memory.temp_size_in_bytes) if memory is not None else 0
+    return FusedSolver(program, dtype, compiling, temporary, placed if devices > 1 else None)
 
 
 def contestants(quick: bool, images: int) -> dict[str, tuple[Callable[[Batch], Solved], int]]:
@@ -165,6 +216,10 @@ def contestants(quick: bool, images: int) -> dict[str, tuple[Callable[[Batch], S
             found[name] = peers.ceres_solver(program, solver, tolerance), share(512)
     if images <= 50:
         found["scipy lm"] = peers.scipy_solver("lm"), share(32)
+        found["scipy lm, 1e-8 (its default)"] = peers.scipy_solver("lm", 1e-8), share(32)
+        found["scipy lm, 1e-8, numerical Jacobian (its default)"] = (
+            peers.scipy_solver("lm", 1e-8, exact=False), share(4)
+        )  # fmt: skip
         found["scipy trf"] = peers.scipy_solver("trf"), share(16)
         dense = share(64)
         found["optimistix LM, dense, vmapped"] = (
@@ -222,14 +277,35 @@ def _first(solved: Solved, count: int) -> Solved:
     return replace(solved, **{name: getattr(solved, name)[:count] for name in names})
 
 
+def from_closed_form(batch: Batch) -> Batch:
+    """The same problems, started where jaxcal starts by itself."""
+
+    def start(poses, points):
+        guess, _, _ = closed_form(images_of(poses, points))
+        return jax.vmap(Parameters.matrix)(guess.parameters()), guess.point.T
+
+    matrix, point = jax.jit(start)(batch.poses, batch.points)
+    return replace(batch, matrix=np.asarray(matrix), point=np.asarray(point))
+
+
 def basins(count: int) -> list[list[object]]:
     """From how far away the optimum is reached: share of problems, against starts at the truth."""
     rows: list[list[object]] = []
     near = draw(count, 50, 0.0, 0.0)
     solve = fused_solver(near)
     best, _ = peers.judge(near, solve(near))
-    for degrees, millimetres in ((5, 5), (20, 20), (40, 20), (60, 20), (90, 20)):
-        batch = draw(count, 50, degrees, millimetres)
+    for degrees, millimetres in (
+        (5, 5),
+        (20, 20),
+        (40, 20),
+        (60, 20),
+        (90, 20),
+        ("closed", "form"),
+    ):
+        if isinstance(degrees, str) or isinstance(millimetres, str):
+            batch = from_closed_form(near)
+        else:
+            batch = draw(count, 50, degrees, millimetres)
         solved = solve(batch)
         cost, cosine = peers.judge(batch, solved)
         finite = int(np.sum(np.isfinite(cost)))
@@ -249,14 +325,20 @@ BASIN_HEADER = (
 def scaling(quick: bool) -> list[list[object]]:
     """Time against the number of images and of problems, precision and compiler options."""
     rows: list[list[object]] = []
+    costs: list[np.ndarray] = []
 
     def measure(label: str, batch: Batch, **arguments) -> Solved:
         solve = fused_solver(batch, **arguments)
         solved = [solve(batch) for _ in range(5)]
         seconds = float(np.median([one.seconds for one in solved]))
         again = all(np.array_equal(solved[0].matrix, one.matrix) for one in solved[1:])
+        cost, cosine = peers.judge(batch, _first(solved[0], 512))
+        megabytes = sum(part.nbytes for part in to_device(batch, solve.dtype)) / 1e6
         rows.append([label, batch.points.shape[1], len(batch), 1e6 * seconds / len(batch),
-                     len(batch) / seconds, again])  # fmt: skip
+                     len(batch) / seconds, float(np.max(cosine)), solve.compile_s, megabytes,
+                     solve.temporary_bytes / 1e6, again])  # fmt: skip
+        costs.append(cost)
+        print(f"scaling: {rows[-1]}", flush=True)
         return solved[0]
 
     for images in (10, 20, 50, 100, 200, 500, 1000):
@@ -273,62 +355,84 @@ def scaling(quick: bool) -> list[list[object]]:
     single = measure("float32", batch, dtype=np.float32)
     for label, other in (("default options", plain), ("float32", single)):
         moved = np.linalg.norm(other.matrix[:, :3, 3] - usual.matrix[:, :3, 3], axis=1)
-        print(f"{label}: X's origin differs by at most {moved.max():.2e} mm", flush=True)
-        rows.append([f"largest difference of X's origin, {label} (mm)", 50, len(batch),
-                     float(moved.max()), float(np.median(moved)), ""])  # fmt: skip
+        turned = np.linalg.norm(other.matrix[:, :3, :3] - usual.matrix[:, :3, :3], axis=(1, 2))
+        for what, values in (
+            ("X's origin (mm)", moved),
+            ("X's rotation (rad)", turned / np.sqrt(2)),
+        ):
+            for name, value in (("largest", values.max()), ("median", np.median(values))):
+                rows.append([f"{label}: {name} difference of {what}", 50, len(batch), float(value)])
+    excess = float(np.max(costs[-1] / costs[-3] - 1))
+    rows.append(["float32: largest relative excess of the objective", 50, len(costs[-1]), excess])
     return rows
 
 
 SCALING_HEADER = (
-    "what",
-    "images",
-    "problems",
-    "us_per_problem",
-    "solves_per_s",
-    "reruns_bitwise_equal",
-)
+    "what", "images", "problems", "us_per_problem_or_difference", "solves_per_s",
+    "gradient_cosine_max", "compile_s", "arguments_MB", "temporary_MB", "reruns_bitwise_equal",
+)  # fmt: skip
 
 
 def cores(quick: bool) -> list[list[object]]:
-    """One process on one core against two processes on two, each with its own problems."""
+    """One core against two: a process on each, or one with two devices that share every batch."""
     if len(CORES) < 2:
         print("cores: there is only one", flush=True)
         return []
-    rounds = 3 if quick else 9
+    rounds = 3 if quick else 7
+    setups = {
+        "one process on one core": [("--core", str(CORES[0]))],
+        "two processes on two cores": [("--core", str(core)) for core in CORES[:2]],
+        "one process, two devices (jax_num_cpu_devices=2, shard_map)": [("--devices", "2")],
+    }
+    rates = {name: [] for name in setups}
+    for number in range(rounds):
+        for name, options in setups.items():
+            rates[name].append(_together(options))
+        print(f"cores: round {number + 1} of {rounds}", flush=True)
+    one = np.array(rates["one process on one core"])
+    return [
+        [name, float(np.median(each)), float(min(each)), float(max(each)),
+         float(np.median(np.array(each) / one))]
+        for name, each in rates.items()
+    ]  # fmt: skip
+
+
+CORES_HEADER = (
+    "cores",
+    "solves_per_s_median",
+    "solves_per_s_min",
+    "solves_per_s_max",
+    "ratio_median",
+)
+
+
+def _together(options: list[tuple[str, str]]) -> float:
+    """Solves a second of several workers at the same time."""
     command = [sys.executable, __file__, "--worker"]
-
-    def together(chosen: list[int]) -> float:
-        running = [
-            subprocess.Popen(
-                [*command, str(core)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-            )
-            for core in chosen
-        ]
-        for process in running:
-            assert process.stdout is not None
-            process.stdout.readline()
-        rates = []
-        for process in running:
-            assert process.stdin is not None
-            process.stdin.write("go\n")
-            process.stdin.flush()
-        for process in running:
-            assert process.stdout is not None
-            rates.append(float(process.stdout.readline()))
-            process.wait()
-        return sum(rates)
-
-    one = [together(CORES[:1]) for _ in range(rounds)]
-    two = [together(CORES[:2]) for _ in range(rounds)]
-    ratio = float(np.median(two) / np.median(one))
-    return [["one core", float(np.median(one)), 1.0], ["two cores", float(np.median(two)), ratio]]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    running = [subprocess.Popen([*command, *option], **pipes) for option in options]
+    rates = []
+    for process in running:
+        assert process.stdout is not None
+        process.stdout.readline()
+    for process in running:
+        assert process.stdin is not None
+        process.stdin.write("go\n")
+        process.stdin.flush()
+    for process in running:
+        assert process.stdout is not None
+        rates.append(float(process.stdout.readline()))
+        process.wait()
+    return sum(rates)
 
 
-def worker(core: int) -> None:
-    """Solve for three seconds on one core when told to."""
-    os.sched_setaffinity(0, {core})
+def worker(core: int | None, devices: int) -> None:
+    """Solve for three seconds on one core, or on so many devices, when told to."""
+    if core is not None:
+        os.sched_setaffinity(0, {core})
+    jax.config.update("jax_num_cpu_devices", devices)
     batch = draw(4096, 50, 20.0, 20.0)
-    solve = fused_solver(batch)
+    solve = fused_solver(batch, devices=devices)
     print("ready", flush=True)
     sys.stdin.readline()
     begun, done = time.perf_counter(), 0
@@ -356,57 +460,86 @@ def latency() -> list[list[object]]:
     return rows
 
 
-def figure(path: Path, rows: list[list[object]], scaled: list[list[object]]) -> None:
-    """Solves a second of every solver; time a problem against images and batch."""
+def figure(folder: Path) -> None:
+    """Solves a second of every solver; time a problem against images and batch; from the tables."""
     from matplotlib.figure import Figure
 
-    drawing = Figure(figsize=(13, 4.5), layout="constrained")
-    left, middle, right = drawing.subplots(1, 3, width_ratios=(1.6, 1, 1))
-    main = [row for row in rows if row[1] == 50]
-    names = [str(row[0]) for row in main][::-1]
-    speed = [float(str(row[3])) for row in main][::-1]
-    left.barh(names, speed, color="tab:blue")
+    rows, scaled = (_table(folder / f"solver_{name}.csv") for name in ("peers", "scaling"))
+    rows += _table(folder / "solver_peers_large.csv")
+    if not rows:
+        return
+    drawing = Figure(figsize=(14, 4.5), layout="constrained")
+    left, middle, right = drawing.subplots(1, 3, width_ratios=(1.5, 1, 1))
+    main = [row for row in rows if row["images"] == "50"][::-1]
+    speed = [float(row["solves_per_s_median"]) for row in main]
+    bars = left.barh([row["solver"] for row in main], speed, color="tab:blue")
+    left.bar_label(bars, fmt="%.3g", padding=3, fontsize="small")
     left.set(xscale="log", xlabel="solves/s, one core, n = 50, float64")
-    for panel, label, column in ((middle, "images", 1), (right, "batch", 2)):
-        chosen = [row for row in scaled if row[0] == label]
-        x = [float(str(row[column])) for row in chosen]
-        panel.loglog(x, [float(str(row[3])) for row in chosen], "o-", label="fused")
-        panel.set(xlabel="images" if label == "images" else "problems at once", ylabel="us/problem")
+    left.set_xlim(right=1e6)
+    for panel, label, column in ((middle, "images", "images"), (right, "batch", "problems")):
+        chosen = [row for row in scaled if row["what"] == label]
+        times = [float(row["us_per_problem_or_difference"]) for row in chosen]
+        panel.loglog([float(row[column]) for row in chosen], times, "o-", label="jaxcal, fused")
+        text = "images" if label == "images" else "problems at once"
+        panel.set(xlabel=text, ylabel="us a problem")
         panel.grid(alpha=0.3)
-    for name in {str(row[0]) for row in rows if "Ceres" in str(row[0])}:
-        chosen = sorted((row for row in rows if row[0] == name), key=lambda row: int(str(row[1])))
-        middle.loglog([int(str(row[1])) for row in chosen],
-                      [1e6 / float(str(row[3])) for row in chosen], "s--", label=name)  # fmt: skip
+    for name in sorted({row["solver"] for row in rows if "Ceres" in row["solver"]}):
+        chosen = sorted((row for row in rows if row["solver"] == name),
+                        key=lambda row: int(row["images"]))  # fmt: skip
+        middle.loglog([int(row["images"]) for row in chosen],
+                      [1e6 / float(row["solves_per_s_median"]) for row in chosen],
+                      "s--", label=name)  # fmt: skip
     middle.legend(fontsize="x-small")
-    with atomic_path(path) as temporary:
-        drawing.savefig(temporary, dpi=110)
+    with atomic_path(folder / "solver_peers.png") as temporary:
+        drawing.savefig(temporary, dpi=110, format="png")
+
+
+def _table(path: Path) -> list[dict[str, str]]:
+    if not path.exists():
+        return []
+    with path.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    return rows[:-1]  # the last one says what machine it was
 
 
 def main() -> None:
-    if "--worker" in sys.argv:
-        worker(int(sys.argv[sys.argv.index("--worker") + 1]))
+    """Run every part, or one."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="few problems; minutes on two cores")
+    parts = ("peers", "large", "basins", "scaling", "cores", "latency")
+    parser.add_argument("--part", choices=parts, help="one table alone")
+    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--core", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--devices", type=int, default=1, help=argparse.SUPPRESS)
+    chosen = parser.parse_args()
+    quick = chosen.quick
+    if chosen.worker:
+        worker(chosen.core, chosen.devices)
         return
-    quick = arguments(__doc__ or "").quick
     folder = results_folder(quick)
     rounds = 3 if quick else 15
-    print(machine(), flush=True)
-    rows = race(50, rounds, quick)
-    for images in (200, 1000):
-        rows += race(images, max(3, rounds // 3), quick)
-    scaled = scaling(quick)
+
+    def large() -> list[list[object]]:
+        return [row for images in (200, 1000) for row in race(images, max(3, rounds // 3), quick)]
+
     tables = {
-        "solver_peers": (RACE_HEADER, rows),
-        "solver_basins": (BASIN_HEADER, basins(1024 if quick else 4096)),
-        "solver_scaling": (SCALING_HEADER, scaled),
-        "solver_cores": (("cores", "solves_per_s", "ratio"), cores(quick)),
-        "solver_latency": (("solver", "us"), latency()),
+        "peers": (RACE_HEADER, lambda: race(50, rounds, quick)),
+        "peers_large": (RACE_HEADER, large),
+        "basins": (BASIN_HEADER, lambda: basins(1024 if quick else 4096)),
+        "scaling": (SCALING_HEADER, lambda: scaling(quick)),
+        "cores": (CORES_HEADER, lambda: cores(quick)),
+        "latency": (("solver", "us"), latency),
     }
-    for name, (header, lines) in tables.items():
-        write_table(folder / f"{name}.csv", header, [*lines, [machine()]])
+    print(machine(), flush=True)
+    for name, (header, rows) in tables.items():
+        if chosen.part is not None and chosen.part not in (name, name.removeprefix("peers_")):
+            continue
+        lines = rows()
+        write_table(folder / f"solver_{name}.csv", header, [*lines, [machine()]])
         for line in lines:
             print(", ".join(f"{head} {value:.4g}" if isinstance(value, float) else f"{head} {value}"
-                            for head, value in zip(header, line, strict=True)))  # fmt: skip
-    figure(folder / "solver_peers.png", rows, scaled)
+                            for head, value in zip(header, line, strict=False)))  # fmt: skip
+    figure(folder)
 
 
 if __name__ == "__main__":
