@@ -14,7 +14,7 @@ fit, which is what an image would show.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -145,7 +145,7 @@ class Experiment(eqx.Module):
 
 
 class Numbers(eqx.Module):
-    """The random numbers of one experiment: functions of its key and counts alone.
+    """The random numbers of one experiment but the noise, functions of its key and counts alone.
 
     Attributes:
         axis: of every rotation: of X, of the images', of the test images' poses.
@@ -153,9 +153,7 @@ class Numbers(eqx.Module):
         place: X's origin and the target, in their SDs.
         position: of images and test images in their fields, each way between -1 and 1.
         offset: of the law's size 1.
-        noise: standard normals of the elements: of the first half as real parts, of the others as
-            imaginary ones.
-        tracker: likewise of the tracker's six errors, or None.
+        tracker: standard normals of the tracker's six errors, or None.
     """
 
     axis: Float[Array, "3 images"]
@@ -163,7 +161,6 @@ class Numbers(eqx.Module):
     place: Float[Array, " 6"]
     position: Float[Array, "2 others"]
     offset: Float[Array, " n"]
-    noise: Complex64[Array, "n half"]
     tracker: Float[Array, "6 n"] | None
 
 
@@ -172,11 +169,11 @@ _AXIS, _TURN, _PLACE, _POSITION, _NOISE, _TRACKER = range(6)
 
 
 class Planes(eqx.Module):
-    """One simulated experiment with its images as the minor axis, as the fused solvers read it.
+    """Where everything is in one experiment, images minor, as the fused solvers read it.
 
     Attributes:
-        rotation: R_i by rows. origin: b_i, mm. point: segmented lateral position and range, mm.
-        exact: true lateral position and range, mm. elevation: y_i, mm.
+        rotation: R_i by rows. origin: b_i, mm.
+        exact: true lateral position and range (curvilinear: depth), mm. elevation: y_i, mm.
         true_rotation: of X. true_translation: of X, mm. target: c, mm.
         test_rotation: of the test images. test_origin: theirs, mm. test_point: exact lateral
             position and range, mm.
@@ -184,7 +181,6 @@ class Planes(eqx.Module):
 
     rotation: Float[Array, "9 n"]
     origin: Float[Array, "3 n"]
-    point: Float[Array, "2 n"]
     exact: Float[Array, "2 n"]
     elevation: Float[Array, " n"]
     true_rotation: Float[Array, "3 3"]
@@ -203,24 +199,29 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
             depend on chunks or devices.
         protocol: the distributions.
     """
-    numbers = draw(key, protocol)
+    numbers, noise = draw(key, protocol), draw_noise(key, protocol)
     planes = arrange(numbers, protocol)
-    elements = jnp.asarray(protocol.probe.element_positions())
+    distances = _distances(planes, noise, protocol)
     if isinstance(protocol.probe, CurvilinearProbe):
-        inverse = fit_in_plane(_distances(planes, numbers, protocol), elements).inverse_normal
-        kept = True
+        fit = fit_in_plane(distances, jnp.asarray(protocol.probe.element_positions()))
+        points, inverse, kept = fit.position, fit.inverse_normal, True
     else:
-        inverse, kept = _inverse_normal(planes.point, elements[:, 0]), protocol.raw
+        elements, kept = protocol.probe.element_lateral(), protocol.raw
+        size = jnp.asarray(protocol.noise_mm, planes.exact.dtype)
+        points = jnp.stack(
+            fit_deviations(noise, size, planes.exact[0], planes.exact[1], elements), axis=1
+        )
+        inverse = _inverse_normal(points, elements)
     return Experiment(
         poses=_matrices(planes.rotation, planes.origin),
-        points=planes.point.T,
+        points=points,
         covariance=protocol.noise_mm**2 * inverse,
         elevation=planes.elevation,
         image_to_probe=matrix_from_rotation(planes.true_rotation, planes.true_translation),
         point=planes.target,
         test_poses=_matrices(planes.test_rotation, planes.test_origin),
         test_points=planes.test_point.T,
-        distances=_distances(planes, numbers, protocol) if kept else None,
+        distances=distances if kept else None,
     )
 
 
@@ -236,13 +237,20 @@ def draw(key: Key[Array, ""], protocol: Protocol) -> Numbers:
         place=draws.normals(key, _PLACE, 6),
         position=2 * position - 1,
         offset=standard_offsets(jax.random.fold_in(key, 0), law, n),
-        noise=draws.normal_pairs(key, _NOISE, (n, -(-protocol.probe.elements // 2))),
         tracker=tracker,
     )
 
 
+def draw_noise(key: Key[Array, ""], protocol: Protocol) -> Complex64[Array, "n half"]:
+    """Standard normals of the elements.
+
+    Those of their first half are the real parts, those of the others the imaginary ones.
+    """
+    return draws.normal_pairs(key, _NOISE, (protocol.images, -(-protocol.probe.elements // 2)))
+
+
 def arrange(numbers: Numbers, protocol: Protocol) -> Planes:
-    """The experiment that its random numbers say: poses, distances, and the fit to these."""
+    """Poses and targets as the random numbers say; nothing is measured yet."""
     probe, n = protocol.probe, protocol.images
     curved = isinstance(probe, CurvilinearProbe)
     width = protocol.sector * probe.half_angle_rad if curved else protocol.lateral_mm
@@ -280,26 +288,20 @@ def arrange(numbers: Numbers, protocol: Protocol) -> Planes:
             for value, error in zip(origins, numbers.tracker[:3], strict=True)
         ]
     exact = jnp.stack([lateral, depth if curved else jnp.hypot(elevation, depth)])
-    planes = Planes(
-        rotation=jnp.stack(tracked), origin=jnp.stack(origins), point=exact, exact=exact,
+    return Planes(
+        rotation=jnp.stack(tracked), origin=jnp.stack(origins), exact=exact,
         elevation=elevation, true_rotation=truth, true_translation=translation, target=target,
         test_rotation=jnp.stack(test_rotation),
         test_origin=jnp.stack(origin(test_rotation, [across, 0, far])),
         test_point=jnp.stack([across, far]),
     )  # fmt: skip
-    if curved:
-        elements = jnp.asarray(probe.element_positions())
-        point = fit_in_plane(_distances(planes, numbers, protocol), elements).position.T
-    else:
-        size, e = jnp.asarray(protocol.noise_mm, exact.dtype), probe.element_lateral()
-        point = jnp.stack(fit_deviations(numbers.noise, size, exact[0], exact[1], e))
-    return replace(planes, point=point)
 
 
-def _distances(planes: Planes, numbers: Numbers, protocol: Protocol) -> Float[Array, "n elements"]:
+def _distances(
+    planes: Planes, noise: Complex64[Array, "n half"], protocol: Protocol
+) -> Float[Array, "n elements"]:
     """What the elements measure, mm."""
     probe = protocol.probe
-    noise = jnp.concatenate(halves(numbers.noise, probe.elements), axis=1)
     if isinstance(probe, CurvilinearProbe):
         target = jnp.stack([planes.exact[0], planes.elevation, planes.exact[1]], -1)
         elements = jnp.asarray(probe.element_positions())
@@ -307,16 +309,16 @@ def _distances(planes: Planes, numbers: Numbers, protocol: Protocol) -> Float[Ar
     else:
         along = planes.exact[0][:, None] - jnp.asarray(probe.element_lateral())
         exact = jnp.hypot(along, planes.exact[1][:, None])
-    return exact + protocol.noise_mm * noise
+    return exact + protocol.noise_mm * jnp.concatenate(halves(noise, probe.elements), axis=1)
 
 
 def _inverse_normal(
-    point: Float[Array, "2 n"], elements: Float[Array, " elements"]
+    points: Float[Array, "n 2"], elements: Float[np.ndarray, " elements"]
 ) -> Float[Array, "n 2 2"]:
     """Inverse of J'J of Eq. 5 at the points."""
-    along = point[0][:, None] - elements
-    far = jnp.hypot(along, point[1][:, None])
-    jx, jr = along / far, point[1][:, None] / far
+    along, distance = points[:, :1] - elements, points[:, 1:]
+    far = jnp.hypot(along, distance)
+    jx, jr = along / far, distance / far
     a, b, c = jnp.sum(jx * jx, 1), jnp.sum(jx * jr, 1), jnp.sum(jr * jr, 1)
     rows = [jnp.stack([c, -b], axis=-1), jnp.stack([-b, a], axis=-1)]
     return jnp.stack(rows, axis=-2) / (a * c - b * b)[:, None, None]

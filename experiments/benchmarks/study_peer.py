@@ -2,15 +2,16 @@
 
 The same protocol, objectives, starts and stopping rules as :mod:`jaxcal.study`, trial by trial, as
 they are written where there is no batch: arrays over the images of a trial are vectorised, BLAS has
-one thread. Two styles:
+one thread. Three styles:
 
 ``best``: distances of all images by one vectorised Gauss-Newton iteration (the study's own five
 steps); least_squares by MINPACK's Levenberg-Marquardt with the exact Jacobian, to tolerances of
 1e-10, where the study's own solves stop.
-``plain``: least_squares for every image's distances, too, and scipy's defaults throughout (trust
+``usual``: the same distance fit; least_squares as most people call it, with scipy's defaults (trust
 region, Jacobian by differences, tolerances of 1e-8).
+``plain``: the same, and least_squares for every image's distances, too.
 
-In both, the alternation is numpy with the exact Jacobian (its rounds are two Gauss-Newton steps by
+In all, the alternation is numpy with the exact Jacobian (its rounds are two Gauss-Newton steps by
 definition), and the variance components are updated by the same REML formula to the same change of
 1e-9. Observability and status, which a study also stores, are not computed here.
 """
@@ -30,6 +31,7 @@ ELEMENTS = (np.arange(128) - 63.5) * 0.45703125
 
 STAGES = ("draws", "distance fit", "conventional", "alternating", "joint self-tuned", "metric")
 METHODS = ("conventional", "alternating", "joint self-tuned")
+STYLES = ("best", "usual", "plain")
 
 MAX_ROUNDS, TURN_RAD, MOVE_MM = 1000, 1e-3, 0.1
 SD_CHANGE, SD_ROUNDS, SD_FLOOR = 1e-9, 60, 1e-3
@@ -318,20 +320,21 @@ def measure(found: Solution, drawn: Drawn) -> tuple[float, float, float, float]:
 
 
 def analyse(
-    drawn: Drawn, *, best: bool, clock: np.ndarray | None = None
+    drawn: Drawn, *, style: str, clock: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Everything after the draws.
 
     Args:
         drawn: one experiment.
-        best: the style.
+        style: one of :data:`STYLES`.
         clock: (stages,) CPU seconds to add to.
 
     Returns:
         (methods, 4) of :func:`measure`, and the self-tuned SDs, mm.
     """
+    best = style == "best"
     times = [time.process_time()]
-    points = fit_distances(drawn.distances, best=best)
+    points = fit_distances(drawn.distances, best=style != "plain")
     times.append(time.process_time())
     model = Model(drawn.poses, points)
     flat = conventional(model, best=best)
@@ -348,7 +351,7 @@ def analyse(
 
 
 def run(
-    seed: tuple[int, ...], trials: int, conditions: tuple[tuple[float, float], ...], best: bool
+    seed: tuple[int, ...], trials: int, conditions: tuple[tuple[float, float], ...], style: str
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """A worker's share: ``trials`` of each (elevation, noise) condition.
 
@@ -363,6 +366,6 @@ def run(
             began = time.process_time()
             drawn = draw(generator, elevation, noise)
             clock[0] += time.process_time() - began
-            precision.append(analyse(drawn, best=best, clock=clock)[0][:, 0])
+            precision.append(analyse(drawn, style=style, clock=clock)[0][:, 0])
     precision = np.array(precision).reshape(len(conditions), trials, len(METHODS))
     return precision, clock, time.process_time() - begun

@@ -3,11 +3,12 @@
 A trial is: draws (n = 50 images, 128 elements), distance fit, conventional, alternating (1 mm) and
 self-tuned joint calibration, reconstruction precision; two sizes of offsets by two of noise. jaxcal
 runs as a study does on two cores, by the worker function of its cluster in two processes, each on a
-core of its own; the peer (study_peer.py, in two styles) in two processes on the same two cores,
+core of its own; the peer (study_peer.py, in three styles) in two processes on the same two cores,
 with one thread of BLAS. Rounds alternate; only one side computes at a time. CPU time is reported
 beside wall time: all programs are single-threaded, and what else runs on the machine does not count
 in it. Before anything is timed, the peer analyses the study's own draws, and all reconstruction
-precisions and SDs have to agree. Seed 20261124.
+precisions and SDs have to agree. At the end, a whole trial of the joint method is set against its
+random numbers alone plus its solve alone. Seed 20261124.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ SPEC = f"""
 name = "throughput"
 seed = {SEED}
 trials = 1000000
-chunk_trials = 256
+chunk_trials = 512
 [conditions]
 images = 50
 test_images = 50
@@ -106,16 +107,16 @@ def agreement(spec: Spec, trials: int) -> dict[str, float]:
     from jaxcal.study.pipeline import compute_chunk
 
     small = replace(spec, chunk_trials=64)
-    apart = {"best": 0.0, "plain": 0.0}
+    apart: dict[str, float] = {style: 0.0 for style in study_peer.STYLES}
     for condition in range(small.condition_count):
         chunk = small.chunk(condition * small.chunks_per_condition)
         ours = compute_chunk(small, chunk)
         for k, drawn in enumerate(draws_of(small, chunk.index, trials)):
             for style in apart:
-                # The plain one takes ten times as long; a few trials of it show the same.
-                if style == "plain" and k >= max(2, trials // 8):
+                # The others take much longer; a few trials of them show the same.
+                if style != "best" and k >= max(2, trials // 8):
                     continue
-                measured, sigma = study_peer.analyse(drawn, best=style == "best")
+                measured, sigma = study_peer.analyse(drawn, style=style)
                 precision = np.abs(measured[:, 0] - ours["rp"][:, k]).max()
                 sds = np.abs(sigma - ours["sigma"][2, k]).max()
                 apart[style] = max(apart[style], float(precision), float(sds))
@@ -125,42 +126,67 @@ def agreement(spec: Spec, trials: int) -> dict[str, float]:
 def stage_times(canonical: str, repeats: int) -> dict[str, float]:
     """Where a trial's time goes in a worker, CPU s: the study's own compiled programs, one by one.
 
-    Draws and distance fit are one program; the fit is timed by itself besides.
+    Those in brackets are further programs, which the study does not run by themselves.
     """
-    from jaxcal.segmentation.time_of_flight import fit_distances
-    from jaxcal.study import pipeline
+    import jax.numpy as jnp
+
+    from jaxcal import abreast
+    from jaxcal.options import Request, prepare
+    from jaxcal.simulation import draw, draw_noise
+    from jaxcal.solvers.fused_methods import from_scratch
+    from jaxcal.study import lean, pipeline
     from jaxcal.study.spec import spec_from_canonical
 
     spec = spec_from_canonical(canonical)
     devices = tuple(jax.local_devices())
     condition = spec.condition(spec.condition_count - 1)
-    lanes = pipeline.LANES["cpu"]
-    shape = pipeline.shape_of(condition, spec.probe)
-    program, seed = pipeline.draw_program(shape, devices), np.asarray(spec.seed, np.uint64)
-    indices = np.arange(lanes, dtype=np.uint32)
+    shape, lanes = pipeline.shape_of(condition, spec.probe), pipeline.LANES["cpu"]
+    given = shape.protocol(pipeline.numbers_of(condition))
+    indices = np.arange(lanes * pipeline.MOST_PIECES, dtype=np.uint32).reshape(-1, lanes)
+    seed = np.asarray(spec.seed, np.uint64)
+    block = pipeline.Block(spec, condition, indices, devices)
+    begin = pipeline.begin_program(100, devices)
 
-    def draw():
-        return jax.block_until_ready(program(indices, seed, pipeline.numbers_of(condition)))
+    def numbers(indices, seed):
+        keys = pipeline.trial_keys(indices, seed)
+        drawn = jax.vmap(lambda key: (draw(key, given), draw_noise(key, given)))(keys)
+        # A complex array is a pair of normals; its sum would do as well, but nobody draws so.
+        return drawn
 
-    drawn = draw()[0]
-    elements = spec.probe.element_lateral()
-    distances = np.abs(np.random.default_rng(0).normal(50, 5, (lanes, 50, len(elements))))
-    distances = jax.device_put(np.hypot(distances[..., :1], elements) + 0.1)
-    fit = jax.jit(fit_distances)
+    def solve(batch):
+        begun = from_scratch(batch.images)
+        problems = lean.problems_of(batch.images)
+        plan, numbers = prepare(problems, Request("joint", "gaussian"))
+        solution = abreast.run_method(begun, batch.images, problems, numbers, plan)
+        return solution.parameters.translation, solution.parameters.rotation
+
+    numbers_alone = pipeline.compile_pieces(numbers, devices, pieces=1)
+    solve_alone = pipeline.compile_pieces(solve, devices, pieces=1)
+    normals = pipeline.compile_pieces(
+        lambda indices, seed: jax.vmap(lambda key: jax.random.normal(key, (50, 128), jnp.float32))(
+            pipeline.trial_keys(indices, seed)
+        ),
+        devices,
+        pieces=1,
+    )
     runs = {
-        "draws and distance fit": draw,
-        "(of which distance fit)": lambda: jax.block_until_ready(fit(distances, elements)),
+        "draws and distance fit": lambda: pipeline.Block(spec, condition, indices, devices).batch,
+        "start and conventional": lambda: begin(block.batch),
+        "(random numbers alone)": lambda: numbers_alone(indices, seed),
+        "(6,400 normals by jax.random in float32)": lambda: normals(indices, seed),
+        "(joint solve alone, from scratch)": lambda: solve_alone(block.batch),
     }
     for method in spec.methods:
-        runs[method.name] = lambda m=method: pipeline.solve_one(m, condition, drawn, devices)
+        name = "what the conventional one stores" if method.name == "conventional" else method.name
+        runs[name] = lambda m=method: block.measured(m)
     spent: dict[str, list[float]] = {name: [] for name in runs}
     for run in runs.values():
-        run()
+        jax.block_until_ready(run())
     for _ in range(repeats):
         for name, run in runs.items():
             began = time.process_time()
-            run()
-            spent[name].append((time.process_time() - began) / lanes)
+            jax.block_until_ready(run())
+            spent[name].append((time.process_time() - began) / indices.size)
     return {name: float(np.median(times)) for name, times in spent.items()}
 
 
@@ -177,7 +203,8 @@ def whole_study(spec: Spec, trials: int) -> float:
 def main() -> None:
     quick = arguments(__doc__ or "").quick
     enable_compilation_cache()
-    rounds, looped = (3, {"best": 8, "plain": 2}) if quick else (15, {"best": 80, "plain": 16})
+    looped = {"best": 80, "usual": 32, "plain": 16}
+    rounds, looped = (3, {name: n // 8 for name, n in looped.items()}) if quick else (15, looped)
     spec = parse_spec(SPEC)
     apart = agreement(spec, 8 if quick else 32)
     print("largest difference from the peer's results (mm):", apart, flush=True)
@@ -195,8 +222,8 @@ def main() -> None:
     if cache is not None:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache)
     ours, theirs = pool(), pool()
-    per_worker = 1  # chunk of each condition
-    rates: dict[str, list[float]] = {"jaxcal": [], "best": [], "plain": []}
+    per_worker = 4  # chunks of each condition
+    rates: dict[str, list[float]] = {"jaxcal": [], **{name: [] for name in looped}}
     busy: dict[str, list[float]] = {name: [] for name in rates}
     clocks = {style: np.zeros(len(study_peer.STAGES)) for style in looped}
     counted = dict.fromkeys(looped, 0)
@@ -220,7 +247,7 @@ def main() -> None:
         trials = looped[style]
         began = time.perf_counter()
         futures = [
-            p.submit(study_peer.run, (SEED, number, k), trials, conditions, style == "best")
+            p.submit(study_peer.run, (SEED, number, k), trials, conditions, style)
             for k, p in enumerate(theirs)
         ]
         results = [future.result() for future in futures]
@@ -269,6 +296,10 @@ def main() -> None:
                  "trials a second", complete, "", ""])  # fmt: skip
     for name, seconds in stages.items():
         rows.append([f"jaxcal, CPU us a trial: {name}", 1e6 * seconds, "", ""])
+    parts = ("draws and distance fit", "start and conventional", "joint self-tuned")
+    alone = stages["(random numbers alone)"] + stages["(joint solve alone, from scratch)"]
+    rows.append(["a whole trial of the joint method over its random numbers alone plus its solve "
+                 "alone", sum(stages[part] for part in parts) / alone, "", ""])  # fmt: skip
     for style in looped:
         for name, seconds in zip(study_peer.STAGES, clocks[style], strict=True):
             label = f"numpy and scipy, {style}, CPU us a trial: {name}"
@@ -299,8 +330,8 @@ def plot(
 
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
-    labels = {"jaxcal": "jaxcal study", "best": "numpy and\nscipy, best",
-              "plain": "numpy and\nscipy, plain"}  # fmt: skip
+    labels = {"jaxcal": "jaxcal study"}
+    labels |= {style: f"numpy and\nscipy, {style}" for style in study_peer.STYLES}
     left.boxplot(list(rates.values()), tick_labels=list(labels.values()), whis=(0, 100))
     left.set(yscale="log", ylabel="complete trials a second, two cores",
              title=f"n = 50; {len(rates['jaxcal'])} alternating rounds")  # fmt: skip
@@ -312,7 +343,8 @@ def plot(
     columns = {"jaxcal": ours}
     for style, clock in clocks.items():
         columns[style] = {n: float(t) for n, t in zip(study_peer.STAGES, clock, strict=True)}
-    parts = ("draws", "distance fit", "draws and distance fit", *study_peer.METHODS, "metric")
+    parts = ("draws", "distance fit", "draws and distance fit", "start and conventional",
+             "what the conventional one stores", *study_peer.METHODS, "metric")  # fmt: skip
     for k, part in enumerate(parts):
         base = [sum(c.get(p, 0.0) for p in parts[:k]) / sum(c.values()) for c in columns.values()]
         height = [c.get(part, 0.0) / sum(c.values()) for c in columns.values()]

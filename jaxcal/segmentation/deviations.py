@@ -32,12 +32,12 @@ LEAST_RANGE_MM = 1e-3
 
 
 def fit_deviations(
-    noise: Complex64[Array, "n half"],
+    noise: Complex64[Array, "*batch n half"],
     size: Float[Array, ""],
-    lateral: Float[Array, " n"],
-    distance: Float[Array, " n"],
+    lateral: Float[Array, "*batch n"],
+    distance: Float[Array, "*batch n"],
     element_lateral: Float[np.ndarray, " elements"],
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch n"]]:
     """Lateral position and range that fit noisy distances best, mm.
 
     Args:
@@ -49,59 +49,69 @@ def fit_deviations(
         element_lateral: e_k, mm.
     """
     single = jnp.float32
-    size = size.astype(single)
-    x0, r0 = lateral.astype(single)[:, None], distance.astype(single)[:, None]
+    size, r0 = size.astype(single), distance.astype(single)
+    x0, far0 = lateral.astype(single)[..., None], r0[..., None]
     elements = np.asarray(element_lateral, np.float32)
-    middle = float(np.mean(elements))
+    middle, count = float(np.mean(elements)), len(elements)
+    spread = float(np.sum((elements - middle) ** 2))
 
     def each() -> list[tuple[Array, np.ndarray]]:
-        return list(zip(halves(noise, len(elements)), split(elements), strict=True))
+        return list(zip(halves(noise, count), split(elements), strict=True))
 
-    def start() -> tuple[Array, Array]:
-        sums = _sums(_line(x0, r0, size * normal, e, middle) for normal, e in each())
+    def start(u: Array, v: Array) -> tuple[Array, Array]:
+        """The closed form, as a step from wherever."""
+        sums = _sums(_line(x0, far0, size * normal, e, middle) for normal, e in each())
         square, slope, far = sums
-        spread = float(np.sum((elements - middle) ** 2))
-        u = -0.5 * slope / spread
-        count = len(elements)
-        change = square / count + 2 * u * middle - u * (2 * x0[:, 0] + u)
-        r = r0[:, 0]
-        # Noise can make the square negative; half the mean distance is then as good a start.
-        r2 = r * r + change
+        across = -0.5 * slope / spread
+        change = square / count + 2 * across * middle - across * (2 * x0[..., 0] + across)
+        r2 = r0 * r0 + change
         near = jnp.sqrt(jnp.where(r2 > 1e-2, r2, 1.0))
-        return u, jnp.where(r2 > 1e-2, change / (near + r), 0.5 * jnp.abs(far) / count - r)
+        # Noise can make the square negative; half the mean distance is then as good a start.
+        deep = jnp.where(r2 > 1e-2, change / (near + r0), 0.5 * jnp.abs(far) / count - r0)
+        return across - u, deep - v
 
-    def step(state: tuple) -> tuple:
-        u, v, _, count = state
-        wide, deep = u[:, None], v[:, None]
-        sums = _sums(_newton(x0, r0, size * normal, e, wide, deep) for normal, e in each())
+    def newton(u: Array, v: Array) -> tuple[Array, Array]:
+        wide, deep = u[..., None], v[..., None]
+        sums = _sums(_newton(x0, far0, size * normal, e, wide, deep) for normal, e in each())
         xx, xr, rr, gx, gr, bxx, bxr, brr = sums
         exact = (xx - bxx) * (rr - brr) - (xr + bxr) ** 2
-        newton = (exact > 0.1 * (xx * rr - xr * xr)) & (xx > bxx)
+        trusted = (exact > 0.1 * (xx * rr - xr * xr)) & (xx > bxx)
         a, b, c = (
-            jnp.where(newton, new, old)
+            jnp.where(trusted, new, old)
             for new, old in ((xx - bxx, xx), (xr + bxr, xr), (rr - brr, rr))
         )
         determinant = a * c - b * b
         du, dv = (c * gx - b * gr) / determinant, (a * gr - b * gx) / determinant
         # A step of more than the range itself can only come from a start far off.
-        r = r0[:, 0] + v
+        r = r0 + v
         du, dv = jnp.clip(du, -r, r), jnp.clip(dv, -0.5 * r, r)
-        dv = jnp.maximum(dv, LEAST_RANGE_MM - r)
-        moved = jnp.max(jnp.maximum(jnp.abs(du), jnp.abs(dv)))
-        return u + du, v + dv, moved, count + 1
+        return du, jnp.maximum(dv, LEAST_RANGE_MM - r)
+
+    def iterate(state: tuple) -> tuple:
+        u, v, going, taken = state
+        # The start is a pass of the loop as well: what another loop made, this one only reads,
+        # and the noise is drawn once, not once for the start and once for the steps.
+        du, dv = jax.lax.cond(taken == 0, start, newton, u, v)
+        du, dv = (jnp.where(going[..., None], move, 0.0) for move in (du, dv))
+        moved = jnp.max(jnp.maximum(jnp.abs(du), jnp.abs(dv)), axis=-1)
+        return u + du, v + dv, going & ((moved > ENOUGH_MM) | (taken == 0)), taken + 1
 
     def unfinished(state: tuple) -> Array:
-        return (state[2] > ENOUGH_MM) & (state[3] < MOST_STEPS)
+        return jnp.any(state[2]) & (state[3] <= MOST_STEPS)
 
-    infinite = jnp.full((), jnp.inf, single)
-    u, v, *_ = jax.lax.while_loop(unfinished, step, (*start(), infinite, jnp.zeros((), jnp.int32)))
+    zero = jnp.zeros_like(r0)
+    going = jnp.ones(r0.shape[:-1], bool)
+    state = (zero, zero, going, jnp.zeros((), jnp.int32))
+    u, v, *_ = jax.lax.while_loop(unfinished, iterate, state)
     return lateral + u, distance + v
 
 
-def halves(noise: Complex64[Array, "n half"], elements: int) -> list[Float[Array, "n some"]]:
+def halves(
+    noise: Complex64[Array, "*batch half"], elements: int
+) -> list[Float[Array, "*batch some"]]:
     """The noise of the first half of the elements, and of the rest."""
-    first = noise.shape[1]
-    return [jnp.real(noise), jnp.imag(noise)[:, : elements - first]]
+    first = noise.shape[-1]
+    return [jnp.real(noise), jnp.imag(noise)[..., : elements - first]]
 
 
 def split(elements: np.ndarray) -> list[np.ndarray]:

@@ -23,7 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxcal import abreast
 from jaxcal.calibration import Status
@@ -41,7 +41,8 @@ from jaxcal.options import (
 )
 from jaxcal.pipeline import Solution
 from jaxcal.problem import Problem
-from jaxcal.simulation import Numbers, Protocol, arrange
+from jaxcal.segmentation.deviations import fit_deviations
+from jaxcal.simulation import Protocol, arrange, draw, draw_noise
 from jaxcal.solvers import unrolled
 from jaxcal.solvers.fused import UNKNOWNS, Guess, Held, Images, Normal, accumulate, targets, total
 from jaxcal.solvers.fused import Measured as MeasuredBelief
@@ -50,6 +51,9 @@ from jaxcal.uncertainty import LARGEST_SD, SINGULAR
 
 Kind = tuple[Method, PriorName]
 """A method and its prior."""
+
+SEGMENTED = 16
+"""Trials whose distances are fitted side by side."""
 
 _MARGIN = 1.001
 """Thresholds are certified with this to spare, against rounding."""
@@ -107,24 +111,42 @@ def _plan(
 
 
 def experiments(
-    numbers: Numbers, protocol: Protocol
+    keys: Key[Array, " trials"], protocol: Protocol
 ) -> tuple[Experiments, Guess, Float[Array, "trials 3"]]:
-    """From a batch's random numbers to its experiments, their truth, and the errors in them.
+    """Simulate a batch: its experiments, their truth, and the errors in them.
 
-    The errors are root mean squares of the lateral, range and elevational errors of each trial, mm,
-    those that a tracker makes among them: what self-tuned SDs estimate.
+    They are those of :func:`jaxcal.simulation.simulate`. The errors are root mean squares of the
+    lateral, range and elevational errors of each trial, mm, those that a tracker makes among them:
+    what self-tuned SDs estimate.
     """
-    one = jax.vmap(lambda numbers: arrange(numbers, protocol))(numbers)
-    images = _images(one.rotation, one.origin, one.point)
-    test = _images(one.test_rotation, one.test_origin, one.test_point)
+    one = jax.vmap(lambda key: arrange(draw(key, protocol), protocol))(keys)
+    elements = protocol.probe.element_lateral()
+    size = jnp.asarray(protocol.noise_mm, one.exact.dtype)
+
+    def segmented(group: tuple) -> tuple[Array, Array]:
+        keys, exact = group
+        noise = jax.vmap(lambda key: draw_noise(key, protocol))(keys)
+        return fit_deviations(noise, size, exact[:, 0], exact[:, 1], elements)
+
+    # The noise of so many stays in the second-level cache until the fit is done with it.
+    points = jax.lax.map(segmented, (_grouped(keys), _grouped(one.exact)))
+    lateral, distance = (value.reshape(len(keys), -1) for value in points)
+    images = _images(one.rotation, one.origin, lateral, distance)
+    test = _images(one.test_rotation, one.test_origin, one.test_point[:, 0], one.test_point[:, 1])
     truth = Guess(jnp.moveaxis(one.true_rotation, 0, -1), one.true_translation.T, one.target.T)
     return Experiments(images, test), truth, jnp.sqrt(_mean_squares(truth, images)).T
 
 
-def _images(rotation: Array, origin: Array, point: Array) -> Images:
+def _grouped(values: Array) -> Array:
+    lanes = len(values)
+    group = SEGMENTED if lanes % SEGMENTED == 0 else lanes
+    return values.reshape(-1, group, *values.shape[1:])
+
+
+def _images(rotation: Array, origin: Array, lateral: Array, distance: Array) -> Images:
     return Images(
         rotation=jnp.moveaxis(rotation, 1, 0), origin=jnp.moveaxis(origin, 1, 0),
-        lateral=point[:, 0], distance=point[:, 1], mask=jnp.ones_like(point[:, 0]),
+        lateral=lateral, distance=distance, mask=jnp.ones_like(lateral),
     )  # fmt: skip
 
 

@@ -1,10 +1,10 @@
 """One chunk of a study: draw, segment, solve by every method, compare with the truth.
 
-One compiled program draws (for each law of the offsets and number of images), one arranges what was
-drawn into experiments, one makes the conventional fits, and one solves for each method and set of
-static options; elevation, noise, bounds and all other numbers are arguments, so that a whole grid
-runs through the same programs. They take blocks of a fixed number of trials, whatever the chunks; a
-short last block is filled up, and what was filled in dropped.
+One compiled program draws and segments (for each law of the offsets and number of images), one
+makes the conventional fits, and one solves for each method and set of static options; elevation,
+noise, bounds and all other numbers are arguments, so that a whole grid runs through the same
+programs. They take blocks of a fixed number of trials, whatever the chunks; a short last block is
+filled up, and what was filled in dropped.
 
 Plain methods are computed by :mod:`jaxcal.study.lean`; the others, and trials whose status it does
 not know, by :func:`jaxcal.calibrate_batch`.
@@ -32,7 +32,7 @@ from jaxcal.compiler import fast_to_run
 from jaxcal.metrics import reconstruction_precision
 from jaxcal.offsets import OffsetLaw, nominal_bound
 from jaxcal.probe import LinearProbe
-from jaxcal.simulation import Experiment, Numbers, Protocol, draw, simulate
+from jaxcal.simulation import Experiment, Protocol, simulate
 from jaxcal.solve import Options, calibrate_batch
 from jaxcal.solvers.fused import Guess
 from jaxcal.solvers.fused_methods import Begun
@@ -44,6 +44,9 @@ LANES = {"cpu": 64}
 
 OTHER_LANES = 4096
 """And on whatever else: enough to fill it."""
+
+MOST_PIECES = 8
+"""So many times these in one call of a program, one after the other; a call takes 0.1 ms."""
 
 _ONE_THREAD: dict[str, Any] = {"xla_cpu_multi_thread_eigen": False}
 """Beside :func:`jaxcal.compiler.fast_to_run`."""
@@ -88,15 +91,16 @@ def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
         drawn, mm. They are the same whatever was computed before, and on whatever worker.
     """
     condition, devices = spec.condition(chunk.condition), tuple(jax.local_devices())
-    block = len(devices) * LANES.get(devices[0].platform, OTHER_LANES)
+    pieces, lanes = _block(spec, devices)
     blocks = []
-    for start in range(chunk.start, chunk.stop, block):
-        trials = np.minimum(start + np.arange(block), chunk.stop - 1)
+    for start in range(chunk.start, chunk.stop, pieces * lanes):
+        trials = np.minimum(start + np.arange(pieces * lanes), chunk.stop - 1)
         indices = (chunk.condition * spec.trials + trials).astype(np.uint32)
+        indices = indices.reshape(pieces, lanes)
         drawn = Block(spec, condition, indices, devices)
         measured = [drawn.measured(method) for method in spec.methods]
         results = {name: np.stack([one[name] for one in measured]) for name in measured[0]}
-        blocks.append((results, np.asarray(drawn.realised)))
+        blocks.append((results, _trials(drawn.realised)))
     count = chunk.stop - chunk.start
     together = {
         name: np.concatenate([results[name] for results, _ in blocks], axis=1)[:, :count]
@@ -106,8 +110,19 @@ def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
     return together
 
 
+def _block(spec: Spec, devices: Devices) -> tuple[int, int]:
+    """How many pieces of how many trials a call gets: the same for all chunks of a study."""
+    lanes = LANES.get(devices[0].platform, OTHER_LANES)
+    needed = -(-spec.chunk_trials // (lanes * len(devices)))
+    calls = -(-needed // MOST_PIECES)
+    return -(-needed // calls) * len(devices), lanes
+
+
 class Block:
-    """Trials drawn side by side, and what methods make of them."""
+    """Pieces of trials drawn side by side, and what methods make of them.
+
+    All arrays between the programs have the pieces as their first axis.
+    """
 
     def __init__(
         self, spec: Spec, condition: Condition, indices: np.ndarray, devices: Devices
@@ -116,9 +131,8 @@ class Block:
         self._seed = np.asarray(spec.seed, np.uint64)
         self._shape = shape_of(condition, spec.probe)
         self._numbers = numbers_of(condition)
-        drawn = draw_program(self._shape, devices)(indices, self._seed)
-        arranged = arrange_program(self._shape, devices)(drawn, self._numbers)
-        self.batch, self.truth, self.realised = arranged
+        drawn = draw_program(self._shape, devices)(indices, self._seed, self._numbers)
+        self.batch, self.truth, self.realised = drawn
         self._begun: dict[int, Begun] = {}
 
     def begun(self, max_steps: int) -> Begun:
@@ -204,42 +218,40 @@ def _options(method: MethodSpec) -> Options:
 
 
 def _as_numpy(measured: Measured) -> dict[str, np.ndarray]:
-    return {name: np.asarray(value) for name, value in vars(measured).items()}
+    return {name: _trials(value) for name, value in vars(measured).items()}
 
 
-def _compile(
-    function: Any, devices: Devices, axes: tuple[int | None, ...], out: Any, *, fast: bool = True
-) -> Any:
-    """Compile a function of batches, which are cut by trial where there are several devices.
+def _trials(value: Array) -> np.ndarray:
+    """Without the pieces."""
+    return np.asarray(value).reshape(-1, *value.shape[2:])
+
+
+def compile_pieces(function: Any, devices: Devices, *, pieces: int, fast: bool = True) -> Any:
+    """Compile a function of a piece for many, which are cut where there are several devices.
 
     Args:
         function: of arrays and nothing static.
-        devices: one, or several that share the trials.
-        axes: for each argument, which axis of all its arrays counts the trials; None: no axis.
-        out: the same for what it returns, an axis or a tuple of them.
+        devices: one, or several that share the pieces.
+        pieces: so many of the function's arguments, the first ones, are given for every piece;
+            further ones are for all of them.
         fast: with the compiler options of :mod:`jaxcal.abreast`.
     """
     platform = devices[0].platform
     options = (fast_to_run(platform) or {}) if fast else {}
     options = options | _ONE_THREAD if platform == "cpu" else None
+
+    def each(*given: Any) -> Any:
+        shared = given[pieces:]
+        return jax.lax.map(lambda piece: function(*piece, *shared), given[:pieces])
+
     if len(devices) == 1:
-        return jax.jit(function, compiler_options=options)
-    mesh = Mesh(np.asarray(devices), ("trials",))
-
-    def specs(axis: int | None, tree: Any) -> Any:
-        def one(leaf: Any) -> PartitionSpec:
-            names: list[str | None] = [None] * leaf.ndim
-            if axis is not None:
-                names[axis] = "trials"
-            return PartitionSpec(*names)
-
-        return jax.tree.map(one, tree)
+        return jax.jit(each, compiler_options=options)
+    mesh = Mesh(np.asarray(devices), ("pieces",))
+    cut, whole = PartitionSpec("pieces"), PartitionSpec()
 
     def spread(*given: Any) -> Any:
-        shapes = jax.eval_shape(function, *given)
-        outs = tuple(map(specs, out, shapes)) if isinstance(out, tuple) else specs(out, shapes)
-        ins = tuple(map(specs, axes, given))
-        mapped = jax.shard_map(function, mesh=mesh, in_specs=ins, out_specs=outs, check_vma=False)
+        specs = tuple(cut if k < pieces else whole for k in range(len(given)))
+        mapped = jax.shard_map(each, mesh=mesh, in_specs=specs, out_specs=cut, check_vma=False)
         return mapped(*given)
 
     return jax.jit(spread, compiler_options=options)
@@ -247,26 +259,19 @@ def _compile(
 
 @cache
 def draw_program(shape: Shape, devices: Devices) -> Any:
-    """From (trial indices, seed) to their random numbers, compiled."""
-    static = shape.protocol({"tracker_mm": 1.0})
+    """From (trial indices, seed, numbers) to :func:`jaxcal.study.lean.experiments`, compiled."""
 
-    def program(indices: Array, seed: Array) -> Numbers:
-        root = jax.random.key(seed)
-        return jax.vmap(lambda index: draw(jax.random.fold_in(root, index), static))(indices)
+    def program(indices: Array, seed: Array, numbers: dict[str, Any]) -> Any:
+        given = shape.protocol(jax.tree.map(jnp.asarray, numbers))
+        return experiments(trial_keys(indices, seed), given)
 
-    return _compile(program, devices, (0, None), 0)
+    return compile_pieces(program, devices, pieces=1)
 
 
-@cache
-def arrange_program(shape: Shape, devices: Devices) -> Any:
-    """From random numbers and the condition's to :func:`jaxcal.study.lean.experiments`."""
-
-    def program(drawn: Numbers, numbers: dict[str, Any]) -> Any:
-        return experiments(drawn, shape.protocol(jax.tree.map(jnp.asarray, numbers)))
-
-    # Noise that another program has written is read; in the same one it would be drawn again by
-    # every loop that takes it.
-    return _compile(program, devices, (0, None), (-2, -1, 0))
+def trial_keys(indices: Array, seed: Array) -> Array:
+    """The keys of trials by their numbers: draws depend on nothing else."""
+    root = jax.random.key(seed)
+    return jax.vmap(lambda index: jax.random.fold_in(root, index))(indices)
 
 
 @cache
@@ -275,16 +280,15 @@ def simulate_program(shape: Shape, devices: Devices) -> Any:
 
     def program(indices: Array, seed: Array, numbers: dict[str, Any]) -> Experiment:
         given = shape.protocol(jax.tree.map(jnp.asarray, numbers))
-        root = jax.random.key(seed)
-        return jax.vmap(lambda index: simulate(jax.random.fold_in(root, index), given))(indices)
+        return jax.vmap(lambda key: simulate(key, given))(trial_keys(indices, seed))
 
-    return _compile(program, devices, (0, None, None), 0)
+    return compile_pieces(program, devices, pieces=1)
 
 
 @cache
 def begin_program(max_steps: int, devices: Devices) -> Any:
     """From experiments to their conventional fits, compiled."""
-    return _compile(lambda batch: begin(batch, max_steps), devices, (-2,), -1)
+    return compile_pieces(lambda batch: begin(batch, max_steps), devices, pieces=1)
 
 
 @cache
@@ -294,7 +298,7 @@ def lean_program(kind: Kind, options: Options, devices: Devices) -> Any:
     def program(batch: Experiments, truth: Guess, begun: Begun, bound: Array | None) -> Any:
         return solve(batch, truth, begun, kind, options, bound)
 
-    return _compile(program, devices, (-2, -1, -1, None), (0, 0))
+    return compile_pieces(program, devices, pieces=3)
 
 
 @cache
@@ -302,7 +306,7 @@ def full_program(kind: Kind, options: Options, devices: Devices) -> Any:
     """From experiments in full and bound to what whole calibrations say, compiled."""
     # The joint bounded method takes the general road, whose rounding is left as it was tested.
     fast = kind != ("joint", "bounded")
-    return _compile(partial(_in_full, kind, options), devices, (0, None), 0, fast=fast)
+    return compile_pieces(partial(_in_full, kind, options), devices, pieces=1, fast=fast)
 
 
 def _in_full(kind: Kind, options: Options, drawn: Experiment, bound: Array | None) -> Measured:
