@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.calibration import Calibration, Status
 from jaxcal.findings import Findings, Solution, find
-from jaxcal.model.parameters import Parameters, block_slice, retract
+from jaxcal.model.parameters import Blocks, Parameters, block_slice, retract
 from jaxcal.model.priors import (
     AbstractPrior,
     AbstractSelfTuned,
@@ -43,9 +43,19 @@ HELD_CHANNEL_SIGMA = (0.5, 1.0)
 """SDs of an element's distance and of the offset (mm), likewise."""
 
 
-def solve_problem(problem: Problem, given: Given, plan: Plan) -> Calibration:
-    """Solve one problem (vmap it for a batch); plain ones take :mod:`jaxcal.abreast` instead."""
-    everything, problem = problem, agreeing(problem, plan)
+def solve_problem(
+    problem: Problem, given: Given, plan: Plan, agreed: Float[Array, " n"] | None = None
+) -> Calibration:
+    """Solve one problem (vmap it for a batch); plain ones take :mod:`jaxcal.abreast` instead.
+
+    Args:
+        problem: the problem.
+        given: numbers that came with the request.
+        plan: what is static about it.
+        agreed: what :func:`agreed_images` found, where it was asked before.
+    """
+    everything = problem
+    problem = agreeing(problem, plan) if agreed is None else replace(problem, mask=agreed)
     frozen = jax.lax.stop_gradient((problem, given))
     return finish(_run_method(*frozen, plan), problem, everything, given, plan)
 
@@ -54,9 +64,23 @@ def agreeing(problem: Problem, plan: Plan) -> Problem:
     """The problem with only those images that agree, where the plan is to find them first."""
     if not plan.robust:
         return problem
+    # One problem at a time, in a batch too: its finalists fill the vector units, and more problems
+    # at once would only leave the cache.
+    found = jax.custom_batching.sequential_vmap(lambda p: agreed_images(p, plan.blocks))
     # Which images are left out is piecewise constant in the data: no derivative passes here.
-    agreed = find_consensus(jax.lax.stop_gradient(problem), rigid_model(plan.blocks))
-    return replace(problem, mask=agreed.keep)
+    return replace(problem, mask=found(jax.lax.stop_gradient(seen(problem))))
+
+
+def agreed_images(problem: Problem, blocks: Blocks) -> Float[Array, " n"]:
+    """1 for the used images that agree with each other."""
+    return find_consensus(jax.lax.stop_gradient(problem), rigid_model(blocks)).keep
+
+
+def seen(problem: Problem) -> Problem:
+    """What the agreement of images is about: their points and poses."""
+    return replace(
+        problem, channels=None, covariance=None, max_elevation=None, sound_speed=None, delay=None
+    )
 
 
 def finish(

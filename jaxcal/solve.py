@@ -33,7 +33,7 @@ from jaxcal.options import (
     prepare,
     with_bound,
 )
-from jaxcal.pipeline import solve_problem
+from jaxcal.pipeline import agreed_images, seen, solve_problem
 from jaxcal.problem import Problem
 from jaxcal.recording import Recording
 
@@ -57,7 +57,7 @@ def calibrate(
     sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S,
     delay_sd: float | Array = DELAY_SD_S,
     options: Options | None = None,
-    robust: bool = False,
+    robust: bool = True,
 ) -> Calibration:
     """Find X, the target and the elevational offsets; nobody supplies a starting guess.
 
@@ -86,7 +86,8 @@ def calibrate(
         options: tolerances and limits.
         robust: first find the images that agree with each other, whatever up to nearly half of the
             others are (:mod:`jaxcal.solvers.consensus`), and leave those out: ``outlier`` and
-            ``departure`` say which and why.
+            ``departure`` say which and why. Where no image is gravely wrong none is left out, and
+            the answer is the one without.
 
     Returns:
         A :class:`Calibration`; ask its ``status`` and ``warnings`` before using it.
@@ -107,7 +108,10 @@ def calibrate(
     problem = with_bound(problem, given)
     # One problem alone gains nothing on the fused pass, and the general road compiles faster.
     alone = compiler.is_whole_program(problem, given)
-    return _one_problem(jax.default_backend() if alone else None)(problem, given, plan)
+    platform = jax.default_backend() if alone else None
+    # A program of its own, which serves every method and prior.
+    agreed = _agreement(platform)(seen(problem), plan.blocks) if plan.robust else None
+    return _one_problem(platform)(problem, given, plan, agreed)
 
 
 def calibrate_batch(
@@ -142,7 +146,7 @@ def calibrate_batch(
         sound_speed_sd: see there.
         delay_sd: see there.
         options: see there.
-        robust: see there.
+        robust: see there; off by default, for it takes longer than the solve.
         chunk: lanes solved side by side; by default 64, on channels 8.
 
     Plain problems are shared out among all of JAX's local devices: a processor is one device unless
@@ -191,6 +195,13 @@ def _one_problem(platform: str | None):
     """The compiled solve of one problem; with a platform, as a program of its own."""
     flags = None if platform is None else compiler.quick_to_compile(platform)
     return jax.jit(solve_problem, static_argnums=2, compiler_options=flags)
+
+
+@cache
+def _agreement(platform: str | None):
+    """The compiled consensus of one problem's images, likewise."""
+    flags = None if platform is None else compiler.quick_to_compile(platform)
+    return jax.jit(agreed_images, static_argnums=1, compiler_options=flags)
 
 
 def solve_chunks(problems: Problem, given: Given, plan: Plan, chunk: int) -> Calibration:

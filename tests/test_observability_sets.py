@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from pose_sets import DEGENERATE, WEAK, PoseSet, make
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from jaxcal.options import Method
 
 KNOWN = 0.25
 """Relative SD of the weakest direction (to the lever arm) below which a set must be solved; the
@@ -23,9 +25,9 @@ elevations = st.one_of(st.just(0.0), st.floats(0.05, 5.0))
 noises = st.one_of(st.just(0.0), st.floats(0.02, 2.0))
 
 
-def solve(posed: PoseSet) -> jaxcal.Calibration:
+def solve(posed: PoseSet, method: Method = "joint") -> jaxcal.Calibration:
     data = jaxcal.Problem.from_arrays(posed.poses, posed.points, mask=posed.mask)
-    return jaxcal.calibrate(data)
+    return jaxcal.calibrate(data, method)
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)
@@ -46,6 +48,25 @@ def test_no_set_is_misjudged(kind, seed, elevation, noise):
         assert str(sight["advice"]).startswith("add ")
     elif posed.relative_sd > HOPELESS:
         assert result.status != "converged"
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(kinds, st.integers(0, 10**6), elevations, noises)
+def test_the_conventional_method_arrives_or_says_why_not(kind, seed, elevation, noise):
+    """Its residuals are the offsets: along a weak direction Gauss-Newton alone would crawl."""
+    posed = make(kind, seed, elevation, noise)
+    result = solve(posed, "conventional")
+    allowed = ("unobservable",) if posed.deficient else ("converged", "unobservable")
+    assert result.status in allowed
+    if not posed.deficient:
+        assert int(result.iterations) < 100
+
+
+def test_no_image_of_a_weak_or_degenerate_set_is_taken_for_wrong():
+    for kind in DEGENERATE + WEAK:
+        for seed in range(4):
+            result = solve(make(kind, seed, 2.0, 0.5), "conventional")
+            assert not np.any(result.outlier), kind
 
 
 @pytest.mark.parametrize("kind", ["parallel", "one-axis", "line-in-plane"])
@@ -124,3 +145,21 @@ def test_five_hundred_sets_in_a_batch():
         elif posed.relative_sd > HOPELESS:
             assert found != "converged", (posed.kind, posed.relative_sd)
     assert jnp.asarray([s.deficient for s in sets]).sum() > 200
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("road", ["side by side", "one by one"])
+def test_two_thousand_weak_sets_by_the_conventional_method(road):
+    rng = np.random.default_rng(11)
+    sets = [
+        make(kind, seed, float(rng.choice([0.0, 0.5, 2.0, 5.0])),
+             float(rng.choice([0.0, 0.05, 0.5, 2.0])))
+        for kind in WEAK for seed in range(3000, 3512)
+    ]  # fmt: skip
+    data = jaxcal.stack([jaxcal.Problem.from_arrays(s.poses, s.points, mask=s.mask) for s in sets])
+    if road == "side by side":
+        result = jaxcal.calibrate_batch(data, "conventional")
+    else:
+        one = jax.jit(lambda p: jaxcal.calibrate(p, "conventional", robust=False))
+        result = jax.lax.map(one, data)
+    assert set(result.status) == {"converged", "unobservable"}

@@ -94,8 +94,8 @@ def test_robust_solve_is_that_of_the_good_images():
 def test_a_wrong_echo_is_told_by_its_range():
     data = problem(0, images=20, elevation_mm=0.5, noise_mm=0.5)
     spoilt = replace(data, measurements=data.measurements.at[7, 1].add(40.0))
-    plain = jaxcal.calibrate(spoilt, "conventional")
-    robust = jaxcal.calibrate(spoilt, "conventional", robust=True)
+    plain = jaxcal.calibrate(spoilt, "conventional", robust=False)
+    robust = jaxcal.calibrate(spoilt, "conventional")
     reason = diagnosis.outlier_reasons(robust)
     assert [(r["image"], r["component"], r["left_out"]) for r in reason] == [(7, "range", True)]
     assert (reason[0]["sds"] or 0) < -100
@@ -113,7 +113,7 @@ def test_command_line(tmp_path, capsys):
     images = replace(recording.calibration, measurements=points)
     path = tmp_path / "spoilt.h5"
     jaxcal.save(replace(recording, calibration=images), path)
-    arguments = ["calibrate", str(path), "--method", "conventional", "--robust", "--json"]
+    arguments = ["calibrate", str(path), "--method", "conventional", "--json"]
     assert main(arguments) == 0
     record = json.loads(capsys.readouterr().out)
     assert record["robust"]
@@ -121,6 +121,41 @@ def test_command_line(tmp_path, capsys):
     assert record["images"] == 20
     assert record["images_used"] == 19
     assert record["outlier_reasons"][0]["image"] == 4
+
+
+def test_of_clean_images_none_is_left_out(consensus):
+    """So the robust answer is exactly the plain one; medians alone would leave some out of few."""
+    for images, count in ((12, 96), (20, 48), (50, 24)):
+        for law in ("uniform", "normal"):
+            clean = jaxcal.stack([
+                problem(seed, images=images, elevation_mm=2.0, noise_mm=2.0,
+                        elevation_distribution=law)
+                for seed in range(count)
+            ])  # fmt: skip
+            np.testing.assert_array_equal(consensus(clean).keep, clean.mask)
+
+
+def test_a_third_of_a_dozen_images():
+    clean = jaxcal.stack([problem(seed, images=12, noise_mm=1.0) for seed in range(96)])
+    keys = jax.random.split(jax.random.key(5), 96)
+    spoilt, outlier = jax.vmap(lambda k, p: contaminate(k, p, 0.3, "mixed"))(keys, clean)
+    found = jax.jit(jax.vmap(lambda p: find_consensus(p, rigid_model(RIGID))))(spoilt)
+    wrong = np.any(np.asarray(found.keep) != 1 - np.asarray(outlier), axis=1)
+    assert wrong.sum() <= 2
+
+
+def test_one_problem_is_robust_unless_told_otherwise():
+    clean, spoilt, outlier = batch(1, 0.2, "slip", elevation_mm=1.0, noise_mm=0.5)
+    clean, spoilt = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in (clean, spoilt))
+    good = outlier[0] == 0
+    found = jaxcal.calibrate(spoilt, "conventional")
+    np.testing.assert_array_equal(found.mask, good)
+    assert np.all(jaxcal.calibrate(spoilt, "conventional", robust=False).mask == 1)
+    traced = jax.jit(lambda p: jaxcal.calibrate(p, "conventional"))(spoilt)
+    np.testing.assert_array_equal(traced.mask, good)
+    np.testing.assert_allclose(traced.image_to_probe, found.image_to_probe, atol=1e-9)
+    robust, plain = (jaxcal.calibrate(clean, "conventional", robust=r) for r in (True, False))
+    np.testing.assert_array_equal(robust.image_to_probe, plain.image_to_probe)
 
 
 def test_consensus_calls_no_lapack(consensus):

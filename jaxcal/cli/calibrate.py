@@ -41,7 +41,7 @@ class _Request:
     data: Literal["auto", "points", "channels"]
     sigma: tuple[float, float, float] | None
     options: dict[str, Any]
-    robust: bool = False
+    robust: bool = True
 
 
 @click.command()
@@ -90,10 +90,11 @@ class _Request:
     "are segmented from them, or every element's; auto: whichever says more.",
 )
 @click.option(
-    "--robust",
-    is_flag=True,
+    "--robust/--no-robust",
+    default=True,
+    show_default=True,
     help="Find the images that agree with each other first, and leave the others out: wrong "
-    "echoes, wrong clicks, a slipped mount.",
+    "echoes, wrong clicks, a slipped mount. Without gross errors it changes nothing.",
 )
 @click.option(
     "--solver",

@@ -45,10 +45,10 @@ from jaxcal.problem import Problem
 from jaxcal.solvers import arrow as arrows
 from jaxcal.solvers.proposals import SUBSET, linear_proposals, nominal, subset_weights
 
-SUBSET_STEPS = 3
+SUBSET_STEPS = 2
 CONCENTRATION = 0.6
-CONCENTRATION_STEPS = 6
-REJECTION_STEPS = 8
+CONCENTRATION_STEPS = 5
+REJECTION_STEPS = 6
 CUT = 6.0
 """SDs beyond which an image stands out. Heavy tails (Student's t4) put 0.3 % of images there."""
 FEW_IMAGES = 30
@@ -159,7 +159,7 @@ def find_consensus(problem: Problem, model: Model) -> Consensus:
 
 def finalists(images: int) -> int:
     """How many proposals to go on with: with few images a clean subset need not look the best."""
-    return int(np.clip(800 // images, 8, 64))
+    return int(np.clip(400 // images, 6, 24))
 
 
 def _finish(
@@ -207,11 +207,9 @@ def _finish(
     predicted = 0.5 * departure**2 + jnp.log(jnp.sqrt(2 * jnp.pi * (1 + leverage)) * sigma)
     wrong = jnp.sum(jnp.minimum(predicted, jnp.log(ANYTHING_MM)), axis=1) - jnp.log(WRONG)
     cost = cost + jnp.sum(jnp.where((used > 0) & (keep == 0), wrong, 0.0))
-    fits = used * (1 - stands_out(departure, keep))
-    fits = jnp.where(all_good, used, fits)
-    sound = (jnp.sum(fits) >= fewest) & jnp.all(jnp.isfinite(departure))
+    sound = (jnp.sum(keep) >= fewest) & jnp.all(jnp.isfinite(departure))
     cost = jnp.where(sound & jnp.isfinite(cost), cost, jnp.inf)
-    return Consensus(fits, parameters, sigma, departure), cost
+    return Consensus(keep, parameters, sigma, departure), cost
 
 
 def departures(
