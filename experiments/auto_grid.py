@@ -30,7 +30,7 @@ from jaxtyping import Array
 
 from jaxcal import Experiment, Problem, Protocol, calibrate_batch, reconstruction_precision
 from jaxcal.cli.cache import enable_compilation_cache
-from jaxcal.compiler import for_batches
+from jaxcal.compiler import fast_to_run
 from jaxcal.io.atomic import atomic_path
 from jaxcal.model.parameters import Parameters
 from jaxcal.offsets import OFFSET_LAWS, OffsetLaw, nominal_bound
@@ -145,7 +145,7 @@ def hindsight(begun, problems: Problem, experiments: Experiment, bounds: Array) 
     return jax.lax.map(some, parts).reshape(-1, bounds.shape[0], len(ROUNDS) + 1)
 
 
-_hindsight = jax.jit(hindsight, compiler_options=for_batches(jax.default_backend()))
+_hindsight = jax.jit(hindsight, compiler_options=fast_to_run(jax.default_backend()))
 
 
 def ratio(values: np.ndarray, to: np.ndarray) -> tuple[float, float]:

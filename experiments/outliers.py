@@ -26,7 +26,7 @@ from jaxtyping import Array
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision, simulate
 from jaxcal.cli.cache import enable_compilation_cache
-from jaxcal.compiler import for_one_problem
+from jaxcal.compiler import quick_to_compile
 from jaxcal.contamination import OutlierKind, contaminate
 from jaxcal.io.atomic import atomic_path
 from jaxcal.model.parameters import RIGID
@@ -95,7 +95,7 @@ def draw(indices: Array, elevation_mm, noise_mm, *, law, fraction, kind, images)
     return jax.vmap(one)(indices)
 
 
-@partial(jax.jit, compiler_options=for_one_problem(jax.default_backend()))
+@partial(jax.jit, compiler_options=quick_to_compile(jax.default_backend()))
 def agree(problems: Problem) -> Array:
     """1 for the images that agree with each other, problem by problem."""
     return jax.lax.map(lambda problem: agreed_images(problem, RIGID), problems)

@@ -31,6 +31,7 @@ from jaxcal.options import (
     Request,
     check_values,
     prepare,
+    robust_by_default,
     with_bound,
 )
 from jaxcal.pipeline import agreed_images, seen, solve_problem
@@ -57,7 +58,7 @@ def calibrate(
     sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S,
     delay_sd: float | Array = DELAY_SD_S,
     options: Options | None = None,
-    robust: bool = True,
+    robust: bool | None = None,
 ) -> Calibration:
     """Find X, the target and the elevational offsets; nobody supplies a starting guess.
 
@@ -87,7 +88,8 @@ def calibrate(
         robust: first find the images that agree with each other, whatever up to nearly half of the
             others are (:mod:`jaxcal.solvers.consensus`), and leave those out: ``outlier`` and
             ``departure`` say which and why. Where no image is gravely wrong none is left out, and
-            the answer is the one without.
+            the answer is the one without. By default the joint method does, unless its prior is
+            ``bounded``; the methods to compare it with fit what they are given.
 
     Returns:
         A :class:`Calibration`; ask its ``status`` and ``warnings`` before using it.
@@ -99,6 +101,8 @@ def calibrate(
     """
     if isinstance(problem, Recording):
         problem = Problem.from_recording(problem)
+    if robust is None:
+        robust = robust_by_default(method, prior)
     request = Request(method, prior, max_elevation, sigma, tracker_sd, estimate, data,
                       sound_speed_sd, delay_sd, options, robust)  # fmt: skip
     plan, given = prepare(problem, request)
