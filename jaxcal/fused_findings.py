@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 from jaxcal.findings import Findings, Solution, differentiable, judge, of_the_laws
 from jaxcal.fused_inspection import Steadied, check_noise_model, gains, usual_rotation
 from jaxcal.fused_uncertainty import (
+    Ends,
     Resting,
     elevation_variance,
     ends,
@@ -89,15 +90,14 @@ def find(
     lever = apart(jnp.sqrt(sums.reach / sums.used))
     one = jnp.ones_like(lever)
     scale = jnp.stack([one] * 3 + [lever] * 3 + [one] * 3)
-    diagonal = _diagonal(sums.design if resting is not None else sums.information)
-    matrices, diagonals = [sums.information, sums.robust], [diagonal, _diagonal(sums.robust)]
-    if not isinstance(prior, Gaussian) and resting is None:
-        inverse, robust = unit_inverse(matrices, diagonals)
-        design = inverse
-    else:
-        matrices, diagonals = [*matrices, sums.design], [*diagonals, _diagonal(sums.design)]
-        inverse, robust, design = unit_inverse(matrices, diagonals)
-    inverse, robust, design = apart((inverse, robust, design))
+    # With equal weights and no offset to eliminate the information is the design's.
+    weighed = isinstance(prior, Gaussian) or resting is not None
+    matrices = [sums.information, sums.robust, *([sums.design] if weighed else [])]
+    diagonals = [_diagonal(matrix) for matrix in matrices]
+    if resting is not None:
+        diagonals[0] = diagonals[2]
+    inverse, robust, *rest = apart(unit_inverse(matrices, diagonals))
+    design = rest[0] if weighed else inverse
     end = ends(sums.information, inverse, sums.design, design, scale)
 
     size = one
@@ -183,7 +183,16 @@ def _diagonal(matrix: Float[Array, "9 9 lanes"]) -> Float[Array, "9 lanes"]:
     return jnp.stack([matrix[k, k] for k in range(UNKNOWNS)])
 
 
-def _uncertainty(view, prior, resting, inverse, end, size, sums, plan) -> Uncertainty:
+def _uncertainty(
+    view: View,
+    prior: AbstractPrior,
+    resting: Resting | None,
+    inverse: Float[Array, "9 9 lanes"],
+    end: Ends,
+    size: Float[Array, " lanes"],
+    sums: _Sums,
+    plan: Plan,
+) -> Uncertainty:
     mask = view.images.mask
     at_bound, known, hold = jnp.zeros_like(mask), mask > 0, jnp.full_like(size, jnp.inf)
     if resting is not None:

@@ -7,12 +7,12 @@ self-tuning finds, so both solve the same objective. Timed are
 - the solvers alone, from the same conventional fits: given SDs, self-tuned (REML);
 - what follows a solution, by the reference (``pipeline.finish`` on every lane: *before*) and by the
   fused passes (``abreast.finish_batch``: *after*), with the largest difference of any number;
-- ``calibrate_batch`` in all, as it is (*after*) and with the reference's finish (*before*).
+- ``calibrate_batch`` in all.
 
-Rounds are interleaved; times are medians with quartiles, microseconds a problem; compilation is CPU
-time of one cold compilation. A second table says what waiting for the slowest of a chunk costs:
-passes needed against passes made, the time when the problems come sorted by their number of passes
-(the most that regrouping stragglers could gain), and other sizes of chunk. Seed 20261126.
+Rounds are interleaved; times are medians with quartiles, microseconds a problem. A second table
+says what waiting for the slowest of a chunk costs: passes needed against passes made, the time when
+the problems come sorted by their number of passes (the most that regrouping stragglers could gain),
+and other sizes of chunk. Seed 20261126.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 CORES = sorted(os.sched_getaffinity(0))
 os.sched_setaffinity(0, {CORES[0]})  # before JAX counts them
@@ -39,7 +40,9 @@ from jaxcal.options import (  # noqa: E402
     DELAY_SD_S,
     SOUND_SPEED_SD_M_S,
     Given,
+    Method,
     Plan,
+    PriorName,
     Request,
     prepare,
     with_bound,
@@ -55,7 +58,7 @@ from jaxcal.solvers.lanes import minimise  # noqa: E402
 SEED = 20261126
 IMAGES, LANES = 50, 64
 ELEVATION_MM, NOISE_MM = 2.0, 2.0
-CHUNKS = (16, 32, 64, 128, 256)
+CHUNKS = (32, 128)
 
 
 def draw(count: int) -> Problem:
@@ -69,26 +72,26 @@ def draw(count: int) -> Problem:
     return jax.block_until_ready(drawn(jax.random.split(jax.random.key(SEED), count)))
 
 
-def compiled(function: Callable, *parts) -> tuple[Callable, float]:
-    """The function with jaxcal's compiler flags, and the CPU seconds that compiling it took."""
-    options = abreast.compiler_options(jax.default_backend())
-    begun = time.process_time()
-    program = jax.jit(function).lower(*parts).compile(compiler_options=options)
-    return program, time.process_time() - begun
+def compiled(function: Callable, *parts) -> Callable:
+    """The function with jaxcal's compiler flags."""
+    options = compiler.fast_to_run(jax.default_backend())
+    return jax.jit(function).lower(*parts).compile(compiler_options=options)
 
 
 def by_chunks(function: Callable, chunk: int) -> Callable:
     """Map a function of batches over chunks of lanes."""
 
     def mapped(*parts):
-        split = jax.tree.map(lambda leaf: leaf.reshape(-1, chunk, *leaf.shape[1:]), parts)
+        split = jax.tree.map(
+            lambda leaf: leaf.reshape(len(leaf) // chunk, chunk, *leaf.shape[1:]), parts
+        )
         done = jax.lax.map(lambda part: function(*part), split)
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), done)
+        return jax.tree.map(lambda leaf: leaf.reshape(len(leaf) * chunk, *leaf.shape[2:]), done)
 
     return mapped
 
 
-def interleaved(programs: dict[str, Callable], rounds: int, count: int) -> dict[str, np.ndarray]:
+def interleaved(programs: dict[Any, Callable], rounds: int, count: int) -> dict[Any, np.ndarray]:
     """Microseconds a problem of every program in every round."""
     taken = {name: [] for name in programs}
     for program in programs.values():
@@ -104,12 +107,14 @@ def interleaved(programs: dict[str, Callable], rounds: int, count: int) -> dict[
 class Case:
     """One method: its plan, its solutions, and the programs that follow."""
 
-    def __init__(self, problems: Problem, method: str, prior: str, sigma: tuple | None) -> None:
+    def __init__(
+        self, problems: Problem, method: Method, prior: PriorName, sigma: tuple | None
+    ) -> None:
         request = Request(
             method, prior, None, sigma, None, (), "auto", SOUND_SPEED_SD_M_S, DELAY_SD_S, None,
             False,
-        )  # type: ignore[arg-type] # fmt: skip
-        self.arguments = {"method": method, "prior": prior, "sigma": sigma}
+        )  # fmt: skip
+        self.arguments: dict[str, Any] = {"method": method, "prior": prior, "sigma": sigma}
         self.plan, self.given = prepare(problems, request)
         self.problems = with_bound(problems, self.given)
 
@@ -187,83 +192,62 @@ def main() -> None:
         "given SDs": Case(problems, "joint", "gaussian", sigma),
         "self-tuned": Case(problems, "joint", "gaussian", None),
     }
-    rows, programs = [], {}
-    seconds: dict[tuple[str, str], float] = {}
-    agreement: dict[str, float] = {}
-
+    rows: list[list[Any]] = []
+    programs: dict[Any, Callable] = {}
+    differs: dict[Any, float] = {}
     solvers, fit = solver_programs(problems, np.array(sigma))
     for name, solver in solvers.items():
-        program, seconds["solver", name] = compiled(by_chunks(solver, LANES), fit, problems)
+        program = compiled(by_chunks(solver, LANES), fit, problems)
         programs["solver", name] = lambda program=program: program(fit, problems)
     for name, case in cases.items():
-        solve, _ = compiled(by_chunks(case.solve, LANES), case.problems)
-        solution = jax.block_until_ready(solve(case.problems))
+        solution = compiled(by_chunks(case.solve, LANES), case.problems)(case.problems)
         results = []
         for label, part in (("before", case.before), ("after", case.after)):
-            program, seconds[f"finish, {label}", name] = compiled(
-                by_chunks(part, LANES), solution, case.problems
-            )
+            program = compiled(by_chunks(part, LANES), solution, case.problems)
             programs[f"finish, {label}", name] = lambda program=program, s=solution, c=case: (
                 program(s, c.problems)
             )
             results.append(program(solution, case.problems))
-
-            def whole(problems, case=case, part=part):
-                return part(case.solve(problems), problems)
-
-            if label == "before":
-                program, seconds["whole, before", name] = compiled(
-                    by_chunks(whole, LANES), case.problems
-                )
-                programs["whole, before", name] = lambda program=program, c=case: program(
-                    c.problems
-                )
-        agreement[name] = largest_difference(results[1], results[0])
-        begun = time.process_time()
-        jax.block_until_ready(jaxcal.calibrate_batch(problems, **case.arguments))
-        seconds["whole, after", name] = time.process_time() - begun
-        programs["whole, after", name] = lambda c=case: jaxcal.calibrate_batch(
-            problems, **c.arguments
-        )
-        print(f"{name}: compiled; largest difference {agreement[name]:.1e}", flush=True)
+        differs["finish, after", name] = largest_difference(results[1], results[0])
+        programs["whole", name] = lambda c=case: jaxcal.calibrate_batch(problems, **c.arguments)
+        print(f"{name}: compiled", flush=True)
 
     taken = interleaved(programs, rounds, count)
     for (part, name), each in taken.items():
         low, middle, high = np.percentile(each, (25, 50, 75))
-        rows.append([part, name, float(middle), float(low), float(high), seconds[part, name],
-                     agreement.get(name, "") if part == "finish, after" else ""])  # fmt: skip
-    for part in ("solver", "whole, after"):
+        rows.append([part, name, float(middle), float(low), float(high),
+                     differs.get((part, name), "")])  # fmt: skip
+    for part in ("solver", "whole"):
         ratio = taken[part, "self-tuned"] / taken[part, "given SDs"]
         low, middle, high = np.percentile(ratio, (25, 50, 75))
         rows.append([f"{part}: ratio", "self-tuned over given SDs", float(middle), float(low),
-                     float(high), "", ""])  # fmt: skip
+                     float(high), ""])  # fmt: skip
     for row in rows:
         print("  ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in row))
-    rows.append([machine(), f"{count} problems, {rounds} rounds", "", "", "", "", ""])
-    header = ["part", "method", "median_us", "quartile1_us", "quartile3_us", "compile_cpu_s",
-              "largest_difference"]  # fmt: skip
+    rows.append([machine(), f"{count} problems, {rounds} rounds", "", "", "", ""])
+    header = ["part", "method", "median_us", "quartile1_us", "quartile3_us", "largest_difference"]
     folder = results_folder(quick)
     write_table(folder / "self_tuned_cost.csv", header, rows)
-    write_table(folder / "stragglers.csv", *stragglers(solvers, fit, problems, rounds))
+    runs = {name: programs["solver", name] for name in solvers}
+    write_table(folder / "stragglers.csv", *stragglers(solvers, runs, fit, problems, rounds))
 
 
-def stragglers(solvers: dict, fit, problems: Problem, rounds: int) -> tuple[list, list]:
+def stragglers(solvers: dict, runs: dict, fit, problems: Problem, rounds: int) -> tuple[list, list]:
     """What waiting for the slowest of a chunk costs: header and rows."""
     count = problems.mask.shape[0]
     rows = []
     for name, solver in solvers.items():
-        program, _ = compiled(by_chunks(solver, LANES), fit, problems)
-        passes = np.asarray(program(fit, problems)[1])
+        passes = np.asarray(runs[name]()[1])
         order = jnp.asarray(np.argsort(passes))
         ranked = jax.tree.map(lambda leaf, order=order: leaf[order], (fit, problems))
+        program = compiled(by_chunks(solver, LANES), fit, problems)
         programs = {
-            "as drawn": lambda program=program: program(fit, problems),
+            "as drawn": runs[name],
             "sorted": lambda program=program, ranked=ranked: program(*ranked),
         }
         for chunk in CHUNKS:
-            if chunk != LANES and count % chunk == 0:
-                other, _ = compiled(by_chunks(solver, chunk), fit, problems)
-                programs[f"chunks of {chunk}"] = lambda other=other: other(fit, problems)
+            other = compiled(by_chunks(solver, chunk), fit, problems)
+            programs[f"chunks of {chunk}"] = lambda other=other: other(fit, problems)
         taken = interleaved(programs, rounds, count)
         made = np.mean(passes.reshape(-1, LANES).max(axis=1))
         for variant, each in taken.items():
