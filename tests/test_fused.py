@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 
 from jaxcal.model.parameters import RIGID, Parameters
 from jaxcal.model.priors import Bounded, Explicit, Gaussian, InPlane
@@ -110,6 +112,54 @@ def test_same_optimum_as_the_reference(drawn, name):
         difference = np.abs(getattr(ours, part) - getattr(expected.parameters, part))
         assert difference.max() < 1e-8, part  # 1e-10 of the lever arm
     assert not np.any(found.active)
+
+
+@pytest.mark.parametrize("name", ["measured", "circle"])
+def test_where_the_last_step_was_not_looked_at_the_gradient_is_gone_too(drawn, name):
+    problems, guess = drawn
+    belief, _ = beliefs(name)
+    images = Images.of(problems)
+    found = jax.jit(lanes.minimise)(guess, belief, images)
+    rounding = lanes.Rounding.of(found.guess, belief, images)
+    normal = accumulate(found.guess, belief, images, jnp.zeros(LANES))
+    assert np.all(found.settled)
+    assert np.all(found.cosine <= 1e-10)
+    assert np.all(lanes.gradient_cosine(normal, rounding.vanished) <= 1e-10)
+    # Its normal equations are those before the last step: the cost there is higher, by nothing.
+    np.testing.assert_allclose(found.normal.cost, normal.cost, rtol=1e-10)
+
+
+def test_offsets_are_the_closest_points_of_the_circles(drawn):
+    problems, guess = drawn
+    images = Images.of(problems)
+    belief = Circle(
+        jnp.tile(jnp.asarray(SIGMA)[:, None], LANES), jnp.full(LANES, OFFSET_SD),
+        jnp.full((LANES, IMAGES), 0.8),
+    )  # fmt: skip
+    found = np.asarray(belief.offset(guess, images))
+    q, _ = targets(guess, images)
+
+    def cost(y, k, i):
+        error = np.array([q[1][k, i] - y, q[2][k, i] - np.sqrt(images.distance[k, i] ** 2 - y**2)])
+        return np.sum((error / np.asarray(SIGMA[1:])) ** 2) + (y / OFFSET_SD) ** 2
+
+    for k, i in [(0, 0), (1, 7), (3, 12), (5, 19)]:
+        best = minimize_scalar(
+            cost, bounds=(-0.8, 0.8), args=(k, i), method="bounded", options={"xatol": 1e-10}
+        )
+        assert abs(found[k, i] - best.x) < 1e-6
+    assert np.all(found[:, 4] == 0)  # the image that is left out
+    assert np.any(np.abs(found) == 0.8)
+
+
+def test_a_step_turns_by_the_rotation_vector_to_third_order():
+    vector = np.array([0.02, -0.03, 0.01])
+    turn = np.array(unrolled.rotation(list(vector)))
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-15)
+    exact = Rotation.from_rotvec(vector).as_matrix()
+    assert np.abs(turn - exact).max() < np.linalg.norm(vector) ** 3 / 12 * 1.01
+    large = np.array(unrolled.rotation([2.0, -3.0, 5.0]))
+    np.testing.assert_allclose(large @ large.T, np.eye(3), atol=1e-14)
 
 
 def test_a_lost_lane_leaves_its_neighbours_alone(drawn):

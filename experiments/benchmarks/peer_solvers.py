@@ -17,6 +17,7 @@ import shutil
 import subprocess
 import tempfile
 import time
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -296,8 +297,10 @@ def build_ceres() -> Path | str:
     """Compile the C++ peers; the program, or why there is none."""
     if shutil.which("cmake") is None or shutil.which("c++") is None:
         return "no cmake or no C++ compiler"
-    folder = Path(tempfile.gettempdir()) / f"jaxcal-ceres-{os.getuid()}"
-    source = Path(__file__).parent / "ceres"
+    source = (Path(__file__).parent / "ceres").resolve()
+    # cmake refuses a folder that it made for another checkout.
+    checkout = f"{zlib.crc32(str(source).encode()):08x}"
+    folder = Path(tempfile.gettempdir()) / f"jaxcal-ceres-{os.getuid()}-{checkout}"
     for command in (
         ["cmake", "-S", str(source), "-B", str(folder), "-DCMAKE_BUILD_TYPE=Release"],
         ["cmake", "--build", str(folder)],
