@@ -5,10 +5,14 @@ them the larger part of a study. Here every number is a function of a key, a str
 and its place in it alone, as there: word pair i of stream s is Threefry-2x32 (20 rounds, Salmon et
 al. 2011) of the counter (i, s) under the key. But both words are used, the rounds are written out,
 so that they fuse with what follows, and normals come in pairs from a logarithm, a root and two
-polynomials (Box and Muller 1958), evaluated in float32 and promoted.
+polynomials (Box and Muller 1958).
 
-What that costs in quality: a normal has a relative rounding of 1e-7 and never exceeds 6.7 SDs (the
-chance of a larger one is 2e-11); uniforms have 32 bits. No statistic of a simulation sees either.
+The measurements' noise, nearly all of the numbers, is evaluated in float32 and promoted: it has a
+relative rounding of 1e-7, which no statistic of a simulation sees. Everything else is evaluated in
+float64, for it is read in several places (a target both as the truth and in every pose): compiled
+loops that compute a number again may round it differently, and what must fit together would fit to
+seven digits only. No normal exceeds 6.7 SDs (the chance of a larger one is 2e-11), and uniforms
+have 32 bits.
 """
 
 from __future__ import annotations
@@ -16,7 +20,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex64, Float, Float32, Key, UInt32
+from jax.typing import DTypeLike
+from jaxtyping import Array, Complex64, Float, Key, UInt32
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = np.uint32(0x1BD11BDA)
@@ -58,20 +63,21 @@ def _threefry(one: Array, other: Array, first: Array, second: Array) -> tuple[Ar
 def uniforms(key: Key[Array, ""], stream: int, count: int) -> Float[Array, " count"]:
     """Uniform on (0, 1), in steps of 2^-32."""
     half = -(-count // 2)
-    both = jnp.concatenate(words(key, stream, (half,)))[:count]
-    return (both.astype(jnp.float64) + 0.5) * 2.0**-32
+    return _open(jnp.concatenate(words(key, stream, (half,)))[:count])
 
 
 def normals(key: Key[Array, ""], stream: int, count: int) -> Float[Array, " count"]:
     """Standard normals."""
-    pairs = normal_pairs(key, stream, (-(-count // 2),))
-    return jnp.concatenate([jnp.real(pairs), jnp.imag(pairs)])[:count].astype(jnp.float64)
+    one, other = words(key, stream, (-(-count // 2),))
+    radius = jnp.sqrt(-2 * jnp.log(_open(one)))
+    cosine, sine = circle(_turns(other, jnp.result_type(float)))
+    return jnp.concatenate([radius * cosine, radius * sine])[:count]
 
 
 def normal_pairs(
     key: Key[Array, ""], stream: int, shape: tuple[int, ...]
 ) -> Complex64[Array, "*shape"]:
-    """Pairs of independent standard normals as real and imaginary parts.
+    """Pairs of independent standard normals as real and imaginary parts, in float32.
 
     One complex array is one compiled loop; as two arrays the pair would be computed twice.
     """
@@ -79,37 +85,47 @@ def normal_pairs(
     half = jnp.float32(2.0**-32)
     # Never 0; rounding may make it 1, whose logarithm is 0.
     radius = jnp.sqrt(-2 * jnp.log(one.astype(jnp.float32) * half + half / 2))
-    turns = jax.lax.bitcast_convert_type(other, jnp.int32).astype(jnp.float32) * half
-    cosine, sine = circle(turns)
+    cosine, sine = circle(_turns(other, jnp.float32))
     return jax.lax.complex(radius * cosine, radius * sine)
 
 
-def circle(
-    turns: Float[Array, "*shape"],
-) -> tuple[Float32[Array, "*shape"], Float32[Array, "*shape"]]:
-    """Cosine and sine of an angle within half a turn either way, to 3e-7, in float32.
+def unit_vectors(key: Key[Array, ""], stream: int, count: int) -> Float[Array, "3 count"]:
+    """Uniform on the sphere (Archimedes: height and azimuth are uniform)."""
+    one, other = words(key, stream, (count,))
+    height = 2 * _open(one) - 1
+    across = jnp.sqrt((1 - height) * (1 + height))
+    cosine, sine = circle(_turns(other, jnp.result_type(float)))
+    return jnp.stack([across * cosine, across * sine, height])
+
+
+def circle(turns: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
+    """Cosine and sine of an angle within half a turn either way, to a few units of rounding.
 
     Args:
-        turns: the angle over 2 pi, between -0.5 and 0.5.
+        turns: the angle over 2 pi, between -0.5 and 0.5, in float32 or float64.
     """
-    turns = turns.astype(jnp.float32)
     quarter = jnp.round(4 * turns)
-    angle = (turns - quarter / 4) * jnp.float32(2 * np.pi)
+    angle = (turns - quarter / 4) * turns.dtype.type(2 * np.pi)
     square = angle * angle
     # Taylor's series within an eighth of a turn.
-    sine = angle * (1 + square * (-1 / 6 + square * (1 / 120 - square / 5040)))
-    cosine = 1 + square * (-1 / 2 + square * (1 / 24 + square * (-1 / 720 + square / 40320)))
+    terms = 4 if turns.dtype == jnp.float32 else 9
+    sine, cosine = jnp.ones_like(square), jnp.ones_like(square)
+    for k in range(terms, 0, -1):
+        cosine = 1 - square * cosine / ((2 * k - 1) * (2 * k))
+        if k < terms or terms > 4:
+            sine = 1 - square * sine / ((2 * k) * (2 * k + 1))
+    sine = angle * sine
     which = quarter.astype(jnp.int32)
     swap = (which & 1) != 0
     x, y = jnp.where(swap, sine, cosine), jnp.where(swap, cosine, sine)
     return jnp.where(((which + 1) & 2) != 0, -x, x), jnp.where((which & 2) != 0, -y, y)
 
 
-def unit_vectors(key: Key[Array, ""], stream: int, count: int) -> Float[Array, "3 count"]:
-    """Uniform on the sphere (Archimedes: height and azimuth are uniform); of length 1 to 1e-6."""
-    one, other = words(key, stream, (count,))
-    height = (one.astype(jnp.float32) + 0.5) * jnp.float32(2.0**-31) - 1
-    across = jnp.sqrt(jnp.maximum(1 - height * height, 0))
-    turns = jax.lax.bitcast_convert_type(other, jnp.int32).astype(jnp.float32)
-    cosine, sine = circle(turns * jnp.float32(2.0**-32))
-    return jnp.stack([across * cosine, across * sine, height]).astype(jnp.float64)
+def _open(word: UInt32[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """A word as a number in (0, 1)."""
+    return (word.astype(jnp.result_type(float)) + 0.5) * 2.0**-32
+
+
+def _turns(word: UInt32[Array, "*shape"], dtype: DTypeLike) -> Float[Array, "*shape"]:
+    """A word as a part of a turn, between -0.5 and 0.5."""
+    return jax.lax.bitcast_convert_type(word, jnp.int32).astype(dtype) * 2.0**-32

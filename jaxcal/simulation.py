@@ -327,9 +327,9 @@ def _inverse_normal(
 def _rotation(axis: Float[Array, "3 count"], angle: Float[Array, " count"]) -> list[Array]:
     """Nine planes of rotations by angles (rad) about axes.
 
-    By quaternions: directions and angles are those of float32, but rotations to the last digit.
+    By quaternions, which need no normalisation.
     """
-    scalar, sine = (part.astype(jnp.float64) for part in draws.circle(angle / (4 * np.pi)))
+    scalar, sine = draws.circle(angle / (4 * np.pi))
     vector = [sine * component for component in axis]
     double = 2 / (scalar * scalar + unrolled.dot(vector, vector))
     lever = unrolled.cross(vector)

@@ -60,18 +60,20 @@ def test_uniforms_and_directions():
     assert 1 - 1e-3 < values.max() < 1
     assert stats.kstest(values, "uniform").pvalue > 1e-3
     vectors = np.asarray(draws.unit_vectors(KEY, 2, 50_000))
-    np.testing.assert_allclose(np.linalg.norm(vectors, axis=0), 1, atol=2e-6)
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=0), 1, atol=1e-15)
     for component in vectors:
         assert stats.kstest(component, "uniform", (-1, 2)).pvalue > 1e-3
     np.testing.assert_allclose(np.cov(vectors), np.eye(3) / 3, atol=0.01)
 
 
-def test_circle():
-    turns = np.linspace(-0.5, 0.5, 2001)
+@pytest.mark.parametrize(("dtype", "within"), [(np.float32, 5e-7), (np.float64, 5e-16)])
+def test_circle(dtype, within):
+    turns = np.linspace(-0.5, 0.5, 2001).astype(dtype)
     cosine, sine = draws.circle(jnp.asarray(turns))
-    angle = 2 * np.pi * turns.astype(np.float32).astype(float)
-    np.testing.assert_allclose(cosine, np.cos(angle), atol=5e-7)
-    np.testing.assert_allclose(sine, np.sin(angle), atol=5e-7)
+    assert np.asarray(cosine).dtype == np.asarray(sine).dtype == dtype
+    angle = 2 * np.pi * turns.astype(float)
+    np.testing.assert_allclose(cosine, np.cos(angle), atol=within)
+    np.testing.assert_allclose(sine, np.sin(angle), atol=within)
 
 
 @pytest.mark.parametrize(("count", "noise_mm", "within"), [(128, 2.0, 3e-6), (33, 0.5, 1e-6)])

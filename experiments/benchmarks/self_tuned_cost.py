@@ -35,7 +35,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from common import arguments, machine, results_folder, write_table  # noqa: E402
 
 import jaxcal  # noqa: E402
-from jaxcal import abreast  # noqa: E402
+from jaxcal import abreast, compiler  # noqa: E402
 from jaxcal.options import (  # noqa: E402
     DELAY_SD_S,
     SOUND_SPEED_SD_M_S,
