@@ -115,8 +115,11 @@ def main() -> None:
     quick = arguments(__doc__ or "").quick
     trials = 50 if quick else 200
     grid = QUICK if quick else tuple(itertools.product(ELEVATIONS_MM[1:], NOISES_MM))
-    cells = [(law, 50, *sizes) for law, sizes in itertools.product(LAWS, grid)]
-    cells += [(law, images, *FEW_IMAGES_CELL) for images in FEW_IMAGES for law in LAWS]
+    cells: list[tuple[OffsetLaw, int, float, float]] = []
+    for law, (elevation, noise) in itertools.product(LAWS, grid):
+        cells.append((law, 50, elevation, noise))
+    for images, law in itertools.product(FEW_IMAGES, LAWS):
+        cells.append((law, images, *FEW_IMAGES_CELL))
     folder, rows, begun = results_folder(quick), [], time.perf_counter()
     for cell, (law, images, elevation, noise) in enumerate(cells):
         rows.append(run_cell(law, images, elevation, noise, cell * 1_000_000 + jnp.arange(trials)))

@@ -177,8 +177,9 @@ def posterior_mean(
         if np.linalg.norm(jacobian @ step) < 1e-3:
             break
     target = about(law, size, data, whitening, x, c)
-    scaled = target.linear(sd)[0] * scale
-    root = scale[:, None] * np.linalg.inv(np.linalg.qr(scaled, mode="r"))
+    jacobian = target.linear(sd)[0]
+    scale = 1 / np.linalg.norm(jacobian, axis=0)
+    root = scale[:, None] * np.linalg.inv(np.linalg.qr(jacobian * scale, mode="r"))
     centre = np.zeros(UNKNOWNS)
     for _ in range(ROUNDS):
         z = random.standard_normal((ADAPTING, UNKNOWNS))
@@ -193,21 +194,18 @@ def posterior_mean(
             break
 
     draws, logs = [], []
+    weight = np.zeros(0)
     for _ in range(MOST_BLOCKS):
         z = random.standard_normal((DRAWS, UNKNOWNS))
         z *= np.sqrt(TAIL / random.chisquare(TAIL, DRAWS))[:, None]
         proposed = 0.5 * (TAIL + UNKNOWNS) * np.log1p(np.einsum("dk,dk->d", z, z) / TAIL)
         draws.append(z)
         logs.append(target.log_density(centre + z @ root.T) + proposed)
-        log_weight = np.concatenate(logs)
-        if np.max(log_weight) == -np.inf:
-            continue
-        weight = weights(log_weight, 1.0)
+        weight = weights(np.concatenate(logs), 1.0)
         if effective(weight) > ENOUGH:
             break
-    else:
-        if np.max(log_weight) == -np.inf:
-            raise RuntimeError("no draw has all offsets within the edges of their law")
+    if not np.any(weight):
+        raise RuntimeError("no draw has all offsets within the edges of their law")
     z = np.concatenate(draws)
     middle = weight @ z
     apart = (z - middle) ** 2
@@ -233,13 +231,17 @@ def moved(x: np.ndarray, tangent: np.ndarray) -> np.ndarray:
 
 
 def effective(weight: np.ndarray) -> float:
-    """How many independent draws weighted ones are worth."""
-    return float(1 / np.sum(weight**2))
+    """How many independent draws normalised weights are worth; 0 for weights of zero."""
+    squares = float(np.sum(weight**2))
+    return 1 / squares if squares > 0 else 0.0
 
 
 def weights(log_weight: np.ndarray, power: float) -> np.ndarray:
-    """Weights to a power, normalised."""
-    weight = np.exp(power * (log_weight - np.max(log_weight)))
+    """Weights to a power, normalised; zeros where every one is zero."""
+    largest = np.max(log_weight)
+    if largest == -np.inf:
+        return np.zeros_like(log_weight)
+    weight = np.exp(power * (log_weight - largest))
     return weight / np.sum(weight)
 
 
