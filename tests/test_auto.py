@@ -15,9 +15,13 @@ from scipy.stats import multivariate_normal, norm, t, uniform
 import jaxcal
 from jaxcal import InputError
 from jaxcal.intervals import degrees_of_freedom
+from jaxcal.model.parameters import RIGID, Parameters
+from jaxcal.model.priors import Gaussian
 from jaxcal.model.shapes import FAMILIES, tilted
-from jaxcal.solvers.dense import inverse_positive
+from jaxcal.solvers.auto import SHAPES, average_over_laws, weights
+from jaxcal.solvers.dense import inverse_abreast, inverse_positive
 from jaxcal.solvers.expectation_propagation import Linear, propagate
+from jaxcal.solvers.fused_auto import average_abreast
 
 DENSITY = {
     "uniform": uniform(-(3**0.5), 2 * 3**0.5).pdf,
@@ -63,6 +67,13 @@ def test_inverse_and_determinant_of_a_positive_matrix():
     )
     assert float(log_determinant) == pytest.approx(np.linalg.slogdet(matrix)[1], rel=1e-12)
     assert np.isnan(np.asarray(inverse_positive(-jnp.eye(3))[0])).all()
+    both = jnp.stack([jnp.asarray(matrix), -jnp.eye(10)], axis=-1)
+    abreast, determinants = inverse_abreast(both)
+    np.testing.assert_allclose(
+        abreast[..., 0] * np.outer(sd, sd), inverse * np.outer(sd, sd), rtol=1e-9, atol=1e-12
+    )
+    assert float(determinants[0]) == pytest.approx(float(log_determinant), rel=1e-12)
+    assert np.isnan(np.asarray(abreast[..., 1])).all()
 
 
 def linear_problem(n: int = 12) -> Linear:
@@ -108,6 +119,62 @@ def test_expectation_propagation_against_integration():
         )  # fmt: skip
     np.testing.assert_allclose(found.log_evidence, evidence, atol=0.05)
     assert float(jnp.max(found.change)) < 0.1
+
+
+def test_a_law_that_excludes_an_image_does_not_count():
+    linear = linear_problem()
+    far = linear.offset.at[5].set(9.0)
+    linear = replace(linear, information=100 * linear.information, offset=far)
+    found = propagate(linear, FAMILIES, jnp.ones(len(FAMILIES)))
+    weight, good = weights(found.log_evidence, found.change, jnp.full(len(FAMILIES), 0.25))
+    assert dict(zip(FAMILIES, good.tolist(), strict=True))["uniform"] is False
+    assert FAMILIES[int(jnp.argmax(weight))] == "student"
+
+
+@pytest.mark.parametrize(
+    "kind", ["common", pytest.param("own", marks=pytest.mark.slow), "own and cut"]
+)
+def test_many_abreast_are_as_one_by_one(kind):
+    """The fused road against the reference, one image left out of each problem."""
+    laws = ("one-sided", "heavy-tailed", "uniform")
+    drawn = [
+        jaxcal.simulate_recording(
+            jaxcal.Protocol(images=14, elevation_mm=3.0, noise_mm=1.0, elevation_distribution=law),
+            k,
+        )
+        for k, law in enumerate(laws)
+    ]
+    problems = jaxcal.stack([jaxcal.Problem.from_recording(recording) for recording in drawn])
+    if kind == "common":
+        problems = replace(problems, covariance=None)
+    if kind == "own and cut":
+        problems = replace(problems, max_elevation=jnp.full((3, 14), 5.5))
+    mask = problems.mask.at[:, 2].set(0.0)
+    measurements = problems.measurements.at[:, 2].set(jnp.nan)
+    problems = replace(problems, mask=mask, measurements=measurements)
+    truth = [recording.truth for recording in drawn]
+    matrix = jnp.asarray(np.stack([each.image_to_probe for each in truth]))
+    point = jnp.asarray(np.stack([each.point for each in truth]))
+    parameters = jax.vmap(Parameters.of)(matrix[:, :3, :3], matrix[:, :3, 3], point)
+    belief = jax.vmap(Gaussian)(jnp.tile(jnp.asarray([0.3, 0.1, 2.0]), (3, 1)))
+
+    @jax.jit
+    def one_by_one(parameters, belief, problems):
+        return jax.vmap(lambda *one: average_over_laws(*one, RIGID, SHAPES))(
+            parameters, belief, problems
+        )
+
+    found = jax.jit(lambda *batch: average_abreast(*batch, SHAPES))(parameters, belief, problems)
+    expected = one_by_one(parameters, belief, problems)
+    assert np.asarray(expected.law.weighed).all()
+    assert np.asarray(expected.law.has_mean).any()
+    size = np.sqrt(np.diagonal(expected.covariance, axis1=1, axis2=2))
+    scaled = [x.covariance / (size[:, :, None] * size[:, None]) for x in (found, expected)]
+    np.testing.assert_allclose(*scaled, atol=1e-7)
+    found, expected = (replace(x, covariance=None) for x in (found, expected))
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.slow

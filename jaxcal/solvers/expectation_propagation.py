@@ -30,8 +30,11 @@ from jaxtyping import Array, Float
 from jaxcal.model.shapes import Family, Moments, tilted
 from jaxcal.solvers import dense
 
-SWEEPS = 8
-DAMPING = 0.7
+SWEEPS = 6
+DAMPING = 0.8
+
+LEAST_ROOM = 1e-3
+"""Least 1 - tau_i v_i: with less, what is left without site i is no Gaussian any more."""
 
 
 class Linear(eqx.Module):
@@ -64,7 +67,8 @@ class Posterior(eqx.Module):
         covariance: of x.
         log_evidence: up to a constant that the laws share.
         change: how far the last sweep moved the mean, in SDs (the length (d' S d)^1/2, S the
-            information).
+            information); infinite where a site leaves nothing for the others: sites that run away
+            can pause for a sweep, with an evidence that is only large.
     """
 
     mean: Float[Array, "k p"]
@@ -107,7 +111,7 @@ def propagate(
 
     def cavity(tau: Array, nu: Array, covariance: Array, mean: Array) -> tuple[Array, Array]:
         variance = (covariance[:, row, column] * twice) @ squares.T
-        shrink = 1 / jnp.maximum(1 - tau * variance, 1e-3)
+        shrink = 1 / jnp.maximum(1 - tau * variance, LEAST_ROOM)
         centre = shrink * (linear.offset + mean @ h.T - variance * nu)
         return centre, jnp.where(used > 0, variance * shrink, 1.0)
 
@@ -143,6 +147,9 @@ def propagate(
     information = linear.information + (tau @ squares)[:, place]
     step = mean - before
     change = jnp.sqrt(jnp.maximum(jnp.einsum("kp,kpq,kq->k", step, information, step), 0.0))
+    # tau w = tau v / (1 - tau v) shows how much room there was.
+    crowded = jnp.any(tau * without * used > 0.99 / LEAST_ROOM, axis=1)
+    change = jnp.where(crowded, jnp.inf, change)
     return Posterior(mean, covariance, evidence - 0.5 * log_determinant, change)
 
 

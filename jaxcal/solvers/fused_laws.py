@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.model.shapes import Family, tilted
 from jaxcal.solvers import dense, unrolled
-from jaxcal.solvers.expectation_propagation import DAMPING, SWEEPS, refreshed
+from jaxcal.solvers.expectation_propagation import DAMPING, LEAST_ROOM, SWEEPS, refreshed
 from jaxcal.solvers.fused import PAIRS, total
 from jaxcal.solvers.lanes import apart
 from jaxcal.solvers.unrolled import Matrix, Vector
@@ -264,7 +264,7 @@ def _sweep_all(
         ]
         variance = unrolled.dot(h, doubled)
         at = offset + unrolled.dot(h, [row[:, None] for row in belief.mean])
-        shrink = 1 / jnp.maximum(1 - tau * variance, 1e-3)
+        shrink = 1 / jnp.maximum(1 - tau * variance, LEAST_ROOM)
         centre = shrink * (at - variance * nu)
         return centre, jnp.where(used > 0, variance * shrink, 1.0)
 
@@ -293,5 +293,8 @@ def _sweep_all(
     site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
     site = site + nu * offset - 0.5 * tau * offset**2
     gained = jnp.sum(belief.rhs * belief.mean, axis=0)
-    evidence = total([used * site])[0] + 0.5 * gained - 0.5 * belief.log_determinant
+    crowded = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)
+    site, crowded = total([used * site, crowded])
+    evidence = site + 0.5 * gained - 0.5 * belief.log_determinant
+    change = jnp.where(crowded > 0, jnp.inf, change)
     return belief.mean, belief.covariance, evidence, change
