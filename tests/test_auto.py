@@ -139,7 +139,7 @@ def test_many_abreast_are_as_one_by_one(kind):
     laws = ("one-sided", "heavy-tailed", "uniform")
     drawn = [
         jaxcal.simulate_recording(
-            jaxcal.Protocol(images=14, elevation_mm=3.0, noise_mm=1.0, elevation_distribution=law),
+            jaxcal.Protocol(images=20, elevation_mm=5.0, noise_mm=0.5, elevation_distribution=law),
             k,
         )
         for k, law in enumerate(laws)
@@ -148,15 +148,15 @@ def test_many_abreast_are_as_one_by_one(kind):
     if kind == "common":
         problems = replace(problems, covariance=None)
     if kind == "own and cut":
-        problems = replace(problems, max_elevation=jnp.full((3, 14), 5.5))
+        problems = replace(problems, max_elevation=jnp.full((3, 20), 9.0))
     mask = problems.mask.at[:, 2].set(0.0)
-    measurements = problems.measurements.at[:, 2].set(jnp.nan)
+    measurements = problems.measurements.at[:, 2].set(77.0)
     problems = replace(problems, mask=mask, measurements=measurements)
     truth = [recording.truth for recording in drawn]
     matrix = jnp.asarray(np.stack([each.image_to_probe for each in truth]))
     point = jnp.asarray(np.stack([each.point for each in truth]))
     parameters = jax.vmap(Parameters.of)(matrix[:, :3, :3], matrix[:, :3, 3], point)
-    belief = jax.vmap(Gaussian)(jnp.tile(jnp.asarray([0.3, 0.1, 2.0]), (3, 1)))
+    belief = jax.vmap(Gaussian)(jnp.tile(jnp.asarray([0.1, 0.05, 4.0]), (3, 1)))
 
     @jax.jit
     def one_by_one(parameters, belief, problems):

@@ -94,8 +94,8 @@ def tilted(
     sd: Float[Array, " k"],
     mean: Float[Array, "k n"],
     variance: Float[Array, "k n"],
-    lower: Float[Array, " n"] | None = None,
-    upper: Float[Array, " n"] | None = None,
+    lower: Float[Array, "*#k n"] | None = None,
+    upper: Float[Array, "*#k n"] | None = None,
 ) -> Moments:
     """Moments of shapes of one family times every image's Gaussian.
 

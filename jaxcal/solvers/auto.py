@@ -190,10 +190,10 @@ def average_over_laws(
 
 
 def weights(
-    log_evidence: Float[Array, " k *lanes"],
-    change: Float[Array, " k *lanes"],
+    log_evidence: Float[Array, "k ..."],
+    change: Float[Array, "k ..."],
     prior: Float[Array, " k"],
-) -> tuple[Float[Array, " k *lanes"], Bool[Array, " k *lanes"]]:
+) -> tuple[Array, Array]:
     """The laws' probabilities, and which of them count at all."""
     good = jnp.isfinite(log_evidence) & (change < LARGEST_CHANGE)
     prior = prior.reshape(-1, *(1,) * (log_evidence.ndim - 1))

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.model.parameters import RIGID, Parameters
 from jaxcal.model.priors import Gaussian, covariance_shape
-from jaxcal.model.shapes import FAMILIES, Shape
+from jaxcal.model.shapes import FAMILIES, Family, Shape
 from jaxcal.problem import Problem
 from jaxcal.solvers import unrolled
 from jaxcal.solvers.auto import (
@@ -72,7 +72,7 @@ def average_abreast(
     precision = mean_precision(best.sigma[2], best.with_mean)
     known = marginal(best.information, best.gradient, precision, best.mean, best.with_mean)
     stretch = jnp.asarray([shape.stretch for shape in shapes], problems.mask.dtype)
-    families = [shape.family for shape in shapes]
+    families: list[Family] = [shape.family for shape in shapes]
     found = propagate(
         known, sites, best.squares, best.pull, families, stretch[:, None] * best.sigma[2]
     )
@@ -115,13 +115,11 @@ def average_abreast(
         weighed=enough,
     )
     moved, sigma = choose(enough, (moved, best.sigma), (guess, belief.sigma.T))
-    return Averaged(
-        parameters=moved.parameters(),
-        belief=Gaussian(sigma.T, covariances),
-        covariance=jnp.moveaxis(shared, -1, 0),
-        elevation_sd=jnp.sqrt(jnp.where(problems.mask > 0, variance, jnp.nan)),
-        law=law,
-    )
+    elevation_sd = jnp.sqrt(jnp.where(problems.mask > 0, variance, jnp.nan))
+    return jax.vmap(Averaged)(
+        moved.parameters(), jax.vmap(Gaussian)(sigma.T, covariances),
+        jnp.moveaxis(shared, -1, 0), elevation_sd, law,
+    )  # fmt: skip
 
 
 class Candidate(eqx.Module):

@@ -223,7 +223,7 @@ def together(entries: Vector) -> Vector:
     return unrolled.rows_of(apart(jnp.stack(entries)))
 
 
-def with_floor(sigma: Float[Array, "3 lanes"]) -> Float[Array, "3 lanes"]:
+def with_floor(sigma: Float[Array, "k lanes"]) -> Float[Array, "k lanes"]:
     """The SDs, none below a thousandth of its lane's largest."""
     least = jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma, axis=0), ABSOLUTE_FLOOR_MM)
     return jnp.maximum(sigma, least)
