@@ -66,7 +66,7 @@ SHAPES: tuple[Shape, ...] = (
 LOG_ODDS_OF_MEAN = float(np.log(9.0))
 """How much more probable the data must be with a mean: it is one more thing to be wrong about."""
 
-LARGEST_CHANGE = 0.1
+LARGEST_CHANGE = 0.05
 """A law counts where the last sweep moved no unknown by more than this many SDs."""
 
 

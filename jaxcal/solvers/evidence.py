@@ -27,7 +27,7 @@ from jaxcal.problem import Problem
 from jaxcal.solvers import dense
 from jaxcal.solvers.expectation_propagation import Linear
 from jaxcal.solvers.least_squares import linearise
-from jaxcal.solvers.variance import with_floor
+from jaxcal.solvers.variance import least_sigma
 
 ROUNDS = 3
 """Linearisations."""
@@ -81,6 +81,9 @@ def tune(
     at = columns[-1].start
     none = jnp.zeros(0, problem.mask.dtype)
     count = belief.count(problem)
+    # One floor for all models: one that followed each model's own offset SD would count a gain in
+    # that SD three times in the evidence, where data are exact.
+    floor = least_sigma(belief.sigma)
 
     def system(parameters: Parameters, mean: Array, sigma: Array):
         prior = belief.with_sigma(sigma)
@@ -117,7 +120,7 @@ def tune(
             factor = squares / freedom
             pooled = jnp.sum(squares[:-1]) / jnp.sum(freedom[:-1])
             factor = factor.at[:-1].set(jnp.where(tied > 0, pooled, factor[:-1]))
-            return with_floor(now * jnp.sqrt(factor)), step
+            return jnp.maximum(now * jnp.sqrt(factor), floor), step
 
         none = jnp.zeros(here[0].shape[0], sigma.dtype)
         sigma, step = jax.lax.fori_loop(0, UPDATES, update, (sigma, none))

@@ -26,8 +26,9 @@ from jaxtyping import Array, Float
 from jaxcal.solvers import dense, unrolled
 from jaxcal.solvers.evidence import MEAN_SD, ROUNDS, UPDATES
 from jaxcal.solvers.fused import PAIRS, UNKNOWNS, Guess, Images, Term, contributions, targets, total
-from jaxcal.solvers.fused_variance import components, with_floor
+from jaxcal.solvers.fused_variance import components
 from jaxcal.solvers.lanes import apart
+from jaxcal.solvers.variance import least_sigma
 
 V_Y = 1
 """The unknown that moves every q_iy by -1."""
@@ -195,6 +196,7 @@ def tune(
         count: residuals of each component.
         rounds: passes before the last.
     """
+    floor = least_sigma(scale)
 
     def one_round(_: Array, state: tuple) -> tuple:
         guess, mean, scale = state
@@ -208,7 +210,7 @@ def tune(
             bent = system.traces(step[:, None] * step)
             left = system.squares + 2 * jnp.sum(system.gradient * step, axis=1) + bent
             freedom = jnp.maximum(count - leverage, 0.05 * count)
-            return with_floor(jnp.sqrt(jnp.maximum(left, 0.0) / freedom)), step
+            return jnp.maximum(jnp.sqrt(jnp.maximum(left, 0.0) / freedom), floor), step
 
         none = jnp.zeros((UNKNOWNS + 1, mean.shape[0]), mean.dtype)
         scale, step = jax.lax.fori_loop(0, UPDATES, update, (scale, none))

@@ -38,7 +38,7 @@ from jaxcal.solvers.fused import (
 )
 from jaxcal.solvers.lanes import IDLE, apart, choose, default_tolerance
 from jaxcal.solvers.unrolled import Matrix, Vector, symmetric
-from jaxcal.solvers.variance import ABSOLUTE_FLOOR_MM, MINIMUM_SELF_TUNING, RELATIVE_FLOOR
+from jaxcal.solvers.variance import MINIMUM_SELF_TUNING, with_floor
 
 GATE = 0.03
 """Gradient cosine below which second derivatives are exact."""
@@ -221,12 +221,6 @@ class _Model(eqx.Module):
 def together(entries: Vector) -> Vector:
     """The same entries, computed here and once."""
     return unrolled.rows_of(apart(jnp.stack(entries)))
-
-
-def with_floor(sigma: Float[Array, "k lanes"]) -> Float[Array, "k lanes"]:
-    """The SDs, none below a thousandth of its lane's largest."""
-    least = jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma, axis=0), ABSOLUTE_FLOOR_MM)
-    return jnp.maximum(sigma, least)
 
 
 def self_tuned(
