@@ -20,8 +20,9 @@ their SD does, heavy tails must not pull it, and a mean that is denied bends it.
    covariance, with the spread between the laws added. A law under which the propagation does not
    settle (its edges exclude some image) has weight zero.
 
-Each step is a fixed number of array operations, so gradients go through (REML's by the implicit
-function theorem). With fewer than eight used images, with given SDs, or where no law settles, the
+This is the readable form, and the one whose derivatives are taken; batches of plain problems take
+the same steps side by side (:mod:`jaxcal.solvers.fused_auto`), several times faster. Each is a
+fixed number of array operations, so gradients go through (REML's by the implicit function theorem). With fewer than eight used images, with given SDs, or where no law settles, the
 plain Gaussian answer stands, and the result says so.
 
 What to expect. The answer is nearly the posterior mean over these laws, so it is better than
