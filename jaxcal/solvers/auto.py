@@ -22,8 +22,9 @@ their SD does, heavy tails must not pull it, and a mean that is denied bends it.
 
 This is the readable form, and the one whose derivatives are taken; batches of plain problems take
 the same steps side by side (:mod:`jaxcal.solvers.fused_auto`), several times faster. Each is a
-fixed number of array operations, so gradients go through (REML's by the implicit function theorem). With fewer than eight used images, with given SDs, or where no law settles, the
-plain Gaussian answer stands, and the result says so.
+fixed number of array operations, so gradients go through (REML's by the implicit function
+theorem). With fewer than eight used images, with given SDs, or where no law settles, the plain
+Gaussian answer stands, and the result says so.
 
 What to expect. The answer is nearly the posterior mean over these laws, so it is better than
 conventional calibration on average, whatever the offsets' law; in a single trial it can be worse.
