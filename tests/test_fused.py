@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -144,7 +145,7 @@ def test_offsets_are_the_closest_points_of_the_circles(drawn):
         return np.sum((error / np.asarray(SIGMA[1:])) ** 2) + (y / OFFSET_SD) ** 2
 
     for k, i in [(0, 0), (1, 7), (3, 12), (5, 19)]:
-        best = minimize_scalar(
+        best: Any = minimize_scalar(
             cost, bounds=(-0.8, 0.8), args=(k, i), method="bounded", options={"xatol": 1e-10}
         )
         assert abs(found[k, i] - best.x) < 1e-6
