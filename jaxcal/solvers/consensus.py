@@ -53,7 +53,7 @@ CUT = 6.0
 """SDs beyond which an image stands out. Heavy tails (Student's t4) put 0.3 % of images there."""
 FEW_IMAGES = 30
 """With fewer images in use, n, the limit is wider by sqrt(30 / n): 9.5 SDs for a dozen."""
-WRONG = 0.05
+WRONG = 0.01
 """How probable it is, to begin with, that an image is wrong."""
 ANYTHING_MM = 200.0
 """Width of the range in which its errors may lie then."""
