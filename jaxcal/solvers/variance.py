@@ -164,11 +164,11 @@ def update_or_hold(
     return jnp.where(enough, update(parameters, sigma, belief, problem, blocks), belief.sigma)
 
 
-def with_floor(sigma: Float[Array, components * lanes]) -> Float[Array, components * lanes]:
+def with_floor(sigma: Float[Array, " components ..."]) -> Float[Array, " components ..."]:
     """The SDs, none below a thousandth of the largest."""
     return jnp.maximum(sigma, least_sigma(sigma))
 
 
-def least_sigma(sigma: Float[Array, components * lanes]) -> Float[Array, "*lanes"]:
+def least_sigma(sigma: Float[Array, " components ..."]) -> Float[Array, "..."]:
     """The floor of SDs, mm: a thousandth of the largest."""
     return jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma, axis=0), ABSOLUTE_FLOOR_MM)
