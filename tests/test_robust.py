@@ -145,14 +145,17 @@ def test_a_third_of_a_dozen_images(consensus):
     assert wrong.sum() <= 2
 
 
-def test_one_problem_is_robust_unless_told_otherwise():
+def test_the_joint_method_is_robust_unless_told_otherwise():
     clean, spoilt, outlier = batch(1, 0.2, "slip", elevation_mm=1.0, noise_mm=0.5)
     clean, spoilt = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in (clean, spoilt))
     good = outlier[0] == 0
-    found = jaxcal.calibrate(spoilt, "conventional")
+    sigma = (0.1, 0.05, 0.6)
+    found = jaxcal.calibrate(spoilt, "joint", sigma=sigma)
     np.testing.assert_array_equal(found.mask, good)
-    assert np.all(jaxcal.calibrate(spoilt, "conventional", robust=False).mask == 1)
-    traced = jax.jit(lambda p: jaxcal.calibrate(p, "conventional"))(spoilt)
+    assert np.all(jaxcal.calibrate(spoilt, "joint", sigma=sigma, robust=False).mask == 1)
+    # What it is compared with fits what it is given.
+    assert np.all(jaxcal.calibrate(spoilt, "conventional").mask == 1)
+    traced = jax.jit(lambda p: jaxcal.calibrate(p, "joint", sigma=sigma))(spoilt)
     np.testing.assert_array_equal(traced.mask, good)
     np.testing.assert_allclose(traced.image_to_probe, found.image_to_probe, atol=1e-9)
     robust, plain = (jaxcal.calibrate(clean, "conventional", robust=r) for r in (True, False))
