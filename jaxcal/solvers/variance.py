@@ -169,6 +169,6 @@ def with_floor(sigma: Float[Array, " components ..."]) -> Float[Array, " compone
     return jnp.maximum(sigma, least_sigma(sigma))
 
 
-def least_sigma(sigma: Float[Array, " components ..."]) -> Float[Array, "..."]:
+def least_sigma(sigma: Float[Array, " components ..."]) -> Float[Array, " ..."]:
     """The floor of SDs, mm: a thousandth of the largest."""
     return jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma, axis=0), ABSOLUTE_FLOOR_MM)
