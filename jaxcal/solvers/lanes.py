@@ -12,6 +12,11 @@ A lane stops when the largest cosine between its residual and a column of its Ja
 tolerance, when its residuals are nothing but rounding, or when steps no longer gain more than that.
 Newton's steps square what is left: from a cosine whose square is well below the tolerance, the
 last step is taken and not looked at again.
+
+Why this is no solver class of optimistix: there one solve has one verdict and one count of steps,
+where here every lane has its own, and it wants an objective that this loop never calls. Time was
+not in the way: behind its interface the same loop took 1.01 times as long as one solve for 64
+lanes, and 1.10 times as one solve a problem, vmapped.
 """
 
 from __future__ import annotations
