@@ -13,6 +13,8 @@ float64, for it is read in several places (a target both as the truth and in eve
 loops that compute a number again may round it differently, and what must fit together would fit to
 seven digits only. No normal exceeds 6.7 SDs (the chance of a larger one is 2e-11), and uniforms
 have 32 bits.
+Words are the same wherever they are computed; the noise may differ in its last digit between
+programs that are compiled differently (another number of devices, say).
 """
 
 from __future__ import annotations

@@ -516,7 +516,8 @@ def test_several_devices_share_a_block(finished, programs, tmp_path):
     assert "2 x cpu" in Store.open(folder).versions(parse_spec(small()).chunk(0))
     one, two = open_results(finished), open_results(folder)
     for name in one.data_vars:
-        np.testing.assert_allclose(one[name], two[name], rtol=1e-9, atol=1e-12, err_msg=str(name))
+        # Another program rounds the noise, which is drawn in float32, differently: by 1e-7 of it.
+        np.testing.assert_allclose(one[name], two[name], rtol=1e-6, atol=1e-6, err_msg=str(name))
 
 
 @pytest.mark.slow
