@@ -143,7 +143,8 @@ def tune(
     direction = sigma[-1] * jacobian[:, :, at].T
     offset = sigma[-1] * residual[:, at]
     noise_jacobian = jacobian.at[:, :, at].set(0.0)
-    gradient = -jnp.einsum("anm,nm->a", noise_jacobian, residual).at[-1].add(-precision * mean)
+    downhill = -jnp.einsum("anm,nm->a", noise_jacobian, residual)
+    gradient = downhill.at[-1].add(-precision * mean)
     lower, upper = None, None
     if problem.max_elevation is not None:
         lower, upper = -problem.max_elevation - mean, problem.max_elevation - mean
