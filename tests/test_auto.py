@@ -151,7 +151,9 @@ def test_many_abreast_are_as_one_by_one(kind):
     if kind == "common":
         problems = replace(problems, covariance=None)
     if kind == "own and cut":
-        problems = replace(problems, max_elevation=jnp.full((3, 30), 9.0))
+        problems = replace(
+            problems, max_elevation=jnp.asarray([[9.0], [40.0], [9.0]]) * jnp.ones(30)
+        )
     mask = problems.mask.at[:, 2].set(0.0)
     measurements = problems.measurements.at[:, 2].set(77.0)
     problems = replace(problems, mask=mask, measurements=measurements)
