@@ -134,8 +134,10 @@ def _newton(x0: Array, r0: Array, n: Array, e: np.ndarray, u: Array, v: Array) -
     along, r = before + u, r0 + v
     h0 = jnp.sqrt(before * before + r0 * r0)
     square = along * along + r * r
-    inverse = jax.lax.rsqrt(square)
-    residual = n - (u * (before + along) + v * (r0 + r)) / (h0 + square * inverse)
+    # With fast math an rsqrt by itself differs between a vector and what is left of a row.
+    h = jnp.sqrt(square)
+    inverse = 1 / h
+    residual = n - (u * (before + along) + v * (r0 + r)) / (h0 + h)
     jx, jr = along * inverse, r * inverse
     bend = residual * inverse
     xx, xr, rr = jx * jx, jx * jr, jr * jr
