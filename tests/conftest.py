@@ -78,8 +78,18 @@ def _float64() -> None:
     assert jax.config.read("jax_enable_x64")
 
 
+LONGEST = (
+    "test_cli", "test_channels", "test_study", "test_solvers", "test_robust", "test_crosswire",
+    "test_resampling", "test_acquire", "test_observability_sets", "test_auto", "test_abreast",
+    "test_live", "test_observability", "test_recorder", "test_pivot", "test_report", "test_fused",
+)  # fmt: skip
+"""Modules that take longest, which start first: no worker is to be left alone with one at the end."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Every solver takes the whole suite; what repeats another's code path does so with -m slow."""
+    place = {name: k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(LONGEST)))
     for item in items:
         parameters = getattr(item, "callspec", None)
         if parameters is None or "solver" not in parameters.params:

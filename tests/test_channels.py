@@ -100,9 +100,17 @@ def test_sound_speed_and_delay_are_estimated_along(probe):
     assert result.delay_sd_s is not None
     assert abs(result.sound_speed_m_s - 1520.0) < 3 * result.sound_speed_sd_m_s < 3.0
     assert abs(result.delay_s - 0.5e-6) < 3 * result.delay_sd_s < 0.15e-6
-    known = jaxcal.calibrate(data, data="channels", prior="gaussian")
-    assert precision(result, data) < 1.1 * precision(known, data)
-    assert precision(jaxcal.calibrate(off, prior="gaussian"), data) > 1.5 * precision(result, data)
+    # In a single experiment either may be better by chance.
+    several = [data, *(recording(probe, seed=seed) for seed in (4, 5, 6, 7, 8))]
+    estimated, known, wrong = [], [], []
+    for each in several:
+        off = wrong_medium(each, 1520.0, 0.5e-6)
+        found = jaxcal.calibrate(off, estimate=("sound-speed", "delay"), prior="gaussian")
+        estimated.append(precision(found, each))
+        known.append(precision(jaxcal.calibrate(each, data="channels", prior="gaussian"), each))
+        wrong.append(precision(jaxcal.calibrate(off, prior="gaussian"), each))
+    assert np.mean(estimated) < 1.1 * np.mean(known)
+    assert np.mean(wrong) > 1.5 * np.mean(estimated)
 
 
 def test_what_points_cannot_tell_is_said_or_refused():
