@@ -83,7 +83,7 @@ LONGEST = (
     "test_resampling", "test_acquire", "test_observability_sets", "test_auto", "test_abreast",
     "test_live", "test_observability", "test_recorder", "test_pivot", "test_report", "test_fused",
 )  # fmt: skip
-"""Modules that take longest, which start first: no worker is to be left alone with one at the end."""
+"""Modules that take longest, which start first: no worker is left alone with one at the end."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
