@@ -134,15 +134,6 @@ class Request:
     robust: bool = False
 
 
-def robust_by_default(method: str, prior: str) -> bool:
-    """Whether :func:`jaxcal.calibrate` leaves gross outliers out if nobody says.
-
-    The conventional method, the alternation and its objective are there to be compared with: they
-    are what the literature says, of all the images.
-    """
-    return method == "joint" and prior != "bounded"
-
-
 def prepare(problem: Problem, request: Request) -> tuple[Plan, Given]:
     """Check a request against its problem and sort it into what is static and what is traced.
 

@@ -31,7 +31,6 @@ from jaxcal.options import (
     Request,
     check_values,
     prepare,
-    robust_by_default,
     with_bound,
 )
 from jaxcal.pipeline import agreed_images, seen, solve_problem
@@ -58,7 +57,7 @@ def calibrate(
     sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S,
     delay_sd: float | Array = DELAY_SD_S,
     options: Options | None = None,
-    robust: bool | None = None,
+    robust: bool = False,
 ) -> Calibration:
     """Find X, the target and the elevational offsets; nobody supplies a starting guess.
 
@@ -88,8 +87,7 @@ def calibrate(
         robust: first find the images that agree with each other, whatever up to nearly half of the
             others are (:mod:`jaxcal.solvers.consensus`), and leave those out: ``outlier`` and
             ``departure`` say which and why. Where no image is gravely wrong none is left out, and
-            the answer is the one without. By default the joint method does, unless its prior is
-            ``bounded``; the methods to compare it with fit what they are given.
+            the answer is the one without.
 
     Returns:
         A :class:`Calibration`; ask its ``status`` and ``warnings`` before using it.
@@ -101,8 +99,6 @@ def calibrate(
     """
     if isinstance(problem, Recording):
         problem = Problem.from_recording(problem)
-    if robust is None:
-        robust = robust_by_default(method, prior)
     request = Request(method, prior, max_elevation, sigma, tracker_sd, estimate, data,
                       sound_speed_sd, delay_sd, options, robust)  # fmt: skip
     plan, given = prepare(problem, request)
@@ -150,7 +146,7 @@ def calibrate_batch(
         sound_speed_sd: see there.
         delay_sd: see there.
         options: see there.
-        robust: see there; off by default, for it takes longer than the solve.
+        robust: see there; it takes longer than the solve.
         chunk: lanes solved side by side; by default 64, on channels 8.
 
     Plain problems are shared out among all of JAX's local devices: a processor is one device unless

@@ -181,7 +181,9 @@ def test_many_abreast_are_as_one_by_one(kind):
         jax.tree.leaves((x.parameters, x.belief, x.elevation_sd, x.law)) for x in (found, expected)
     )
     for a, b in zip(found, expected, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
+        # Sums of squares about the minimum come from sums over the images there, not from the
+        # residuals themselves: of logarithms of probabilities that costs a digit or two.
+        np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-7)
 
 
 @pytest.mark.slow

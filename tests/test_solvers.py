@@ -79,7 +79,8 @@ def test_recovers_the_truth_from_exact_data(solver):
 
 def test_images_left_out_do_not_count(solver):
     everything = noisy(12, noise_mm=0.2, elevation_mm=0.3)
-    keep = np.array([1, 4, 7, 11])
+    # Of four images the bounded answer is hardly determined: it moves along a valley.
+    keep = np.array([0, 1, 4, 6, 7, 9, 11])
     mask = np.zeros(12)
     mask[keep] = 1
     rubbish = np.array(everything.measurements)
@@ -92,7 +93,7 @@ def test_images_left_out_do_not_count(solver):
         np.asarray(left_out.elevation)[keep], without.elevation, atol=100 * solver.agreement
     )
     np.testing.assert_allclose(left_out.rms, without.rms, atol=solver.agreement)
-    assert int(left_out.images_used) == 4
+    assert int(left_out.images_used) == len(keep)
     assert np.all(np.asarray(left_out.elevation)[mask == 0] == 0)
 
 

@@ -41,7 +41,7 @@ class _Request:
     data: Literal["auto", "points", "channels"]
     sigma: tuple[float, float, float] | None
     options: dict[str, Any]
-    robust: bool | None = None
+    robust: bool = False
 
 
 @click.command()
@@ -91,10 +91,10 @@ class _Request:
 )
 @click.option(
     "--robust/--no-robust",
-    default=None,
+    default=False,
+    show_default=True,
     help="Find the images that agree with each other first, and leave the others out: wrong "
-    "echoes, wrong clicks, a slipped mount. Without gross errors it changes nothing. The joint "
-    "method does by default, unless its prior is bounded.",
+    "echoes, wrong clicks, a slipped mount.",
 )
 @click.option(
     "--solver",
@@ -152,7 +152,7 @@ def calibrate(
     tolerance_rad: float | None,
     max_rounds: int | None,
     data: Literal["auto", "points", "channels"],
-    robust: bool | None,
+    robust: bool,
     test: str | None,
     cross_validate: bool,
     bootstrap: int | None,

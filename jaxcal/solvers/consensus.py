@@ -55,10 +55,10 @@ FEW_IMAGES = 30
 """With fewer images in use, n, the limit is wider by sqrt(30 / n): 9.5 SDs for a dozen."""
 WRONG = 0.01
 """How probable it is, to begin with, that an image is wrong."""
-ANYTHING_MM = 30.0
+ANYTHING_MM = 60.0
 """Width of the range in which its errors may lie then. Errors of 20 to 100 mm are found all the
 same; a wider one lets a third of the images that slipped together pass for noise (200 mm: in 67 of
-200 trials of 12 images; 30 mm: in 6)."""
+200 trials of 12 images; 60 mm: in 9)."""
 FEWEST_IMAGES = 8
 """With fewer used images nothing is left out: they cannot outvote one another."""
 MAD = 1.4826
