@@ -23,6 +23,7 @@ def data() -> jaxcal.Problem:
     return problem(2, images=20, elevation_mm=1.0, noise_mm=1.0)
 
 
+@pytest.mark.slow
 def test_holding_out_an_image_is_calibrating_without_it(data):
     whole = jaxcal.calibrate(data, **CONVENTIONAL)
     found = cross_validate(data, result=whole, **CONVENTIONAL)

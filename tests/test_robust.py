@@ -145,6 +145,7 @@ def test_a_third_of_a_dozen_images(consensus):
     assert wrong.sum() <= 2
 
 
+@pytest.mark.slow
 def test_one_problem_leaves_out_what_a_batch_does():
     clean, spoilt, outlier = batch(1, 0.2, "slip", elevation_mm=1.0, noise_mm=0.5)
     clean, spoilt = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in (clean, spoilt))
