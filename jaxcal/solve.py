@@ -134,6 +134,10 @@ def calibrate_batch(
 
     A lane that is bad (NaN, degenerate) gets its own status and leaves its neighbours alone.
 
+    Plain problems are shared out among all of JAX's local devices: a processor is one device unless
+    ``jax.config.update("jax_num_cpu_devices", n)`` (or JAX_NUM_CPU_DEVICES=n) says before JAX's
+    first use that it is n, one a core. Results do not depend on it.
+
     Args:
         problems: leading axes of any shape; see :func:`jaxcal.stack`.
         method: as for :func:`calibrate`, and so are the following.
@@ -148,10 +152,6 @@ def calibrate_batch(
         options: see there.
         robust: see there; it takes longer than the solve.
         chunk: lanes solved side by side; by default 64, on channels 8.
-
-    Plain problems are shared out among all of JAX's local devices: a processor is one device unless
-    ``jax.config.update("jax_num_cpu_devices", n)`` (or JAX_NUM_CPU_DEVICES=n) says before JAX's
-    first use that it is n, one a core. Results do not depend on it.
 
     Returns:
         A :class:`Calibration` whose arrays have the problems' leading axes.

@@ -56,9 +56,8 @@ FEW_IMAGES = 30
 WRONG = 0.01
 """How probable it is, to begin with, that an image is wrong."""
 ANYTHING_MM = 60.0
-"""Width of the range in which its errors may lie then. Errors of 20 to 100 mm are found all the
-same; a wider one lets a third of the images that slipped together pass for noise (200 mm: in 67 of
-200 trials of 12 images; 60 mm: in 9)."""
+"""Width of the range in which its errors may lie then. Larger ones are found all the same; a wider
+range lets a third of the images that slipped together pass for noise."""
 FEWEST_IMAGES = 8
 """With fewer used images nothing is left out: they cannot outvote one another."""
 MAD = 1.4826

@@ -234,7 +234,7 @@ def compile_pieces(function: Any, devices: Devices, *, pieces: int, fast: bool =
         devices: one, or several that share the pieces.
         pieces: so many of the function's arguments, the first ones, are given for every piece;
             further ones are for all of them.
-        fast: with the compiler options of :mod:`jaxcal.abreast`.
+        fast: with the flags of :func:`jaxcal.compiler.fast_to_run`.
     """
     platform = devices[0].platform
     options = (fast_to_run(platform) or {}) if fast else {}
