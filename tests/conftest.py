@@ -7,9 +7,9 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 
-# Nearly all of the tests' time is compilation: building each fusion with MLIR is most of that (jax
-# 0.10), optimising it with LLVM comes next. What XLA does to a program as a whole stays as it is for
-# users. Read when JAX starts its backend, so first of all.
+# Nearly all of the tests' time is compilation: building each fusion with MLIR is most of that (with
+# jax 0.10), optimising it with LLVM comes next. What XLA does to a program as a whole stays as it
+# is for users. Read when JAX starts its backend, so first of all.
 os.environ["XLA_FLAGS"] = (
     os.environ.get("XLA_FLAGS", "")
     + " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
