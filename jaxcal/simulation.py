@@ -329,7 +329,8 @@ def _rotation(axis: Float[Array, "3 count"], angle: Float[Array, " count"]) -> l
 
     By quaternions, which need no normalisation.
     """
-    scalar, sine = draws.circle(angle / (4 * np.pi))
+    # Computed once, where each of the nine entries would compute it again.
+    scalar, sine, axis = jax.lax.optimization_barrier((*draws.circle(angle / (4 * np.pi)), axis))
     vector = [sine * component for component in axis]
     double = 2 / (scalar * scalar + unrolled.dot(vector, vector))
     lever = unrolled.cross(vector)
