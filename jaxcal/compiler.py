@@ -11,11 +11,14 @@ Flags belong to a whole program, so none are given inside somebody else's jit, v
 from __future__ import annotations
 
 import os
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.core
 import jax.numpy as jnp
+
+T = TypeVar("T")
 
 SWITCH = "JAXCAL_FAST_MATH"
 """Environment variable; 0 leaves batches the compiler's default flags."""
@@ -47,6 +50,28 @@ def quick_to_compile(platform: str) -> Flags | None:
     nothing faster that could be measured.
     """
     return {"xla_cpu_use_fusion_emitters": False} if platform == "cpu" else None
+
+
+def computed_once(make: Callable[[], T], witness: jax.typing.ArrayLike) -> T:
+    """What a function makes, as arrays that whoever reads them does not compute again.
+
+    On a CPU, XLA puts a loop that several others read into each of them, unless it holds what is
+    thought expensive (integer rounds and polynomials are not), and drops optimization_barrier
+    before it does. A branch is where that ends, provided that the compiler cannot tell that it is
+    always taken.
+
+    Args:
+        make: without arguments; what it closes over may be traced.
+        witness: any number that is not negative and, for an effect, an argument of the program and
+            the same for the whole batch. Where it is NaN, all is zero.
+    """
+    taken = jnp.asarray(witness) >= 0
+    if not isinstance(taken, jax.core.Tracer):
+        return make()
+    nothing = jax.eval_shape(make)
+    return jax.lax.cond(
+        taken, make, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
+    )
 
 
 def is_whole_program(*arguments: object) -> bool:

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Complex64, Float, Key
 
 from jaxcal import draws
-from jaxcal.compiler import quick_to_compile
+from jaxcal.compiler import computed_once, quick_to_compile
 from jaxcal.errors import InputError
 from jaxcal.geometry import matrix_from_rotation
 from jaxcal.offsets import OffsetLaw, check_law, standard_offsets
@@ -227,6 +227,10 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
 
 def draw(key: Key[Array, ""], protocol: Protocol) -> Numbers:
     """All random numbers of one experiment; of the protocol only what is static counts."""
+    return computed_once(lambda: _numbers(key, protocol), protocol.noise_mm)
+
+
+def _numbers(key: Key[Array, ""], protocol: Protocol) -> Numbers:
     n, images = protocol.images, protocol.images + protocol.test_images
     position = draws.uniforms(key, _POSITION, 2 * images).reshape(2, images)
     tracker = draws.normals(key, _TRACKER, 6 * n).reshape(6, n) if _tracked(protocol) else None
@@ -246,17 +250,18 @@ def draw_noise(key: Key[Array, ""], protocol: Protocol) -> Complex64[Array, "n h
 
     Those of their first half are the real parts, those of the others the imaginary ones.
     """
-    return draws.normal_pairs(key, _NOISE, (protocol.images, -(-protocol.probe.elements // 2)))
+    shape = (protocol.images, -(-protocol.probe.elements // 2))
+    return computed_once(lambda: draws.normal_pairs(key, _NOISE, shape), protocol.noise_mm)
 
 
 def arrange(numbers: Numbers, protocol: Protocol) -> Planes:
     """Poses and targets as the random numbers say; nothing is measured yet."""
     probe, n = protocol.probe, protocol.images
-    curved = isinstance(probe, CurvilinearProbe)
+    curved, witness = isinstance(probe, CurvilinearProbe), protocol.noise_mm
     width = protocol.sector * probe.half_angle_rad if curved else protocol.lateral_mm
     shallow, deep = protocol.depth_mm
     middle, half = 0.5 * (shallow + deep), 0.5 * abs(deep - shallow)
-    truth = _rotation(numbers.axis[:, :1], numbers.turn[:1] * np.pi)
+    truth = _rotation(numbers.axis[:, :1], numbers.turn[:1] * np.pi, witness)
     truth = jnp.stack(truth).reshape(3, 3)
     translation, target = 50.0 * numbers.place[:3], 100.0 * numbers.place[3:]
 
@@ -269,7 +274,7 @@ def arrange(numbers: Numbers, protocol: Protocol) -> Planes:
     lateral, depth = positions(numbers.position[:, :n], 1.0)
     across, far = positions(numbers.position[:, n:], protocol.test_fraction)
     elevation = protocol.elevation_mm * numbers.offset
-    turns = _rotation(numbers.axis[:, 1:], numbers.turn[1:] * protocol.rotation_rad)
+    turns = _rotation(numbers.axis[:, 1:], numbers.turn[1:] * protocol.rotation_rad, witness)
     rotation, test_rotation = [row[:n] for row in turns], [row[n:] for row in turns]
 
     def origin(rotation: list[Array], in_image: list[Array | int]) -> list[Array]:
@@ -324,13 +329,15 @@ def _inverse_normal(
     return jnp.stack(rows, axis=-2) / (a * c - b * b)[:, None, None]
 
 
-def _rotation(axis: Float[Array, "3 count"], angle: Float[Array, " count"]) -> list[Array]:
+def _rotation(
+    axis: Float[Array, "3 count"], angle: Float[Array, " count"], witness: Scalar
+) -> list[Array]:
     """Nine planes of rotations by angles (rad) about axes.
 
     By quaternions, which need no normalisation.
     """
-    # Computed once, where each of the nine entries would compute it again.
-    scalar, sine, axis = jax.lax.optimization_barrier((*draws.circle(angle / (4 * np.pi)), axis))
+    half = angle / (4 * np.pi)
+    scalar, sine = computed_once(lambda: draws.circle(half), witness)
     vector = [sine * component for component in axis]
     double = 2 / (scalar * scalar + unrolled.dot(vector, vector))
     lever = unrolled.cross(vector)
