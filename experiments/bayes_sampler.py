@@ -48,6 +48,11 @@ def log_law(law: OffsetLaw, u: Float[np.ndarray, "n draws"]) -> Float[np.ndarray
         return np.log(np.prod(np.maximum(inside, 0.0), axis=0))
 
 
+def log_uniform_untold(u: Float[np.ndarray, "n draws"]) -> Float[np.ndarray, " draws"]:
+    """Log density of uniform offsets of any size a, all ln a as probable: int a^-n da / a."""
+    return -len(u) * np.log(np.max(np.abs(u), axis=0))
+
+
 def soft_log_law(law: OffsetLaw, u: Float[np.ndarray, "n draws"]) -> Float[np.ndarray, " draws"]:
     """The same with slopes beyond the edges, for a proposal to find its way inside."""
     if law in ("normal", "heavy-tailed"):
@@ -69,6 +74,7 @@ class Target:
         law: of the offsets.
         size: of the law, mm.
         position: q_i at the origin, mm.
+        told: the size is told; otherwise (uniform law only) it is one more unknown.
         turn: how c moves q_i there.
         points: lateral position and range, mm.
         whitening: lower triangular inverse root of every covariance.
@@ -76,6 +82,7 @@ class Target:
 
     law: OffsetLaw
     size: float
+    told: bool
     position: Float[np.ndarray, "n 3"]
     turn: Float[np.ndarray, "n 3 3"]
     points: Float[np.ndarray, "n 2"]
@@ -105,8 +112,11 @@ class Target:
         lateral = w[:, 0, 0, None] * lateral
         squares = np.einsum("nd,nd->d", lateral, lateral)
         squares += np.einsum("nd,nd->d", distance, distance)
+        offsets = q[:, 1] / self.size
+        if not self.told:
+            return log_uniform_untold(offsets) - 0.5 * squares
         law = soft_log_law if soft else log_law
-        return law(self.law, q[:, 1] / self.size) - 0.5 * squares
+        return law(self.law, offsets) - 0.5 * squares
 
     def linear(self, sd: float) -> tuple[Float[np.ndarray, "m 9"], Float[np.ndarray, " m"]]:
         """Jacobian and whitened residuals at the origin, offsets taken as Gaussian of this SD."""
@@ -155,6 +165,7 @@ def posterior_mean(
     data: tuple[np.ndarray, np.ndarray, np.ndarray],
     start: tuple[np.ndarray, np.ndarray],
     random: np.random.Generator,
+    told: bool = True,
 ) -> Mean:
     """Posterior mean of X by adaptive importance sampling.
 
@@ -164,19 +175,20 @@ def posterior_mean(
         data: poses (n, 4, 4), points (n, 2), covariances (n, 2, 2), mm.
         start: X and c near the solution.
         random: a generator.
+        told: the size is told; otherwise it is only where the search begins (uniform law).
     """
     x, c = (np.array(value) for value in start)
     sd = size * standard_deviation(law)
     whitening = np.linalg.inv(np.linalg.cholesky(data[2]))
     for _ in range(8):
-        target = about(law, size, data, whitening, x, c)
+        target = about(law, (size, told), data, whitening, x, c)
         jacobian, errors = target.linear(sd)
         scale = 1 / np.linalg.norm(jacobian, axis=0)
         step = -scale * np.linalg.lstsq(jacobian * scale, errors, rcond=None)[0]
         x, c = moved(x, step[:6]), c + step[6:]
         if np.linalg.norm(jacobian @ step) < 1e-3:
             break
-    target = about(law, size, data, whitening, x, c)
+    target = about(law, (size, told), data, whitening, x, c)
     jacobian = target.linear(sd)[0]
     scale = 1 / np.linalg.norm(jacobian, axis=0)
     root = scale[:, None] * np.linalg.inv(np.linalg.qr(jacobian * scale, mode="r"))
@@ -214,12 +226,14 @@ def posterior_mean(
     return Mean(moved(x, mean[:6]), effective(weight), error)
 
 
-def about(law: OffsetLaw, size: float, data: tuple, whitening: np.ndarray, x, c) -> Target:
+def about(
+    law: OffsetLaw, size: tuple[float, bool], data: tuple, whitening: np.ndarray, x, c
+) -> Target:
     """The posterior about X and c."""
     poses, points, _ = data
     turn = np.swapaxes(poses[:, :3, :3] @ x[:3, :3], 1, 2)
     in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], c - poses[:, :3, 3])
-    return Target(law, size, (in_probe - x[:3, 3]) @ x[:3, :3], turn, points, whitening)
+    return Target(law, *size, (in_probe - x[:3, 3]) @ x[:3, :3], turn, points, whitening)
 
 
 def moved(x: np.ndarray, tangent: np.ndarray) -> np.ndarray:

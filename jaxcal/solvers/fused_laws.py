@@ -11,8 +11,8 @@ eliminated once, exactly, from what the measurements say (:func:`marginal`); the
 z = (s, w_x, w_z, d), 21 + 6 sums over the images and a 6x6 inverse each; and what comes out, after
 the average over the laws, is carried back to all unknowns (:meth:`Marginal.lifted`).
 
-The laws of one family stand beside each other as further lanes. The Gaussian law needs no sweep:
-its sites are the sums that the evidence step left.
+The laws of one family share a program. The Gaussian law needs no sweep: its sites are the sums that
+the evidence step left.
 """
 
 from __future__ import annotations
@@ -189,29 +189,25 @@ def propagate(
         sd: their SDs, mm.
         sweeps: how many.
     """
-    lanes = sd.shape[1]
     squares = _full([squares[PAIRS.index((SEEN[i], SEEN[j]))] for i, j in TRIANGLE])
     pull = jnp.stack([pull[k] for k in SEEN])
     parts, order = [], []
     for family in dict.fromkeys(families):
         at = [k for k, name in enumerate(families) if name == family]
-        count = len(at)
-
-        def beside(values: Array, count: int = count) -> Array:
-            return jnp.tile(values, (1,) * (values.ndim - 1) + (count,))
-
-        wide = jax.tree.map(lambda plane, count=count: jnp.tile(plane, (count, 1)), sites)
-        scale = jnp.concatenate([sd[k] for k in at])
-        start = _solved(
-            beside(known.information) + beside(squares) / scale**2,
-            beside(known.gradient) - beside(pull) / scale**2,
-        )
         exact = family == "gaussian" and sites.lower is None
-        found = _sweep_all(
-            family, scale, wide, beside(known.information), beside(known.gradient), start,
-            0 if exact else sweeps,
-        )  # fmt: skip
-        parts.append(jax.tree.map(lambda x, n=count: x.reshape(*x.shape[:-1], n, lanes), found))
+
+        def swept(scale: Array, family: Family = family, exact: bool = exact) -> tuple:
+            start = _solved(
+                known.information + squares / scale**2, known.gradient - pull / scale**2
+            )
+            return _sweep_all(
+                family, scale, sites, known.information, known.gradient, start,
+                0 if exact else sweeps,
+            )  # fmt: skip
+
+        # One after the other: side by side they would not stay in the second-level cache.
+        found = jax.lax.map(swept, jnp.stack([sd[k] for k in at]))
+        parts.append([jnp.moveaxis(each, 0, -2) for each in found])
         order += at
     back = [order.index(k) for k in range(len(order))]
     mean, covariance, evidence, change = (
