@@ -29,7 +29,7 @@ from jaxcal.solvers.expectation_propagation import Linear
 from jaxcal.solvers.least_squares import linearise
 from jaxcal.solvers.variance import least_sigma
 
-ROUNDS = 3
+ROUNDS = 2
 """Linearisations."""
 
 UPDATES = 2

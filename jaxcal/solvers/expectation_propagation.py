@@ -86,7 +86,7 @@ def propagate(
         linear: the linearised problem.
         families: of the laws.
         sd: their SDs, mm.
-        sweeps: how many.
+        sweeps: how many, at least one.
     """
     h, used = linear.direction, linear.used
     size = h.shape[1]
@@ -101,7 +101,7 @@ def propagate(
     for k, family in enumerate(families):
         groups.setdefault(family, []).append(k)
     precision = jnp.broadcast_to((1 / sd**2)[:, None], (len(families), len(used))) * used
-    start = (precision, jnp.zeros_like(precision), jnp.zeros((len(families), size), h.dtype))
+    start = (precision, jnp.zeros_like(precision))
 
     def belief(tau: Array, nu: Array) -> tuple[Array, Array, Array, Array]:
         information = linear.information + (tau @ squares)[:, place]
@@ -125,32 +125,38 @@ def propagate(
         order = np.argsort(np.concatenate(list(groups.values())))
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *parts)
 
-    def sweep(_: Array, state: tuple) -> tuple:
-        tau, nu, _ = state
-        covariance, mean, _, _ = belief(tau, nu)
+    def found_at(tau: Array, nu: Array, covariance: Array, mean: Array):
         centre, without = cavity(tau, nu, covariance, mean)
-        found = moments(centre, without)
+        return moments(centre, without), centre, without
+
+    def refresh(tau: Array, nu: Array, found: Moments, centre: Array, without: Array):
         new_tau, new_nu = refreshed(found, centre, without)
         tau = tau + DAMPING * used * (new_tau - tau)
-        nu = nu + DAMPING * used * (new_nu - nu)
-        return tau, nu, mean
+        return tau, nu + DAMPING * used * (new_nu - nu)
 
-    tau, nu, before = jax.lax.fori_loop(0, sweeps, sweep, start)
-    covariance, mean, rhs, log_determinant = belief(tau, nu)
-    centre, without = cavity(tau, nu, covariance, mean)
-    mass = moments(centre, without).log_mass
+    def sweep(_: Array, state: tuple) -> tuple:
+        covariance, mean, _, _ = belief(*state)
+        return refresh(*state, *found_at(*state, covariance, mean))
+
+    tau, nu = jax.lax.fori_loop(0, sweeps - 1, sweep, start)
+    covariance, before, rhs, log_determinant = belief(tau, nu)
+    found, centre, without = found_at(tau, nu, covariance, before)
+    # The evidence is stationary in the sites, so it is as good before the last sweep as after.
     joined = 1 + tau * without
-    site = mass + 0.5 * jnp.log(joined)
+    site = found.log_mass + 0.5 * jnp.log(joined)
     site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
     site = site + nu * linear.offset - 0.5 * tau * linear.offset**2
-    evidence = jnp.sum(used * site, axis=1) + 0.5 * jnp.sum(rhs * mean, axis=1)
+    evidence = jnp.sum(used * site, axis=1) + 0.5 * jnp.sum(rhs * before, axis=1)
+    evidence = evidence - 0.5 * log_determinant
+    # tau w = tau v / (1 - tau v) shows how much room there was.
+    crowded = jnp.any(tau * without * used > 0.99 / LEAST_ROOM, axis=1)
+
+    tau, nu = refresh(tau, nu, found, centre, without)
+    covariance, mean, _, _ = belief(tau, nu)
     information = linear.information + (tau @ squares)[:, place]
     step = mean - before
     change = jnp.sqrt(jnp.maximum(jnp.einsum("kp,kpq,kq->k", step, information, step), 0.0))
-    # tau w = tau v / (1 - tau v) shows how much room there was.
-    crowded = jnp.any(tau * without * used > 0.99 / LEAST_ROOM, axis=1)
-    change = jnp.where(crowded, jnp.inf, change)
-    return Posterior(mean, covariance, evidence - 0.5 * log_determinant, change)
+    return Posterior(mean, covariance, evidence, jnp.where(crowded, jnp.inf, change))
 
 
 def refreshed(found: Moments, centre: Array, without: Array) -> tuple[Array, Array]:

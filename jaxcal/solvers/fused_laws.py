@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxcal.model.shapes import Family, tilted
+from jaxcal.model.shapes import Family, Moments, tilted
 from jaxcal.solvers import dense, unrolled
 from jaxcal.solvers.expectation_propagation import DAMPING, LEAST_ROOM, SWEEPS, refreshed
 from jaxcal.solvers.fused import PAIRS, total
@@ -250,7 +250,7 @@ def _sweep_all(
     """Mean, covariance, log evidence and last change under laws of one family."""
     h, offset, used = sites.direction, sites.offset, sites.used
     tau = used / (sd * sd)[:, None]
-    state = (tau, jnp.zeros_like(tau), start, jnp.zeros_like(sd))
+    state = (tau, jnp.zeros_like(tau), start)
 
     def cavity(tau: Array, nu: Array, belief: _Belief) -> tuple[Array, Array]:
         entry = belief.covariance[..., None]
@@ -264,10 +264,14 @@ def _sweep_all(
         centre = shrink * (at - variance * nu)
         return centre, jnp.where(used > 0, variance * shrink, 1.0)
 
-    def sweep(_: Array, state: tuple) -> tuple:
-        tau, nu, before, _ = state
-        centre, without = cavity(tau, nu, before)
+    def moments(tau: Array, nu: Array, belief: _Belief) -> tuple[Moments, Array, Array]:
+        centre, without = cavity(tau, nu, belief)
         found = tilted(family, sd, centre, without, sites.lower, sites.upper)
+        return found, centre, without
+
+    def refresh(
+        tau: Array, nu: Array, before: _Belief, found: Moments, centre: Array, without: Array
+    ) -> tuple[Array, Array, _Belief]:
         new_tau, new_nu = refreshed(found, centre, without)
         tau = tau + DAMPING * used * (new_tau - tau)
         nu = nu + DAMPING * used * (new_nu - nu)
@@ -276,21 +280,26 @@ def _sweep_all(
         force = nu - tau * offset
         planes = [weighted[i] * h[j] for i, j in TRIANGLE]
         sums = total([*planes, *(force * row for row in h)])
-        after = _solved(information + _full(sums[:21]), gradient + jnp.stack(sums[21:]))
-        step = after.mean - before.mean
-        length = jnp.sum(step * dense.product_abreast(after.information, step), axis=0)
-        return tau, nu, after, jnp.sqrt(jnp.maximum(length, 0.0))
+        return tau, nu, _solved(information + _full(sums[:21]), gradient + jnp.stack(sums[21:]))
 
-    tau, nu, belief, change = jax.lax.fori_loop(0, sweeps, sweep, state)
-    centre, without = cavity(tau, nu, belief)
-    mass = tilted(family, sd, centre, without, sites.lower, sites.upper).log_mass
+    state = jax.lax.fori_loop(
+        0, max(sweeps - 1, 0), lambda _, state: refresh(*state, *moments(*state)), state
+    )
+    tau, nu, belief = state
+    found, centre, without = moments(tau, nu, belief)
+    # The evidence is stationary in the sites, so it is as good before the last sweep as after.
     joined = 1 + tau * without
-    site = mass + 0.5 * jnp.log(joined)
+    site = found.log_mass + 0.5 * jnp.log(joined)
     site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
     site = site + nu * offset - 0.5 * tau * offset**2
     gained = jnp.sum(belief.rhs * belief.mean, axis=0)
     crowded = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)
     site, crowded = total([used * site, crowded])
     evidence = site + 0.5 * gained - 0.5 * belief.log_determinant
-    change = jnp.where(crowded > 0, jnp.inf, change)
-    return belief.mean, belief.covariance, evidence, change
+    if sweeps == 0:
+        return belief.mean, belief.covariance, evidence, jnp.where(crowded > 0, jnp.inf, 0.0)
+    *_, after = refresh(tau, nu, belief, found, centre, without)
+    step = after.mean - belief.mean
+    length = jnp.sum(step * dense.product_abreast(after.information, step), axis=0)
+    change = jnp.where(crowded > 0, jnp.inf, jnp.sqrt(jnp.maximum(length, 0.0)))
+    return after.mean, after.covariance, evidence, change
