@@ -11,8 +11,8 @@ half its square: 0.05 is an eighth of a per cent. ``ci95_half`` is that of ``aut
 the trials, paired. Data without noise are told a noise of EXACT_MM, not zero. The self-tuned
 Gaussian beside it (``gaussian``) is given points alone, without covariances.
 
-Where the offsets are uniform there is a second limit, ``untold``: the same, but that the bound is one
-more unknown (every logarithm of it as probable), as it is to everybody in fact.
+Where the offsets are uniform there is a second limit, ``untold``: the same, but that the bound is
+one more unknown (every logarithm of it as probable), as it is to everybody in fact.
 
 Seed 20261126; trial k of a cell is fold_in(root, cell * 10^6 + k), cells counted over all laws.
 """

@@ -54,7 +54,7 @@ def solve_problem(
         plan: what is static about it.
         agreed: what :func:`agreed_images` found, where it was asked before.
     """
-    everything = problem
+    everything = problem = problem.cleared(problem.mask)
     problem = agreeing(problem, plan) if agreed is None else replace(problem, mask=agreed)
     frozen = jax.lax.stop_gradient((problem, given))
     return finish(_run_method(*frozen, plan), problem, everything, given, plan)
@@ -95,6 +95,7 @@ def finish(
         given: numbers that came with the request.
         plan: what is static about it.
     """
+    problem, everything = problem.cleared(everything.mask), everything.cleared(everything.mask)
     # The solver saw constants; here its answer becomes a function of the data again.
     parameters, offset, prior = _attach(solution, problem, given, plan)
     averaged = None

@@ -7,6 +7,8 @@ is the same class with leading axes on every array.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.core
@@ -80,6 +82,33 @@ class Problem(eqx.Module):
     def batch_shape(self) -> tuple[int, ...]:
         """Leading axes; () for one problem."""
         return self.mask.shape[:-1]
+
+    def cleared(self, used: Float[Array, "*batch n"]) -> Problem:
+        """With harmless values where an image is not used: NaN times a mask of 0 is NaN, not 0.
+
+        Args:
+            used: 0 for images whose values are not to be read.
+        """
+
+        def keep(values: Array | None, instead: np.ndarray | float) -> Array | None:
+            if values is None:
+                return None
+            shape = used.shape + (1,) * (values.ndim - used.ndim)
+            return jnp.where(used.reshape(shape) > 0, values, jnp.asarray(instead, values.dtype))
+
+        channels = self.channels
+        if channels is not None:
+            channels = Channels(
+                keep(channels.distances, 0.0), keep(channels.heard, 0.0), channels.elements
+            )  # fmt: skip
+        return replace(
+            self,
+            poses=keep(self.poses, np.eye(4)),
+            measurements=keep(self.measurements, 1.0),
+            covariance=keep(self.covariance, np.eye(2)),
+            max_elevation=keep(self.max_elevation, 1.0),
+            channels=channels,
+        )
 
     @classmethod
     def from_recording(

@@ -83,9 +83,13 @@ def test_images_left_out_do_not_count(solver):
     keep = np.array([0, 1, 4, 6, 7, 9, 11])
     mask = np.zeros(12)
     mask[keep] = 1
-    rubbish = np.array(everything.measurements)
-    rubbish[mask == 0] = 1e4
-    masked = replace(everything, mask=jnp.asarray(mask), measurements=jnp.asarray(rubbish))
+    rubbish, nowhere = np.array(everything.measurements), np.array(everything.poses)
+    rubbish[mask == 0] = [[1e4], [np.nan], [1e4], [np.nan], [1e4]]
+    nowhere[8] = np.nan
+    masked = replace(
+        everything, mask=jnp.asarray(mask), measurements=jnp.asarray(rubbish),
+        poses=jnp.asarray(nowhere),
+    )  # fmt: skip
     left_out = jaxcal.calibrate(masked, **solver.arguments)
     without = jaxcal.calibrate(select(everything, keep), **solver.arguments)
     assert_same(left_out, without, solver.agreement)
@@ -95,6 +99,7 @@ def test_images_left_out_do_not_count(solver):
     np.testing.assert_allclose(left_out.rms, without.rms, atol=solver.agreement)
     assert int(left_out.images_used) == len(keep)
     assert np.all(np.asarray(left_out.elevation)[mask == 0] == 0)
+    assert np.all(np.isfinite(left_out.covariance)) == np.all(np.isfinite(without.covariance))
 
 
 @pytest.mark.parametrize("images", [4, 1000])
