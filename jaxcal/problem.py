@@ -90,9 +90,7 @@ class Problem(eqx.Module):
             used: 0 for images whose values are not to be read.
         """
 
-        def keep(values: Array | None, instead: np.ndarray | float) -> Array | None:
-            if values is None:
-                return None
+        def keep(values: Array, instead: np.ndarray | float) -> Array:
             shape = used.shape + (1,) * (values.ndim - used.ndim)
             return jnp.where(used.reshape(shape) > 0, values, jnp.asarray(instead, values.dtype))
 
@@ -105,8 +103,8 @@ class Problem(eqx.Module):
             self,
             poses=keep(self.poses, np.eye(4)),
             measurements=keep(self.measurements, 1.0),
-            covariance=keep(self.covariance, np.eye(2)),
-            max_elevation=keep(self.max_elevation, 1.0),
+            covariance=None if self.covariance is None else keep(self.covariance, np.eye(2)),
+            max_elevation=None if self.max_elevation is None else keep(self.max_elevation, 1.0),
             channels=channels,
         )
 

@@ -257,7 +257,8 @@ def draw_noise(key: Key[Array, ""], protocol: Protocol) -> Complex64[Array, "n h
 def arrange(numbers: Numbers, protocol: Protocol) -> Planes:
     """Poses and targets as the random numbers say; nothing is measured yet."""
     probe, n = protocol.probe, protocol.images
-    curved, witness = isinstance(probe, CurvilinearProbe), protocol.noise_mm
+    curved = isinstance(probe, CurvilinearProbe)
+    witness = protocol.noise_mm
     width = protocol.sector * probe.half_angle_rad if curved else protocol.lateral_mm
     shallow, deep = protocol.depth_mm
     middle, half = 0.5 * (shallow + deep), 0.5 * abs(deep - shallow)

@@ -125,18 +125,23 @@ def propagate(
         order = np.argsort(np.concatenate(list(groups.values())))
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *parts)
 
-    def found_at(tau: Array, nu: Array, covariance: Array, mean: Array):
+    def found_at(
+        tau: Array, nu: Array, covariance: Array, mean: Array
+    ) -> tuple[Moments, Array, Array]:
         centre, without = cavity(tau, nu, covariance, mean)
         return moments(centre, without), centre, without
 
-    def refresh(tau: Array, nu: Array, found: Moments, centre: Array, without: Array):
+    def refresh(
+        tau: Array, nu: Array, found: Moments, centre: Array, without: Array
+    ) -> tuple[Array, Array]:
         new_tau, new_nu = refreshed(found, centre, without)
         tau = tau + DAMPING * used * (new_tau - tau)
         return tau, nu + DAMPING * used * (new_nu - nu)
 
     def sweep(_: Array, state: tuple) -> tuple:
-        covariance, mean, _, _ = belief(*state)
-        return refresh(*state, *found_at(*state, covariance, mean))
+        tau, nu = state
+        covariance, mean, _, _ = belief(tau, nu)
+        return refresh(tau, nu, *found_at(tau, nu, covariance, mean))
 
     tau, nu = jax.lax.fori_loop(0, sweeps - 1, sweep, start)
     covariance, before, rhs, log_determinant = belief(tau, nu)

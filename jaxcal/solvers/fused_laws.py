@@ -282,10 +282,11 @@ def _sweep_all(
         sums = total([*planes, *(force * row for row in h)])
         return tau, nu, _solved(information + _full(sums[:21]), gradient + jnp.stack(sums[21:]))
 
-    state = jax.lax.fori_loop(
-        0, max(sweeps - 1, 0), lambda _, state: refresh(*state, *moments(*state)), state
-    )
-    tau, nu, belief = state
+    def sweep(_: Array, state: tuple) -> tuple:
+        tau, nu, belief = state
+        return refresh(tau, nu, belief, *moments(tau, nu, belief))
+
+    tau, nu, belief = jax.lax.fori_loop(0, max(sweeps - 1, 0), sweep, state)
     found, centre, without = moments(tau, nu, belief)
     # The evidence is stationary in the sites, so it is as good before the last sweep as after.
     joined = 1 + tau * without
