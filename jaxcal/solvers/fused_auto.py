@@ -2,20 +2,18 @@
 
 It is :func:`jaxcal.solvers.auto.average_over_laws`, which is the reference and explains it, for
 plain problems: a rigid X and common SDs or own covariances. Evidence and laws have their own
-modules, :mod:`jaxcal.solvers.fused_evidence` and :mod:`jaxcal.solvers.fused_laws`. Derivatives are
-the reference's.
+modules, :mod:`jaxcal.solvers.fused_evidence` and :mod:`jaxcal.solvers.fused_laws`. Nobody takes its
+derivatives: those of an answer are the reference's (:mod:`jaxcal.abreast`).
 """
 
 from __future__ import annotations
-
-from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxcal.model.parameters import RIGID, Parameters
+from jaxcal.model.parameters import Parameters
 from jaxcal.model.priors import Gaussian, covariance_shape
 from jaxcal.model.shapes import FAMILIES, Family, Shape
 from jaxcal.problem import Problem
@@ -24,7 +22,6 @@ from jaxcal.solvers.auto import (
     LOG_ODDS_OF_MEAN,
     Averaged,
     OffsetLaw,
-    average_over_laws,
     weights,
 )
 from jaxcal.solvers.fused import UNKNOWNS, Guess, Images, targets
@@ -43,7 +40,6 @@ from jaxcal.solvers.lanes import apart, choose
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(3,))
 def average_abreast(
     parameters: Parameters, belief: Gaussian, problems: Problem, shapes: tuple[Shape, ...]
 ) -> Averaged:
@@ -201,11 +197,3 @@ def candidates(
         three = jnp.concatenate([ratio * each.scale[0], each.scale[1:]])
         found.append(Candidate.of(each, three, each.log_evidence - shapes))
     return found, shape
-
-
-@average_abreast.defjvp
-def _average_jvp(shapes: tuple[Shape, ...], primals: tuple, tangents: tuple) -> tuple:
-    def one(parameters: Parameters, belief: Gaussian, problem: Problem) -> Averaged:
-        return average_over_laws(parameters, belief, problem, RIGID, shapes)
-
-    return jax.jvp(jax.vmap(one), primals, tangents)
