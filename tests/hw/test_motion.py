@@ -218,6 +218,7 @@ def fault_in_motion(
     with ThreadPoolExecutor(1) as pool:
         future = pool.submit(motion.move_to, PLAN.targets[2])
         while math.hypot(*robot.state()["velocity"]) < 0.04:
+            assert not future.done(), f"over before the fault: {future.exception()}"
             time.sleep(0.002)
         before = robot.state()["t"]
         fault()
@@ -262,7 +263,9 @@ def test_the_robot_rests_within_200_ms_of_a_fault(name, kind, text, ends):
             time.sleep(0.6)
         return reasons[0]
 
-    with EmulatedRobot() as robot, moving(robot, guard=guard, caller_s=0.15) as motion:
+    # On a machine with other work any caller is silent for a while; only one case is about that.
+    patience = 0.15 if name == "silent" else 2.0
+    with EmulatedRobot() as robot, moving(robot, guard=guard, caller_s=patience) as motion:
         faults = {
             "guard": lambda: reasons.__setitem__(0, "30 echo frames were lost"),
             "silent": lambda: reasons.__setitem__(0, "silent"),
