@@ -339,6 +339,7 @@ def test_killing_the_caller_stops_the_robot():
             assert caller.stdout is not None
             assert caller.stdout.readline() == b"ready\n"
             while math.hypot(*robot.state()["velocity"]) < 0.04:
+                assert caller.poll() is None
                 time.sleep(0.002)
             before = robot.state()["t"]
             caller.kill()
