@@ -56,6 +56,7 @@ def test_a_curved_array_gives_the_offsets_with_their_signs():
     assert joint.channel_sigma == pytest.approx(0.05, rel=0.1)
 
 
+@pytest.mark.slow
 def test_on_a_straight_array_points_with_covariances_say_the_same():
     noise, offset = 0.05, 1.2
     data = recording(STRAIGHT, noise=noise)
@@ -147,6 +148,7 @@ def test_missing_and_late_lines_do_no_harm():
     assert precision(result, data) < 1.5 * precision(jaxcal.calibrate(data, prior="gaussian"), data)
 
 
+@pytest.mark.slow
 def test_derivative_matches_finite_differences():
     problem = jaxcal.Problem.from_recording(recording(CURVED, noise=0.2))
     assert problem.channels is not None
@@ -174,6 +176,7 @@ def test_a_batch_is_its_lanes():
         np.testing.assert_allclose(batch.elevation[lane], alone.elevation, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_command_line_calibrates_raw_times(tmp_path, capsys):
     path = tmp_path / "raw.h5"
     save(wrong_medium(recording(STRAIGHT), 1500.0, 0.0), path)

@@ -42,6 +42,7 @@ def test_holding_out_an_image_is_calibrating_without_it(data):
     assert np.asarray(found.converged).all()
 
 
+@pytest.mark.slow
 def test_a_bad_image_has_the_most_influence(data):
     spoilt = replace(data, measurements=data.measurements.at[4].add(jnp.asarray([6.0, 4.0])))
     found = cross_validate(spoilt, **CONVENTIONAL)

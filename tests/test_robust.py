@@ -123,6 +123,7 @@ def test_command_line(tmp_path, capsys):
     assert record["outlier_reasons"][0]["image"] == 4
 
 
+@pytest.mark.slow
 def test_of_clean_images_hardly_any_is_left_out(consensus):
     """Then the robust answer is the plain one; medians alone would leave out one in 200 of few."""
     left_out = images = 0
@@ -136,6 +137,7 @@ def test_of_clean_images_hardly_any_is_left_out(consensus):
     assert left_out <= images / 1500
 
 
+@pytest.mark.slow
 def test_a_third_of_a_dozen_images(consensus):
     clean = jaxcal.stack([problem(seed, images=12, noise_mm=1.0) for seed in range(128)])
     keys = jax.random.split(jax.random.key(5), 128)

@@ -69,6 +69,7 @@ def taken(path: Path) -> np.ndarray:
         return np.asarray(file["calibration/pose"])
 
 
+@pytest.mark.slow
 def test_a_short_run_ends_in_a_recording_that_calibrate_takes(tmp_path, capsys):
     path, lines, pause = tmp_path / "rec.h5", [], Pause()
 
