@@ -31,7 +31,7 @@ from jaxcal import Problem, calibrate_batch  # noqa: E402
 from jaxcal.simulation import Protocol, simulate  # noqa: E402
 
 SEED = 20261126
-SIZES = ((50, 512), (12, 512), (200, 128), (50, 64), (50, 4096))
+SIZES = ((50, 512), (12, 512))
 QUICK = ((50, 512),)
 ROUNDS, QUICK_ROUNDS = 15, 5
 HEADER = ["images", "batch", "rounds", "contestant", "us_per_problem", "us_quartile_low",

@@ -28,6 +28,10 @@ from typing import IO, Any
 CORES = sorted(os.sched_getaffinity(0))
 if "--devices" not in sys.argv:
     os.sched_setaffinity(0, {CORES[0]})  # before JAX counts them
+    os.environ["BENCHMARK_CORES"] = ",".join(map(str, CORES))
+else:
+    # A process inherits the one core of the one that started it.
+    os.sched_setaffinity(0, {int(core) for core in os.environ["BENCHMARK_CORES"].split(",")})
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax  # noqa: E402
