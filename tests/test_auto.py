@@ -93,6 +93,7 @@ def linear_problem(n: int = 12) -> Linear:
     )
 
 
+@pytest.mark.slow
 def test_expectation_propagation_against_integration():
     linear = linear_problem()
     sd = jnp.asarray([1.1, 1.0, 0.8, 0.9])

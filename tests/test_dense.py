@@ -61,6 +61,7 @@ def test_triangularised_least_squares():
     np.testing.assert_allclose(np.linalg.solve(reduced[:, :12], reduced[:, 12:]), wanted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -50,6 +50,7 @@ def test_no_set_is_misjudged(kind, seed, elevation, noise):
         assert result.status != "converged"
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None, derandomize=True)
 @given(kinds, st.integers(0, 10**6), elevations, noises)
 def test_the_conventional_method_arrives_or_says_why_not(kind, seed, elevation, noise):

@@ -74,6 +74,7 @@ def test_few_or_hopeless_images_are_all_kept(consensus):
     np.testing.assert_array_equal(found.keep[1], consensus(spoilt).keep[1])
 
 
+@pytest.mark.slow
 def test_robust_solve_is_that_of_the_good_images():
     _, spoilt, outlier = batch(2, 0.3, "mixed", elevation_mm=1.0, noise_mm=0.5)
     robust = jaxcal.calibrate_batch(spoilt, "conventional", robust=True)

@@ -102,6 +102,7 @@ def test_images_left_out_do_not_count(solver):
     assert np.all(np.isfinite(left_out.covariance)) == np.all(np.isfinite(without.covariance))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("images", [4, 1000])
 def test_any_number_of_images(solver, images):
     recording = experiment(5, images=images, noise_mm=0.2, elevation_mm=0.3)
