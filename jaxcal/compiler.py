@@ -62,15 +62,19 @@ def computed_once(make: Callable[[], T], witness: jax.typing.ArrayLike) -> T:
 
     Args:
         make: without arguments; what it closes over may be traced.
-        witness: any number that is not negative and, for an effect, an argument of the program and
-            the same for the whole batch. Where it is NaN, all is zero.
+        witness: a number that is not negative and, for an effect, an argument of the program and
+            the same for the whole batch. Where it is negative or NaN, everything is NaN, which
+            nobody takes for an answer.
+
+    Returns:
+        The same arrays as ``make()``, which have to be floating or complex.
     """
     taken = jnp.asarray(witness) >= 0
     if not isinstance(taken, jax.core.Tracer):
         return make()
     nothing = jax.eval_shape(make)
     return jax.lax.cond(
-        taken, make, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
+        taken, make, lambda: jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), nothing)
     )
 
 

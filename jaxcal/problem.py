@@ -86,6 +86,8 @@ class Problem(eqx.Module):
     def cleared(self, used: Float[Array, "*batch n"]) -> Problem:
         """With harmless values where an image is not used: NaN times a mask of 0 is NaN, not 0.
 
+        The mask stays as it is, and so do all shapes.
+
         Args:
             used: 0 for images whose values are not to be read.
         """

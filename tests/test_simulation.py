@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,3 +54,13 @@ def test_normal_offsets_have_the_given_sd():
 def test_bad_protocols_are_refused(bad):
     with pytest.raises(InputError):
         Protocol(**bad)
+
+
+def test_a_traced_size_that_makes_no_sense_is_not_passed_over_in_silence():
+    @jax.jit
+    def poses(noise):
+        return simulate(jax.random.key(0), replace(Protocol(images=8), noise_mm=noise)).poses
+
+    for noise, lost in ((0.0, False), (-1.0, True), (np.nan, True)):
+        assert np.isnan(np.asarray(poses(noise))[:, :3]).all() == lost
+        assert np.isnan(np.asarray(poses(noise))).any() == lost
