@@ -112,7 +112,7 @@ def run_method(
     start = begun.fit.guess
     if plan.method == "conventional":
         fit = begun.fit
-        return solution(fit, fit.settled, cost=fit.normal.cost, iterations=fit.iterations)
+        return solution(fit, fit.settled, cost=fit.cost, iterations=fit.iterations)
     if isinstance(prior, Bounded):
         done = alternate(
             start, prior.bound, images, tolerance_rad=options.tolerance_rad,
@@ -127,9 +127,10 @@ def run_method(
     assert isinstance(prior, Gaussian)
     if not plan.self_tuning:
         fit = minimise(
-            start, Measured(prior.sigma.T), images, damping=1e-6, max_steps=options.max_iterations
-        )
-        return solution(fit, fit.settled, cost=fit.normal.cost, iterations=fit.iterations)
+            start, Measured(prior.sigma.T), images, damping=1e-6, max_steps=options.max_iterations,
+            head_start=False,
+        )  # fmt: skip
+        return solution(fit, fit.settled, cost=fit.cost, iterations=fit.iterations)
     tuned = self_tuned(start, prior.sigma.T, images, max_rounds=options.max_iterations)
     floored = tuned.updated <= 1.001 * RELATIVE_FLOOR * jnp.max(tuned.updated, axis=0)
     return solution(

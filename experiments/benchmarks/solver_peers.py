@@ -154,10 +154,7 @@ def fused_solver(
         )  # fmt: skip
         images = images_of(poses, points)
         sigma = jnp.full((3, points.shape[0]), SIGMA_MM, points.dtype)
-        belief = Circle(
-            sigma, jnp.full(points.shape[0], OFFSET_SD_MM, points.dtype),
-            jnp.full(points.shape[:2], jnp.inf, points.dtype),
-        )  # fmt: skip
+        belief = Circle(sigma, jnp.full(points.shape[0], OFFSET_SD_MM, points.dtype))
         done = lanes.minimise(guess, belief, images)
         found = done.guess.parameters()
         return (

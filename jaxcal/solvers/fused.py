@@ -175,6 +175,10 @@ class Belief(eqx.Module):
         """How much a mm of error can be in a whitened residual."""
         return 1.0
 
+    def planar_weight(self) -> Float[Array, "3 lanes"] | None:
+        """Weights of q - (x, 0, r), 1/mm^2, with which the belief is nearly this; None for none."""
+        return None
+
 
 class Measured(Belief):
     """Lateral position, range and elevational offset, each with its SD; no offset unknown is left.
@@ -205,6 +209,10 @@ class Measured(Belief):
 
     def largest_weight(self) -> Float[Array, " lanes"]:
         return 1 / jnp.min(self.sigma, axis=0)
+
+    def planar_weight(self) -> Float[Array, "3 lanes"]:
+        lateral, axial, across = self.sigma
+        return 1 / jnp.stack([lateral**2, across**2, axial**2])
 
 
 class Held(Belief):
@@ -255,19 +263,19 @@ class Circle(Belief):
     Attributes:
         sigma: SDs of the lateral, elevational and axial components, mm.
         offset_sd: SD of y_i, mm; inf for none.
-        bound: of |y_i|, mm; it is kept below 0.95 of the range in any case.
-        steps: Halley's, on theta_i.
+        bound: of |y_i|, mm, or None; it is kept below 0.95 of the range in any case.
     """
 
     sigma: Float[Array, "3 lanes"]
     offset_sd: Float[Array, " lanes"]
-    bound: Float[Array, "lanes n"]
-    steps: int = eqx.field(static=True, default=1)
+    bound: Float[Array, "lanes n"] | None = None
 
     def padded(self) -> Circle:
-        return Circle(self.sigma, self.offset_sd, whole(self.bound, 0.0), self.steps)
+        if self.bound is None:
+            return self
+        return Circle(self.sigma, self.offset_sd, whole(self.bound, 0.0))
 
-    def _solve(self, q: Vector, images: Images, steps: int | None = None) -> _OnCircle:
+    def _solve(self, q: Vector, images: Images) -> _OnCircle:
         """The point of every image's circle that belongs to q."""
         across, axial = (1 / (sd * sd)[:, None] for sd in self.sigma[1:])
         prior = (1 / (self.offset_sd * self.offset_sd))[:, None]
@@ -284,30 +292,41 @@ class Circle(Belief):
         ahead = jnp.maximum(b + k, jnp.finfo(a.dtype).tiny ** 0.25)
         inverse = jax.lax.rsqrt(a * a + ahead * ahead)
         s, c = a * inverse, ahead * inverse
-        for _ in range(self.steps if steps is None else steps):
-            slope, plain, exact = at(s, c)
-            third = a * c - (b + 4 * k * c) * s
-            convex = exact > 0.1 * plain
-            up = slope * jnp.where(convex, exact, 1)
-            down = 2 * jnp.where(convex, exact * exact, plain) - jnp.where(convex, slope * third, 0)
-            # tan(half the turn) = -up / down, by the half-angle formulae.
-            square = up * up
-            inverse = 1 / (down * down + square)
-            keep, turn = (down * down - square) * inverse, -2 * up * down * inverse
-            s, c = s * keep + c * turn, c * keep - s * turn
-        limit = jnp.minimum(self.bound / radius, LARGEST_ELEVATION)
-        s = jnp.clip(s, -limit, limit)
-        c = jnp.sqrt(1 - s * s)
         slope, plain, exact = at(s, c)
-        held = ((s >= limit) & (slope < 0)) | ((s <= -limit) & (slope > 0))
+        third = a * c - (b + 4 * k * c) * s
+        convex = exact > 0.1 * plain
+        up = slope * jnp.where(convex, exact, 1)
+        down = 2 * jnp.where(convex, exact * exact, plain) - jnp.where(convex, slope * third, 0)
+        # tan(half the turn) = -up / down, by the half-angle formulae.
+        keep, turn, inverse = down * down - up * up, -2 * up * down, 1 / (down * down + up * up)
+        s, c = (s * keep + c * turn) * inverse, (c * keep - s * turn) * inverse
+        # Within the limit the angle has its cosine; only the limit's own takes another root.
+        limit, beside = self._limit(radius)
+        above, below = s >= limit, s <= -limit
+        bounded = above | below
+        s = jnp.where(above, limit, jnp.where(below, -limit, s))
+        c = jnp.where(bounded | (c < beside), beside, c)
+        slope, plain, exact = at(s, c)
+        held = (above & (slope < 0)) | (below & (slope > 0))
         return _OnCircle(radius, s, c, slope, plain, exact, held)
+
+    def _limit(self, radius: Array) -> tuple[Array | float, Array | float]:
+        """Sine and cosine of the largest theta."""
+        if self.bound is None:
+            return LARGEST_ELEVATION, (1 - LARGEST_ELEVATION**2) ** 0.5
+        sine = jnp.minimum(self.bound / radius, LARGEST_ELEVATION)
+        return sine, jnp.sqrt(1 - sine * sine)
 
     def offset(self, guess: Guess, images: Images) -> Float[Array, "lanes n"]:
         """y_i at a guess, mm."""
         count, images = images.mask.shape[1], images.padded()
         q, _ = targets(guess, images)
-        there = self.padded()._solve(q, images, steps=3)
-        return (images.mask * there.radius * there.sine)[:, :count]
+        there = self.padded()._solve(q, images)
+        # One more Newton step from a place that is as good as exact.
+        steep = jnp.where(there.exact > 0, there.exact, there.plain)
+        turn = jnp.where(there.held, 0.0, -there.slope / steep)
+        sine = there.sine * (1 - 0.5 * turn * turn) + there.cosine * turn
+        return (images.mask * there.radius * sine)[:, :count]
 
     def term(self, q: Vector, images: Images, gate: Float[Array, "lanes 1"]) -> Term:
         there = self._solve(q, images)
@@ -338,6 +357,14 @@ class Circle(Belief):
 
     def largest_weight(self) -> Float[Array, " lanes"]:
         return 1 / jnp.min(self.sigma, axis=0)
+
+    def planar_weight(self) -> Float[Array, "3 lanes"]:
+        lateral, across, axial = self.sigma
+        loose = 1 / self.offset_sd**2
+        if self.bound is not None:
+            # A uniform law's variance.
+            loose = loose + 3 / jnp.max(self.bound, axis=1) ** 2
+        return 1 / jnp.stack([lateral**2, across**2 + 1 / loose, axial**2])
 
 
 def contributions(

@@ -171,7 +171,7 @@ def from_scratch(images: Images, *, max_steps: int = 100) -> Begun:
         turned = _rest(rotation, moments)
         first = choose(index == 0, start, turned)
         fit = minimise(apart(first), belief, images, max_steps=max_steps)
-        lower = (fit.normal.cost < best.normal.cost) | ~jnp.isfinite(best.normal.cost)
+        lower = (fit.cost < best.cost) | ~jnp.isfinite(best.cost)
         better = (index == 0) | (lower & ~sound)
         return index + 1, choose(better, fit, best)
 

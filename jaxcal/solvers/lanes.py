@@ -1,10 +1,15 @@
 """Levenberg-Marquardt on many problems side by side, one pass over the images an iteration.
 
 Every lane has its own damping, gate and stopping rule; a lane that has arrived waits for its
-neighbours with its answer kept. An iteration passes over the images at the lanes' candidates: the
-cost decides whether a candidate is taken, and the same sums are already the normal equations for
-the next. The first candidate is the start, so that one loop body is all there is to compile. Steps
-are Gauss-Newton's until the gradient cosine falls below :data:`GATE`, then exact Newton steps
+neighbours with its answer kept. An iteration looks at the lanes' candidates: the cost decides
+whether a candidate is taken, and the same sums are already the normal equations for the next. The
+first candidate is the start, so that one loop body is all there is to compile.
+
+From a start that may be far away the loop runs twice. First on the moments of the images
+(:mod:`jaxcal.solvers.moments`), where an iteration costs a third of a pass and reads no image, to
+within a few tenths of a mm; then on the images, from where nearly all lanes need the same three
+passes and hardly any waits. Steps on the moments are Gauss-Newton's. Those on the images are so
+where the gradient cosine is above :data:`GATE`, and exact Newton steps below it
 (:mod:`jaxcal.solvers.fused`); where the exact matrix is indefinite the same place is passed again
 without.
 
@@ -21,13 +26,17 @@ lanes, and 1.10 times as one solve a problem, vmapped.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxcal.compiler import computed_once
 from jaxcal.solvers import unrolled
-from jaxcal.solvers.fused import PAIRS, UNKNOWNS, Belief, Guess, Images, Normal, accumulate
+from jaxcal.solvers.fused import Belief, Guess, Images, Normal, accumulate
+from jaxcal.solvers.moments import Moments
 from jaxcal.solvers.unrolled import Vector
 
 GATE = 0.2
@@ -43,48 +52,53 @@ SMALL = 1e-11
 IDLE = 4
 """Steps in a row without a gain above rounding before a lane is called settled."""
 
+NEAR = 0.03
+"""Gradient cosine on the moments from where one step more ends their use."""
+
+NEAR_DAMPING = 1e-6
+"""Marquardt's lambda from where that step ends."""
+
+Equations = Callable[[Guess, Float[Array, " lanes"]], Normal]
+"""Normal equations at a guess, with exact second derivatives where a gate is 1."""
+
 
 class Descent(eqx.Module):
     """The state of every lane.
 
     Attributes:
-        guess: the best place so far. candidate: the next. normal: the normal equations at the last
-            place that was passed and taken. gate: 1 where their curvature is exact. ahead: the
-            gate of the next pass. damping: Marquardt's lambda. predicted: decrease of half the
-            cost by the next step. lost: whether there is none, the matrix being indefinite. idle:
-            steps without a gain. iterations: passes. cosine: the gradient cosine; after a last
-            step that was not passed again, what is taken to bound it. settled: arrived, as far as
-            rounding allows. active: whether a lane goes on.
+        guess: the best place so far. cost: there; sum of squared (whitened) residuals. cosine: the
+            gradient cosine there; after a last step that was not looked at, what is taken to bound
+            it. candidate: the place to look at next. again: whether that is the guess once more,
+            with more damping or without second derivatives. gate: 1 where the step to the
+            candidate came from an exact curvature. ahead: the gate at the candidate. damping:
+            Marquardt's lambda. predicted: decrease of half the cost by the step. idle: steps
+            without a gain. iterations: places looked at. settled: arrived, as far as rounding
+            allows. active: whether a lane goes on.
     """
 
     guess: Guess
+    cost: Float[Array, " lanes"]
+    cosine: Float[Array, " lanes"]
     candidate: Guess
-    normal: Normal
+    again: Bool[Array, " lanes"]
     gate: Float[Array, " lanes"]
     ahead: Float[Array, " lanes"]
     damping: Float[Array, " lanes"]
     predicted: Float[Array, " lanes"]
-    lost: Bool[Array, " lanes"]
     idle: Int[Array, " lanes"]
     iterations: Int[Array, " lanes"]
-    cosine: Float[Array, " lanes"]
     settled: Bool[Array, " lanes"]
     active: Bool[Array, " lanes"]
 
     @classmethod
-    def before(cls, start: Guess, damping: float) -> Descent:
-        """Nothing passed yet."""
+    def before(cls, start: Guess, damping: float, *, exact: bool = False) -> Descent:
+        """Nothing looked at yet."""
         number = jnp.zeros_like(start.point[0])
         no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
-        normal = Normal(
-            jnp.zeros((len(PAIRS), *number.shape), number.dtype),
-            jnp.zeros((UNKNOWNS, *number.shape), number.dtype),
-            number + jnp.inf,
-        )
         return cls(
-            guess=start, candidate=start, normal=normal, gate=number, ahead=number,
-            damping=number + damping, predicted=number, lost=no, idle=count, iterations=count,
-            cosine=number + jnp.inf, settled=no, active=~no,
+            guess=start, cost=number + jnp.inf, cosine=number + jnp.inf, candidate=start,
+            again=~no, gate=number, ahead=number + exact, damping=number + damping,
+            predicted=number, idle=count, iterations=count, settled=no, active=~no,
         )  # fmt: skip
 
 
@@ -146,62 +160,67 @@ def propose(
 
 def iterate(
     state: Descent,
-    belief: Belief,
-    images: Images,
+    equations: Equations,
     rounding: Rounding,
     tolerance: float,
     max_steps: int,
 ) -> Descent:
-    """One pass for every active lane."""
-    eps, first = jnp.finfo(rounding.residual.dtype).eps, state.iterations == 0
-    normal = apart(accumulate(state.candidate, belief, images, state.ahead))
+    """Every active lane's candidate looked at, and the next one chosen.
 
-    half = 0.5 * jnp.where(first, normal.cost, state.normal.cost)
-    noise = 8 * eps * half + 2 * rounding.residual * jnp.sqrt(half)
-    decrease, lost = half - 0.5 * normal.cost, state.lost
-    accept = (decrease >= 1e-4 * state.predicted - noise) | lost | first
-    good = (decrease >= 0.25 * state.predicted - noise) & jnp.logical_not(lost)
+    Normal equations are used where they are made and then forgotten: it is cheaper to look at a
+    place again, where a step from there has failed, than to keep 54 numbers of every lane.
+    """
+    normal = apart(equations(state.candidate, state.ahead))
+
+    half = 0.5 * jnp.where(state.again, normal.cost, state.cost)
+    noise = 8 * jnp.finfo(half.dtype).eps * half + 2 * rounding.residual * jnp.sqrt(half)
+    decrease = half - 0.5 * normal.cost
+    accept = (decrease >= 1e-4 * state.predicted - noise) | state.again
+    good = (decrease >= 0.25 * state.predicted - noise) & jnp.logical_not(state.again)
     # The exact matrix needs no damping; a Gauss-Newton one is wanted less and less.
     factor = jnp.where(good, jnp.where(state.gate > 0, 1e-4, 0.1), 1.0)
-    factor = jnp.where(first, 1.0, factor)
     raised = jnp.maximum(10 * state.damping, 1e-8)
-    damping = jnp.where(accept & ~(lost & (state.gate == 0)), factor * state.damping, raised)
-    idle = jnp.where((decrease > noise) | first, 0, state.idle + 1)
+    damping = jnp.where(accept, factor * state.damping, raised)
+    gained = jnp.where(decrease > noise, 0, state.idle + 1)
+    idle = jnp.where(accept & jnp.logical_not(state.again), gained, state.idle)
+
+    guess = choose(accept & state.active, state.candidate, state.guess)
+    cost = jnp.where(accept, normal.cost, state.cost)
+    cosine = jnp.where(accept, gradient_cosine(normal, rounding.vanished), state.cosine)
+    move, predicted, lost = propose(normal, damping)
+    lost = lost & accept
+    # Indefinite: the same place again without second derivatives, or with more damping.
+    damping = jnp.where(lost & (state.ahead == 0), jnp.maximum(10 * damping, 1e-8), damping)
+    again = lost | jnp.logical_not(accept)
+    candidate = choose(again, guess, state.candidate.moved(move))
+
     iterations = state.iterations + 1
     stuck = (idle >= IDLE) | (damping > 1e12) | (iterations >= max_steps)
-
-    guess, normal, gate = apart(
-        choose(
-            accept & state.active,
-            (state.candidate, normal, state.ahead),
-            (state.guess, state.normal, state.gate),
-        )
-    )
-    cosine = gradient_cosine(normal, rounding.vanished)
-    move, predicted, lost = propose(normal, damping)
-    candidate = guess.moved(move)
     left = SQUARED * cosine * cosine
     last = (
-        (gate > 0) & (damping < 1e-6) & jnp.logical_not(lost)
-        & (left <= tolerance) & (predicted <= SMALL * normal.cost) & (cosine > tolerance)
+        (state.ahead > 0) & (damping < 1e-6) & jnp.logical_not(again)
+        & (left <= tolerance) & (predicted <= SMALL * cost) & (cosine > tolerance)
     )  # fmt: skip
     ahead = (cosine <= GATE) & jnp.logical_not(lost)
     after = Descent(
-        guess=choose(last, candidate, guess),
+        guess=guess,
+        cost=cost,
+        cosine=jnp.where(last, left, cosine),
         candidate=candidate,
-        normal=normal,
-        gate=gate,
-        ahead=jnp.where(ahead, 1.0, 0.0).astype(gate.dtype),
+        again=again,
+        gate=jnp.where(accept, state.ahead, state.gate),
+        ahead=jnp.where(ahead, 1.0, 0.0).astype(half.dtype),
         damping=damping,
         predicted=predicted,
-        lost=lost,
-        idle=jnp.where(accept, idle, state.idle),
+        idle=idle,
         iterations=iterations,
-        cosine=jnp.where(last, left, cosine),
         settled=(cosine <= 10 * tolerance) | last | (idle >= IDLE),
         active=(cosine > tolerance) & jnp.logical_not(stuck | last),
     )
-    return choose(state.active, after, state)
+    after = choose(state.active, after, eqx.tree_at(lambda old: old.guess, state, guess))
+    return eqx.tree_at(
+        lambda new: new.guess, after, choose(last & state.active, candidate, after.guess)
+    )
 
 
 def minimise(
@@ -212,6 +231,7 @@ def minimise(
     damping: float = 1e-3,
     tolerance: float | None = None,
     max_steps: int = 100,
+    head_start: bool = True,
 ) -> Descent:
     """Minimise every lane's objective.
 
@@ -221,7 +241,9 @@ def minimise(
         images: the data.
         damping: first lambda, relative to the diagonal.
         tolerance: gradient cosine to stop at; by default 1e-10 in float64, 1e-4 in float32.
-        max_steps: most passes.
+        max_steps: most passes, and most steps before them.
+        head_start: begin on the moments, where the belief has something to do with them. From a
+            start that is another method's answer this gains nothing.
 
     Returns:
         Where every lane stopped.
@@ -229,12 +251,36 @@ def minimise(
     if tolerance is None:
         tolerance = default_tolerance(images.mask.dtype)
 
-    def one(state: Descent) -> Descent:
-        return iterate(state, belief, images, rounding, tolerance, max_steps)
+    def at_images(guess: Guess, gate: Array) -> Normal:
+        return accumulate(guess, belief, images, gate)
 
     images, belief = apart((images.padded(), belief.padded()))
     rounding = apart(Rounding.of(start, belief, images))
-    begun = Descent.before(start, damping)
+    begun, weight = Descent.before(start, damping), belief.planar_weight()
+    if head_start and weight is not None:
+        moments = apart(Moments.of(images, start.point))
+
+        def at_moments(guess: Guess, gate: Array) -> Normal:
+            # Many read the result, and each would compute all of it.
+            return computed_once(lambda: moments.normal(guess, weight), gate[0])
+
+        near = descend(begun, at_moments, rounding, NEAR, max_steps)
+        begun = Descent.before(near.candidate, NEAR_DAMPING, exact=True)
+    return descend(begun, at_images, rounding, tolerance, max_steps)
+
+
+def descend(
+    begun: Descent,
+    equations: Equations,
+    rounding: Rounding,
+    tolerance: float,
+    max_steps: int,
+) -> Descent:
+    """Steps until no lane is active."""
+
+    def one(state: Descent) -> Descent:
+        return iterate(state, equations, rounding, tolerance, max_steps)
+
     return jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun)
 
 
