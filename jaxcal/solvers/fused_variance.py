@@ -68,25 +68,47 @@ class Tuned(eqx.Module):
     """The state of every lane; at the end, its answer.
 
     Attributes:
-        guess: X and c. sums: those there. sigma: the SDs, mm. updated: the SDs after one more
-            update there. cost: of the weighted residuals. change: largest relative change of the
-            SDs by that update. cosine: gradient cosine. damping: Marquardt's lambda. idle: steps
-            without a gain. rounds: passes. settled: arrived, as far as rounding allows. active:
-            whether a lane goes on.
+        guess: X and c. sigma: the SDs, mm. updated: the SDs after one more update there. cost: of
+            the weighted residuals. change: largest relative change of the SDs by that update.
+            cosine: gradient cosine. candidate: the place to look at next. proposed: the SDs there.
+            again: whether that is the guess once more, with more damping. weighed: the SDs that
+            belong to the step to the candidate. half: half the cost before it, with these.
+            predicted: how much less it should be after it. gate: 1 where the step came from exact
+            second derivatives. damping: Marquardt's lambda. idle: steps without a gain. rounds:
+            passes. settled: arrived, as far as rounding allows. active: whether a lane goes on.
     """
 
     guess: Guess
-    sums: Sums
     sigma: Float[Array, "3 lanes"]
     updated: Float[Array, "3 lanes"]
     cost: Float[Array, " lanes"]
     change: Float[Array, " lanes"]
     cosine: Float[Array, " lanes"]
+    candidate: Guess
+    proposed: Float[Array, "3 lanes"]
+    again: Bool[Array, " lanes"]
+    weighed: Float[Array, "3 lanes"]
+    half: Float[Array, " lanes"]
+    predicted: Float[Array, " lanes"]
+    gate: Float[Array, " lanes"]
     damping: Float[Array, " lanes"]
     idle: Int[Array, " lanes"]
     rounds: Int[Array, " lanes"]
     settled: Bool[Array, " lanes"]
     active: Bool[Array, " lanes"]
+
+    @classmethod
+    def before(cls, start: Guess) -> Tuned:
+        """Nothing looked at yet; with infinite SDs, C vanishes."""
+        number = jnp.zeros_like(start.point[0])
+        no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
+        sigma = jnp.zeros_like(start.point) + jnp.inf
+        return cls(
+            guess=start, sigma=sigma, updated=sigma, cost=number, change=number, cosine=number,
+            candidate=start, proposed=sigma, again=~no, weighed=sigma, half=number,
+            predicted=number, gate=number, damping=number + 1e-6, idle=count, rounds=count,
+            settled=no, active=~no,
+        )  # fmt: skip
 
 
 def components(guess: Guess, images: Images, sigma: Float[Array, "3 lanes"] | None) -> Sums:
@@ -272,76 +294,83 @@ def self_tuned(
         vanished = cost <= 3 * images.mask.shape[1] * (2 * rounding) ** 2
         return cost, jnp.where(vanished, 0.0, jnp.where(jnp.isfinite(cost), cosine, jnp.nan))
 
-    def iterate(state: Tuned) -> Tuned:
-        gate = jnp.where(state.cosine <= GATE, 1.0, 0.0).astype(reach.dtype)
-        damping = state.damping + 16 * eps
+    def propose(sums: Sums, sigma: Array, damping: Array, gate: Array) -> tuple[Array, ...]:
+        """What the sums of a place say of the next: a few updates of the SDs and their step."""
 
         def again(carry: tuple) -> tuple:
             count, sigma, _, _, first, gate, _ = carry
-            move, after, lost = update(state.sums, sigma, damping, gate)
+            move, after, lost = update(sums, sigma, damping, gate)
             first = jnp.where(count == 0, after, first)
             return count + 1, after, sigma, move, first, jnp.where(lost, 0.0, gate), lost
 
-        none = jnp.zeros_like(state.sums.gradient[0])
-        carry = (jnp.zeros((), jnp.int32), state.sigma, state.sigma, none, state.sigma, gate,
-                 state.active)  # fmt: skip
+        none = jnp.zeros_like(sums.gradient[0])
+        carry = (jnp.zeros((), jnp.int32), sigma, sigma, none, sigma, gate, gate > 1)
         carry = jax.lax.while_loop(lambda carry: carry[0] < UPDATES, again, carry)
-        _, sigma, chosen, move, first, gate, bad = carry
-        change = jnp.max(jnp.abs(jnp.log(first / state.sigma)), axis=0)
-        there = (state.cosine <= standing) | (state.idle >= IDLE)
-        done = there & (change <= tolerance)
-        over = (state.damping > 1e12) | (state.rounds >= max_rounds)
-        lost = jnp.logical_not(jnp.isfinite(state.cost))
+        _, after, weighed, move, first, gate, lost = carry
+        weight = 1 / weighed**2
+        half = 0.5 * jnp.sum(weight * sums.squares, axis=0)
+        gradient = jnp.sum(weight[:, None] * sums.gradient, axis=0)
+        diagonal = jnp.sum(weight[:, None] * sums.matrix[:, DIAGONAL], axis=0)
+        predicted = 0.5 * jnp.sum(move * (damping * diagonal * move - gradient), axis=0)
+        return move, after, weighed, first, gate, lost, half, predicted
 
-        weight = 1 / chosen**2
-        move = unrolled.rows_of(move)
-        guess = apart(state.guess.moved(move))
-        sums = apart(components(guess, images, sigma))
-        cost, cosine = judge(guess, sums, sigma)
-        half = 0.5 * jnp.sum(weight * state.sums.squares, axis=0)
-        gradient = jnp.sum(weight[:, None] * state.sums.gradient, axis=0)
-        diagonal = jnp.sum(weight[:, None] * state.sums.matrix[:, DIAGONAL], axis=0)
-        heavy = sum(d * m * m for d, m in zip(diagonal, move, strict=True))
-        predicted = 0.5 * (damping * heavy - unrolled.dot(list(gradient), move))
-        rounding = reach / jnp.min(sigma, axis=0)
-        noise = 8 * eps * half + 2 * rounding * jnp.sqrt(half)
-        decrease = half - 0.5 * jnp.sum(weight * sums.squares, axis=0)
-        accept = (decrease >= 1e-4 * predicted - noise) & jnp.logical_not(bad)
-        good = decrease >= 0.25 * predicted - noise
-        factor = jnp.where(good, jnp.where(gate > 0, 1e-4, 0.1), 1.0)
+    def iterate(state: Tuned) -> Tuned:
+        sums = apart(components(state.candidate, images, state.proposed))
+        crude = jnp.where(enough, with_floor(jnp.sqrt(sums.squares / used)), held)
+        proposed = jnp.where(state.rounds == 0, crude, state.proposed)
+        cost, cosine = judge(state.candidate, sums, proposed)
+
+        rounding = reach / jnp.min(proposed, axis=0)
+        noise = 8 * eps * state.half + 2 * rounding * jnp.sqrt(state.half)
+        decrease = state.half - 0.5 * jnp.sum(sums.squares / state.weighed**2, axis=0)
+        accept = (decrease >= 1e-4 * state.predicted - noise) | state.again
+        good = (decrease >= 0.25 * state.predicted - noise) & jnp.logical_not(state.again)
+        factor = jnp.where(good, jnp.where(state.gate > 0, 1e-4, 0.1), 1.0)
         raised = jnp.maximum(10 * state.damping, 1e-8)
-        idle = jnp.where(decrease > noise, 0, state.idle + 1)
-        # A lane that has arrived, or is lost, keeps its place; so does one whose step failed.
-        stays = done | over | lost
-        moved = accept & jnp.logical_not(stays)
-        kept = choose(
-            moved,
-            (guess, sums, sigma, cost, cosine),
-            (state.guess, state.sums, state.sigma, state.cost, state.cosine),
+        damping = jnp.where(accept, factor * state.damping, raised)
+        gained = jnp.where(decrease > noise, 0, state.idle + 1)
+        idle = jnp.where(accept & jnp.logical_not(state.again), gained, state.idle)
+        guess, sigma, cost, cosine = apart(
+            choose(
+                accept & state.active,
+                (state.candidate, proposed, cost, cosine),
+                (state.guess, state.sigma, state.cost, state.cosine),
+            )
         )
-        after = Tuned(
-            guess=kept[0],
-            sums=kept[1],
-            sigma=kept[2],
-            updated=first,
-            cost=kept[3],
-            change=change,
-            cosine=kept[4],
-            damping=jnp.where(accept, factor * state.damping, raised),
-            idle=jnp.where(accept, idle, state.idle),
-            rounds=state.rounds + jnp.where(stays, 0, 1),
-            settled=done,
-            active=jnp.logical_not(stays),
-        )
-        return choose(state.active, after, state)
 
-    sums = apart(components(apart(start), images, None))
-    first = with_floor(jnp.sqrt(sums.squares / used))
-    sigma = jnp.where(enough, first, held)
-    cost, cosine = judge(start, sums, sigma)
-    zero, none = jnp.zeros_like(cost), jnp.zeros(cost.shape, jnp.int32)
-    state = Tuned(
-        guess=start, sums=sums, sigma=sigma, updated=sigma, cost=cost, change=zero, cosine=cosine,
-        damping=zero + 1e-6, idle=none, rounds=none + 1, settled=zero > 0, active=zero == 0,
-    )  # fmt: skip
-    return jax.lax.while_loop(lambda state: jnp.any(state.active), iterate, state)
+        # Where the place was not taken, what its sums propose is not used.
+        gate = jnp.where(cosine <= GATE, 1.0, 0.0).astype(reach.dtype)
+        move, after, weighed, first, gate, bad, half, predicted = propose(
+            sums, sigma, damping + 16 * eps, gate
+        )
+        change = jnp.where(accept, jnp.max(jnp.abs(jnp.log(first / sigma)), axis=0), state.change)
+        there = (cosine <= standing) | (idle >= IDLE)
+        done = there & (change <= tolerance) & accept
+        damping = jnp.where(bad & accept, jnp.maximum(10 * damping, 1e-8), damping)
+        rounds = state.rounds + 1
+        over = (damping > 1e12) | (rounds >= max_rounds) | jnp.logical_not(jnp.isfinite(cost))
+        again = bad | jnp.logical_not(accept)
+        new = Tuned(
+            guess=guess,
+            sigma=sigma,
+            updated=jnp.where(accept, first, state.updated),
+            cost=cost,
+            change=change,
+            cosine=cosine,
+            candidate=choose(again, guess, guess.moved(unrolled.rows_of(apart(move)))),
+            proposed=jnp.where(again, sigma, after),
+            again=again,
+            weighed=weighed,
+            half=half,
+            predicted=predicted,
+            gate=gate,
+            damping=damping,
+            idle=idle,
+            rounds=rounds,
+            settled=done,
+            active=jnp.logical_not(done | over),
+        )
+        return choose(state.active, new, state)
+
+    begun = Tuned.before(apart(start))
+    return jax.lax.while_loop(lambda state: jnp.any(state.active), iterate, begun)
