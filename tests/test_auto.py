@@ -18,9 +18,19 @@ from jaxcal.intervals import degrees_of_freedom
 from jaxcal.model.parameters import RIGID, Parameters
 from jaxcal.model.priors import Gaussian
 from jaxcal.model.shapes import FAMILIES, tilted
-from jaxcal.solvers.auto import SHAPES, average_over_laws, weights
+from jaxcal.solvers.auto import (
+    LOG_ODDS_OF_MEAN,
+    SHAPES,
+    UNIFORM,
+    average_over_laws,
+    log_together,
+    median,
+    odds_of_mean,
+    weigh,
+    weights,
+)
 from jaxcal.solvers.dense import inverse_abreast, inverse_positive
-from jaxcal.solvers.expectation_propagation import Linear, propagate
+from jaxcal.solvers.expectation_propagation import Linear, gaussian_evidence, propagate
 from jaxcal.solvers.fused import Guess, Images
 from jaxcal.solvers.fused_auto import average_abreast
 from jaxcal.solvers.fused_variance import self_tuned
@@ -132,6 +142,101 @@ def test_a_law_that_excludes_an_image_does_not_count():
     weight, good = weights(found.log_evidence, found.change, jnp.full(len(FAMILIES), 0.25))
     assert dict(zip(FAMILIES, good.tolist(), strict=True))["uniform"] is False
     assert FAMILIES[int(jnp.argmax(weight))] == "student"
+
+
+def test_laws_in_turn_settle_where_long_sweeps_do():
+    """Each from the sites of the one before, against many sweeps."""
+    linear = linear_problem(n=40)
+    families = tuple(shape.family for shape in UNIFORM)
+    sd = jnp.asarray([1.2 * shape.stretch for shape in UNIFORM])
+    assert np.all(np.diff(sd) < 0)
+    found = propagate(linear, families, sd)
+    settled = propagate(linear, families, sd, ahead=20, sweeps=20)
+    assert np.asarray(settled.change).max() < 1e-3
+    size = np.sqrt(np.diagonal(settled.covariance, axis1=1, axis2=2))
+    np.testing.assert_allclose(found.mean / size, settled.mean / size, atol=0.1)
+    np.testing.assert_allclose(found.log_evidence, settled.log_evidence, atol=0.05)
+
+
+def test_evidence_of_the_gaussian_law_needs_no_sites():
+    linear = linear_problem()
+    found = propagate(linear, ("gaussian",), jnp.asarray([0.8]))
+    said = gaussian_evidence(linear, jnp.asarray(0.8))
+    assert float(said) == pytest.approx(float(found.log_evidence[0]), rel=1e-12)
+
+
+def test_the_median_is_where_the_expected_distance_is_least():
+    rng = np.random.default_rng(3)
+    # One unknown: E |x - N(m, s^2)| of the mixture, over x.
+    means, sd = np.array([0.0, 1.0, 4.0]), np.array([0.3, 0.5, 0.8])
+    weight = np.array([0.5, 0.2, 0.3])
+    share = median(
+        jnp.asarray(means)[None], jnp.asarray(sd**2), jnp.asarray(weight), jnp.ones((1, 1))
+    )
+    axis = np.linspace(-1, 5, 6001)
+    z = (axis[:, None] - means) / sd
+    distance = sd * (2 * norm.pdf(z) + z * (2 * norm.cdf(z) - 1))
+    best = axis[np.argmin(distance @ weight)]
+    assert float(jnp.sum(share)) == pytest.approx(1)
+    assert abs(float(share @ means) - best) < 0.1 < abs(weight @ means - best)
+    # Many lanes, any metric: nothing but a law that has all the weight is in the answer, and where
+    # none counts there are still numbers.
+    root = rng.normal(size=(4, 4))
+    squares = np.stack([root @ root.T] * 2, axis=-1)
+    only = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
+    share = median(
+        jnp.asarray(rng.normal(size=(4, 3, 2))), jnp.ones((3, 2)), jnp.asarray(only),
+        jnp.asarray(squares),
+    )  # fmt: skip
+    np.testing.assert_array_equal(share, only)
+
+
+def test_all_laws_have_to_agree_to_a_mean():
+    """Edges tell of the mean what a Gaussian does not see."""
+    asks = LOG_ODDS_OF_MEAN + 1
+    for gaussian, together, odds in (
+        (asks, 20.0, asks), (asks, 0.5, 0.5), (asks, -np.inf, -np.inf), (asks, np.nan, asks),
+        (-2.0, 20.0, -2.0),
+    ):  # fmt: skip
+        found = odds_of_mean(jnp.asarray(gaussian), jnp.asarray(0.0), jnp.asarray(together))
+        assert float(found) == odds
+    good = jnp.asarray([[True, False], [True, False]])
+    evidence = jnp.asarray([[-3.0, 1.0], [-5.0, jnp.nan]])
+    found = log_together(evidence, good, jnp.asarray([0.5, 0.5]))
+    assert float(found[0]) == pytest.approx(np.log(0.5 * np.exp(-3) + 0.5 * np.exp(-5)))
+    assert float(found[1]) == -np.inf
+
+
+def test_covariance_is_about_the_answer():
+    """Spread of the laws' answers about the answer given, and their own covariances."""
+    linear = linear_problem(n=30)
+    found = weigh(linear, jnp.asarray(1.1), SHAPES)
+    laws = propagate(
+        linear, tuple(shape.family for shape in SHAPES),
+        jnp.asarray([1.1 * shape.stretch for shape in SHAPES]),
+    )  # fmt: skip
+    expected = np.zeros((2, 2))
+    for k, share in enumerate(np.asarray(found.weight)):
+        if share > 0:
+            off = np.asarray(laws.mean[k] - found.mean)
+            expected += share * (np.asarray(laws.covariance[k]) + np.outer(off, off))
+    np.testing.assert_allclose(found.covariance, expected, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_mean_that_the_edges_deny_is_not_believed():
+    """Two of 300 draws of exact uniform offsets: the Gaussian believes in a mean in both."""
+    protocol = jaxcal.Protocol(
+        images=30, elevation_mm=5.0, noise_mm=0.0, elevation_distribution="uniform"
+    )
+    drawn = [
+        jaxcal.Problem.from_recording(jaxcal.simulate_recording(protocol, k)) for k in (119, 224)
+    ]
+    law = jaxcal.calibrate_batch(replace(jaxcal.stack(drawn), covariance=None)).offset_law
+    assert law is not None
+    # The Gaussian's log odds are 3.5 and 3.7.
+    assert law.has_mean.tolist() == [True, False]
+    assert law.log_odds_mean[1] < LOG_ODDS_OF_MEAN < law.log_odds_mean[0] < 3.5
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,10 @@ times the true law:
     mass Z_i, mean and variance of p(u) N(u; c_i, w_i)                             a quadrature
     tau_i <- 1/variance - 1/w_i,  nu_i <- mean/variance - c_i/w_i                  all i, damped
 
-A sweep is O(n p^2). It starts from the Gaussian law of the same SD, for which it is exact, and a
-fixed number of sweeps is taken, so it can be differentiated like any other array code. With it
-comes the evidence, the probability of the data under that law, by which laws are compared.
+A sweep is O(n p^2). It starts from the Gaussian law of the same SD, for which it is exact, or from
+the sites of the same law with another SD, and a fixed number of sweeps is taken, so it can be
+differentiated like any other array code. With it comes the evidence, the probability of the data
+under that law, by which laws are compared.
 
 Reference: Minka 2001; Rasmussen and Williams 2006, section 3.6.
 """
@@ -30,7 +31,12 @@ from jaxtyping import Array, Float
 from jaxcal.model.shapes import Family, Moments, tilted
 from jaxcal.solvers import dense
 
-SWEEPS = 6
+AHEAD = 3
+"""Sweeps under a family's first law before the following."""
+
+SWEEPS = 3
+"""Sweeps under each law, from the sites of the one before it."""
+
 DAMPING = 0.8
 
 LEAST_ROOM = 1e-3
@@ -78,17 +84,37 @@ class Posterior(eqx.Module):
 
 
 def propagate(
-    linear: Linear, families: tuple[Family, ...], sd: Float[Array, " k"], sweeps: int = SWEEPS
+    linear: Linear,
+    families: tuple[Family, ...],
+    sd: Float[Array, " k"],
+    ahead: int = AHEAD,
+    sweeps: int = SWEEPS,
 ) -> Posterior:
     """Belief and evidence under every law.
+
+    Laws of one family are taken in their order, each from the sites of the one before.
 
     Args:
         linear: the linearised problem.
         families: of the laws.
-        sd: their SDs, mm.
-        sweeps: how many, at least one.
+        sd: their SDs, mm; of a family with edges, the widest first, which leaves no image out.
+        ahead: sweeps under a family's first law before those that each law gets.
+        sweeps: how many under each law, at least one.
     """
-    h, used = linear.direction, linear.used
+    parts, order = [], []
+    for family in dict.fromkeys(families):
+        members = [k for k, name in enumerate(families) if name == family]
+        parts.append(_in_turn(linear, family, sd[np.asarray(members)], ahead, sweeps))
+        order += members
+    back = np.argsort(order)
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[back], *parts)
+
+
+def _in_turn(
+    linear: Linear, family: Family, sd: Float[Array, " k"], ahead: int, sweeps: int
+) -> Posterior:
+    """Belief and evidence under the laws of one family, one after the other."""
+    h, used, offset = linear.direction, linear.used, linear.offset
     size = h.shape[1]
     # Symmetric p x p matrices are kept as one row of their upper triangle: sums over the images
     # are then plain matrix products.
@@ -97,39 +123,24 @@ def propagate(
     twice = jnp.asarray(np.where(row == column, 1.0, 2.0), h.dtype)
     place = np.zeros((size, size), int)
     place[row, column] = place[column, row] = np.arange(len(row))
-    groups: dict[Family, list[int]] = {}
-    for k, family in enumerate(families):
-        groups.setdefault(family, []).append(k)
-    precision = jnp.broadcast_to((1 / sd**2)[:, None], (len(families), len(used))) * used
-    start = (precision, jnp.zeros_like(precision))
 
-    def belief(tau: Array, nu: Array) -> tuple[Array, Array, Array, Array]:
-        information = linear.information + (tau @ squares)[:, place]
-        rhs = linear.gradient + (nu - tau * linear.offset) @ h
-        covariance, log_determinant = jax.vmap(dense.inverse_positive)(information)
-        return covariance, jnp.sum(covariance * rhs[:, None, :], axis=2), rhs, log_determinant
-
-    def cavity(tau: Array, nu: Array, covariance: Array, mean: Array) -> tuple[Array, Array]:
-        variance = (covariance[:, row, column] * twice) @ squares.T
-        shrink = 1 / jnp.maximum(1 - tau * variance, LEAST_ROOM)
-        centre = shrink * (linear.offset + mean @ h.T - variance * nu)
-        return centre, jnp.where(used > 0, variance * shrink, 1.0)
-
-    def moments(centre: Array, without: Array) -> Moments:
-        parts = []
-        for family, members in groups.items():
-            at = np.asarray(members)
-            parts.append(
-                tilted(family, sd[at], centre[at], without[at], linear.lower, linear.upper)
-            )
-        order = np.argsort(np.concatenate(list(groups.values())))
-        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[order], *parts)
+    def belief(tau: Array, nu: Array) -> tuple[Array, Array, Array, Array, Array]:
+        information = linear.information + (tau @ squares)[place]
+        rhs = linear.gradient + (nu - tau * offset) @ h
+        covariance, log_determinant = dense.inverse_positive(information)
+        return covariance, covariance @ rhs, information, rhs, log_determinant
 
     def found_at(
-        tau: Array, nu: Array, covariance: Array, mean: Array
+        scale: Array, tau: Array, nu: Array, covariance: Array, mean: Array
     ) -> tuple[Moments, Array, Array]:
-        centre, without = cavity(tau, nu, covariance, mean)
-        return moments(centre, without), centre, without
+        variance = squares @ (covariance[row, column] * twice)
+        shrink = 1 / jnp.maximum(1 - tau * variance, LEAST_ROOM)
+        centre = shrink * (offset + h @ mean - variance * nu)
+        without = jnp.where(used > 0, variance * shrink, 1.0)
+        found = tilted(
+            family, scale[None], centre[None], without[None], linear.lower, linear.upper
+        )  # fmt: skip
+        return jax.tree.map(lambda leaf: leaf[0], found), centre, without
 
     def refresh(
         tau: Array, nu: Array, found: Moments, centre: Array, without: Array
@@ -138,30 +149,48 @@ def propagate(
         tau = tau + DAMPING * used * (new_tau - tau)
         return tau, nu + DAMPING * used * (new_nu - nu)
 
-    def sweep(_: Array, state: tuple) -> tuple:
-        tau, nu = state
-        covariance, mean, _, _ = belief(tau, nu)
-        return refresh(tau, nu, *found_at(tau, nu, covariance, mean))
+    def swept(times: int, scale: Array, state: tuple) -> tuple:
+        def sweep(_: Array, state: tuple) -> tuple:
+            tau, nu = state
+            covariance, mean = belief(tau, nu)[:2]
+            return refresh(tau, nu, *found_at(scale, tau, nu, covariance, mean))
 
-    tau, nu = jax.lax.fori_loop(0, sweeps - 1, sweep, start)
-    covariance, before, rhs, log_determinant = belief(tau, nu)
-    found, centre, without = found_at(tau, nu, covariance, before)
-    # The evidence is stationary in the sites, so it is as good before the last sweep as after.
-    joined = 1 + tau * without
-    site = found.log_mass + 0.5 * jnp.log(joined)
-    site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
-    site = site + nu * linear.offset - 0.5 * tau * linear.offset**2
-    evidence = jnp.sum(used * site, axis=1) + 0.5 * jnp.sum(rhs * before, axis=1)
-    evidence = evidence - 0.5 * log_determinant
-    # tau w = tau v / (1 - tau v) shows how much room there was.
-    crowded = jnp.any(tau * without * used > 0.99 / LEAST_ROOM, axis=1)
+        return jax.lax.fori_loop(0, times, sweep, state)
 
-    tau, nu = refresh(tau, nu, found, centre, without)
-    covariance, mean, _, _ = belief(tau, nu)
-    information = linear.information + (tau @ squares)[:, place]
-    step = mean - before
-    change = jnp.sqrt(jnp.maximum(jnp.einsum("kp,kpq,kq->k", step, information, step), 0.0))
-    return Posterior(mean, covariance, evidence, jnp.where(crowded, jnp.inf, change))
+    def law(state: tuple, scale: Array) -> tuple[tuple, tuple[Array, Array, Array, Array]]:
+        tau, nu = swept(sweeps - 1, scale, state)
+        covariance, before, _, rhs, log_determinant = belief(tau, nu)
+        found, centre, without = found_at(scale, tau, nu, covariance, before)
+        # The evidence is stationary in the sites, so it is as good before the last sweep as after.
+        joined = 1 + tau * without
+        site = found.log_mass + 0.5 * jnp.log(joined)
+        site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
+        site = site + nu * offset - 0.5 * tau * offset**2
+        evidence = jnp.sum(used * site) + 0.5 * rhs @ before - 0.5 * log_determinant
+        # tau w = tau v / (1 - tau v) shows how much room there was.
+        crowded = jnp.any(tau * without * used > 0.99 / LEAST_ROOM)
+
+        tau, nu = refresh(tau, nu, found, centre, without)
+        covariance, mean, information, *_ = belief(tau, nu)
+        step = mean - before
+        change = jnp.sqrt(jnp.maximum(step @ information @ step, 0.0))
+        change = jnp.where(crowded, jnp.inf, change)
+        return (tau, nu), (mean, covariance, evidence, change)
+
+    tau = used / sd[0] ** 2
+    start = swept(ahead, sd[0], (tau, jnp.zeros_like(tau)))
+    return Posterior(*jax.lax.scan(law, start, sd)[1])
+
+
+def gaussian_evidence(linear: Linear, sd: Float[Array, ""]) -> Float[Array, ""]:
+    """Log evidence under the Gaussian law of that SD, uncut: no sites have to be found."""
+    used, precision = linear.used, 1 / sd**2
+    weighted = precision * used[:, None] * linear.direction
+    information = linear.information + weighted.T @ linear.direction
+    rhs = linear.gradient - linear.offset @ weighted
+    covariance, log_determinant = dense.inverse_positive(information)
+    outer = jnp.sum(used * (jnp.log(2 * np.pi / precision) + precision * linear.offset**2))
+    return 0.5 * (rhs @ covariance @ rhs - log_determinant - outer)
 
 
 def refreshed(found: Moments, centre: Array, without: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.priors import Gaussian, covariance_shape
@@ -22,6 +22,9 @@ from jaxcal.solvers.auto import (
     LOG_ODDS_OF_MEAN,
     Averaged,
     OffsetLaw,
+    log_together,
+    median,
+    odds_of_mean,
     weights,
 )
 from jaxcal.solvers.fused import UNKNOWNS, Guess, Images, targets
@@ -35,7 +38,7 @@ from jaxcal.solvers.fused_evidence import (
     row_of,
     tune,
 )
-from jaxcal.solvers.fused_laws import SEEN, Sites, marginal, propagate
+from jaxcal.solvers.fused_laws import SEEN, Sites, gaussian_evidence, marginal, propagate, seen
 from jaxcal.solvers.lanes import apart, choose
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING
 
@@ -56,62 +59,57 @@ def average_abreast(
     pairs = jnp.stack([model.log_evidence for model in models])
     pairs = jnp.where(jnp.isfinite(pairs), pairs, -jnp.inf).reshape(-1, 2, len(used))
     wanted = pairs - jnp.asarray([0.0, LOG_ODDS_OF_MEAN])[:, None]
-    chosen = jnp.argmax(wanted.reshape(-1, len(used)), axis=0)
-    best = models[0]
-    for k, model in enumerate(models[1:], 1):
-        best = choose(chosen == k, model, best)
-    best = apart(best)
+    which = jnp.argmax(jnp.max(wanted, axis=1), axis=0)
+    common, others = (models[0], models[1], pairs[0]), (*models[-2:], pairs[-1])
+    without, with_mean, pair = choose(which > 0, others, common)
+    gaussian = pair[1] - pair[0]
+    asked = gaussian > LOG_ODDS_OF_MEAN
 
-    q, turned = targets(best.guess, images)
-    bound = problems.max_elevation
-    sites = apart(Sites.of(q, turned, images.mask, best.mean, bound))
-    precision = mean_precision(best.sigma[2], best.with_mean)
-    known = marginal(best.information, best.gradient, precision, best.mean, best.with_mean)
-    stretch = jnp.asarray([shape.stretch for shape in shapes], problems.mask.dtype)
-    families: list[Family] = [shape.family for shape in shapes]
-    found = propagate(
-        known, sites, best.squares, best.pull, families, stretch[:, None] * best.sigma[2]
-    )
-    prior = jnp.asarray([shape.prior for shape in shapes], problems.mask.dtype)
-    weight, good = weights(found.log_evidence, found.change, prior)
-    means = jnp.where(good, found.mean, 0.0)
-    mean = jnp.sum(weight * means, axis=1)
-    off = jnp.where(good, means - mean[:, None], 0.0)
-    within = jnp.where(good, found.covariance, 0.0)
-    spread = jnp.sum(weight * (within + off[:, None] * off[None]), axis=2)
-    step, covariance = known.lifted(*apart((mean, spread)))
-    step, covariance = apart((step, covariance))
-    shared, variance_of_mean = covariance[:UNKNOWNS, :UNKNOWNS], covariance[-1, -1]
+    def turn(k: Array, state: tuple[Answer, Array]) -> tuple[Answer, Array]:
+        # First with the mean where a lane's Gaussian believes in one, and then, should there be
+        # such lanes, without: all laws together have to agree, or the second answer stands.
+        before, odds = state
+        model = apart(choose(asked & (k == 0), with_mean, without))
+        now = answered(model, images, problems.max_elevation, shapes)
+        together = odds_of_mean(gaussian, pair[0] + now.gain, pair[1] + before.gain)
+        odds = jnp.where(k == 0, odds, together)
+        agreed = (k > 0) & ~(asked & ~(odds > LOG_ODDS_OF_MEAN))
+        return choose(agreed, before, now), odds
 
-    enough = (used >= MINIMUM_SELF_TUNING) & jnp.any(good, axis=0)
+    # One program for both turns.
+    shaped = jax.eval_shape(lambda: answered(without, images, problems.max_elevation, shapes))
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shaped)
+    best, log_odds = jax.lax.fori_loop(0, 1 + jnp.any(asked), turn, (nothing, gaussian))
+    best, log_odds = apart((best, log_odds))
+    step, shared = best.step, best.covariance[:UNKNOWNS, :UNKNOWNS]
+
+    enough = (used >= MINIMUM_SELF_TUNING) & best.settled
     enough = enough & jnp.all(jnp.isfinite(step), axis=0)
-    along = [[shared[i, j][:, None] for j in SEEN] for i in SEEN]
-    variance = unrolled.dot(sites.direction, unrolled.apply(along, sites.direction))
-    moved = best.guess.moved(list(step[:UNKNOWNS]))
-    member = jnp.asarray([[family == name for family in families] for name in FAMILIES])
-    has_mean = enough & (chosen % 2 == 1)
+    moved = best.model.guess.moved(list(step[:UNKNOWNS]))
+    member = jnp.asarray([[shape.family == name for shape in shapes] for name in FAMILIES])
+    has_mean = enough & (best.model.with_mean > 0)
     own_covariances = jnp.zeros_like(enough)
-    log_odds_own = jnp.zeros_like(variance_of_mean)
+    log_odds_own = jnp.zeros_like(log_odds)
     covariances = None
     if shape is not None:
-        own_covariances = enough & (chosen >= 2)
+        own_covariances = enough & (which > 0)
         log_odds_own = jnp.max(pairs[1], axis=0) - jnp.max(pairs[0], axis=0)
         covariances = jnp.where(
-            (chosen >= 2)[:, None, None, None], shape, jnp.eye(2, dtype=shape.dtype)
+            (which > 0)[:, None, None, None], shape, jnp.eye(2, dtype=shape.dtype)
         )
-    both = jnp.where(chosen >= 2, pairs[-1], pairs[0])
+    mean_sd = jnp.sqrt(jnp.maximum(best.covariance[-1, -1], 0.0))
     law = OffsetLaw(
-        probability=(member @ weight).T,
-        mean=jnp.where(has_mean, best.mean + step[-1], 0.0),
-        mean_sd=jnp.where(has_mean, jnp.sqrt(jnp.maximum(variance_of_mean, 0.0)), 0.0),
+        probability=(member @ best.weight).T,
+        mean=jnp.where(has_mean, best.model.mean + step[-1], 0.0),
+        mean_sd=jnp.where(has_mean, mean_sd, 0.0),
         has_mean=has_mean,
         own_covariances=own_covariances,
-        log_odds_mean=both[1] - both[0],
+        log_odds_mean=log_odds,
         log_odds_own=log_odds_own,
         weighed=enough,
     )
-    moved, sigma = choose(enough, (moved, best.sigma), (guess, belief.sigma.T))
-    elevation_sd = jnp.sqrt(jnp.where(problems.mask > 0, variance, jnp.nan))
+    moved, sigma = choose(enough, (moved, best.model.sigma), (guess, belief.sigma.T))
+    elevation_sd = jnp.sqrt(jnp.where(problems.mask > 0, best.variance.T, jnp.nan))
     return jax.vmap(Averaged)(
         moved.parameters(), jax.vmap(Gaussian)(sigma.T, covariances),
         jnp.moveaxis(shared, -1, 0), elevation_sd, law,
@@ -151,6 +149,61 @@ class Candidate(eqx.Module):
             sums.matrix[-1],
             sums.gradient[-1] + tuned.mean * along,
         )  # fmt: skip
+
+
+class Answer(eqx.Module):
+    """What the laws say together about a noise model's unknowns; lanes last.
+
+    Attributes:
+        model: the noise model. step, covariance: of X, the target and b: the laws' median, and
+            about it. weight: the laws' probabilities. settled: at least one of them counts.
+            variance: of the images' offsets, mm^2. gain: ln of how much more probable all laws
+            together make the data than the Gaussian alone.
+    """
+
+    model: Candidate
+    step: Float[Array, "10 lanes"]
+    covariance: Float[Array, "10 10 lanes"]
+    weight: Float[Array, "k lanes"]
+    settled: Bool[Array, " lanes"]
+    variance: Float[Array, "n lanes"]
+    gain: Float[Array, " lanes"]
+
+
+def answered(
+    model: Candidate,
+    images: Images,
+    bound: Float[Array, "lanes n"] | None,
+    shapes: tuple[Shape, ...],
+) -> Answer:
+    """Weigh the laws: :func:`jaxcal.solvers.auto.weigh`."""
+    q, turned = targets(model.guess, images)
+    sites = apart(Sites.of(q, turned, images.mask, model.mean, bound))
+    precision = mean_precision(model.sigma[2], model.with_mean)
+    known = marginal(model.information, model.gradient, precision, model.mean, model.with_mean)
+    stretch = jnp.asarray([shape.stretch for shape in shapes], images.mask.dtype)
+    prior = jnp.asarray([shape.prior for shape in shapes], images.mask.dtype)
+    families: list[Family] = [shape.family for shape in shapes]
+    sd = model.sigma[2]
+    squares, pull = apart(seen(model.squares, model.pull))
+    found = propagate(known, sites, squares, pull, families, stretch[:, None] * sd)
+    weight, good = weights(found.log_evidence, found.change, prior)
+    means = jnp.where(good, found.mean, 0.0)
+    within = jnp.where(good, found.covariance, 0.0)
+    means, within, weight = apart((means, within, weight))
+    spread = jnp.sum(squares[:, :, None] * within, axis=(0, 1))
+    share = median(means, apart(spread), weight, squares)
+    mean = jnp.sum(apart(share) * means, axis=1)
+    off = jnp.where(good, means - mean[:, None], 0.0)
+    covariance = jnp.sum(weight * (within + off[:, None] * off[None]), axis=2)
+    step, covariance = apart(known.lifted(*apart((mean, covariance))))
+    along = [[covariance[i, j][:, None] for j in SEEN] for i in SEEN]
+    variance = unrolled.dot(sites.direction, unrolled.apply(along, sites.direction))
+    gain = log_together(found.log_evidence, good, prior)
+    gain = gain - gaussian_evidence(known, sites, squares, pull, sd)
+    return Answer(
+        model, step, covariance, weight, jnp.any(good, axis=0), variance.T, gain
+    )  # fmt: skip
 
 
 def candidates(

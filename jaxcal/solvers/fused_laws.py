@@ -11,8 +11,8 @@ eliminated once, exactly, from what the measurements say (:func:`marginal`); the
 z = (s, w_x, w_z, d), 21 + 6 sums over the images and a 6x6 inverse each; and what comes out, after
 the average over the laws, is carried back to all unknowns (:meth:`Marginal.lifted`).
 
-The laws of one family share a program. The Gaussian law needs no sweep: its sites are the sums that
-the evidence step left.
+The laws of one family share a program, and each begins with the sites of the one before. The
+Gaussian law needs no sweep: its sites are the sums that the evidence step left.
 """
 
 from __future__ import annotations
@@ -27,7 +27,13 @@ from jaxtyping import Array, Float
 
 from jaxcal.model.shapes import Family, Moments, tilted
 from jaxcal.solvers import dense, unrolled
-from jaxcal.solvers.expectation_propagation import DAMPING, LEAST_ROOM, SWEEPS, refreshed
+from jaxcal.solvers.expectation_propagation import (
+    AHEAD,
+    DAMPING,
+    LEAST_ROOM,
+    SWEEPS,
+    refreshed,
+)
 from jaxcal.solvers.fused import PAIRS, total
 from jaxcal.solvers.lanes import apart
 from jaxcal.solvers.unrolled import Matrix, Vector
@@ -172,10 +178,11 @@ class Posterior(eqx.Module):
 def propagate(
     known: Marginal,
     sites: Sites,
-    squares: Float[Array, "45 lanes"],
-    pull: Float[Array, "9 lanes"],
+    squares: Float[Array, "6 6 lanes"],
+    pull: Float[Array, "6 lanes"],
     families: Sequence[Family],
     sd: Float[Array, "k lanes"],
+    ahead: int = AHEAD,
     sweeps: int = SWEEPS,
 ) -> Posterior:
     """Belief and evidence under every law.
@@ -183,30 +190,19 @@ def propagate(
     Args:
         known: what the measurements say.
         sites: the offsets.
-        squares: sum of h_i h_i' over the used images, all nine unknowns, upper triangle.
-        pull: sum of h_i o_i, likewise.
+        squares: sum of h_i h_i' over the used images.
+        pull: sum of h_i o_i.
         families: of the laws.
-        sd: their SDs, mm.
-        sweeps: how many.
+        sd: their SDs, mm; of a family with edges, the widest first.
+        ahead: sweeps under a family's first law before those that each law gets.
+        sweeps: how many under each law.
     """
-    squares = _full([squares[PAIRS.index((SEEN[i], SEEN[j]))] for i, j in TRIANGLE])
-    pull = jnp.stack([pull[k] for k in SEEN])
     parts, order = [], []
     for family in dict.fromkeys(families):
         at = [k for k, name in enumerate(families) if name == family]
-        exact = family == "gaussian" and sites.lower is None
-
-        def swept(scale: Array, family: Family = family, exact: bool = exact) -> tuple:
-            start = _solved(
-                known.information + squares / scale**2, known.gradient - pull / scale**2
-            )
-            return _sweep_all(
-                family, scale, sites, known.information, known.gradient, start,
-                0 if exact else sweeps,
-            )  # fmt: skip
-
-        # One after the other: side by side they would not stay in the second-level cache.
-        found = jax.lax.map(swept, jnp.stack([sd[k] for k in at]))
+        found = _in_turn(
+            family, jnp.stack([sd[k] for k in at]), sites, known, (squares, pull), ahead, sweeps
+        )  # fmt: skip
         parts.append([jnp.moveaxis(each, 0, -2) for each in found])
         order += at
     back = [order.index(k) for k in range(len(order))]
@@ -225,6 +221,28 @@ class _Belief(eqx.Module):
     log_determinant: Float[Array, " lanes"]
 
 
+def gaussian_evidence(
+    known: Marginal,
+    sites: Sites,
+    squares: Float[Array, "6 6 lanes"],
+    pull: Float[Array, "6 lanes"],
+    sd: Float[Array, " lanes"],
+) -> Float[Array, " lanes"]:
+    """Log evidence under the Gaussian law of that SD, uncut."""
+    square, count = total([sites.used * sites.offset * sites.offset, sites.used])
+    belief = _solved(known.information + squares / sd**2, known.gradient - pull / sd**2)
+    outer = square / sd**2 + count * jnp.log(2 * np.pi * sd**2)
+    return 0.5 * (jnp.sum(belief.rhs * belief.mean, axis=0) - belief.log_determinant - outer)
+
+
+def seen(
+    squares: Float[Array, "45 lanes"], pull: Float[Array, "9 lanes"]
+) -> tuple[Float[Array, "6 6 lanes"], Float[Array, "6 lanes"]]:
+    """Of sums of h_i h_i' (upper triangle) and h_i o_i over all nine unknowns, those for z."""
+    matrix = _full([squares[PAIRS.index((SEEN[i], SEEN[j]))] for i, j in TRIANGLE])
+    return matrix, jnp.stack([pull[k] for k in SEEN])
+
+
 def _full(flat: Vector) -> Array:
     """A symmetric 6x6 matrix from its upper triangle."""
     return jnp.stack([jnp.stack(row) for row in unrolled.symmetric(flat)])
@@ -238,19 +256,25 @@ def _solved(information: Float[Array, "6 6 lanes"], rhs: Float[Array, "6 lanes"]
     return apart(_Belief(covariance, mean, information, rhs, log_determinant))
 
 
-def _sweep_all(
+def _in_turn(
     family: Family,
-    sd: Float[Array, " lanes"],
+    sd: Float[Array, "k lanes"],
     sites: Sites,
-    information: Float[Array, "6 6 lanes"],
-    gradient: Float[Array, "6 lanes"],
-    start: _Belief,
+    known: Marginal,
+    sums: tuple[Float[Array, "6 6 lanes"], Float[Array, "6 lanes"]],
+    ahead: int,
     sweeps: int,
 ) -> tuple[Array, Array, Array, Array]:
-    """Mean, covariance, log evidence and last change under laws of one family."""
+    """Mean, covariance, log evidence and last change under laws of one family, one by one."""
     h, offset, used = sites.direction, sites.offset, sites.used
-    tau = used / (sd * sd)[:, None]
-    state = (tau, jnp.zeros_like(tau), start)
+    information, gradient = known.information, known.gradient
+
+    def begun(sd: Array) -> tuple[Array, Array, _Belief]:
+        """The sites of the Gaussian law."""
+        squares, pull = sums
+        tau = used / (sd * sd)[:, None]
+        belief = _solved(information + squares / sd**2, gradient - pull / sd**2)
+        return tau, jnp.zeros_like(tau), belief
 
     def cavity(tau: Array, nu: Array, belief: _Belief) -> tuple[Array, Array]:
         entry = belief.covariance[..., None]
@@ -264,7 +288,7 @@ def _sweep_all(
         centre = shrink * (at - variance * nu)
         return centre, jnp.where(used > 0, variance * shrink, 1.0)
 
-    def moments(tau: Array, nu: Array, belief: _Belief) -> tuple[Moments, Array, Array]:
+    def moments(sd: Array, tau: Array, nu: Array, belief: _Belief) -> tuple[Moments, Array, Array]:
         centre, without = cavity(tau, nu, belief)
         found = tilted(family, sd, centre, without, sites.lower, sites.upper)
         return found, centre, without
@@ -282,25 +306,45 @@ def _sweep_all(
         sums = total([*planes, *(force * row for row in h)])
         return tau, nu, _solved(information + _full(sums[:21]), gradient + jnp.stack(sums[21:]))
 
-    def sweep(_: Array, state: tuple) -> tuple:
-        tau, nu, belief = state
-        return refresh(tau, nu, belief, *moments(tau, nu, belief))
+    def swept(times: int, sd: Array, state: tuple) -> tuple:
+        def sweep(_: Array, state: tuple) -> tuple:
+            tau, nu, belief = state
+            return refresh(tau, nu, belief, *moments(sd, tau, nu, belief))
 
-    tau, nu, belief = jax.lax.fori_loop(0, max(sweeps - 1, 0), sweep, state)
-    found, centre, without = moments(tau, nu, belief)
-    # The evidence is stationary in the sites, so it is as good before the last sweep as after.
-    joined = 1 + tau * without
-    site = found.log_mass + 0.5 * jnp.log(joined)
-    site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
-    site = site + nu * offset - 0.5 * tau * offset**2
-    gained = jnp.sum(belief.rhs * belief.mean, axis=0)
-    crowded = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)
-    site, crowded = total([used * site, crowded])
-    evidence = site + 0.5 * gained - 0.5 * belief.log_determinant
-    if sweeps == 0:
-        return belief.mean, belief.covariance, evidence, jnp.where(crowded > 0, jnp.inf, 0.0)
-    *_, after = refresh(tau, nu, belief, found, centre, without)
-    step = after.mean - belief.mean
-    length = jnp.sum(step * dense.product_abreast(after.information, step), axis=0)
-    change = jnp.where(crowded > 0, jnp.inf, jnp.sqrt(jnp.maximum(length, 0.0)))
-    return after.mean, after.covariance, evidence, change
+        return jax.lax.fori_loop(0, times, sweep, state)
+
+    def judged(sd: Array, state: tuple) -> tuple[Array, Array, tuple[Moments, Array, Array]]:
+        """Log evidence, whether a site leaves nothing for the others, and what was found."""
+        tau, nu, belief = state
+        found, centre, without = moments(sd, tau, nu, belief)
+        # The evidence is stationary in the sites, so it is as good before the last sweep as after.
+        joined = 1 + tau * without
+        site = found.log_mass + 0.5 * jnp.log(joined)
+        site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
+        site = site + nu * offset - 0.5 * tau * offset**2
+        gained = jnp.sum(belief.rhs * belief.mean, axis=0)
+        crowded = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)
+        site, crowded = total([used * site, crowded])
+        evidence = site + 0.5 * gained - 0.5 * belief.log_determinant
+        return evidence, crowded > 0, (found, centre, without)
+
+    def law(state: tuple, sd: Array) -> tuple[tuple, tuple[Array, Array, Array, Array]]:
+        tau, nu, before = state = swept(sweeps - 1, sd, state)
+        evidence, crowded, found = judged(sd, state)
+        after = refresh(tau, nu, before, *found)
+        belief = after[-1]
+        step = belief.mean - before.mean
+        length = jnp.sum(step * dense.product_abreast(belief.information, step), axis=0)
+        change = jnp.where(crowded, jnp.inf, jnp.sqrt(jnp.maximum(length, 0.0)))
+        return after, (belief.mean, belief.covariance, evidence, change)
+
+    def exact(sd: Array) -> tuple[Array, Array, Array, Array]:
+        state = begun(sd)
+        evidence, crowded, _ = judged(sd, state)
+        belief = state[-1]
+        return belief.mean, belief.covariance, evidence, jnp.where(crowded, jnp.inf, 0.0)
+
+    # One after the other: side by side they would not stay in the second-level cache.
+    if family == "gaussian" and sites.lower is None:
+        return jax.lax.map(exact, sd)
+    return jax.lax.scan(law, swept(ahead, sd[0], begun(sd[0])), sd)[1]
