@@ -23,14 +23,15 @@ from jaxcal.solvers.auto import (
     SHAPES,
     UNIFORM,
     average_over_laws,
-    log_together,
     median,
     odds_of_mean,
     weigh,
     weights,
+    without_mean,
 )
 from jaxcal.solvers.dense import inverse_abreast, inverse_positive
-from jaxcal.solvers.expectation_propagation import Linear, gaussian_evidence, propagate
+from jaxcal.solvers.evidence import MEAN_SD
+from jaxcal.solvers.expectation_propagation import Linear, propagate
 from jaxcal.solvers.fused import Guess, Images
 from jaxcal.solvers.fused_auto import average_abreast
 from jaxcal.solvers.fused_variance import self_tuned
@@ -158,13 +159,6 @@ def test_laws_in_turn_settle_where_long_sweeps_do():
     np.testing.assert_allclose(found.log_evidence, settled.log_evidence, atol=0.05)
 
 
-def test_evidence_of_the_gaussian_law_needs_no_sites():
-    linear = linear_problem()
-    found = propagate(linear, ("gaussian",), jnp.asarray([0.8]))
-    said = gaussian_evidence(linear, jnp.asarray(0.8))
-    assert float(said) == pytest.approx(float(found.log_evidence[0]), rel=1e-12)
-
-
 def test_the_median_is_where_the_expected_distance_is_least():
     rng = np.random.default_rng(3)
     # One unknown: E |x - N(m, s^2)| of the mixture, over x.
@@ -191,26 +185,46 @@ def test_the_median_is_where_the_expected_distance_is_least():
     np.testing.assert_array_equal(share, only)
 
 
+def test_evidence_without_a_mean_follows_from_that_with_it():
+    """For the Gaussian law, where all of it is exact: against the problem that has no mean."""
+    sd, about = 1.3, 0.4
+    few = linear_problem(n=30)
+    precision = 1 / (MEAN_SD * sd) ** 2
+    # q = h'x - (about + b), and b + about ~ N(0, 1 / precision).
+    more = Linear(
+        jnp.pad(few.information, (0, 1)).at[2, 2].set(precision),
+        jnp.append(few.gradient, -precision * about),
+        jnp.concatenate([few.direction, -jnp.ones((30, 1))], axis=1),
+        few.offset - about, few.used,
+    )  # fmt: skip
+    without, with_it = (
+        propagate(linear, ("gaussian",), jnp.asarray([sd])) for linear in (few, more)
+    )
+    b, variance = with_it.mean[:, -1] + about, with_it.covariance[:, -1, -1]
+    gain, pull = without_mean(b, variance, jnp.asarray(sd))
+    known = 0.5 * np.log(precision) - 0.5 * precision * about**2
+    expected = with_it.log_evidence + known - without.log_evidence
+    np.testing.assert_allclose(gain, expected, rtol=1e-9)
+    along = with_it.covariance[0, -1]
+    held = with_it.mean[0] - along * pull[0]
+    np.testing.assert_allclose(held, [*without.mean[0], -about], rtol=1e-9)
+
+
 def test_all_laws_have_to_agree_to_a_mean():
-    """Edges tell of the mean what a Gaussian does not see."""
-    asks = LOG_ODDS_OF_MEAN + 1
-    for gaussian, together, odds in (
-        (asks, 20.0, asks), (asks, 0.5, 0.5), (asks, -np.inf, -np.inf), (asks, np.nan, asks),
-        (-2.0, 20.0, -2.0),
-    ):  # fmt: skip
-        found = odds_of_mean(jnp.asarray(gaussian), jnp.asarray(0.0), jnp.asarray(together))
-        assert float(found) == odds
     good = jnp.asarray([[True, False], [True, False]])
     evidence = jnp.asarray([[-3.0, 1.0], [-5.0, jnp.nan]])
-    found = log_together(evidence, good, jnp.asarray([0.5, 0.5]))
-    assert float(found[0]) == pytest.approx(np.log(0.5 * np.exp(-3) + 0.5 * np.exp(-5)))
-    assert float(found[1]) == -np.inf
+    gain = jnp.asarray([[2.0, 0.0], [-1.0, jnp.nan]])
+    found = odds_of_mean(evidence, gain, good, jnp.asarray([0.5, 0.5]))
+    expected = np.log((np.exp(-3) + np.exp(-5)) / (np.exp(-5) + np.exp(-4)))
+    assert float(found[0]) == pytest.approx(expected)
+    assert np.isnan(found[1])
 
 
 def test_covariance_is_about_the_answer():
     """Spread of the laws' answers about the answer given, and their own covariances."""
     linear = linear_problem(n=30)
-    found = weigh(linear, jnp.asarray(1.1), SHAPES)
+    none = jnp.asarray(0.0)
+    found = weigh(linear, jnp.asarray(1.1), SHAPES, none, jnp.asarray(False))
     laws = propagate(
         linear, tuple(shape.family for shape in SHAPES),
         jnp.asarray([1.1 * shape.stretch for shape in SHAPES]),

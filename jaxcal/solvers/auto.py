@@ -48,8 +48,8 @@ from jaxcal.model.parameters import Blocks, Parameters, retract
 from jaxcal.model.priors import AbstractSelfTuned, Gaussian, covariance_shape
 from jaxcal.model.shapes import FAMILIES, Shape
 from jaxcal.problem import Problem
-from jaxcal.solvers.evidence import Tuned, tune
-from jaxcal.solvers.expectation_propagation import Linear, gaussian_evidence, propagate
+from jaxcal.solvers.evidence import MEAN_SD, Tuned, tune
+from jaxcal.solvers.expectation_propagation import Linear, propagate
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING
 
 UNIFORM: tuple[Shape, ...] = tuple(
@@ -151,15 +151,13 @@ def average_over_laws(
     # One more SD that is tuned costs half the log of the number of images.
     used = jnp.sum(problem.mask)
     pairs = (evidence + 0.5 * models.tied * jnp.log(used)).reshape(-1, 2)
-    which = jnp.argmax(jnp.max(pairs - jnp.asarray([0.0, LOG_ODDS_OF_MEAN]), axis=1))
-    pair: Tuned = jax.tree.map(lambda leaf: leaf.reshape(-1, 2, *leaf.shape[1:])[which], tuned)
-    both = jax.vmap(lambda linear, sd: weigh(linear, sd, shapes))(pair.linear, pair.sigma[:, -1])
-    log_odds = odds_of_mean(pairs[which, 1] - pairs[which, 0], *(pairs[which] + both.gain))
-    with_mean = (log_odds > LOG_ODDS_OF_MEAN).astype(int)
-    best, weighed = jax.tree.map(lambda leaf: leaf[with_mean], (pair, both))
-    chosen_belief = jax.tree.map(lambda leaf: leaf[2 * which], models.belief)
-    used_belief = chosen_belief.with_sigma(best.sigma)
+    chosen = jnp.argmax(pairs - jnp.asarray([0.0, LOG_ODDS_OF_MEAN]))
+    best: Tuned = jax.tree.map(lambda leaf: leaf[chosen], tuned)
+    used_belief = jax.tree.map(lambda leaf: leaf[chosen], models.belief).with_sigma(best.sigma)
+    asked = chosen % 2 == 1
+    weighed = weigh(best.linear, best.sigma[-1], shapes, best.mean, asked)
     mean, covariance = weighed.mean, weighed.covariance
+    gaussian = pairs[chosen // 2, 1] - pairs[chosen // 2, 0]
 
     enough = (used >= MINIMUM_SELF_TUNING) & weighed.settled
     enough = enough & jnp.all(jnp.isfinite(mean))
@@ -168,11 +166,11 @@ def average_over_laws(
     variance = jnp.einsum("np,pq,nq->n", along, shared, along)
     moved = retract(best.parameters, mean[:-1], blocks)
     member = jnp.asarray([[shape.family == name for shape in shapes] for name in FAMILIES])
-    has_mean = enough & (with_mean > 0)
+    has_mean = enough & asked & jnp.logical_not(weighed.denied)
     own = jnp.asarray(False)
     log_odds_own = jnp.zeros((), problem.mask.dtype)
     if pairs.shape[0] > 1:
-        own = enough & (which > 0)
+        own = enough & (chosen >= 2)
         log_odds_own = jnp.max(pairs[1]) - jnp.max(pairs[0])
     law = OffsetLaw(
         probability=member @ weighed.weight,
@@ -180,7 +178,8 @@ def average_over_laws(
         mean_sd=jnp.where(has_mean, jnp.sqrt(jnp.maximum(covariance[-1, -1], 0.0)), 0.0),
         has_mean=has_mean,
         own_covariances=own,
-        log_odds_mean=log_odds,
+        # fmin: where no law settles, the Gaussian's odds stand.
+        log_odds_mean=jnp.where(asked, jnp.fmin(gaussian, weighed.log_odds), gaussian),
         log_odds_own=log_odds_own,
         weighed=enough,
     )
@@ -205,32 +204,81 @@ class Weighed(eqx.Module):
         covariance: about it.
         weight: the laws' probabilities.
         settled: at least one of them counts.
-        gain: ln of how much more probable all laws together make the data than the Gaussian alone.
+        log_odds: ln of how much more probable they make the data with a mean of the offsets.
+        denied: a mean was asked for, and all laws together do not believe in it.
     """
 
     mean: Float[Array, " p"]
     covariance: Float[Array, "p p"]
     weight: Float[Array, " k"]
     settled: Bool[Array, ""]
-    gain: Float[Array, ""]
+    log_odds: Float[Array, ""]
+    denied: Bool[Array, ""]
 
 
-def weigh(linear: Linear, sd: Float[Array, ""], shapes: Sequence[Shape]) -> Weighed:
-    """Weigh the laws on a linearised problem, the offsets' SD (mm) being what REML found."""
+def weigh(
+    linear: Linear,
+    sd: Float[Array, ""],
+    shapes: Sequence[Shape],
+    mean: Float[Array, ""],
+    asked: Bool[Array, ""],
+) -> Weighed:
+    """Weigh the laws on a linearised problem.
+
+    A law with edges says of the mean b what a Gaussian does not see, so where the Gaussian asks for
+    one, all laws together have to agree. That needs no second propagation: the evidence with b over
+    that without is the density of b at zero before the data over that after (Savage and Dickey),
+    and where the laws deny the mean, their beliefs are conditioned on b = 0.
+
+    Args:
+        linear: the problem; b is the last unknown.
+        sd: the offsets' SD that REML found, mm.
+        shapes: the laws.
+        mean: b where the problem is linearised, mm.
+        asked: the Gaussian believes in a mean.
+
+    Reference: Dickey 1971.
+    """
     stretch = jnp.asarray([shape.stretch for shape in shapes], sd.dtype)
     prior = jnp.asarray([shape.prior for shape in shapes], sd.dtype)
     found = propagate(linear, tuple(shape.family for shape in shapes), stretch * sd)
     weight, good = weights(found.log_evidence, found.change, prior)
-    means = jnp.where(good[:, None], found.mean, 0.0).T
-    within = jnp.where(good[:, None, None], found.covariance, 0.0)
+    means = jnp.where(good[:, None], found.mean, 0.0)
+    within = jnp.where(good[:, None, None], found.covariance, jnp.eye(found.mean.shape[1]))
+
+    gain, pull = without_mean(means[:, -1] + mean, within[:, -1, -1], sd)
+    log_odds = odds_of_mean(found.log_evidence, gain, good, prior)
+    denied = asked & jnp.logical_not(log_odds > LOG_ODDS_OF_MEAN)
+    fewer, _ = weights(found.log_evidence - gain, found.change, prior)
+    along = within[:, -1]
+    conditioned = within - along[:, :, None] * along[:, None] / within[:, -1, -1, None, None]
+    means = jnp.where(denied, means - along * pull[:, None], means)
+    within = jnp.where(denied, conditioned, within)
+    weight = jnp.where(denied, fewer, weight)
+
     squares = linear.direction.T @ (linear.used[:, None] * linear.direction)
     spread = jnp.einsum("pq,kpq->k", squares, within)
-    mean = means @ median(means, spread, weight, squares)
-    off = jnp.where(good, means - mean[:, None], 0.0)
+    answer = means.T @ median(means.T, spread, weight, squares)
+    off = means - answer
     covariance = jnp.einsum("k,kpq->pq", weight, within)
-    covariance = covariance + jnp.einsum("k,pk,qk->pq", weight, off, off)
-    gain = log_together(found.log_evidence, good, prior) - gaussian_evidence(linear, sd)
-    return Weighed(mean, covariance, weight, jnp.any(good), gain)
+    covariance = covariance + jnp.einsum("k,kp,kq->pq", weight, off, off)
+    return Weighed(answer, covariance, weight, jnp.any(good), log_odds, denied)
+
+
+def without_mean(off: Array, variance: Array, sd: Array) -> tuple[Array, Array]:
+    """What a belief about the offsets' mean b says of b = 0.
+
+    Args:
+        off: expectation of b, mm.
+        variance: of b, mm^2.
+        sd: the offsets' SD, mm.
+
+    Returns:
+        Log of the evidence with b over that without, and by how many covariances with b (1/mm) the
+        other unknowns give way where b is held at zero.
+    """
+    pull = off / variance
+    return 0.5 * (jnp.log(variance) - 2 * jnp.log(MEAN_SD * sd) + off * pull), pull
 
 
 def median(
@@ -269,29 +317,27 @@ def median(
     return jax.lax.fori_loop(0, MEDIAN_STEPS, once, weight)
 
 
-def odds_of_mean(gaussian: Array, without: Array, with_mean: Array) -> Array:
-    """Log of how much more probable the data are with a mean of the offsets.
-
-    A law with edges says of the mean what a Gaussian does not see, so where the Gaussian believes
-    in one all laws together are asked as well: the smaller odds count.
+def odds_of_mean(
+    log_evidence: Float[Array, "k ..."],
+    gain: Float[Array, "k ..."],
+    good: Bool[Array, "k ..."],
+    prior: Float[Array, " k"],
+) -> Array:
+    """Log of how much more probable all laws together make the data with a mean than without.
 
     Args:
-        gaussian: the odds under the Gaussian law.
-        without: ln evidence of all laws together without a mean.
-        with_mean: with one.
+        log_evidence: with one.
+        gain: how much less each law's is without.
+        good: laws that count; NaN where none does.
+        prior: their probabilities.
     """
-    # fmin: where no law settles either way, the Gaussian's odds stand.
-    together = jax.lax.stop_gradient(with_mean - without)
-    return jnp.where(gaussian > LOG_ODDS_OF_MEAN, jnp.fmin(gaussian, together), gaussian)
-
-
-def log_together(
-    log_evidence: Float[Array, "k ..."], good: Bool[Array, "k ..."], prior: Float[Array, " k"]
-) -> Array:
-    """Log of the average evidence of the laws that count; -inf where none does."""
-    score = jnp.where(good, log_evidence, -jnp.inf)
     prior = prior.reshape(-1, *(1,) * (log_evidence.ndim - 1))
-    return jax.nn.logsumexp(jax.lax.stop_gradient(score), axis=0, b=prior)
+
+    def together(score: Array) -> Array:
+        score = jnp.where(good, jax.lax.stop_gradient(score), -jnp.inf)
+        return jax.nn.logsumexp(score, axis=0, b=prior)
+
+    return together(log_evidence) - together(log_evidence - gain)
 
 
 def weights(

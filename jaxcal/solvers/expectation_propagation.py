@@ -182,17 +182,6 @@ def _in_turn(
     return Posterior(*jax.lax.scan(law, start, sd)[1])
 
 
-def gaussian_evidence(linear: Linear, sd: Float[Array, ""]) -> Float[Array, ""]:
-    """Log evidence under the Gaussian law of that SD, uncut: no sites have to be found."""
-    used, precision = linear.used, 1 / sd**2
-    weighted = precision * used[:, None] * linear.direction
-    information = linear.information + weighted.T @ linear.direction
-    rhs = linear.gradient - linear.offset @ weighted
-    covariance, log_determinant = dense.inverse_positive(information)
-    outer = jnp.sum(used * (jnp.log(2 * np.pi / precision) + precision * linear.offset**2))
-    return 0.5 * (rhs @ covariance @ rhs - log_determinant - outer)
-
-
 def refreshed(found: Moments, centre: Array, without: Array) -> tuple[Array, Array]:
     """The sites (tau, nu) that reproduce moments found, beside the Gaussian without them."""
     tau = 1 / found.variance - 1 / without

@@ -1,4 +1,4 @@
-"""The average over noise models and laws of the offsets, many problems side by side.
+"""The answer over noise models and laws of the offsets, many problems side by side.
 
 It is :func:`jaxcal.solvers.auto.average_over_laws`, which is the reference and explains it, for
 plain problems: a rigid X and common SDs or own covariances. Evidence and laws have their own
@@ -22,10 +22,10 @@ from jaxcal.solvers.auto import (
     LOG_ODDS_OF_MEAN,
     Averaged,
     OffsetLaw,
-    log_together,
     median,
     odds_of_mean,
     weights,
+    without_mean,
 )
 from jaxcal.solvers.fused import UNKNOWNS, Guess, Images, targets
 from jaxcal.solvers.fused_evidence import (
@@ -38,7 +38,7 @@ from jaxcal.solvers.fused_evidence import (
     row_of,
     tune,
 )
-from jaxcal.solvers.fused_laws import SEEN, Sites, gaussian_evidence, marginal, propagate, seen
+from jaxcal.solvers.fused_laws import SEEN, Sites, marginal, propagate, seen
 from jaxcal.solvers.lanes import apart, choose
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING
 
@@ -59,35 +59,21 @@ def average_abreast(
     pairs = jnp.stack([model.log_evidence for model in models])
     pairs = jnp.where(jnp.isfinite(pairs), pairs, -jnp.inf).reshape(-1, 2, len(used))
     wanted = pairs - jnp.asarray([0.0, LOG_ODDS_OF_MEAN])[:, None]
-    which = jnp.argmax(jnp.max(wanted, axis=1), axis=0)
-    common, others = (models[0], models[1], pairs[0]), (*models[-2:], pairs[-1])
-    without, with_mean, pair = choose(which > 0, others, common)
-    gaussian = pair[1] - pair[0]
-    asked = gaussian > LOG_ODDS_OF_MEAN
-
-    def turn(k: Array, state: tuple[Answer, Array]) -> tuple[Answer, Array]:
-        # First with the mean where a lane's Gaussian believes in one, and then, should there be
-        # such lanes, without: all laws together have to agree, or the second answer stands.
-        before, odds = state
-        model = apart(choose(asked & (k == 0), with_mean, without))
-        now = answered(model, images, problems.max_elevation, shapes)
-        together = odds_of_mean(gaussian, pair[0] + now.gain, pair[1] + before.gain)
-        odds = jnp.where(k == 0, odds, together)
-        agreed = (k > 0) & ~(asked & ~(odds > LOG_ODDS_OF_MEAN))
-        return choose(agreed, before, now), odds
-
-    # One program for both turns.
-    shaped = jax.eval_shape(lambda: answered(without, images, problems.max_elevation, shapes))
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shaped)
-    best, log_odds = jax.lax.fori_loop(0, 1 + jnp.any(asked), turn, (nothing, gaussian))
-    best, log_odds = apart((best, log_odds))
+    chosen = jnp.argmax(wanted.reshape(len(models), -1), axis=0)
+    model = models[0]
+    for k, other in enumerate(models[1:], start=1):
+        model = choose(chosen == k, other, model)
+    asked, which = chosen % 2 == 1, chosen // 2
+    best = apart(answered(apart(model), asked, images, problems.max_elevation, shapes))
+    pair = jnp.where(which > 0, pairs[-1], pairs[0])
+    log_odds = jnp.where(asked, jnp.fmin(pair[1] - pair[0], best.log_odds), pair[1] - pair[0])
     step, shared = best.step, best.covariance[:UNKNOWNS, :UNKNOWNS]
 
     enough = (used >= MINIMUM_SELF_TUNING) & best.settled
     enough = enough & jnp.all(jnp.isfinite(step), axis=0)
-    moved = best.model.guess.moved(list(step[:UNKNOWNS]))
+    moved = model.guess.moved(list(step[:UNKNOWNS]))
     member = jnp.asarray([[shape.family == name for shape in shapes] for name in FAMILIES])
-    has_mean = enough & (best.model.with_mean > 0)
+    has_mean = enough & asked & jnp.logical_not(best.denied)
     own_covariances = jnp.zeros_like(enough)
     log_odds_own = jnp.zeros_like(log_odds)
     covariances = None
@@ -100,7 +86,7 @@ def average_abreast(
     mean_sd = jnp.sqrt(jnp.maximum(best.covariance[-1, -1], 0.0))
     law = OffsetLaw(
         probability=(member @ best.weight).T,
-        mean=jnp.where(has_mean, best.model.mean + step[-1], 0.0),
+        mean=jnp.where(has_mean, model.mean + step[-1], 0.0),
         mean_sd=jnp.where(has_mean, mean_sd, 0.0),
         has_mean=has_mean,
         own_covariances=own_covariances,
@@ -108,7 +94,7 @@ def average_abreast(
         log_odds_own=log_odds_own,
         weighed=enough,
     )
-    moved, sigma = choose(enough, (moved, best.model.sigma), (guess, belief.sigma.T))
+    moved, sigma = choose(enough, (moved, model.sigma), (guess, belief.sigma.T))
     elevation_sd = jnp.sqrt(jnp.where(problems.mask > 0, best.variance.T, jnp.nan))
     return jax.vmap(Averaged)(
         moved.parameters(), jax.vmap(Gaussian)(sigma.T, covariances),
@@ -155,23 +141,24 @@ class Answer(eqx.Module):
     """What the laws say together about a noise model's unknowns; lanes last.
 
     Attributes:
-        model: the noise model. step, covariance: of X, the target and b: the laws' median, and
-            about it. weight: the laws' probabilities. settled: at least one of them counts.
-            variance: of the images' offsets, mm^2. gain: ln of how much more probable all laws
-            together make the data than the Gaussian alone.
+        step, covariance: of X, the target and b: the laws' median, and about it. weight: the laws'
+            probabilities. settled: at least one of them counts. variance: of the images' offsets,
+            mm^2. log_odds: ln of how much more probable they make the data with a mean. denied: a
+            mean was asked for, and all laws together do not believe in it.
     """
 
-    model: Candidate
     step: Float[Array, "10 lanes"]
     covariance: Float[Array, "10 10 lanes"]
     weight: Float[Array, "k lanes"]
     settled: Bool[Array, " lanes"]
     variance: Float[Array, "n lanes"]
-    gain: Float[Array, " lanes"]
+    log_odds: Float[Array, " lanes"]
+    denied: Bool[Array, " lanes"]
 
 
 def answered(
     model: Candidate,
+    asked: Bool[Array, " lanes"],
     images: Images,
     bound: Float[Array, "lanes n"] | None,
     shapes: tuple[Shape, ...],
@@ -189,20 +176,30 @@ def answered(
     found = propagate(known, sites, squares, pull, families, stretch[:, None] * sd)
     weight, good = weights(found.log_evidence, found.change, prior)
     means = jnp.where(good, found.mean, 0.0)
-    within = jnp.where(good, found.covariance, 0.0)
+    within = jnp.where(good, found.covariance, jnp.eye(len(SEEN))[:, :, None, None])
     means, within, weight = apart((means, within, weight))
+
+    expected, variance, along = apart(known.of_mean(means, within))
+    gain, away = without_mean(expected + model.mean, variance, sd)
+    log_odds = apart(odds_of_mean(found.log_evidence, gain, good, prior))
+    denied = asked & jnp.logical_not(log_odds > LOG_ODDS_OF_MEAN)
+    fewer, _ = weights(found.log_evidence - gain, found.change, prior)
+    conditioned = within - along[:, None] * along[None] / variance
+    means, within, weight = apart(
+        choose(denied, (means - along * away, conditioned, fewer), (means, within, weight))
+    )
+    known = choose(denied, known.held(-model.mean), known)
+
     spread = jnp.sum(squares[:, :, None] * within, axis=(0, 1))
     share = median(means, apart(spread), weight, squares)
     mean = jnp.sum(apart(share) * means, axis=1)
-    off = jnp.where(good, means - mean[:, None], 0.0)
+    off = means - mean[:, None]
     covariance = jnp.sum(weight * (within + off[:, None] * off[None]), axis=2)
     step, covariance = apart(known.lifted(*apart((mean, covariance))))
-    along = [[covariance[i, j][:, None] for j in SEEN] for i in SEEN]
-    variance = unrolled.dot(sites.direction, unrolled.apply(along, sites.direction))
-    gain = log_together(found.log_evidence, good, prior)
-    gain = gain - gaussian_evidence(known, sites, squares, pull, sd)
+    across = [[covariance[i, j][:, None] for j in SEEN] for i in SEEN]
+    offset = unrolled.dot(sites.direction, unrolled.apply(across, sites.direction))
     return Answer(
-        model, step, covariance, weight, jnp.any(good, axis=0), variance.T, gain
+        step, covariance, weight, jnp.any(good, axis=0), offset.T, log_odds, denied
     )  # fmt: skip
 
 

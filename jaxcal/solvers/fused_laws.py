@@ -115,6 +115,25 @@ class Marginal(eqx.Module):
         matrix = matrix - shear[:, None] * matrix[9]
         return whole, matrix - shear[None] * matrix[:, 9, None]
 
+    def of_mean(
+        self, mean: Float[Array, "6 k lanes"], covariance: Float[Array, "6 6 k lanes"]
+    ) -> tuple[Float[Array, "k lanes"], Float[Array, "k lanes"], Float[Array, "6 k lanes"]]:
+        """Expectation and variance of b, and its covariances with z, from beliefs about z."""
+        slope = self.slope[3, :, None]
+        along = jnp.sum(covariance * slope, axis=1)
+        expected = self.shift[3] + jnp.sum(slope * mean, axis=0)
+        return expected, self.spread[3, 3] + jnp.sum(slope * along, axis=0), along
+
+    def held(self, mean: Float[Array, " lanes"]) -> Marginal:
+        """The same where b is known."""
+        share = self.spread[:, 3] / self.spread[3, 3]
+        shift = self.shift + share * (mean - self.shift[3])
+        slope = self.slope - share[:, None] * self.slope[3]
+        spread = self.spread - share[:, None] * self.spread[3]
+        return Marginal(
+            self.information, self.gradient, shift, slope, spread, self.with_mean
+        )  # fmt: skip
+
 
 def marginal(
     information: Float[Array, "45 lanes"],
@@ -219,20 +238,6 @@ class _Belief(eqx.Module):
     information: Float[Array, "6 6 lanes"]
     rhs: Float[Array, "6 lanes"]
     log_determinant: Float[Array, " lanes"]
-
-
-def gaussian_evidence(
-    known: Marginal,
-    sites: Sites,
-    squares: Float[Array, "6 6 lanes"],
-    pull: Float[Array, "6 lanes"],
-    sd: Float[Array, " lanes"],
-) -> Float[Array, " lanes"]:
-    """Log evidence under the Gaussian law of that SD, uncut."""
-    square, count = total([sites.used * sites.offset * sites.offset, sites.used])
-    belief = _solved(known.information + squares / sd**2, known.gradient - pull / sd**2)
-    outer = square / sd**2 + count * jnp.log(2 * np.pi * sd**2)
-    return 0.5 * (jnp.sum(belief.rhs * belief.mean, axis=0) - belief.log_determinant - outer)
 
 
 def seen(
