@@ -65,10 +65,9 @@ SHAPES: tuple[Shape, ...] = (
 )
 """The laws that are weighed: a fifth for each family, two for the uniform one.
 
-With equal shares the answer is farthest from the Bayes limit where offsets are uniform. The uniform
-share is that at which it is as far for triangular ones (50 images, exact data, draws of their own):
-1.12 times, of 1.15 and 1.11 with quarters. More of it is paid for by Gaussian offsets and few
-images."""
+With equal shares the answer is farthest from the Bayes limit where offsets are uniform; a larger one
+of the uniform laws is paid for where they are triangular, and by few images.
+"""
 
 LOG_ODDS_OF_MEAN = float(np.log(9.0))
 """How much more probable the data must be with a mean: it is one more thing to be wrong about."""

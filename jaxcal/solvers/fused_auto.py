@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxcal.model.parameters import Parameters
+from jaxcal.model.parameters import RIGID, Parameters, retract
 from jaxcal.model.priors import Gaussian, covariance_shape
 from jaxcal.model.shapes import FAMILIES, Family, Shape
 from jaxcal.problem import Problem
@@ -71,7 +71,13 @@ def average_abreast(
 
     enough = (used >= MINIMUM_SELF_TUNING) & best.settled
     enough = enough & jnp.all(jnp.isfinite(step), axis=0)
-    moved = model.guess.moved(list(step[:UNKNOWNS]))
+    # As the reference does: from the linearisation it may be a hundredth of a radian, where the
+    # kernel's own rotation is another one in the eighth digit.
+    moved = Guess.of(
+        jax.vmap(lambda here, by: retract(here, by, RIGID))(
+            model.guess.parameters(), step[:UNKNOWNS].T
+        )
+    )
     member = jnp.asarray([[shape.family == name for shape in shapes] for name in FAMILIES])
     has_mean = enough & asked & jnp.logical_not(best.denied)
     own_covariances = jnp.zeros_like(enough)
