@@ -9,8 +9,9 @@ their SD does, heavy tails must not pull it, and a mean that is denied bends it.
 1. *REML* tunes the SDs of lateral position, range and offset, with Gaussian offsets of mean zero.
 2. *Evidence* (:mod:`jaxcal.solvers.evidence`). The same with a mean b ~ N(0, (2 sigma_y)^2) and,
    where the images came with covariances of their own, with those, up to one factor. A mean is
-   believed where it makes the data nine times as probable, with Gaussian offsets and under the laws
-   of step 3 together; of own covariances and common SDs, the more probable are.
+   believed where it makes the data nine times as probable, with Gaussian offsets and, as their
+   beliefs about b tell, under the laws of step 3 together; of own covariances and common SDs, the
+   more probable are.
 3. *Laws* (:mod:`jaxcal.model.shapes`). Linearised there, everything is Gaussian but the offsets'
    law. Expectation propagation gives X under each law of :data:`SHAPES` and how probable the data
    are under it: uniform, a bell with edges, Gaussian, Student's t4; the uniform one with five SDs
@@ -65,8 +66,8 @@ SHAPES: tuple[Shape, ...] = (
 )
 """The laws that are weighed: a fifth for each family, two for the uniform one.
 
-With equal shares the answer is farthest from the Bayes limit where offsets are uniform; a larger one
-of the uniform laws is paid for where they are triangular, and by few images.
+With equal shares the answer is farthest from the Bayes limit where offsets are uniform; a larger
+one of the uniform laws is paid for where they are triangular, and by few images.
 """
 
 LOG_ODDS_OF_MEAN = float(np.log(9.0))
