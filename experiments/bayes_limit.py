@@ -14,7 +14,11 @@ Gaussian beside it (``gaussian``) is given points alone, without covariances.
 Where the offsets are uniform there is a second limit, ``untold``: the same, but that the bound is
 one more unknown (every logarithm of it as probable), as it is to everybody in fact.
 
-Seed 20261126; trial k of a cell is fold_in(root, cell * 10^6 + k), cells counted over all laws.
+The largest ratio of so many cells is large by chance as well. Cells above BOUND are therefore run
+again on AGAIN draws of their own (``bayes_limit_again.csv``).
+
+Seed 20261126; trial k of a cell is fold_in(root, cell * 10^6 + k), cells counted over all laws;
+the second time k begins at 500,000.
 """
 
 from __future__ import annotations
@@ -42,7 +46,9 @@ FEW_IMAGES = (12, 20)
 FEW_IMAGES_CELL = (2.0, 2.0)
 QUICK = ((1.0, 2.0), (3.0, 6.0))
 BOUND = 1.20
-"""What the worst cell should stay below; the cells above it are named."""
+"""What the worst cell should stay below; the cells above it are named, and run again."""
+AGAIN = 1000
+"""Trials of the second time."""
 EXACT_MM = 1e-6
 
 HEADER = [
@@ -141,8 +147,23 @@ def main() -> None:
         ), flush=True)  # fmt: skip
         write_table(folder / "bayes_limit.csv", HEADER, rows)
     summary(rows)
+    write_table(folder / "bayes_limit_again.csv", HEADER, again(cells, rows, trials * AGAIN // 200))
     print(f"{time.perf_counter() - begun:.0f} s; {machine()}")
     plot(folder / "bayes_limit.png", rows)
+
+
+def again(
+    cells: list[tuple[OffsetLaw, int, float, float]], rows: list[list[object]], trials: int
+) -> list[list[object]]:
+    """Cells above the bound on other draws."""
+    found = []
+    for cell, (law, images, elevation, noise) in enumerate(cells):
+        if float(str(rows[cell][9])) > BOUND:
+            indices = cell * 1_000_000 + 500_000 + jnp.arange(trials)
+            found.append(run_cell(law, images, elevation, noise, indices))
+            print(f"  again: {law}, n = {images}, {elevation:g} mm, noise {noise:g} mm: "
+                  f"{found[-1][9]:.3f} +- {found[-1][10]:.3f}", flush=True)  # fmt: skip
+    return found
 
 
 def ratios(rows: list[list[object]], law: OffsetLaw | None, images: int) -> np.ndarray:
