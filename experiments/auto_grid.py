@@ -220,11 +220,14 @@ def main() -> None:
     folder, todo = results_folder(quick), cells(quick)
     rows: list[dict[str, Any]] = []
     for index, cell in enumerate(todo):
+        if index and cell.images != todo[index - 1].images:
+            jax.clear_caches()  # a process may map only so many compiled programs
         rows.append(run_cell(cell, index * 1_000_000 + jnp.arange(trials)))
         told = (*COMPARED[:3], "not_converged", "hindsight_over_auto", "hindsight_bound_over_true",
                 "hindsight_rounds")  # fmt: skip
         print(f"{cell}: " + ", ".join(f"{name} {rows[-1][name]:.4g}" for name in told), flush=True)
         write(folder / "auto_grid.csv", rows)
+    jax.clear_caches()
     repeated = []
     for index, (cell, row) in enumerate(zip(todo, rows, strict=True)):
         if any(row[name] > 1 for name in COMPARED):
