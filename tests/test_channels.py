@@ -39,6 +39,7 @@ def precision(result: jaxcal.Calibration, data: jaxcal.Recording) -> float:
     )
 
 
+@pytest.mark.slow
 def test_a_curved_array_gives_the_offsets_with_their_signs():
     data = recording(CURVED, noise=0.05)
     assert data.truth is not None
@@ -114,6 +115,7 @@ def test_sound_speed_and_delay_are_estimated_along(probe):
     assert np.mean(wrong) > 1.5 * np.mean(estimated)
 
 
+@pytest.mark.slow
 def test_what_points_cannot_tell_is_said_or_refused():
     data = recording(STRAIGHT, noise=0.2)
     points = replace(jaxcal.Problem.from_recording(data), channels=None)

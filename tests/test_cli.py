@@ -212,6 +212,7 @@ def test_calibrate_speaks_to_a_person(calibrated, simulated, jaxcal_process):
     assert max(map(len, done.stdout.splitlines())) <= 100
 
 
+@pytest.mark.slow
 def test_demo_compares_and_reports(calibrated, jaxcal_process, tmp_path):
     done = jaxcal_process("demo", "--json", "--seed", 1, "--out", tmp_path / "new")
     assert (done.returncode, done.stderr) == (0, "")
