@@ -167,7 +167,9 @@ def solver_programs(problems: Problem, sigma: np.ndarray) -> tuple[dict, Callabl
 
     def fixed(fit, problems: Problem):
         sd = jnp.tile(jnp.asarray(sigma)[:, None], problems.mask.shape[0])
-        done = minimise(lanes_last(fit), Measured(sd), Images.of(problems), damping=1e-6)
+        done = minimise(
+            lanes_last(fit), Measured(sd), Images.of(problems), damping=1e-6, head_start=False
+        )
         return done.guess.parameters(), done.iterations
 
     def tuned(fit, problems: Problem):
