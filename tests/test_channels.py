@@ -87,9 +87,8 @@ def wrong_medium(data: jaxcal.Recording, speed: float, delay_s: float) -> jaxcal
     return replace(data, calibration=replace(data.calibration, measurements=times))
 
 
-@pytest.mark.parametrize(
-    "probe", [pytest.param(STRAIGHT, marks=pytest.mark.slow), CURVED], ids=["straight", "curved"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("probe", [STRAIGHT, CURVED], ids=["straight", "curved"])
 def test_sound_speed_and_delay_are_estimated_along(probe):
     data = recording(probe, seed=3)
     off = wrong_medium(data, 1520.0, 0.5e-6)

@@ -261,10 +261,8 @@ def degenerate(shared, simulated):
     return shared
 
 
-@pytest.mark.parametrize(
-    ("name", "files"),
-    [("parallel", set()), pytest.param("duplicates", REPORT, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "files"), [("parallel", set()), ("duplicates", REPORT)])
 def test_degenerate_sets_are_solved_but_not_observable(
     name, files, degenerate, calibrated, jaxcal_process, tmp_path
 ):
