@@ -9,7 +9,7 @@ first order in the step (v, w, d) of X and the target,
 so the sites never see v_x, v_z, w_y, and see v_y and the mean b only together. These four are
 eliminated once, exactly, from what the measurements say (:func:`marginal`); the sweeps run on
 z = (s, w_x, w_z, d), 21 + 6 sums over the images and a 6x6 inverse each; and what comes out, after
-the average over the laws, is carried back to all unknowns (:meth:`Marginal.lifted`).
+the laws' median, is carried back to all unknowns (:meth:`Marginal.lifted`).
 
 The laws of one family share a program, and each begins with the sites of the one before. The
 Gaussian law needs no sweep: its sites are the sums that the evidence step left.
