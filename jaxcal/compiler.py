@@ -5,18 +5,22 @@ should run as fast as the hardware allows: :func:`fast_to_run`. Of one problem, 
 the compiler and not for the answer: :func:`quick_to_compile`.
 
 Flags belong to a whole program, so none are given inside somebody else's jit, vmap or grad:
-:func:`is_whole_program`.
+:func:`is_whole_program`. They come and go with versions of XLA, so each is a wish: it is offered to
+the compiler once, and left out where the compiler does not know it (:func:`known`).
 """
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
+from functools import cache
 from typing import Any, TypeVar
 
 import jax
 import jax.core
 import jax.numpy as jnp
+import numpy as np
 
 T = TypeVar("T")
 
@@ -24,6 +28,37 @@ SWITCH = "JAXCAL_FAST_MATH"
 """Environment variable; 0 leaves batches the compiler's default flags."""
 
 Flags = dict[str, Any]
+
+_log = logging.getLogger(__name__)
+
+
+def known(platform: str, flags: Flags) -> Flags:
+    """Those of some compiler flags that the present compiler knows.
+
+    Args:
+        platform: ``cpu``, ``gpu`` or ``tpu``, as :func:`jax.default_backend` says it.
+        flags: wished for, by the names of XLA's debug options.
+
+    Returns:
+        The known ones. A flag that is not known is logged at level DEBUG and changes nothing.
+    """
+    items = tuple(flags.items())
+    if _are_known(platform, items):
+        return dict(flags)
+    return {name: value for name, value in items if _are_known(platform, ((name, value),))}
+
+
+@cache
+def _are_known(platform: str, flags: tuple[tuple[str, Any], ...]) -> bool:
+    # Tried on the smallest program; XLA refuses all flags of a call where it refuses one.
+    try:
+        with jax.default_device(jax.local_devices(backend=platform)[0]):
+            program = jax.jit(lambda x: x, compiler_options=dict(flags))
+            program.lower(np.float32(0)).compile()
+    except (jax.errors.JaxRuntimeError, ValueError, TypeError) as error:
+        _log.debug("compiler flags refused: %s (%s)", flags, error)
+        return False
+    return True
 
 
 def fast_to_run(platform: str) -> Flags | None:
@@ -35,21 +70,31 @@ def fast_to_run(platform: str) -> Flags | None:
     """
     if platform != "cpu" or os.environ.get(SWITCH, "1") == "0":
         return None
-    return {
-        "xla_cpu_enable_fast_math": True,
-        "xla_cpu_fast_math_honor_nans": True,
-        "xla_cpu_fast_math_honor_infs": True,
-        "xla_cpu_prefer_vector_width": 512,
-    }
+    fast = known(
+        platform,
+        {
+            "xla_cpu_enable_fast_math": True,
+            "xla_cpu_fast_math_honor_nans": True,
+            "xla_cpu_fast_math_honor_infs": True,
+        },
+    )
+    # Without NaN and Inf, a bad lane would become a wrong answer: all three or none.
+    fast = fast if len(fast) == 3 else {}
+    return fast | known(platform, {"xla_cpu_prefer_vector_width": 512})
 
 
 def quick_to_compile(platform: str) -> Flags | None:
     """Flags for the general road, or None.
 
-    Building every fusion with MLIR is half of the compiler's work (jax 0.10); there it makes
-    nothing faster that could be measured.
+    Building every fusion with MLIR is half of the compiler's work with jax 0.10, and makes nothing
+    faster there that could be measured. jaxlib 0.11.2 dropped the flag.
     """
-    return {"xla_cpu_use_fusion_emitters": False} if platform == "cpu" else None
+    return known(platform, {"xla_cpu_use_fusion_emitters": False}) if platform == "cpu" else None
+
+
+def single_threaded(platform: str) -> Flags:
+    """Flags that keep a program on one thread, for processes that share the cores among them."""
+    return known(platform, {"xla_cpu_multi_thread_eigen": False}) if platform == "cpu" else {}
 
 
 def computed_once(make: Callable[[], T], witness: jax.typing.ArrayLike) -> T:

@@ -4,16 +4,37 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 # Nearly all of the tests' time is compilation: building each fusion with MLIR is most of that (with
 # jax 0.10), optimising it with LLVM comes next. What XLA does to a program as a whole stays as it
-# is for users. Read when JAX starts its backend, so first of all.
+# is for users.
+QUICK = ("--xla_backend_optimization_level=0", "--xla_cpu_use_fusion_emitters=false")
+
+
+def _known_flags() -> str:
+    """Those of ``QUICK`` that this jaxlib knows.
+
+    An unknown flag in XLA_FLAGS ends the process without a word, so they are tried in another one.
+    """
+
+    def accepted(flags: tuple[str, ...]) -> bool:
+        start = [sys.executable, "-c", "import jax; jax.devices()"]
+        environment = os.environ | {"XLA_FLAGS": " ".join(flags), "JAX_PLATFORMS": "cpu"}
+        return not subprocess.run(start, env=environment, capture_output=True).returncode
+
+    return " ".join(QUICK if accepted(QUICK) else [flag for flag in QUICK if accepted((flag,))])
+
+
+# Read when JAX starts its backend, so first of all; workers of pytest-xdist inherit the answer.
+if "JAXCAL_TEST_XLA_FLAGS" not in os.environ:
+    os.environ["JAXCAL_TEST_XLA_FLAGS"] = _known_flags()
 os.environ["XLA_FLAGS"] = (
-    os.environ.get("XLA_FLAGS", "")
-    + " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-)
+    os.environ.get("XLA_FLAGS", "") + " " + os.environ["JAXCAL_TEST_XLA_FLAGS"]
+).strip()
 
 # A shell's background job ignores Ctrl-C, and so would every process that a test starts.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -28,7 +28,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
-from jaxcal.compiler import fast_to_run
+from jaxcal.compiler import fast_to_run, single_threaded
 from jaxcal.metrics import reconstruction_precision
 from jaxcal.offsets import OffsetLaw, nominal_bound
 from jaxcal.probe import LinearProbe
@@ -47,9 +47,6 @@ OTHER_LANES = 4096
 
 MOST_PIECES = 8
 """So many times these in one call of a program, one after the other; a call takes 0.1 ms."""
-
-_ONE_THREAD: dict[str, Any] = {"xla_cpu_multi_thread_eigen": False}
-"""Beside :func:`jaxcal.compiler.fast_to_run`."""
 
 Devices = tuple[Any, ...]
 """jax.Device, which is no type to the type checker."""
@@ -238,7 +235,7 @@ def compile_pieces(function: Any, devices: Devices, *, pieces: int, fast: bool =
     """
     platform = devices[0].platform
     options = (fast_to_run(platform) or {}) if fast else {}
-    options = options | _ONE_THREAD if platform == "cpu" else None
+    options = (options | single_threaded(platform)) or None
 
     def each(*given: Any) -> Any:
         shared = given[pieces:]
