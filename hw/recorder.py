@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
@@ -30,6 +29,7 @@ from hw.recording_file import utc_now
 from hw.recording_layout import Header
 from hw.robot.pose import ur_to_pose
 from jaxcal.errors import CalibrationError, FormatError, OutputError
+from jaxcal.isolated import python_command
 
 if TYPE_CHECKING:
     from hw.active_echo.device import EchoFrame
@@ -84,7 +84,7 @@ class Recorder:
         self._marks = 0
         # In a session of its own: Ctrl-C, or a signal to the whole group, must not stop the writer.
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "hw.recorder_process", self.path],
+            python_command("hw.recorder_process", self.path),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
         )  # fmt: skip
         assert self._process.stdin is not None

@@ -22,7 +22,7 @@ from dataclasses import asdict
 from hw.bench.arm import Arm, Motion
 from hw.bench.rtde import RtdeServer
 from hw.clock import REAL, Clock
-from hw.robot._process import import_path
+from jaxcal.isolated import python_command
 
 START = (0.4, -0.1, 0.3, 0.0, 3.0, 0.2)
 """Where the arm starts by default: m and rotation vector (rad)."""
@@ -72,8 +72,8 @@ class RobotProcess:
             OSError: its address is taken.
         """
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "hw.bench.robot", json.dumps(self._setup)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=import_path(),
+            python_command("hw.bench.robot", json.dumps(self._setup)),
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         self._thread = threading.Thread(target=self._receive, name="robot's process", daemon=True)
         self._thread.start()

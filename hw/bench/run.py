@@ -10,14 +10,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import queue
 import subprocess
 import sys
 import tempfile
 import threading
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +25,7 @@ from hw.bench.control import ControlClient
 from hw.clock import Clock
 from hw.scene import Scene
 from jaxcal.errors import InputError
+from jaxcal.isolated import python_command
 from jaxcal.probe import LinearProbe
 
 __all__ = ["Bench", "Options", "main", "serve", "start_bench"]
@@ -156,13 +155,11 @@ def start_bench(options: Options | None = None, **changes) -> Bench:
         InputError: options that cannot be, or a bench that does not start; one line.
     """
     options = Options(**{**(asdict(options) if options is not None else {}), **changes})
-    root = str(Path(__file__).resolve().parents[2])
-    path = os.pathsep.join(part for part in (root, os.environ.get("PYTHONPATH")) if part)
     with tempfile.TemporaryFile() as complaints:
         process = subprocess.Popen(
-            [sys.executable, "-m", "hw.bench.run", "--json", json.dumps(asdict(options))],
+            python_command("hw.bench.run", "--json", json.dumps(asdict(options))),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=complaints,
-            env={**os.environ, "PYTHONPATH": path}, start_new_session=True,
+            start_new_session=True,
         )  # fmt: skip
         assert process.stdout is not None
         line = _first_line(process)

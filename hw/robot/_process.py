@@ -7,27 +7,23 @@ import os
 import subprocess
 import sys
 
+from jaxcal.isolated import python_command
+
 
 def spawn(module: str, *arguments: str, stdin: bool = False) -> subprocess.Popen[bytes]:
-    """Start ``python -m module`` with this process's import path; its output is a pipe.
+    """Start a module in an isolated interpreter (:mod:`jaxcal.isolated`); its output is a pipe.
 
     A fresh interpreter rather than a fork: a fork of a process with threads (JAX has many) may
     deadlock. It leads its own process group, so that Ctrl-C reaches only the parent, which then
     stops it in order.
     """
     return subprocess.Popen(
-        [sys.executable, "-m", module, *arguments],
+        python_command(module, *arguments),
         stdin=subprocess.PIPE if stdin else subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env=import_path(),
         start_new_session=True,
     )
-
-
-def import_path() -> dict[str, str]:
-    """The environment with which another interpreter imports what this one does."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
 
 def be_prompt(priority: int) -> None:

@@ -21,11 +21,11 @@ from robots import START, EmulatedRobot
 
 import hw
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
-from hw.robot._process import import_path
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.pose import ur_to_pose
 from hw.robot.safety import MotionPlan, confirm
+from jaxcal.isolated import import_path
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 
@@ -333,7 +333,8 @@ def test_killing_the_caller_stops_the_robot():
         ]  # fmt: skip
         caller = subprocess.Popen(
             [sys.executable, "-c", _CALLER, json.dumps(values)],
-            stdout=subprocess.PIPE, env=import_path(),
+            stdout=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(import_path())},
         )  # fmt: skip
         with caller:
             assert caller.stdout is not None
