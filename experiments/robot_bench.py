@@ -190,7 +190,7 @@ def speeds(moves: int) -> list[list[object]]:
                     done += 1
                 except DeviceError as error:
                     stopped[type(error).__name__] += 1
-                    if not robot.state()["running"]:
+                    if motion.ended:
                         restarts += 1
                         motion.close()
                         motion = started(robot, plan, caller_s=0.15)

@@ -139,12 +139,19 @@ class Session:
 
     # Trouble
 
-    def trouble(self) -> str | None:
-        """What is wrong with a device now, as one line; None if nothing is."""
+    def trouble(self) -> str | StaleError | None:
+        """What is wrong with a device now (:data:`hw.robot.motion.Guard`); None if nothing is.
+
+        Returns:
+            A StaleError where the device was only silent for a moment, or a line with the reason
+            for which motion must end.
+        """
         error = self._trouble()
+        if error is None or isinstance(error, StaleError):
+            return error
         if isinstance(error, DeviceError) and error.device == "robot":
             return str(error.args[0])  # whoever stops the robot for it names the robot
-        return None if error is None else str(error)
+        return str(error)
 
     def check(self) -> None:
         """Raise what is wrong.

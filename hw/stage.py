@@ -1,8 +1,8 @@
 """The probe at one pose of the plan: the procedures' view of the real clients.
 
-Moves go through the motion process and its gate; a hesitation of a device stops the robot, and the
-move is asked for again when the device is back, a few times at most. Everything else ends the
-acquisition.
+Moves go through the motion process and its gate; a hesitation of a device (StaleError) stops the
+robot, and the move is asked for again when the device is back, a few times at most. Everything else
+ends the acquisition (:mod:`hw.robot.motion` says which is which).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from hw.errors import DeviceError, RefusedError, StaleError, StoppedError
+from hw.errors import RefusedError, StaleError
 from hw.midplane.search import Echoes
 from hw.robot.motion import Motion
 from hw.robot.pose import turn_deg
@@ -107,23 +107,14 @@ class ProbeStage:
             self._session.wait_until_clear()
             try:
                 sample = self._motion.move_to(pose, speed_mm_s)
-            except (StoppedError, StaleError, RefusedError) as error:
-                if not self._hesitated(error) or hesitation == _MOST_HESITATIONS:
+            except StaleError as error:
+                if self._motion.ended or hesitation == _MOST_HESITATIONS:
                     raise
                 self._note("hesitation", str(error))
                 continue
             self._arrived = self._session.clock.now()
             return sample
         raise AssertionError
-
-    def _hesitated(self, error: DeviceError) -> bool:
-        """Whether it was our own stop, or an old pose, after which motion may go on.
-
-        A protective stop, a force, a lost connection end motion for good.
-        """
-        if isinstance(error, RefusedError):
-            return "ms old" in str(error)
-        return not self._motion.ended
 
 
 def _apart(first: np.ndarray, second: np.ndarray) -> float:

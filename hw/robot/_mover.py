@@ -5,6 +5,22 @@ the controller's watchdog quiet and takes requests, line by line as JSON, from i
 Nothing in it waits for a motion: motions are asynchronous, so that every pose is looked at while
 the robot moves. When the input ends (the caller is gone), the robot is stopped.
 
+A stop cannot be lost. Every line of input is looked at when it is read, whatever the loop is doing:
+a request to stop is latched there (:attr:`Mover._stop`), a request to move waits in a queue, and
+nothing that was read is dropped. The states (:class:`State`) and what leads from one to another:
+
+    REST -> SENDING      a request to move was taken from the queue
+    SENDING -> REST      the gate or the controller refused it
+    SENDING -> MOVING    moveL was taken by the controller
+    MOVING -> REST       arrived: at the target, steady, and no stop latched
+    any -> STOPPING      a stop is latched; stopL is sent, and again until the robot rests
+    STOPPING -> REST     the stop was a hesitation (StaleError): the move may be asked for again
+    STOPPING -> the end  any other stop: this process ends, and with it the confirmation
+
+The last line is what "latched until a new confirmation" means: a process that was stopped never
+moves again. The latch is looked at before each command of SENDING and right after moveL, so that
+a stop that comes while ur_rtde waits for the controller acts on the next command.
+
 What ur_rtde does and this must live with (each measured): a getter of a lost connection goes on
 with the last values, so freshness comes from :class:`hw.robot.rtde.PacketReader`; calls to a mute
 controller hang, so the caller kills this process after a while, and the controller's own watchdog
@@ -15,12 +31,14 @@ a disconnect, so the robot is stopped first.
 
 from __future__ import annotations
 
+import enum
 import json
 import math
 import os
 import select
 import sys
-from dataclasses import replace
+from collections import deque
+from dataclasses import dataclass, replace
 from typing import NoReturn
 
 import numpy as np
@@ -42,12 +60,38 @@ _KICK_S = 0.02
 _REPORT_S = 0.05
 _STEADY_S, _STEADY_POLL_S = 0.5, 0.05
 _STOP_M_S2 = 2.0
+_STOPPED_MM_S, _STOPPED_RAD_S = 1.0, 0.01
+"""Slower than this the TCP rests; a real arm's reading is never quite zero."""
+_REST_SEEN_S = 0.03
+"""How long the poses must show rest after stopL before a stop is done (4 poses at 125 Hz)."""
+_STOP_PATIENCE_S = 2.0
 _ARRIVED_MM, _ARRIVED_DEG = 0.2, 0.1
 _REST_MM_S = 0.2
 _LEAST_PATIENCE_S = 3.0
 _PROGRAM_RUNS = 0b10
 _BOX_MARGIN_MM = 1.0
 _RECONNECTS = ("econnect", "Lost connection", "Could not receive", "closed the connection")
+
+
+class State(enum.Enum):
+    """What the mover is doing; see the module."""
+
+    REST = "rest"
+    SENDING = "sending"
+    MOVING = "moving"
+    STOPPING = "stopping"
+
+
+@dataclass(frozen=True)
+class _Stop:
+    """Why the robot must stop, and whether motion is over then."""
+
+    error: DeviceError
+    for_good: bool
+
+
+class _Interrupted(Exception):
+    """A stop was latched, or the caller left, while a motion was being sent."""
 
 
 class _Ended(Exception):
@@ -78,6 +122,14 @@ class Mover:
         self._packet: Packet | None = None
         self._sample: PoseSample | None = None
         self._offset: tuple[float, ...] | None = None
+        self._state = State.REST
+        self._stop: _Stop | None = None
+        self._closing = False
+        self._requests: deque[dict] = deque()
+        self._count = 0
+        """Of the newest request to move that was taken."""
+        self._answered = 0
+        """Of the newest request to move that was answered."""
         self._moving: Command | None = None
         self._deadline = self._steady_due = 0.0
         self._heard = self._kicked = self._reported = -math.inf
@@ -129,41 +181,47 @@ class Mover:
 
     def close(self) -> None:
         """Stop, end the script in order (its watchdog must not trip), then disconnect."""
+        self._brake()
         if self._control is not None and self._usable():
-            self._command("stopL", _STOP_M_S2, False)
-            self._log("kickWatchdog", times=self._kicks)
-            self._command("stopScript")
+            self._end_script()
             self._log("disconnect")
             self._control.disconnect()
+
+    def _end_script(self) -> None:
+        self._log("kickWatchdog", times=self._kicks)
+        self._command("stopScript")
 
     # The loop
 
     def run(self) -> None:
-        """Serve until the input ends or asks to close, or the robot is lost.
+        """Serve until the input ends or asks to close, or the robot is lost or stopped.
 
         Raises:
             _Ended: motion is over for good.
         """
         tick = min(0.01, max(0.001, self._clock.wall(0.01)))
         while True:
-            lines = self._read(tick)
-            trouble = self._trouble()
-            if trouble is not None:
-                self._halt(*trouble)
+            self._read(tick)
+            self._watch()
             self._kick()
-            for line in lines:
-                if not self._take(json.loads(line)):
-                    return
-            if self._moving is not None:
+            if self._stop is not None:
+                self._halt()
+            elif self._closing:
+                return
+            elif self._moving is not None:
                 self._follow(self._moving)
+            elif self._requests:
+                self._take(self._requests.popleft())
             now = self._clock.now()
             if now - self._reported > _REPORT_S:
                 self._reported = now
                 self._tell("alive")
 
-    def _read(self, timeout_s: float) -> list[bytes]:
-        """Wait for input or a packet; returns whole lines of input."""
-        sources = [0, self._reader, *([] if self._library is None else [self._library])]
+    def _read(self, timeout_s: float) -> None:
+        """Wait for input or a packet, and take in all that is there."""
+        sources = [self._reader, *([] if self._library is None else [self._library])]
+        if not self._closing:
+            sources.append(0)
         ready = select.select(sources, [], [], timeout_s)[0]
         if self._reader in ready:
             try:
@@ -183,38 +241,72 @@ class Mover:
             text = os.read(self._library, 65536).decode("utf-8", "replace")
             if any(word in text for word in _RECONNECTS):
                 raise _Ended(self._lost("the control connection was reset"))
-        if 0 not in ready:
-            return []
-        data = os.read(0, 65536)
-        if not data:
-            return [b'{"request": "close"}']
-        *lines, self._input = (self._input + data).split(b"\n")
-        return lines
+        if 0 in ready:
+            data = os.read(0, 65536)
+            *lines, self._input = (self._input + data).split(b"\n")
+            for line in lines:
+                self._take_in(json.loads(line))
+            # The input's end: the caller closed it, or was killed.
+            self._closing = self._closing or not data
+
+    def _take_in(self, request: dict) -> None:
+        """One line of input, at the moment it is read: a stop acts now, a move must wait."""
+        match request["request"]:
+            case "move":
+                self._requests.append(request)
+            case "stop":
+                kind = StaleError if request["kind"] == StaleError.__name__ else StoppedError
+                hesitation = kind is StaleError
+                # A hesitation is about one move; one that was answered meanwhile needs no stop.
+                if not hesitation or request["move"] > self._answered:
+                    self._latch(kind(request["reason"], device="robot"), not hesitation)
+            case "heard":
+                self._heard = self._clock.now()
+            case "close":
+                self._closing = True
+
+    def _latch(self, error: DeviceError, for_good: bool) -> None:
+        """Keep a stop until the robot rests; one for good outweighs a hesitation."""
+        if self._stop is None or (for_good and not self._stop.for_good):
+            self._stop = _Stop(error, for_good)
+
+    def _watch(self) -> None:
+        trouble = self._trouble()
+        if trouble is not None:
+            self._latch(*trouble)
+
+    def _heed(self) -> None:
+        """Look at all that came while a command was being sent.
+
+        Raises:
+            _Interrupted: there is a stop among it; nothing more may be sent but stopL.
+        """
+        self._read(0.0)
+        self._watch()
+        if self._stop is not None or self._closing:
+            raise _Interrupted
 
     def _compare(self, offset: tuple[float, ...] | None) -> None:
         if offset is None:
             return
         if self._offset is not None and offset_changed(self._offset, offset):
             error = RefusedError("the controller's TCP offset was changed", device="robot")
-            self._halt(error, True)
+            self._latch(error, True)
         self._offset = offset
 
-    def _take(self, request: dict) -> bool:
-        match request["request"]:
-            case "move":
-                self._heard = self._clock.now()
-                try:
-                    self._move(request["pose"], request["speed_mm_s"])
-                except RefusedError as error:
-                    self._log("refused", why=error.args[0])
-                    self._answer(error)
-            case "stop":
-                self._halt(StoppedError(request["reason"], device="robot"), False)
-            case "heard":
-                self._heard = self._clock.now()
-            case "close":
-                return False
-        return True
+    def _take(self, request: dict) -> None:
+        self._count = request["move"]
+        self._heard = self._clock.now()
+        self._state = State.SENDING
+        try:
+            self._move(request["pose"], request["speed_mm_s"])
+        except _Interrupted:
+            # The loop stops the robot, and answers.
+            return
+        except (RefusedError, StaleError) as error:
+            self._state = State.REST
+            self._log("refused", why=error.args[0])
+            self._answer(error)
 
     def _kick(self) -> None:
         now = self._clock.now()
@@ -227,8 +319,13 @@ class Mover:
     # Motion
 
     def _move(self, pose: object, speed_mm_s: object) -> None:
-        if self._moving is not None:
-            raise RefusedError("the robot is moving already", device="robot")
+        """Ask the gate and the controller, and send the motion.
+
+        Raises:
+            RefusedError: one of them says no.
+            StaleError: the newest pose is too old.
+            _Interrupted: a stop came before the motion was sent.
+        """
         if self._dry_run:
             self._pretend(pose, speed_mm_s)
             return
@@ -236,9 +333,10 @@ class Mover:
         if not self._command("isPoseWithinSafetyLimits", raw):
             text = "the controller says that the pose is outside its safety limits"
             raise RefusedError(text, device="robot")
+        self._heed()
         self._command("setWatchdog", WATCHDOG_HZ / self._clock.patience(1.0))
-        # What was asked took time: look again, at the newest pose.
-        self._read(0.0)
+        # What was asked took time: look again, at the newest pose, and for a stop.
+        self._heed()
         command = self._allow(pose, speed_mm_s)
         sent = self._command(
             "moveL", list(command.raw), command.speed_m_s, command.acceleration_m_s2, True
@@ -247,14 +345,18 @@ class Mover:
             raise _Ended(self._lost("the controller did not take the motion"))
         now = self._clock.now()
         self._kicked, self._steady_due = now, now + _STEADY_S
-        self._deadline = now + 1.5 * command.duration_s + _LEAST_PATIENCE_S
-        self._moving = command
+        self._deadline = now + 1.5 * command.duration_s + self._clock.patience(_LEAST_PATIENCE_S)
+        self._moving, self._state = command, State.MOVING
+        # A stop that came while moveL was being sent acts at once, not a tick later.
+        self._heed()
 
     def _allow(self, pose: object, speed_mm_s: object) -> Command:
         assert self._sample is not None
+        assert self._packet is not None
         return self._gate.check_move(
-            pose, self._sample, speed_mm_s, serial=self._serial, tcp_offset=self._offset
-        )
+            pose, self._sample, speed_mm_s, serial=self._serial, tcp_offset=self._offset,
+            force_n=math.hypot(*self._packet.tcp_force[:3]),
+        )  # fmt: skip
 
     def _pretend(self, pose: object, speed_mm_s: object) -> None:
         """A dry run: as if the robot stood where the last motion would have taken it."""
@@ -263,9 +365,10 @@ class Mover:
         if self._virtual is not None:
             here = replace(here, raw=self._virtual.raw)
         command = self._gate.check_geometry(pose, here, speed_mm_s)
+        self._heed()
         self._log("dry run: moveL", raw=command.raw, speed_m_s=command.speed_m_s)
         self._virtual = replace(here, raw=command.raw)
-        self._tell("arrived", sample=_plain(self._virtual))
+        self._arrive(self._virtual)
 
     def _follow(self, command: Command) -> None:
         """Whether the motion has arrived, and rests."""
@@ -283,14 +386,21 @@ class Mover:
         elif now >= self._steady_due:
             self._steady_due = now + _STEADY_POLL_S
             if self._command("isSteady"):
-                self._moving = None
                 self._command("setWatchdog", IDLE_WATCHDOG_HZ)
                 self._read(0.0)
-                self._tell("arrived", sample=_plain(self._sample))
+                self._watch()
+                # "Arrived" is never the answer to a motion that was asked to stop.
+                if self._stop is None:
+                    self._arrive(self._sample)
                 return
         if now > self._deadline:
             text = f"not arrived in time: {off:.2f} mm from the target"
-            self._halt(StoppedError(text, device="robot"), False)
+            self._latch(StoppedError(text, device="robot"), True)
+
+    def _arrive(self, sample: PoseSample) -> None:
+        self._moving, self._state = None, State.REST
+        self._answered = self._count
+        self._tell("arrived", move=self._count, sample=_plain(sample))
 
     def _trouble(self) -> tuple[DeviceError, bool] | None:
         """What speaks against going on, and whether it ends motion for good."""
@@ -322,21 +432,75 @@ class Mover:
             text = f"the probe's tip is {out:.1f} mm out of the box"
             return StoppedError(text, device="robot"), True
         if now - self._heard > self._clock.patience(self._caller_s):
+            # Our own fault, as a silent stream is: nothing says that motion is dangerous.
             text = f"the caller was silent for {now - self._heard:.2f} s"
-            return StoppedError(text, device="robot"), False
+            return StaleError(text, device="robot"), False
         return None
 
-    def _halt(self, error: DeviceError, for_good: bool) -> None:
-        """Stop the robot, as far as that can be done from here, then say so."""
-        moving, self._moving = self._moving, None
-        self._tell("stopping", kind=type(error).__name__, text=error.args[0])
-        if self._control is not None and self._usable():
-            self._command("stopL", _STOP_M_S2, False)
+    def _halt(self) -> None:
+        """Do what the latched stop asks for; returns only after a hesitation.
+
+        Raises:
+            _Ended: any other stop.
+        """
+        told: _Stop | None = None
+        self._state = State.STOPPING
+        while self._stop is not None and self._stop is not told:
+            # Braking takes in what comes meanwhile: a hesitation may turn into a stop for good.
+            told = self._stop
+            self._tell("stopping", kind=type(told.error).__name__, text=told.error.args[0])
+            try:
+                self._brake()
+            except _Ended as ended:
+                text = f"{told.error.args[0]}; {ended.cause.args[0]}"
+                raise _Ended(type(ended.cause)(text, device="robot")) from None
+        assert told is not None
+        if told.for_good:
+            if self._usable():
+                self._end_script()
+            raise _Ended(told.error)
+        if self._usable():
             self._command("setWatchdog", IDLE_WATCHDOG_HZ)
-        if for_good:
-            raise _Ended(error)
-        if moving is not None:
-            self._answer(error)
+        self._stop, self._moving, self._state = None, None, State.REST
+        asked = self._requests[-1]["move"] if self._requests else self._count
+        self._requests.clear()
+        if asked > self._answered:
+            self._count = asked
+            self._answer(told.error)
+
+    def _brake(self) -> None:
+        """Send stopL until the poses show rest, as far as the controller takes commands.
+
+        Raises:
+            _Ended: the robot does not stop, or is lost.
+        """
+        give_up = self._clock.now() + self._clock.patience(_STOP_PATIENCE_S)
+        while self._usable():
+            # It answers nothing; whether it was taken is seen in the poses.
+            self._command("stopL", _STOP_M_S2, False)
+            if self._rests():
+                return
+            if self._clock.now() > give_up:
+                text = "the robot was told to stop and still moves: press the emergency stop"
+                raise _Ended(LostError(text, device="robot"))
+
+    def _rests(self) -> bool:
+        """Whether every pose of the next few shows rest."""
+        assert self._packet is not None
+        since = self._packet.timestamp_s
+        give_up = self._clock.now() + self._clock.patience(10 * _REST_SEEN_S)
+        while self._clock.now() < give_up:
+            self._read(self._clock.wall(_REST_SEEN_S / 4))
+            self._kick()
+            packet = self._packet
+            speed = math.hypot(*packet.tcp_speed[:3]) * 1000.0
+            if packet.timestamp_s > since and (
+                speed > _STOPPED_MM_S or math.hypot(*packet.tcp_speed[3:]) > _STOPPED_RAD_S
+            ):
+                return False
+            if packet.timestamp_s - since >= _REST_SEEN_S:
+                return True
+        return False
 
     def _usable(self) -> bool:
         """Whether the controller takes commands; else ur_rtde would hang or reconnect."""
@@ -375,7 +539,9 @@ class Mover:
         self._tell("log", t=self._clock.now(), command=command, numbers=numbers)
 
     def _answer(self, error: DeviceError) -> None:
-        self._tell("error", kind=type(error).__name__, text=error.args[0], ended=False)
+        self._answered = self._count
+        kind = type(error).__name__
+        self._tell("error", move=self._count, kind=kind, text=error.args[0], ended=False)
 
     def end(self, error: DeviceError) -> NoReturn:
         """Say why, and leave at once: ur_rtde must not reconnect, or wait, behind our back."""
@@ -383,7 +549,11 @@ class Mover:
         os._exit(1)
 
     def _tell(self, what: str, **values: object) -> None:
-        _write(self._output, {"what": what, **values})
+        try:
+            _write(self._output, {"what": what, **values})
+        except BrokenPipeError:
+            # Nobody listens any more; the robot must be stopped all the same.
+            self._closing = True
 
 
 def _plain(sample: PoseSample) -> list:

@@ -2,8 +2,22 @@
 
 :class:`Motion` starts dry: it checks and logs every motion and sends none. To move, it takes the
 operator's confirmation of the plan, which serves for one connection; after anything that ends it
-(a protective stop, a reset connection, a stopped program) a new one is needed. A protective stop is
-reported and never released from here.
+(a stop, a protective stop, a reset connection, a stopped program) a new one is needed. A protective
+stop is reported and never released from here.
+
+A stop is latched on both sides of the pipe: here in :attr:`Motion._stop`, in the other process as
+described in :mod:`hw.robot._mover`. What stops a motion is one of two things.
+
+- A *stop* (:meth:`Motion.stop`, a guard that reports danger or fails, an interrupt such as Ctrl-C,
+  force, the box, a protective stop, a motion that does not arrive) ends motion:
+  :attr:`Motion.ended` is true, every later move is refused, and only a new confirmation lets the
+  robot move again.
+- A *hesitation* (StaleError: poses, echo frames, images or this process were silent for a moment)
+  stops the robot in the same way, but the same move may be asked for again. Nothing said that
+  moving is dangerous; the software could not know for a moment that it is not.
+
+Requests to move are counted, and stops and answers carry the count, so that none of them can be
+taken for that of another move.
 """
 
 from __future__ import annotations
@@ -28,8 +42,9 @@ from hw.robot.stream import PoseSample
 
 Log = Callable[[float, str, dict[str, object]], None]
 """Takes bench time (s), the command, and its numbers."""
-Guard = Callable[[], str | None]
-"""Asked at every tick of a motion; a reason stops it."""
+Guard = Callable[[], str | StaleError | None]
+"""Asked before a motion is requested and at every tick of it. A reason (str) stops it and ends
+motion; a StaleError stops it as a hesitation."""
 
 _KINDS = {kind.__name__: kind for kind in (LostError, RefusedError, StaleError, StoppedError)}
 _TICK_S = 0.02
@@ -80,6 +95,9 @@ class Motion:
         self._sending = threading.Lock()
         self._one_at_a_time = threading.Lock()
         self._ended: DeviceError | None = None
+        self._stop: StoppedError | None = None
+        """The stop that was asked for; it stays, and so nothing is sent or answered as before."""
+        self._count = 0
         self._heard = 0.0
         self._in_motion = False
 
@@ -104,14 +122,21 @@ class Motion:
                     device="robot",
                 )
             given.used.set()
+        if self._stop is not None:
+            self._ended = self._stop
+            raise RefusedError(f"motion was stopped ({self._stop.args[0]})", device="robot")
         self._process = spawn("hw.robot._mover", stdin=True)
         self._thread = threading.Thread(target=self._receive, name="motion", daemon=True)
         self._thread.start()
-        self._send(self._setup())
         try:
-            answer = self._answers.get(timeout=_START_PATIENCE_S)
-        except queue.Empty:
-            answer = {}
+            self._send(self._setup())
+            try:
+                answer = self._answers.get(timeout=_START_PATIENCE_S)
+            except queue.Empty:
+                answer = {}
+        except BaseException:
+            self._kill(RefusedError("motion was interrupted at its start", device="robot"))
+            raise
         if answer.get("what") != "ready":
             error = _error(answer) or LostError(
                 f"the controller at {self.host} did not let us in within {_START_PATIENCE_S:g} s",
@@ -165,66 +190,95 @@ class Motion:
 
         Raises:
             RefusedError: the gate or the controller does not allow it; nothing moved.
-            StaleError: poses stopped coming, and so did the robot. It may be tried again.
+            StaleError: a hesitation; the robot rests, and the move may be asked for again.
             StoppedError: stopped before arrival: by :meth:`stop`, the guard, force, the box, a
-                protective stop, or because it took too long.
+                protective stop, or because it took too long. Motion needs a new confirmation.
             LostError: the connection is gone; motion needs a new confirmation.
         """
         with self._one_at_a_time:
             self._alive()
             while not self._answers.empty():
                 self._answers.get()
-            self._send(
-                {"request": "move", "pose": np.asarray(pose).tolist(), "speed_mm_s": speed_mm_s}
-            )
+            asked = np.asarray(pose).tolist()
+            self._count += 1
             self._in_motion = True
             try:
-                return self._wait()
+                hesitation = self._ask_guard()
+                if hesitation is not None:
+                    self._in_motion = False
+                    raise hesitation
+                if self._stop is None:
+                    self._send(
+                        {
+                            "request": "move",
+                            "move": self._count,
+                            "pose": asked,
+                            "speed_mm_s": speed_mm_s,
+                        }
+                    )
+                return self._wait(self._count)
             finally:
                 if self._in_motion:
                     self._stop_and_wait()
 
     def _stop_and_wait(self) -> None:
         """After an interrupt, or a guard that failed: the robot must rest before that goes on."""
-        self._send({"request": "stop", "reason": "interrupted"})
-        deadline = time.monotonic() + 0.5 + self.clock.wall(0.5)
-        with contextlib.suppress(queue.Empty):
-            while self._answers.get(timeout=max(0.0, deadline - time.monotonic()))["what"] not in (
-                "arrived", "error",
-            ):  # fmt: skip
-                pass
-        self._in_motion = False
+        try:
+            self.stop("interrupted")
+        finally:
+            self._in_motion = False
+            self._wait_for_end()
 
-    def _wait(self) -> PoseSample:
+    def _wait_for_end(self) -> None:
+        """Until the other process says that the robot rests and that it ends; else it is killed."""
+        deadline = time.monotonic() + 0.5 + self.clock.wall(0.5)
+        answer: dict = {}
+        with contextlib.suppress(queue.Empty):
+            while not answer.get("ended", False):
+                answer = self._answers.get(timeout=max(0.0, deadline - time.monotonic()))
+        self._kill(_error(answer) or LostError("the motion process hangs", device="robot"))
+
+    def _wait(self, count: int) -> PoseSample:
+        """Until a move was answered; a stop is sent again until the other process confirms it."""
         tick = max(0.001, self.clock.wall(_TICK_S))
+        hesitation: StaleError | None = None
         stopping: DeviceError | None = None
         while True:
             try:
                 answer = self._answers.get(timeout=tick)
             except queue.Empty:
                 answer = {}
+            error = _error(answer)
             match answer.get("what"):
-                case "arrived":
+                case "arrived" if answer["move"] == count and self._stop is None:
+                    # It arrived before it read a stop; asked to stop, it has not arrived.
                     self._in_motion = False
+                    if hesitation is not None:
+                        raise hesitation
                     t_host, t_device, raw, *rest = answer["sample"]
                     return PoseSample(t_host, t_device, tuple(raw), *rest)
-                case "error":
+                case "error" if error is not None and answer["ended"]:
                     self._in_motion = False
-                    error = _error(answer)
-                    assert error is not None
-                    if answer["ended"]:
-                        self._kill(error)
+                    self._kill(error)
                     raise error
+                case "error" if error is not None and answer["move"] == count:
+                    # With a stop under way its own answer follows, and ends motion.
+                    if self._stop is None:
+                        self._in_motion = False
+                        raise error if hesitation is None else hesitation
                 case "stopping":
-                    stopping = _error(answer)
-            reason = self.guard() if self.guard is not None and stopping is None else None
-            if reason is not None:
-                stopping = StoppedError(reason, device="robot")
-                self._send({"request": "stop", "reason": reason})
+                    stopping = error
+            hesitation = hesitation or self._ask_guard()
+            if self._stop is not None and type(stopping) is not StoppedError:
+                self._send_stop(self._stop)
+            elif hesitation is not None and stopping is None:
+                self._send_stop(hesitation)
             self._send({"request": "heard"})
             silent = time.monotonic() - self._heard
             if silent > _HANGS_WALL_S + self.clock.wall(0.5):
-                error = stopping or LostError("the motion process hangs", device="robot")
+                error = self._stop or stopping or LostError(
+                    "the motion process hangs", device="robot"
+                )  # fmt: skip
                 self._in_motion = False
                 self._kill(error)
                 raise type(error)(
@@ -233,14 +287,33 @@ class Motion:
                     device="robot",
                 )
 
+    def _ask_guard(self) -> StaleError | None:
+        """Ask the guard; a danger is latched and sent, a hesitation is returned."""
+        if self.guard is None or self._stop is not None:
+            return None
+        reason = self.guard()
+        if isinstance(reason, StaleError):
+            return StaleError(str(reason.args[0]), device=reason.device)
+        if reason is not None:
+            self.stop(reason)
+        return None
+
+    def _send_stop(self, error: DeviceError) -> None:
+        kind, reason = type(error).__name__, error.args[0]
+        self._send({"request": "stop", "kind": kind, "reason": reason, "move": self._count})
+
     @property
     def ended(self) -> bool:
         """Whether motion is over for good, so that the plan must be confirmed again."""
-        return self._ended is not None
+        return self._ended is not None or self._stop is not None
 
     def stop(self, reason: str) -> None:
-        """Stop the robot; a :meth:`move_to` that waits in another thread raises StoppedError."""
-        self._send({"request": "stop", "reason": reason})
+        """Stop the robot, for good: :attr:`ended` is true from now on.
+
+        A :meth:`move_to` that waits in another thread raises StoppedError; a later one is refused.
+        """
+        self._stop = self._stop or StoppedError(reason, device="robot")
+        self._send_stop(self._stop)
 
     def close(self) -> None:
         """Stop the robot, end its program, disconnect. Idempotent."""
@@ -255,9 +328,10 @@ class Motion:
     def _alive(self) -> None:
         if self._process is None:
             raise RefusedError("motion was not started", device="robot")
-        if self._ended is not None:
+        over = self._ended or self._stop
+        if over is not None:
             raise RefusedError(
-                f"motion has ended ({self._ended.args[0]}); confirm the plan again and start anew",
+                f"motion has ended ({over.args[0]}); confirm the plan again and start anew",
                 device="robot",
             )
         while not self._answers.empty():

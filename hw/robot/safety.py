@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 
 from hw.clock import Clock
-from hw.errors import RefusedError
+from hw.errors import RefusedError, StaleError
 from hw.robot.limits import Limits, between, numbers
 from hw.robot.pose import pose_to_ur, rotation_matrix, rotation_vector, turn_deg
 from hw.robot.rtde import RUNNING_MODE, safety_text
@@ -35,6 +35,8 @@ _POSITION_TOLERANCE_MM = 1e-6
 _TURN_TOLERANCE_DEG = 1e-3
 _PATH_STEP_DEG = 0.25
 _MOST_TARGETS = 10_000
+_LEAST_SPEED_MM_S = 0.01
+"""A slower move is a mistake of units; at 0.01 mm/s a search step of 0.05 mm takes 5 s."""
 
 
 def _refuse(text: str) -> RefusedError:
@@ -214,6 +216,7 @@ class Gate:
         *,
         serial: str,
         tcp_offset: object,
+        force_n: float,
     ) -> Command:
         """Allow one motion, from where the robot is now.
 
@@ -223,11 +226,16 @@ class Gate:
             speed_mm_s: wanted speed of TCP and tip; None for the cap.
             serial: of the robot that is connected.
             tcp_offset: (6,) of the controller now (m, rad).
+            force_n: at the TCP now.
 
         Raises:
             RefusedError: it may not be done; the text says why. Nothing was sent.
+            StaleError: the newest pose is too old.
         """
         self.check_authority(serial, tcp_offset)
+        cap = self.plan.limits.max_force_n
+        if not force_n <= cap:
+            raise _refuse(f"a force of {force_n:.1f} N meets the tool, over the cap of {cap:g} N")
         return self.check_geometry(target, sample, speed_mm_s)
 
     def check_geometry(self, target: object, sample: PoseSample, speed_mm_s: object) -> Command:
@@ -245,8 +253,11 @@ class Gate:
         searching = any(_within(self.plan.targets[k], start, limits) for k in near)
         cap = min(limits.max_speed_mm_s, limits.search_speed_mm_s if searching else math.inf)
         speed = cap if speed_mm_s is None else speed_mm_s
-        if not isinstance(speed, int | float) or not 0 < speed <= cap:
-            raise _refuse(f"a speed of {speed!r} mm/s is not within 0 and {cap:g} mm/s")
+        number = isinstance(speed, int | float) and not isinstance(speed, bool)
+        if not number or not min(_LEAST_SPEED_MM_S, cap) <= speed <= cap:
+            raise _refuse(
+                f"a speed of {speed!r} mm/s is not within {_LEAST_SPEED_MM_S:g} and {cap:g} mm/s"
+            )
         _check_path(start, goal, limits, "the motion")
 
         distance = float(np.linalg.norm(goal[:3, 3] - start[:3, 3])) / 1000.0
@@ -285,11 +296,12 @@ def check_sample(sample: PoseSample, limits: Limits, clock: Clock) -> None:
     """Whether a pose is new, and the robot fit to move.
 
     Raises:
-        RefusedError: too old, from the future, or a robot in another mode than running.
+        StaleError: too old; a new pose may come.
+        RefusedError: from the future, or a robot in another mode than running.
     """
     age, oldest = sample.age_s(clock.now()), clock.patience(limits.max_pose_age_s)
     if not age <= oldest:
-        raise _refuse(f"the newest pose is {age * 1000:.0f} ms old")
+        raise StaleError(f"the newest pose is {age * 1000:.0f} ms old", device="robot")
     if age < -oldest:
         raise _refuse("the newest pose is of another clock: it lies in the future")
     problem = safety_text(sample.safety_bits)

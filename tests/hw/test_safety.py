@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from hw.clock import Clock
-from hw.errors import RefusedError
+from hw.errors import RefusedError, StaleError
 from hw.robot.limits import Limits
 from hw.robot.pose import pose_to_ur, ur_to_pose
 from hw.robot.safety import Command, Confirmation, Gate, MotionPlan, check_plan, confirm
@@ -67,8 +67,16 @@ def gate(plan: MotionPlan = PLAN) -> Gate:
     return Gate(plan, Confirmation(plan.digest, plan.serial, now, now + 1000.0), CLOCK)
 
 
-def move(target: object, start: PoseSample, speed: object = None, plan: MotionPlan = PLAN):
-    return gate(plan).check_move(target, start, speed, serial=SERIAL, tcp_offset=OFFSET)
+def move(
+    target: object,
+    start: PoseSample,
+    speed: object = None,
+    plan: MotionPlan = PLAN,
+    force: float = 0.0,
+):
+    return gate(plan).check_move(
+        target, start, speed, serial=SERIAL, tcp_offset=OFFSET, force_n=force
+    )
 
 
 def assert_safe(command: Command, start: PoseSample, limits: Limits) -> None:
@@ -215,14 +223,20 @@ def refused(match: str, *arguments, **named):
 
 
 def test_every_reason_has_its_line():
-    refused("100|101 ms old|ms old", HOME, sample(HOME, age=0.101))
-    refused("ms old", HOME, sample(HOME, lag=0.12))
+    with pytest.raises(StaleError, match=r"10\d ms old"):
+        move(HOME, sample(HOME, age=0.101))
+    with pytest.raises(StaleError, match="ms old"):
+        move(HOME, sample(HOME, lag=0.12))
     refused("of another clock", HOME, sample(HOME, age=-5.0))
     refused("protective stop", HOME, sample(HOME, safety=0b101))
     refused("not running", HOME, sample(HOME, mode=5))
     refused("neither a planned pose nor", pose(430, -90, 270), sample(HOME))
-    refused("is not within 0 and 10 mm/s", HOME, sample(HOME), 11.0)
-    refused("is not within 0 and 50 mm/s", PLAN.targets[1], sample(HOME), 51.0)
+    refused("is not within 0.01 and 10 mm/s", HOME, sample(HOME), 11.0)
+    refused("is not within 0.01 and 50 mm/s", PLAN.targets[1], sample(HOME), 51.0)
+    for speed in (True, False, 1e-300, 0.0, -1.0, math.nan, "10"):
+        refused("is not within", PLAN.targets[1], sample(HOME), speed)
+    for force in (20.1, math.inf, math.nan):
+        refused("meets the tool", HOME, sample(HOME), force=force)
     refused("over the cap of 60 mm", HOME, sample(pose(400, -100, 345)))
     refused("over the cap of 30 deg", HOME, sample(pose(400, -100, 280, (31, 0, 0))))
     refused("NaN", np.full((4, 4), np.nan), sample(HOME))
@@ -292,7 +306,9 @@ def test_a_confirmation_is_bound_to_robot_time_and_tcp_offset():
             found.check_authority(*arguments)
         serial, offset = arguments
         with pytest.raises(RefusedError, match=text):
-            found.check_move(HOME, sample(HOME), None, serial=serial, tcp_offset=offset)
+            found.check_move(
+                HOME, sample(HOME), None, serial=serial, tcp_offset=offset, force_n=0.0
+            )
     for answer in ("", "yes", PLAN.digest, "0" * 8):
         with pytest.raises(RefusedError, match="code typed"):
             confirm(PLAN, answer, clock=CLOCK)
