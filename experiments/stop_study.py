@@ -41,12 +41,12 @@ from hw.bench.arm import Motion as ArmMotion
 from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
 from hw.clock import Clock
 from hw.errors import DeviceError
-from hw.robot._process import import_path
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import read_identity
 from hw.robot.safety import MotionPlan, confirm
+from jaxcal.isolated import import_path
 
 SEED = 16
 SERIES = {"CB": CB_SERIES, "e": E_SERIES}
@@ -144,7 +144,8 @@ class Bench:
         }  # fmt: skip
         caller = subprocess.Popen(
             [sys.executable, __file__, "--caller", json.dumps(task)],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=import_path(),
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(import_path())},
         )  # fmt: skip
         told: queue.SimpleQueue[str] = queue.SimpleQueue()
         reader = threading.Thread(target=_lines_into, args=(told, caller.stdout), daemon=True)
