@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from hw.rigid import looking_rotation, rotation
+from hw.rigid import looking_rotation, rotation_matrix
 from hw.scene import Scene
 from jaxcal.errors import InputError
 from jaxcal.geometry import check_poses
@@ -164,8 +164,8 @@ def _orientation(
     tilt = np.arccos(1 - fraction[0] * (1 - np.cos(np.radians(extent.cone_deg))))
     azimuth = 2 * np.pi * fraction[1]
     turn = np.radians(extent.turn_deg) * (2 * fraction[2] - 1)
-    tilted = rotation(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
-    return image @ tilted @ rotation(np.array([0.0, 0.0, turn])) @ nominal[:3, :3].T
+    tilted = rotation_matrix(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
+    return image @ tilted @ rotation_matrix(np.array([0.0, 0.0, turn])) @ nominal[:3, :3].T
 
 
 def _allowed(pose: np.ndarray, tip: np.ndarray, extent: Extent) -> bool:

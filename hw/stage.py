@@ -14,8 +14,8 @@ from jaxtyping import Float
 
 from hw.errors import RefusedError, StaleError
 from hw.midplane.search import Echoes
+from hw.rigid import turn_deg
 from hw.robot.motion import Motion
-from hw.robot.pose import turn_deg
 from hw.robot.stream import PoseSample
 from hw.session import Session
 

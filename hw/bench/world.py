@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hw.rigid import looking_rotation, rigid, rotation
+from hw.rigid import looking_rotation, rigid, rotation_matrix
 from hw.scene import Scene
 from jaxcal.errors import InputError
 from jaxcal.probe import L14_5, LinearProbe
@@ -219,7 +219,7 @@ class World:
         for pose, (lateral, depth) in zip(poses, points, strict=True):
             axis = rng.normal(size=3)
             turn = axis / np.linalg.norm(axis) * np.radians(30.0) * rng.random()
-            pose[:3, :3] = looking @ rotation(turn) @ self.image_to_probe[:3, :3].T
+            pose[:3, :3] = looking @ rotation_matrix(turn) @ self.image_to_probe[:3, :3].T
             place = self.image_to_probe[:3, :3] @ [lateral, 0.0, depth] + self.image_to_probe[:3, 3]
             pose[:3, 3] = self.point_mm - pose[:3, :3] @ place
         return poses, points

@@ -46,9 +46,9 @@ import numpy as np
 from hw.clock import Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 from hw.extras import require
+from hw.rigid import turn_deg
 from hw.robot._process import ASKS, RECEIVES, be_prompt
 from hw.robot.limits import Limits, numbers
-from hw.robot.pose import turn_deg
 from hw.robot.rtde import Packet, PacketReader, read_identity, safety_text
 from hw.robot.safety import Command, Confirmation, Gate, MotionPlan, check_plan
 from hw.robot.stream import Lag, PoseSample, offset_changed

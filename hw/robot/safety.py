@@ -25,8 +25,9 @@ import numpy as np
 
 from hw.clock import Clock
 from hw.errors import RefusedError, StaleError
+from hw.rigid import rotation_matrix, rotation_vector, turn_deg
 from hw.robot.limits import Limits, between, numbers
-from hw.robot.pose import pose_to_ur, rotation_matrix, rotation_vector, turn_deg
+from hw.robot.pose import pose_to_ur
 from hw.robot.rtde import RUNNING_MODE, safety_text
 from hw.robot.stream import PoseSample, offset_changed
 

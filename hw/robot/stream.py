@@ -26,9 +26,10 @@ from jaxtyping import Float
 
 from hw.clock import REAL, Clock
 from hw.errors import LostError, RefusedError, StaleError
+from hw.rigid import rotation_vector
 from hw.robot._process import spawn
 from hw.robot._reader import ERROR, POSE, RECORD
-from hw.robot.pose import rotation_vector, ur_to_pose
+from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import Identity, read_identity
 
 _OFFSET_TOLERANCE = 1e-6
