@@ -266,7 +266,8 @@ def test_scale_on_the_group(path):
         file.move("calibration/point", "calibration/pixel")
         file["calibration"].attrs["spacing_mm"] = [0.1, 0.2]
         file["calibration"].attrs["face_offset_mm"] = 2.0
-        assert load(path).calibration.face_offset_mm == 2.0
+    assert load(path).calibration.face_offset_mm == 2.0
+    with h5py.File(path, "r+") as file:
         file["calibration/pixel"].attrs["face_offset_mm"] = 3.0
     images = load(path).calibration
     np.testing.assert_array_equal(images.spacing_mm, [0.1, 0.2])
@@ -325,7 +326,8 @@ def test_file_that_is_being_written(path):
             check=False,
         )
     assert process.stderr.splitlines()[-1] == (
-        f"jaxcal.errors.FormatError: {path}: is being written by another program"
+        f"jaxcal.errors.FormatError: {path}: is being written: close it in the program that "
+        "writes it"
     )
 
 
@@ -418,7 +420,8 @@ def test_wrong_units(path, where, unit, right):
         file["calibration/covariance"] = np.tile(np.eye(2), (COUNT, 1, 1))
         file["calibration/max_elevation"] = np.ones(COUNT)
         file[where].attrs["units"] = right.replace("\\", "")
-        load(path)
+    load(path)
+    with h5py.File(path, "r+") as file:
         file[where].attrs["units"] = unit
     refused(path, f"/{where} is in units '{unit}', {right} is needed")
 

@@ -1,4 +1,4 @@
-"""A look at an HDF5 file's global heaps before HDF5 reads them.
+"""A file as HDF5 reads it, with a look at every global heap before HDF5 walks through it.
 
 Text attributes of variable length, which h5py writes, lie in "global heap collections": a 16-byte
 header (``GCOL``, version 1, size) and objects, each a 16-byte header (index, references, size) and
@@ -6,60 +6,173 @@ its bytes padded to 8; index 0 is the free rest, whose size includes its header.
 without checking that it moves on, so one flipped byte makes it loop for ever, in C code that no
 signal or time-out of ours can end (HDFGroup/hdf5 issue 1707, h5py issue 2088).
 
+So HDF5 reads an untrusted file through :class:`CheckedFile`: whatever it asks for is searched for
+the beginning of a heap, and a heap that begins there is walked in Python before HDF5 gets the
+bytes. Nothing else of the file is read, so that the cost does not depend on the file's size.
+
 What this does not see is a reference to a heap that lies about the length of its text: HDF5 then
 allocates that much, at most 4 GiB, before it notices and reports an error.
 """
 
 from __future__ import annotations
 
+import io
 import os
 import struct
+from typing import Any
 
 from jaxcal.errors import FormatError
 
-MAXIMUM_BYTES = 2**30
-"""Files above this size (1 GiB) are not searched: they would have to be read from end to end."""
+_LARGEST_HEAP = 2**26
+_MOST_BYTES = 2**28
+"""Of all heaps together; every one is walked once."""
 
-_MAXIMUM_OBJECTS = 10**6
+_MOST_OBJECTS = 10**6
+_LOOKALIKE = 10
+"""Objects that a place counts for where only the first bytes are a heap's."""
+
 _START = b"GCOL\x01"
-_BLOCK = 2**24
+_BEFORE = len(_START) - 1
 
 
-def check_heaps(path: str | os.PathLike[str]) -> None:
-    """Check that every global heap collection in a file can be walked to its end.
+class CheckedFile(io.RawIOBase):
+    """A file to read from, whose heaps are checked as they are met.
 
     Args:
-        path: an HDF5 file with 8-byte lengths (all that current programs write).
+        source: a path or a binary file object that can seek.
+        length: bytes that the file is to have, zeros beyond its end; None: those it has.
+
+    Attributes:
+        damage: what was found; HDF5 gets zeros in place of such a heap, and an exception. Its
+            own error hides this one, so whoever reads must ask.
 
     Raises:
-        FormatError: one that cannot, or absurdly many of them.
+        BlockingIOError: another program has the file open for writing.
     """
-    size = os.path.getsize(path)
-    if size > MAXIMUM_BYTES:
+
+    def __init__(self, source: str | os.PathLike[str] | Any, length: int | None = None) -> None:
+        self.damage: FormatError | None = None
+        self._ours = isinstance(source, str | os.PathLike)
+        self._file: Any = io.FileIO(source) if self._ours else source  # pyright: ignore
+        if self._ours:
+            try:
+                _lock(self._file.fileno())
+            except BlockingIOError:
+                self._file.close()
+                raise
+        found = self._file.seek(0, os.SEEK_END)
+        self._length = found if length is None else max(found, length)
+        self._place = 0
+        self._seen: set[int] = set()
+        self._bytes_left, self._objects_left = _MOST_BYTES, _MOST_OBJECTS
+
+    def readable(self) -> bool:
+        """Yes."""
+        return True
+
+    def seekable(self) -> bool:
+        """Yes."""
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """As of any file."""
+        origin = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._length}[whence]
+        self._place = origin + offset
+        return self._place
+
+    def tell(self) -> int:
+        """As of any file."""
+        return self._place
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill a buffer from the current place, after a look at the heaps that begin in it.
+
+        Raises:
+            FormatError: a heap that cannot be walked to its end.
+        """
+        view = memoryview(buffer).cast("B")
+        start = self._place
+        # A heap's first bytes may come in two reads.
+        before = min(_BEFORE, start)
+        data = self._read(start - before, before + len(view) + _BEFORE)
+        try:
+            self._check(start - before, data)
+        except FormatError as error:
+            self.damage = error
+            view[:] = bytes(len(view))
+            raise
+        data = data[before : before + len(view)]
+        view[: len(data)] = data
+        view[len(data) :] = bytes(len(view) - len(data))
+        count = max(0, min(len(view), self._length - start))
+        self._place += count
+        return count
+
+    def close(self) -> None:
+        """Close the file where it was opened here."""
+        if self._ours:
+            self._file.close()
+        super().close()
+
+    def _read(self, start: int, size: int) -> bytes:
+        self._file.seek(start)
+        parts = []
+        while size > 0:
+            part = self._file.read(size)
+            if not part:
+                break
+            parts.append(part)
+            size -= len(part)
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def _check(self, start: int, data: bytes) -> None:
+        place = data.find(_START)
+        while place >= 0:
+            if start + place not in self._seen:
+                self._seen.add(start + place)
+                self._walk(start + place)
+            place = data.find(_START, place + 1)
+
+    def _walk(self, heap: int) -> None:
+        """Walk the objects of one collection as HDF5 does, but with the eyes open."""
+        header = self._read(heap + 8, 8)
+        length = int.from_bytes(header, "little")
+        # The five bytes may be anything; HDF5 takes no heap beyond the file's end.
+        if len(header) < 8 or length > self._length - heap:
+            self._spend(0, _LOOKALIKE)
+            return
+        if length > _LARGEST_HEAP:
+            raise FormatError(f"is damaged: a heap of text claims {length} bytes")
+        self._spend(length, 1)
+        objects = self._read(heap + 16, max(0, length - 16))
+        place = 0
+        while place + 16 <= len(objects):
+            index, _, _, size = struct.unpack_from("<HHIQ", objects, place)
+            step = size if index == 0 else 16 + (size + 7) // 8 * 8
+            if step == 0 or place + step > len(objects):
+                raise FormatError("is damaged: a heap of text cannot be followed to its end")
+            self._spend(0, 1)
+            place += step
+
+    def _spend(self, size: int, objects: int) -> None:
+        self._bytes_left -= size
+        self._objects_left -= objects
+        if self._bytes_left < 0 or self._objects_left < 0:
+            raise FormatError("is damaged: absurdly many heaps of text")
+
+
+def _lock(descriptor: int) -> None:
+    """HDF5's own lock of a file that it reads, which it does not take through a file object."""
+    if os.environ.get("HDF5_USE_FILE_LOCKING", "").upper() in ("FALSE", "0"):
         return
-    budget = _MAXIMUM_OBJECTS
-    with open(path, "rb") as file:
-        for block_start in range(0, size, _BLOCK):
-            file.seek(block_start)
-            block = file.read(_BLOCK + len(_START) - 1)
-            place = block.find(_START)
-            while place >= 0:
-                file.seek(block_start + place + 8)
-                length = int.from_bytes(file.read(8), "little")
-                # These five bytes may be anything; HDF5 takes no heap beyond the file's end.
-                if length <= size - block_start - place:
-                    budget -= _walk(file.read(max(0, length - 16)), budget)
-                place = block.find(_START, place + 1)
-
-
-def _walk(objects: bytes, budget: int) -> int:
-    """Walk the objects of one collection and count them, as HDF5 does but with its eyes open."""
-    place, count = 0, 0
-    while place + 16 <= len(objects):
-        index, _, _, size = struct.unpack_from("<HHIQ", objects, place)
-        step = size if index == 0 else 16 + (size + 7) // 8 * 8
-        count += 1
-        if step == 0 or place + step > len(objects) or count > budget:
-            raise FormatError("is damaged: a heap of text cannot be followed to its end")
-        place += step
-    return count
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError:
+        # A file system without locks.
+        return

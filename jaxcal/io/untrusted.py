@@ -20,7 +20,7 @@ import numpy as np
 from h5py import h5a, h5d, h5g, h5l, h5o, h5s, h5t, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxcal.errors import CalibrationError, FormatError
-from jaxcal.io.heap import check_heaps
+from jaxcal.io.heap import CheckedFile
 from jaxcal.io.readable import one_line, quoted
 
 MAXIMUM_BYTES = 2**28
@@ -53,12 +53,15 @@ class Node:
 
 
 @contextmanager
-def open_root(source: str | os.PathLike[str] | object) -> Iterator[Node]:
+def open_root(
+    source: str | os.PathLike[str] | object, *, length: int | None = None
+) -> Iterator[Node]:
     """Open a file for reading and give its root group.
 
     Args:
         source: a path (checked by :func:`jaxcal.io.readable.check_readable`) or a binary file
             object.
+        length: bytes that the file is taken to have, zeros beyond its end; None: those it has.
 
     Yields:
         The root.
@@ -67,9 +70,27 @@ def open_root(source: str | os.PathLike[str] | object) -> Iterator[Node]:
         FormatError: not HDF5, truncated, damaged, or being written.
     """
     try:
-        file = h5py.File(source, "r")
+        checked = CheckedFile(source, length)
     except BlockingIOError:
-        raise FormatError("is being written by another program") from None
+        raise FormatError("is being written: close it in the program that writes it") from None
+    except OSError as error:
+        raise FormatError(f"cannot be opened: {one_line(error)}") from None
+    try:
+        with _opened(checked, source) as file:
+            yield Node(file, "")
+    except FormatError:
+        # What HDF5 makes of a heap that was not handed out says nothing to a person.
+        if checked.damage is not None:
+            raise checked.damage from None
+        raise
+    finally:
+        checked.close()
+
+
+@contextmanager
+def _opened(checked: CheckedFile, source: object) -> Iterator[h5py.File]:
+    try:
+        file = h5py.File(checked, "r")
     except Exception as error:
         if isinstance(source, str | os.PathLike) and not h5py.is_hdf5(source):
             raise FormatError("is not an HDF5 file") from None
@@ -78,9 +99,7 @@ def open_root(source: str | os.PathLike[str] | object) -> Iterator[Node]:
         with _reading("the file"):
             if file.id.get_create_plist().get_sizes() != (8, 8):
                 raise FormatError("has addresses or lengths of other than 8 bytes")
-            if isinstance(source, str | os.PathLike):
-                check_heaps(source)
-        yield Node(file, "")
+        yield file
     finally:
         with _reading("the file"):
             file.close()

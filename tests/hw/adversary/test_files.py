@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 import os
+import struct
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
+
+import jaxcal
+from hw.recording_file import RecordingWriter
+from hw.recording_layout import LAYOUT, Header
+
+PROBE = {"kind": "linear", "elements": 8, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
+HEADER = Header(kind="time_of_flight", probe=PROBE)
 
 EVIL = "open({mark!r}, 'a').write(__name__ + chr(10))\nraise SystemExit('a stranger ran')\n"
 SHADOWED = (
@@ -71,3 +82,92 @@ def test_no_console_script_runs_a_file_of_the_current_folder(hostile, program):
     done = subprocess.run([script, "--help"], cwd=folder, capture_output=True, check=False)
     assert not mark.exists(), mark.read_text()
     assert done.returncode == 0, done.stderr
+
+
+# -- HDF5
+
+
+@pytest.fixture(scope="module")
+def complete(tmp_path_factory) -> bytes:
+    """A small recording that loads."""
+    path = tmp_path_factory.mktemp("files") / "rec.h5"
+    writer = RecordingWriter.create(path, HEADER)
+    for k in range(6):
+        select(writer, k)
+    writer.finish()
+    return path.read_bytes()
+
+
+def select(writer: RecordingWriter, k: int) -> None:
+    """A selected image: any times of flight."""
+    pose, bracket = np.eye(4), dict.fromkeys(LAYOUT["placement"], np.ones(1))
+    pose[0, 3] = k
+    writer.append("calibration", {
+        "pose": pose[None], "time_of_flight": np.full((1, 8), 4e-5), "max_elevation": np.ones(1),
+        "amplitude": np.ones(1), "mask": np.ones(1, bool), "time": np.array([float(k)]),
+        "target": np.array([k]),
+    })  # fmt: skip
+    writer.append("placement", bracket)
+
+
+LOAD = """
+import sys, time, jaxcal
+from jaxcal.io.hdf5 import load
+began = time.perf_counter()
+try:
+    load(sys.argv[1])
+except jaxcal.FormatError as error:
+    print(time.perf_counter() - began, error)
+"""
+
+
+def endless(content: bytes) -> bytes:
+    """The first object of the first heap of text gets the size 0: HDF5 never gets past it."""
+    changed = bytearray(content)
+    heap = changed.index(b"GCOL")
+    changed[heap + 16 : heap + 32] = struct.pack("<HHIQ", 0, 1, 0, 0)
+    return bytes(changed)
+
+
+def test_a_looping_heap_is_refused_in_a_file_of_more_than_a_gibibyte(tmp_path, complete):
+    path = tmp_path / "rec.h5"
+    path.write_bytes(endless(complete))
+    os.truncate(path, 2**30 + 2**12)
+    # In a process that can be killed: HDF5 loops in C, where no signal and no time-out ends it.
+    done = subprocess.run(
+        [sys.executable, "-c", LOAD, path], capture_output=True, text=True, timeout=30, check=False
+    )
+    seconds, _, line = done.stdout.partition(" ")
+    assert f"{path}: is damaged: a heap of text cannot be followed to its end\n" == line
+    assert float(seconds) < 2.0
+    # The same bytes without the loop: a large file loads, and what is after the end costs nothing.
+    path.write_bytes(complete)
+    os.truncate(path, 2**40)
+    began = time.perf_counter()
+    assert len(jaxcal.load(path)) == 6
+    assert time.perf_counter() - began < 2.0
+
+
+def test_heaps_without_number_or_end_take_no_time(tmp_path, complete):
+    def refused_soon(content: bytes, match: str, size: int = 0) -> None:
+        path = tmp_path / "rec.h5"
+        path.write_bytes(content)
+        os.truncate(path, max(size, len(content)))
+        began = time.perf_counter()
+        with pytest.raises(jaxcal.FormatError, match=match):
+            jaxcal.load(path)
+        assert time.perf_counter() - began < 3.0
+
+    huge = bytearray(complete)
+    heap = huge.index(b"GCOL")
+    huge[heap + 8 : heap + 16] = (2**33).to_bytes(8, "little")
+    refused_soon(bytes(huge), "a heap of text claims 8589934592 bytes", 2**34)
+
+    path = tmp_path / "many.h5"
+    path.write_bytes(complete)
+    with h5py.File(path, "r+") as file:
+        del file["calibration/pose"]
+        like = np.frombuffer(b"GCOL\1\0\0\0" + (2**20).to_bytes(8, "little"), float)
+        file["calibration/pose"] = np.tile(like, 2**20 * 3).reshape(-1, 4, 4)[:100_000]
+        file["calibration/pose"].attrs["units"] = "mm"
+    refused_soon(path.read_bytes(), "heap")
