@@ -29,7 +29,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import tomllib
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -40,7 +39,8 @@ from hw.midplane.search import Settings
 from hw.poses import Extent
 from hw.scene import Scene
 from jaxcal.errors import InputError
-from jaxcal.io.readable import check_readable, one_line, quoted
+from jaxcal.io.readable import quoted
+from jaxcal.io.toml import load_toml
 from jaxcal.probe import LinearProbe
 
 _LARGEST_BYTES = 2**18
@@ -87,16 +87,13 @@ def load_setup(path: str | os.PathLike[str]) -> Setup:
     """Read a bench's description.
 
     Raises:
-        FormatError: no such file.
-        InputError: not TOML, unknown or missing keys, numbers that are none; one line that starts
-            with the path.
+        FormatError: no such file, or not TOML.
+        InputError: unknown or missing keys, numbers that are none; like the other one line that
+            starts with the path.
     """
-    check_readable(path, maximum_bytes=_LARGEST_BYTES)
+    tables = load_toml(path, maximum_bytes=_LARGEST_BYTES)
     try:
-        with open(path, "rb") as file:
-            return _setup(tomllib.load(file))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: is not TOML: {one_line(error)}") from None
+        return _setup(tables)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 

@@ -7,7 +7,6 @@ an unknown or missing name is not read at all.
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
@@ -15,8 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from hw.errors import RefusedError
+from jaxcal.errors import FormatError
+from jaxcal.io.toml import load_toml
 
-_MOST_TOML_BYTES = 1 << 20
+_LARGEST = 1e300
 _VECTORS = ("box_min_mm", "box_max_mm", "tip_mm", "cone_axis")
 
 Vector3 = tuple[float, float, float]
@@ -89,13 +90,9 @@ class Limits:
             RefusedError: no such file or table, unknown or missing keys, or values out of bounds.
         """
         try:
-            with Path(path).open("rb") as file:
-                text = file.read(_MOST_TOML_BYTES + 1)
-            if len(text) > _MOST_TOML_BYTES:
-                raise _refuse(f"{path}: larger than {_MOST_TOML_BYTES} bytes")
-            table = tomllib.loads(text.decode("utf-8")).get("limits")
-        except (OSError, ValueError) as error:
-            raise _refuse(f"{path}: {error}") from error
+            table = load_toml(path).get("limits")
+        except FormatError as error:
+            raise _refuse(str(error)) from None
         if not isinstance(table, dict):
             raise _refuse(f"{path}: there is no table [limits]")
         try:
@@ -138,7 +135,7 @@ def numbers(value: object, size: int, name: str) -> tuple[float, ...]:
         items = items.tolist() if isinstance(items, np.ndarray) and items.ndim == 1 else []
     good = [
         float(item) for item in items
-        if isinstance(item, int | float) and not isinstance(item, bool) and math.isfinite(item)
+        if isinstance(item, int | float) and not isinstance(item, bool) and abs(item) <= _LARGEST
     ]  # fmt: skip
     if len(good) != len(items) or len(good) != size:
         count = "a finite number" if size == 1 else f"{size} finite numbers"

@@ -112,4 +112,4 @@ def _check(text: str) -> None:
 
 def _refused(line: int, what: str, most: int | None = None) -> FormatError:
     bound = "" if most is None else f" (at most {most})"
-    return FormatError(f"is refused as TOML: {what} in line {line}{bound}")
+    return FormatError(f"is not TOML that is read here: {what} in line {line}{bound}")

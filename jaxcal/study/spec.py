@@ -53,14 +53,13 @@ import json
 import math
 import os
 import re
-import tomllib
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any, Literal
 
-from jaxcal.errors import FormatError, InputError
-from jaxcal.io.readable import check_readable, quoted
+from jaxcal.errors import InputError
+from jaxcal.io.readable import quoted
+from jaxcal.io.toml import load_toml, parse_toml
 from jaxcal.probe import LinearProbe
 
 MAXIMUM_BYTES = 2**20
@@ -266,13 +265,11 @@ def load_spec(path: str | os.PathLike[str]) -> Spec:
         InputError: an unknown, missing or wrong field, which is named. Either is one line that
             starts with the path.
     """
-    check_readable(path, maximum_bytes=MAXIMUM_BYTES)
+    content = load_toml(path, maximum_bytes=MAXIMUM_BYTES)
     try:
-        return parse_spec(Path(path).read_text(encoding="utf-8"))
+        return _spec(content)
     except InputError as error:
         raise type(error)(f"{path}: {error}") from None
-    except UnicodeDecodeError:
-        raise FormatError(f"{path}: is not UTF-8 text") from None
 
 
 def parse_spec(text: str) -> Spec:
@@ -282,11 +279,10 @@ def parse_spec(text: str) -> Spec:
         FormatError: not TOML.
         InputError: see there.
     """
-    try:
-        content = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        reason = " ".join(str(error).split()) or "nested too deep"
-        raise FormatError(f"is not TOML: {reason}") from None
+    return _spec(parse_toml(text))
+
+
+def _spec(content: dict[str, Any]) -> Spec:
     _known(content, {"name", "seed", "trials", "chunk_trials", "conditions", "probe", "methods"})
     name = _required(content, "name")
     if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z0-9_-]{1,100}", name)):

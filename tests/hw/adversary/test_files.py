@@ -14,8 +14,13 @@ import numpy as np
 import pytest
 
 import jaxcal
+from hw.cli import main as acquire
+from hw.errors import RefusedError
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import LAYOUT, Header
+from hw.robot.limits import Limits
+from jaxcal.cli.main import main as study
+from jaxcal.io.toml import parse_toml
 
 PROBE = {"kind": "linear", "elements": 8, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
 HEADER = Header(kind="time_of_flight", probe=PROBE)
@@ -171,3 +176,79 @@ def test_heaps_without_number_or_end_take_no_time(tmp_path, complete):
         file["calibration/pose"] = np.tile(like, 2**20 * 3).reshape(-1, 4, 4)[:100_000]
         file["calibration/pose"].attrs["units"] = "mm"
     refused_soon(path.read_bytes(), "heap")
+
+
+# -- TOML
+
+SETUP = """
+[robot]
+host = "192.168.1.10"
+[active_echo]
+url = "/dev/ttyUSB0"
+[probe]
+elements = 64
+[scene]
+image_to_probe = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 60], [0, 0, 0, 1]]
+point_mm = [350, -250, 80]
+looking = [0, 0, -1]
+[limits]
+max_speed_mm_s = 50
+"""
+BOMBS = {
+    "dotted key": (f"a{'.b' * 60_000} = 1\n", "a key of more than 8 parts in line 1"),
+    "dotted key with spaces": (f'"a" {". b" * 60_000} = 1\n', "a key of more than 8 parts"),
+    "dotted table": (f"[a{'.b' * 60_000}]\n", "a key of more than 8 parts"),
+    "many keys": ("\n".join(f"a{k}=1" for k in range(20_000)), "more than 10000 keys in line 10"),
+    "many tables": ("[[a]]\n" * 20_000, "more than 10000 keys"),
+    "digits": (f"a = {'1' * 5001}\n", "a number of 5001 characters in line 1"),
+    "10^400": (f"\na = -1{'0' * 400}\n", "a number of 402 characters in line 2"),
+    "arrays": (f"a = {'[' * 50_000}\n", "nested more than 16 deep"),
+    "inline tables": (f"a = {'{a=' * 5000}\n", "nested more than 16 deep"),
+    "quotes": ('a = """' + '\\"""' * 50_000, "a string that does not end"),
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_toml_bomb_is_one_line_at_once(tmp_path, capsys, name):
+    content, what = BOMBS[name]
+    path = tmp_path / "bomb.toml"
+    began = time.process_time()
+    for table, read in (
+        (SETUP, lambda: acquire(["acquire", "--setup", str(path), "--images", "4"])),
+        ("", lambda: study(["study", "run", str(path), "--out", str(tmp_path / "out")])),
+    ):
+        path.write_text(content + table)
+        assert read() == 2
+        line = capsys.readouterr().err
+        assert line.count("\n") == 1
+        assert f"{path}: is not TOML" in line
+        assert what in line
+    path.write_text(content + SETUP)
+    with pytest.raises(RefusedError, match="is not TOML") as caught:
+        Limits.from_toml(path)
+    assert what in str(caught.value)
+    assert time.process_time() - began < 10.0
+
+
+@pytest.mark.parametrize("value", ["1e400", "-inf", "nan", "9" * 99, "1979-05-27", "{}"])
+def test_numbers_that_are_none_or_too_large_are_one_line(tmp_path, capsys, value):
+    path = tmp_path / "bench.toml"
+    for old in ("max_speed_mm_s = 50", "elements = 64"):
+        name = old.split()[0]
+        path.write_text(SETUP.replace(old, f"{name} = {value}"))
+        assert acquire(["acquire", "--setup", str(path), "--images", "4"]) in (2, 4)
+        line = capsys.readouterr().err
+        assert line.count("\n") == 1
+        assert "internal error" not in line
+    with pytest.raises(RefusedError):
+        Limits.from_mapping({"max_speed_mm_s": 10**400})
+
+
+def test_toml_with_all_that_toml_has_is_read():
+    text = (
+        'a = """x [[[ "" """""\nb.c."d.e.f.g.h.i.j" = 1.5 # """ [[[\r\n'
+        "c = '''[\n{'''\nd = [[[1]]]"
+    )
+    assert parse_toml(text) == {
+        "a": 'x [[[ "" ""', "b": {"c": {"d.e.f.g.h.i.j": 1.5}}, "c": "[\n{", "d": [[[1]]]
+    }  # fmt: skip
