@@ -29,11 +29,10 @@ from hw.recorder import Recorder
 from hw.recording_check import Progress, read_progress
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import Header
-from hw.robot.limits import Limits
 from hw.robot.motion import Motion
-from hw.robot.safety import Confirmation, MotionPlan
+from hw.robot.safety import Confirmation, MotionPlan, check_plan
 from hw.session import Session, Watch, median_times
-from hw.setup import Setup
+from hw.setup import Setup, controller_arm
 from hw.stage import ProbeStage
 from jaxcal.cli.common import ExitCode
 from jaxcal.errors import CalibrationError, InputError
@@ -43,6 +42,10 @@ MOST_IMAGES = 1000
 _MOST_GIVEN_UP = 3
 _FURTHEST_START_MM = 3.0
 _IMAGES_FOR_PREDICTION = 8
+NOT_CHECKED = (
+    "reach, joints and singularities are NOT checked: neither the setup ([robot] model) nor the "
+    "controller names an arm that is known"
+)
 
 
 class AcquisitionStopped(CalibrationError):
@@ -267,6 +270,8 @@ def _run(
     session = Session(setup, recorder, watch=watch, every_frame=job.request.every_frame)
     with session:
         plan = _motion_plan(job, session, recorder)
+        course = check_plan(plan)
+        note("arm", NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}")
         confirmation = confirm(plan)
         note("confirmed", f"plan {plan.digest[:12]} for robot {plan.serial}")
 
@@ -330,9 +335,9 @@ def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
     recorder.attributes("tracker", {"serial_number": identity.serial, "tcp_offset": list(offset)})
     recorder.attributes("ae", {"clock_hz": session.echo.clock_hz(), "trigger_delay_s": 0.0})
     recorder.sync()
-    tip = job.setup.scene.tip_mm.tolist()
-    limits = Limits.from_mapping({"tip_mm": tip, **job.setup.limits})
-    return MotionPlan(job.targets, limits, offset, identity.serial)
+    limits = job.setup.motion_limits(controller_arm(identity.model, identity.version))
+    joints = session.poses.latest().joints
+    return MotionPlan(job.targets, limits, offset, identity.serial, joints)
 
 
 def _place(

@@ -236,12 +236,14 @@ def _confirming(setup: Setup, emulated: bool, code: str | None) -> Confirm:
     """Who confirms the plan: the emulated bench's needs nobody's word, a robot's a person's."""
 
     def ask(plan):
-        from hw.robot.safety import confirm
+        from hw.robot.safety import confirm, plan_lines
 
         if emulated:
             return confirm(plan, plan.code, clock=setup.clock)
         if code is not None:
             return confirm(plan, code, clock=setup.clock)
+        for line in plan_lines(plan):
+            click.echo(line, err=True)
         click.echo(
             f"{len(plan.targets)} poses for robot {plan.serial}; its speed is capped at "
             f"{plan.limits.max_speed_mm_s:g} mm/s. Clear the tank, keep the emergency stop in "

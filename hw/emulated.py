@@ -36,8 +36,8 @@ def setup_of(bench: Bench) -> Setup:
         probe=bench.probe,
         clock=bench.clock,
         limits={
-            "box_min_mm": [x - 120.0, y - 120.0, z - 15.0],
-            "box_max_mm": [x + 120.0, y + 120.0, z + 140.0],
+            "box_min_mm": [x - 200.0, y - 200.0, z - 45.0],
+            "box_max_mm": [x + 200.0, y + 200.0, z + 200.0],
             "cone_axis": [0.0, 0.0, -1.0],
             "cone_deg": 60.0,
             "max_step_mm": 250.0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from hw.acquire import Outcome, Request
 from hw.poses import plan_poses, preview
 from hw.robot.limits import Limits
-from hw.robot.safety import MotionPlan, check_plan
+from hw.robot.safety import MotionPlan, check_plan, plan_lines
 from hw.setup import Setup
 from jaxcal.errors import InputError
 
@@ -26,16 +27,32 @@ def dry_run(setup: Setup, path: str, request: Request | None, figure: str | None
     if request is None:
         raise InputError("--resume needs --move: a dry run has nothing to resume")
     plan = plan_poses(request.images, setup.scene, setup.extent, request.seed)
-    limits = Limits.from_mapping({"tip_mm": setup.scene.tip_mm.tolist(), **setup.limits})
-    check_plan(MotionPlan(plan.poses, limits, (0.0,) * 6, "dry run"))
+    motion = MotionPlan(plan.poses, _dry_limits(setup), setup.tcp_offset or (0.0,) * 6, "dry run")
+    course = check_plan(motion)
     if figure is not None:
         preview(plan, Path(figure))
+    if course is None:
+        known = "model" if setup.tcp_offset is not None else "model and tcp_offset"
+        arm = (
+            "kinematics NOT checked here: reach, joints, singularities and links of the arm are "
+            f"checked before the confirmation, or now with [robot] {known} in the setup"
+        )
+    else:
+        arm = f"a {motion.limits.arm_model} reaches every pose on every way: {course.text}"
     return [
         f"dry run: {len(plan)} poses, {request.placement}, the tip travels {plan.travel_mm:.0f} mm "
         f"({plan.passed_over} poses passed over)",
+        *plan_lines(motion, tcp_offset_known=setup.tcp_offset is not None),
         "every pose and every way between two lies within the limits",
+        arm,
         f"nothing moved and {path} was not made; add --move to acquire",
     ]
+
+
+def _dry_limits(setup: Setup) -> Limits:
+    """The limits, without the arm where its TCP offset is not known: only the controller tells."""
+    limits = setup.motion_limits()
+    return limits if setup.tcp_offset is not None else replace(limits, arm_model="")
 
 
 def draw(setup: Setup, request: Request, figure: str) -> None:

@@ -5,7 +5,9 @@ A TOML file, units in the names; a key that is not known is refused:
     [robot]
     host = "192.168.1.10"
     frequency_hz = 125              # optional: the controller's own rate otherwise
-    tcp_offset = [0, 0, 0.12, 0, 0, 0]  # m, rad; only for controllers that do not tell it
+    tcp_offset = [0, 0, 0.12, 0, 0, 0]  # m, rad; for controllers that do not tell it, and dry runs
+    model = "UR5"                   # of hw.robot.kinematics.MODELS: what the dry run checks; else
+                                    # the controller is asked, and a dry run leaves it out
     settle_s = 0.3                  # poses are averaged for so long after a move
     [active_echo]
     url = "/dev/ttyUSB0"
@@ -16,11 +18,15 @@ A TOML file, units in the names; a key that is not known is refused:
     elements = 128
     pitch_mm = 0.457
     sound_speed_m_s = 1490
+    housing_mm = [58.5, 25, 60]     # width, thickness, length back from the face; optional, this is
+                                    # the array's width, 25 and 60
     [scene]                         # as drawn or measured with a ruler
     image_to_probe = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 60], [0, 0, 0, 1]]
     point_mm = [350, -250, 80]
     looking = [0, 0, -1]
-    [limits]                        # of hw.robot.safety; the box bounds the probe's tip
+    tip_at_tcp = false              # true where the controller's TCP is the probe's tip itself:
+                                    # else image_to_probe must be at least 5 mm long
+    [limits]                        # of hw.robot.limits; the box bounds the probe with its housing
     [plan]                          # of hw.poses.Extent
     [search]                        # of hw.midplane.search.Settings
 """
@@ -35,8 +41,11 @@ from typing import Any
 import numpy as np
 
 from hw.clock import REAL, Clock
+from hw.errors import RefusedError
 from hw.midplane.search import Settings
 from hw.poses import Extent
+from hw.robot.kinematics import model_named
+from hw.robot.limits import FURTHEST_TIP_MM, Limits, hull_of, numbers
 from hw.scene import Scene
 from jaxcal.errors import InputError
 from jaxcal.io.readable import quoted
@@ -44,6 +53,15 @@ from jaxcal.io.toml import load_toml
 from jaxcal.probe import LinearProbe
 
 _LARGEST_BYTES = 2**18
+_LEAST_TIP_MM = 5.0
+_TARGET_MM = (50.0, 2000.0)
+"""Distance of a target from the base: not within it, and no arm reaches further."""
+_WIDTH_MM = (2.0, 300.0)
+"""Of an array."""
+_HOUSING_MM = (25.0, 60.0)
+"""Thickness and length of a housing that the setup does not tell: a common linear probe's."""
+_LONGEST_OFFSET_M = 1.0
+_TIP_TOLERANCE_MM = 0.1
 
 
 @dataclass(frozen=True)
@@ -55,7 +73,8 @@ class Setup:
         active_echo_url: serial port, pty or ``socket://host:port``.
         ultrasound: (host, port) of the OpenIGTLink server; None: no images.
         scene: probe and target as drawn.
-        limits: tables of :class:`hw.robot.safety.Limits`, by name.
+        limits: fields of :class:`hw.robot.limits.Limits`, by name; those that follow from the scene
+            and the probe are added by :meth:`motion_limits`.
         probe: the transducer.
         extent: what the plan covers.
         search: steps and stated accuracies of the placement.
@@ -65,6 +84,9 @@ class Setup:
         settle_s: poses are averaged for so long.
         caller_s: bench seconds that this process may be silent while the robot moves.
         frames: active-echo frames of an image.
+        model: of the arm, by name; None: what the controller says.
+        housing_mm: width, thickness and length of the probe's housing; None: the array's width, 25
+            and 60 mm.
     """
 
     robot_host: str
@@ -81,6 +103,57 @@ class Setup:
     settle_s: float = 0.3
     caller_s: float = 0.15
     frames: int = 9
+    model: str | None = None
+    housing_mm: tuple[float, float, float] | None = None
+
+    def motion_limits(self, controller_model: str | None = None) -> Limits:
+        """What bounds every motion of this bench.
+
+        Args:
+            controller_model: of the arm, as the controller tells it (:func:`controller_arm`).
+
+        Raises:
+            RefusedError: limits that are none, that contradict the scene, or another arm than the
+                setup's.
+        """
+        tip = self.scene.tip_mm
+        given = self.limits.get("tip_mm")
+        if given is not None and not np.allclose(
+            numbers(given, 3, "tip_mm"), tip, rtol=0.0, atol=_TIP_TOLERANCE_MM
+        ):
+            raise RefusedError(
+                f"[limits] tip_mm {given} contradicts [scene] image_to_probe, whose tip is "
+                f"{np.round(tip, 3).tolist()} mm: leave tip_mm out",
+                device="robot",
+            )
+        model = self.model or self.limits.get("arm_model") or controller_model or ""
+        if model and controller_model and model_named(model).name != controller_model:
+            raise RefusedError(
+                f"the setup is for a {model}, but the controller is that of a {controller_model}",
+                device="robot",
+            )
+        width = self.probe.elements * self.probe.pitch_mm
+        hull = hull_of(self.scene.image_to_probe, *(self.housing_mm or (width, *_HOUSING_MM)))
+        return Limits.from_mapping(
+            {"hull_mm": hull, **self.limits, "tip_mm": tip.tolist(), "arm_model": model}
+        )
+
+
+def controller_arm(model: str, version: str) -> str | None:
+    """The arm that a controller says it moves; None where that is none that is known.
+
+    Args:
+        model: the dashboard's answer to ``get robot model``, which has no "e" for e-Series arms.
+        version: of PolyScope; e-Series controllers run version 5 and later.
+    """
+    name = model.strip()
+    newer = version.split(".")[0].isdigit() and int(version.split(".")[0]) >= 5
+    for candidate in ([f"{name}e"] if newer else []) + [name]:
+        try:
+            return model_named(candidate).name
+        except RefusedError:
+            continue
+    return None
 
 
 def load_setup(path: str | os.PathLike[str]) -> Setup:
@@ -100,11 +173,12 @@ def load_setup(path: str | os.PathLike[str]) -> Setup:
 
 _TABLES = {
     "robot": {"host": str, "frequency_hz": float, "settle_s": float,
-              "tcp_offset": list},
+              "tcp_offset": list, "model": str},
     "active_echo": {"url": str, "frames": int},
     "ultrasound": {"host": str, "port": int},
-    "probe": {"elements": int, "pitch_mm": float, "sound_speed_m_s": float, "delay_s": float},
-    "scene": {"image_to_probe": list, "point_mm": list, "looking": list},
+    "probe": {"elements": int, "pitch_mm": float, "sound_speed_m_s": float, "delay_s": float,
+              "housing_mm": list},
+    "scene": {"image_to_probe": list, "point_mm": list, "looking": list, "tip_at_tcp": bool},
     "limits": None,
     "plan": {f.name: list if f.name.endswith("_mm") and f.name != "lateral_mm" else float
              for f in dataclasses.fields(Extent)},
@@ -138,12 +212,24 @@ def _setup(tables: dict[str, Any]) -> Setup:
             raise InputError(f"[robot] {key} must be a positive number")
     if "tcp_offset" in robot:
         offset = _numbers("tcp_offset", robot["tcp_offset"], (6,), "robot")
+        if np.linalg.norm(offset[:3]) > _LONGEST_OFFSET_M:
+            raise InputError(
+                f"[robot] tcp_offset is {np.linalg.norm(offset[:3]):g} m long: is it in mm? It is "
+                "in m and rad, as at the pendant"
+            )
         robot["tcp_offset"] = tuple(offset.tolist())
+    if "model" in robot:
+        robot["model"] = _arm_name(robot["model"])
+    housing = found["probe"].pop("housing_mm", None)
+    if housing is not None:
+        housing = tuple(_numbers("housing_mm", housing, (3,), "probe").tolist())
+        if not all(1.0 <= value <= FURTHEST_TIP_MM for value in housing):
+            raise InputError(f"[probe] housing_mm must be 1 to {FURTHEST_TIP_MM:g} mm each")
     echo = found["active_echo"]
     if not 1 <= echo.get("frames", 9) <= 1000:
         raise InputError("[active_echo] frames must be 1 to 1000")
     plan: dict[str, Any] = {key: _tuples(key, value) for key, value in found["plan"].items()}
-    return Setup(
+    setup = Setup(
         active_echo_url=echo["url"],
         frames=echo.get("frames", 9),
         ultrasound=ultrasound,
@@ -156,8 +242,46 @@ def _setup(tables: dict[str, Any]) -> Setup:
         probe=LinearProbe(**found["probe"]),
         extent=Extent(**plan),
         search=Settings(**found["search"]),
+        housing_mm=housing,
         **robot,
     )
+    _check_lengths(setup, scene.get("tip_at_tcp", False))
+    return setup
+
+
+def _check_lengths(setup: Setup, tip_at_tcp: bool) -> None:
+    """Lengths that are not plausible in mm: the box bounds nothing where the tip is elsewhere."""
+    tip = float(np.linalg.norm(setup.scene.tip_mm))
+    if tip < _LEAST_TIP_MM and not tip_at_tcp:
+        raise InputError(
+            f"[scene] image_to_probe puts the probe's tip {tip:g} mm from the TCP: are its lengths "
+            "in metres? They are in mm. Where the controller's TCP is the tip itself, add "
+            "tip_at_tcp = true"
+        )
+    if tip > FURTHEST_TIP_MM:
+        raise InputError(
+            f"[scene] image_to_probe puts the probe's tip {tip:g} mm from the TCP, over "
+            f"{FURTHEST_TIP_MM:g} mm: its lengths are in mm"
+        )
+    away = float(np.linalg.norm(setup.scene.point_mm))
+    if not _TARGET_MM[0] <= away <= _TARGET_MM[1]:
+        raise InputError(
+            f"[scene] point_mm is {away:g} mm from the robot's base: it is in mm, "
+            f"{_TARGET_MM[0]:g} to {_TARGET_MM[1]:g} away"
+        )
+    width = setup.probe.elements * setup.probe.pitch_mm
+    if not _WIDTH_MM[0] <= width <= _WIDTH_MM[1]:
+        raise InputError(
+            f"[probe] elements and pitch_mm make an array {width:g} mm wide: pitch_mm is in mm, "
+            f"and the array {_WIDTH_MM[0]:g} to {_WIDTH_MM[1]:g} mm wide"
+        )
+
+
+def _arm_name(name: str) -> str:
+    try:
+        return model_named(name).name
+    except RefusedError as error:
+        raise InputError(f"[robot] model: {error.args[0]}") from None
 
 
 def _table(tables: dict[str, Any], name: str) -> dict[str, Any]:
@@ -174,8 +298,11 @@ def _table(tables: dict[str, Any], name: str) -> dict[str, Any]:
         kind = kinds[key]
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
-        if not isinstance(value, kind) or isinstance(value, bool):
-            wanted = {str: "text", int: "a whole number", float: "a number", list: "a list"}[kind]
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            wanted = {
+                str: "text", int: "a whole number", float: "a number", list: "a list",
+                bool: "true or false",
+            }[kind]  # fmt: skip
             raise InputError(f"[{name}] {key} must be {wanted}")
         checked[key] = value
     return checked
@@ -184,7 +311,7 @@ def _table(tables: dict[str, Any], name: str) -> dict[str, Any]:
 def _numbers(name: str, value: Any, shape: tuple[int, ...], table: str = "scene") -> np.ndarray:
     try:
         array = np.asarray(value, float)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         array = np.empty(0)
     if array.shape != shape or not np.isfinite(array).all():
         raise InputError(f"[{table}] {name} must be numbers of shape {shape}")

@@ -244,7 +244,7 @@ def dexterity_mm(model: ArmModel, joints: Float[np.ndarray, "*n 6"]) -> Float[np
     The reciprocal is by how much the joints must turn, at worst, for a mm of the flange (Klein and
     Blaho 1987).
     """
-    return np.linalg.svd(scaled_jacobian(model, joints), compute_uv=False)[..., -1]
+    return np.asarray(np.linalg.svd(scaled_jacobian(model, joints), compute_uv=False)[..., -1])
 
 
 def nearest_singularity(model: ArmModel, joints: Float[np.ndarray, 6]) -> str:
@@ -367,10 +367,9 @@ def branch_of(model: ArmModel, joints: Float[np.ndarray, "*n 6"]) -> Int[np.ndar
     centre = link_frames(model, joints)[..., 5, :3, 3]
     # The wrist centre along the arm's plane: joint 1's sine and cosine turn it into that.
     along = centre[..., 0] * np.cos(joints[..., 0]) + centre[..., 1] * np.sin(joints[..., 0])
-    return (
-        4 * (along > 0).astype(int)
-        + 2 * (np.sin(joints[..., 4]) < 0).astype(int)
-        + (np.sin(joints[..., 2]) < 0).astype(int)
+    negative = [along > 0, np.sin(joints[..., 4]) < 0, np.sin(joints[..., 2]) < 0]
+    return np.asarray(np.array([4, 2, 1]) @ np.array(negative, dtype=int).reshape(3, -1)).reshape(
+        along.shape
     )
 
 

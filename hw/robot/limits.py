@@ -2,6 +2,12 @@
 
 A limit that does not limit anything is refused: every value has a bound of its own, and a file with
 an unknown or missing name is not read at all.
+
+Two boxes bound what moves. The box (``box_min_mm``, ``box_max_mm``) holds the probe: its tip and
+the convex hull of array face and housing (``hull_mm``). The arm's box (``arm_box_min_mm``,
+``arm_box_max_mm``) holds the TCP, the flange and, where the arm's model is known, its elbow and
+wrists with their housings; by default it is the half-space above the floor of the probe's box. The
+arm's base stands outside of the first and is not checked against the second.
 """
 
 from __future__ import annotations
@@ -12,15 +18,32 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from hw.errors import RefusedError
+from hw.robot.kinematics import model_named
 from jaxcal.errors import FormatError
 from jaxcal.io.toml import load_toml
 
-_LARGEST = 1e300
-_VECTORS = ("box_min_mm", "box_max_mm", "tip_mm", "cone_axis")
+_VECTORS = {
+    "box_min_mm": 3, "box_max_mm": 3, "tip_mm": 3, "cone_axis": 3, "arm_box_min_mm": 3,
+    "arm_box_max_mm": 3, "joint_min_deg": 6, "joint_max_deg": 6,
+}  # fmt: skip
+_TEXTS = ("arm_model", "force_reason")
+_MOST_TEXT = 200
+
+FURTHEST_MM = 2000.0
+"""No corner of a box lies further than this from the base, along any axis: the largest arm that is
+known (UR20) reaches 1.75 m."""
+FURTHEST_TIP_MM = 500.0
+"""No part of a probe is further from the TCP than this."""
+FORCE_WITHOUT_REASON_N = 140.0
+"""The quasi-static limits of ISO/TS 15066 for contact with people lie at and below this for chest
+and abdomen; a higher cap needs ``force_reason``."""
+_MOST_CORNERS = 64
 
 Vector3 = tuple[float, float, float]
+Vector6 = tuple[float, float, float, float, float, float]
 
 
 def _refuse(text: str) -> RefusedError:
@@ -61,26 +84,79 @@ class Limits:
     """Oldest pose on which to move; at most 0.1 s."""
     max_force_n: float = 20.0
     """Force at the TCP at which a motion is stopped."""
+    force_reason: str = ""
+    """Why a cap above 140 N is needed; such a cap is refused without."""
+    hull_mm: tuple[Vector3, ...] = ()
+    """Corners of the probe's array face and housing in the TCP's frame (:func:`hull_of`)."""
+    arm_model: str = ""
+    """Of :data:`hw.robot.kinematics.MODELS`; empty: reach, joints and singularities are not
+    checked."""
+    arm_box_min_mm: Vector3 | None = None
+    """Lowest corner of the arm's box; by default at the height of ``box_min_mm``, and 2 m away
+    along x and y."""
+    arm_box_max_mm: Vector3 | None = None
+    """Highest corner of the arm's box; by default 2 m away along every axis."""
+    joint_min_deg: Vector6 = (-360.0, -360.0, -180.0, -360.0, -360.0, -360.0)
+    """Lowest angle of each joint. The elbow's own range is wider, but the upper arm is in its
+    way."""
+    joint_max_deg: Vector6 = (360.0, 360.0, 180.0, 360.0, 360.0, 360.0)
+    """Highest angle of each joint."""
+    max_joint_speed_deg_s: float = 90.0
+    """Of any joint."""
+    min_singular_value_mm: float = 10.0
+    """Least singular value of the arm's Jacobian, mm per rad with 100 mm for a rad of the flange;
+    near a wrist singularity it is about joint 5's angle from it in degrees."""
 
     def __post_init__(self) -> None:
         for item in fields(self):
             object.__setattr__(self, item.name, _checked(item.name, getattr(self, item.name)))
-        if any(low >= high for low, high in zip(self.box_min_mm, self.box_max_mm, strict=True)):
-            raise _refuse("box_min_mm must lie below box_max_mm on every axis")
+        # The half-space above the floor of the probe's box.
+        if self.arm_box_min_mm is None:
+            low = (-FURTHEST_MM, -FURTHEST_MM, self.box_min_mm[2])
+            object.__setattr__(self, "arm_box_min_mm", low)
+        if self.arm_box_max_mm is None:
+            object.__setattr__(self, "arm_box_max_mm", (FURTHEST_MM,) * 3)
+        for name in ("box", "arm_box"):
+            low, high = getattr(self, f"{name}_min_mm"), getattr(self, f"{name}_max_mm")
+            if max(map(abs, low + high)) > FURTHEST_MM:
+                raise _refuse(
+                    f"{name}_min_mm and {name}_max_mm must lie within {FURTHEST_MM:g} mm of the "
+                    "base along every axis"
+                )
+            if any(a >= b for a, b in zip(low, high, strict=True)):
+                raise _refuse(f"{name}_min_mm must lie below {name}_max_mm on every axis")
+        for point in (self.tip_mm, *self.hull_mm):
+            if math.hypot(*point) > FURTHEST_TIP_MM:
+                raise _refuse(
+                    f"a point of the probe is {math.hypot(*point):g} mm from the TCP, over "
+                    f"{FURTHEST_TIP_MM:g} mm: is its position in mm?"
+                )
         if not 0.99 < math.hypot(*self.cone_axis) < 1.01:
             raise _refuse("cone_axis must be a unit vector")
         between("cone_deg", self.cone_deg, 0.0, 90.0)
         between("max_turn_deg", self.max_turn_deg, 0.0, 120.0)
-        between("max_step_mm", self.max_step_mm, 0.0, 1000.0)
+        between("max_step_mm", self.max_step_mm, 0.0, 500.0)
         between("max_speed_mm_s", self.max_speed_mm_s, 0.0, 250.0)
         between("max_acceleration_mm_s2", self.max_acceleration_mm_s2, 0.0, 2000.0)
-        between("search_mm", self.search_mm, -1.0, 100.0)
-        between("search_deg", self.search_deg, -1.0, 30.0)
+        between("search_mm", self.search_mm, -1.0, 50.0)
+        between("search_deg", self.search_deg, -1.0, 10.0)
         between("search_speed_mm_s", self.search_speed_mm_s, 0.0, 10.0)
         between("max_pose_age_s", self.max_pose_age_s, 0.0, 0.1)
         between("max_force_n", self.max_force_n, 0.0, 250.0)
+        between("max_joint_speed_deg_s", self.max_joint_speed_deg_s, 0.0, 180.0)
+        between("min_singular_value_mm", self.min_singular_value_mm, 0.999, 100.0)
+        if self.max_force_n > FORCE_WITHOUT_REASON_N and len(self.force_reason.strip()) < 10:
+            raise _refuse(
+                f"max_force_n of {self.max_force_n:g} N, above {FORCE_WITHOUT_REASON_N:g} N, needs "
+                "a sentence why: force_reason"
+            )
         if self.search_mm < 0 or self.search_deg < 0:
             raise _refuse("search_mm and search_deg cannot be negative")
+        for low, high in zip(self.joint_min_deg, self.joint_max_deg, strict=True):
+            if not -360.0 <= low < high <= 360.0:
+                raise _refuse("joint_min_deg and joint_max_deg must be in order, within 360 deg")
+        if self.arm_model:
+            object.__setattr__(self, "arm_model", model_named(self.arm_model).name)
 
     @classmethod
     def from_toml(cls, path: Path | str) -> Limits:
@@ -118,9 +194,20 @@ class Limits:
         return cls(**checked)  # pyright: ignore[reportArgumentType]
 
 
-def _checked(name: str, value: object) -> float | tuple[float, ...]:
+def _checked(name: str, value: object) -> float | str | tuple | None:
+    if name in _TEXTS:
+        if not isinstance(value, str) or len(value) > _MOST_TEXT:
+            raise _refuse(f"{name} must be text of at most {_MOST_TEXT} letters")
+        return value
+    if name == "hull_mm":
+        rows = value if isinstance(value, list | tuple) else [value]
+        if len(rows) > _MOST_CORNERS:
+            raise _refuse(f"hull_mm has more than {_MOST_CORNERS} corners")
+        return tuple(numbers(row, 3, "every corner of hull_mm") for row in rows)
+    if name in ("arm_box_min_mm", "arm_box_max_mm") and value is None:
+        return None
     if name in _VECTORS:
-        return numbers(value, 3, name)
+        return numbers(value, _VECTORS[name], name)
     return numbers([value], 1, name)[0]
 
 
@@ -133,14 +220,42 @@ def numbers(value: object, size: int, name: str) -> tuple[float, ...]:
     items = value
     if not isinstance(items, Sequence) or isinstance(items, str):
         items = items.tolist() if isinstance(items, np.ndarray) and items.ndim == 1 else []
-    good = [
-        float(item) for item in items
-        if isinstance(item, int | float) and not isinstance(item, bool) and abs(item) <= _LARGEST
-    ]  # fmt: skip
+    good = [number for item in items if (number := _finite(item)) is not None]
     if len(good) != len(items) or len(good) != size:
         count = "a finite number" if size == 1 else f"{size} finite numbers"
         raise _refuse(f"{name} must be {count}")
     return tuple(good)
+
+
+def _finite(value: object) -> float | None:
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number beyond the largest float
+        return None
+    return number if math.isfinite(number) else None
+
+
+def hull_of(
+    image_to_probe: Float[np.ndarray, "4 4"], width_mm: float, thickness_mm: float, length_mm: float
+) -> tuple[Vector3, ...]:
+    """The eight corners of a probe's array face and housing in the TCP's frame, mm.
+
+    Args:
+        image_to_probe: image -> TCP, mm; the image's origin is the middle of the face.
+        width_mm: of the face, lateral.
+        thickness_mm: of the housing, elevational.
+        length_mm: of the housing, from the face backwards.
+    """
+    corners = [
+        (side * width_mm / 2, across * thickness_mm / 2, back, 1.0)
+        for side in (-1.0, 1.0)
+        for across in (-1.0, 1.0)
+        for back in (0.0, -length_mm)
+    ]
+    placed = np.asarray(corners) @ np.asarray(image_to_probe, dtype=np.float64).T
+    return tuple((float(x), float(y), float(z)) for x, y, z, _ in placed)
 
 
 def between(name: str, value: float, low: float, high: float) -> None:

@@ -4,9 +4,11 @@ Nothing is commanded that :meth:`Gate.check_move` did not allow, and what is sen
 :class:`Command` that it returned. This comes on top of the robot's own safety configuration and
 emergency stop, and replaces neither.
 
-The box bounds the probe's tip, not the flange or the tool centre point (TCP). Between start and
-target the TCP runs along a line while it turns about a fixed axis; the tip then runs along an arc,
-so the whole path is checked, not only its ends.
+The box bounds the probe: its tip and the hull of its array face and housing. Between start and
+target the tool centre point (TCP) runs along a line while it turns about a fixed axis; every other
+point runs along an arc, so the whole path is checked, not only its ends. Where the arm's model is
+known, its joints, singularities and links are checked along the same path
+(:mod:`hw.robot.feasibility`).
 
 A move goes to a pose of the plan, or to one within the declared search envelope of such a pose
 (fine elevational steps are searched for, they cannot be planned).
@@ -25,7 +27,9 @@ import numpy as np
 
 from hw.clock import Clock
 from hw.errors import RefusedError, StaleError
-from hw.rigid import rotation_matrix, rotation_vector, turn_deg
+from hw.rigid import inverse, straight_way, turn_deg
+from hw.robot.feasibility import Arm, Course, check_model, follow, follow_all
+from hw.robot.kinematics import model_named, tool_of
 from hw.robot.limits import Limits, between, numbers
 from hw.robot.pose import pose_to_ur
 from hw.robot.rtde import RUNNING_MODE, safety_text
@@ -59,6 +63,9 @@ class MotionPlan:
     """(6,) of the controller when the plan was made: m and rotation vector (rad)."""
     serial: str
     """Of the robot."""
+    joints: tuple[float, ...] | None = None
+    """(6,) rad of the arm when the plan was made, which decide the branch of its kinematics that
+    the plan is checked in; None: any branch. Not part of the digest: it permits nothing."""
 
     def __post_init__(self) -> None:
         targets = _array(self.targets, "the plan's poses")
@@ -69,6 +76,8 @@ class MotionPlan:
         targets.setflags(write=False)
         object.__setattr__(self, "targets", targets)
         object.__setattr__(self, "tcp_offset", numbers(self.tcp_offset, 6, "tcp_offset"))
+        if self.joints is not None:
+            object.__setattr__(self, "joints", numbers(self.joints, 6, "joints"))
         if not 1 <= len(self.serial) <= 100:
             raise _refuse("the plan does not say which robot it is for")
 
@@ -99,6 +108,23 @@ class MotionPlan:
         state.update(json.dumps(head, sort_keys=True).encode())
         state.update(self.targets.astype("<f8").tobytes())
         return state.hexdigest()
+
+    @cached_property
+    def arm(self) -> Arm | None:
+        """The arm that the plan is checked for; None where its model is not known."""
+        limits = self.limits
+        if not limits.arm_model:
+            return None
+        return Arm(
+            model_named(limits.arm_model),
+            self.tcp_offset,
+            np.radians(limits.joint_min_deg),
+            np.radians(limits.joint_max_deg),
+            limits.min_singular_value_mm,
+            math.radians(limits.max_joint_speed_deg_s),
+            np.asarray(limits.arm_box_min_mm),
+            np.asarray(limits.arm_box_max_mm),
+        )
 
     @property
     def code(self) -> str:
@@ -254,43 +280,137 @@ class Gate:
         searching = any(_within(self.plan.targets[k], start, limits) for k in near)
         cap = min(limits.max_speed_mm_s, limits.search_speed_mm_s if searching else math.inf)
         speed = cap if speed_mm_s is None else speed_mm_s
-        number = isinstance(speed, int | float) and not isinstance(speed, bool)
-        if not number or not min(_LEAST_SPEED_MM_S, cap) <= speed <= cap:
+        if (
+            not isinstance(speed, int | float)
+            or isinstance(speed, bool)
+            or not min(_LEAST_SPEED_MM_S, cap) <= speed <= cap
+        ):
             raise _refuse(
                 f"a speed of {speed!r} mm/s is not within {_LEAST_SPEED_MM_S:g} and {cap:g} mm/s"
             )
-        _check_path(start, goal, limits, "the motion")
-
-        distance = float(np.linalg.norm(goal[:3, 3] - start[:3, 3])) / 1000.0
-        turn = math.radians(turn_deg(start, goal))
-        length = max(distance, turn, 1e-9)
-        lever = math.hypot(*limits.tip_mm) / 1000.0
-        # The controller reads a speed in m/s as rad/s where a motion is mostly a turn; the tip
-        # must keep the cap as well as the TCP.
-        ratio = max(1.0, (distance + turn * lever) / length)
-        velocity = speed / 1000.0 / ratio
+        _check_path(self.plan, start, goal, "the motion")
+        length, velocity = _pace(start, goal, limits, speed)
+        self._check_arm(start, goal, sample, length / velocity)
         acceleration = limits.max_acceleration_mm_s2 / 1000.0
         return Command(
             near[0], tuple(float(v) for v in pose_to_ur(goal)), goal, velocity, acceleration,
             length / velocity + velocity / acceleration,
         )  # fmt: skip
 
+    def _check_arm(
+        self, start: np.ndarray, goal: np.ndarray, sample: PoseSample, duration_s: float
+    ) -> None:
+        """Whether the arm can follow the motion from the joints at which it is."""
+        arm = self.plan.arm
+        if arm is None:
+            return
+        if sample.joints is None:
+            # Without joints, any branch will do.
+            follow_all(arm, np.stack([start, goal]), np.array([duration_s]))
+            return
+        joints = np.asarray(sample.joints)
+        check_model(arm, start, joints)
+        follow(arm, start, goal, joints, "the motion", duration_s)
 
-def check_plan(plan: MotionPlan) -> None:
+
+def check_plan(plan: MotionPlan) -> Course | None:
     """Whether every pose of a plan, and the way from each to the next, is within its limits.
+
+    Returns:
+        How the arm follows the plan; None where its model is not known, so that reach, joints and
+        singularities were not checked.
 
     Raises:
         RefusedError: the first pose that is not, and why.
     """
-    limits = plan.limits
-    previous = None
+    previous, durations = None, []
+    _check_box_in_reach(plan)
     for k, target in enumerate(plan.targets):
         pose = _pose(target, f"pose {k} of the plan")
-        _check_path(pose, pose, limits, f"pose {k} of the plan")
+        _check_path(plan, pose, pose, f"pose {k} of the plan")
         if previous is not None:
             what = f"the way from pose {k - 1} to pose {k}"
-            _check_path(previous, pose, limits, what, reserve=True)
+            _check_path(plan, previous, pose, what, reserve=True)
+            length, velocity = _pace(previous, pose, plan.limits, plan.limits.max_speed_mm_s)
+            durations.append(length / velocity)
         previous = pose
+    if plan.arm is None:
+        return None
+    joints = None if plan.joints is None else np.asarray(plan.joints)
+    return follow_all(plan.arm, plan.targets, np.array(durations), joints)
+
+
+def plan_lines(plan: MotionPlan, *, tcp_offset_known: bool = True) -> list[str]:
+    """The plan's limits as a person must see them before it is confirmed; one fact a line."""
+    limits = plan.limits
+    hull = np.ptp(np.array([limits.tip_mm, *limits.hull_mm]), axis=0)
+    x, y, z, *turn = plan.tcp_offset
+    offset = (
+        f"TCP offset: {_vector(1000 * np.array([x, y, z]))} mm, turned by "
+        f"{_vector(np.degrees(turn))} deg"
+    )
+    return [
+        f"probe's tip at {_vector(limits.tip_mm)} mm of the TCP; probe with housing "
+        f"{_vector(hull, ' x ')} mm along the TCP's axes",
+        f"box for the probe: {_vector(limits.box_min_mm)} to {_vector(limits.box_max_mm)} mm",
+        f"box for the arm: {_vector(limits.arm_box_min_mm or ())} to "
+        f"{_vector(limits.arm_box_max_mm or ())} mm",
+        offset if tcp_offset_known else "TCP offset: not known before the controller is asked",
+        f"arm: {limits.arm_model or 'reach, joints, singularities and links NOT checked'}",
+        f"caps: step {limits.max_step_mm:g} mm, turn {limits.max_turn_deg:g} deg, tilt "
+        f"{limits.cone_deg:g} deg, speed {limits.max_speed_mm_s:g} mm/s "
+        f"({limits.search_speed_mm_s:g} mm/s within {limits.search_mm:g} mm and "
+        f"{limits.search_deg:g} deg of a pose), force {limits.max_force_n:g} N"
+        + (f" ({limits.force_reason})" if limits.force_reason else ""),
+    ]
+
+
+def _vector(values: object, between: str = ", ") -> str:
+    return between.join(f"{value:.4g}" for value in np.asarray(values, dtype=np.float64))
+
+
+def out_of_box_mm(pose: np.ndarray, limits: Limits) -> float:
+    """By how much the probe at a pose is out of the box, mm; negative inside."""
+    points = _probe_points(limits) @ pose[:3, :3].T + pose[:3, 3]
+    low, high = np.asarray(limits.box_min_mm), np.asarray(limits.box_max_mm)
+    return float(np.maximum(low - points, points - high).max())
+
+
+def _probe_points(limits: Limits) -> np.ndarray:
+    """(n, 3) the tip and the corners of the hull in the TCP's frame, mm."""
+    return np.array([limits.tip_mm, *limits.hull_mm])
+
+
+def _pace(
+    start: np.ndarray, goal: np.ndarray, limits: Limits, speed_mm_s: float
+) -> tuple[float, float]:
+    """Length of a motion as the controller counts it, and its speed (m and m/s, or rad and rad/s).
+
+    The controller reads a speed in m/s as rad/s where a motion is mostly a turn; the tip must keep
+    the cap as well as the TCP.
+    """
+    distance = float(np.linalg.norm(goal[:3, 3] - start[:3, 3])) / 1000.0
+    turn = math.radians(turn_deg(start, goal))
+    length = max(distance, turn, 1e-9)
+    lever = math.hypot(*limits.tip_mm) / 1000.0
+    ratio = max(1.0, (distance + turn * lever) / length)
+    return length, speed_mm_s / 1000.0 / ratio
+
+
+def _check_box_in_reach(plan: MotionPlan) -> None:
+    """A box that the arm can never leave bounds nothing."""
+    if plan.arm is None:
+        return
+    model, limits = plan.arm.model, plan.limits
+    tool = 1000.0 * math.hypot(*plan.tcp_offset[:3])
+    tip = float(np.linalg.norm(_probe_points(limits), axis=1).max())
+    reach = model.reach_mm + model.d1 + tool + tip
+    furthest = max(map(abs, limits.box_min_mm + limits.box_max_mm))
+    if furthest > reach:
+        raise _refuse(
+            f"the box goes to {furthest:g} mm from the base, but a {model.name} with this tool "
+            f"reaches {reach:.0f} mm at most: bound the box by what the probe may touch"
+        )
 
 
 def check_sample(sample: PoseSample, limits: Limits, clock: Clock) -> None:
@@ -347,12 +467,13 @@ def _within(planned: np.ndarray, pose: np.ndarray, limits: Limits) -> bool:
 
 
 def _check_path(
-    start: np.ndarray, goal: np.ndarray, limits: Limits, what: str, *, reserve: bool = False
+    plan: MotionPlan, start: np.ndarray, goal: np.ndarray, what: str, *, reserve: bool = False
 ) -> None:
-    """Step, turn, box and cone along a motion.
+    """Step, turn, boxes and cone along a motion.
 
     ``reserve`` keeps room for a motion that starts anywhere in the start's search envelope.
     """
+    limits = plan.limits
     tip = np.asarray(limits.tip_mm)
     travel = goal[:3, 3] - start[:3, 3]
     tip_travel = travel + (goal[:3, :3] - start[:3, :3]) @ tip
@@ -364,20 +485,38 @@ def _check_path(
         raise _refuse(f"{what} turns {turn:.3f} deg, over the cap of {limits.max_turn_deg:g} deg")
 
     count = 2 + math.ceil(turn / _PATH_STEP_DEG)
-    part = np.linspace(0.0, 1.0, count)
-    axis = rotation_vector(goal[:3, :3] @ start[:3, :3].T)
-    rotations = rotation_matrix(part[:, None] * axis) @ start[:3, :3]
-    tips = start[:3, 3] + part[:, None] * travel + rotations @ tip
-    # Between two samples the tip leaves its chord by at most this.
-    sag = float(np.linalg.norm(tip)) * (1 - math.cos(math.radians(turn) / (2 * (count - 1))))
-    room = np.minimum(tips - limits.box_min_mm, limits.box_max_mm - tips).min(axis=0)
-    if not room.min() >= sag - _POSITION_TOLERANCE_MM:
-        axis_name = "xyz"[int(room.argmin())]
-        raise _refuse(
-            f"{what} takes the probe's tip {sag - room.min():.3f} mm out of the box along "
-            f"{axis_name}"
-        )
-    cosine = rotations[:, :, 2] @ np.asarray(limits.cone_axis) / math.hypot(*limits.cone_axis)
+    way = straight_way(start, goal, np.linspace(0.0, 1.0, count))
+    spread = math.radians(turn) / (count - 1)
+    probe = _probe_points(limits)
+    names = ["the probe's tip"] + ["a corner of the probe"] * len(limits.hull_mm)
+    _check_box(way, spread, probe, names, limits.box_min_mm, limits.box_max_mm, f"{what} takes", "")
+    flange = inverse(tool_of(plan.tcp_offset))[:3, 3]
+    _check_box(
+        way, spread, np.array([np.zeros(3), flange]), ["the TCP", "the flange"],
+        limits.arm_box_min_mm, limits.arm_box_max_mm, f"{what} takes", "arm's ",
+    )  # fmt: skip
+    cosine = way[:, :3, 2] @ np.asarray(limits.cone_axis) / math.hypot(*limits.cone_axis)
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)).max()))
     if not angle <= limits.cone_deg + _TURN_TOLERANCE_DEG:
         raise _refuse(f"{what} tilts the tool {angle:.2f} deg, over {limits.cone_deg:g} deg")
+
+
+def _check_box(
+    way: np.ndarray, spread: float, points: np.ndarray, names: list[str], low: object,
+    high: object, what: str, whose: str,
+) -> None:  # fmt: skip
+    """Points of the tool in a box along a way, whose samples are ``spread`` rad apart.
+
+    A point a mm from the TCP runs along a line plus an arc about the TCP. Linear interpolation of
+    an arc is off by at most a spread^2 / 8 (the second derivative is a spread^2), and a box is
+    convex: what holds at the samples with that margin holds between them.
+    """
+    places = np.einsum("nij,pj->npi", way[:, :3, :3], points) + way[:, None, :3, 3]
+    sag = np.linalg.norm(points, axis=1) * spread**2 / 8.0
+    room = np.minimum(places - np.asarray(low), np.asarray(high) - places)
+    room = (room - sag[:, None]).min(axis=0)
+    if not room.min() >= -_POSITION_TOLERANCE_MM:
+        point, axis = np.unravel_index(int(room.argmin()), room.shape)
+        raise _refuse(
+            f"{what} {names[point]} {-room.min():.3f} mm out of the {whose}box along {'xyz'[axis]}"
+        )

@@ -51,6 +51,8 @@ class PoseSample:
     runtime_state: int
     lag_s: float = 0.0
     """Bench seconds by which it came later than the promptest poses before it."""
+    joints: tuple[float, ...] | None = None
+    """(6,) rad; None where the controller's were not read."""
 
     @cached_property
     def pose(self) -> Float[np.ndarray, "4 4"]:

@@ -46,8 +46,8 @@ def test_a_dry_run_shows_the_plan_and_makes_nothing(tmp_path, monkeypatch, capsy
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "bench.toml"
     limits = """
-box_min_mm = [230, -370, 60]
-box_max_mm = [470, -130, 220]
+box_min_mm = [200, -400, 40]
+box_max_mm = [500, -100, 260]
 cone_axis = [0, 0, -1]
 cone_deg = 60
 max_step_mm = 250
@@ -62,9 +62,30 @@ search_deg = 0.5
     path.write_text(good)
     arguments = ["acquire", "out.h5", "--setup", str(path), "--images", "6"]
     assert main([*arguments, "--preview", "plan.png"]) == 0
-    assert "dry run: 6 poses" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "dry run: 6 poses" in out
+    assert "kinematics NOT checked here" in out
+    assert "TCP offset: not known before the controller is asked" in out
     assert (tmp_path / "plan.png").stat().st_size > 1000
     assert not (tmp_path / "out.h5").exists()
+    armed = good.replace("settle_s = 1", 'model = "ur5"\ntcp_offset = [0, 0, 0.12, 0, 0, 0]')
+    path.write_text(armed)
+    assert main(arguments) == 0
+    out = capsys.readouterr().out
+    for line in (
+        "probe's tip at 0, 0, 60 mm of the TCP; probe with housing 25.6 x 25 x 60 mm",
+        "box for the probe: 200, -400, 40 to 500, -100, 260 mm",
+        "box for the arm: -2000, -2000, 40 to 2000, 2000, 2000 mm",
+        "TCP offset: 0, 0, 120 mm, turned by 0, 0, 0 deg",
+        "arm: UR5",
+        "caps: step 250 mm, turn 120 deg, tilt 60 deg, speed 50 mm/s (10 mm/s within 25 mm and 0.5 "
+        "deg of a pose), force 20 N",
+        "a UR5 reaches every pose on every way: branch ",
+    ):
+        assert line in out
+    path.write_text(armed.replace("search_deg = 0.5", "min_singular_value_mm = 95"))
+    assert main(arguments) == 4
+    assert "comes too near a singularity of the arm" in capsys.readouterr().err
     path.write_text(good.replace("max_step_mm = 250", "max_step_mm = 5"))
     assert main(arguments) == 4
     assert "over the cap" in capsys.readouterr().err

@@ -141,7 +141,7 @@ def offer(targets: object, chosen: int, start: np.ndarray, speed: object, age: f
         now = sample(start, age=age)
         target = plan.targets[chosen % len(plan.targets)]
         command = move(target, now, speed, plan)
-    except RefusedError:
+    except (RefusedError, StaleError):
         return False
     assert now.age_s(CLOCK.now()) <= 0.1 + 0.5
     assert age <= 0.1
@@ -201,7 +201,7 @@ def test_searches_stay_in_their_envelope_and_under_their_speed(step, turn, speed
     start = sample(_nearby(HOME, (0.5, 0.0, 0.0), (0.0, 0.0, 0.0)))
     try:
         command = move(goal, start, speed)
-    except RefusedError:
+    except (RefusedError, StaleError):
         return
     assert np.linalg.norm(step) <= LIMITS.search_mm + 1e-3
     assert abs(turn) <= LIMITS.search_deg + 1e-2
