@@ -18,10 +18,10 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from common import arguments, machine, results_folder, write_table
 from jaxtyping import Array
+from scipy.spatial.transform import Rotation
 
 from jaxcal import Protocol, calibrate_batch, predicted_tre, simulate, transform_intervals
 from jaxcal.io.atomic import atomic_path
@@ -54,19 +54,15 @@ def draw(law: OffsetLaw, images: int, indices: Array, elevation: Array, noise: A
     return jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol))(indices)
 
 
-@jax.jit
-def errors(estimate: Array, truth: Array) -> tuple[Array, Array]:
+def errors(estimate: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The right perturbation from estimate to truth (6), and how far the points are off, mm."""
-
-    def one(x: Array, true: Array) -> tuple[Array, Array]:
-        turn = jaxlie.SO3.from_matrix(x[:3, :3].T @ true[:3, :3]).log()
-        shift = x[:3, :3].T @ (true[:3, 3] - x[:3, 3])
-        points = jnp.asarray(POINTS_MM)
-        there = jnp.stack([points[..., 0], 0 * points[..., 0], points[..., 1]], axis=-1)
-        apart = there @ (x - true)[:3, :3].T + (x - true)[:3, 3]
-        return jnp.concatenate([shift, turn]), jnp.linalg.norm(apart, axis=-1)
-
-    return jax.vmap(one)(estimate, truth)
+    inverse = estimate[:, :3, :3].swapaxes(1, 2)
+    turn = Rotation.from_matrix(inverse @ truth[:, :3, :3]).as_rotvec()
+    shift = np.einsum("kij,kj->ki", inverse, truth[:, :3, 3] - estimate[:, :3, 3])
+    points = POINTS_MM.reshape(-1, 2)
+    there = np.stack([points[:, 0], 0 * points[:, 0], points[:, 1], np.ones(len(points))])
+    apart = ((estimate - truth) @ there)[:, :3]
+    return np.concatenate([shift, turn], axis=1), np.linalg.norm(apart, axis=1)
 
 
 def main() -> None:
@@ -81,10 +77,12 @@ def main() -> None:
         plain = jax.vmap(lambda experiment: experiment.problem())(experiments)
         problems = replace(plain, covariance=experiments.covariance)
         result = calibrate_batch(problems, "joint", chunk=50)
-        error, distance = errors(result.image_to_probe, experiments.image_to_probe)
+        error, distance = errors(
+            np.asarray(result.image_to_probe), np.asarray(experiments.image_to_probe)
+        )
         cover = np.abs(error) <= transform_intervals(result)
         predicted = np.asarray(predicted_tre(result, POINTS_MM))
-        actual = float(np.sqrt(np.mean(np.asarray(distance) ** 2)))
+        actual = float(np.sqrt(np.mean(distance**2)))
         told = float(np.sqrt(np.mean(predicted**2)))
         row = [law, images, elevation, noise, trials, *map(float, cover.mean(axis=0)), actual, told,
                told / actual, int(np.sum(~np.asarray(result.converged)))]  # fmt: skip

@@ -15,10 +15,10 @@ from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Float, Key
 
 from jaxcal.errors import InputError
+from jaxcal.geometry import matrix_from_rotation, rotation_from_vector
 from jaxcal.problem import Problem
 
 OutlierKind = Literal["echo", "click", "pose", "slip", "mixed"]
@@ -77,8 +77,7 @@ def contaminate(
     def moved(pose: Array, draw: Array, size: Array) -> Array:
         shift = size * draw[:3] / jnp.linalg.norm(draw[:3])
         turn = LARGEST_TURN_RAD * jax.nn.sigmoid(draw[6]) * draw[3:6] / jnp.linalg.norm(draw[3:6])
-        slip = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.exp(turn), shift)
-        return pose @ slip.as_matrix()
+        return pose @ matrix_from_rotation(rotation_from_vector(turn), shift)
 
     poses = jax.vmap(moved)(problem.poses, draws, size)
     off = (spoilt > 0) & (chosen == 2)

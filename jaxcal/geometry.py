@@ -7,6 +7,8 @@ it by SVD (text files and optical trackers round); anything farther is refused w
 
 from __future__ import annotations
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -18,6 +20,11 @@ AnyArray = Array | np.ndarray
 
 ROTATION_TOLERANCE = 1e-2
 """Largest Frobenius distance from SO(3) that is taken for rounding."""
+
+_SMALL_ANGLE_SQUARED = 1e-2
+"""rad^2; below it a series replaces quotients, whose derivatives divide by powers of the angle."""
+_TERMS = 7
+"""The first term left out is below 1e-26, its second derivative below 1e-20."""
 
 
 def nearest_rotations(
@@ -110,6 +117,32 @@ def matrix_from_rotation(
     top = jnp.concatenate([rotation, translation[:, None]], axis=1)
     bottom = jnp.asarray([[0.0, 0.0, 0.0, 1.0]], dtype=top.dtype)
     return jnp.concatenate([top, bottom], axis=0)
+
+
+def rotation_from_vector(vector: Float[Array, 3]) -> Float[Array, "3 3"]:
+    """Rotation matrix of an axis times an angle (rad), by Rodrigues' formula.
+
+    Derivatives of every order that the solvers take are accurate everywhere, zero included.
+    """
+    squared = vector @ vector
+    small = squared < _SMALL_ANGLE_SQUARED
+    # The unused branch must stay finite, or its derivative would be NaN times zero.
+    angle = jnp.sqrt(jnp.where(small, 1.0, squared))
+    first = jnp.where(small, _series(squared, 1), jnp.sin(angle) / angle)
+    second = jnp.where(small, _series(squared, 2), 2 * (jnp.sin(angle / 2) / angle) ** 2)
+    x, y, z = vector
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    identity = jnp.eye(3, dtype=vector.dtype)
+    return (1 - second * squared) * identity + first * cross + second * jnp.outer(vector, vector)
+
+
+def _series(squared: Float[Array, ""], order: int) -> Float[Array, ""]:
+    """sin(t) / t (order 1) or (1 - cos(t)) / t^2 (order 2) of t^2, for small t."""
+    total = jnp.zeros_like(squared)
+    for power in reversed(range(_TERMS)):
+        total = total * squared + (-1) ** power / math.factorial(2 * power + order)
+    return total
 
 
 def rotation_angle(first: np.ndarray, second: np.ndarray) -> float:

@@ -24,9 +24,9 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Float
 
+from jaxcal.geometry import rotation_from_vector
 from jaxcal.model.parameters import Blocks, Parameters, retract
 from jaxcal.model.priors import AbstractPrior, Gaussian
 from jaxcal.model.residuals import measured_points, measurement_residual
@@ -211,7 +211,7 @@ def gains(
     places = jnp.concatenate([jnp.broadcast_to(middle, (6, 2)), elsewhere])
 
     def pose(turn: Float[Array, 3], place: Float[Array, 2]) -> Float[Array, "4 4"]:
-        own = parameters.rotation @ jaxlie.SO3.exp(turn).as_matrix() @ parameters.rotation.T
+        own = parameters.rotation @ rotation_from_vector(turn) @ parameters.rotation.T
         rotation = usual @ own
         in_image = jnp.stack([place[0], jnp.zeros_like(place[0]), place[1]])
         in_probe = parameters.rotation @ in_image + parameters.translation

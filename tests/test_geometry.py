@@ -1,12 +1,21 @@
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from jaxcal import InputError
-from jaxcal.geometry import check_poses, nearest_rotations, rotation_angle, transform_points
+from jaxcal.geometry import (
+    check_poses,
+    nearest_rotations,
+    rotation_angle,
+    rotation_from_vector,
+    transform_points,
+)
 
 
 def random_poses(seed: int, count: int = 5) -> np.ndarray:
@@ -72,3 +81,37 @@ def test_points_are_rotated_then_translated():
     point = np.array([1.0, 2.0, 3.0])
     expected = np.stack([(p @ [*point, 1])[:3] for p in poses])
     np.testing.assert_allclose(transform_points(poses, np.tile(point, (5, 1))), expected)
+
+
+ANGLES = (0.0, 1e-200, 1e-9, 1e-4, 0.0999, 0.1, 0.1001, 1.0, np.pi, 6.0)
+AXIS = np.array([2.0, -1.0, 2.0]) / 3
+
+
+def test_rotations_of_vectors():
+    vectors = np.concatenate(
+        [np.outer(ANGLES, AXIS), 3 * np.random.default_rng(5).normal(size=(50, 3))]
+    )
+    found = jax.vmap(rotation_from_vector)(jnp.asarray(vectors))
+    expected = Rotation.from_rotvec(vectors).as_matrix()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
+    single = jax.vmap(rotation_from_vector)(jnp.asarray(vectors, jnp.float32))
+    assert single.dtype == jnp.float32
+    np.testing.assert_allclose(single, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivatives_of_rotations_are_those_of_the_matrix_exponential(mode):
+    """First and second ones, at zero too, and on both sides of where the series ends."""
+
+    def exponential(vector):
+        x, y, z = vector
+        return jax.scipy.linalg.expm(jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
+
+    vectors = jnp.asarray(np.outer(ANGLES, AXIS))
+    for found, expected in (
+        (mode(rotation_from_vector), jax.jacfwd(exponential)),
+        (jax.jacfwd(mode(rotation_from_vector)), jax.jacfwd(jax.jacfwd(exponential))),
+    ):
+        np.testing.assert_allclose(
+            jax.jit(jax.vmap(found))(vectors), jax.jit(jax.vmap(expected))(vectors), atol=2e-12
+        )

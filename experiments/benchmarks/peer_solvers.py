@@ -250,14 +250,15 @@ def optimistix_solver(batch: Batch) -> Callable[[Batch], Solved]:
     """
     import jax
     import jax.numpy as jnp
-    import jaxlie
     import optimistix as optx
+
+    from jaxcal.geometry import rotation_from_vector
 
     weight, elevation_weight = jnp.asarray(batch.weight), batch.elevation_weight
 
     def residual(x, args):
         poses, points, matrix, point = args
-        turn = matrix[:3, :3] @ jaxlie.SO3.exp(x[3:6]).as_matrix()
+        turn = matrix[:3, :3] @ rotation_from_vector(x[3:6])
         shift = matrix[:3, 3] + matrix[:3, :3] @ x[:3]
         in_probe = jnp.einsum("nji,nj->ni", poses[:, :3, :3], point + x[6:9] - poses[:, :3, 3])
         q = (in_probe - shift) @ turn

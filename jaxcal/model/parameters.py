@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-import jaxlie
 from jaxtyping import Array, Float
 
-from jaxcal.geometry import matrix_from_rotation
+from jaxcal.geometry import matrix_from_rotation, rotation_from_vector
 
 Blocks = tuple[str, ...]
 
@@ -91,7 +90,7 @@ def retract(parameters: Parameters, tangent: Float[Array, " p"], blocks: Blocks)
     # R Exp([v, w]) with Exp's translation taken as v itself: the same first order as SE(3)'s
     # exponential, defined for any step, and cheaper. Rotations are kept as matrices: the residuals
     # need nothing else, and a product of quaternions to get there doubles what XLA must compile.
-    turn = jaxlie.SO3.exp(part("rotation")).as_matrix().astype(tangent.dtype)
+    turn = rotation_from_vector(part("rotation"))
     return Parameters(
         rotation=parameters.rotation @ turn,
         translation=parameters.translation + parameters.rotation @ part("translation"),
