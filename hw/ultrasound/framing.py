@@ -12,7 +12,8 @@ import math
 import re
 from dataclasses import dataclass
 
-from hw.ultrasound.crc64 import crc64
+from fastcrc import crc64
+
 from hw.ultrasound.openigtlink import (
     BEGINNING,
     HEADER_SIZE,
@@ -116,7 +117,7 @@ class MessageDecoder:
         if not self._wrong_crc:
             body = bytes(memoryview(self._buffer)[HEADER_SIZE:end])
             self._budget -= len(body)
-            if crc64(body) == self._header.crc:
+            if crc64.ecma_182(body) == self._header.crc:
                 self._accept(self._header, body, found)
                 self._drop(end)
                 return True

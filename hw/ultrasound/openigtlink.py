@@ -6,7 +6,7 @@ size u64, CRC-64 of the body u64``; in header version 2 the body begins with an 
 that holds a message id, and ends with metadata. What is read here comes from a socket and is not
 trusted: sizes are bounded, counts must agree with sizes, and nothing is allocated for what has
 not arrived. The protocol's CRC is the body's: a wrong bit in a header's name or time stamp
-passes, since nothing tells.
+passes, since nothing tells. The CRC-64 is ECMA-182, not reflected, zero at the start.
 
 Units: translations are mm; an image's spacing is mm per pixel. Only plane images of one
 component, uint8 (B-mode) or int16, are taken. No wire format for RF channel data is public; that
@@ -21,9 +21,8 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
+from fastcrc import crc64
 from jaxtyping import Float, Int16, UInt8
-
-from hw.ultrasound.crc64 import crc64
 
 HEADER_SIZE = 58
 RF_DEVICE = "RF"
@@ -321,7 +320,7 @@ def encode_header(version: int, message: Message, body: bytes) -> bytes:
     stamp = 0.0 if math.isnan(message.t_device) else message.t_device
     seconds = int(stamp)
     fraction = min(int((stamp - seconds) * 2.0**32), 0xFFFFFFFF)
-    return _HEADER.pack(version, kind, device, seconds, fraction, len(body), crc64(body))
+    return _HEADER.pack(version, kind, device, seconds, fraction, len(body), crc64.ecma_182(body))
 
 
 def _encode_image(picture: Picture) -> bytes:

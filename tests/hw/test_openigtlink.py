@@ -9,10 +9,10 @@ import time
 import jaxtyping
 import numpy as np
 import pytest
+from fastcrc.crc64 import ecma_182 as crc64
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hw.ultrasound.crc64 import crc64
 from hw.ultrasound.framing import MessageDecoder
 from hw.ultrasound.openigtlink import (
     HEADER_SIZE,
@@ -49,7 +49,7 @@ def decode(data: bytes) -> list[Message]:
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=3000))
 def test_crc(data: bytes) -> None:
-    """Bit by bit as the polynomial says, for lengths on both sides of the change of method."""
+    """The library's, bit by bit as the protocol's polynomial says."""
     expected = 0
     for byte in data:
         expected ^= byte << 56
@@ -64,18 +64,6 @@ def test_crc_of_the_catalogue() -> None:
     assert crc64(b"") == 0
     data = np.random.default_rng(0).bytes(640 * 480 + 72)
     assert crc64(data) == pyigtl.messages.CRC64(data)
-
-
-def test_crc_keeps_up_with_the_images() -> None:
-    """Far under the 33 ms between images, even on a machine that is loaded many times over."""
-    data = bytes(640 * 480 + 72)
-    crc64(data)
-    times = []
-    for _ in range(7):
-        start = time.thread_time()
-        crc64(data)
-        times.append(time.thread_time() - start)
-    assert min(times) < 0.015
 
 
 def test_images_that_pyigtl_sends() -> None:
