@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
+from scipy.stats import theilslopes
 
 from jaxcal.errors import InputError
 from jaxcal.geometry import check_poses
@@ -120,10 +121,9 @@ def interpolate_poses(
     before = _interval(times, asked)
     first, second = sound[before], sound[before + 1]
     share = (asked - times[before]) / (times[before + 1] - times[before])
-    start = Rotation.from_matrix(first[:, :3, :3])
-    turn = (start.inv() * Rotation.from_matrix(second[:, :3, :3])).as_rotvec()
+    turning = Slerp(times, Rotation.from_matrix(sound[:, :3, :3]))
     result = np.tile(np.eye(4), (len(asked), 1, 1))
-    result[:, :3, :3] = (start * Rotation.from_rotvec(share[:, None] * turn)).as_matrix()
+    result[:, :3, :3] = turning(asked).as_matrix()
     result[:, :3, 3] = first[:, :3, 3] + share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
     return result
 
@@ -201,9 +201,7 @@ def fit_clock(
 def _theil_sen(x: np.ndarray, y: np.ndarray, most: int = 1000) -> float:
     """Median of the slopes of all pairs; n^2, so of a long recording every so many samples."""
     step = -(-len(x) // most)
-    x, y = x[::step], y[::step]
-    first, second = np.triu_indices(len(x), 1)
-    return float(np.median((y[second] - y[first]) / (x[second] - x[first])))
+    return float(theilslopes(y[::step], x[::step]).slope)
 
 
 def _lower_envelope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import builtins
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import jaxcal
 from jaxcal.segmentation.image import images_from_frames, localise
+from jaxcal.segmentation.spot import half_maximum, local_maxima
 
 POINT_SPREAD = (3.0, 1.2)
 """SD of the envelope along u and v, px."""
@@ -231,17 +232,26 @@ def test_bad_input(frames, options, message):
         localise(frames, **options)
 
 
-def test_without_scikit_image_the_extra_is_named(monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *arguments, **keywords):
-        if name.startswith("skimage"):
-            raise ImportError(name)
-        return real(name, *arguments, **keywords)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(jaxcal.MissingExtraError, match=r"jaxcal\[image\]"):
-        localise(np.zeros((40, 40)))
+def test_local_maxima():
+    """Plateaus whole, borders too, nothing of the least value, highest first, then by rows."""
+    frame = np.array(
+        [
+            [5.0, 0.0, 0.0, 0.0, 0.0],
+            [0.0, 0.0, 7.0, 7.0, 0.0],
+            [0.0, 0.0, 1.0, 0.0, 0.0],
+            [3.0, 0.0, 0.0, 0.0, 0.0],
+            [0.0, 0.0, 0.0, 0.0, 5.0],
+        ]
+    )
+    peaks = [[1, 2], [1, 3], [0, 0], [4, 4], [3, 0]]
+    np.testing.assert_array_equal(local_maxima(frame), peaks)
+    np.testing.assert_array_equal(local_maxima(frame - 9), peaks)
+    assert len(local_maxima(np.full((4, 5), 3.0))) == 0
+    # Diagonal neighbours hide each other, and are of one area.
+    stairs = np.diag([1.0, 2.0, 3.0, 2.0, 1.0])
+    np.testing.assert_array_equal(local_maxima(stairs), [[2, 2]])
+    shape, _ = half_maximum(stairs, (2, 2))
+    np.testing.assert_array_equal(shape, np.diag([0, 1, 1, 1, 0]).astype(bool))
 
 
 def test_frames_become_images_that_calibrate():
@@ -296,8 +306,6 @@ def wires(real_data: Path) -> np.ndarray:
 
 def test_real_wires(wires):
     """Two parallel wires: found in every frame, where a centroid is, at a steady distance."""
-    from skimage.measure import label, regionprops
-
     upper = localise(wires, region=(180, 260, 120, 85))
     lower = localise(wires, region=(180, 345, 120, 70))
     assert upper.found.all()
@@ -306,8 +314,9 @@ def test_real_wires(wires):
         part = wires[:, top : top + rows, left : left + 120]
         centroids = []
         for frame in part:
-            shapes = regionprops(label(frame >= 0.7 * frame.max()), intensity_image=frame)
-            v, u = max(shapes, key=lambda s: s.intensity_max).centroid_weighted
+            areas, _ = ndimage.label(frame >= 0.7 * frame.max(), structure=np.ones((3, 3)))
+            brightest = areas[np.unravel_index(frame.argmax(), frame.shape)]
+            v, u = ndimage.center_of_mass(frame, areas, brightest)
             centroids.append([u + left, v + top])
         gap = located.position - np.array(centroids)
         assert (np.median(np.abs(gap), axis=0) < 1.0).all()

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from jaxcal.errors import FormatError, InputError
 from jaxcal.io.readable import check_readable, one_line, quoted
@@ -126,14 +127,7 @@ def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "n 4 4"]:
             f"{os.fspath(path)}:{lines[off[0]]}: the quaternion's length is {length[off[0]]:g}, "
             "not 1"
         )
-    x, y, z, s = (rows[:, 3:] / length[:, None]).T
-    poses[:, :3, :3] = np.stack(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * s), 2 * (x * z + y * s)],
-            [2 * (x * y + z * s), 1 - 2 * (x * x + z * z), 2 * (y * z - x * s)],
-            [2 * (x * z - y * s), 2 * (y * z + x * s), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 3:]).as_matrix()
     poses[:, :3, 3] = rows[:, :3]
     return poses
 

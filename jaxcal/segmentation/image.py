@@ -39,7 +39,6 @@ from jaxcal.segmentation.spot import (
     brightest,
     fit_spot,
     half_maximum,
-    libraries,
     saturated_pixels,
 )
 
@@ -120,7 +119,6 @@ def localise(
     Raises:
         InputError: arrays of other dimensions or types, frames or regions that are too small or too
             large, contradicting options.
-        MissingExtraError: scikit-image is not installed (``pip install 'jaxcal[image]'``).
     """
     stack = _check_frames(frames)
     if target not in ("echo", "cross"):
@@ -141,8 +139,6 @@ def localise(
     scatter = np.asarray(target_sd_px, dtype=float)
     if scatter.shape not in ((), (2,)) or not (np.isfinite(scatter) & (scatter >= 0)).all():
         raise InputError(f"target_sd_px must be one or two numbers >= 0, not {target_sd_px!r}")
-    libraries()
-
     corner = np.array([first_column, first_row], dtype=float)
     results: list[Spot | NotFoundError] = []
     for index, frame in enumerate(stack):

@@ -18,13 +18,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.optimize import least_squares
 
-from jaxcal.errors import MissingExtraError
 from jaxcal.segmentation.speckle import (
     HALF_MAXIMUM,
     NotFoundError,
@@ -69,19 +69,6 @@ class Spot:
     width: np.ndarray
 
 
-def libraries() -> tuple[ModuleType, ModuleType, Callable]:
-    """scikit-image's feature and measure, and scipy's least_squares, which comes with it."""
-    try:
-        import skimage.feature
-        import skimage.measure
-        from scipy.optimize import least_squares
-    except ImportError as error:
-        raise MissingExtraError(
-            "segmentation of B-mode frames needs scikit-image: pip install 'jaxcal[image]'"
-        ) from error
-    return skimage.feature, skimage.measure, least_squares
-
-
 def saturated_pixels(values: np.ndarray) -> Bool[np.ndarray, "rows columns"]:
     """Pixels cut off at the top: they only say that the echo was stronger."""
     top = values == values.max()
@@ -92,7 +79,6 @@ def brightest(
     envelope: np.ndarray, expected: np.ndarray | None, radius: float
 ) -> tuple[tuple[int, int], Callable[[list[int]], float]]:
     """Row and column of the brightest place, and how bright the next one is outside a distance."""
-    feature, _, _ = libraries()
     place = np.ones(envelope.shape, bool)
     if expected is not None:
         v, u = np.indices(envelope.shape)
@@ -100,18 +86,32 @@ def brightest(
         if not place.any():
             raise NotFoundError("the expected place lies outside the region")
     candidates = np.where(place, envelope, 0.0)
-    peaks = feature.peak_local_max(candidates, min_distance=1, exclude_border=False, num_peaks=4096)
+    peaks = local_maxima(candidates)
     if len(peaks) == 0:
         raise NotFoundError("nothing stands out: the region is flat")
     heights = candidates[tuple(peaks.T)]
-    order = np.argsort(-heights, kind="stable")
-    peaks, heights = peaks[order], heights[order]
 
     def rival(keep_out: list[int]) -> float:
         away = (np.abs(peaks - peaks[0]) > keep_out).any(axis=1)
         return float(heights[away].max()) if away.any() else 0.0
 
     return (int(peaks[0, 0]), int(peaks[0, 1])), rival
+
+
+def local_maxima(values: Float[np.ndarray, "rows columns"]) -> Int[np.ndarray, "peaks 2"]:
+    """Pixels that none of their eight neighbours exceeds, highest first.
+
+    Of a plateau every pixel counts. Pixels of the least value do not, nor does any pixel where
+    every one of them equals its neighbours.
+
+    Returns:
+        Rows and columns; equal heights are in the order of the rows.
+    """
+    top = values == ndimage.maximum_filter(values, size=3, mode="nearest")
+    if top.all():
+        return np.empty((0, 2), int)
+    peaks = np.argwhere(top & (values > values.min()))
+    return peaks[np.argsort(-values[tuple(peaks.T)], kind="stable")]
 
 
 def half_maximum(
@@ -121,8 +121,7 @@ def half_maximum(
 
     Of an ellipse filled evenly the variance is a quarter of its squared half axis.
     """
-    _, measure, _ = libraries()
-    labels = measure.label(envelope >= 0.5 * envelope[peak], connectivity=2)
+    labels, _ = ndimage.label(envelope >= 0.5 * envelope[peak], structure=np.ones((3, 3)))
     shape = labels == labels[peak]
     rows, columns = np.nonzero(shape)
     v, u = (np.sqrt((4 * np.var(k) + 1 / 3) / HALF_MAXIMUM) for k in (rows, columns))
@@ -140,7 +139,6 @@ def fit_spot(
     margin: float,
 ) -> Spot:
     """Least squares of the spot on a window, and its covariance from the background's speckle."""
-    _, _, least_squares = libraries()
     rows, columns = np.nonzero(shape)
     weights = envelope[rows, columns]
     start = np.array([np.average(columns, weights=weights), np.average(rows, weights=weights)])
