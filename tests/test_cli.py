@@ -65,13 +65,18 @@ def shared(tmp_path_factory):
 @pytest.fixture(scope="module")
 def jaxcal_process(shared):
     """Run the command line in its own process: ``jaxcal_process("demo", "--json")``."""
-    environment = {**os.environ, "XDG_CACHE_HOME": str(shared / "cache"), "COLUMNS": "100"}
+    environment = {
+        **os.environ,
+        "XDG_CACHE_HOME": str(shared / "cache"),
+        "COLUMNS": "100",
+        "PYTHONWARNINGS": "error::DeprecationWarning",  # they are not shown otherwise
+    }
     for name in ("JAXCAL_NO_CACHE", "JAX_COMPILATION_CACHE_DIR"):
         environment.pop(name, None)
 
     def run(*arguments, **others):
         options = {"capture_output": True, "text": True, "check": False, "timeout": 300, **others}
-        command = [sys.executable, "-m", "jaxcal.cli.main", *map(str, arguments)]
+        command = [sys.executable, "-m", "jaxcal", *map(str, arguments)]
         return subprocess.run(command, env=environment, **options)
 
     return run
@@ -133,6 +138,29 @@ def test_help_and_version_import_nothing_heavy():
     assert (done.returncode, done.stderr) == (0, "")
     assert f"jaxcal, version {jaxcal.__version__}" in done.stdout
     assert all(name in done.stdout for name in commands.commands)
+
+
+@pytest.mark.parametrize(("module", "name"), [("jaxcal", "jaxcal"), ("hw", "jaxcal-hw")])
+def test_runs_as_a_module_and_completes_in_a_shell(module, name):
+    def run(*arguments, **variables):
+        return subprocess.run(
+            [sys.executable, "-m", module, *arguments], env=os.environ | variables,
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+
+    wrong = run("no-such-command")
+    assert (wrong.returncode, wrong.stdout, wrong.stderr.count("\n")) == (2, "", 1)
+    assert wrong.stderr.startswith(f"{name}: error: ")
+    variable = f"_{name}_COMPLETE".replace("-", "_").upper()
+    for shell in ("bash", "zsh", "fish"):
+        script = run(**{variable: f"{shell}_source"})
+        assert (script.returncode, script.stderr) == (0, "")
+        assert f"{variable}={shell}_complete" in script.stdout
+    asked = {"COMP_WORDS": f"{name} calibrate --bootst" if module == "jaxcal" else f"{name} ch"}
+    word = {"COMP_CWORD": "2" if module == "jaxcal" else "1"}
+    done = run(**{variable: "bash_complete"}, **asked, **word)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.split() == (["plain,--bootstrap"] if module == "jaxcal" else ["plain,check"])
 
 
 def test_simulate_writes_what_load_reads(simulated):

@@ -25,6 +25,10 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
         The exit status. Errors have been reported on standard error by then, in one line.
     """
     try:
+        if arguments is None and (instruction := os.environ.get(_completion_variable(name))):
+            from click.shell_completion import shell_complete
+
+            return shell_complete(commands, {}, name, _completion_variable(name), instruction)
         code = _invoke(commands, name, sys.argv[1:] if arguments is None else arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -59,8 +63,14 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
         )
 
 
+def _completion_variable(name: str) -> str:
+    """The variable by which a shell asks for completions, named as click names it."""
+    return f"_{name}_COMPLETE".replace("-", "_").upper()
+
+
 def _invoke(commands: click.Group, name: str, arguments: Sequence[str]) -> int:
-    # Not click's own main(): it would print usage over several lines.
+    # Not click's own main(): it prints a blank line when interrupted, and ends the process itself
+    # when a pipe was closed early.
     try:
         with commands.make_context(name, list(arguments)) as context:
             return commands.invoke(context) or 0

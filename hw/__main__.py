@@ -1,0 +1,8 @@
+"""``python -m hw``: the command line ``jaxcal-hw``."""
+
+import sys
+
+from hw.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())
