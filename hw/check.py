@@ -10,6 +10,7 @@ import numpy as np
 
 from hw.active_echo.device import ActiveEcho
 from hw.errors import DeviceError
+from hw.extras import missing
 from hw.robot.rtde import safety_text
 from hw.robot.stream import PoseStream
 from hw.setup import Setup
@@ -55,6 +56,9 @@ def check(setup: Setup, seconds: float = 2.0) -> list[Finding]:
 
 def _robot(setup: Setup, seconds: float) -> Finding:
     wrong = []
+    absent = missing("rtde_control", extra="robot")
+    if absent is not None:
+        wrong.append(f"poses can be read, but nothing can be moved: {absent}")
     with PoseStream(setup.robot_host, clock=setup.clock, frequency_hz=setup.frequency_hz) as stream:
         identity = stream.identity()
         stream.drain()

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
+import platform
+import sys
 from types import ModuleType
 from typing import Literal
 
@@ -20,12 +23,41 @@ def require(name: str, *, extra: Extra) -> ModuleType:
         extra: the extra of this package that installs it.
 
     Raises:
-        DeviceError: it is not installed; the text names ``pip install "jaxcal[extra]"``.
+        DeviceError: it is not installed; the text says how to install it, or that it cannot be.
     """
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        hint = f'{name} cannot be imported ({error}): pip install "jaxcal[{extra}]"'
-        if extra == "robot":
-            hint += " (ur_rtde has wheels for CPython 3.7-3.12 on Linux x86-64 and Windows only)"
-        raise DeviceError(hint, device=_DEVICE[extra]) from error
+        text = f"{name} cannot be imported ({error}): {_cure(extra)}"
+        raise DeviceError(text, device=_DEVICE[extra]) from error
+
+
+def missing(name: str, *, extra: Extra) -> str | None:
+    """What to do if an optional module is not installed, or None if it is; imports nothing.
+
+    Args:
+        name: the module, not within a package.
+        extra: the extra of this package that installs it.
+    """
+    if importlib.util.find_spec(name) is not None:
+        return None
+    return f"{name} is not installed: {_cure(extra)}"
+
+
+def robot_wheels() -> bool:
+    """Whether ur_rtde publishes wheels for this Python, system and processor.
+
+    The same condition stands at the extra ``robot`` in pyproject.toml.
+    """
+    system = sys.platform == "win32" or (sys.platform == "linux" and platform.machine() == "x86_64")
+    return system and sys.version_info < (3, 13)
+
+
+def _cure(extra: Extra) -> str:
+    if extra == "robot" and not robot_wheels():
+        return (
+            f"ur_rtde has no wheels for Python {platform.python_version()} on {platform.system()} "
+            f'{platform.machine()}, and "jaxcal[robot]" installs nothing here: use CPython 3.11 or '
+            "3.12 on Linux x86-64 or Windows, or build ur_rtde from source"
+        )
+    return f'pip install "jaxcal[{extra}]"'

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import pickle
+import platform
 import subprocess
 import sys
 import time
+from importlib.metadata import requires
 
 import pytest
+from packaging.requirements import Requirement
 
+from hw import extras
 from hw.clock import REAL, Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
-from hw.extras import require
+from hw.extras import missing, require
 
 
 def test_bench_time_runs_at_its_speed():
@@ -51,11 +55,38 @@ def test_errors_are_one_line_and_know_their_device(kind):
     assert isinstance(error, DeviceError)
 
 
-def test_a_missing_extra_is_named():
+def test_a_missing_extra_is_named(monkeypatch):
     assert require("struct", extra="serial").calcsize("<H") == 2
+    assert missing("struct", extra="serial") is None
+    monkeypatch.setattr(extras, "robot_wheels", lambda: True)
     with pytest.raises(DeviceError, match=r'pip install "jaxcal\[robot\]"') as caught:
         require("rtde_receive_of_nowhere", extra="robot")
     assert caught.value.device == "robot"
+    monkeypatch.setattr(extras, "robot_wheels", lambda: False)
+    with pytest.raises(DeviceError, match=r"no wheels for Python .* use CPython 3\.11 or 3\.12"):
+        require("rtde_receive_of_nowhere", extra="robot")
+    assert "installs nothing here" in str(missing("rtde_of_nowhere", extra="robot"))
+
+
+@pytest.mark.parametrize("version", [(3, 11, 7), (3, 12, 1), (3, 13, 0), (3, 14, 0)])
+@pytest.mark.parametrize("system", ["linux", "win32", "darwin"])
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64", "arm64"])
+def test_where_the_robot_extra_installs_something(version, system, machine, monkeypatch):
+    """The program's condition is the installer's."""
+    (robot,) = (
+        Requirement(text)
+        for text in requires("jaxcal") or ()
+        if text.startswith("ur-rtde") and text.endswith("extra == 'robot'")
+    )
+    assert robot.marker is not None
+    installs = robot.marker.evaluate(
+        {"python_version": f"{version[0]}.{version[1]}", "sys_platform": system,
+         "platform_machine": machine, "extra": "robot"}
+    )  # fmt: skip
+    monkeypatch.setattr(sys, "version_info", version)
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    assert extras.robot_wheels() == installs
 
 
 def test_device_processes_do_not_load_the_engine():
