@@ -10,8 +10,8 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from typing import Protocol, runtime_checkable
 
@@ -49,10 +49,16 @@ NOT_CHECKED = (
 
 
 class AcquisitionStopped(CalibrationError):
-    """A run that ended early; one line with what happened and what to do next."""
+    """A run that ended early; one line with what happened and what to do next.
 
-    def __init__(self, message: str, *, interrupted: bool = False) -> None:
+    Attributes:
+        exit_code: of the command line.
+        by_itself: whether it may be resumed without a person who puts something right.
+    """
+
+    def __init__(self, message: str, *, interrupted: bool = False, by_itself: bool = False) -> None:
         super().__init__(message)
+        self.by_itself = by_itself
         self.exit_code = ExitCode.INTERRUPTED if interrupted else ExitCode.STOPPED
 
 
@@ -188,29 +194,42 @@ def acquire(
         AcquisitionStopped: a device failed, the person interrupted or refused: one line, the file
             closed and resumable.
         InputError: a plan or a recording that cannot be used; nothing moved.
-        OutputError: the recording cannot be written.
+        OutputError: the recording cannot be made; nothing moved.
     """
     job = _prepare(setup, path, request)
     estimator = Estimator(len(job.targets), setup, job.progress)
     say(f"plan: {len(job.targets)} poses, {len(job.missing)} to go; compiling the estimate")
     estimator.warm_up(job.targets)
     recorder = _open_recorder(path, job)
-    with recorder:
+    with _closing(recorder):
         try:
             return _run(job, recorder, estimator, confirm, say, oracle, operator, pause, watch)
         except KeyboardInterrupt:
             reason, interrupted = "interrupted", True
         except (DeviceError, CalibrationError) as error:
             reason, interrupted = str(error), False
-        count = estimator.count
-        line = f"{reason}; {count} of {len(job.targets)} images are in {os.fspath(path)}"
-        # Where the recorder is what failed, it has said so.
+        # The robot rests by now.
         with suppress(CalibrationError):
             recorder.add_event("stopped", reason, setup.clock.now())
+    if recorder.error is not None and not interrupted:
+        # Everything else that went wrong came of it.
+        reason = str(recorder.error)
     raise AcquisitionStopped(
-        f"{line}; put it right, then: jaxcal-hw acquire --resume {os.fspath(path)}",
+        f"{reason}; {estimator.count} of {len(job.targets)} images are in {recorder.kept}; put it "
+        f"right, then: jaxcal-hw acquire --resume {recorder.kept}",
         interrupted=interrupted,
+        by_itself=recorder.error is None,
     )
+
+
+@contextmanager
+def _closing(recorder: Recorder) -> Iterator[None]:
+    """Close a recorder; what it failed of is in its ``error``."""
+    try:
+        yield
+    finally:
+        with suppress(CalibrationError):
+            recorder.close()
 
 
 def _prepare(setup: Setup, path: str | os.PathLike[str], request: Request | None) -> _Job:
@@ -276,7 +295,9 @@ def _run(
         note("confirmed", f"plan {plan.digest[:12]} for robot {plan.serial}")
 
         def log(t: float, command: str, numbers: dict[str, object]) -> None:
-            recorder.add_event("command", f"{command} {json.dumps(numbers)}", t)
+            # Called where the controller is heard: what the recorder fails of is seen elsewhere.
+            with suppress(CalibrationError):
+                recorder.add_event("command", f"{command} {json.dumps(numbers)}", t)
 
         motion = Motion(
             setup.robot_host, plan, confirmation, clock=clock, dry_run=False, log=log,

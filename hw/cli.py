@@ -218,7 +218,7 @@ def _acquire(
             try:
                 return _finished(path, attempt(request), setup)
             except AcquisitionStopped as error:
-                if error.exit_code == ExitCode.INTERRUPTED:
+                if error.exit_code == ExitCode.INTERRUPTED or not error.by_itself:
                     raise
                 # A busy machine trips the emulated controller's watchdog; nobody has to look.
                 click.echo(f"stopped: {error}", err=True)

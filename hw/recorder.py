@@ -79,7 +79,10 @@ class Recorder:
         self._waiting = 0
         self._changed = threading.Condition()
         self._answers: dict[str, Any] = {}
-        self._error: CalibrationError | None = None
+        self.error: CalibrationError | None = None
+        """What the writer failed of, first; None as long as it writes."""
+        self.kept = self.path
+        """Where the rows are: another file where this one was moved or removed."""
         self._ending = self._ended = False
         self._marks = 0
         # In a session of its own: Ctrl-C, or a signal to the whole group, must not stop the writer.
@@ -273,11 +276,11 @@ class Recorder:
         """
         if self._ended:
             return
-        if self._error is None:
+        if self.error is None:
             self._note_drops()
         self._stop()
-        if self._error is not None:
-            raise self._error
+        if self.error is not None:
+            raise self.error
 
     def _note_drops(self) -> None:
         for group, count in self.dropped.items():
@@ -334,8 +337,8 @@ class Recorder:
             return self._answers.pop(mark)
 
     def _raise_error(self) -> None:
-        if self._error is not None:
-            raise self._error
+        if self.error is not None:
+            raise self.error
         if self._ended:
             raise OutputError(f"{self.path}: the recording is closed")
 
@@ -381,6 +384,9 @@ class Recorder:
     def _listen(self, pipe: BinaryIO) -> None:
         for line in pipe:
             answer = json.loads(line)
+            if "kept" in answer:
+                self.kept = answer["kept"]
+                continue
             if "error" in answer:
                 kinds = {"FormatError": FormatError}
                 self._fail(kinds.get(answer["kind"], OutputError)(answer["error"]))
@@ -394,7 +400,7 @@ class Recorder:
     def _fail(self, error: CalibrationError) -> None:
         with self._changed:
             # What went wrong first is what matters.
-            self._error = self._error or error
+            self.error = self.error or error
             self._changed.notify_all()
 
 

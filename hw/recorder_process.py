@@ -42,34 +42,38 @@ def main(path: str) -> int:
             answers.write(json.dumps(content).encode() + b"\n")
             answers.flush()
 
+    # Objects of a file that cannot be written complain on the person's screen when they end.
+    sys.unraisablehook = lambda _: None
     writer = None
     try:
         with os.fdopen(os.dup(0), "rb", buffering=0) as source:
-            writer = _serve(path, source, answer)
-        if writer is not None:
-            writer.close()
-    except CalibrationError as error:
-        answer(error=str(error), kind=type(error).__name__)
-        return 1
+            first = _read(source)
+            if first is None:
+                return 0
+            given = first[0]["header"]
+            if given is None:
+                writer = RecordingWriter.resume(path)
+            else:
+                writer = RecordingWriter.create(path, Header(**given))
+            answer(mark="open", rows=writer.rows)
+            _serve(writer, source, answer)
+        writer.close()
     except Exception as error:
-        # A full or vanished disk: h5py has many exceptions for it.
-        answer(error=f"{path}: cannot be written: {one_line(error)}", kind="OutputError")
-        # HDF5 would try again, and complain on the person's screen, while Python clears up.
+        known = isinstance(error, CalibrationError)
+        # A vanished disk: h5py has many exceptions for it.
+        line = str(error) if known else f"{path}: cannot be written: {one_line(error)}"
+        # First of all, so that the robot stops.
+        answer(error=line, kind=type(error).__name__ if known else "OutputError")
+        if writer is not None:
+            with suppress(CalibrationError, OSError):
+                answer(kept=os.fspath(writer.rescue()))
+        # HDF5 would try again while Python clears up.
         os._exit(1)
     return 0
 
 
-def _serve(path: str, source: RawIOBase, answer) -> RecordingWriter | None:
-    """Handle messages until the pipe ends; the writer that is still open then."""
-    first = _read(source)
-    if first is None:
-        return None
-    given = first[0]["header"]
-    if given is None:
-        writer = RecordingWriter.resume(path)
-    else:
-        writer = RecordingWriter.create(path, Header(**given))
-    answer(mark="open", rows=writer.rows)
+def _serve(writer: RecordingWriter, source: RawIOBase, answer) -> None:
+    """Handle messages until the pipe ends or the recording is finished."""
     # When the file on the disk has to be brought up to date; None while it is.
     due: float | None = None
     while True:
@@ -82,7 +86,7 @@ def _serve(path: str, source: RawIOBase, answer) -> RecordingWriter | None:
             continue
         received = _read(source)
         if received is None:
-            return writer
+            return
         message, columns = received
         due = time.monotonic() + FLUSH_S if due is None else due
         match message["do"]:
@@ -101,7 +105,7 @@ def _serve(path: str, source: RawIOBase, answer) -> RecordingWriter | None:
                 answer(mark=message["mark"])
             case "finish":
                 answer(mark="finish", sha256=writer.finish())
-                return None
+                return
 
 
 def _exactly(source: RawIOBase, size: int) -> bytes:

@@ -22,22 +22,37 @@ from hw.recording_layout import (
 )
 from jaxcal.errors import FormatError, InputError
 from jaxcal.io.readable import check_readable
-from jaxcal.io.untrusted import Node, UpTo, array, child, flag, group, number, open_root, text
+from jaxcal.io.untrusted import (
+    Node,
+    UpTo,
+    array,
+    check_attributes,
+    child,
+    flag,
+    group,
+    members,
+    number,
+    open_root,
+    text,
+)
+
+_MOST_MEMBERS = 100
+"""Arrays in a group that is written once: ten times what an acquisition writes."""
 
 
 def check_resumable(path: str | os.PathLike[str]) -> None:
-    """Look at a file before it is opened for writing; it is not trusted.
+    """Look at a file before it is opened for writing; it is not trusted, and not changed.
 
-    A file that a full disk cut short of what it says of itself gets its length back, with zeros.
+    A file that is shorter than it says of itself (:func:`stored_length`) is looked at as if zeros
+    were at its end. Text that the writer may touch is read, so that its heaps have been checked.
 
     Raises:
         FormatError: missing, not a recording, complete, of another layout, with links or data
             outside of it. One line that starts with the path.
     """
     check_readable(path)
-    _mend_length(path)
     try:
-        with open_root(path) as root:
+        with open_root(path, length=stored_length(path)) as root:
             if text(root, "format") != FORMAT or number(root, "version") != VERSION:
                 raise FormatError("is not a recording of this version")
             if flag(root, "complete") is not False:
@@ -50,8 +65,16 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
                     dataset = child(node, key)
                     if dataset is not None:
                         _check_column(dataset, column)
-            for name in STATIC:
-                group(root, name)
+                        check_attributes(dataset)
+                check_attributes(node)
+            check_attributes(root)
+            for name in ("probe", *STATIC):
+                node = group(root, name)
+                if node is not None:
+                    check_attributes(node)
+                    for member in members(node, _MOST_MEMBERS):
+                        _check_place(member)
+                        check_attributes(member)
     except FormatError as error:
         raise FormatError(f"{path}: {error}") from None
 
@@ -91,7 +114,7 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
 
     check_readable(path)
     try:
-        with open_root(path) as root:
+        with open_root(path, length=stored_length(path)) as root:
             images = UpTo(100_000, "images")
             taken = _read(root, "calibration", "target", (images,), "i")
             last = [0.0]
@@ -128,7 +151,7 @@ def settings_of(path: str | os.PathLike[str]) -> dict[str, object]:
     """
     check_readable(path)
     try:
-        with open_root(path) as root:
+        with open_root(path, length=stored_length(path)) as root:
             return _settings(root)
     except FormatError as error:
         raise FormatError(f"{path}: {error}") from None
@@ -155,15 +178,17 @@ def _read(
     return array(dataset, shape, kinds)
 
 
-def _mend_length(path: str | os.PathLike[str]) -> None:
-    """HDF5 refuses a file shorter than its superblock (version 0) says; only its last rows are."""
+def stored_length(path: str | os.PathLike[str]) -> int | None:
+    """The length that a file says it has, where it is a little shorter; None otherwise.
+
+    HDF5 refuses a file that is shorter than its superblock (version 0) says.
+    """
     with open(path, "rb") as file:
         start = file.read(48)
     if start[:9] != b"\x89HDF\r\n\x1a\n\0":
-        return
-    missing = int.from_bytes(start[40:48], "little") - os.path.getsize(path)
-    if 0 < missing <= LARGEST_ROW:
-        os.truncate(path, os.path.getsize(path) + missing)
+        return None
+    length = int.from_bytes(start[40:48], "little")
+    return length if 0 < length - os.path.getsize(path) <= LARGEST_ROW else None
 
 
 def _check_column(node: Node, column: Column) -> None:
@@ -182,6 +207,8 @@ def _check_column(node: Node, column: Column) -> None:
 
 
 def _check_place(node: Node) -> None:
+    if not isinstance(node.item, h5py.Dataset):
+        raise FormatError(f"{node} must be a dataset")
     layout = node.item.id.get_create_plist()
     if layout.get_layout() == h5d.VIRTUAL or layout.get_external_count():
         raise FormatError(f"{node} is stored in another file: recordings must hold their data")

@@ -4,13 +4,20 @@ How it stays readable: default file format (no SWMR, which plain readers refuse)
 poses in chunks of 256, a checksum on every chunk, and a flush at least once a second. Between
 flushes HDF5 is kept from writing its own structures (evictions are off), so what is on the disk is
 what the last flush left. ``complete`` is set last, then a SHA-256 sidecar is written.
+
+A flush must not fail half-way: HDF5 would leave new structures beside old ones. So the bytes that
+the next flush may need are allocated in the file before any row is taken (:meth:`_make_room`). When
+the disk refuses them (full, quota, limit of a file's size), what was taken is flushed into what is
+there, and the file is closed in order.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import secrets
+import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -20,7 +27,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hw.recording_check import check_resumable
+from hw.recording_check import check_resumable, stored_length
 from hw.recording_layout import (
     FORMAT,
     FRAME_TYPES,
@@ -39,6 +46,15 @@ from jaxcal.io.readable import one_line
 RESERVE_BYTES = 2**27
 """The writer ends in order while this much of the disk is free: 128 MiB, many seconds of data."""
 
+_STRUCTURES_BYTES = 2**21
+"""More than HDF5's own structures, and chunks that are not yet full, take in one flush."""
+
+_STEP_BYTES = 2**23
+"""Allocated ahead, so that not every row asks the file system."""
+
+_END_OF_FILE = slice(40, 48)
+"""Where a superblock of version 0 keeps the file's length, little endian."""
+
 
 class RecordingWriter:
     """Appends rows to a recording and keeps it readable; one process at a time.
@@ -55,6 +71,10 @@ class RecordingWriter:
         self.path = path
         self.reserve_bytes = RESERVE_BYTES
         self._file = file
+        # Ours, not HDF5's: it stays the same file whatever becomes of the path.
+        self._descriptor = os.dup(file.id.get_vfd_handle())
+        self._allocated = self._pending = 0
+        self._make_room(0)
         members = {name: _columns(file, name) for name in LAYOUT}
         self.rows = {
             name: len(next(iter(found.values()))) for name, found in members.items() if found
@@ -98,6 +118,9 @@ class RecordingWriter:
             OutputError: it cannot be opened for writing.
         """
         check_resumable(path)
+        length = stored_length(path)
+        if length is not None:
+            os.truncate(path, length)
         file = _open_for_writing(Path(path))
         try:
             for name in LAYOUT:
@@ -126,6 +149,7 @@ class RecordingWriter:
         if len(counts) != 1 or set(columns) != set(target):
             raise FormatError(f"/{name}: needs one row in each of {', '.join(target)}")
         arrays = {key: _fitting(name, key, values, target[key]) for key, values in columns.items()}
+        self._make_room(sum(values.nbytes for values in arrays.values()))
         start = self.rows.get(name, 0)
         stop = start + counts.pop()
         for key, values in arrays.items():
@@ -138,6 +162,7 @@ class RecordingWriter:
         """Write an array of /plan, /test or /truth, once; the same name again replaces it."""
         if name not in STATIC:
             raise FormatError(f"/{name} is not among {', '.join(STATIC)}")
+        self._make_room(values.nbytes)
         target = self._file.require_group(name)
         if key in target:
             del target[key]
@@ -160,30 +185,170 @@ class RecordingWriter:
             OutputError: the disk is nearly full; the file has been closed and can be resumed.
         """
         self._file.flush()
-        disk = os.statvfs(self.path)
-        if disk.f_bavail * disk.f_frsize < self.reserve_bytes:
-            self._file.close()
-            raise OutputError(f"{self.path}: the disk is nearly full; make room, then resume")
         if durable:
-            os.fsync(self._file.id.get_vfd_handle())
+            os.fsync(self._descriptor)
+        disk = os.fstatvfs(self._descriptor)
+        if disk.f_bavail * disk.f_frsize < self.reserve_bytes:
+            self.close()
+            raise OutputError(f"{self.path}: the disk is nearly full: make room")
+        # HDF5 cuts the file to its length, and with it what was allocated ahead.
+        self._allocated, self._pending = os.fstat(self._descriptor).st_size, 0
+        self._check_place()
+        self._make_room(0)
 
     def close(self) -> None:
-        """Flush and close; the recording stays marked incomplete and can be resumed."""
-        if self._file.id.valid:
+        """Flush and close; the recording stays marked incomplete and can be resumed.
+
+        Raises:
+            OutputError: the disk refused it; the file was mended so that it opens.
+        """
+        try:
+            self._close_file()
+        finally:
+            self._forget()
+
+    def _close_file(self) -> None:
+        if not self._file.id.valid:
+            return
+        try:
             self._file.flush()
-            os.fsync(self._file.id.get_vfd_handle())
+            length = self._file.id.get_filesize()
+            os.fsync(self._descriptor)
             self._file.close()
+            if os.fstat(self._descriptor).st_size > length:
+                os.ftruncate(self._descriptor, length)
+        except Exception as error:
+            self._mend()
+            raise OutputError(f"{self.path}: cannot be written: {one_line(error)}") from None
+
+    def _forget(self) -> None:
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _make_room(self, size: int) -> None:
+        """Allocate what the next flush needs once ``size`` bytes more are to be written.
+
+        Raises:
+            OutputError: the disk has no room; what was taken before is in the closed file.
+        """
+        # Chunks with a checksum get their place in the file only when they are flushed.
+        self._pending += size
+        needed = self._file.id.get_filesize() + self._pending + _STRUCTURES_BYTES
+        if needed <= self._allocated:
+            return
+        try:
+            try:
+                self._allocate(needed + _STEP_BYTES)
+            except OSError:
+                self._allocate(needed)
+        except OSError as error:
+            self._close_file()
+            raise OutputError(
+                f"{self.path}: the disk takes no more: {one_line(error)}: make room"
+            ) from None
+
+    def _allocate(self, end: int) -> None:
+        try:
+            os.posix_fallocate(self._descriptor, self._allocated, end - self._allocated)
+        except AttributeError:  # not on this system
+            pass
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP, errno.ENOSYS):
+                raise
+        self._allocated = end
+
+    def _mend(self) -> None:
+        """Make a file whose last flush failed open again: its length as its superblock says it."""
+        with suppress(OSError):
+            size = os.fstat(self._descriptor).st_size
+            start = os.pread(self._descriptor, _END_OF_FILE.stop, 0)
+            if start[8] != 0 or int.from_bytes(start[_END_OF_FILE], "little") <= size:
+                return
+            try:
+                os.ftruncate(self._descriptor, int.from_bytes(start[_END_OF_FILE], "little"))
+            except OSError:
+                os.pwrite(self._descriptor, size.to_bytes(8, "little"), _END_OF_FILE.start)
+
+    def _check_place(self) -> None:
+        """Check that the path still leads to the file that is being written.
+
+        Raises:
+            OutputError: it does not; the file has been closed in order, wherever it is.
+        """
+        if not self._in_place():
+            what = "replaced by another file" if self.path.exists() else "removed"
+            self._close_file()
+            raise OutputError(f"{self.path}: was {what} while it was being recorded")
+
+    def _in_place(self) -> bool:
+        try:
+            return os.path.samestat(os.stat(self.path), os.fstat(self._descriptor))
+        except OSError:
+            return False
+
+    def rescue(self) -> Path:
+        """Close the file whatever has failed, and say where it is.
+
+        A file that was moved is where it was moved to. One that has no name any more is copied:
+        back to its path, or beside it where another file has taken that.
+        """
+        if self._descriptor < 0:
+            return self.path
+        with suppress(OutputError):
+            self._close_file()
+        try:
+            if self._in_place():
+                return self.path
+            if os.fstat(self._descriptor).st_nlink == 0:
+                return self._copied()
+            return Path(os.readlink(f"/proc/self/fd/{self._descriptor}"))
+        except OSError:  # no such folder on this system
+            return self.path
+        finally:
+            self._forget()
+
+    def _copied(self) -> Path:
+        temporary = self.path.parent / f".partial-{secrets.token_hex(8)}{self.path.suffix}"
+        try:
+            with open(temporary, "xb") as copy:
+                os.lseek(self._descriptor, 0, os.SEEK_SET)
+                with open(os.dup(self._descriptor), "rb") as source:
+                    shutil.copyfileobj(source, copy, 2**20)
+                copy.flush()
+                os.fsync(copy.fileno())
+            final = self.path
+            while True:
+                try:
+                    os.link(temporary, final)
+                    return final
+                except FileExistsError:
+                    name = f"{self.path.stem}.{secrets.token_hex(4)}{self.path.suffix}"
+                    final = self.path.with_name(name)
+        finally:
+            with suppress(OSError):
+                temporary.unlink()
 
     def finish(self) -> str:
         """Mark the recording complete, close it, and write its SHA-256 beside it.
 
         Returns:
-            The digest, hexadecimal; the sidecar ``<file>.sha256`` is what ``sha256sum -c`` reads.
+            The digest, hexadecimal, of the file that was written, wherever its path leads; the
+            sidecar ``<file>.sha256`` is what ``sha256sum -c`` reads.
+
+        Raises:
+            OutputError: the disk is full, or the path leads to another file.
         """
         self.flush(durable=True)
         self._file.attrs["complete"] = True
-        self.close()
-        return write_sidecar(self.path)
+        self._close_file()
+        with open(os.dup(self._descriptor), "rb") as file:
+            file.seek(0)
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        self._check_place()
+        self._forget()
+        write_text(self.path.with_name(self.path.name + ".sha256"), f"{digest}  {self.path.name}\n")
+        return digest
 
     def _prepare(self, name: str, columns: Mapping[str, np.ndarray]) -> dict[str, h5py.Dataset]:
         if name not in LAYOUT:
@@ -196,18 +361,6 @@ class RecordingWriter:
             sizes = {"height": shape[1], "width": shape[2], "frame": dtype.name}
             _make_columns(target, LAYOUT["us"], sizes)
         return _columns(self._file, name)
-
-
-def write_sidecar(path: Path) -> str:
-    """Write ``<file>.sha256``; returns the hexadecimal digest.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    with open(path, "rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    write_text(path.with_name(path.name + ".sha256"), f"{digest}  {path.name}\n")
-    return digest
 
 
 def utc_now() -> str:

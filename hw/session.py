@@ -187,6 +187,8 @@ class Session:
             time.sleep(_PERIOD_WALL_S)
 
     def _trouble(self) -> Exception | None:
+        if self._recorder.error is not None:
+            return self._recorder.error
         with self._changed:
             if self._failure is not None:
                 return self._failure

@@ -28,6 +28,7 @@ MAXIMUM_BYTES = 2**28
 
 _MAXIMUM_STEPS = 64
 _MAXIMUM_TEXT = 1024
+_MOST_ATTRIBUTES = 100
 _FILTERS = (h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32)
 # Inflating is at most 1032-fold: a chunk stored in 64 KiB cannot ask for more than 66 MiB.
 _HARMLESS_CHUNK = 2**16
@@ -152,6 +153,37 @@ def group(parent: Node, name: str) -> Node | None:
     if node is not None and not isinstance(node.item, h5py.Group):
         raise FormatError(f"{node} must be a group")
     return node
+
+
+def members(node: Node, most: int) -> list[Node]:
+    """The members of a group, of any name; FormatError where there are more than ``most``."""
+    assert isinstance(node.item, h5py.Group)
+    with _reading(str(node)):
+        if len(node.item) > most:
+            raise FormatError(f"{node} has {len(node.item)} members; at most {most} are read")
+        names = list(node.item)
+    found = [child(node, name) for name in names]
+    return [member for member in found if member is not None]
+
+
+def check_attributes(node: Node) -> None:
+    """Check all attributes, whose text is read so that its heaps have been walked.
+
+    Raises:
+        FormatError: too many, neither text nor numbers, or damaged.
+    """
+    with _reading(str(node)):
+        count = h5a.get_num_attrs(node.item.id)
+        if count > _MOST_ATTRIBUTES:
+            raise FormatError(f"{node} has {count} attributes")
+        for index in range(count):
+            attribute = h5a.open(node.item.id, index=index)
+            kind = attribute.get_type().get_class()
+            name = attribute.name.decode()
+            if kind == h5t.STRING:
+                text(node, name)
+            elif kind not in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM):
+                raise FormatError(f"{node}: attribute {quoted(name)} is neither text nor a number")
 
 
 def array(node: Node, shape: tuple[int | UpTo, ...], kinds: str = "iuf") -> np.ndarray:

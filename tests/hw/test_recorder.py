@@ -258,12 +258,14 @@ def test_a_disk_that_does_not_answer_or_is_full_is_one_line(tmp_path):
     limit = path.stat().st_size + 100_000
     resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (limit, limit))
 
+    large = np.zeros((512, 512), np.uint8)
+
     def fill() -> None:
         for k in range(400):
-            recorder.add_images(frames(k, 1))
+            recorder.add_images([SimpleNamespace(**{**vars(frames(k, 1)[0]), "array": large})])
             recorder.sync()
 
-    with pytest.raises(jaxcal.OutputError, match="cannot be written"):
+    with pytest.raises(jaxcal.OutputError, match="the disk takes no more"):
         fill()
     with pytest.raises(jaxcal.OutputError):
         recorder.close()

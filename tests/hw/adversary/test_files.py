@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import resource
+import shutil
 import struct
 import subprocess
 import sys
@@ -16,6 +18,7 @@ import pytest
 import jaxcal
 from hw.cli import main as acquire
 from hw.errors import RefusedError
+from hw.recorder import Recorder
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import LAYOUT, Header
 from hw.robot.limits import Limits
@@ -252,3 +255,136 @@ def test_toml_with_all_that_toml_has_is_read():
     assert parse_toml(text) == {
         "a": 'x [[[ "" ""', "b": {"c": {"d.e.f.g.h.i.j": 1.5}}, "c": "[\n{", "d": [[[1]]]
     }  # fmt: skip
+
+
+# -- disks that fail, files that go
+
+WRITE = """
+import sys
+from types import SimpleNamespace
+import numpy as np
+from hw.recorder import Recorder
+from hw.recording_layout import Header
+from jaxcal.errors import CalibrationError
+probe = {"kind": "linear", "elements": 8, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
+recorder = Recorder(sys.argv[1], Header(kind="time_of_flight", probe=probe))
+frame = np.full((128, 128), 7, np.uint8)
+try:
+    for k in range(4000):
+        recorder.add_images([SimpleNamespace(t_host=k, t_device=k, frame_id=k, array=frame)])
+        if k % 20 == 0:
+            recorder.add_selected(
+                np.eye(4), np.full(8, 4e-5), kind="time_of_flight", max_elevation=1.0,
+                amplitude=1.0, t_host=k, target=k // 20, bracket=(0.0, -1.0, 1.0, 0.5),
+            )
+            print(k // 20 + 1, flush=True)
+            input()
+except CalibrationError as error:
+    try:
+        recorder.close()
+    except CalibrationError:
+        pass
+    print("kept", recorder.kept)
+    print("error", error)
+"""
+
+
+class Writing:
+    """An acquisition's recorder in a process of its own, which takes an image when asked."""
+
+    def __init__(self, path: Path, file_bytes: int = resource.RLIM_INFINITY) -> None:
+        self.path, self.images = path, 0
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", WRITE, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes,) * 2),
+        )  # fmt: skip
+
+    def take(self) -> bool:
+        """Have an image taken; False when the recorder has failed."""
+        if self.images:
+            self._process.stdin.write("\n")
+            self._process.stdin.flush()
+        line = self._process.stdout.readline().split()
+        if line[0] == "kept":
+            self.kept = Path(line[1])
+            self._error = self._process.stdout.readline().strip()
+            return False
+        self.images = int(line[0])
+        return True
+
+    def error(self) -> str:
+        """What the recorder failed of; nothing else was said."""
+        assert self._process.stderr.read() == ""
+        return self._error
+
+    def __enter__(self) -> Writing:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+
+def whole(path: Path, images: int) -> None:
+    """Without resuming it opens in h5py and has these images; then it can be resumed."""
+    with h5py.File(path) as file:
+        assert not file.attrs["complete"]
+        assert list(file["calibration/target"]) == list(range(images))
+        times = np.full((images, 8), 4e-5)
+        np.testing.assert_array_equal(file["calibration/time_of_flight"], times)
+        rows = len(file["us/frames"])
+        assert rows > 20 * (images - 1)
+        np.testing.assert_array_equal(file["us/frames"][()], np.full((rows, 128, 128), 7))
+    with Recorder(path) as recorder:
+        assert recorder.rows["calibration"] == images
+        recorder.finish()
+    assert len(jaxcal.load(path)) == images
+
+
+@pytest.mark.parametrize("limit", [2**22, 5_123_456])
+def test_a_limit_of_a_files_size_ends_in_a_file_that_opens(tmp_path, limit):
+    with Writing(tmp_path / "rec.h5", limit) as writing:
+        while writing.take():
+            pass
+        what = "the disk takes no more: File too large: make room"
+        assert writing.error() == f"error {writing.path}: {what}"
+    assert writing.kept == writing.path
+    assert writing.images >= 2
+    assert writing.path.stat().st_size <= limit
+    whole(writing.path, writing.images)
+
+
+@pytest.mark.parametrize("what", ["removed", "moved", "replaced"])
+def test_a_file_that_goes_while_it_is_written_is_noticed_and_nothing_is_lost(tmp_path, what):
+    path, away = tmp_path / "rec.h5", tmp_path / "away.h5"
+    with Writing(path) as writing:
+        assert writing.take()
+        assert writing.take()
+        if what == "removed":
+            path.unlink()
+        else:
+            path.rename(away)
+        if what == "replaced":
+            path.write_bytes(b"other")
+        while writing.take():
+            assert writing.images < 4
+        noticed = "replaced by another file" if what == "replaced" else "removed"
+        line = f"error {path}: was {noticed} while it was being recorded"
+        assert writing.error() == line
+    assert writing.kept == (path if what == "removed" else away)
+    assert not path.with_name("rec.h5.sha256").exists()
+    if what == "replaced":
+        assert path.read_bytes() == b"other"
+    whole(writing.kept, 3)
+
+
+def test_the_digest_is_of_what_was_written(tmp_path):
+    """Replaced at the last moment, after the last flush, by a file of the same length."""
+    path = tmp_path / "rec.h5"
+    recorder = Recorder(path, HEADER)
+    recorder.sync()
+    os.replace(shutil.copy(path, tmp_path / "copy.h5"), path)
+    with pytest.raises(jaxcal.OutputError, match="was replaced by another file"):
+        recorder.finish()
+    assert not path.with_name("rec.h5.sha256").exists()
