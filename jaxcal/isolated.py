@@ -8,7 +8,7 @@ directory. What the parent could import its helpers can, from the same places, e
 installations and ``PYTHONPATH`` included.
 
 The console scripts ``jaxcal`` and ``jaxcal-hw`` do not have the current directory on their path
-either; ``python -m jaxcal.cli.main`` does (use ``python -P -m``).
+either; ``python -m jaxcal`` does (use ``python -P -m``).
 """
 
 from __future__ import annotations

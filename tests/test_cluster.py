@@ -12,9 +12,9 @@ import pytest
 from jaxcal import InputError
 from jaxcal.cli.main import main
 from jaxcal.study import open_results, run_study
-from jaxcal.study.cluster import core_groups
 from jaxcal.study.spec import parse_spec
 from jaxcal.study.store import Store
+from jaxcal.study.workers import core_groups
 
 SPEC = """
 name = "cluster"
@@ -154,6 +154,58 @@ def workers_of(parent):
         if above == parent and computes:
             found.append(int(name))
     return found
+
+
+def listening(pid):
+    """Addresses at which a process and its children listen, as /proc tells them."""
+    sockets = {}
+    for table in ("tcp", "tcp6"):
+        with open(f"/proc/net/{table}") as stream:
+            for fields in (line.split() for line in stream.readlines()[1:]):
+                if fields[3] == "0A":
+                    sockets[f"socket:[{fields[9]}]"] = fields[1]
+    found, family = [], {pid}
+    for name in sorted((n for n in os.listdir("/proc") if n.isdigit()), key=int):
+        try:
+            with open(f"/proc/{name}/stat") as stream:
+                above = int(stream.read().rsplit(")", 1)[1].split()[1])
+            if int(name) != pid and above not in family:
+                continue
+            family.add(int(name))
+            for descriptor in os.listdir(f"/proc/{name}/fd"):
+                link = os.readlink(f"/proc/{name}/fd/{descriptor}")
+                found += [sockets[link]] if link in sockets else []
+        except OSError:
+            continue
+    return found
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/net/tcp"), reason="needs Linux's /proc")
+def test_local_workers_open_no_port_and_run_no_file_of_the_current_folder(tmp_path):
+    """On a shared machine any user could connect to a port, and run programs as this one."""
+    spec, mark = tmp_path / "spec.toml", tmp_path / "ran"
+    spec.write_text(SPEC)
+    for name in ("queue", "pickle", "socket", "numpy", "jax", "jaxcal/__init__"):
+        path = tmp_path / "data" / f"{name}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"open({str(mark)!r}, 'a').write(__name__ + ' ')\nraise SystemExit(9)\n")
+    study = subprocess.Popen(
+        [sys.executable, "-P", "-m", "jaxcal.cli.main", "study", "run", spec,
+         "--out", tmp_path / "out", "--workers", "1"],
+        cwd=tmp_path / "data", stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        ports = []
+        while not workers_of(study.pid):
+            assert study.poll() is None, study.communicate()
+            assert not mark.exists(), mark.read_text()
+            ports += listening(study.pid)
+            time.sleep(0.05)
+        assert ports + listening(study.pid) == []
+        assert not mark.exists(), mark.read_text()
+    finally:
+        study.send_signal(signal.SIGINT)
+        study.communicate()
 
 
 def test_no_scheduler(tmp_path, capsys, monkeypatch):

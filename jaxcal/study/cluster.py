@@ -5,15 +5,14 @@ common file system. A worker that dies costs the chunk that it was computing: Da
 another one, and what had been sent back is on the disk already. Only a few chunks for each worker
 are handed out at a time, so that neither side's memory grows with the study.
 
-Whoever reaches a Dask scheduler can run programs on it: keep it on loopback or behind TLS.
+Whoever reaches a Dask scheduler can run programs on it, every user of the scheduler's machine
+included: keep it behind TLS, or on the loopback of a machine of your own. Workers on this machine
+need no scheduler (:mod:`jaxcal.study.workers`).
 """
 
 from __future__ import annotations
 
-import logging
-import os
 from collections.abc import Iterator
-from contextlib import ExitStack
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, cast
 
@@ -33,15 +32,14 @@ CONNECT_SECONDS = 30
 
 
 def compute_on_cluster(
-    spec: Spec, chunks: list[Chunk], *, workers: int = 0, scheduler: Any = None
+    spec: Spec, chunks: list[Chunk], scheduler: Any
 ) -> Iterator[tuple[Chunk, dict[str, np.ndarray], str]]:
     """Compute chunks on worker processes; yields them as they are done.
 
     Args:
         spec: the study.
         chunks: what to compute.
-        workers: so many processes on this machine, on loopback, each on cores of its own; or
-        scheduler: address of a running scheduler, e.g. ``tcp://127.0.0.1:8786``, or a Dask cluster.
+        scheduler: address of a running scheduler, e.g. ``tls://host:8786``, or a Dask cluster.
 
     Raises:
         MissingExtraError: Dask is not installed.
@@ -49,16 +47,11 @@ def compute_on_cluster(
         CalibrationError: a chunk could not be computed, or the scheduler was lost.
     """
     try:
-        import distributed
+        import distributed  # noqa: F401
     except ImportError:
-        raise MissingExtraError("workers need Dask: pip install 'jaxcal[cluster]'") from None
+        raise MissingExtraError("a cluster needs Dask: pip install 'jaxcal[cluster]'") from None
 
-    with ExitStack() as stack:
-        if scheduler is None:
-            cluster = stack.enter_context(_local_cluster(min(workers, len(chunks))))
-            client = stack.enter_context(distributed.Client(cluster))
-        else:
-            client = stack.enter_context(_connect(scheduler))
+    with _connect(scheduler) as client:
         yield from _distribute(client, spec, chunks)
 
 
@@ -69,53 +62,6 @@ def _connect(scheduler: Any) -> Client:
         return Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"no Dask scheduler answers at {scheduler}: {one_line(error)}") from None
-
-
-def _local_cluster(workers: int) -> Any:
-    import jax
-    from distributed import LocalCluster
-    from distributed.diagnostics.plugin import WorkerPlugin
-
-    # Where this process keeps its compiled programs its workers may, too.
-    cache = getattr(jax.config, "jax_compilation_cache_dir", None)
-    groups = core_groups(workers)
-
-    class OneGroup(WorkerPlugin):
-        """Keeps a worker on its cores, before it imports JAX, which counts them."""
-
-        name = "jaxcal-cores"
-
-        def setup(self, worker: Any) -> None:
-            if hasattr(os, "sched_setaffinity"):
-                os.sched_setaffinity(0, groups[int(worker.name) % len(groups)])
-            if cache is not None:
-                os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", cache)
-
-    cluster = LocalCluster(
-        # None: no dashboard, which would listen on a port.
-        n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
-        dashboard_address=cast("str", None), silence_logs=logging.CRITICAL, memory_limit=0,
-    )  # fmt: skip
-    with ExitStack() as undo:
-        undo.callback(cluster.close)
-        from distributed import Client
-
-        with Client(cluster, set_as_default=False) as client:
-            client.register_plugin(OneGroup())
-        undo.pop_all()
-    return cluster
-
-
-def core_groups(workers: int) -> list[set[int]]:
-    """This process's cores shared out to workers, as evenly as can be.
-
-    More workers than cores share them.
-    """
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    cores = cores or list(range(os.cpu_count() or 1))
-    if workers > len(cores):
-        return [{cores[k % len(cores)]} for k in range(workers)]
-    return [{int(core) for core in part} for part in np.array_split(cores, workers)]
 
 
 def compute_from_text(canonical: str, index: int) -> tuple[dict[str, np.ndarray], str]:

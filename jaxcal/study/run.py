@@ -141,10 +141,15 @@ def _computed(
 ) -> Generator[Computed]:
     if not missing:
         return
-    if workers or scheduler is not None:
+    if scheduler is not None:
         from jaxcal.study.cluster import compute_on_cluster
 
-        yield from compute_on_cluster(spec, missing, workers=workers, scheduler=scheduler)
+        yield from compute_on_cluster(spec, missing, scheduler)
+    elif workers:
+        from jaxcal.study.workers import compute_on_workers, core_groups
+
+        groups = core_groups(min(workers, len(missing)))
+        yield from compute_on_workers(spec, missing, groups)
     else:
         yield from _compute_here(spec, missing)
 

@@ -1,0 +1,216 @@
+"""Worker processes of a study on this machine, which talk through pipes.
+
+A pipe has no address: nobody else on the machine can reach the workers, and none of their results
+are unpickled. The parent writes a line of JSON for each chunk, the worker answers with a line of
+JSON (names, types and shapes) and the arrays' bytes. A worker that dies costs the chunk that it was
+computing: another process takes its place and computes that chunk again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from jaxcal.errors import CalibrationError
+from jaxcal.io.readable import one_line
+from jaxcal.isolated import python_command
+from jaxcal.study.spec import Chunk, Spec, spec_from_canonical
+
+MOST_DEATHS = 3
+"""Workers that may die over one chunk before the study gives up."""
+
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+_POLL_S = 0.2
+
+
+class Worker:
+    """One worker process.
+
+    Args:
+        spec: the study.
+        cores: that the process is kept on.
+    """
+
+    def __init__(self, spec: Spec, cores: set[int]) -> None:
+        cache = None
+        if "jax" in sys.modules:
+            # Where this process keeps its compiled programs its workers may, too.
+            cache = getattr(sys.modules["jax"].config, "jax_compilation_cache_dir", None)
+        environment = {**os.environ, **_ONE_THREAD}
+        if cache is not None:
+            environment.setdefault("JAX_COMPILATION_CACHE_DIR", cache)
+        # In a session of its own: Ctrl-C reaches the parent, which ends its workers.
+        self.process = subprocess.Popen(
+            python_command("jaxcal.study.workers"),
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True,
+        )  # fmt: skip
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self._to, self._from = self.process.stdin, self.process.stdout
+        with contextlib.suppress(OSError):
+            self._say({"spec": spec.canonical(), "cores": sorted(cores)})
+
+    def compute(self, chunk: Chunk) -> tuple[dict[str, np.ndarray], str] | None:
+        """A chunk's arrays and the device that computed them; None where the worker died.
+
+        Raises:
+            CalibrationError: the chunk cannot be computed.
+        """
+        try:
+            self._say({"chunk": chunk.index})
+            header = json.loads(self._from.readline())
+            if "error" in header:
+                raise CalibrationError(
+                    f"chunk {chunk.index} could not be computed: {header['error']}"
+                )
+            arrays = {}
+            for name, dtype, shape in header["arrays"]:
+                kind = np.dtype(dtype)
+                size = int(np.prod(shape, dtype=object)) * kind.itemsize
+                body = self._from.read(size)
+                if len(body) < size:
+                    return None
+                arrays[name] = np.frombuffer(body, kind).reshape(shape).copy()
+            return arrays, str(header["device"])
+        except (OSError, ValueError):
+            return None
+
+    def end(self) -> None:
+        """Kill the process; safe to repeat."""
+        self.process.kill()
+        self.process.wait()
+        for pipe in (self._to, self._from):
+            with contextlib.suppress(OSError):
+                pipe.close()
+
+    def _say(self, message: dict[str, Any]) -> None:
+        self._to.write(json.dumps(message).encode() + b"\n")
+        self._to.flush()
+
+
+def compute_on_workers(
+    spec: Spec, chunks: list[Chunk], groups: list[set[int]]
+) -> Iterator[tuple[Chunk, dict[str, np.ndarray], str]]:
+    """Compute chunks on worker processes; yields them as they are done.
+
+    Args:
+        spec: the study.
+        chunks: what to compute.
+        groups: the cores of each worker (:func:`core_groups`).
+
+    Raises:
+        CalibrationError: a chunk could not be computed, or killed its workers.
+    """
+    waiting: queue.SimpleQueue[Chunk] = queue.SimpleQueue()
+    for chunk in chunks:
+        waiting.put(chunk)
+    # Bounded, so that a slow disk does not fill this process's memory.
+    done: queue.Queue[Any] = queue.Queue(maxsize=len(groups))
+    ending = threading.Event()
+    workers: dict[int, Worker] = {}
+
+    def hand_over(result: Any) -> None:
+        while not ending.is_set():
+            with contextlib.suppress(queue.Full):
+                done.put(result, timeout=_POLL_S)
+                return
+
+    def drive(place: int) -> None:
+        try:
+            while not ending.is_set():
+                chunk = waiting.get_nowait()
+                hand_over((chunk, *_computed(place, chunk)))
+        except queue.Empty:
+            return
+        except Exception as error:
+            hand_over(error)
+
+    def _computed(place: int, chunk: Chunk) -> tuple[dict[str, np.ndarray], str]:
+        for _ in range(MOST_DEATHS):
+            if place not in workers:
+                workers[place] = Worker(spec, groups[place])
+            found = workers[place].compute(chunk)
+            if found is not None:
+                return found
+            workers.pop(place).end()
+            if ending.is_set():
+                break
+        raise CalibrationError(f"chunk {chunk.index}: {MOST_DEATHS} workers died computing it")
+
+    threads = [
+        threading.Thread(target=drive, args=(place,), daemon=True, name=f"study worker {place}")
+        for place in range(len(groups))
+    ]
+    for thread in threads:
+        thread.start()
+    try:
+        for _ in chunks:
+            result = done.get()
+            if isinstance(result, Exception):
+                raise result
+            yield result
+    finally:
+        ending.set()
+        for worker in list(workers.values()):
+            worker.process.kill()
+        for thread in threads:
+            thread.join()
+        for worker in list(workers.values()):
+            worker.end()
+
+
+def core_groups(workers: int) -> list[set[int]]:
+    """This process's cores shared out to workers, as evenly as can be.
+
+    More workers than cores share them.
+    """
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    cores = cores or list(range(os.cpu_count() or 1))
+    if workers > len(cores):
+        return [{cores[k % len(cores)]} for k in range(workers)]
+    return [{int(core) for core in part} for part in np.array_split(cores, workers)]
+
+
+def main() -> None:
+    """What a worker does, until its standard input ends."""
+    answers = os.fdopen(os.dup(1), "wb")
+    # JAX or a library may print; only answers may go where the parent listens.
+    os.dup2(2, 1)
+    requests = sys.stdin.buffer
+    given = json.loads(requests.readline())
+    if given["cores"] and hasattr(os, "sched_setaffinity"):
+        # Before JAX is imported, which counts them.
+        os.sched_setaffinity(0, given["cores"])
+    spec = spec_from_canonical(given["spec"])
+    for line in requests:
+        _answer(answers, spec, json.loads(line)["chunk"])
+
+
+def _answer(answers: BinaryIO, spec: Spec, index: int) -> None:
+    from jaxcal.study.pipeline import compute_chunk, device_name
+
+    try:
+        arrays = compute_chunk(spec, spec.chunk(index))
+        found = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+        described = [[name, values.dtype.str, list(values.shape)] for name, values in found.items()]
+        header: dict[str, Any] = {"arrays": described, "device": device_name()}
+    except Exception as error:
+        found = {}
+        header = {"error": f"{type(error).__name__}: {one_line(error)[:300]}"}
+    answers.write(json.dumps(header).encode() + b"\n")
+    for values in found.values():
+        answers.write(values.tobytes())
+    answers.flush()
+
+
+if __name__ == "__main__":
+    main()
