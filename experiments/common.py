@@ -11,7 +11,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+import jax
+
 from jaxcal.io.atomic import atomic_path
+
+# The scripts' own arrays; jaxcal computes in 64 bits anyway.
+jax.config.update("jax_enable_x64", True)
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -12,10 +12,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from jaxcal._configuration import configure_jax
-
-configure_jax()
-
 __version__ = "0.1.0"
 
 _HOME = {

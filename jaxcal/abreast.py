@@ -19,6 +19,7 @@ from jaxcal.model.parameters import RIGID
 from jaxcal.model.priors import Bounded, Gaussian
 from jaxcal.options import Given, Plan
 from jaxcal.pipeline import Solution, agreeing, assemble, belief, finish
+from jaxcal.precision import in_standard_promotion
 from jaxcal.problem import Problem
 from jaxcal.solvers.fused import Images, Measured
 from jaxcal.solvers.fused_auto import average_abreast
@@ -44,6 +45,8 @@ def plain(problem: Problem, given: Given, plan: Plan) -> bool:
 
 def solve_problems(problems: Problem, given: Given, plan: Plan) -> Calibration:
     """Solve a batch (one leading axis) of plain problems."""
+    if not plan.options.differentiate:
+        problems, given = jax.lax.stop_gradient((problems, given))
     everything, problems = problems, jax.vmap(lambda problem: agreeing(problem, plan))(problems)
     frozen, numbers = jax.lax.stop_gradient((problems, given))
     images = Images.of(frozen)
@@ -79,6 +82,7 @@ def finish_batch(
 
 
 @finish_batch.defjvp
+@in_standard_promotion
 def _finish_batch_jvp(plan: Plan, primals: tuple, tangents: tuple) -> tuple:
     def reference(solution, problems, everything, given) -> Calibration:
         return jax.vmap(lambda s, p, e: finish(s, p, e, given, plan))(

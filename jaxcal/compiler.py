@@ -22,6 +22,8 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcal.precision import inside_transformation
+
 T = TypeVar("T")
 
 SWITCH = "JAXCAL_FAST_MATH"
@@ -125,5 +127,4 @@ def computed_once(make: Callable[[], T], witness: jax.typing.ArrayLike) -> T:
 
 def is_whole_program(*arguments: object) -> bool:
     """Whether arrays have values, so that what is called with them is a program of its own."""
-    leaves = jax.tree.leaves((arguments, jnp.zeros(())))
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+    return not inside_transformation(*arguments)

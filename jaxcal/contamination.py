@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Key
 
 from jaxcal.errors import InputError
 from jaxcal.geometry import matrix_from_rotation, rotation_from_vector
+from jaxcal.precision import in_own_modes
 from jaxcal.problem import Problem
 
 OutlierKind = Literal["echo", "click", "pose", "slip", "mixed"]
@@ -29,6 +30,7 @@ LARGEST_TURN_RAD = 0.1745
 _SHALLOWEST_MM = 1.0
 
 
+@in_own_modes
 def contaminate(
     key: Key[Array, ""], problem: Problem, fraction: float, kind: OutlierKind = "mixed"
 ) -> tuple[Problem, Float[Array, " n"]]:

@@ -24,8 +24,10 @@ from jaxcal.diagnosis import TUNED
 from jaxcal.errors import InputError
 from jaxcal.geometry import AnyArray
 from jaxcal.model.parameters import size
+from jaxcal.precision import in_own_modes
 
 
+@in_own_modes
 def degrees_of_freedom(calibration: Calibration) -> Float[Array, "*batch"]:
     """What the used images leave for the noise's SDs (traceable); inf where SDs were given."""
     left = calibration.images_used - size(calibration.blocks) / 3
@@ -58,6 +60,7 @@ def transform_intervals(
     return factor[..., None] * np.sqrt(variance)
 
 
+@in_own_modes
 def predicted_tre(
     calibration: Calibration, points: Float[AnyArray, "*points 2"]
 ) -> Float[Array, "*shape"]:

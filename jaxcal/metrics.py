@@ -6,8 +6,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.geometry import AnyArray, transform_points
+from jaxcal.precision import in_own_modes
 
 
+@in_own_modes
 def reconstruction_precision(
     image_to_probe: Float[AnyArray, "4 4"],
     poses: Float[AnyArray, "n 4 4"],
@@ -34,6 +36,7 @@ def reconstruction_precision(
     return jnp.sqrt(jnp.sum(weight * (cloud - mean) ** 2) / (count - 1))
 
 
+@in_own_modes
 def reconstruct(
     image_to_probe: Float[AnyArray, "4 4"],
     poses: Float[AnyArray, "n 4 4"],
@@ -47,6 +50,7 @@ def reconstruct(
                                                                  points))  # fmt: skip
 
 
+@in_own_modes
 def calibration_reproducibility(
     transforms: Float[AnyArray, "k 4 4"], image_points: Float[AnyArray, "m 2"]
 ) -> Float[Array, " m"]:
@@ -68,6 +72,7 @@ def calibration_reproducibility(
     return jnp.mean(jnp.linalg.norm(images - jnp.mean(images, axis=0), axis=-1), axis=0)
 
 
+@in_own_modes
 def image_corners(width_mm: float, depth_mm: float) -> Float[Array, "5 2"]:
     """The four corners of a linear probe's image and its centre, [lateral, axial] mm."""
     half = 0.5 * width_mm
@@ -76,6 +81,7 @@ def image_corners(width_mm: float, depth_mm: float) -> Float[Array, "5 2"]:
     )
 
 
+@in_own_modes
 def root_mean_square(
     residual: Float[AnyArray, "n 3"], mask: Float[AnyArray, " n"] | None = None
 ) -> Float[Array, ""]:

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Float
 
 from jaxcal.errors import InputError
@@ -44,7 +45,10 @@ class Options:
     """How to solve; static, so each combination is compiled once.
 
     Attributes:
-        solver: the conventional method's: ``lm``, ``gauss-newton`` or ``gradient``.
+        solver: ``lm`` is ours. The conventional method also has ``gauss-newton`` and ``gradient``.
+            An optimistix least-squares solver, e.g. ``optimistix.Dogleg(1e-10, 1e-10)``, takes the
+            place of ours in the conventional method and, but for its prior ``bounded``, the joint
+            one; it begins where ours would, stops by its own rule, and takes longer in a batch.
         gradient_tolerance: where ``gradient`` stops, relative.
         tolerance_rad: the alternation stops when a round turns X by less than this (rad) and
         tolerance_mm: moves its origin by less than this (mm). The defaults reproduce the paper.
@@ -52,9 +56,13 @@ class Options:
         inner_steps: Gauss-Newton steps on X and c in each of its rounds.
         max_iterations: most linearisations of the other solvers.
         trace: how many values of the objective to keep in the result.
+        differentiate: False where nobody will differentiate the answer: inside a grad of the
+            caller it is then a constant, and derivatives are neither traced nor compiled.
+        precision: ``float64``, whatever the problem's arrays hold, or ``float32``, which is faster
+            on some devices and loses six digits.
     """
 
-    solver: Literal["lm", "gauss-newton", "gradient"] = "lm"
+    solver: Literal["lm", "gauss-newton", "gradient"] | optx.AbstractLeastSquaresSolver = "lm"
     gradient_tolerance: float = 1e-6
     tolerance_rad: float = 1e-3
     tolerance_mm: float = 0.1
@@ -62,10 +70,19 @@ class Options:
     inner_steps: int = 2
     max_iterations: int = 100
     trace: int = 0
+    differentiate: bool = True
+    precision: Literal["float64", "float32"] = "float64"
 
     def __post_init__(self) -> None:
-        if self.solver not in ("lm", "gauss-newton", "gradient"):
-            raise InputError(f"solver must be lm, gauss-newton or gradient, not {self.solver!r}")
+        if isinstance(self.solver, optx.AbstractLeastSquaresSolver):
+            _check_static(self.solver)
+        elif self.solver not in ("lm", "gauss-newton", "gradient"):
+            raise InputError(
+                "solver must be lm, gauss-newton, gradient or an optimistix least-squares solver, "
+                f"not {self.solver!r}"
+            )
+        if self.precision not in ("float64", "float32"):
+            raise InputError(f"precision must be float64 or float32, not {self.precision!r}")
         for name in ("gradient_tolerance", "tolerance_rad", "tolerance_mm"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
@@ -75,6 +92,16 @@ class Options:
         ):  # fmt: skip
             if getattr(self, name) < least:
                 raise InputError(f"{name} must be at least {least}, not {getattr(self, name)}")
+
+
+def _check_static(solver: optx.AbstractLeastSquaresSolver) -> None:
+    """A solver is part of what is compiled, so its tolerances must be plain numbers."""
+    try:
+        hash(solver)
+    except TypeError:
+        raise InputError(
+            f"the settings of {type(solver).__name__} must be plain numbers, not arrays"
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -93,6 +120,12 @@ class Plan:
     blocks: Blocks
     options: Options
     robust: bool = False
+
+    @property
+    def other_solver(self) -> optx.AbstractLeastSquaresSolver | None:
+        """The caller's solver, where one was handed over."""
+        solver = self.options.solver
+        return solver if isinstance(solver, optx.AbstractLeastSquaresSolver) else None
 
     @property
     def reported_prior(self) -> str:
@@ -208,6 +241,12 @@ def _check_combination(request: Request, kind: str) -> None:
             "uniform (without given sigma) and bounded"
         )
     options = request.options
+    other = options is not None and isinstance(options.solver, optx.AbstractLeastSquaresSolver)
+    if other and kind == "bounded":
+        raise InputError(
+            "another solver would not keep the offsets within their bounds: it goes with the "
+            "conventional method and the joint one's priors auto, uniform and gaussian"
+        )
     historical = options is not None and options.solver == "gradient"
     if request.estimate and historical and request.method == "conventional":
         raise InputError(

@@ -26,6 +26,7 @@ from jaxcal.model.priors import (
     covariance_shape,
 )
 from jaxcal.options import DEFAULT_MAX_ELEVATION_MM, Given, Plan
+from jaxcal.precision import in_standard_promotion
 from jaxcal.problem import Problem
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import alternate
@@ -33,6 +34,7 @@ from jaxcal.solvers.auto import OffsetLaw, average_over_laws
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.solvers.conventional import from_scratch, pairwise_gradient
 from jaxcal.solvers.joint import joint
+from jaxcal.solvers.least_squares import minimise
 from jaxcal.solvers.variance import MINIMUM_SELF_TUNING, self_tuned
 from jaxcal.sound import WATER_M_S
 
@@ -54,6 +56,8 @@ def solve_problem(
         plan: what is static about it.
         agreed: what :func:`agreed_images` found, where it was asked before.
     """
+    if not plan.options.differentiate:
+        problem, given = jax.lax.stop_gradient((problem, given))
     everything = problem = problem.cleared(problem.mask)
     problem = agreeing(problem, plan) if agreed is None else replace(problem, mask=agreed)
     frozen = jax.lax.stop_gradient((problem, given))
@@ -66,7 +70,8 @@ def agreeing(problem: Problem, plan: Plan) -> Problem:
         return problem
     # One problem at a time, in a batch too: its finalists fill the vector units, and more problems
     # at once would only leave the cache.
-    found = jax.custom_batching.sequential_vmap(lambda p: agreed_images(p, plan.blocks))
+    agreed = in_standard_promotion(lambda p: agreed_images(p, plan.blocks))
+    found = jax.custom_batching.sequential_vmap(agreed)
     # Which images are left out is piecewise constant in the data: no derivative passes here.
     return replace(problem, mask=found(jax.lax.stop_gradient(seen(problem))))
 
@@ -140,10 +145,11 @@ def nominal_sound_speed(problem: Problem) -> Float[Array, ""]:
 def _run_method(problem: Problem, given: Given, plan: Plan) -> Solution:
     options, blocks = plan.options, plan.blocks
     conventional = plan.method == "conventional"
-    historical = options.solver == "gradient"
+    historical, other = options.solver == "gradient", plan.other_solver
+    undamped = conventional and options.solver == "gauss-newton"
     begun = from_scratch(
         problem, blocks,
-        solver=options.solver if conventional and not historical else "lm",
+        solver="gauss-newton" if undamped else "lm",
         exact=conventional and options.solver == "lm",
         max_steps=options.max_iterations,
         trace=options.trace if conventional else 0,
@@ -170,6 +176,11 @@ def _run_method(problem: Problem, given: Given, plan: Plan) -> Solution:
                 begun.start, problem, blocks, tolerance=options.gradient_tolerance,
                 max_steps=100 * options.max_iterations, trace=options.trace,
             )  # fmt: skip
+        if other is not None:
+            fit = minimise(
+                begun.start, InPlane(), problem, blocks, max_steps=options.max_iterations,
+                trace=options.trace, solver=other,
+            )  # fmt: skip
         return solution(fit, prior, fit.settled)
 
     if plan.method == "alternating" and isinstance(prior, Bounded):
@@ -185,14 +196,26 @@ def _run_method(problem: Problem, given: Given, plan: Plan) -> Solution:
 
     if plan.self_tuning and isinstance(prior, AbstractSelfTuned):
         tuned = self_tuned(
-            start, prior, problem, blocks, max_steps=options.max_iterations, trace=options.trace
+            start,
+            prior,
+            problem,
+            blocks,
+            max_steps=options.max_iterations,
+            trace=options.trace,
+            solver=other,
         )
         return solution(
             tuned.fit, prior.with_sigma(tuned.sigma), tuned.fit.settled & tuned.settled,
             sigma_floored=tuned.floored, variance_rounds=tuned.rounds,
         )  # fmt: skip
     fit = joint(
-        start, prior, problem, blocks, max_steps=options.max_iterations, trace=options.trace
+        start,
+        prior,
+        problem,
+        blocks,
+        max_steps=options.max_iterations,
+        trace=options.trace,
+        solver=other,
     )
     return solution(fit, prior, fit.settled)
 
@@ -202,6 +225,8 @@ def _attach(
 ) -> tuple[Parameters, Array, AbstractPrior]:
     """The solution as a differentiable function of the problem (and of given numbers)."""
     reference, offset = solution.parameters, solution.offset
+    if not plan.options.differentiate:
+        return reference, offset, solution.prior
     prior = belief(problem, given, plan)
     if plan.self_tuning:
         assert isinstance(prior, AbstractSelfTuned)
@@ -261,7 +286,7 @@ def assemble(
         sigma_tuned=jnp.asarray(plan.self_tuning) & enough,
         sigma_floored=floored[jnp.asarray([0, 0, 1])] if plan.channels else floored,
         tolerance_met=solution.arrived,
-        differentiable=found.differentiable,
+        differentiable=found.differentiable & plan.options.differentiate,
         rotation_change=solution.rotation_change,
         translation_change=solution.translation_change,
         trace=solution.trace,

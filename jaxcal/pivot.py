@@ -26,6 +26,7 @@ from jaxcal.metrics import root_mean_square
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.priors import InPlane
 from jaxcal.model.residuals import circle_residual
+from jaxcal.precision import in_own_modes, require_float64
 from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES
 from jaxcal.solvers import dense
@@ -102,6 +103,7 @@ class Pivot(eqx.Module):
         return found
 
 
+@in_own_modes
 def calibrate_pivot(
     poses: Float[np.ndarray | Array, "*batch n rows 4"],
     mask: Float[np.ndarray | Array, "*batch n"] | Bool[np.ndarray, " n"] | None = None,
@@ -127,7 +129,8 @@ def calibrate_pivot(
             raise InputError(
                 f"{int(used.sum())} used poses are too few: at least {MINIMUM_IMAGES} are needed"
             )
-    array = jnp.asarray(poses, jnp.result_type(float))
+    require_float64("jaxcal.calibrate_pivot")
+    array = jnp.asarray(poses, np.float64)
     weight = jnp.ones(array.shape[:-2]) if mask is None else jnp.asarray(mask)
     weight = jnp.broadcast_to(weight.astype(array.dtype), array.shape[:-2])
     alone = compiler.is_whole_program(array, weight)

@@ -18,6 +18,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxcal.errors import InputError
+from jaxcal.precision import in_own_modes
 from jaxcal.probe import CurvilinearProbe
 from jaxcal.recording import Images, Kind, Recording, make_images
 from jaxcal.segmentation.segment import segment
@@ -111,6 +112,7 @@ class Problem(eqx.Module):
         )
 
     @classmethod
+    @in_own_modes
     def from_recording(
         cls, recording: Recording | Images, dtype: DTypeLike | None = None
     ) -> Problem:
@@ -118,14 +120,14 @@ class Problem(eqx.Module):
 
         Args:
             recording: a :class:`Recording`, or one set of :class:`Images`.
-            dtype: float64 by default (float32 where JAX runs in 32 bits).
+            dtype: float64 by default.
 
         Raises:
             InputError: for times of flight that cannot be segmented, or come without a probe.
         """
         probe = recording.probe if isinstance(recording, Recording) else None
         images = recording.calibration if isinstance(recording, Recording) else recording
-        dtype = jnp.result_type(float) if dtype is None else dtype
+        dtype = np.float64 if dtype is None else dtype
 
         def array(values: np.ndarray | float) -> Array:
             return jnp.asarray(values, dtype=dtype)
@@ -196,6 +198,7 @@ class Problem(eqx.Module):
         return cls.from_recording(images, dtype=dtype)
 
 
+@in_own_modes
 def stack(problems: list[Problem]) -> Problem:
     """Problems of one structure as a batch with one leading axis.
 

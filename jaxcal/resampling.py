@@ -26,6 +26,7 @@ from jaxcal.metrics import calibration_reproducibility
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.pipeline import nominal_sound_speed
+from jaxcal.precision import in_own_modes
 from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES, Recording
 from jaxcal.solve import calibrate, calibrate_batch
@@ -89,6 +90,7 @@ class Bootstrap(eqx.Module):
     image_points: Float[Array, "m 2"]
 
 
+@in_own_modes
 def cross_validate(
     problem: Problem | Recording,
     *,
@@ -145,6 +147,7 @@ def cross_validate(
     )
 
 
+@in_own_modes
 def bootstrap(
     problem: Problem | Recording,
     resamples: int = 200,

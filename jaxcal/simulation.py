@@ -27,6 +27,7 @@ from jaxcal.compiler import computed_once, quick_to_compile
 from jaxcal.errors import InputError
 from jaxcal.geometry import matrix_from_rotation
 from jaxcal.offsets import OffsetLaw, check_law, standard_offsets
+from jaxcal.precision import in_own_modes, require_float64
 from jaxcal.probe import L14_5, CurvilinearProbe, Probe
 from jaxcal.problem import Channels, Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES, Recording, Truth, make_images
@@ -117,6 +118,7 @@ class Experiment(eqx.Module):
     test_points: Float[Array, "m 2"]
     distances: Float[Array, "n elements"] | None = None
 
+    @in_own_modes
     def problem(self, max_elevation: float | None = None, probe: Probe | None = None) -> Problem:
         """The calibration images as a :class:`Problem` (traceable; without covariances).
 
@@ -191,6 +193,7 @@ class Planes(eqx.Module):
     test_point: Float[Array, "2 m"]
 
 
+@in_own_modes
 def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
     """Draw one experiment; vmap over keys for a batch.
 
@@ -199,6 +202,7 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
             depend on chunks or devices.
         protocol: the distributions.
     """
+    require_float64("jaxcal.simulate")
     numbers, noise = draw(key, protocol), draw_noise(key, protocol)
     planes = arrange(numbers, protocol)
     distances = _distances(planes, noise, protocol)
@@ -395,6 +399,7 @@ def times_of_flight(
     return np.round(times * clock_hz) / clock_hz
 
 
+@in_own_modes
 def simulate_recording(
     protocol: Protocol, seed: int = 0, *, clock_hz: float | None = None
 ) -> Recording:

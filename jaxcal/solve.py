@@ -34,6 +34,7 @@ from jaxcal.options import (
     with_bound,
 )
 from jaxcal.pipeline import agreed_images, seen, solve_problem
+from jaxcal.precision import in_own_modes, require_float64, with_dtype
 from jaxcal.problem import Problem
 from jaxcal.recording import Recording
 
@@ -44,6 +45,7 @@ CHANNELS_CHUNK = 8
 """The same for solves on channels, whose problems are a hundred times larger."""
 
 
+@in_own_modes
 def calibrate(
     problem: Problem | Recording,
     method: Method = "joint",
@@ -99,6 +101,7 @@ def calibrate(
     """
     if isinstance(problem, Recording):
         problem = Problem.from_recording(problem)
+    problem = _in_asked_precision(problem, options, "jaxcal.calibrate")
     request = Request(method, prior, max_elevation, sigma, tracker_sd, estimate, data,
                       sound_speed_sd, delay_sd, options, robust)  # fmt: skip
     plan, given = prepare(problem, request)
@@ -108,12 +111,13 @@ def calibrate(
     problem = with_bound(problem, given)
     # One problem alone gains nothing on the fused pass, and the general road compiles faster.
     alone = compiler.is_whole_program(problem, given)
-    platform = jax.default_backend() if alone else None
+    platform = _devices(problem)[0].platform if alone else None
     # A program of its own, which serves every method and prior.
     agreed = _agreement(platform)(seen(problem), plan.blocks) if plan.robust else None
     return _one_problem(platform)(problem, given, plan, agreed)
 
 
+@in_own_modes
 def calibrate_batch(
     problems: Problem,
     method: Method = "joint",
@@ -163,10 +167,30 @@ def calibrate_batch(
         raise InputError("calibrate_batch needs problems with a leading axis; use calibrate")
     if chunk is not None and chunk < 1:
         raise InputError(f"chunk must be at least 1, not {chunk}")
+    problems = _in_asked_precision(problems, options, "jaxcal.calibrate_batch")
     request = Request(method, prior, max_elevation, sigma, tracker_sd, estimate, data,
                       sound_speed_sd, delay_sd, options, robust)  # fmt: skip
     plan, given = prepare(problems, request)
     return _solve_batch(problems, given, plan, chunk)
+
+
+def _in_asked_precision(problem: Problem, options: Options | None, name: str) -> Problem:
+    precision = Options.precision if options is None else options.precision
+    if precision == "float64":
+        require_float64(name)
+    return with_dtype(problem, np.dtype(precision))
+
+
+def _devices(problems: Problem) -> tuple[Any, ...]:
+    """The devices that hold a problem's arrays, or all local ones where they may go anywhere."""
+    leaves = [leaf for leaf in jax.tree.leaves(problems) if isinstance(leaf, jax.Array)]
+    held = {frozenset(leaf.devices()) for leaf in leaves if leaf.committed}
+    if len(held) > 1:
+        raise InputError(
+            "the problem's arrays lie on different devices: put all of them on the same ones "
+            "(jax.device_put takes a whole problem)"
+        )
+    return tuple(sorted(held.pop(), key=lambda d: d.id)) if held else tuple(jax.local_devices())
 
 
 def _solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None) -> Calibration:
@@ -242,6 +266,6 @@ def _chunks_program(problems: Problem, given: Given, plan: Plan, *, spread: bool
     """The compiled form, and the devices that it runs on."""
     alone = compiler.is_whole_program(problems, given)
     fused = abreast.plain(problems, given, plan)
-    devices = tuple(jax.local_devices())
+    devices = _devices(problems) if alone else tuple(jax.local_devices())
     devices = devices if alone and fused and spread else devices[:1]
     return _chunks(devices, alone, fused), devices

@@ -51,6 +51,10 @@ import pytest
 
 import jaxcal
 
+# Many tests look at the insides, which compute in the caller's bits; test_guest.py is about callers
+# who have 32. Not by the environment: processes that the tests start are users'.
+jax.config.update("jax_enable_x64", True)
+
 REAL_DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
@@ -92,11 +96,6 @@ def select(problem: jaxcal.Problem, rows: object) -> jaxcal.Problem:
 
 def angle(first: np.ndarray, second: np.ndarray) -> float:
     return jaxcal.geometry.rotation_angle(np.asarray(first), np.asarray(second))
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _float64() -> None:
-    assert jax.config.read("jax_enable_x64")
 
 
 LONGEST = (

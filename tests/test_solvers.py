@@ -179,10 +179,12 @@ def test_float32(solver):
     reference = noisy(12)
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), reference)
     arguments = dict(solver.arguments)
+    options = arguments.get("options", Options())
     if solver.agreement > 1e-8:
-        arguments["options"] = Options(solver=arguments["options"].solver)
+        options = Options(solver=options.solver)
         if solver.name == "alternating":
-            arguments["options"] = Options(tolerance_rad=1e-5, tolerance_mm=1e-3)
+            options = Options(tolerance_rad=1e-5, tolerance_mm=1e-3)
+    arguments["options"] = replace(options, precision="float32")
     result = jaxcal.calibrate(single, **arguments)
     exact = jaxcal.calibrate(reference, **solver.arguments)
     assert result.image_to_probe.dtype == jnp.float32

@@ -31,6 +31,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxcal.precision import in_standard_promotion
+
 NODES = 8
 """In each half of the interval."""
 
@@ -208,6 +210,7 @@ def _sums_at_once(family: Family, abrupt: bool, window: Window) -> tuple[Array, 
 
 
 @_sums.defjvp
+@in_standard_promotion
 def _sums_jvp(
     family: Family, abrupt: bool, primals: tuple[Window], tangents: tuple[Window]
 ) -> tuple:

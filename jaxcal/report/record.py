@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -163,10 +162,10 @@ def _precision(
     if images.mask.sum() < 2:
         return None, name
     value = reconstruction_precision(
-        jnp.asarray(result.image_to_probe),
-        jnp.asarray(images.poses),
-        jnp.asarray(_points_mm(images, result)),
-        jnp.asarray(images.mask.astype(float)),
+        np.asarray(result.image_to_probe),
+        images.poses,
+        _points_mm(images, result),
+        images.mask.astype(float),
     )
     return float(value), name
 

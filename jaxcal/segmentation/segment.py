@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from jaxcal.compiler import fast_to_run
 from jaxcal.errors import InputError
 from jaxcal.geometry import AnyArray
+from jaxcal.precision import in_own_modes
 from jaxcal.probe import CurvilinearProbe, Probe
 from jaxcal.recording import MINIMUM_IMAGES, Images, Recording, make_images
 from jaxcal.segmentation.time_of_flight import Fit, fit_in_plane, fit_out_of_plane, shortest
@@ -91,6 +92,7 @@ class Segmentation:
     warnings: tuple[str, ...] = ()
 
 
+@in_own_modes
 def segment(
     data: Recording | Images,
     probe: Probe | None = None,

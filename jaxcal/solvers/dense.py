@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxcal.precision import in_standard_promotion
+
 MAX_SWEEPS = 30
 
 
@@ -128,6 +130,7 @@ def singular_values(matrix: Float[Array, "m p"]) -> SingularValues:
 
 
 @singular_values.def_vmap
+@in_standard_promotion
 def _singular_values_batch(size: int, batched: list, matrix: Array) -> tuple:
     del size, batched
     found = _side_by_side(jnp.moveaxis(matrix, 0, -1))

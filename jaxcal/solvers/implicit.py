@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.model.parameters import Blocks, Parameters, retract, size
 from jaxcal.model.priors import AbstractPrior, AbstractSelfTuned
+from jaxcal.precision import in_standard_promotion
 from jaxcal.problem import Problem
 from jaxcal.solvers import dense, variance
 
@@ -51,6 +52,7 @@ def optimum(
 
 
 @optimum.defjvp
+@in_standard_promotion
 def _optimum_jvp(blocks: Blocks, primals: tuple, tangents: tuple) -> tuple:
     reference, offset, prior, problem = primals
     _, _, prior_dot, problem_dot = tangents
@@ -113,6 +115,7 @@ def self_tuned_optimum(
 
 
 @self_tuned_optimum.defjvp
+@in_standard_promotion
 def _self_tuned_jvp(blocks: Blocks, primals: tuple, tangents: tuple) -> tuple:
     reference, sigma, belief, problem = primals
     _, _, belief_dot, problem_dot = tangents

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Float
 
 from jaxcal.model.parameters import Blocks, Parameters, retract
@@ -35,6 +36,7 @@ def joint(
     *,
     max_steps: int = 100,
     trace: int = 0,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
 ) -> Fit:
     """Minimise a prior's objective over the shared unknowns and all offsets, to full precision.
 
@@ -45,12 +47,22 @@ def joint(
         blocks: the free unknowns.
         max_steps: most linearisations from each start.
         trace: how many values of the objective to keep (of the joint steps from the best start).
+        solver: another optimistix solver; not with bounds, which it would not keep.
 
     Returns:
         The fit; with bounds, its iterations are those from all starts and their warm-up.
     """
     if not isinstance(prior, Bounded) or "rotation" not in blocks:
-        return minimise(start, prior, problem, blocks, max_steps=max_steps, exact=True, trace=trace)
+        return minimise(
+            start,
+            prior,
+            problem,
+            blocks,
+            max_steps=max_steps,
+            exact=True,
+            trace=trace,
+            solver=solver,
+        )
     count = jnp.sum(problem.mask)
     bound = jnp.sum(problem.mask * prior.limit(start, problem)) / count
     distance = jnp.sum(problem.mask * measured_points(start, problem)[:, 1]) / count

@@ -17,8 +17,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxcal.geometry import AnyArray
 from jaxcal.model.parameters import Blocks, Parameters, retract, size
 from jaxcal.model.priors import AbstractPrior
 from jaxcal.problem import Problem
@@ -281,6 +283,7 @@ def minimise(
     max_steps: int = 100,
     exact: bool = False,
     trace: int = 0,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
 ) -> Fit:
     """Minimise the prior's sum of squares over the shared unknowns and every offset, jointly.
 
@@ -295,6 +298,8 @@ def minimise(
         max_steps: most linearisations.
         exact: use exact second derivatives near the optimum.
         trace: how many values of the objective to keep.
+        solver: another optimistix solver, which stops by a rule of its own; damping, tolerance,
+            exact and trace are then of no effect.
 
     Returns:
         A :class:`Fit`; it never raises, the caller judges by its stationarity.
@@ -317,10 +322,23 @@ def minimise(
         return exact_arrow(residual, unknowns, limit)
 
     first = Unknowns(jnp.zeros(size(blocks), dtype), offset)
+    if solver is not None:
+        found = optx.least_squares(residual, solver, first, max_steps=max_steps, throw=False)
+        parameters = retract(start, found.value.tangent, blocks)
+        arrow, _, _ = linearise(parameters, found.value.offset, prior, problem, blocks)
+        return Fit(
+            parameters=parameters,
+            offset=found.value.offset,
+            cost=arrow.cost,
+            stationarity=arrows.stationarity(arrow),
+            settled=found.result == optx.RESULTS.successful,
+            iterations=jnp.asarray(found.stats["num_steps"]),
+            trace=jnp.full(trace, jnp.nan, dtype) if trace else None,
+        )
     reach = jnp.max(jnp.abs(problem.poses[:, :3, 3]) * problem.mask[:, None])
     reach = jnp.maximum(reach, jnp.max(jnp.abs(start.point)))
     rounding = eps * reach * prior.largest_weight()
-    solver = ArrowLeastSquares(
+    ours = ArrowLeastSquares(
         rtol=0.0,
         atol=tolerance,
         rounding=rounding,
@@ -333,10 +351,10 @@ def minimise(
         ),
         search=GainRatio(rounding, trace, damping == 0),
     )
-    solution = optx.least_squares(residual, solver, first, max_steps=max_steps, throw=False)
+    solution = optx.least_squares(residual, ours, first, max_steps=max_steps, throw=False)
     # The descent was last queried at the accepted iterate, which is the one returned.
     arrow = solution.state.descent_state.arrow
-    stationarity = jnp.where(solver.vanished(arrow), 0.0, arrows.stationarity(arrow))
+    stationarity = jnp.where(ours.vanished(arrow), 0.0, arrows.stationarity(arrow))
     return Fit(
         parameters=retract(start, solution.value.tangent, blocks),
         offset=solution.value.offset,
@@ -346,3 +364,57 @@ def minimise(
         iterations=solution.stats["num_steps"],
         trace=solution.state.search_state.trace if trace else None,
     )
+
+
+def arrow_least_squares(
+    residual: Callable[[Any, Float[Array, " n"], Any], Float[Array, "n columns"]],
+    shared: Any,
+    local: Float[AnyArray, " n"],
+    args: Any = None,
+    *,
+    limit: Float[AnyArray, " n"] | float = jnp.inf,
+    damping: float = 1e-3,
+    tolerance: float | None = None,
+    max_steps: int = 100,
+    throw: bool = True,
+) -> optx.Solution:
+    """Minimise any sum of squares with shared unknowns and one local unknown a row.
+
+    Each step eliminates the local unknowns by scalar divisions, so that it costs O(n p^2) for p
+    shared unknowns where a dense solver takes O(n (n + p)^2).
+
+    Args:
+        residual: from (shared, local, args) to (n, columns); row i depends on local[i] only.
+        shared: first value of the shared unknowns, any pytree of floating arrays.
+        local: first value of the local unknowns, one a row.
+        args: what the residuals are differentiable in: derivatives of the solution with respect to
+            it are optimistix's implicit ones.
+        limit: bound on the magnitude of the local unknowns; inf where there is none.
+        damping: first Levenberg-Marquardt lambda relative to the diagonal.
+        tolerance: scaled KKT residual to stop at; by default 1e-10 in float64, 1e-4 in float32.
+        max_steps: most linearisations.
+        throw: raise where ``max_steps`` do not suffice; else the solution's ``result`` says so.
+
+    Returns:
+        optimistix's solution; its ``value`` is (shared, local).
+    """
+    flat, unravel = ravel_pytree(shared)
+    eps = float(jnp.finfo(flat.dtype).eps)
+    first = Unknowns(flat, jnp.asarray(local, flat.dtype))
+
+    def function(unknowns: Unknowns, args: Any) -> Float[Array, "n columns"]:
+        return residual(unravel(unknowns.tangent), unknowns.offset, args)
+
+    value = function(first, args)
+    rounding = jax.lax.stop_gradient(eps * jnp.max(jnp.abs(value)))
+    solver = ArrowLeastSquares(
+        rtol=0.0,
+        atol=(1e-10 if eps < 1e-10 else 1e-4) if tolerance is None else tolerance,
+        rounding=rounding,
+        residuals=value.size,
+        descent=ArrowDescent(jnp.broadcast_to(jnp.asarray(limit), first.offset.shape), damping),
+        search=GainRatio(rounding, 0, False),
+    )
+    solution = optx.least_squares(function, solver, first, args, max_steps=max_steps, throw=throw)
+    found = solution.value
+    return eqx.tree_at(lambda s: s.value, solution, (unravel(found.tangent), found.offset))

@@ -24,6 +24,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.model.parameters import Blocks, Parameters
@@ -67,6 +68,7 @@ def self_tuned(
     max_rounds: int = 60,
     max_steps: int = 100,
     trace: int = 0,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
 ) -> SelfTuned:
     """Solve with a Gaussian belief, its SDs estimated by REML.
 
@@ -80,6 +82,7 @@ def self_tuned(
         max_rounds: most variance updates.
         max_steps: most linearisations in each weighted solve.
         trace: how many values of the last solve's objective to keep.
+        solver: another optimistix solver for the weighted solves.
     """
     dtype = problem.mask.dtype
     if tolerance is None:
@@ -97,7 +100,7 @@ def self_tuned(
         wanted = jnp.clip(0.01 * change, tightest, 1e-3)
         return minimise(
             parameters, belief.with_sigma(sigma), problem, blocks, damping=1e-6,
-            max_steps=max_steps, exact=True, tolerance=wanted, trace=trace,
+            max_steps=max_steps, exact=True, tolerance=wanted, trace=trace, solver=solver,
         )  # fmt: skip
 
     def unfinished(state: tuple) -> Bool[Array, ""]:

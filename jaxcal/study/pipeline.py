@@ -31,6 +31,7 @@ from jaxtyping import Array
 from jaxcal.compiler import fast_to_run, single_threaded
 from jaxcal.metrics import reconstruction_precision
 from jaxcal.offsets import OffsetLaw, nominal_bound
+from jaxcal.precision import in_own_modes
 from jaxcal.probe import LinearProbe
 from jaxcal.simulation import Experiment, Protocol, simulate
 from jaxcal.solve import Options, calibrate_batch
@@ -75,6 +76,7 @@ class Shape:
         )  # fmt: skip
 
 
+@in_own_modes
 def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
     """All results of one chunk.
 

@@ -1,0 +1,285 @@
+"""jaxcal as a guest: the settings of a process stay, its modes and devices are lived with."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from conftest import experiment, problem
+
+import jaxcal
+from jaxcal import Options
+from jaxcal.deprecation import deprecated
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def run_fresh(code: str, folder: Path, **variables: str) -> str:
+    """Run a program in a fresh interpreter as a user's; returns what it printed.
+
+    It finds two problems of 8 images in the folder, as ``k-poses.npy`` and ``k-points.npy``.
+    """
+    for k in range(2):
+        there = problem(k, images=8)
+        np.save(folder / f"{k}-poses.npy", there.poses)
+        np.save(folder / f"{k}-points.npy", there.measurements)
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "JAXTYPING"))}
+    environment["XLA_FLAGS"] = os.environ["JAXCAL_TEST_XLA_FLAGS"]
+    done = subprocess.run(
+        [sys.executable, "-W", "error::DeprecationWarning:__main__", "-c", code],
+        env=environment | variables,
+        capture_output=True,
+        text=True,
+        cwd=folder,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+PROCESS = """
+import os, subprocess, sys
+import numpy as np
+show = ["env"]
+jax_first = {jax_first}
+if jax_first:
+    import jax, jax.numpy as jnp
+    jax.devices()
+    settings = dict(jax.config.values)
+    assert jnp.ones(2).dtype == "float32"
+before = subprocess.check_output(show)
+import jaxcal
+jaxcal.calibrate, jaxcal.simulate, jaxcal.segment, jaxcal.bootstrap, jaxcal.predicted_tre
+import jax, jax.numpy as jnp
+assert jnp.ones(2).dtype == "float32"
+if jax_first:
+    assert dict(jax.config.values) == settings, "importing changed a setting"
+    problem = jaxcal.Problem.from_arrays(np.load("0-poses.npy"), np.load("0-points.npy"))
+    result = jaxcal.calibrate(problem, "conventional")
+    print(result.status, type(result.image_to_probe).__name__, result.image_to_probe.dtype)
+    assert result.warnings is not None and result.observability["condition"] > 1
+    assert jaxcal.predicted_tre(result, np.zeros((1, 2))).dtype == "float64"
+    assert jnp.ones(2).dtype == "float32"
+    assert dict(jax.config.values) == settings, "calibrating changed a setting"
+    assert subprocess.check_output(show) == before, "a child's environment changed"
+else:
+    changed = set(subprocess.check_output(show).splitlines()) ^ set(before.splitlines())
+    assert not any(b"X64" in line for line in changed), changed
+"""
+
+
+@pytest.mark.parametrize("jax_first", [True, False])
+def test_importing_and_calibrating_change_nothing_of_the_process(jax_first, tmp_path):
+    said = run_fresh(PROCESS.format(jax_first=jax_first), tmp_path)
+    assert said == ("converged ndarray float64\n" if jax_first else "")
+
+
+def test_answers_do_not_depend_on_the_callers_bits():
+    there = problem(3, images=12)
+    wide = jaxcal.calibrate(there, "conventional")
+    with jax.enable_x64(False):
+        recording = experiment(3, images=12)
+        here = jaxcal.Problem.from_recording(recording)
+        assert isinstance(here.poses, np.ndarray)
+        narrow = jaxcal.calibrate(here, "conventional")
+        # What JAX made 32 bits of has lost digits of the data, but is not solved in 32 bits.
+        rounded = jaxcal.calibrate(jax.tree.map(jnp.asarray, here), "conventional")
+        assert jnp.ones(2).dtype == jnp.float32
+    assert isinstance(wide.image_to_probe, jax.Array)
+    assert isinstance(narrow.image_to_probe, np.ndarray)
+    assert rounded.image_to_probe.dtype == np.float64
+    np.testing.assert_array_equal(narrow.image_to_probe, wide.image_to_probe)
+    np.testing.assert_allclose(rounded.image_to_probe, wide.image_to_probe, atol=1e-3)
+
+
+def test_a_float64_problem_inside_a_transformation_without_64_bits_gets_one_clear_line():
+    there = problem(3, images=12)
+    for transformed in (
+        jax.jit(jaxcal.calibrate),
+        jax.grad(lambda p: jaxcal.calibrate(p, "conventional").rms),
+        jax.vmap(jaxcal.calibrate_batch),
+    ):
+        data = jaxcal.stack([jaxcal.stack([there])]) if "batch" in str(transformed) else there
+        with jax.enable_x64(False), pytest.raises(jaxcal.InputError, match="enable_x64") as error:
+            transformed(data)
+        assert "\n" not in str(error.value)
+
+
+def test_32_bits_where_they_are_asked_for():
+    there = problem(3, images=12)
+    single = Options(precision="float32")
+    wide = jaxcal.calibrate(there, "conventional")
+    with jax.enable_x64(False):
+        inside = jax.jit(lambda p: jaxcal.calibrate(p, "conventional", options=single))(there)
+    assert inside.image_to_probe.dtype == jnp.float32
+    np.testing.assert_allclose(inside.image_to_probe, wide.image_to_probe, atol=5e-3)
+
+
+STRICT = {
+    "jax_numpy_dtype_promotion": ("standard", "strict"),
+    "jax_numpy_rank_promotion": ("allow", "raise"),
+    "jax_debug_nans": (False, True),
+}
+
+
+@pytest.fixture
+def strict():
+    """All strict modes at once, for everybody in the process."""
+    for name, (_, strictest) in STRICT.items():
+        jax.config.update(name, strictest)
+    yield
+    for name, (usual, _) in STRICT.items():
+        jax.config.update(name, usual)
+
+
+@pytest.mark.usefixtures("strict")
+def test_strict_modes_of_a_call_with_values():
+    there = problem(3, images=12)
+    result = jaxcal.calibrate(there, "conventional")
+    assert result.status == "converged"
+    with jax.debug_nans(False):
+        bad = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), there)
+    both = jaxcal.calibrate_batch(jaxcal.stack([there, bad]), "conventional")
+    assert list(both.status) == ["converged", "failed"]
+    assert np.isfinite(jaxcal.predicted_tre(result, np.zeros((1, 2)))).all()
+
+
+@pytest.mark.usefixtures("strict")
+def test_strict_modes_of_a_compiled_function_that_is_differentiated_and_batched_later():
+    there = problem(3, images=12)
+
+    @jax.jit
+    def rms(p):
+        return jaxcal.calibrate(p, "conventional").rms
+
+    gradient = jax.grad(rms)(there)
+    assert np.isfinite(gradient.measurements).all()
+    assert np.abs(gradient.measurements).max() > 0
+    two = jaxcal.stack([there, there])
+    np.testing.assert_allclose(jax.vmap(rms)(two), jnp.stack([rms(there)] * 2), rtol=1e-9)
+
+
+DEVICES = """
+import jax, numpy as np, jaxcal
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+first, second = jax.devices()
+jax.config.update("jax_enable_x64", True)
+several = [
+    jaxcal.Problem.from_arrays(np.load(f"{k}-poses.npy"), np.load(f"{k}-points.npy"))
+    for k in (0, 1, 0, 1)
+]
+problems = jaxcal.stack(several)
+free = jaxcal.calibrate_batch(problems, "conventional")
+there = jaxcal.calibrate_batch(jax.device_put(problems, second), "conventional")
+assert there.rms.devices() == {second}, there.rms.devices()
+np.testing.assert_allclose(there.image_to_probe, free.image_to_probe, atol=1e-9)
+sharding = NamedSharding(Mesh(np.array([first, second]), "k"), PartitionSpec("k"))
+spread = jaxcal.calibrate_batch(jax.device_put(problems, sharding), "conventional", chunk=2)
+assert spread.rms.devices() == {first, second}
+np.testing.assert_allclose(spread.image_to_probe, free.image_to_probe, atol=1e-9)
+import dataclasses
+there = jax.device_put(problems, second)
+torn = dataclasses.replace(there, poses=jax.device_put(problems.poses, first))
+try:
+    jaxcal.calibrate_batch(torn, "conventional")
+except jaxcal.InputError as error:
+    print(error)
+"""
+
+
+def test_committed_and_sharded_arrays_stay_on_their_devices(tmp_path):
+    said = run_fresh(DEVICES, tmp_path, JAX_NUM_CPU_DEVICES="2", JAX_PLATFORMS="cpu")
+    assert "different devices" in said
+
+
+def blocks_of(page: str) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```$", (DOCS / page).read_text(), re.M | re.S)
+
+
+def test_the_documentations_examples_with_another_solver_and_on_another_problem():
+    first, dogleg, pieces, circle = (blocks_of("api.md")[k] for k in range(4))
+    names: dict[str, object] = {}
+    exec(compile(first, "api.md", "exec"), names)
+    assert np.isfinite(names["gradient"].measurements).all()
+    exec(compile(dogleg, "api.md", "exec"), names)
+    assert names["result"].status == "converged"
+    assert names["result"].stationarity < 1e-8
+    exec(compile(pieces, "api.md", "exec"), names)
+
+    def cost(tangent):
+        return jnp.sum(names["residual"](tangent, names["problem"]) ** 2)
+
+    value, slope = jax.value_and_grad(cost)(names["solution"].value)
+    assert value < cost(jnp.zeros(9))
+    assert np.abs(slope).max() < 1e-5 * value
+    exec(compile(circle, "api.md", "exec"), names)
+    np.testing.assert_allclose(names["circle"]["centre"], [3, 1], atol=0.02)
+    np.testing.assert_allclose(names["circle"]["radius"], 5, atol=0.02)
+
+
+def test_our_solver_on_another_problem_equals_a_dense_one_and_differentiates():
+    from scipy.optimize import least_squares
+
+    from jaxcal import backend
+
+    rng = np.random.default_rng(1)
+    x = np.linspace(0, 1, 12)
+    data = np.stack([x, 2 + 3 * x**2], 1) + 0.05 * rng.normal(size=(12, 2))
+
+    def residual(curve, local, data):
+        return jnp.stack([local, curve[0] + curve[1] * local**2], 1) - data
+
+    def fit(data):
+        return backend.arrow_least_squares(residual, jnp.ones(2), data[:, 0], data).value[0]
+
+    def dense(v):
+        return np.asarray(residual(v[:2], v[2:], data)).ravel()
+
+    peer = least_squares(dense, np.concatenate([np.ones(2), data[:, 0]]), xtol=1e-15, ftol=1e-15)
+    found = fit(jnp.asarray(data))
+    np.testing.assert_allclose(found, peer.x[:2], atol=1e-6)
+    slope = jax.jacobian(fit)(jnp.asarray(data))[:, 3, 1]
+    step = np.zeros_like(data)
+    step[3, 1] = 1e-5
+    difference = (fit(jnp.asarray(data + step)) - fit(jnp.asarray(data - step))) / 2e-5
+    np.testing.assert_allclose(slope, difference, rtol=1e-5)
+
+
+def test_another_solver_is_refused_where_it_cannot_do_it():
+    other = Options(solver=optx.LevenbergMarquardt(1e-8, 1e-8))
+    for arguments in ({"method": "alternating"}, {"prior": "bounded"}):
+        with pytest.raises(jaxcal.InputError, match="bounds"):
+            jaxcal.calibrate(problem(1, images=8), options=other, **arguments)
+    with pytest.raises(jaxcal.InputError, match="plain numbers"):
+        Options(solver=optx.LevenbergMarquardt(jnp.asarray(1e-8), 1e-8))
+
+
+def test_without_derivatives_the_answer_is_a_constant():
+    there = problem(3, images=12)
+    still = Options(differentiate=False)
+
+    def rms(p, options):
+        result = jaxcal.calibrate(p, "conventional", options=options)
+        return result.rms, result.differentiable
+
+    gradient, flag = jax.grad(rms, has_aux=True)(there, still)
+    assert not flag
+    assert not np.any(gradient.measurements)
+    assert jaxcal.calibrate(there, "conventional").differentiable
+
+
+def test_a_deprecated_name_works_and_says_what_replaces_it():
+    @deprecated("better", "0.3")
+    def worse(x: int) -> int:
+        return x + 1
+
+    with pytest.warns(DeprecationWarning, match=r"worse is deprecated .* 0\.3: use better") as seen:
+        assert worse(1) == 2
+    assert len(seen) == 1
