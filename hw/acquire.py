@@ -21,7 +21,12 @@ from hw.acquire_live import Estimator
 from hw.errors import DeviceError, RefusedError
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
-from hw.midplane.pattern_injection import Operator, SteadyOperator, pattern_injection
+from hw.midplane.pattern_injection import (
+    Operator,
+    SkippedError,
+    SteadyOperator,
+    pattern_injection,
+)
 from hw.midplane.search import PlacementError, first_seen
 from hw.midplane.threshold_climb import threshold_climb
 from hw.poses import plan_poses
@@ -38,6 +43,7 @@ from jaxcal.cli.common import ExitCode
 from jaxcal.errors import CalibrationError, InputError
 
 PLACEMENTS = ("amplitude-scan", "threshold-climb", "pattern-injection", "none")
+OPERATORS = ("person", "window", "simulated")
 MOST_IMAGES = 1000
 _MOST_GIVEN_UP = 3
 _FURTHEST_START_MM = 3.0
@@ -89,6 +95,8 @@ class Request:
         seed: of the plan.
         every_frame: record every ultrasound frame, not one an image.
         bench: seed of the emulated bench; None for a real one.
+        operator: one of :data:`OPERATORS`: who follows the injected pattern, a person at the
+            terminal or before a window, or a rule.
     """
 
     images: int = 60
@@ -96,10 +104,13 @@ class Request:
     seed: int = 0
     every_frame: bool = False
     bench: int | None = None
+    operator: str = "simulated"
 
     def __post_init__(self) -> None:
         if self.placement not in PLACEMENTS:
             raise InputError(f"placement must be one of {', '.join(PLACEMENTS)}")
+        if self.operator not in OPERATORS:
+            raise InputError(f"operator must be one of {', '.join(OPERATORS)}")
         if not 4 <= self.images <= MOST_IMAGES:
             raise InputError(f"images must be 4 to {MOST_IMAGES}, not {self.images}")
 
@@ -183,7 +194,7 @@ def acquire(
         confirm: asked once before anything moves, with the plan of motion; resuming asks again.
         say: told one line after every image, and of everything that a person should know.
         oracle: of an emulated bench; its truth goes into the recording.
-        operator: makes who follows the injected pattern.
+        operator: makes who follows the injected pattern, afresh for every pose.
         pause: to hold the run between images.
         watch: limits of the devices' silence.
 
@@ -314,6 +325,10 @@ def _run(
                 began = clock.now()
                 try:
                     placement = _place(job, row, stage, estimator, operator)
+                except SkippedError as error:
+                    given_up.append(row)
+                    note("skipped", f"pose {row + 1}: {error.args[0]}")
+                    continue
                 except PlacementError as error:
                     given_up.append(row)
                     note("given up", f"pose {row + 1}: {error}")
@@ -374,7 +389,10 @@ def _place(
         case "amplitude-scan":
             return amplitude_scan(stage, settings, start)
         case "pattern-injection":
-            return pattern_injection(stage, stage, operator(), settings, start)
+            title = f"pose {row + 1} of {len(job.targets)}"
+            return pattern_injection(
+                stage, stage, operator(), settings, start, frame=stage.frame, title=title
+            )
     return first_seen(stage, settings, 0.0)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from datetime import datetime
 from typing import TYPE_CHECKING
@@ -18,10 +18,15 @@ from jaxcal.errors import InputError
 if TYPE_CHECKING:
     from hw.acquire import Confirm, Outcome, Request
     from hw.bench.run import Bench
+    from hw.keys import Keyboard
+    from hw.midplane.pattern_injection import Operator
+    from hw.midplane.terminal_image import Screen
+    from hw.robot.safety import Confirmation, MotionPlan
     from hw.setup import Setup
 
 _RESUMED_BY_ITSELF = 30
 PLACEMENTS = ("amplitude-scan", "threshold-climb", "pattern-injection", "none")
+OPERATORS = ("person", "window", "simulated")
 
 
 @click.group(
@@ -62,6 +67,12 @@ _bench_seed = click.option(
     type=click.Choice(PLACEMENTS),
     help="How the target is brought into the mid-plane.  [default: amplitude-scan]",
 )
+@click.option(
+    "--operator",
+    type=click.Choice(OPERATORS),
+    help="Who follows the injected pattern: you at this terminal, you before a window, or a rule.  "
+    "[default: person with --setup, simulated with --bench]",
+)
 @click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Of the plan.  [default: 0]")
 @click.option("--every-frame", is_flag=True, help="Record every ultrasound frame, not one a pose.")
 @click.option("--resume", is_flag=True, help="Go on with RECORDING, which ended early.")
@@ -76,6 +87,7 @@ def acquire(
     setup_path: str | None,
     images: int | None,
     placement: str | None,
+    operator: str | None,
     seed: int | None,
     every_frame: bool,
     resume: bool,
@@ -94,13 +106,16 @@ def acquire(
     if not bench and (speed is not None or bench_seed is not None):
         raise InputError("--speed and --bench-seed need --bench")
     given = [name for name, value in (
-        ("--images", images), ("--placement", placement), ("--seed", seed),
+        ("--images", images), ("--placement", placement), ("--operator", operator),
+        ("--seed", seed),
         ("--every-frame", every_frame or None), ("--bench-seed", bench_seed),
     ) if value is not None]  # fmt: skip
     if resume and given:
         raise InputError(f"{given[0]} does not go with --resume: the recording knows")
     if resume and recording is None:
         raise InputError("--resume needs the RECORDING to go on with")
+    if operator is not None and not resume and placement != "pattern-injection":
+        raise InputError("--operator needs --placement pattern-injection")
     if code is not None and not move:
         raise InputError("--confirm needs --move")
     from hw.recording_check import check_resumable, settings_of
@@ -108,7 +123,9 @@ def acquire(
     if resume:
         assert recording is not None
         check_resumable(recording)
-        bench_seed = _recorded_bench(settings_of(recording), bench)
+        recorded = settings_of(recording)
+        bench_seed = _recorded_bench(recorded, bench)
+        operator = _recorded_operator(recorded)
     path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
     from jaxcal.cli.cache import enable_compilation_cache
 
@@ -116,10 +133,14 @@ def acquire(
     from hw.acquire import Request
 
     request = None
+    if operator is None:
+        asks = placement == "pattern-injection" and not bench
+        operator = "person" if asks else "simulated"
     if not resume:
         request = Request(
             images or 60, placement or PLACEMENTS[0], seed or 0, every_frame,
             (bench_seed or 0) if bench else None,
+            operator,
         )  # fmt: skip
     with ExitStack() as stack:
         emulated = _started(stack, bench, bench_seed, speed)
@@ -128,7 +149,7 @@ def acquire(
             return _dry_run(setup, path, request, preview)
         if preview is not None:
             _preview(setup, request, preview)
-        return _acquire(setup, path, request, emulated, code)
+        return _acquire(setup, path, request, emulated, code, operator)
 
 
 @commands.command()
@@ -177,6 +198,12 @@ def _recorded_bench(settings: dict[str, object], bench: bool) -> int | None:
     return seed if isinstance(seed, int) else None
 
 
+def _recorded_operator(settings: dict[str, object]) -> str:
+    asked = settings.get("request")
+    operator = asked.get("operator") if isinstance(asked, dict) else None
+    return operator if isinstance(operator, str) and operator in OPERATORS else "simulated"
+
+
 def _started(stack: ExitStack, bench: bool, seed: int | None, speed: float | None) -> Bench | None:
     if not bench:
         return None
@@ -196,24 +223,38 @@ def _setup_of(path: str | None, emulated: Bench | None) -> Setup:
 
 
 def _acquire(
-    setup: Setup, path: str, request: Request | None, emulated: Bench | None, code: str | None
+    setup: Setup,
+    path: str,
+    request: Request | None,
+    emulated: Bench | None,
+    code: str | None,
+    operator: str,
 ) -> int:
     from hw.acquire import AcquisitionStopped, Pause
     from hw.acquire import acquire as run_acquisition
     from hw.emulated import BenchOracle
     from hw.keys import watch_keys
+    from hw.midplane.terminal_image import Screen
 
-    pause = Pause()
+    pause, screen = Pause(), Screen(sys.stderr)
+    confirming = _confirming(setup, emulated is not None, code)
 
     def attempt(request: Request | None) -> Outcome:
+        def confirm(plan: MotionPlan) -> Confirmation:
+            with keyboard.lines():
+                return confirming(plan)
+
         return run_acquisition(
-            setup, path, request, _confirming(setup, emulated is not None, code),
-            say=lambda line: click.echo(line, err=True),
+            setup, path, request, confirm,
+            say=screen.say,
             oracle=None if emulated is None else BenchOracle(emulated),
+            operator=_operators(operator, keyboard, screen),
             pause=pause,
         )  # fmt: skip
 
-    with watch_keys(pause):
+    # A person's Enter accepts a place.
+    pause_keys = ("p",) if operator == "person" else ("enter", "p")
+    with watch_keys(pause, screen.say, pause_keys) as keyboard:
         for _ in range(_RESUMED_BY_ITSELF if emulated is not None else 0):
             try:
                 return _finished(path, attempt(request), setup)
@@ -221,9 +262,32 @@ def _acquire(
                 if error.exit_code == ExitCode.INTERRUPTED or not error.by_itself:
                     raise
                 # A busy machine trips the emulated controller's watchdog; nobody has to look.
-                click.echo(f"stopped: {error}", err=True)
+                screen.say(f"stopped: {error}")
                 request = None
         return _finished(path, attempt(request), setup)
+
+
+def _operators(operator: str, keyboard: Keyboard, screen: Screen) -> Callable[[], Operator]:
+    """Who follows the injected pattern at each pose.
+
+    Raises:
+        InputError: a person without a terminal, or without a display for the window.
+    """
+    from hw.midplane.live_view import TerminalOperator, WindowOperator
+    from hw.midplane.pattern_injection import SteadyOperator
+
+    match operator:
+        case "person":
+            if not keyboard.there:
+                raise InputError(
+                    "pattern injection by a person needs a terminal to read keys from; "
+                    "--operator simulated follows a rule instead"
+                )
+            return lambda: TerminalOperator(keyboard, screen)
+        case "window":
+            window = WindowOperator()
+            return lambda: window
+    return SteadyOperator
 
 
 def _finished(path: str, outcome: Outcome, setup: Setup) -> int:

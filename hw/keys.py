@@ -1,41 +1,216 @@
-"""Keys of the person at the terminal: Enter holds the acquisition, and lets it go on."""
+"""Keys of the person at the terminal, one at a time, without Enter.
+
+Nothing is read where standard input is no terminal, or where this process is in the background.
+Ctrl-C stays a signal, and the terminal is as it was afterwards.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import queue
+import select
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import ModuleType
 from typing import TYPE_CHECKING
-
-import click
 
 if TYPE_CHECKING:
     from hw.acquire import Pause
 
+_PERIOD_S = 0.05
+_NAMES = {
+    b"\r": "enter", b"\n": "enter", b"\x1b": "escape",
+    b"\x1b[A": "up", b"\x1b[B": "down", b"\x1bOA": "up", b"\x1bOB": "down",
+    b"\x1b[5~": "pageup", b"\x1b[6~": "pagedown",
+}  # fmt: skip
+
+
+def names_of(typed: bytes) -> list[str]:
+    """Names of the keys in what a terminal sent at once; unknown control sequences are left out."""
+    names = []
+    while typed:
+        size = next((n for n in (4, 3) if typed[:n] in _NAMES), 1)
+        if size == 1 and typed[:1] == b"\x1b" and typed[1:2] in (b"[", b"O"):
+            # A control sequence ends with its first letter or tilde.
+            size = 2
+            while size < len(typed) and not (
+                typed[size : size + 1].isalpha() or typed[size] == 126
+            ):
+                size += 1
+            typed = typed[size + 1 :]
+            continue
+        key = typed[:size]
+        typed = typed[size:]
+        if key in _NAMES:
+            names.append(_NAMES[key])
+        elif key.isascii() and key.decode().isprintable():
+            names.append(key.decode())
+    return names
+
+
+class Keyboard:
+    """Hands every key to whoever asks for one, and otherwise lets the pause keys hold the run.
+
+    Args:
+        pause: held and released by ``pause_keys`` while nobody asks.
+        pause_keys: names of keys.
+        say: told what the pause keys did.
+    """
+
+    def __init__(
+        self, pause: Pause, pause_keys: tuple[str, ...], say: Callable[[str], None]
+    ) -> None:
+        self._pause, self._pause_keys, self._say = pause, pause_keys, say
+        self._keys: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._asking = threading.Event()
+        self._by_lines = threading.Event()
+        self._terminal = _Terminal() if _in_foreground() else None
+        self._ending = False
+        self._thread: threading.Thread | None = None
+
+    @property
+    def there(self) -> bool:
+        """Whether there is a terminal to read from."""
+        return self._terminal is not None
+
+    def __enter__(self) -> Keyboard:
+        if self._terminal is not None:
+            self._terminal.keys()
+            self._thread = threading.Thread(target=self._listen, daemon=True, name="keys")
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ending = True
+        if self._thread is not None and self._terminal is not None:
+            self._thread.join()
+            self._terminal.lines()
+        self._pause.go_on()
+
+    @contextmanager
+    def asking(self) -> Iterator[None]:
+        """Keys go to :meth:`read` meanwhile; those pressed before are forgotten."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._keys.get_nowait()
+        self._asking.set()
+        try:
+            yield
+        finally:
+            self._asking.clear()
+
+    def read(self, timeout_s: float) -> str | None:
+        """The next key's name within :meth:`asking`; None if none came in time."""
+        try:
+            return self._keys.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+    @contextmanager
+    def lines(self) -> Iterator[None]:
+        """The terminal reads whole lines meanwhile, for a question that is answered with Enter."""
+        if self._terminal is None:
+            yield
+            return
+        self._by_lines.set()
+        with self._terminal.lock:
+            self._terminal.lines()
+            try:
+                yield
+            finally:
+                self._terminal.keys()
+                self._by_lines.clear()
+
+    def _listen(self) -> None:
+        terminal = self._terminal
+        assert terminal is not None
+        while not self._ending:
+            if self._by_lines.is_set():
+                time.sleep(_PERIOD_S)
+                continue
+            with terminal.lock:
+                typed = terminal.typed()
+            if typed is None:
+                return
+            for name in names_of(typed):
+                if self._asking.is_set():
+                    self._keys.put(name)
+                elif name in self._pause_keys:
+                    self._toggle(name)
+
+    def _toggle(self, name: str) -> None:
+        if self._pause.held:
+            self._pause.go_on()
+        else:
+            self._pause.hold()
+            self._say(f"paused after this image; {_spoken(name)} goes on")
+
+
+class _Terminal:
+    """Standard input, a POSIX terminal: by lines as it was, or key by key."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self._number = sys.stdin.fileno()
+        self._before = _termios().tcgetattr(self._number)
+
+    def keys(self) -> None:
+        import tty
+
+        tty.setcbreak(self._number)
+
+    def lines(self) -> None:
+        termios = _termios()
+        termios.tcsetattr(self._number, termios.TCSADRAIN, self._before)
+
+    def typed(self) -> bytes | None:
+        """What was typed within a short time; None when the terminal is gone."""
+        try:
+            if not self._waiting():
+                return b""
+            typed = os.read(self._number, 256)
+            # The rest of an arrow key's sequence may come a little later than its first byte.
+            if typed.endswith(b"\x1b") and self._waiting():
+                typed += os.read(self._number, 256)
+            return typed or None
+        except OSError:
+            return None
+
+    def _waiting(self) -> bool:
+        return bool(select.select([self._number], [], [], _PERIOD_S)[0])
+
 
 @contextmanager
-def watch_keys(pause: Pause) -> Iterator[None]:
-    """Let Enter hold an acquisition before its next image; without a terminal nothing listens."""
+def watch_keys(
+    pause: Pause, say: Callable[[str], None], pause_keys: tuple[str, ...] = ("enter", "p")
+) -> Iterator[Keyboard]:
+    """Let a key hold an acquisition before its next image; without a terminal nothing listens."""
+    with Keyboard(pause, pause_keys, say) as keyboard:
+        if keyboard.there:
+            say(f"{_spoken(pause_keys[0])} pauses, Ctrl-C stops the robot and ends")
+        yield keyboard
+
+
+def _spoken(name: str) -> str:
+    return "Enter" if name == "enter" else name
+
+
+def _termios() -> ModuleType:
+    import termios
+
+    return termios
+
+
+def _in_foreground() -> bool:
+    """Whether standard input is a terminal that this process may read from."""
     if sys.stdin is None or not sys.stdin.isatty():
-        yield
-        return
-    done = threading.Event()
-
-    def listen() -> None:
-        for _ in sys.stdin:
-            if done.is_set():
-                return
-            if pause.held:
-                pause.go_on()
-            else:
-                pause.hold()
-                click.echo("paused after this image; Enter goes on", err=True)
-
-    threading.Thread(target=listen, daemon=True, name="keys").start()
-    click.echo("Enter pauses, Ctrl-C stops the robot and ends", err=True)
+        return False
     try:
-        yield
-    finally:
-        done.set()
-        pause.go_on()
+        _termios()
+        return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+    except (ImportError, OSError, ValueError):
+        return False

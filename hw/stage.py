@@ -97,6 +97,16 @@ class ProbeStage:
         """Switch injection."""
         self._session.echo.inject(on, delay_ticks)
 
+    def frame(self) -> np.ndarray | None:
+        """The newest B-mode frame for whoever looks on; None where no images come.
+
+        Raises:
+            DeviceError: a device is lost, so that looking on leads nowhere.
+        """
+        self._session.wait_until_clear()
+        image = self._session.latest_image()
+        return image.array if image is not None and image.array.dtype == np.uint8 else None
+
     @property
     def arrived_s(self) -> float:
         """Bench time since which nothing has moved and the threshold is what it is."""

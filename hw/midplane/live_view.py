@@ -1,29 +1,37 @@
 """What a person looks at during pattern injection: B-mode frame, bar, and how the bar went.
 
-Two operators for :func:`hw.midplane.pattern_injection.pattern_injection`: a window (matplotlib with
-a display) and a terminal. Keys are the same in both:
+Two operators for :func:`hw.midplane.pattern_injection.pattern_injection`: a terminal, and a window
+(matplotlib with a display). Both say in words what to do next. Keys are the same in both:
 
     up / down, k / j     one step along the elevational axis
     page up / down, K/J  four steps
     + / -                larger or smaller steps
     m                    to the middle of the two flanks seen so far
     enter                accept
-    escape, q            give up
+    s, q, escape         skip this pose
 """
 
 from __future__ import annotations
 
-import sys
 from collections import deque
-from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Protocol, runtime_checkable
 
-from hw.midplane.pattern_injection import LONGEST, Decision, View, middle_of
+import numpy as np
+
+from hw.midplane.pattern_injection import LONGEST, Decision, View, middle_of, sides_seen
+from hw.midplane.terminal_image import COLUMNS, ROWS, Screen, picture
 from jaxcal.errors import InputError
 
 _LEAST_STEP_MM, _LARGEST_STEP_MM = 0.02, 1.0
-_INSTRUCTION = (
-    "Move up through the longest bar until it shrinks on both sides, go to the middle (m), accept "
-    "(enter)."
+_REFRESH_S = 0.25
+_NEAR_MM = 0.3
+_PROFILE = " ▁▂▃▄▅▆▇█"
+_PROFILE_COLUMNS = 60
+_OTHER_ROWS = 9
+KEYS = (
+    "k/up j/down: step, K J: four steps, + -: step size, m: middle, Enter: accept, "
+    "s: skip this pose, Ctrl-C: stop"
 )
 
 
@@ -31,15 +39,19 @@ class Keys:
     """Turns key presses into decisions; the step is the person's.
 
     Attributes:
-        step_mm: of the next move.
+        step_mm: of the next move; None: the procedure's own.
     """
 
     def __init__(self) -> None:
         self.step_mm: float | None = None
 
+    def step(self, view: View) -> float:
+        """Of the next move, mm."""
+        return view.step_mm if self.step_mm is None else self.step_mm
+
     def decide(self, key: str, view: View) -> Decision | None:
         """What a key asks for; None where it asks for no move (an unknown key, another step)."""
-        step = view.step_mm if self.step_mm is None else self.step_mm
+        step = self.step(view)
         way = {"up": 1, "k": 1, "pageup": 4, "K": 4,
                "down": -1, "j": -1, "pagedown": -4, "J": -4}.get(key)  # fmt: skip
         if way is not None:
@@ -51,7 +63,7 @@ class Keys:
             return Decision("go", middle_of(view.seen))
         elif key == "enter":
             return Decision("accept")
-        elif key in ("escape", "q"):
+        elif key in ("escape", "q", "s"):
             return Decision("give-up")
         return None
 
@@ -65,62 +77,86 @@ def describe(view: View, step_mm: float) -> str:
     )
 
 
+def advice(view: View) -> str:
+    """What to do next, in words: both flanks must be seen before the middle between them counts."""
+    below, above = sides_seen(view.seen)
+    gone = "" if view.length else "The pattern is gone here. "
+    if not below:
+        return f"{gone}Step down (j) until the bar is clearly shorter than the longest, twice."
+    if not above:
+        return (
+            f"{gone}Step up (k) through the longest bar until it is clearly shorter again, twice."
+        )
+    if view.length > 0 and abs(view.offset_mm - middle_of(view.seen)) <= _NEAR_MM:
+        return "This is the middle: Enter accepts it, s skips the pose."
+    return "The bar was seen to shrink on both sides: m lets the robot go to the middle."
+
+
+def profile(view: View, columns: int = _PROFILE_COLUMNS) -> tuple[str, str]:
+    """The longest bar seen in each stretch of offsets, drawn as columns, and a pointer below it."""
+    places = np.array([place for place, _ in view.seen])
+    low, high = min(places.min(), -2.0), max(places.max(), 2.0)
+    at = np.clip(((places - low) / (high - low) * (columns - 1)).round().astype(int), 0, None)
+    heights = np.zeros(columns, int)
+    np.maximum.at(heights, at, np.array([length for _, length in view.seen]))
+    steps = np.ceil(heights / LONGEST * (len(_PROFILE) - 1)).astype(int)
+    drawn = "".join(_PROFILE[step] for step in steps)
+    here = int(np.clip(round((view.offset_mm - low) / (high - low) * (columns - 1)), 0, columns))
+    return f"{low:+6.1f} {drawn} {high:+.1f} mm", f"{'':7}{'':{here}}^"
+
+
+@runtime_checkable
+class KeySource(Protocol):
+    """Where keys come from (see :class:`hw.keys.Keyboard`)."""
+
+    def asking(self) -> AbstractContextManager[None]:
+        """Keys go to :meth:`read` meanwhile; those pressed before are forgotten."""
+        ...
+
+    def read(self, timeout_s: float) -> str | None:
+        """The next key's name; None if none came in time."""
+        ...
+
+
 class TerminalOperator:
     """A person at a terminal.
 
     Args:
-        read_key: gives the next key's name; by default from standard input, which must be a
-            terminal.
-        write: takes the text to show; by default standard output.
+        keys: what the person types; keys pressed while the robot moves do not count, because they
+            were pressed before its result was seen.
+        screen: where to show it.
     """
 
-    def __init__(
-        self,
-        read_key: Callable[[], str] | None = None,
-        write: Callable[[str], object] | None = None,
-    ) -> None:
-        if read_key is None and not sys.stdin.isatty():
-            raise InputError("pattern injection by hand needs a terminal to read keys from")
-        self._read = _read_key if read_key is None else read_key
-        self._write = sys.stdout.write if write is None else write
+    def __init__(self, keys: KeySource, screen: Screen) -> None:
+        self._source, self._screen = keys, screen
         self._keys = Keys()
-        self._write(_INSTRUCTION + "\n")
 
     def __call__(self, view: View) -> Decision:
-        """Show and ask."""
+        """Show, keep the frame up to date, and wait for a key that decides."""
+        with self._source.asking():
+            while True:
+                self._show(view)
+                key = self._source.read(_REFRESH_S)
+                decision = None if key is None else self._keys.decide(key, view)
+                if decision is not None:
+                    if decision.what != "go":
+                        self._screen.clear()
+                    return decision
+
+    def _show(self, view: View) -> None:
+        frame = view.frame()
+        rows = [view.title] if view.title else []
+        if frame is not None and self._screen.pictures:
+            columns, lines = self._screen.size
+            height = min(ROWS, lines - _OTHER_ROWS)
+            if height > 0:
+                rows += picture(frame, min(COLUMNS, columns - 1), height)
+        rows.append(describe(view, self._keys.step(view)))
+        rows += profile(view)
         if view.message:
-            self._write(view.message + "\n")
-        while True:
-            step = self._keys.step_mm
-            self._write(describe(view, view.step_mm if step is None else step) + "\n")
-            sys.stdout.flush()
-            decision = self._keys.decide(self._read(), view)
-            if decision is not None:
-                return decision
-
-
-def _read_key() -> str:
-    """One key of a POSIX terminal, by the names of :class:`Keys`."""
-    import termios
-    import tty
-
-    number = sys.stdin.fileno()
-    before = termios.tcgetattr(number)
-    try:
-        tty.setcbreak(number)
-        first = sys.stdin.read(1)
-        if first == "\x1b":
-            import select
-
-            if not select.select([sys.stdin], [], [], 0.05)[0]:
-                return "escape"
-            rest = sys.stdin.read(2)
-            if rest in ("[5", "[6"):
-                sys.stdin.read(1)
-            return {"[A": "up", "[B": "down", "[5": "pageup", "[6": "pagedown"}.get(rest, "")
-        return {"\n": "enter", "\r": "enter", "": "escape"}.get(first, first)
-    finally:
-        termios.tcsetattr(number, termios.TCSADRAIN, before)
+            rows.append(view.message)
+        rows += [advice(view), KEYS]
+        self._screen.show(rows)
 
 
 class WindowOperator:
@@ -156,30 +192,32 @@ class WindowOperator:
         figure.canvas.mpl_connect("close_event", lambda _: self._pressed.append("escape"))
 
     def __call__(self, view: View) -> Decision:
-        """Show and wait for a key."""
+        """Show, keep the frame up to date, and wait for a key that decides."""
         while True:
             self._show(view)
-            while not self._pressed:
-                self._figure.canvas.start_event_loop(0.05)
+            if not self._pressed:
+                self._figure.canvas.start_event_loop(_REFRESH_S)
+                continue
             decision = self._keys.decide(self._pressed.popleft(), view)
             if decision is not None:
                 return decision
 
     def _show(self, view: View) -> None:
-        if view.frame is not None:
+        frame = view.frame()
+        if frame is not None:
             if self._picture is None:
                 self._picture = self._image_axes.imshow(
-                    view.frame, cmap="gray", vmin=0, vmax=255, aspect=self._aspect
+                    frame, cmap="gray", vmin=0, vmax=255, aspect=self._aspect
                 )
             else:
-                self._picture.set_data(view.frame)
+                self._picture.set_data(frame)
         places = [place for place, _ in view.seen]
         self._line.set_data(places, [length for _, length in view.seen])
         self._here.set_data(places[-1:], [view.length])
         margin = 0.5
         self._axes.set_xlim(min(places) - margin, max(places) + margin)
-        step = view.step_mm if self._keys.step_mm is None else self._keys.step_mm
-        self._axes.set_title(describe(view, step).split("|")[-1].strip())
-        self._figure.suptitle(view.message or _INSTRUCTION, fontsize=9)
+        self._axes.set_title(describe(view, self._keys.step(view)).split("|")[-1].strip())
+        text = "\n".join(part for part in (view.title, view.message, advice(view)) if part)
+        self._figure.suptitle(text, fontsize=9)
         self._figure.canvas.draw_idle()
         self._figure.canvas.flush_events()

@@ -13,7 +13,7 @@ The operator is a callable: a person before a live view (:mod:`hw.midplane.live_
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
@@ -30,6 +30,8 @@ LONGEST = 31
 _DARKEST = 64
 _MOST_LOOKS = 150
 _VISIBLE_DROP = 4
+_LEAST_SHORT = 2
+_SAME_PLACE_MM = 0.05
 # Shown on a scale that begins here, so that a few per cent near the maximum can be seen.
 _SCALE_FROM = 0.4
 
@@ -75,6 +77,17 @@ def bar(length: int, line: int, lines: int) -> bytes:
     return pattern.tobytes()
 
 
+class SkippedError(PlacementError):
+    """The operator skipped the pose; the probe is at the last good place."""
+
+
+Frame = UInt8[np.ndarray, "rows columns"]
+
+
+def _no_frame() -> None:
+    return None
+
+
 @dataclass(frozen=True)
 class View:
     """What the operator has before the eyes.
@@ -86,8 +99,10 @@ class View:
         step_mm: of the next move.
         amplitude: counts.
         seen: (offset, length) of every look so far, this one last.
-        frame: the newest B-mode frame, or None.
+        frame: gives the newest B-mode frame, or None where there is none; raises the error of a
+            device that is lost while the operator looks.
         message: what the procedure has to say.
+        title: which pose this is.
     """
 
     length: int
@@ -96,13 +111,14 @@ class View:
     step_mm: float
     amplitude: float
     seen: tuple[tuple[float, int], ...]
-    frame: UInt8[np.ndarray, "rows columns"] | None = None
+    frame: Callable[[], Frame | None] = _no_frame
     message: str = ""
+    title: str = ""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What the operator wants: go to an offset, accept the place, or give up."""
+    """What the operator wants: go to an offset, accept the place, or skip the pose."""
 
     what: Literal["go", "accept", "give-up"]
     offset_mm: float = 0.0
@@ -167,8 +183,23 @@ def middle_of(seen: tuple[tuple[float, int], ...]) -> float:
     return 0.5 * float(rising + falling)
 
 
-def _flanks(
-    seen: list[tuple[float, int]], place: float
+def sides_seen(seen: Sequence[tuple[float, int]]) -> tuple[bool, bool]:
+    """Whether the bar was seen to shrink below, and above, the place where it was longest.
+
+    It must be clearly shorter at two places on a side: one may be a stop that fell short.
+    """
+    longest = max(length for _, length in seen)
+    place = next(at for at, length in seen if length == longest)
+    short = {
+        round(at / _SAME_PLACE_MM) for at, length in seen if length <= longest - 2 * _VISIBLE_DROP
+    }
+    middle = round(place / _SAME_PLACE_MM)
+    below, above = sum(at < middle for at in short), sum(at > middle for at in short)
+    return below >= _LEAST_SHORT, above >= _LEAST_SHORT
+
+
+def flanks(
+    seen: Sequence[tuple[float, int]], place: float
 ) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
     """On either side of a place, the nearest stop with a visibly shorter bar and the one before."""
     longest = max(length for _, length in seen)
@@ -193,7 +224,8 @@ def pattern_injection(
     settings: Settings | None = None,
     start_mm: float = 0.0,
     *,
-    frame: Callable[[], UInt8[np.ndarray, "rows columns"] | None] | None = None,
+    frame: Callable[[], Frame | None] = _no_frame,
+    title: str = "",
     delay_ticks: int = 400,
     watch: Callable[[float, float, int], None] | None = None,
 ) -> Placement:
@@ -206,6 +238,7 @@ def pattern_injection(
         settings: see there; every move, the operator's too, is within its caps and from below.
         start_mm: where the mid-plane is expected, as an offset from the plan's pose.
         frame: gives the newest B-mode frame for the view.
+        title: which pose this is, for the view.
         delay_ticks: how long after the echo the bar is sent, clock ticks.
         watch: told of every stop.
 
@@ -214,7 +247,8 @@ def pattern_injection(
         shorter, widened by what nobody sees. Injection is off again.
 
     Raises:
-        PlacementError: given up by the operator or by a guard; the probe is at the last good place.
+        SkippedError: by the operator.
+        PlacementError: given up by a guard; the probe is at the last good place.
     """
     settings = Settings() if settings is None else settings
 
@@ -234,14 +268,15 @@ def pattern_injection(
             injector.inject(True, delay_ticks)
             decision = operator(View(
                 seen[-1][1], max(length for _, length in seen), where, settings.fine_mm,
-                echoes.peak, tuple(seen), None if frame is None else frame(), message,
+                echoes.peak, tuple(seen), frame, message, title,
             ))  # fmt: skip
             message = ""
             if decision.what == "give-up":
-                raise PlacementError("the operator gave up")
+                raise SkippedError("the operator gave up the pose")
             if decision.what == "accept":
-                low, high = _flanks(seen, where)
-                if low is not None and high is not None and echoes.heard:
+                low, high = flanks(seen, where)
+                enough = all(sides_seen(seen)) and echoes.heard
+                if enough and low is not None and high is not None:
                     edges = (0.5 * sum(low), 0.5 * sum(high))
                     spread = np.hypot(low[1] - low[0], high[1] - high[0]) / np.sqrt(48.0)
                     spread = float(np.hypot(spread, settings.position_sd_mm / np.sqrt(2.0)))

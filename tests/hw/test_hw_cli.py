@@ -28,6 +28,8 @@ from hw.recording_layout import Header
         (["acquire", "--setup", "x.toml", "--speed", "2"], "need --bench"),
         (["acquire", "--setup", "missing.toml"], "no such file"),
         (["acquire", "--bench", "--confirm", "12345678"], "--confirm needs --move"),
+        (["acquire", "--bench", "--operator", "person"], "--operator needs --placement"),
+        (["acquire", "--bench", "--operator", "nobody"], "'--operator'"),
         (["check"], "either --bench or --setup"),
         (["bench", "--speed", "0"], "'--speed'"),
         (["fly"], "No such command"),
