@@ -39,6 +39,7 @@ from hw.robot.safety import Confirmation, MotionPlan, check_plan
 from hw.session import Session, Watch, median_times
 from hw.setup import Setup, controller_arm
 from hw.stage import ProbeStage
+from hw.view.feed import Audience, Nobody, watched
 from jaxcal.cli.common import ExitCode
 from jaxcal.errors import CalibrationError, InputError
 
@@ -184,6 +185,7 @@ def acquire(
     operator: Callable[[], Operator] = SteadyOperator,
     pause: Pause | None = None,
     watch: Watch | None = None,
+    view: Audience | None = None,
 ) -> Outcome:
     """Run the experiment to its end, or go on with one that ended early.
 
@@ -197,6 +199,7 @@ def acquire(
         operator: makes who follows the injected pattern, afresh for every pose.
         pause: to hold the run between images.
         watch: limits of the devices' silence.
+        view: told how it goes; nothing comes back from there.
 
     Returns:
         The outcome; the file is complete then.
@@ -214,7 +217,10 @@ def acquire(
     recorder = _open_recorder(path, job)
     with _closing(recorder):
         try:
-            return _run(job, recorder, estimator, confirm, say, oracle, operator, pause, watch)
+            return _run(
+                job, recorder, estimator, confirm, say, oracle, operator, pause, watch,
+                Nobody() if view is None else view,
+            )  # fmt: skip
         except KeyboardInterrupt:
             reason, interrupted = "interrupted", True
         except (DeviceError, CalibrationError) as error:
@@ -287,7 +293,7 @@ def _open_recorder(path: str | os.PathLike[str], job: _Job) -> Recorder:
 def _run(
     job: _Job, recorder: Recorder, estimator: Estimator, confirm: Confirm,
     say: Callable[[str], None], oracle: Oracle | None, operator: Callable[[], Operator],
-    pause: Pause | None, watch: Watch | None,
+    pause: Pause | None, watch: Watch | None, view: Audience,
 ) -> Outcome:  # fmt: skip
     setup, clock = job.setup, job.setup.clock
     started = clock.now()
@@ -298,10 +304,13 @@ def _run(
 
     note("resumed" if job.progress else "started", f"{len(job.missing)} images to take")
     session = Session(setup, recorder, watch=watch, every_frame=job.request.every_frame)
-    with session:
+    given_up: list[int] = []
+    skipped: list[int] = []
+    with session, watched(view, session):
         plan = _motion_plan(job, session, recorder)
         course = check_plan(plan)
         note("arm", NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}")
+        view.plan(setup, plan, [row for row in range(len(job.targets)) if row not in job.missing])
         confirmation = confirm(plan)
         note("confirmed", f"plan {plan.digest[:12]} for robot {plan.serial}")
 
@@ -316,21 +325,23 @@ def _run(
         )  # fmt: skip
         with motion:
             stage = ProbeStage(session, motion, job.targets, note)
-            given_up: list[int] = []
             for row in job.missing:
                 if pause is not None and pause.held:
                     note("paused", "before the next image")
                     pause.wait()
                     note("continued", "by the operator")
                 began = clock.now()
+                view.going(row)
                 try:
-                    placement = _place(job, row, stage, estimator, operator)
+                    placement = _place(job, row, stage, estimator, operator, view)
                 except SkippedError as error:
-                    given_up.append(row)
+                    skipped.append(row)
+                    view.given_up(row)
                     note("skipped", f"pose {row + 1}: {error.args[0]}")
                     continue
                 except PlacementError as error:
                     given_up.append(row)
+                    view.given_up(row)
                     note("given up", f"pose {row + 1}: {error}")
                     session.check()
                     if len(given_up) >= _MOST_GIVEN_UP and given_up[-_MOST_GIVEN_UP:] == list(
@@ -339,12 +350,15 @@ def _run(
                         raise
                     continue
                 _take(job, row, stage, session, recorder, estimator, placement, oracle, began)
+                view.taken(row, placement, estimator.answer)
                 say(estimator.line(len(job.targets), placement))
     if oracle is not None:
         _write_truth(recorder, oracle)
     note("finished", f"{estimator.count} images")
     digest = recorder.finish()
-    return Outcome(estimator.count, tuple(given_up), digest, clock.now() - started)
+    return Outcome(
+        estimator.count, tuple(sorted(given_up + skipped)), digest, clock.now() - started
+    )
 
 
 def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
@@ -377,23 +391,25 @@ def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
 
 
 def _place(
-    job: _Job, row: int, stage: ProbeStage, estimator: Estimator, operator: Callable[[], Operator]
-) -> Placement:
+    job: _Job, row: int, stage: ProbeStage, estimator: Estimator,
+    operator: Callable[[], Operator], view: Audience,
+) -> Placement:  # fmt: skip
     pose, settings = job.targets[row], job.setup.search
     start = estimator.expected_offset_mm(pose) if estimator.count >= _IMAGES_FOR_PREDICTION else 0.0
     start = float(np.clip(start, -_FURTHEST_START_MM, _FURTHEST_START_MM))
     stage.go_to(row)
     match job.request.placement:
         case "threshold-climb":
-            return threshold_climb(stage, settings, start)
+            return threshold_climb(stage, settings, start, watch=view.stop)
         case "amplitude-scan":
-            return amplitude_scan(stage, settings, start)
+            return amplitude_scan(stage, settings, start, watch=view.stop)
         case "pattern-injection":
             title = f"pose {row + 1} of {len(job.targets)}"
             return pattern_injection(
-                stage, stage, operator(), settings, start, frame=stage.frame, title=title
-            )
-    return first_seen(stage, settings, 0.0)
+                stage, stage, operator(), settings, start, frame=stage.frame, title=title,
+                watch=view.stop,
+            )  # fmt: skip
+    return first_seen(stage, settings, 0.0, watch=view.stop)
 
 
 def _take(

@@ -45,6 +45,11 @@ class Estimator:
         """Images taken."""
         return len(self._live) + self._left_out
 
+    @property
+    def answer(self) -> Calibration | None:
+        """The calibration from the images so far; None with too few."""
+        return self._result
+
     def warm_up(self, targets: np.ndarray) -> None:
         """Compile before anything moves, on what the drawing says that the plan will measure."""
         live, probe, scene = self._empty(), self._setup.probe, self._setup.scene

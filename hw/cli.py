@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from hw.midplane.terminal_image import Screen
     from hw.robot.safety import Confirmation, MotionPlan
     from hw.setup import Setup
+    from hw.view.feed import LiveView
 
 _RESUMED_BY_ITSELF = 30
 PLACEMENTS = ("amplitude-scan", "threshold-climb", "pattern-injection", "none")
@@ -79,6 +80,7 @@ _bench_seed = click.option(
 @click.option("--move", is_flag=True, help="Move the robot, after a confirmation; else a dry run.")
 @click.option("--confirm", "code", metavar="CODE", help="The plan's code, instead of being asked.")
 @click.option("--preview", type=click.Path(), metavar="PNG", help="Draw the plan.")
+@click.option("--view", is_flag=True, help="Show it live in the browser, on this machine only.")
 @_speed
 @_bench_seed
 def acquire(
@@ -94,6 +96,7 @@ def acquire(
     move: bool,
     code: str | None,
     preview: str | None,
+    view: bool,
     speed: float | None,
     bench_seed: int | None,
 ) -> int:
@@ -149,7 +152,7 @@ def acquire(
             return _dry_run(setup, path, request, preview)
         if preview is not None:
             _preview(setup, request, preview)
-        return _acquire(setup, path, request, emulated, code, operator)
+        return _acquire(setup, path, request, emulated, code, operator, view)
 
 
 @commands.command()
@@ -229,6 +232,7 @@ def _acquire(
     emulated: Bench | None,
     code: str | None,
     operator: str,
+    show: bool,
 ) -> int:
     from hw.acquire import AcquisitionStopped, Pause
     from hw.acquire import acquire as run_acquisition
@@ -239,6 +243,11 @@ def _acquire(
     pause, screen = Pause(), Screen(sys.stderr)
     confirming = _confirming(setup, emulated is not None, code)
 
+    def say(line: str) -> None:
+        screen.say(line)
+        if view is not None:
+            view.say(line)
+
     def attempt(request: Request | None) -> Outcome:
         def confirm(plan: MotionPlan) -> Confirmation:
             with keyboard.lines():
@@ -246,15 +255,22 @@ def _acquire(
 
         return run_acquisition(
             setup, path, request, confirm,
-            say=screen.say,
+            say=say,
             oracle=None if emulated is None else BenchOracle(emulated),
             operator=_operators(operator, keyboard, screen),
             pause=pause,
+            view=view,
         )  # fmt: skip
 
     # A person's Enter accepts a place.
     pause_keys = ("p",) if operator == "person" else ("enter", "p")
-    with watch_keys(pause, screen.say, pause_keys) as keyboard:
+    with ExitStack() as stack:
+        view: LiveView | None = None
+        if show:
+            from hw.view.feed import LiveView
+
+            view = stack.enter_context(LiveView(screen.say))
+        keyboard = stack.enter_context(watch_keys(pause, screen.say, pause_keys))
         for _ in range(_RESUMED_BY_ITSELF if emulated is not None else 0):
             try:
                 return _finished(path, attempt(request), setup)
@@ -262,7 +278,7 @@ def _acquire(
                 if error.exit_code == ExitCode.INTERRUPTED or not error.by_itself:
                     raise
                 # A busy machine trips the emulated controller's watchdog; nobody has to look.
-                screen.say(f"stopped: {error}")
+                say(f"stopped: {error}")
                 request = None
         return _finished(path, attempt(request), setup)
 

@@ -11,8 +11,8 @@ from typing import Literal
 
 from hw.errors import Device, DeviceError
 
-Extra = Literal["robot", "serial"]
-_DEVICE: dict[Extra, Device] = {"robot": "robot", "serial": "active echo"}
+Extra = Literal["robot", "serial", "view"]
+_DEVICE: dict[str, Device] = {"robot": "robot", "serial": "active echo"}
 
 
 def require(name: str, *, extra: Extra) -> ModuleType:

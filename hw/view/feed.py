@@ -1,0 +1,319 @@
+"""The acquisition's end of the live view: what is known, ten times a second, into a pipe.
+
+The pipe holds one message at most. While the viewer has not read it nothing more is put together,
+so a slow, stopped or dead viewer costs the acquisition nothing and holds nothing up; what it missed
+it never sees. What changes seldom is sent when it has changed, the pose and the newest frame every
+time.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from hw.errors import DeviceError
+from hw.extras import missing
+from hw.midplane.bracket import Placement
+from hw.robot.safety import MotionPlan
+from hw.session import Session
+from hw.setup import Setup
+from jaxcal.calibration import Calibration
+from jaxcal.errors import InputError
+from jaxcal.isolated import python_command
+
+RATE_HZ = 10.0
+_START_WALL_S = 30.0
+_END_WALL_S = 2.0
+_LINES = 5
+
+
+@runtime_checkable
+class Audience(Protocol):
+    """Who is told how an acquisition goes; see :class:`LiveView`."""
+
+    def plan(self, setup: Setup, plan: MotionPlan, done: list[int]) -> None:
+        """What shall be acquired; ``done`` are the rows that a resumed recording has."""
+        ...
+
+    def watch(self, session: Session | None) -> None:
+        """Whose poses and frames to show; None: no longer."""
+        ...
+
+    def going(self, row: int) -> None:
+        """The robot travels to a pose of the plan."""
+        ...
+
+    def stop(self, offset_mm: float, amplitude: float, threshold: int) -> None:
+        """The search listened somewhere."""
+        ...
+
+    def taken(self, row: int, placement: Placement, answer: Calibration | None) -> None:
+        """An image was taken, and this is the estimate now."""
+        ...
+
+    def given_up(self, row: int) -> None:
+        """No mid-plane was found there, or the operator skipped it."""
+        ...
+
+
+class Nobody:
+    """Looks at nothing."""
+
+    def plan(self, setup: Setup, plan: MotionPlan, done: list[int]) -> None:
+        """Nothing."""
+
+    def watch(self, session: Session | None) -> None:
+        """Nothing."""
+
+    def going(self, row: int) -> None:
+        """Nothing."""
+
+    def stop(self, offset_mm: float, amplitude: float, threshold: int) -> None:
+        """Nothing."""
+
+    def taken(self, row: int, placement: Placement, answer: Calibration | None) -> None:
+        """Nothing."""
+
+    def given_up(self, row: int) -> None:
+        """Nothing."""
+
+
+@contextmanager
+def watched(view: Audience, session: Session) -> Iterator[None]:
+    """Show a session's poses and frames as long as it is open."""
+    view.watch(session)
+    try:
+        yield
+    finally:
+        view.watch(None)
+
+
+class LiveView:
+    """The live view of one acquisition; a context manager.
+
+    Args:
+        say: told the address, and once that the viewer is gone.
+        port: of the page; another one is taken if it is not free.
+        rate_hz: messages a second.
+
+    Attributes:
+        url: of the page.
+        pid: of the viewer's process.
+        sent: messages.
+        left_out: messages for which the viewer had no room.
+        seconds: CPU time of the thread that feeds.
+
+    Raises:
+        InputError: viser is not installed, or the viewer does not start; one line.
+    """
+
+    def __init__(
+        self, say: Callable[[str], None], port: int = 8080, rate_hz: float = RATE_HZ
+    ) -> None:
+        cure = missing("viser", extra="view")
+        if cure is not None:
+            raise InputError(f"--view: {cure}")
+        self._say, self._period_s = say, 1.0 / rate_hz
+        self._process = subprocess.Popen(
+            python_command("hw.view.server", str(port)),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        self.pid = self._process.pid
+        self.url = self._greeting()
+        assert self._process.stdin is not None
+        self._pipe = self._process.stdin.fileno()
+        os.set_blocking(self._pipe, False)
+        self.sent = self.left_out = 0
+        self.seconds = 0.0
+        self._lock = threading.Lock()
+        self._session: Session | None = None
+        self._slow: dict[str, Any] = {"done": [], "given_up": [], "row": None, "said": []}
+        self._said: deque[str] = deque(maxlen=_LINES)
+        self._changed = True
+        self._pending = memoryview(b"")
+        self._frame_id: int | None = None
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._feed, daemon=True, name="view")
+        self._thread.start()
+        say(f"view: {self.url} (this machine only; it shows and never moves anything)")
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the viewer's process; safe to repeat."""
+        self._ending.set()
+        self._thread.join()
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with suppress(OSError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(_END_WALL_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+
+    # What the acquisition tells
+
+    def plan(self, setup: Setup, plan: MotionPlan, done: list[int]) -> None:
+        """What shall be acquired; ``done`` are the rows that a resumed recording has."""
+        scene, limits = setup.scene, plan.limits
+        self._tell(
+            plan=np.asarray(plan.targets, float)[:, :3].reshape(-1, 12).tolist(),
+            box=[list(limits.box_min_mm), list(limits.box_max_mm)],
+            tcp_offset=list(plan.tcp_offset),
+            arm=getattr(setup, "model", None) or getattr(limits, "arm_model", "") or "UR5",
+            image_to_probe=np.asarray(scene.image_to_probe, float).ravel().tolist(),
+            point=np.asarray(scene.point_mm, float).tolist(),
+            width_mm=float(setup.probe.width_mm),
+            done=list(done),
+            given_up=[],
+            row=None,
+        )
+
+    def watch(self, session: Session | None) -> None:
+        """Whose poses and frames to show; None: no longer."""
+        with self._lock:
+            self._session = session
+
+    def going(self, row: int) -> None:
+        """The robot travels to a pose of the plan."""
+        self._tell(row=row, stop=None)
+
+    def stop(self, offset_mm: float, amplitude: float, threshold: int) -> None:
+        """The search listened somewhere."""
+        self._tell(stop=[float(offset_mm), float(amplitude), int(threshold)])
+
+    def taken(self, row: int, placement: Placement, answer: Calibration | None) -> None:
+        """An image was taken, and this is the estimate now."""
+        bracket = placement.bracket
+        self._tell(
+            done=[*self._slow["done"], row],
+            bracket=[bracket.centre_mm, bracket.low_mm, bracket.high_mm],
+            estimate=None if answer is None else _estimate(answer),
+        )
+
+    def given_up(self, row: int) -> None:
+        """No mid-plane was found there, or the operator skipped it."""
+        self._tell(given_up=[*self._slow["given_up"], row])
+
+    def say(self, line: str) -> None:
+        """A line for the page, as the person at the terminal reads it."""
+        self._said.append(line)
+        self._tell(said=list(self._said))
+
+    def _tell(self, **changes: Any) -> None:
+        with self._lock:
+            self._slow.update(changes)
+            self._changed = True
+
+    # The thread that feeds
+
+    def _feed(self) -> None:
+        before = time.thread_time()
+        try:
+            while not self._ending.wait(self._period_s):
+                if len(self._pending):
+                    self.left_out += 1
+                else:
+                    self._pending = memoryview(self._message())
+                    self.sent += 1
+                self._write()
+                self.seconds = time.thread_time() - before
+        except OSError:
+            self._say("view: the viewer ended; the acquisition goes on without it")
+
+    def _write(self) -> None:
+        """Hand over what fits now.
+
+        Raises:
+            OSError: the viewer is gone.
+        """
+        with suppress(BlockingIOError):
+            while len(self._pending):
+                written = os.write(self._pipe, self._pending)
+                self._pending = self._pending[written:]
+
+    def _message(self) -> bytes:
+        with self._lock:
+            session = self._session
+            told = {**self._slow} if self._changed else {}
+            self._changed = False
+        frame = b""
+        if session is not None:
+            try:
+                told["pose"] = session.poses.latest().pose[:3].ravel().tolist()
+            except DeviceError as error:
+                told["trouble"] = str(error)
+            image = session.latest_image()
+            fresh = image is not None and image.frame_id != self._frame_id
+            if image is not None and fresh and image.array.dtype == np.uint8:
+                self._frame_id = image.frame_id
+                small = halved(image.array)
+                frame = small.tobytes()
+                told["frame"] = [*small.shape, *(2 * s for s in image.spacing_mm)]
+        return encoded(told, frame)
+
+    def _greeting(self) -> str:
+        """The address that the viewer prints when its page can be opened."""
+        process = self._process
+        assert process.stdout is not None
+        line = b""
+        if select.select([process.stdout], [], [], _START_WALL_S)[0]:
+            line = process.stdout.readline()
+        told = json.loads(line) if line else {}
+        if "url" in told:
+            return told["url"]
+        process.kill()
+        process.communicate()
+        why = told.get("error", "no reason told")
+        raise InputError(f"view: the viewer did not start: {why}")
+
+
+def _estimate(answer: Calibration) -> dict[str, Any]:
+    """What the page shows of an estimate; unknown covariances are None."""
+    found = answer.numpy()
+
+    def known(matrix: Any) -> list[float] | None:
+        values = np.asarray(matrix).ravel()
+        return values.tolist() if np.isfinite(values).all() else None
+
+    return {
+        "image_to_probe": found.image_to_probe.ravel().tolist(),
+        "covariance": known(found.covariance),
+        "point": found.point.tolist(),
+        "point_covariance": known(found.point_covariance),
+        "rms": float(found.rms),
+        "status": answer.status,
+    }
+
+
+def halved(frame: np.ndarray) -> np.ndarray:
+    """A frame of half the size; each pixel is the brightest of four, so that thin bars stay."""
+    rows, columns = (size // 2 * 2 for size in frame.shape)
+    even = np.maximum(frame[:rows:2, :columns], frame[1:rows:2, :columns])
+    return np.maximum(even[:, ::2], even[:, 1::2])
+
+
+def encoded(told: dict[str, Any], frame: bytes = b"") -> bytes:
+    """A message: sizes of both parts (4 bytes each), JSON, pixels."""
+    text = json.dumps(told).encode()
+    return len(text).to_bytes(4, "big") + len(frame).to_bytes(4, "big") + text + frame

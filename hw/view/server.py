@@ -1,0 +1,99 @@
+"""The viewer's process: messages on standard input, one page on 127.0.0.1.
+
+Started by :class:`hw.view.feed.LiveView`. It prints one JSON line, its address or why there is
+none, and ends with its standard input. It has no connection to any device, and drops every message
+of a browser: cameras and panels work in the browser alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import redirect_stdout
+from io import RawIOBase
+from typing import Any
+
+import numpy as np
+
+HOST = "127.0.0.1"
+_LARGEST = 1 << 26
+
+
+def main(port: int) -> int:
+    """Serve until standard input ends."""
+    answers = os.fdopen(os.dup(1), "w")
+
+    def answer(**content: Any) -> None:
+        print(json.dumps(content), file=answers, flush=True)
+
+    try:
+        import viser
+    except ImportError as error:
+        answer(error=f"viser cannot be imported ({error})")
+        return 2
+    with redirect_stdout(sys.stderr):
+        try:
+            server = viser.ViserServer(host=HOST, port=port, verbose=False)
+        except OSError as error:
+            answer(error=f"no page on port {port}: {error.strerror or error}")
+            return 2
+        ignore_browsers(server)
+        from hw.view.page import Page
+
+        page = Page(server)
+        answer(url=f"http://{HOST}:{server.get_port()}")
+        answers.close()
+        with os.fdopen(os.dup(0), "rb", buffering=0) as source:
+            for told, frame in messages(source):
+                page.show(told, frame)
+        server.stop()
+    return 0
+
+
+def ignore_browsers(server: Any) -> None:
+    """Drop what browsers send.
+
+    viser acts on some messages by itself: it would open a tunnel through a public server when a
+    page asks for a link to share, and tell all pages what one of them put into a panel.
+    """
+
+    async def dropped(client_id: int, message: object) -> None:
+        return None
+
+    server._websock_server._handle_incoming_message = dropped
+
+
+def messages(source: RawIOBase) -> Iterator[tuple[dict[str, Any], np.ndarray | None]]:
+    """What the feed sends, until its end, also in the middle of a message cut off by a death."""
+    while True:
+        start = _exactly(source, 8)
+        sizes = int.from_bytes(start[:4], "big"), int.from_bytes(start[4:], "big")
+        if len(start) < 8 or max(sizes) > _LARGEST:
+            return
+        text, pixels = _exactly(source, sizes[0]), _exactly(source, sizes[1])
+        if len(text) < sizes[0] or len(pixels) < sizes[1]:
+            return
+        told = json.loads(text)
+        frame = None
+        if pixels:
+            rows, columns = told["frame"][:2]
+            frame = np.frombuffer(pixels, np.uint8).reshape(rows, columns)
+        yield told, frame
+
+
+def _exactly(source: RawIOBase, size: int) -> bytes:
+    """``size`` bytes, or fewer where the pipe ends."""
+    parts, missing = [], size
+    while missing:
+        part = source.read(missing)
+        if not part:
+            break
+        parts.append(part)
+        missing -= len(part)
+    return b"".join(parts)
+
+
+if __name__ == "__main__":
+    sys.exit(main(int(sys.argv[1])))

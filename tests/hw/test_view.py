@@ -1,0 +1,238 @@
+"""The live view: a page on loopback that shows what the bench does, and cannot do anything to it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="viser is not installed (jaxcal[view])")
+
+from browser import addresses, browsing, pixels
+
+from hw.bench.run import Bench
+from hw.emulated import setup_of, start
+from hw.extras import check_installed
+from hw.midplane.bracket import Bracket, Placement
+from hw.poses import plan_poses
+from hw.recorder import Recorder
+from hw.recording_layout import Header
+from hw.robot.limits import Limits
+from hw.robot.motion import Motion
+from hw.robot.safety import MotionPlan, confirm
+from hw.session import Session
+from hw.setup import Setup
+from hw.view.feed import LiveView, halved, watched
+from hw.view.page import ellipsoid, quaternion, to_scale, towards
+from jaxcal.errors import InputError
+
+PLACEMENT = Placement(
+    "none", Bracket(0.1, -0.7, 0.9, 0.3), 0.1, 800.0, 100, 3, 1.0, 9, np.zeros((0, 3))
+)
+
+
+def wait_until(condition, timeout_s: float = 30.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.02)
+
+
+def listeners(port: int) -> set[str]:
+    """Local addresses, in hexadecimal as the kernel writes them, that listen on a port."""
+    found = set()
+    for name in ("tcp", "tcp6"):
+        path = Path("/proc/net", name)
+        for line in path.read_text().splitlines()[1:] if path.exists() else []:
+            address, state = line.split()[1], line.split()[3]
+            host, _, number = address.partition(":")
+            if state == "0A" and int(number, 16) == port:
+                found.add(host)
+    return found
+
+
+def port_of(view: LiveView) -> int:
+    return int(view.url.rsplit(":", 1)[1])
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[Bench]:
+    pytest.importorskip("serial", reason="needs jaxcal[serial]")
+    pytest.importorskip("rtde_receive", reason="needs jaxcal[robot]")
+    with start(3, 1.0) as bench:
+        yield bench
+
+
+def a_plan(setup: Setup, serial: str = "none") -> MotionPlan:
+    poses = plan_poses(5, setup.scene, setup.extent, 1).poses
+    tip = setup.scene.tip_mm.tolist()
+    limits = Limits.from_mapping({"tip_mm": tip, **setup.limits})
+    return MotionPlan(poses, limits, (0.0, 0.0, 0.12, 0.0, 0.0, 0.0), serial)
+
+
+@contextmanager
+def a_session(setup: Setup, folder: Path) -> Iterator[Session]:
+    probe = {"kind": "linear", "elements": 128, "pitch_mm": 0.457, "sound_speed_m_s": 1490.0}
+    header = Header("time_of_flight", probe, 128, None, "{}")
+    with Recorder(folder / "rec.h5", header) as recorder, Session(setup, recorder) as session:
+        yield session
+
+
+def test_the_page_is_on_loopback_only():
+    with LiveView(lambda line: None, port=8190) as view:
+        assert view.url.startswith("http://127.0.0.1:")
+        assert listeners(port_of(view)) == {"0100007F"}
+    with pytest.raises(ProcessLookupError):
+        os.kill(view.pid, 0)
+
+
+def test_a_dead_viewer_is_told_once_and_holds_nothing_up():
+    said = []
+    with LiveView(said.append, port=8191) as view:
+        wait_until(lambda: view.sent > 2)
+        os.kill(view.pid, signal.SIGKILL)
+        wait_until(lambda: len(said) > 1)
+        for row in range(100):
+            view.going(row)
+            view.say("a line")
+        time.sleep(0.5)
+    assert len(said) == 2
+    assert "the acquisition goes on without it" in said[1]
+
+
+def test_a_viewer_that_does_not_read_costs_one_message():
+    said = []
+    with LiveView(said.append, port=8192) as view:
+        wait_until(lambda: view.sent > 2)
+        os.kill(view.pid, signal.SIGSTOP)
+        try:
+            before = view.sent
+            # More than the pipe holds, so that a message stays half handed over.
+            for _ in range(20):
+                view.say("x" * 50_000)
+                time.sleep(0.05)
+            wait_until(lambda: view.left_out > 5)
+            assert view.sent - before < 20
+        finally:
+            os.kill(view.pid, signal.SIGCONT)
+        missed = view.left_out
+        wait_until(lambda: view.sent > before + 20)
+        assert missed > 5
+    assert len(said) == 1
+
+
+def test_a_page_can_do_nothing(monkeypatch):
+    """A browser's messages are dropped, those too on which viser itself would act."""
+    import viser
+    from viser import _messages
+    from websockets.asyncio.client import connect
+
+    asked = _messages.ShareUrlRequest()
+    answer = _messages.ShareUrlUpdated.__name__.encode()
+
+    async def talk(url: str) -> bytes:
+        heard = b""
+        protocol = f"viser-v{viser.__version__}"
+        async with connect(
+            url.replace("http", "ws"), subprotocols=[protocol], max_size=None
+        ) as socket:
+            await socket.send(asked.as_serializable_dict_bytes())
+            await socket.send(b"\xff not a message")
+            try:
+                while True:
+                    part = await asyncio.wait_for(socket.recv(), 3.0)
+                    heard += part if isinstance(part, bytes) else part.encode()
+            except (TimeoutError, OSError):
+                pass
+            except Exception as error:
+                assert "Closed" in type(error).__name__
+        return heard
+
+    with LiveView(lambda line: None, port=8193) as view:
+        heard = asyncio.run(talk(view.url))
+        assert answer not in heard
+        # The server is as it was.
+        sent = view.sent
+        wait_until(lambda: view.sent > sent + 3)
+        assert listeners(port_of(view)) == {"0100007F"}
+
+
+def test_the_extra_is_named_where_viser_is_missing():
+    with pytest.raises(InputError, match=r'pip install "jaxcal\[view\]"'):
+        check_installed("viser_that_is_not_there", extra="view")
+
+
+def test_a_browser_sees_the_bench_move_and_killing_the_view_changes_nothing(bench, tmp_path):
+    setup = setup_of(bench)
+    said = []
+    with (
+        LiveView(said.append, port=8194) as view,
+        a_session(setup, tmp_path) as session,
+        watched(view, session),
+        browsing(tmp_path / "profile") as browser,
+    ):
+        plan = a_plan(setup, session.poses.identity().serial)
+        view.plan(setup, plan, [])
+        browser.get(view.url)
+        addresses(browser)  # those of the browser's own first page
+        browser.refresh()
+
+        def text() -> str:
+            return browser.find_element("tag name", "body").text
+
+        wait_until(lambda: "0 of 5 images" in text(), 60)
+        wait_until(lambda: "B-mode, newest frame" in text(), 60)
+        before = pixels(browser)
+        with Motion(
+            setup.robot_host, plan, confirm(plan, plan.code, clock=setup.clock),
+            clock=setup.clock, dry_run=False, guard=session.trouble,
+        ) as motion:  # fmt: skip
+            view.going(0)
+            motion.move_to(plan.targets[0])
+            view.taken(0, PLACEMENT, None)
+            wait_until(lambda: "1 of 5 images" in text(), 60)
+            after = pixels(browser)
+            # The scene's part of the page: arm, image plane and poses have moved.
+            scene = slice(0, int(0.6 * before.shape[1]))
+            moved = np.abs(after[:, scene].astype(int) - before[:, scene]).max(axis=2) > 40
+            assert moved.mean() > 0.01
+            assert addresses(browser) <= {"127.0.0.1"}
+            os.kill(view.pid, signal.SIGKILL)
+            wait_until(lambda: len(said) > 1)
+            tracked = motion.move_to(plan.targets[1])
+            assert np.allclose(tracked.pose[:3, 3], plan.targets[1][:3, 3], atol=0.5)
+            session.check()
+
+
+def test_geometry_of_the_page():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        rotation = towards(rng.normal(size=3))
+        assert np.linalg.det(rotation) == pytest.approx(1.0)
+        w, x, y, z = quaternion(rotation)
+        axis = np.array([
+            2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)
+        ])  # fmt: skip
+        np.testing.assert_allclose(axis, rotation[:, 2], atol=1e-12)
+    turned = towards(np.array([1.0, 2.0, 3.0]))
+    half, axes, magnified = ellipsoid(turned @ np.diag([0.01, 0.04, 0.09]) @ turned.T)
+    # 2.795 SDs hold 95 % in three dimensions.
+    np.testing.assert_allclose(half / magnified, 2.7955 * np.array([0.1, 0.2, 0.3]), rtol=1e-4)
+    assert magnified == 10
+    assert abs(axes[:, 2] @ turned[:, 2]) == pytest.approx(1.0)
+
+
+def test_pictures_keep_bars_and_proportions():
+    frame = np.zeros((480, 640), np.uint8)
+    frame[241, 301] = 200
+    assert halved(frame)[120, 150] == 200
+    tall = to_scale(np.full((240, 320), 7, np.uint8), (58.5 / 320, 90 / 240))
+    columns = (tall[120, :, 0] == 7).sum()
+    assert columns / 240 == pytest.approx(58.5 / 90, rel=0.02)
