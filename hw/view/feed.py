@@ -180,7 +180,7 @@ class LiveView:
             plan=np.asarray(plan.targets, float)[:, :3].reshape(-1, 12).tolist(),
             box=[list(limits.box_min_mm), list(limits.box_max_mm)],
             tcp_offset=list(plan.tcp_offset),
-            arm=getattr(setup, "model", None) or getattr(limits, "arm_model", "") or "UR5",
+            arm=limits.arm_model or "UR5",
             image_to_probe=np.asarray(scene.image_to_probe, float).ravel().tolist(),
             point=np.asarray(scene.point_mm, float).tolist(),
             width_mm=float(setup.probe.width_mm),
