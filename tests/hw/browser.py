@@ -40,11 +40,12 @@ def browsing(folder: Path, size: tuple[int, int] = (900, 600)) -> Iterator:
     path, driver = chromium()
     options = webdriver.ChromeOptions()
     options.binary_location = path
+    # Whoever asks waits for what the page says, not for its last byte.
+    options.page_load_strategy = "none"
     for option in (*OPTIONS, f"--user-data-dir={folder}", f"--window-size={size[0]},{size[1]}"):
         options.add_argument(option)
     options.set_capability("goog:loggingPrefs", {"performance": "ALL"})
     browser = webdriver.Chrome(options=options, service=Service(driver))
-    browser.set_page_load_timeout(60)
     try:
         yield browser
     finally:
