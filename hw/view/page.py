@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
 
 from hw.robot.kinematics import (
     MODELS,
@@ -45,20 +46,7 @@ _LEGEND = (
 
 def quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, 4]:
     """Unit quaternion (w, x, y, z) of a rotation matrix."""
-    m = rotation
-    # Four times the squares; the largest is safe to divide by.
-    squares = np.array([
-        1 + m[0, 0] + m[1, 1] + m[2, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2],
-        1 - m[0, 0] + m[1, 1] - m[2, 2], 1 - m[0, 0] - m[1, 1] + m[2, 2],
-    ])  # fmt: skip
-    best = int(np.argmax(squares))
-    rows = np.array([
-        [squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-        [m[2, 1] - m[1, 2], squares[1], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]],
-        [m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], squares[2], m[2, 1] + m[1, 2]],
-        [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], squares[3]],
-    ])  # fmt: skip
-    return rows[best] / np.linalg.norm(rows[best])
+    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
 
 
 def towards(direction: Float[np.ndarray, 3]) -> Float[np.ndarray, "3 3"]:
@@ -115,6 +103,9 @@ class Page:
         server.gui.configure_theme(
             control_layout="fixed", control_width="large", show_logo=False, show_share_button=False
         )
+        # Shadows and reflections are dear where there is no graphics processor.
+        server.scene.configure_default_lights(cast_shadow=False)
+        server.scene.configure_environment_map(hdri=None)
         server.gui.set_panel_label("jaxcal: acquisition")
         self._state = server.gui.add_markdown("Waiting for the plan.", order=0)
         self._picture: Any = None

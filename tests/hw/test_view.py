@@ -22,19 +22,17 @@ from websockets.sync.client import connect
 
 from hw.bench.run import Bench
 from hw.emulated import setup_of, start
-from hw.extras import check_installed
+from hw.extras import missing
 from hw.midplane.bracket import Bracket, Placement
 from hw.poses import plan_poses
 from hw.recorder import Recorder
 from hw.recording_layout import Header
-from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.safety import MotionPlan, confirm
 from hw.session import Session
 from hw.setup import Setup
 from hw.view.feed import LiveView, halved, watched
-from hw.view.page import ellipsoid, quaternion, to_scale, towards
-from jaxcal.errors import InputError
+from hw.view.page import ellipsoid, to_scale, towards
 
 PLACEMENT = Placement(
     "none", Bracket(0.1, -0.7, 0.9, 0.3), 0.1, 800.0, 100, 3, 1.0, 9, np.zeros((0, 3))
@@ -75,9 +73,7 @@ def bench() -> Iterator[Bench]:
 
 def a_plan(setup: Setup, serial: str = "none") -> MotionPlan:
     poses = plan_poses(5, setup.scene, setup.extent, 1).poses
-    tip = setup.scene.tip_mm.tolist()
-    limits = Limits.from_mapping({"tip_mm": tip, **setup.limits})
-    return MotionPlan(poses, limits, (0.0, 0.0, 0.12, 0.0, 0.0, 0.0), serial)
+    return MotionPlan(poses, setup.motion_limits(), (0.0, 0.0, 0.12, 0.0, 0.0, 0.0), serial)
 
 
 @contextmanager
@@ -158,8 +154,9 @@ def test_a_page_can_do_nothing():
 
 
 def test_the_extra_is_named_where_viser_is_missing():
-    with pytest.raises(InputError, match=r'pip install "jaxcal\[view\]"'):
-        check_installed("viser_that_is_not_there", extra="view")
+    text = missing("viser_that_is_not_there", extra="view")
+    assert text is not None
+    assert 'pip install "jaxcal[view]"' in text
 
 
 def test_a_browser_sees_the_bench_move_and_killing_the_view_changes_nothing(bench, tmp_path):
@@ -209,11 +206,7 @@ def test_geometry_of_the_page():
     for _ in range(20):
         rotation = towards(rng.normal(size=3))
         assert np.linalg.det(rotation) == pytest.approx(1.0)
-        w, x, y, z = quaternion(rotation)
-        axis = np.array([
-            2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)
-        ])  # fmt: skip
-        np.testing.assert_allclose(axis, rotation[:, 2], atol=1e-12)
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     turned = towards(np.array([1.0, 2.0, 3.0]))
     half, axes, magnified = ellipsoid(turned @ np.diag([0.01, 0.04, 0.09]) @ turned.T)
     # 2.795 SDs hold 95 % in three dimensions.
