@@ -1,4 +1,4 @@
-"""An arm that moves its tool along straight lines: pure kinematics in bench time.
+"""An arm that moves its tool along straight lines, in bench time.
 
 A motion is a path (position along a line, orientation along a great circle, both with the same
 parameter) and a profile over it (trapezoid of speed, or a brake). The state at any bench time
@@ -8,6 +8,8 @@ The tool is where the commands put it only to within the arm's repeatability: :m
 what the joint encoders say, :meth:`Arm.true_raw` is where the tool is. The difference is redrawn
 with travel (its correlation falls as exp(-travel / ``correlation_mm``)), as a fine step hardly
 changes the gears' error while a long move changes all of it.
+
+With a model the arm has joints (:mod:`hw.bench.joints`), and places where it cannot follow.
 """
 
 from __future__ import annotations
@@ -17,7 +19,16 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from hw.bench.joints import LEAST_DEXTERITY_MM, JointTrack, first_joints, track
+from hw.robot.kinematics import branch_of, dexterity_mm, flange_of, inverse, model_named
+from hw.robot.pose import ur_to_pose
+
 Vector = tuple[float, ...]
+
+_AHEAD_S = 0.01
+"""A controller looks at its arm no less often than that; a CB-series one every 8 ms."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +94,10 @@ class Arm:
         correlation_mm: travel over which the error is forgotten.
         seed: of the errors.
         halt_acceleration: m/s^2 of a protective stop, and of a program that is stopped.
-        reach_m: smallest and largest distance of the tool from the base that counts as safe.
+        reach_m: smallest and largest distance of the tool from the base that counts as safe, where
+            the arm has no model.
+        model: name of the arm whose joints these are (:data:`hw.robot.kinematics.MODELS`); None: a
+            tool that moves without an arm, without joints and singularities.
     """
 
     def __init__(
@@ -97,11 +111,12 @@ class Arm:
         seed: int = 0,
         halt_acceleration: float = 2.0,
         reach_m: tuple[float, float] = (0.15, 0.85),
+        model: str | None = None,
     ) -> None:
         self.settings = {
             "raw": _six(raw), "tcp_offset": _six(tcp_offset), "repeatability_mm": repeatability_mm,
             "repeatability_deg": repeatability_deg, "correlation_mm": correlation_mm, "seed": seed,
-            "halt_acceleration": halt_acceleration, "reach_m": tuple(reach_m),
+            "halt_acceleration": halt_acceleration, "reach_m": tuple(reach_m), "model": model,
         }  # fmt: skip
         """What it was made of: another process can make the same arm."""
         self.watcher: Callable[[Motion], None] | None = None
@@ -120,6 +135,11 @@ class Arm:
             -math.inf, start[:3], _quaternion(start[3:]), (0.0,) * 3, (0.0,) * 3, 0.0, 1.0, 1.0,
             error=(first, first),
         )  # fmt: skip
+        self.model = None if model is None else model_named(model)
+        self._track: JointTrack | None = None
+        if self.model is not None:
+            joints = first_joints(self.model, start, self.tcp_offset)
+            self._track = track(self.model, self._motion, self.tcp_offset, joints)
 
     def move_linear(
         self, t: float, target: Sequence[float], speed: float, acceleration: float
@@ -203,8 +223,58 @@ class Arm:
         end = self._motion.start + self._motion.duration()
         return None if t < end else end
 
+    def joints(self, t: float) -> Vector | None:
+        """Angles of the joints by the encoders at bench time t, rad; None without a model."""
+        found = self._tracked()
+        if found is None:
+            return None
+        return tuple(found.at(self._motion.at(t)[0]).tolist())
+
+    def joint_speeds(self, t: float) -> Vector | None:
+        """Speeds of the joints at bench time t, rad/s; None without a model."""
+        found = self._tracked()
+        if found is None:
+            return None
+        place, rate = self._motion.at(t)
+        return tuple((rate * found.slope(place)).tolist())
+
+    def at_its_end(self, t: float) -> bool:
+        """Whether the arm must be stopped now to rest before a place where it cannot follow."""
+        found, moving = self._tracked(), self._motion
+        if found is None or math.isinf(found.end) or moving.brake:
+            return False
+        place, rate = moving.at(t)
+        if t >= moving.start + moving.duration():
+            return False
+        ahead = rate * _AHEAD_S + rate**2 / (2 * self.halt_acceleration)
+        return place + ahead >= found.end - 1e-6
+
+    def _tracked(self) -> JointTrack | None:
+        """The joints along the motion that runs, worked out when they are first asked for."""
+        before, moving = self._track, self._motion
+        if before is None or self.model is None or before.motion is moving:
+            return before
+        if before.same_path(moving):
+            found = replace(before, motion=moving)
+        else:
+            start = before.at(before.motion.at(moving.start)[0])
+            found = track(self.model, moving, self.tcp_offset, start)
+        self._track = found
+        return found
+
     def within_reach(self, raw: Sequence[float]) -> bool:
         """Whether a pose (m, rad) counts as within the arm's safety limits."""
+        found = self._tracked()
+        if found is not None and self.model is not None:
+            if not all(math.isfinite(v) for v in raw):
+                return False
+            flange = flange_of(ur_to_pose(np.array(raw, dtype=np.float64)), self.tcp_offset)
+            here = inverse(self.model, flange)
+            branch = int(branch_of(self.model, found.joints[-1]))
+            return bool(
+                here.reached[branch]
+                and dexterity_mm(self.model, here.joints[branch]) >= LEAST_DEXTERITY_MM
+            )
         low, high = self.reach_m
         return all(math.isfinite(v) for v in raw) and low <= math.hypot(*raw[:3]) <= high
 

@@ -16,7 +16,7 @@ from hw.bench.active_echo import AuspisEmulator
 from hw.bench.arm import Arm
 from hw.bench.control import ControlServer
 from hw.bench.frames import Camera
-from hw.bench.robot import CB_SERIES, E_SERIES, RobotProcess
+from hw.bench.robot import CB_SERIES, E_SERIES, RobotProcess, model_of
 from hw.bench.ultrasound import ImageServer
 from hw.bench.world import World, make_world
 from hw.clock import Clock
@@ -99,6 +99,7 @@ class Assembly:
             tcp_offset=(0.0, 0.0, 0.12, 0.0, 0.0, 0.0),
             repeatability_mm=options.repeatability_mm,
             seed=options.seed,
+            model=model_of(VERSIONS[options.pose_hz]),
         )
         self.camera = Camera(self.world, seed=options.seed)
         self._echo_rng = np.random.default_rng([options.seed, 1])

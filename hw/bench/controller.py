@@ -81,10 +81,10 @@ class Controller:
         self._waits_for = self._finishes = self._watchdog_s = self._starts = None
         self.arm.stop(t)
 
-    def protect(self, t: float) -> None:
+    def protect(self, t: float, reason: str = "protective stop") -> None:
         """A protective stop."""
         self.protective = True
-        self.halt(t, "protective stop")
+        self.halt(t, reason)
 
     def kick(self, t: float) -> None:
         """input_int_register_0 was written."""
@@ -94,6 +94,10 @@ class Controller:
         """Do what the program would do by bench time t."""
         if self._starts is not None and t >= self._starts and not self.protective:
             self._start(t)
+        if not self.protective and self.arm.at_its_end(t):
+            # As a real one does: a joint too fast, a singularity, the end of the reach.
+            self.protect(t, "protective stop: the arm cannot follow the path")
+            return
         if not self.running:
             return
         if self._watchdog_s is not None and t - self._kicked > self._watchdog_s:

@@ -33,6 +33,11 @@ E_SERIES, CB_SERIES = (5, 11, 0, 108249), (3, 15, 8, 106339)
 _PATIENCE_S = 30.0
 
 
+def model_of(version: tuple[int, ...]) -> str:
+    """The emulated arm that goes with a controller: the paper's UR5, or its successor."""
+    return "UR5e" if version[0] >= 5 else "UR5"
+
+
 class RobotProcess:
     """An arm and its controller in a child process.
 
@@ -194,7 +199,8 @@ class EmulatedRobot(RobotProcess):
         raw: Sequence[float] = START,
         tcp_offset: Sequence[float] = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0),
     ) -> None:
-        super().__init__(Arm(raw, tcp_offset=tcp_offset), host, version=version, clock=Clock(speed))
+        arm = Arm(raw, tcp_offset=tcp_offset, model=model_of(version))
+        super().__init__(arm, host, version=version, clock=Clock(speed))
         self.start()
 
     def __enter__(self) -> EmulatedRobot:
@@ -210,7 +216,8 @@ def _motion(told: dict) -> Motion:
 def _state(robot: RtdeServer) -> dict:
     arm, program, t = robot.arm, robot.controller, robot.clock.now()
     return {
-        "t": t, "raw": arm.raw(t), "velocity": arm.velocity(t), "rest_since": arm.rest_since(t),
+        "t": t, "raw": arm.raw(t), "joints": arm.joints(t),
+        "velocity": arm.velocity(t), "rest_since": arm.rest_since(t),
         "running": program.running, "reason": program.reason, "log": program.log,
         "packets": robot.packets, "late": robot.late, "skipped": robot.skipped,
         "unlocks": robot.unlock_requests,

@@ -343,6 +343,10 @@ class RtdeServer:
             "speed_scaling": 1.0,
             "target_speed_fraction": 1.0,
         }
+        joints, speeds = arm.joints(t), arm.joint_speeds(t)
+        if joints is not None and speeds is not None:
+            values |= {"actual_q": joints, "target_q": joints}
+            values |= {"actual_qd": speeds, "target_qd": speeds}
         for k in range(3):
             values[f"output_int_register_{k}"] = program.int_out[k]
         for k in range(6):
@@ -453,7 +457,9 @@ class RtdeServer:
             case "get serial number" if new:
                 return self.serial
             case "get robot model":
-                return "UR5"
+                # The dashboard's names have no "e": the software's version tells the series.
+                model = self.arm.model
+                return "UR5" if model is None else model.name.removesuffix("e")
             case "is in remote control" if new:
                 return "true"
             case "robotmode":

@@ -9,6 +9,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from hw.bench.arm import Arm
+from hw.bench.controller import Controller
+from hw.bench.robot import START as START_DOWN
+from hw.robot.kinematics import MODELS, forward, link_frames, tool_of
+from hw.robot.pose import pose_to_ur, ur_to_pose
 
 START = (0.4, 0.0, 0.3, 0.0, 3.0, 0.0)
 
@@ -95,3 +99,92 @@ def test_repeatability_is_redrawn_with_travel_and_is_seeded():
 def test_poses_of_another_shape_are_refused(raw):
     with pytest.raises(ValueError, match="six finite"):
         Arm(raw)
+
+
+OFFSET = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
+
+
+def check_along(arm: Arm, model: str, times: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """The joints' pose is the arm's, at every time; returns the last joints."""
+    for now in times:
+        assert not arm.at_its_end(now)
+        joints = np.array(arm.joints(now))
+        pose = forward(MODELS[model], joints) @ tool_of(OFFSET)
+        wanted = ur_to_pose(np.array(arm.raw(now)))
+        # Between its samples a path of joints is interpolated.
+        assert np.abs(pose - wanted)[:3, 3].max() < 0.02
+        assert np.abs(pose - wanted)[:3, :3].max() < 1e-4
+        # In small steps: the branch is kept.
+        assert np.abs(joints - before).max() < 0.05
+        before = joints
+    return before
+
+
+@pytest.mark.parametrize("model", ["UR5", "UR5e"])
+def test_joints_bring_the_tool_where_the_arm_says_that_it_is(model):
+    """Through the forward kinematics, along moves that brake and replace one another."""
+    arm = Arm(START_DOWN, tcp_offset=OFFSET, model=model)
+    t, rng = 0.0, np.random.default_rng(0)
+    before = np.array(arm.joints(0.0))
+    for k in range(12):
+        target = np.array(START_DOWN) + rng.uniform(-0.08, 0.08, 6)
+        last = arm.move_linear(t, target.tolist(), 0.1, 1.0)
+        if not k % 3:
+            last = t + 0.4 * (last - t)
+        times = np.linspace(t, last, 80)
+        if not k % 3:
+            before = check_along(arm, model, times[:-1], before)
+            times = np.linspace(last, arm.stop(last, 2.0), 10)
+            last = times[-1]
+        before = check_along(arm, model, times, before)
+        t = last
+    velocity = (np.array(arm.joints(t - 0.1)) - np.array(arm.joints(t - 0.1001))) / 1e-4
+    np.testing.assert_allclose(arm.joint_speeds(t - 0.1), velocity, atol=1e-3)
+
+
+def test_the_arm_stops_protectively_before_a_wrist_singularity_and_its_reach():
+    """A tool that points sideways is turned about the vertical, so that axis 6 meets axis 4."""
+    ur5 = MODELS["UR5"]
+    near = np.array([0.3, -1.3, 1.6, -0.3, 0.475, 0.2])
+    frames = link_frames(ur5, near)
+    (x, y), (u, v) = frames[6, :2, 2], frames[1, :2, 2]
+    swing = Rotation.from_rotvec([0.0, 0.0, 2 * np.arctan2(x * v - y * u, x * u + y * v)])
+    start = pose_to_ur(frames[6])
+    turned = frames[6].copy()
+    turned[:3, :3] = swing.as_matrix() @ turned[:3, :3]
+    goal = pose_to_ur(turned)
+    out = start.copy()
+    out[:2] += 0.6 * start[:2] / np.linalg.norm(start[:2])
+    for target, text in ((goal, "singularity"), (out, "reach")):
+        arm = Arm(start.tolist(), model="UR5")
+        program = Controller(arm)
+        program.upload(0.0)
+        program.step(0.1)
+        arm.move_linear(0.1, target.tolist(), 0.1, 1.0)
+        t = 0.1
+        while not program.protective:
+            t += 0.002
+            program.step(t)
+            assert t < 30.0, text
+        assert "cannot follow" in program.reason
+        rest = t + 1.0
+        joints = np.array(arm.joints(rest))
+        assert np.isfinite(joints).all()
+        # It rests short of the place, and about where it says that it is: where the arm is nearly
+        # stretched, joints that are interpolated over 4 mm are off by a tenth of a mm.
+        pose = forward(ur5, joints)
+        told = ur_to_pose(np.array(arm.raw(rest)))
+        np.testing.assert_allclose(pose[:3, 3], told[:3, 3], atol=0.2)
+        assert not arm.within_reach(out.tolist())
+        # Once released, it may go back.
+        program.protective = False
+        arrival = arm.move_linear(rest, start.tolist(), 0.05, 1.0)
+        for now in np.linspace(rest, arrival, 200):
+            program.step(now)
+        assert not program.protective
+        assert arm.raw(arrival) == pytest.approx(tuple(start), abs=1e-9)
+
+
+def test_an_arm_that_does_not_reach_its_start_is_refused():
+    with pytest.raises(ValueError, match="UR3 does not reach"):
+        Arm((0.9, 0.0, 0.3, 0.0, 3.0, 0.0), model="UR3")

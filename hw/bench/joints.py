@@ -1,0 +1,138 @@
+"""Joints of the emulated arm along its motions, and where a real controller would stop them.
+
+The path of a motion is put through the inverse kinematics once, when it begins, in the branch of
+the joints at which it begins; in between its samples the joints are interpolated. A controller
+stops protectively where a joint would turn faster than it can, where its range ends, and near a
+singularity; the emulated one does so early enough to rest before that place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from hw.rigid import quaternion_to_matrix, rigid
+from hw.robot.kinematics import (
+    ANGLE_MM,
+    ArmModel,
+    branch_of,
+    dexterity_mm,
+    flange_of,
+    inverse,
+    joint_points,
+    nearest_turn,
+)
+from hw.robot.pose import ur_to_pose
+
+if TYPE_CHECKING:
+    from hw.bench.arm import Motion
+
+LEAST_DEXTERITY_MM = 1.0
+"""Smallest singular value (mm per rad, :func:`hw.robot.kinematics.dexterity_mm`) at which the
+emulated controller moves the tool along a line: a wrist singularity's last degree."""
+_RANGE = 2 * math.pi
+_SPACING_MM = 4.0
+_MOST_SAMPLES = 500
+
+
+def first_joints(
+    model: ArmModel, raw: tuple[float, ...], tcp_offset: tuple[float, ...]
+) -> Float[np.ndarray, 6]:
+    """Joints of an arm that was put somewhere: elbow up, as far as can be from singularities.
+
+    Raises:
+        ValueError: out of reach.
+    """
+    found = inverse(model, flange_of(ur_to_pose(np.array(raw)), tcp_offset))
+    if not found.reached.any():
+        raise ValueError(f"a {model.name} does not reach the pose {raw} (m, rad)")
+    joints = found.joints[found.reached]
+    height = joint_points(model, joints)[:, :, 2]
+    score = dexterity_mm(model, joints) + np.where(height[:, 0] > height[:, 2], 1000.0, 0.0)
+    return joints[int(np.argmax(score))]
+
+
+@dataclass(frozen=True, eq=False)
+class JointTrack:
+    """Joints along the path of one motion.
+
+    Attributes:
+        motion: whose path it is.
+        places: (n,) path parameter of each sample, m or rad as the motion counts.
+        joints: (n, 6) there, rad.
+        end: path parameter beyond which the arm cannot follow; infinite where it can to the end.
+    """
+
+    motion: Motion
+    places: Float[np.ndarray, " n"]
+    joints: Float[np.ndarray, "n 6"]
+    end: float
+
+    def at(self, place: float) -> Float[np.ndarray, 6]:
+        """Joints at a path parameter, rad."""
+        k = int(np.searchsorted(self.places, place))
+        if k == 0:
+            return self.joints[0]
+        if k == len(self.places):
+            return self.joints[-1]
+        low, high = self.places[k - 1], self.places[k]
+        part = (place - low) / (high - low)
+        return (1 - part) * self.joints[k - 1] + part * self.joints[k]
+
+    def slope(self, place: float) -> Float[np.ndarray, 6]:
+        """Change of the joints per path parameter there."""
+        if len(self.places) < 2:
+            return np.zeros(6)
+        k = min(max(int(np.searchsorted(self.places, place)), 1), len(self.places) - 1)
+        step = self.places[k] - self.places[k - 1]
+        return (self.joints[k] - self.joints[k - 1]) / step
+
+    def same_path(self, motion: Motion) -> bool:
+        """Whether another motion (a brake) runs along the same path."""
+        mine = self.motion
+        return (mine.position, mine.quaternion, mine.travel, mine.turn) == (
+            motion.position, motion.quaternion, motion.travel, motion.turn,
+        )  # fmt: skip
+
+
+def track(
+    model: ArmModel, motion: Motion, tcp_offset: tuple[float, ...], start: Float[np.ndarray, 6]
+) -> JointTrack:
+    """Joints along a motion that begins at some joints."""
+    travel, turn = np.array(motion.travel), np.array(motion.turn)
+    length = math.hypot(
+        1000 * float(np.linalg.norm(travel)), ANGLE_MM * float(np.linalg.norm(turn))
+    )
+    if length == 0.0 or motion.length == 0.0:
+        return JointTrack(motion, np.zeros(1), start[None], math.inf)
+    parts = np.linspace(0.0, 1.0, min(2 + math.ceil(length / _SPACING_MM), _MOST_SAMPLES))
+    way = rigid(parts[:, None] * turn, 1000 * (np.array(motion.position) + parts[:, None] * travel))
+    way[:, :3, :3] = way[:, :3, :3] @ quaternion_to_matrix(np.array(motion.quaternion))
+    found = inverse(model, flange_of(way, tcp_offset), joint_6=float(start[5]))
+    branch = int(branch_of(model, start))
+    good, joints = found.reached[:, branch], found.joints[:, branch]
+    # Beyond the reach the joints stay where they were.
+    count = len(parts) if good.all() else int(np.argmin(good))
+    joints = joints[: max(count, 1)]
+    if count == 0:
+        return JointTrack(motion, np.zeros(1), start[None], 0.0)
+    joints = np.unwrap(joints, axis=0)
+    joints += nearest_turn(joints[0], start) - joints[0]
+    places = parts[:count] * motion.length
+    # What a real arm does not do: near a singularity, out of a joint's range, faster than it can.
+    dexterity = dexterity_mm(model, joints)
+    wrong = (np.abs(joints) > _RANGE).any(axis=1)
+    # Out of a singularity it may go.
+    wrong |= (dexterity < LEAST_DEXTERITY_MM) & (np.gradient(dexterity) <= 0 if count > 1 else True)
+    steps = np.abs(np.diff(joints, axis=0)).max(axis=1) / np.diff(places)
+    peak = min(motion.speed, math.sqrt(motion.length * motion.acceleration))
+    wrong[1:] |= steps * peak > math.radians(model.joint_speed_deg_s)
+    if wrong.any():
+        end = float(places[max(int(np.argmax(wrong)) - 1, 0)])
+    else:
+        end = math.inf if count == len(parts) else float(places[-1])
+    return JointTrack(motion, places, joints, end)
