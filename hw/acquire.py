@@ -34,6 +34,7 @@ from hw.recorder import Recorder
 from hw.recording_check import Progress, read_progress
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import Header
+from hw.resuming import compare, described
 from hw.robot.motion import Motion
 from hw.robot.safety import Confirmation, MotionPlan, check_plan
 from hw.session import Session, Watch, median_times
@@ -164,6 +165,7 @@ class _Job:
     request: Request
     targets: np.ndarray
     progress: Progress | None
+    changes: tuple[str, ...] = ()
 
     @property
     def missing(self) -> list[int]:
@@ -263,12 +265,11 @@ def _prepare(setup: Setup, path: str | os.PathLike[str], request: Request | None
         request = Request(**asked)
     except TypeError:
         raise InputError(f"{path}: has no settings of an acquisition to resume") from None
-    if progress.measurements.shape[1:] != (setup.probe.elements,):
-        raise InputError(
-            f"{path}: was recorded with {progress.measurements.shape[1]} elements, this bench's "
-            f"probe has {setup.probe.elements}"
-        )
-    return _Job(setup, request, progress.targets, progress)
+    try:
+        changes = compare(progress, setup)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return _Job(setup, request, progress.targets, progress, tuple(changes))
 
 
 def _open_recorder(path: str | os.PathLike[str], job: _Job) -> Recorder:
@@ -283,7 +284,9 @@ def _open_recorder(path: str | os.PathLike[str], job: _Job) -> Recorder:
             "sound_speed_m_s": probe.sound_speed_m_s, "delay_s": probe.delay_s,
         },
         lines=probe.elements,
-        settings=json.dumps({"request": asdict(job.request)}),
+        settings=json.dumps(
+            {"request": asdict(job.request), "bench": described(job.setup, job.targets)}
+        ),
     )  # fmt: skip
     recorder = Recorder(path, header)
     recorder.put("plan", "targets", job.targets, "mm")
@@ -303,6 +306,8 @@ def _run(
         say(f"{kind}: {text}")
 
     note("resumed" if job.progress else "started", f"{len(job.missing)} images to take")
+    for change in job.changes:
+        note("changed", change)
     session = Session(setup, recorder, watch=watch, every_frame=job.request.every_frame)
     given_up: list[int] = []
     skipped: list[int] = []
@@ -380,7 +385,8 @@ def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
                 "would not fit together",
                 device="robot",
             )
-    settings = {"request": asdict(job.request), "robot": known}
+    bench = described(job.setup, job.targets)
+    settings = {"request": asdict(job.request), "robot": known, "bench": bench}
     recorder.put("plan", "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8), "1")
     recorder.attributes("tracker", {"serial_number": identity.serial, "tcp_offset": list(offset)})
     recorder.attributes("ae", {"clock_hz": session.echo.clock_hz(), "trigger_delay_s": 0.0})

@@ -92,6 +92,7 @@ class Progress:
         taken: (k,) row of the plan of every image.
         true_elevation: (k,) mm, NaN on a real bench.
         last_s: latest host time in the file.
+        probe: numbers of /probe: elements, pitch_mm, sound_speed_m_s, delay_s.
     """
 
     settings: dict[str, object]
@@ -102,6 +103,7 @@ class Progress:
     taken: np.ndarray
     true_elevation: np.ndarray
     last_s: float
+    probe: dict[str, float]
 
 
 def read_progress(path: str | os.PathLike[str]) -> Progress:
@@ -135,6 +137,7 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
                 taken=taken,
                 true_elevation=_read(root, "placement", "true_elevation", (images,)),
                 last_s=max(last),
+                probe=_probe(root),
             )
     except InputError as error:
         raise FormatError(f"{path}: {error}") from None
@@ -155,6 +158,15 @@ def settings_of(path: str | os.PathLike[str]) -> dict[str, object]:
             return _settings(root)
     except FormatError as error:
         raise FormatError(f"{path}: {error}") from None
+
+
+def _probe(root: Node) -> dict[str, float]:
+    node = group(root, "probe")
+    if node is None:
+        raise FormatError("has no /probe: it was not made by an acquisition")
+    names = ("elements", "pitch_mm", "sound_speed_m_s", "delay_s")
+    found = {name: number(node, name) for name in names}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def _settings(root: Node) -> dict[str, object]:

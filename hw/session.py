@@ -30,6 +30,9 @@ _PERIOD_WALL_S = 0.005
 # Rows are written in batches: a write costs a millisecond, however many rows it has.
 _BATCH_WALL_S = 0.25
 _KEPT_FRAMES = 256
+_DELAY_S = 10.0
+"""How often, in bench seconds, the delay of the echo frames is measured anew."""
+
 _LEAST_STAMPS, _MOST_STAMPS = 20, 20_000
 
 
@@ -39,6 +42,7 @@ class Watch:
 
     Attributes:
         echo_age_s: no active-echo frame for so long.
+        echo_late_s: active-echo frames arrive so long after their triggers.
         image_age_s: no ultrasound frame for so long.
         pose_age_s: poses older than this are not used.
         burst: damaged or missing frames within ``burst_s`` that are more than bad luck.
@@ -48,6 +52,7 @@ class Watch:
     """
 
     echo_age_s: float = 0.12
+    echo_late_s: float = 0.3
     image_age_s: float = 1.0
     pose_age_s: float = 0.1
     burst: int = 3
@@ -111,6 +116,7 @@ class Session:
                 opened.append(self.images)
             self.echo.stream(True)
             self._clock_hz = self.echo.clock_hz()
+            self._measure_echo_delay()
         except BaseException:
             for device in reversed(opened):
                 device.close()
@@ -133,6 +139,12 @@ class Session:
         self._stopping = True
         self._thread.join()
         self._record_clocks()
+        with suppress(CalibrationError):
+            repeated = self.echo.statistics().repeated
+            self._recorder.attributes("ae", {"repeated": repeated})
+            if repeated:
+                text = f"{repeated} echo frames came twice; the second ones were dropped"
+                self._recorder.add_event("repeated", text, self.clock.now())
         for device in (self.images, self.echo, self.poses):
             if device is not None:
                 device.close()
@@ -207,6 +219,13 @@ class Session:
                     "frozen, or its frame trigger unplugged?",
                     device="active echo",
                 )
+            late = self._echo_frames[-1].late_s if self._echo_frames else 0.0
+            if late > self.clock.patience(watch.echo_late_s):
+                return StaleError(
+                    f"echo frames are {late:.1f} s late: look at the link to the device, e.g. a "
+                    "bridge from serial line to network",
+                    device="active echo",
+                )
             if self.images is not None and now - self._image_seen > self.clock.patience(
                 watch.image_age_s
             ):
@@ -234,9 +253,14 @@ class Session:
         """
         period = 1 / 30
         deadline = self.clock.now() + 2 * frames * period + self.clock.patience(self.watch.grace_s)
+        if self.clock.now() - self._delay_measured > _DELAY_S:
+            self._measure_echo_delay()
         with self._changed:
             while True:
-                found = [f for f in self._echo_frames if f.t_host - period > since]
+                found = [
+                    f for f in self._echo_frames
+                    if f.t_host - (f.late_s if f.late_s > period else period) > since
+                ]  # fmt: skip
                 if len(found) >= frames:
                     return found[:frames]
                 if self._failure is not None:
@@ -246,6 +270,10 @@ class Session:
                 self._changed.wait(self.clock.wall(0.1))
         self.check()
         raise StaleError(f"only {len(found)} of {frames} frames came in time", device="active echo")
+
+    def _measure_echo_delay(self) -> None:
+        self._delay_measured = self.clock.now()
+        self.echo.measure_delay()
 
     def latest_image(self) -> Image | None:
         """The newest ultrasound frame, or None before the first."""

@@ -3,7 +3,12 @@
 A thread reads the line and decodes; frames wait in a bounded queue. Nothing is made up: a gap in
 the device's frame counter is counted as lost, a damaged frame is dropped and counted, a frame
 with fewer lines than the probe fires (a missed line trigger: nothing tells which) is counted and
-not handed on, and when the queue is full the oldest frame goes and is counted.
+not handed on, a frame that comes again is counted and dropped, and when the queue is full the
+oldest frame goes and is counted.
+
+How late frames are (:attr:`EchoFrame.late_s`): the device is asked for its count of frame triggers;
+the frame with that number was triggered after the question, so its way here took at most the time
+since then. From there the device's ticks tell by how much later, or earlier, the others came.
 """
 
 from __future__ import annotations
@@ -39,6 +44,10 @@ COMMAND_TIMEOUT_S = 1.0
 _SHORTEST_WAIT_S = 0.25
 
 _LARGEST_GAP = 2**31
+_REMEMBERED = 256
+_ANCHOR_S = 60.0
+"""A measured delay is used for so long: two quartz clocks drift apart by 6 ms meanwhile."""
+
 _MAXIMUM_DELAY_TICKS = 0xFFFF
 
 
@@ -54,6 +63,7 @@ class EchoFrame:
         tof_s: (lines,) one-way time of flight, s; NaN where nothing was heard.
         tof_ticks: (lines,) the same as it came, 0xFFFF where nothing was heard.
         amplitude: (lines,) peak amplitude, counts.
+        late_s: at most so long after its trigger it arrived, s; NaN where that is not known.
     """
 
     t_host: float
@@ -63,6 +73,7 @@ class EchoFrame:
     tof_s: Float[np.ndarray, " lines"]
     tof_ticks: UInt16[np.ndarray, " lines"]
     amplitude: UInt16[np.ndarray, " lines"]
+    late_s: float = float("nan")
 
     @property
     def responses(self) -> int:
@@ -82,6 +93,7 @@ class EchoStatistics:
         dropped: frames that the full queue had no room for.
         short: frames with fewer or more lines than the probe fires; not handed on.
         restarts: how often the counter went back (the device was restarted).
+        repeated: frames that came again; not handed on.
     """
 
     received: int = 0
@@ -91,6 +103,7 @@ class EchoStatistics:
     dropped: int = 0
     short: int = 0
     restarts: int = 0
+    repeated: int = 0
 
 
 class ActiveEcho:
@@ -121,7 +134,13 @@ class ActiveEcho:
         self._frames: deque[EchoFrame] = deque(maxlen=queue)
         self._replies: deque[Reply] = deque(maxlen=64)
         self._received = self._lost = self._dropped = self._short = self._restarts = 0
+        self._repeated = 0
         self._last_frame: int | None = None
+        self._recent: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
+        # The question: when, and the number of the next frame then. The answer: a frame's arrival,
+        # its ticks, and how late it was at most.
+        self._asked: tuple[float, int] | None = None
+        self._anchor: tuple[float, int, float] | None = None
         self._tick_s = 0.0
         self._failure: LostError | None = None
         self._stopping = False
@@ -142,7 +161,9 @@ class ActiveEcho:
             self._frames.clear()
             self._decoder.forget_counts()
             self._received = self._lost = self._dropped = self._short = self._restarts = 0
+            self._repeated = 0
             self._last_frame = None
+            self._recent.clear()
 
     # Commands
 
@@ -216,6 +237,13 @@ class ActiveEcho:
             raise DeviceError(f"{self.url} answered TRIG:COUN? by {text!r}", device=DEVICE)
         return self._integer("TRIG:COUN?", lines), self._integer("TRIG:COUN?", frames)
 
+    def measure_delay(self) -> None:
+        """Ask the device for its count, so that the next frames know how late they are."""
+        sent = self._clock.now()
+        _, frames = self.trigger_count()
+        with self._changed:
+            self._asked = sent, frames
+
     def device_error(self) -> str | None:
         """The oldest error that the device has kept and nobody has asked for; None without one."""
         text = self._ask("SYST:ERR?", attempts=1)
@@ -279,6 +307,7 @@ class ActiveEcho:
                 dropped=self._dropped,
                 short=self._short,
                 restarts=self._restarts,
+                repeated=self._repeated,
             )
 
     def close(self) -> None:
@@ -386,12 +415,17 @@ class ActiveEcho:
                 self._changed.notify_all()
 
     def _take(self, packet: EchoPacket, now: float) -> None:
+        if (packet.frame, packet.ticks) in self._recent:
+            self._repeated += 1
+            return
+        self._recent.append((packet.frame, packet.ticks))
         if self._last_frame is not None:
             gap = (packet.frame - self._last_frame - 1) % 2**32
             if gap < _LARGEST_GAP:
                 self._lost += gap
             else:
                 self._restarts += 1
+                self._asked = self._anchor = None
         self._last_frame = packet.frame
         if len(packet.tof_ticks) != self.lines:
             self._short += 1
@@ -410,5 +444,24 @@ class ActiveEcho:
                 tof_s=seconds,
                 tof_ticks=packet.tof_ticks,
                 amplitude=packet.amplitude,
+                late_s=self._late(packet, now),
             )
         )
+
+    def _late(self, packet: EchoPacket, now: float) -> float:
+        """By how much a frame is late at most, s; NaN where nobody has asked of late."""
+        late = float("nan")
+        if self._anchor is not None:
+            arrived, ticks, before = self._anchor
+            late = before + (now - arrived) - (packet.ticks - ticks) * self._tick_s
+            if now - arrived > _ANCHOR_S:
+                late, self._anchor = float("nan"), None
+        if self._asked is not None:
+            sent, frame = self._asked
+            if (packet.frame - frame) % 2**32 < _LARGEST_GAP:
+                self._asked = None
+                # Both are bounds: the smaller one holds.
+                if not late <= now - sent:
+                    late = now - sent
+                self._anchor = now, packet.ticks, late
+        return late

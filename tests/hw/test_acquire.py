@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import resource
 import signal
 import subprocess
 import sys
@@ -225,3 +227,40 @@ def test_killed_and_resumed(tmp_path, capfd):
     assert "reconstruction precision" in done.stdout
     assert len(jaxcal.load(path)) == IMAGES
     np.testing.assert_array_equal(taken(path)[: len(before)], before)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["limit", "removed"])
+def test_a_failing_disk_is_one_line_and_status_4(tmp_path, what):
+    path = tmp_path / "rec.h5"
+    code = "import sys; from hw.cli import main; sys.exit(main())"
+    limit = 3 * 2**20 if what == "limit" else resource.RLIM_INFINITY
+    arguments = ["acquire", str(path), "--bench", "--images", "12", "--placement", "none",
+                 "--speed", "2", "--bench-seed", "3"]  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-c", code, *arguments], stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit,) * 2),
+    )  # fmt: skip
+    assert process.stderr is not None
+    lines = []
+    for line in process.stderr:
+        lines.append(line)
+        if line.startswith("image 1/") and what == "removed":
+            path.unlink()
+    assert process.wait() == 4, lines
+    process.stderr.close()
+    assert not any("Traceback" in line or "Exception" in line for line in lines)
+    reason = "the disk takes no more: File too large" if what == "limit" else "was removed"
+    found = re.search(
+        r"(\d+) of 12 images are in (\S+); put it right, then: .* --resume", lines[-1]
+    )
+    assert reason in lines[-1]
+    assert found is not None
+    assert found[2] == str(path)
+    with h5py.File(path) as file:
+        assert not file.attrs["complete"]
+        assert len(file["calibration/target"]) >= int(found[1])
+    finish_with = [sys.executable, "-P", "-c", code, "acquire", str(path), "--bench", "--resume"]
+    done = subprocess.run(finish_with, capture_output=True, text=True, timeout=900, check=False)
+    assert done.returncode in (0, 3), done.stderr
+    assert len(jaxcal.load(path)) == 12

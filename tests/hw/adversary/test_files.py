@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import shutil
@@ -16,12 +17,16 @@ import numpy as np
 import pytest
 
 import jaxcal
+from hw.acquire import acquire as run_acquisition
 from hw.cli import main as acquire
 from hw.errors import RefusedError
 from hw.recorder import Recorder
+from hw.recording_check import check_resumable, read_progress
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import LAYOUT, Header
+from hw.resuming import compare, described
 from hw.robot.limits import Limits
+from hw.setup import Setup, load_setup
 from jaxcal.cli.main import main as study
 from jaxcal.io.toml import parse_toml
 
@@ -106,12 +111,13 @@ def complete(tmp_path_factory) -> bytes:
     return path.read_bytes()
 
 
-def select(writer: RecordingWriter, k: int) -> None:
+def select(writer: RecordingWriter, k: int, elements: int = 8) -> None:
     """A selected image: any times of flight."""
     pose, bracket = np.eye(4), dict.fromkeys(LAYOUT["placement"], np.ones(1))
     pose[0, 3] = k
     writer.append("calibration", {
-        "pose": pose[None], "time_of_flight": np.full((1, 8), 4e-5), "max_elevation": np.ones(1),
+        "pose": pose[None], "time_of_flight": np.full((1, elements), 4e-5),
+        "max_elevation": np.ones(1),
         "amplitude": np.ones(1), "mask": np.ones(1, bool), "time": np.array([float(k)]),
         "target": np.array([k]),
     })  # fmt: skip
@@ -388,3 +394,86 @@ def test_the_digest_is_of_what_was_written(tmp_path):
     with pytest.raises(jaxcal.OutputError, match="was replaced by another file"):
         recorder.finish()
     assert not path.with_name("rec.h5.sha256").exists()
+
+
+# -- resuming on another bench
+
+
+def interrupted(path: Path, setup: Setup, *, old: bool = False) -> None:
+    """A recording with one image of a plan of two, as an acquisition leaves it."""
+    targets = np.tile(np.eye(4), (2, 1, 1))
+    probe = setup.probe
+    attributes = {
+        "kind": "linear", "elements": probe.elements, "pitch_mm": probe.pitch_mm,
+        "sound_speed_m_s": probe.sound_speed_m_s, "delay_s": probe.delay_s,
+    }  # fmt: skip
+    settings = {"request": {"images": 4}}
+    if not old:
+        settings["bench"] = described(setup, targets)
+    header = Header(kind="time_of_flight", probe=attributes, settings=json.dumps(settings))
+    writer = RecordingWriter.create(path, header)
+    writer.put("plan", "targets", targets, "mm")
+    select(writer, 0, probe.elements)
+    writer.close()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("elements = 64", "elements = 64\npitch_mm = 0.6", "[probe] pitch_mm = "),
+        ("elements = 64", "elements = 64\nsound_speed_m_s = 1540", "[probe] sound_speed_m_s = "),
+        ("elements = 64", "elements = 65", "[probe] elements = "),
+        ("[0, 0, 1, 60]", "[0, 0, 1, 61]", "[scene] image_to_probe = "),
+        ("[350, -250, 80]", "[350, -250, 81]", "[scene] point_mm = "),
+    ],
+)
+def test_another_probe_or_scene_is_refused_by_name(tmp_path, old, new, said):
+    bench, path = tmp_path / "bench.toml", tmp_path / "rec.h5"
+    bench.write_text(SETUP)
+    interrupted(path, load_setup(bench), old=said == "[probe] pitch_mm = ")
+    bench.write_text(SETUP.replace(old, new))
+
+    def never(_):
+        raise AssertionError("asked to confirm")
+
+    with pytest.raises(jaxcal.InputError) as caught:
+        run_acquisition(load_setup(bench), path, None, never)
+    assert f"{path}: was recorded with {said}" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_other_limits_and_an_edited_plan_are_said(tmp_path):
+    bench, path = tmp_path / "bench.toml", tmp_path / "rec.h5"
+    bench.write_text(SETUP)
+    setup = load_setup(bench)
+    interrupted(path, setup)
+    assert compare(read_progress(path), setup) == []
+    with h5py.File(path, "r+") as file:
+        file["plan/targets"][1, 0, 3] += 5.0
+    bench.write_text(SETUP.replace("max_speed_mm_s = 50", "max_speed_mm_s = 250"))
+    changes = compare(read_progress(path), load_setup(bench))
+    assert "'max_speed_mm_s' was 50, is 250" in changes[0]
+    assert "the plan in the file is not the one" in changes[1]
+    assert len(changes) == 2
+
+
+@pytest.mark.parametrize("ours", [False, True])
+def test_a_file_cut_short_is_lengthened_only_where_it_is_ours(tmp_path, ours):
+    bench, path = tmp_path / "bench.toml", tmp_path / "rec.h5"
+    bench.write_text(SETUP)
+    if ours:
+        interrupted(path, load_setup(bench))
+    else:
+        with h5py.File(path, "w") as file:
+            file["something"] = np.zeros(100_000)
+    os.truncate(path, path.stat().st_size - 64)
+    before = path.read_bytes()
+    if not ours:
+        with pytest.raises(jaxcal.FormatError):
+            Recorder(path)
+        assert path.read_bytes() == before
+        return
+    check_resumable(path)
+    assert path.read_bytes() == before
+    with Recorder(path) as recorder:
+        assert recorder.rows["events"] == 0

@@ -1,0 +1,93 @@
+"""Whether a recording that is resumed fits the bench as it is now.
+
+Images taken with another probe or another mounting do not fit together with those that are there:
+such a difference is refused by name. Other limits, or an edited plan, change what the robot does
+but not what the images mean: they are said, and the person confirms the plan with them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+import numpy as np
+
+from hw.recording_check import Progress
+from hw.setup import Setup
+from jaxcal.errors import InputError
+from jaxcal.io.readable import quoted
+
+_SAME = 1e-9
+"""Relative difference below which two numbers are the same."""
+
+
+def described(setup: Setup, targets: np.ndarray) -> dict[str, Any]:
+    """What a recording keeps of its bench, as JSON takes it: probe, scene, limits, plan."""
+    probe, scene = setup.probe, setup.scene
+    content = {
+        "probe": {
+            "elements": probe.elements, "pitch_mm": probe.pitch_mm,
+            "sound_speed_m_s": probe.sound_speed_m_s, "delay_s": probe.delay_s,
+        },
+        "scene": {
+            "image_to_probe": scene.image_to_probe.tolist(), "point_mm": scene.point_mm.tolist(),
+            "looking": scene.looking.tolist(),
+        },
+        "limits": dict(setup.limits),
+        "plan_sha256": hashlib.sha256(np.ascontiguousarray(targets, float).tobytes()).hexdigest(),
+    }  # fmt: skip
+    return json.loads(json.dumps(content))
+
+
+def compare(progress: Progress, setup: Setup) -> list[str]:
+    """What differs between a recording and the bench and does not matter to its images.
+
+    Args:
+        progress: what the recording holds.
+        setup: the bench now.
+
+    Returns:
+        One line for each difference that a person has to confirm.
+
+    Raises:
+        InputError: a difference after which the images would not fit together.
+    """
+    now = described(setup, progress.targets)
+    before = progress.settings.get("bench")
+    before = before if isinstance(before, dict) else {}
+    # The file's own /probe is what calibrates; recordings of before this comparison have it too.
+    for table, kept in (
+        ("probe", progress.probe),
+        *((t, before.get(t)) for t in ("probe", "scene")),
+    ):
+        for name, value in now[table].items():
+            if isinstance(kept, dict) and name in kept and not _same(kept[name], value):
+                raise InputError(
+                    f"was recorded with [{table}] {name} = {_shown(kept[name])}, this bench has "
+                    f"{_shown(value)}: the images would not fit together"
+                )
+    changes = []
+    limits = before.get("limits")
+    if isinstance(limits, dict):
+        for name in sorted({*limits, *now["limits"]}):
+            old, new = limits.get(name), now["limits"].get(name)
+            if not _same(old, new):
+                changes.append(
+                    f"[limits] {quoted(name)} was {_shown(old)}, is {_shown(new)} from here on"
+                )
+    if before.get("plan_sha256") not in (None, now["plan_sha256"]):
+        changes.append("the plan in the file is not the one that it was begun with: it was edited")
+    return changes
+
+
+def _same(old: Any, new: Any) -> bool:
+    try:
+        first, second = np.asarray(old, float), np.asarray(new, float)
+    except (TypeError, ValueError, OverflowError):
+        return old == new
+    return first.shape == second.shape and np.allclose(first, second, _SAME, _SAME)
+
+
+def _shown(value: Any) -> str:
+    return "not given" if value is None else quoted(json.dumps(value), 120).strip("'")
