@@ -283,3 +283,15 @@ def test_a_deprecated_name_works_and_says_what_replaces_it():
     with pytest.warns(DeprecationWarning, match=r"worse is deprecated .* 0\.3: use better") as seen:
         assert worse(1) == 2
     assert len(seen) == 1
+
+
+def test_public_names_are_there_and_listed():
+    import jaxcal.backend
+    import jaxcal.study
+
+    for module, names in (
+        (jaxcal, dir(jaxcal)),
+        (jaxcal.study, dir(jaxcal.study)),
+        (jaxcal.backend, jaxcal.backend.__all__),
+    ):
+        assert all(getattr(module, name) is not None for name in names)
