@@ -24,6 +24,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import matplotlib
 
@@ -34,15 +35,16 @@ from common import arguments, machine, results_folder, write_table
 
 from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
 from hw.errors import DeviceError
+from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.pose import ur_to_pose
-from hw.robot.safety import MotionPlan, confirm
+from hw.robot.safety import MotionPlan, confirm_unattended
 from hw.robot.stream import PoseStream
 
 SEED = 7
 HOME = ur_to_pose(np.array(START))
-SERIAL, OFFSET = "20195500042", (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
+SERIAL, OFFSET = "of each robot", (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
 LIMITS = Limits(
     box_min_mm=(330.0, -170.0, 180.0),
     box_max_mm=(470.0, -30.0, 320.0),
@@ -85,7 +87,8 @@ def real_time() -> bool:
 
 def started(robot: EmulatedRobot, plan: MotionPlan, **named) -> Motion:
     """A confirmed motion, connected."""
-    given = confirm(plan, plan.code, clock=robot.clock)
+    plan = replace(plan, serial=read_identity(robot.host).name)
+    given = confirm_unattended(plan, plan.digest, clock=robot.clock)
     return Motion(
         robot.host, plan, given, clock=robot.clock, dry_run=False, **named
     ).start()  # fmt: skip

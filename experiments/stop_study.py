@@ -2,20 +2,23 @@
 
 Each trial is a process of its own that confirms a plan, connects by the real ur_rtde to an emulated
 controller at real time, and asks for a move of 40 to 80 mm at 100 mm/s. The stop comes at a random
-moment from 50 ms before to 200 ms after that request, in one of four ways:
+moment from 50 ms before to 200 ms after that request, in one of five ways:
 
 - ``guard``: from that moment on the guard reports danger;
 - ``stop``: another thread calls ``Motion.stop``;
 - ``interrupt``: the process gets SIGINT (Ctrl-C);
-- ``kill``: the process gets SIGKILL, so that the pipe to the mover closes.
+- ``pipe``: the pipe to the mover closes;
+- ``kill``: the process gets SIGKILL, so that the operating system closes that pipe, when it gets to
+  it: on a busy machine the end of a process takes long.
 
 Times and places are the emulated controller's. A stop counts as lost if the arm comes to rest later
 than 200 ms after it, or travels more than 15 mm after it, or if the answer was "arrived", or if the
 same connection moves again afterwards. Both series of controllers: CB (3.15.8, 125 Hz) and e-Series
 (5.11, 500 Hz). ``stops.csv`` has a row for each series and way, ``stops_each.csv`` every trial.
 
-``--trials N`` for each series (default 500), ``--robots N`` at once (default 2: more of them share
-the cores, and what is measured is then the machine).
+``--trials N`` for each series and way (default 125), ``--robots N`` at once (default 2: more of
+them share the cores, and what is measured is then the machine), ``--ways`` for some ways only; the
+others' trials are then taken from the table that is there.
 """
 
 from __future__ import annotations
@@ -33,7 +36,7 @@ import threading
 import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 
@@ -41,16 +44,16 @@ from hw.bench.arm import Motion as ArmMotion
 from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
 from hw.clock import Clock
 from hw.errors import DeviceError
+from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.pose import ur_to_pose
-from hw.robot.rtde import read_identity
-from hw.robot.safety import MotionPlan, confirm
+from hw.robot.safety import MotionPlan, confirm_unattended
 from jaxcal.isolated import import_path
 
 SEED = 16
 SERIES = {"CB": CB_SERIES, "e": E_SERIES}
-WAYS = ("guard", "stop", "interrupt", "kill")
+WAYS = ("guard", "stop", "interrupt", "pipe", "kill")
 EARLIEST_S, LATEST_S = -0.05, 0.2
 """When a stop may come, counted from the request to move."""
 REST_WITHIN_S, TRAVEL_WITHIN_MM = 0.2, 15.0
@@ -120,7 +123,7 @@ class Bench:
         self.robot = EmulatedRobot(host, version=SERIES[series])
         self._motions: list[ArmMotion] = []
         self.robot.arm.watcher = self._motions.append
-        self.plan = MotionPlan(np.array([HOME, FAR]), LIMITS, OFFSET, read_identity(host).serial)
+        self.plan = MotionPlan(np.array([HOME, FAR]), LIMITS, OFFSET, read_identity(host).name)
 
     def __enter__(self) -> Bench:
         return self
@@ -224,10 +227,15 @@ def caller(task: dict) -> None:
     def guard() -> str | None:
         return "danger" if task["way"] == "guard" and clock.now() >= stop_s else None
 
-    given = confirm(plan, plan.code, clock=clock)
+    # A shell's background job ignores Ctrl-C, and hands that on.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    # A process that is killed says nothing any more; whichever is noticed first counts, as it would
+    # in use. The others must be stopped by what is tried, not by a busy machine's silence.
+    patience = 0.15 if task["way"] == "kill" else 2.0
+    given = confirm_unattended(plan, plan.digest, clock=clock)
     answer: dict[str, object] = {}
     with Motion(
-        task["host"], plan, given, clock=clock, dry_run=False, guard=guard, caller_s=2.0
+        task["host"], plan, given, clock=clock, dry_run=False, guard=guard, caller_s=patience
     ) as motion:
         # ur_rtde is still busy for a moment after it has connected.
         clock.sleep(0.1)
@@ -236,13 +244,18 @@ def caller(task: dict) -> None:
         try:
             if task["way"] == "guard":
                 stop_s = request_s + task["delay_s"]
-            elif task["way"] == "stop":
+            elif task["way"] in ("stop", "pipe"):
 
                 def stop() -> None:
                     nonlocal stop_s
                     clock.sleep(request_s + task["delay_s"] - clock.now())
                     stop_s = clock.now()
-                    motion.stop("the operator pressed stop")
+                    if task["way"] == "stop":
+                        motion.stop("the operator pressed stop")
+                    else:
+                        assert motion._process is not None
+                        assert motion._process.stdin is not None
+                        motion._process.stdin.close()
 
                 threading.Thread(target=stop).start()
             clock.sleep(request_s - clock.now())
@@ -269,12 +282,13 @@ def _again(motion: Motion, plan: MotionPlan) -> str:
     return "moved"
 
 
-def run(series: str, count: int, robots: int, seed: int) -> list[Trial]:
-    """Random stops on controllers of one series, several at once."""
+def run(series: str, ways: list[str], count: int, robots: int, seed: int) -> list[Trial]:
+    """Random stops on controllers of one series, several at once; ``count`` for each way."""
     rng = np.random.default_rng([seed, list(SERIES).index(series)])
     tasks: queue.SimpleQueue[tuple[str, float]] = queue.SimpleQueue()
-    for k in range(count):
-        tasks.put((WAYS[k % len(WAYS)], float(rng.uniform(EARLIEST_S, LATEST_S))))
+    for _ in range(count):
+        for way in ways:
+            tasks.put((way, float(rng.uniform(EARLIEST_S, LATEST_S))))
 
     def work(number: int) -> list[Trial]:
         done = []
@@ -341,20 +355,31 @@ def figure(trials: list[Trial], path: os.PathLike[str]) -> None:
 
 def main() -> int:
     """Make the tables and the figure; 1 if any stop was lost."""
+    import csv
+
     from common import machine, results_folder, write_table
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="24 trials for each series")
-    parser.add_argument("--trials", type=int, default=500, help="for each series")
+    parser.add_argument("--quick", action="store_true", help="5 trials for each way")
+    parser.add_argument("--trials", type=int, default=125, help="for each series and way")
+    parser.add_argument("--ways", default=",".join(WAYS), help="some of them, with commas between")
     parser.add_argument("--robots", type=int, default=2, help="at once")
     given = parser.parse_args()
     folder = results_folder(given.quick)
-    print(f"{machine()}; seed {SEED}, {given.robots} robots at once")
-    trials = [
-        trial
-        for series in SERIES
-        for trial in run(series, 24 if given.quick else given.trials, given.robots, SEED)
-    ]
+    ways = given.ways.split(",")
+    each = folder / "stops_each.csv"
+    print(f"{machine()}; seed {SEED}, {given.robots} robots at once; {', '.join(ways)}")
+    trials = []
+    if each.exists() and set(ways) != set(WAYS):
+        kinds = {item.name: float if item.type == "float" else str for item in fields(Trial)}
+        with each.open(newline="") as file:
+            trials = [
+                Trial(**{name: kinds[name](row[name]) for name in kinds})
+                for row in csv.DictReader(file)
+                if row["way"] not in ways
+            ]
+    for series in SERIES:
+        trials += run(series, ways, 5 if given.quick else given.trials, given.robots, SEED)
     rows = summary(trials)
     for row in rows:
         print(*(f"{value:.3g}" if isinstance(value, float) else value for value in row))
@@ -365,7 +390,7 @@ def main() -> int:
         rows,
     )  # fmt: skip
     write_table(
-        folder / "stops_each.csv",
+        each,
         [*asdict(trials[0]), "lost"],
         [[*asdict(trial).values(), trial.lost] for trial in trials],
     )

@@ -317,7 +317,8 @@ def _run(
         note("arm", NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}")
         view.plan(setup, plan, [row for row in range(len(job.targets)) if row not in job.missing])
         confirmation = confirm(plan)
-        note("confirmed", f"plan {plan.digest[:12]} for robot {plan.serial}")
+        by = "unattended: nobody was asked" if confirmation.unattended else "by the operator"
+        note("confirmed", f"{by}; plan {plan.digest[:16]} for robot {plan.serial}, {plan.pendant}")
 
         def log(t: float, command: str, numbers: dict[str, object]) -> None:
             # Called where the controller is heard: what the recorder fails of is seen elsewhere.
@@ -376,7 +377,7 @@ def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
             "[robot] tcp_offset = [x, y, z, rx, ry, rz] (m, rad); it is compared before moving",
             device="robot",
         )
-    known = {"serial_number": identity.serial, "tcp_offset": list(offset)}
+    known = {"serial_number": identity.name, "tcp_offset": list(offset)}
     if job.progress is not None:
         before = job.progress.settings.get("robot")
         if before is not None and json.loads(json.dumps(known)) != before:
@@ -388,12 +389,15 @@ def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
     bench = described(job.setup, job.targets)
     settings = {"request": asdict(job.request), "robot": known, "bench": bench}
     recorder.put("plan", "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8), "1")
-    recorder.attributes("tracker", {"serial_number": identity.serial, "tcp_offset": list(offset)})
+    recorder.attributes("tracker", known)
     recorder.attributes("ae", {"clock_hz": session.echo.clock_hz(), "trigger_delay_s": 0.0})
     recorder.sync()
+    pendant = session.poses.pendant
+    if pendant is None:
+        raise RefusedError("the controller does not tell its speed slider", device="robot")
     limits = job.setup.motion_limits(controller_arm(identity.model, identity.version))
     joints = session.poses.latest().joints
-    return MotionPlan(job.targets, limits, offset, identity.serial, joints)
+    return MotionPlan(job.targets, limits, offset, identity.name, joints, pendant)
 
 
 def _place(

@@ -78,7 +78,10 @@ def _robot(setup: Setup, seconds: float) -> Finding:
             wrong.append(f"it does not rest: poses scatter by {steady.scatter_mm:.2f} mm")
         if stream.tcp_offset is None and setup.tcp_offset is None:
             wrong.append("it does not tell its TCP offset: put [robot] tcp_offset into the setup")
-    return Finding("robot", f"serial {identity.serial}, {rate:.0f} poses/s", tuple(wrong))
+    name = identity.name
+    if not identity.identified:
+        name += " (nothing identifies this arm: neither serial number nor calibration is told)"
+    return Finding("robot", f"{name}, {stream.pendant}, {rate:.0f} poses/s", tuple(wrong))
 
 
 def _active_echo(setup: Setup, seconds: float) -> Finding:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hw.view.feed import LiveView
 
 _RESUMED_BY_ITSELF = 30
+_POSE_HZ = {"cb": 125, "e": 500}
 PLACEMENTS = ("amplitude-scan", "threshold-climb", "pattern-injection", "none")
 OPERATORS = ("person", "window", "simulated")
 
@@ -53,6 +54,11 @@ _setup = click.option(
 _speed = click.option(
     "--speed", type=POSITIVE, metavar="K", help="Emulated bench: times faster than real time."
 )
+_controller = click.option(
+    "--controller",
+    type=click.Choice(list(_POSE_HZ)),
+    help="Emulated bench: series of the robot, CB (125 poses/s) or e-Series (500).  [default: cb]",
+)
 _bench_seed = click.option(
     "--bench-seed", type=click.IntRange(min=0), metavar="N", help="Emulated bench: which world."
 )
@@ -78,10 +84,17 @@ _bench_seed = click.option(
 @click.option("--every-frame", is_flag=True, help="Record every ultrasound frame, not one a pose.")
 @click.option("--resume", is_flag=True, help="Go on with RECORDING, which ended early.")
 @click.option("--move", is_flag=True, help="Move the robot, after a confirmation; else a dry run.")
-@click.option("--confirm", "code", metavar="CODE", help="The plan's code, instead of being asked.")
+@click.option(
+    "--unattended",
+    metavar="DIGEST",
+    help="Move without asking anybody. It gives up that a person at the robot says, just before it "
+    "moves, that its way is clear. DIGEST names the plan (16 digits or more, as --move shows it); "
+    "any other plan, robot, TCP offset, payload or speed slider is refused.",
+)
 @click.option("--preview", type=click.Path(), metavar="PNG", help="Draw the plan.")
 @click.option("--view", is_flag=True, help="Show it live in the browser, on this machine only.")
 @_speed
+@_controller
 @_bench_seed
 def acquire(
     recording: str | None,
@@ -94,10 +107,11 @@ def acquire(
     every_frame: bool,
     resume: bool,
     move: bool,
-    code: str | None,
+    unattended: str | None,
     preview: str | None,
     view: bool,
     speed: float | None,
+    controller: str | None,
     bench_seed: int | None,
 ) -> int:
     """Take the images of a plan of poses, and calibrate from them.
@@ -106,8 +120,8 @@ def acquire(
     """
     if bench == (setup_path is not None):
         raise InputError("give either --bench or --setup TOML")
-    if not bench and (speed is not None or bench_seed is not None):
-        raise InputError("--speed and --bench-seed need --bench")
+    if not bench and (speed, controller, bench_seed) != (None, None, None):
+        raise InputError("--speed, --controller and --bench-seed need --bench")
     given = [name for name, value in (
         ("--images", images), ("--placement", placement), ("--operator", operator),
         ("--seed", seed),
@@ -119,8 +133,8 @@ def acquire(
         raise InputError("--resume needs the RECORDING to go on with")
     if operator is not None and not resume and placement != "pattern-injection":
         raise InputError("--operator needs --placement pattern-injection")
-    if code is not None and not move:
-        raise InputError("--confirm needs --move")
+    if unattended is not None and not move:
+        raise InputError("--unattended needs --move")
     from hw.recording_check import check_resumable, settings_of
 
     if resume:
@@ -146,23 +160,25 @@ def acquire(
             operator,
         )  # fmt: skip
     with ExitStack() as stack:
-        emulated = _started(stack, bench, bench_seed, speed)
+        emulated = _started(stack, bench, bench_seed, speed, controller)
         setup = _setup_of(setup_path, emulated)
         if not bench and not move:
             return _dry_run(setup, path, request, preview)
         if preview is not None:
             _preview(setup, request, preview)
-        return _acquire(setup, path, request, emulated, code, operator, view)
+        return _acquire(setup, path, request, emulated, unattended, operator, view)
 
 
 @commands.command()
 @_speed
+@_controller
 @click.option("--seed", type=click.IntRange(min=0), default=0, metavar="N", help="Which world.")
-def bench(speed: float | None, seed: int) -> int:
+def bench(speed: float | None, controller: str | None, seed: int) -> int:
     """Serve an emulated bench until Ctrl-C; prints one JSON line with its addresses."""
     from hw.bench.run import Options, serve
 
-    serve(Options(speed=1.0 if speed is None else speed, seed=seed))
+    pose_hz = _POSE_HZ[controller or "cb"]
+    serve(Options(speed=1.0 if speed is None else speed, seed=seed, pose_hz=pose_hz))
     return ExitCode.CONVERGED
 
 
@@ -170,16 +186,17 @@ def bench(speed: float | None, seed: int) -> int:
 @_bench
 @_setup
 @_speed
-def check(bench: bool, setup_path: str | None, speed: float | None) -> int:
+@_controller
+def check(bench: bool, setup_path: str | None, speed: float | None, controller: str | None) -> int:
     """Look at each device and say what is wrong; nothing moves."""
     if bench == (setup_path is not None):
         raise InputError("give either --bench or --setup TOML")
-    if speed is not None and not bench:
-        raise InputError("--speed needs --bench")
+    if (speed, controller) != (None, None) and not bench:
+        raise InputError("--speed and --controller need --bench")
     from hw.check import check as look
 
     with ExitStack() as stack:
-        found = look(_setup_of(setup_path, _started(stack, bench, None, speed or 1.0)))
+        found = look(_setup_of(setup_path, _started(stack, bench, None, speed or 1.0, controller)))
     for finding in found:
         click.echo(f"{finding.device}: {'wrong' if finding.wrong else 'good'}: {finding.facts}")
         for line in finding.wrong:
@@ -207,12 +224,15 @@ def _recorded_operator(settings: dict[str, object]) -> str:
     return operator if isinstance(operator, str) and operator in OPERATORS else "simulated"
 
 
-def _started(stack: ExitStack, bench: bool, seed: int | None, speed: float | None) -> Bench | None:
+def _started(
+    stack: ExitStack, bench: bool, seed: int | None, speed: float | None, controller: str | None
+) -> Bench | None:
     if not bench:
         return None
     from hw.emulated import SPEED, start
 
-    return stack.enter_context(start(seed or 0, SPEED if speed is None else speed))
+    speed = SPEED if speed is None else speed
+    return stack.enter_context(start(seed or 0, speed, _POSE_HZ[controller or "cb"]))
 
 
 def _setup_of(path: str | None, emulated: Bench | None) -> Setup:
@@ -230,7 +250,7 @@ def _acquire(
     path: str,
     request: Request | None,
     emulated: Bench | None,
-    code: str | None,
+    unattended: str | None,
     operator: str,
     show: bool,
 ) -> int:
@@ -241,7 +261,7 @@ def _acquire(
     from hw.midplane.terminal_image import Screen
 
     pause, screen = Pause(), Screen(sys.stderr)
-    confirming = _confirming(setup, emulated is not None, code)
+    confirming = _confirming(setup, emulated is not None, unattended)
 
     def say(line: str) -> None:
         screen.say(line)
@@ -312,27 +332,45 @@ def _finished(path: str, outcome: Outcome, setup: Setup) -> int:
     return exit_code([calibrate_and_print(path, outcome, setup.clock.speed)])
 
 
-def _confirming(setup: Setup, emulated: bool, code: str | None) -> Confirm:
+def _confirming(setup: Setup, emulated: bool, unattended: str | None) -> Confirm:
     """Who confirms the plan: the emulated bench's needs nobody's word, a robot's a person's."""
 
-    def ask(plan):
-        from hw.robot.safety import confirm, plan_lines
+    def ask(plan: MotionPlan) -> Confirmation:
+        from hw.robot.safety import Challenge, confirm, confirm_unattended
 
         if emulated:
-            return confirm(plan, plan.code, clock=setup.clock)
-        if code is not None:
-            return confirm(plan, code, clock=setup.clock)
-        for line in plan_lines(plan):
+            return confirm_unattended(plan, plan.digest, clock=setup.clock)
+        for line in _plan_page(plan):
             click.echo(line, err=True)
+        if unattended is not None:
+            return confirm_unattended(plan, unattended, clock=setup.clock)
+        challenge = Challenge(plan)
         click.echo(
-            f"{len(plan.targets)} poses for robot {plan.serial}; its speed is capped at "
-            f"{plan.limits.max_speed_mm_s:g} mm/s. Clear the tank, keep the emergency stop in "
-            f"reach, then type {plan.code} to let it move.",
+            "Clear the tank, keep the emergency stop in reach, then type "
+            f"{challenge.code} to let it move.",
             err=True,
         )
-        return confirm(plan, click.prompt("code", err=True), clock=setup.clock)
+        return confirm(challenge, click.prompt("code", err=True), clock=setup.clock)
 
     return ask
+
+
+def _plan_page(plan: MotionPlan) -> list[str]:
+    """What somebody who confirms a plan must know of it."""
+    from hw.robot.safety import plan_lines
+
+    lines = [
+        f"{len(plan.targets)} poses for robot {plan.serial}",
+        *plan_lines(plan),
+        f"at the pendant: {plan.pendant}",
+        f"the plan's digest begins with {plan.digest[:16]}",
+    ]
+    if not plan.identified:
+        lines.append(
+            "NOTHING IDENTIFIES THIS ARM: its controller tells neither serial number nor "
+            "calibration, only its address is known; look which arm it is"
+        )
+    return lines
 
 
 def _dry_run(setup: Setup, path: str, request: Request | None, preview: str | None) -> int:

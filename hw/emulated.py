@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.bench.run import Bench, start_bench
+from hw.bench.run import Bench, Options, start_bench
 from hw.setup import Setup
 
 SPEED = 5.0
@@ -13,14 +13,19 @@ SPEED = 5.0
 _IMAGES_WALL_HZ = 10.0
 
 
-def start(seed: int, speed: float) -> Bench:
+def start(seed: int, speed: float, pose_hz: int = Options.pose_hz) -> Bench:
     """Start a bench for an acquisition.
+
+    Args:
+        seed: of the world.
+        speed: bench seconds per second on the wall.
+        pose_hz: of the robot, which says what series it is (:class:`hw.bench.run.Options`).
 
     Raises:
         InputError: a speed that cannot be.
     """
     return start_bench(
-        seed=seed, speed=speed, pose_hz=500, most_images_wall_hz=_IMAGES_WALL_HZ,
+        seed=seed, speed=speed, pose_hz=pose_hz, most_images_wall_hz=_IMAGES_WALL_HZ,
         most_poses_wall_hz=min(max(62.5 * speed, 125.0), 1000.0),
     )  # fmt: skip
 
@@ -35,6 +40,7 @@ def setup_of(bench: Bench) -> Setup:
         scene=bench.scene,
         probe=bench.probe,
         clock=bench.clock,
+        tcp_offset=bench.tcp_offset,
         limits={
             "box_min_mm": [x - 200.0, y - 200.0, z - 45.0],
             "box_max_mm": [x + 200.0, y + 200.0, z + 200.0],

@@ -45,6 +45,8 @@ def dry_run(setup: Setup, path: str, request: Request | None, figure: str | None
         *plan_lines(motion, tcp_offset_known=setup.tcp_offset is not None),
         "every pose and every way between two lies within the limits",
         arm,
+        "not looked at: which arm it is, its TCP offset, payload and speed slider; they are read, "
+        "shown and confirmed with --move (jaxcal-hw check shows them now)",
         f"nothing moved and {path} was not made; add --move to acquire",
     ]
 

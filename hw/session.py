@@ -12,8 +12,10 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -246,26 +248,29 @@ class Session:
 
         Args:
             frames: how many.
-            since: bench time; a frame is taken to have begun a frame's period before it arrived.
+            since: bench time; a frame is taken to have begun a frame's period before it arrived,
+                by the stream's own period (:func:`frame_period`).
 
         Raises:
             DeviceError: trouble while waiting.
         """
-        period = 1 / 30
-        deadline = self.clock.now() + 2 * frames * period + self.clock.patience(self.watch.grace_s)
-        if self.clock.now() - self._delay_measured > _DELAY_S:
+        began = self.clock.now()
+        if began - self._delay_measured > _DELAY_S:
             self._measure_echo_delay()
+        found: list[EchoFrame] = []
         with self._changed:
             while True:
-                found = [
-                    f for f in self._echo_frames
-                    if f.t_host - (f.late_s if f.late_s > period else period) > since
-                ]  # fmt: skip
+                period = frame_period(list(self._echo_frames), self._clock_hz)
+                if period is not None:
+                    found = [
+                        f for f in self._echo_frames if f.t_host - max(f.late_s, period) > since
+                    ]
                 if len(found) >= frames:
                     return found[:frames]
                 if self._failure is not None:
                     raise self._failure
-                if self.clock.now() > deadline:
+                late = 2 * frames * (period or 0.0) + self.clock.patience(self.watch.grace_s)
+                if self.clock.now() > began + late:
                     break
                 self._changed.wait(self.clock.wall(0.1))
         self.check()
@@ -361,6 +366,24 @@ class Session:
                 self._recorder.add_clock(
                     device, fit.offset_s, fit.drift, fit.reference_s, residual, now
                 )
+
+
+def frame_period(frames: Sequence[EchoFrame], clock_hz: float) -> float | None:
+    """Seconds from one frame trigger to the next, by the device's clock; None where unknown.
+
+    Args:
+        frames: in order; where some are missing, their numbers say how many.
+        clock_hz: of the device's ticks.
+
+    Returns:
+        The median over pairs of frames that follow each other.
+    """
+    periods = [
+        (second.ticks - first.ticks) / clock_hz / (second.frame - first.frame)
+        for first, second in pairwise(frames)
+        if second.frame > first.frame and second.ticks > first.ticks
+    ]
+    return float(np.median(periods)) if periods else None
 
 
 def median_times(frames: list[EchoFrame]) -> tuple[np.ndarray, float]:

@@ -4,6 +4,9 @@ A motion is a path (position along a line, orientation along a great circle, bot
 parameter) and a profile over it (trapezoid of speed, or a brake). The state at any bench time
 follows from the last motion alone, so reading it has no side effects and any thread may do so.
 
+Another TCP offset (:meth:`Arm.set_tcp_offset`) changes what is reported and commanded, not where
+the tool is: the path of a motion is that of the TCP at its start.
+
 The tool is where the commands put it only to within the arm's repeatability: :meth:`Arm.raw` is
 what the joint encoders say, :meth:`Arm.true_raw` is where the tool is. The difference is redrawn
 with travel (its correlation falls as exp(-travel / ``correlation_mm``)), as a fine step hardly
@@ -51,6 +54,10 @@ class Motion:
     """Path parameter (m or rad) at which the profile starts."""
     brake: bool = False
     error: tuple[Vector, Vector] = ((0.0,) * 6, (0.0,) * 6)
+    planned_tcp: Vector = (0.0,) * 6
+    """TCP offset (m, rad) whose path it is."""
+    tcp: Vector = (0.0,) * 6
+    """TCP offset (m, rad) that is reported."""
 
     def duration(self) -> float:
         """Bench seconds from its start until the arm rests."""
@@ -88,7 +95,7 @@ class Arm:
 
     Args:
         raw: where the tool starts, [x, y, z] m and rotation vector rad, in the base frame.
-        tcp_offset: the tool centre point in the flange's frame, as ``raw``; recorded, not used.
+        tcp_offset: the tool centre point in the flange's frame, as ``raw``: that of the real tool.
         repeatability_mm: SD of the tool's position error per axis.
         repeatability_deg: SD of its orientation error per axis.
         correlation_mm: travel over which the error is forgotten.
@@ -121,7 +128,7 @@ class Arm:
         """What it was made of: another process can make the same arm."""
         self.watcher: Callable[[Motion], None] | None = None
         """Told of every new motion, in the thread that commands it."""
-        self.tcp_offset: Vector = _six(tcp_offset)
+        self._tool: Vector = _six(tcp_offset)
         self.halt_acceleration = halt_acceleration
         self.reach_m = reach_m
         self.force: Vector = (0.0,) * 6
@@ -133,13 +140,22 @@ class Arm:
         start = _six(raw)
         self._motion = Motion(
             -math.inf, start[:3], _quaternion(start[3:]), (0.0,) * 3, (0.0,) * 3, 0.0, 1.0, 1.0,
-            error=(first, first),
+            error=(first, first), planned_tcp=self._tool, tcp=self._tool,
         )  # fmt: skip
         self.model = None if model is None else model_named(model)
         self._track: JointTrack | None = None
         if self.model is not None:
             joints = first_joints(self.model, start, self.tcp_offset)
             self._track = track(self.model, self._motion, self.tcp_offset, joints)
+
+    @property
+    def tcp_offset(self) -> Vector:
+        """Of the tool centre point in the flange's frame (m, rad), as the controller believes."""
+        return self._motion.tcp
+
+    def set_tcp_offset(self, offset: Sequence[float]) -> None:
+        """Report and command another point of the tool; nothing moves."""
+        self.follow(replace(self._motion, tcp=_six(offset)))
 
     def move_linear(
         self, t: float, target: Sequence[float], speed: float, acceleration: float
@@ -164,6 +180,7 @@ class Arm:
 
     def _plan(self, t: float, target: Sequence[float], speed: float, acceleration: float) -> Motion:
         position, quaternion, error = self._where(t)
+        tcp = self._motion.tcp
         goal = _six(target)
         travel = tuple(b - a for a, b in zip(position, goal[:3], strict=True))
         turn = _rotation_vector(_multiply(_quaternion(goal[3:]), _conjugate(quaternion)))
@@ -177,7 +194,7 @@ class Arm:
         )
         return Motion(
             t, position, quaternion, travel, turn, length, speed, acceleration,
-            error=(error, drawn),
+            error=(error, drawn), planned_tcp=tcp, tcp=tcp,
         )  # fmt: skip
 
     def servo(self, t: float, target: Sequence[float], duration: float) -> None:
@@ -207,6 +224,7 @@ class Arm:
     def true_raw(self, t: float) -> Vector:
         """Where the tool really is at bench time t: m and rotation vector (rad)."""
         position, quaternion, error = self._where(t)
+        position, quaternion = _retooled(position, quaternion, self._motion.tcp, self._tool)
         moved = tuple(p + e for p, e in zip(position, error, strict=False))
         return moved + _rotation_vector(_multiply(_quaternion(error[3:]), quaternion))
 
@@ -279,13 +297,28 @@ class Arm:
         return all(math.isfinite(v) for v in raw) and low <= math.hypot(*raw[:3]) <= high
 
     def _where(self, t: float) -> tuple[Vector, Vector, Vector]:
+        """Position and orientation of the TCP that is reported, and the arm's error."""
         moving = self._motion
         part = 0.0 if moving.length == 0.0 else moving.at(t)[0] / moving.length
         position = tuple(p + part * d for p, d in zip(moving.position, moving.travel, strict=True))
         step = _quaternion(tuple(part * w for w in moving.turn))
         first, last = moving.error
         error = tuple(a + part * (b - a) for a, b in zip(first, last, strict=True))
-        return position, _multiply(step, moving.quaternion), error
+        quaternion = _multiply(step, moving.quaternion)
+        return *_retooled(position, quaternion, moving.planned_tcp, moving.tcp), error
+
+
+def _retooled(
+    position: Vector, quaternion: Vector, before: Vector, after: Vector
+) -> tuple[Vector, Vector]:
+    """Pose of another point of the same tool: both points as TCP offsets (m, rad)."""
+    if before == after:
+        return position, quaternion
+    flange = _multiply(quaternion, _conjugate(_quaternion(before[3:])))
+    arm = tuple(b - a for a, b in zip(before[:3], after[:3], strict=True))
+    shift = _multiply(_multiply(flange, (0.0, *arm)), _conjugate(flange))[1:]
+    moved = tuple(p + s for p, s in zip(position, shift, strict=True))
+    return moved, _multiply(flange, _quaternion(after[3:]))
 
 
 def _six(values: Sequence[float]) -> Vector:

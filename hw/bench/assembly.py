@@ -129,7 +129,8 @@ class Assembly:
             "true_pose": lambda _: self.true_pose(self.clock.now()).tolist(),
             "rest_since": lambda _: self._rest_since(),
             "world": lambda _: self._world(), "test_set": self._test_set,
-            "statistics": lambda _: self._statistics(), "close": lambda _: self._done.put(None),
+            "statistics": lambda _: self._statistics(), "robot": lambda _: self._robot(),
+            "close": lambda _: self._done.put(None),
         })  # fmt: skip
 
     # What the devices notice
@@ -166,7 +167,8 @@ class Assembly:
         return {
             "speed": self.clock.speed, "origin_s": self.clock.origin_s,
             "robot_host": self.robot.host, "robot_serial": self.robot.serial,
-            "pose_hz": self.robot.frequency_hz, "active_echo_url": self.echo.path,
+            "pose_hz": self.robot.frequency_hz, "tcp_offset": list(self.arm.tcp_offset),
+            "active_echo_url": self.echo.path,
             "ultrasound": [self.images.host, self.images.port], "control": self.control.port,
             "spacing_mm": list(self.camera.spacing_mm), "clock_hz": world.clock_hz,
             "scene": {name: np.asarray(part).tolist() for name, part in vars(world.scene).items()},
@@ -222,6 +224,8 @@ class Assembly:
             "drop": lambda: robot().drop(),
             "protective_stop": lambda: robot().protective_stop(),
             "unlock": lambda: robot().unlock(),
+            "payload": lambda mass_kg: robot().set_payload(float(mass_kg)),
+            "speed_slider": lambda fraction: robot().set_speed_slider(float(fraction)),
             "tcp_offset": lambda offset: robot().set_tcp_offset(tuple(map(float, offset))),
             "crc_errors": lambda rate: self.echo.crc_errors(float(rate)),
             "miss_triggers": lambda rate: self.echo.miss_triggers(float(rate)),
@@ -274,6 +278,12 @@ class Assembly:
     def _test_set(self, request: dict) -> list:
         poses, points = self.world.test_set(**request)
         return [poses.tolist(), points.tolist()]
+
+    def _robot(self) -> dict:
+        """Whether the controller's program runs, and why it last stopped."""
+        assert self.robot is not None
+        state = self.robot.state()
+        return {name: state[name] for name in ("running", "reason")}
 
     def _statistics(self) -> dict:
         assert self.robot is not None

@@ -8,6 +8,7 @@ synchronous motion runs, the program reads nothing, as on the real controller.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from hw.bench.arm import Arm
@@ -22,6 +23,14 @@ NORMAL_BIT, PROTECTIVE_BIT = 1 << 0, 1 << 2
 _REAL_TIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71})
 _START_S = 0.05
 """From the end of the script's upload to its first line."""
+_NAMES = {
+    1: "moveJ", 2: "moveJ_IK", 4: "moveL_FK", 6: "forceMode", 7: "forceModeStop", 9: "speedJ",
+    10: "speedL", 11: "servoJ", 12: "servoC", 18: "teachMode", 19: "endTeachMode",
+    25: "toolContact", 30: "getInverseKinematics", 37: "isJointsWithinSafetyLimits",
+    41: "jogStart", 43: "getForwardKinematics", 44: "getForwardKinematics", 45: "movePath",
+    46: "getInverseKinematics",
+}  # fmt: skip
+"""ur_rtde's names of commands that end the program, as an unknown function ends a real script."""
 STEADY_S = 0.5
 """How long the arm must have rested to count as steady (URScript manual, is_steady)."""
 
@@ -41,6 +50,12 @@ class Controller:
     """Commands taken: bench time, code, double registers 0-8. The last 10,000."""
     reason: str = ""
     """Why the program last stopped."""
+    payload_kg: float = 0.0
+    payload_cog_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    speed_fraction: float = 1.0
+    """Of the speed slider."""
+    told: Callable[[str, bool], None] = field(default=lambda reason, fault: None, repr=False)
+    """Called when a program stops: the reason, and whether it is a fault of the program."""
 
     _starts: float | None = None
     _latched: bool = False
@@ -73,13 +88,15 @@ class Controller:
         self.halt(t, "another script was sent")
         self._starts = t + _START_S
 
-    def halt(self, t: float, reason: str) -> None:
-        """Stop the program, and the arm with it."""
-        if self.running:
-            self.reason = reason
-        self.running = self._latched = False
+    def halt(self, t: float, reason: str, *, fault: bool = False) -> None:
+        """Stop the program, and the arm with it; ``fault``: as a runtime error of the script."""
+        ran, self.running = self.running, False
+        self._latched = False
         self._waits_for = self._finishes = self._watchdog_s = self._starts = None
         self.arm.stop(t)
+        if ran:
+            self.reason = reason
+            self.told(reason, fault)
 
     def protect(self, t: float, reason: str = "protective stop") -> None:
         """A protective stop."""
@@ -142,8 +159,12 @@ class Controller:
                 self.arm.servo(t, d[:6], d[8])
             case 15 | 16 | 33 | 34:
                 self._stop(t, d[0])
+            case 8:
+                self.arm.force = (0.0,) * 6
+            case 17:
+                self.payload_kg, self.payload_cog_m = d[0], tuple(d[1:4])
             case 29:
-                self.arm.tcp_offset = tuple(d[:6])
+                self.arm.set_tcp_offset(d[:6])
             case 31:
                 self.protect(t)
             case 35:
@@ -159,16 +180,17 @@ class Controller:
             case 255:
                 self.halt(t, "the client stopped the script")
             case _:
-                self.halt(t, f"command {command} is not emulated")
+                name = _NAMES.get(command, "an unknown command")
+                self.halt(t, f"{name} (command {command}) is not emulated", fault=True)
 
     def _move(self, t: float) -> None:
         d = self.double_in
         if not self.arm.within_reach(d[:6]) or not (d[6] > 0 and d[7] > 0):
-            self.halt(t, "moveL to a pose out of reach, or without speed")
+            self.halt(t, "moveL to a pose out of reach, or without speed", fault=True)
             return
         if self._finishes is not None:
             self._finish()
-        arrival = self.arm.move_linear(t, d[:6], d[6], d[7])
+        arrival = self.arm.move_linear(t, d[:6], d[6] * max(self.speed_fraction, 1e-3), d[7])
         if self.int_in[1]:
             self._progress(0)
             self._finishes = arrival

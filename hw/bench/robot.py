@@ -127,6 +127,14 @@ class RobotProcess:
         """What a person does at the pendant: another tool (m, rad)."""
         self.ask("set_tcp_offset", tuple(offset))
 
+    def set_payload(self, mass_kg: float, cog_m: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        """What a person does at the pendant: another payload."""
+        self.ask("set_payload", mass_kg, tuple(cog_m))
+
+    def set_speed_slider(self, fraction: float) -> None:
+        """What a person does at the pendant."""
+        self.ask("set_speed_slider", fraction)
+
     def state(self) -> dict:
         """Where the arm is, what the program does, and every command so far."""
         state = self.ask("state")
@@ -232,7 +240,10 @@ def _do(robot: RtdeServer, name: str, values: list) -> dict:
             robot.arm.force = tuple(values[0])
         case "drop control":
             robot.drop(control_only=True)
-        case "mute" | "drop" | "protective_stop" | "unlock" | "set_tcp_offset":
+        case (
+            "mute" | "drop" | "protective_stop" | "unlock" | "set_tcp_offset" | "set_payload"
+            | "set_speed_slider"
+        ):  # fmt: skip
             getattr(robot, name)(*values)
         case _:
             return {"trouble": f"unknown request {name}"}

@@ -1,10 +1,20 @@
 """A Universal Robots controller on loopback that the real ur_rtde accepts.
 
-Ports are fixed: 29999 dashboard, 30003 scripts, 30004 real-time data (RTDE); several robots live at
-several loopback addresses. Run it in another process than its client, whose constructors hold the
-interpreter's lock. Two versions are known to be taken: 5.11.0 (500 Hz) and 3.15.8 (125 Hz).
+Ports are fixed: 29999 dashboard, 30001 primary interface, 30003 scripts, 30004 real-time data
+(RTDE); several robots live at several loopback addresses. Run it in another process than its
+client, whose constructors hold the interpreter's lock. Two versions are known to be taken: 5.11.0
+(500 Hz) and 3.15.8 (125 Hz).
 
-Source: the RTDE guide of Universal Robots, and what ur_rtde 1.6.5 sends and expects.
+What it does not do, it says: a command of ur_rtde's script that is not emulated ends the program,
+as an unknown function ends a script, and the reason goes to the primary interface as a text
+message, to the process's standard error, and into the ``state`` of :mod:`hw.bench.robot`
+(``robot`` of a bench's control socket). The primary interface sends the arm's kinematic calibration
+when a client connects (3.6 or newer), and those texts; not the ten states a second of a real
+controller. Only one client may write an input register (IN_USE); a recipe with an unknown variable
+cannot be started; a packet of an unknown type ends the connection.
+
+Source: the RTDE guide of Universal Robots, its articles on the client interfaces and the dashboard,
+ur_client_library, and what ur_rtde 1.6.5 sends and expects.
 """
 
 from __future__ import annotations
@@ -12,6 +22,7 @@ from __future__ import annotations
 import contextlib
 import math
 import queue
+import random
 import selectors
 import socket
 import struct
@@ -24,12 +35,21 @@ from hw.bench.controller import Controller
 from hw.bench.rtde_fields import INPUTS, OUTPUTS, STRUCT, output_type
 from hw.clock import REAL, Clock
 from hw.robot._process import ANSWERS, be_prompt
+from hw.robot.identity import (
+    DASHBOARD_PORT,
+    KINEMATICS,
+    KINEMATICS_INFO,
+    PRIMARY_PORT,
+    ROBOT_STATE,
+)
+from hw.robot.kinematics import MODELS
 
 __all__ = ["Arm", "RtdeServer"]
 
-DASHBOARD, SCRIPT, RTDE = 29999, 30003, 30004
+DASHBOARD, PRIMARY, SCRIPT, RTDE = DASHBOARD_PORT, PRIMARY_PORT, 30003, 30004
 _MAX_WAITING = 1 << 16
 """Bytes that may wait for a client that does not read; further packets are left out for it."""
+_ROBOT_MESSAGE = 20
 _LATE_S = 1.0
 _MAX_INPUT = 1 << 20
 """Bytes that a client may send without completing a message or script."""
@@ -43,6 +63,8 @@ class _Connection:
         self.outputs: list[tuple[str, int, str]] = []
         self.packet = bytearray()
         self.inputs: list[list[str]] = []
+        self.complete = True
+        """Whether every variable of the output recipe exists."""
         self.started = False
 
 
@@ -56,7 +78,7 @@ class RtdeServer:
         clock: bench time; the controller's own time is this plus an offset and a drift.
         frequency_hz: packets per bench second; by default 500 from version 5 on, else 125.
         max_rate_hz: packets per wall second, whatever the clock's speed asks for.
-        serial: what the dashboard says.
+        serial: what the dashboard says; the arm's kinematic calibration is drawn from it.
         offset_s: controller time at bench time zero.
         drift_ppm: of the controller's time against bench time.
 
@@ -80,7 +102,7 @@ class RtdeServer:
         self.serial = serial
         nominal = frequency_hz or (500.0 if version[0] >= 5 else 125.0)
         self.frequency_hz = min(nominal, max_rate_hz / clock.speed)
-        self.controller = Controller(arm)
+        self.controller = Controller(arm, told=self._say_why)
         self.unlock_requests = 0
         self.packets = 0
         self.skipped = 0
@@ -107,7 +129,7 @@ class RtdeServer:
             OSError: an address is taken.
         """
         try:
-            for port in (DASHBOARD, SCRIPT, RTDE):
+            for port in (DASHBOARD, PRIMARY, SCRIPT, RTDE):
                 listener = socket.create_server((self.host, port))
                 listener.setblocking(False)
                 self._listeners.append(listener)
@@ -182,9 +204,22 @@ class RtdeServer:
 
     def set_tcp_offset(self, offset: tuple[float, ...]) -> None:
         """What a person does at the pendant: another tool."""
+        self._call(lambda: self.arm.set_tcp_offset(offset))
+
+    def set_payload(self, mass_kg: float, cog_m: tuple[float, ...]) -> None:
+        """What a person does at the pendant: another payload."""
 
         def act() -> None:
-            self.arm.tcp_offset = tuple(offset)
+            self.controller.payload_kg = float(mass_kg)
+            self.controller.payload_cog_m = tuple(cog_m)
+
+        self._call(act)
+
+    def set_speed_slider(self, fraction: float) -> None:
+        """What a person does at the pendant; motions from now on are slower."""
+
+        def act() -> None:
+            self.controller.speed_fraction = float(fraction)
 
         self._call(act)
 
@@ -248,6 +283,8 @@ class RtdeServer:
                 self._selector.register(sock, selectors.EVENT_READ, connection)
             if data == DASHBOARD:
                 connection.waiting += b"Connected: Universal Robots Dashboard Server\n"
+            elif data == PRIMARY and self.version[:2] >= (3, 6):
+                connection.waiting += self._kinematics()
         else:
             self._read(data)
 
@@ -269,6 +306,9 @@ class RtdeServer:
             self._messages(connection)
         elif connection.port == SCRIPT:
             self._script(connection)
+        elif connection.port == PRIMARY:
+            # It would run what is sent; nobody here sends anything.
+            self._forget(connection)
         else:
             self._dashboard(connection)
 
@@ -340,8 +380,10 @@ class RtdeServer:
             "runtime_state": program.runtime_state,
             "robot_status_bits": program.robot_status_bits,
             "safety_status_bits": program.safety_status_bits,
-            "speed_scaling": 1.0,
-            "target_speed_fraction": 1.0,
+            "speed_scaling": program.speed_fraction,
+            "target_speed_fraction": program.speed_fraction,
+            "payload": program.payload_kg,
+            "payload_cog": program.payload_cog_m,
         }
         joints, speeds = arm.joints(t), arm.joint_speeds(t)
         if joints is not None and speeds is not None:
@@ -381,23 +423,37 @@ class RtdeServer:
             case "O":
                 return self._set_outputs(connection, payload)
             case "I":
-                names = _names(payload)
-                connection.inputs.append(names)
-                types = ",".join(INPUTS.get(name, "NOT_FOUND") for name in names)
-                return bytes([len(connection.inputs)]) + types.encode()
+                return self._set_inputs(connection, payload)
             case "S" | "P":
-                connection.started = chr(kind) == "S"
-                return b"\x01"
+                connection.started = chr(kind) == "S" and connection.complete
+                return bytes([connection.complete or chr(kind) == "P"])
             case "U":
                 self._take(connection, payload)
                 return None
             case _:
+                self._forget(connection)
                 return None
+
+    def _set_inputs(self, connection: _Connection, payload: bytes) -> bytes:
+        names = _names(payload)
+        taken = {
+            name for other in self._connections if other is not connection
+            for recipe in other.inputs for name in recipe
+        }  # fmt: skip
+        types = [
+            "IN_USE" if name in taken else INPUTS.get(name, "NOT_FOUND") for name in names
+        ]  # fmt: skip
+        if "IN_USE" in types or "NOT_FOUND" in types:
+            return b"\x00" + ",".join(types).encode()
+        connection.inputs.append(names)
+        return bytes([len(connection.inputs)]) + ",".join(types).encode()
 
     def _set_outputs(self, connection: _Connection, payload: bytes) -> bytes:
         names = _names(payload[8:])
         types = [output_type(name, self.version) for name in names]
-        if "NOT_FOUND" not in types:
+        connection.complete = "NOT_FOUND" not in types
+        connection.started = connection.started and connection.complete
+        if connection.complete:
             codes = [">" + STRUCT[kind] for kind in types]
             offsets = [4]
             for code in codes:
@@ -413,6 +469,10 @@ class RtdeServer:
         return b"\x01" + ",".join(types).encode()
 
     def _take(self, connection: _Connection, payload: bytes) -> None:
+        if not 1 <= payload[0] <= len(connection.inputs):
+            # A recipe that was refused, or never set.
+            self._forget(connection)
+            return
         names = connection.inputs[payload[0] - 1]
         offset = 1
         program = self.controller
@@ -429,6 +489,34 @@ class RtdeServer:
         if "input_int_register_0" in names:
             program.kick(now)
         program.step(now)
+
+    # Primary interface
+
+    def _kinematics(self) -> bytes:
+        """A state message with the arm's kinematic calibration: nominal numbers, a little off."""
+        model = MODELS["UR5e" if self.version[0] >= 5 else "UR5"]
+        rng = random.Random(self.serial)
+        checksums = [rng.getrandbits(32) for _ in range(6)]
+        # The factory finds some tenths of a mm and of a mrad.
+        theta, alpha = ([rng.gauss(0.0, 3e-4) for _ in range(6)] for _ in range(2))
+        alpha = [a + b for a, b in zip(alpha, (1.5708, 0, 0, 1.5708, -1.5708, 0), strict=True)]
+        a = [value / 1000.0 + rng.gauss(0.0, 3e-4) for value in model.a]
+        d = [value / 1000.0 + rng.gauss(0.0, 3e-4) for value in model.d]
+        body = KINEMATICS.pack(*checksums, *theta, *a, *d, *alpha, 0)
+        part = struct.pack(">IB", 5 + len(body), KINEMATICS_INFO) + body
+        return struct.pack(">IB", 5 + len(part), ROBOT_STATE) + part
+
+    def _say_why(self, reason: str, fault: bool) -> None:
+        """A text message to the primary interface's clients, and a line for who runs this."""
+        if fault:
+            print(f"emulated controller {self.host}: program stopped: {reason}", file=sys.stderr)
+        # Robot message: time, source (-2: the controller), type 0 (text).
+        stamp = int(1e6 * self.clock.now())
+        body = struct.pack(">QbB", max(stamp, 0), -2, 0) + f"program stopped: {reason}".encode()
+        message = struct.pack(">IB", 5 + len(body), _ROBOT_MESSAGE) + body
+        for connection in list(self._connections):
+            if connection.port == PRIMARY and len(connection.waiting) < _MAX_WAITING:
+                connection.waiting += message
 
     # Scripts and dashboard
 
@@ -450,21 +538,21 @@ class RtdeServer:
             self._send(connection, (self._say(line) + "\n").encode())
 
     def _say(self, line: str) -> str:
-        program, new = self.controller, self.version[0] >= 5
+        program = self.controller
         match line.lower():
             case "polyscopeversion":
                 return f"URSoftware {'.'.join(map(str, self.version))} (Jan 01 2022)"
-            case "get serial number" if new:
+            case "get serial number" if self._since((3, 12), (5, 6)):
                 return self.serial
-            case "get robot model":
+            case "get robot model" if self._since((3, 12), (5, 6)):
                 # The dashboard's names have no "e": the software's version tells the series.
                 model = self.arm.model
                 return "UR5" if model is None else model.name.removesuffix("e")
-            case "is in remote control" if new:
+            case "is in remote control" if self._since(None, (5, 6)):
                 return "true"
             case "robotmode":
                 return "Robotmode: RUNNING"
-            case "safetystatus" if new:
+            case "safetystatus" if self._since(None, (5, 4)):
                 return f"Safetystatus: {'PROTECTIVE_STOP' if program.protective else 'NORMAL'}"
             case "safetymode":
                 return f"Safetymode: {'PROTECTIVE_STOP' if program.protective else 'NORMAL'}"
@@ -480,6 +568,11 @@ class RtdeServer:
                 return "Protective stop releasing"
             case _:
                 return f"could not understand: '{line}'"
+
+    def _since(self, cb: tuple[int, int] | None, e: tuple[int, int]) -> bool:
+        """Whether this version has what came with these: CB (None: never) and e-Series."""
+        least = e if self.version[0] >= 5 else cb
+        return least is not None and self.version[:2] >= least
 
 
 def _names(text: bytes) -> list[str]:

@@ -44,6 +44,7 @@ class Bench:
         clock: shared with the emulators.
         robot_host: loopback address of the controller.
         robot_serial: what its dashboard says.
+        tcp_offset: (6,) m and rad, of the controller at the start.
         active_echo_url: what to open.
         ultrasound: (host, port).
         scene: what a person knows.
@@ -58,6 +59,7 @@ class Bench:
         self.clock = Clock(told["speed"], told["origin_s"])
         self.robot_host, self.robot_serial = told["robot_host"], told["robot_serial"]
         self.pose_hz: float = told["pose_hz"]
+        self.tcp_offset: tuple[float, ...] = tuple(told["tcp_offset"])
         self.active_echo_url = told["active_echo_url"]
         self.ultrasound: tuple[str, int] = (told["ultrasound"][0], told["ultrasound"][1])
         self.spacing_mm = tuple(told["spacing_mm"])
@@ -80,7 +82,8 @@ class Bench:
         """Have a fault; returns the bench time at which it was in force.
 
         Args:
-            name: mute, drop, protective_stop, unlock, tcp_offset (offset), crc_errors (rate),
+            name: mute, drop, protective_stop, unlock, tcp_offset (offset), payload
+                (mass_kg), speed_slider (fraction), crc_errors (rate),
                 miss_triggers (rate), miss_lines (rate), echo_stale, echo_mute, unplug, replug,
                 image_stale, image_freeze, image_drop or image_corrupt (rate).
             arguments: of the fault.
@@ -126,6 +129,12 @@ class Bench:
     def statistics(self) -> dict[str, int]:
         """What was sent: packets, packets_skipped, echo_frames, images, images_refused."""
         told = self._control.ask("statistics")
+        assert isinstance(told, dict)
+        return told
+
+    def robot(self) -> dict[str, object]:
+        """``running`` and ``reason``: the controller's program, and why it last stopped."""
+        told = self._control.ask("robot")
         assert isinstance(told, dict)
         return told
 

@@ -48,9 +48,17 @@ from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedE
 from hw.extras import require
 from hw.rigid import turn_deg
 from hw.robot._process import ASKS, RECEIVES, be_prompt
+from hw.robot.identity import read_identity
 from hw.robot.limits import Limits, numbers
-from hw.robot.rtde import Packet, PacketReader, read_identity, safety_text
-from hw.robot.safety import Command, Confirmation, Gate, MotionPlan, check_plan
+from hw.robot.rtde import Packet, PacketReader, PendantSettings, safety_text
+from hw.robot.safety import (
+    Command,
+    Confirmation,
+    Gate,
+    MotionPlan,
+    check_plan,
+    out_of_box_mm,
+)
 from hw.robot.stream import Lag, PoseSample, offset_changed
 
 WATCHDOG_HZ, IDLE_WATCHDOG_HZ = 10.0, 0.5
@@ -109,9 +117,15 @@ class Mover:
         self._clock = Clock(*setup["clock"])
         plan = setup["plan"]
         limits = Limits.from_mapping(plan["limits"])
+        pendant = plan["pendant"]
+        cog = pendant["payload_cog_m"]
         self._plan = MotionPlan.from_poses(
-            plan["targets"], limits, plan["tcp_offset"], plan["serial"]
-        )
+            plan["targets"], limits, plan["tcp_offset"], plan["serial"],
+            PendantSettings(
+                pendant["payload_kg"], None if cog is None else tuple(cog),
+                pendant["speed_fraction"],
+            ),
+        )  # fmt: skip
         given = setup["confirmation"]
         confirmation = None if given is None else Confirmation(**given)
         self._gate = Gate(self._plan, confirmation, self._clock)
@@ -122,6 +136,7 @@ class Mover:
         self._packet: Packet | None = None
         self._sample: PoseSample | None = None
         self._offset: tuple[float, ...] | None = None
+        self._pendant: PendantSettings | None = None
         self._state = State.REST
         self._stop: _Stop | None = None
         self._closing = False
@@ -144,13 +159,16 @@ class Mover:
     def start(self) -> None:
         """Connect; the caller waits for the line ``ready``."""
         check_plan(self._plan)
-        self._serial = read_identity(self._host).serial
+        self._serial = read_identity(self._host).name
         self._reader = PacketReader(self._host)
+        asked_s, stamp_s = self._reader.bound
+        if math.isfinite(asked_s):
+            self._lag = Lag(self._clock.at(asked_s), stamp_s)
         self._wait_for_packet()
         if self._dry_run:
             self._tell("ready", serial=self._serial, tcp_offset=self._offset)
             return
-        self._gate.check_authority(self._serial, self._offset or self._plan.tcp_offset)
+        self._gate.check_start(self._serial, self._offset or self._plan.tcp_offset, self._pendant)
         module = require("rtde_control", extra="robot")
         self._log("connect", host=self._host, serial=self._serial)
         try:
@@ -165,7 +183,7 @@ class Mover:
         self._kicked = self._clock.now()
         if self._offset is None:
             self._offset = numbers(self._command("getTCPOffset"), 6, "TCP offset")
-        self._gate.check_authority(self._serial, self._offset)
+        self._gate.check_authority(self._serial, self._offset, self._pendant)
         self._wait_for_packet(running=True)
         self._tell("ready", serial=self._serial, tcp_offset=self._offset)
 
@@ -236,7 +254,7 @@ class Mover:
                     t_host, packet.timestamp_s, packet.tcp_pose, packet.safety_bits,
                     packet.robot_mode, packet.runtime_state, lag,
                 )  # fmt: skip
-                self._compare(packet.tcp_offset)
+                self._compare(packet.tcp_offset, packet.pendant)
         if self._library in ready and self._library is not None:
             text = os.read(self._library, 65536).decode("utf-8", "replace")
             if any(word in text for word in _RECONNECTS):
@@ -286,7 +304,11 @@ class Mover:
         if self._stop is not None or self._closing:
             raise _Interrupted
 
-    def _compare(self, offset: tuple[float, ...] | None) -> None:
+    def _compare(self, offset: tuple[float, ...] | None, pendant: PendantSettings) -> None:
+        changed = "" if self._pendant is None else self._pendant.changed(pendant)
+        if changed:
+            self._latch(RefusedError(f"changed at the pendant: {changed}", device="robot"), True)
+        self._pendant = pendant
         if offset is None:
             return
         if self._offset is not None and offset_changed(self._offset, offset):
@@ -329,6 +351,9 @@ class Mover:
         if self._dry_run:
             self._pretend(pose, speed_mm_s)
             return
+        if self._packet is not None and self._packet.tcp_offset is None:
+            # It is not among this controller's real-time data.
+            self._offset = numbers(self._command("getTCPOffset"), 6, "TCP offset")
         raw = list(self._allow(pose, speed_mm_s).raw)
         if not self._command("isPoseWithinSafetyLimits", raw):
             text = "the controller says that the pose is outside its safety limits"
@@ -355,7 +380,7 @@ class Mover:
         assert self._packet is not None
         return self._gate.check_move(
             pose, self._sample, speed_mm_s, serial=self._serial, tcp_offset=self._offset,
-            force_n=math.hypot(*self._packet.tcp_force[:3]),
+            pendant=self._pendant, force_n=math.hypot(*self._packet.tcp_force[:3]),
         )  # fmt: skip
 
     def _pretend(self, pose: object, speed_mm_s: object) -> None:
@@ -426,10 +451,9 @@ class Mover:
         if force > limits.max_force_n:
             text = f"a force of {force:.1f} N, over the cap of {limits.max_force_n:g} N"
             return StoppedError(text, device="robot"), True
-        tip = sample.pose[:3, :3] @ limits.tip_mm + sample.pose[:3, 3]
-        out = float(np.maximum(limits.box_min_mm - tip, tip - limits.box_max_mm).max())
+        out = out_of_box_mm(sample.pose, limits)
         if out > _BOX_MARGIN_MM:
-            text = f"the probe's tip is {out:.1f} mm out of the box"
+            text = f"the probe is {out:.1f} mm out of the box"
             return StoppedError(text, device="robot"), True
         if now - self._heard > self._clock.patience(self._caller_s):
             # Our own fault, as a silent stream is: nothing says that motion is dangerous.

@@ -6,6 +6,7 @@ last one that says why there are no more. It ends when nobody reads its output.
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import struct
@@ -17,14 +18,18 @@ from hw.extras import require
 from hw.robot._process import RECEIVES, be_prompt
 from hw.robot.rtde import Packet, PacketReader
 
-RECORD = struct.Struct("<8dIiII6d")
-"""Host and device s, pose (6), safety bits, mode, runtime state, whether an offset, offset (6)."""
-POSE, ERROR = b"P", b"E"
-_NO_OFFSET = (0.0,) * 6
+RECORD = struct.Struct("<8dIiI6d5d")
+"""Host and device s, pose (6), safety bits, mode, runtime state, TCP offset (6), payload, its
+centre of gravity (3), speed slider; NaN where the controller does not tell."""
+POSE, ERROR, BOUND = b"P", b"E", b"B"
+"""What a record is; ``BOUND`` comes first: host and device s (:attr:`PacketReader.bound`)."""
+_NOT_TOLD = (math.nan,)
 
 
 def _packets(output: int, host: str, frequency_hz: float | None, timeout_s: float) -> None:
     reader = PacketReader(host, frequency_hz=frequency_hz, timeout_s=timeout_s)
+    if math.isfinite(reader.bound[0]):
+        _write(output, BOUND + struct.pack("<2d", *reader.bound))
     while True:
         if not select.select([reader], [], [], timeout_s)[0]:
             raise LostError(f"the controller was silent for {timeout_s:g} s", device="robot")
@@ -33,10 +38,12 @@ def _packets(output: int, host: str, frequency_hz: float | None, timeout_s: floa
 
 
 def _pack(packet: Packet) -> bytes:
-    offset = packet.tcp_offset
+    pendant = packet.pendant
     return RECORD.pack(
         packet.monotonic_s, packet.timestamp_s, *packet.tcp_pose, packet.safety_bits,
-        packet.robot_mode, packet.runtime_state, offset is not None, *(offset or _NO_OFFSET),
+        packet.robot_mode, packet.runtime_state, *(packet.tcp_offset or _NOT_TOLD * 6),
+        math.nan if pendant.payload_kg is None else pendant.payload_kg,
+        *(pendant.payload_cog_m or _NOT_TOLD * 3), pendant.speed_fraction,
     )  # fmt: skip
 
 
@@ -53,7 +60,7 @@ def _ur_rtde(output: int, host: str, frequency_hz: float | None) -> None:
             continue
         record = (
             *robot.getActualTCPPose(), robot.getSafetyStatusBits(), robot.getRobotMode(),
-            robot.getRuntimeState(), 0, *_NO_OFFSET,
+            robot.getRuntimeState(), *_NOT_TOLD * 11,
         )  # fmt: skip
         if robot.getTimestamp() != before:
             continue

@@ -161,6 +161,7 @@ class Motion:
                 "limits": asdict(self.plan.limits),
                 "tcp_offset": self.plan.tcp_offset,
                 "serial": self.plan.serial,
+                "pendant": asdict(self.plan.pendant),
             },
             "confirmation": None
             if given is None

@@ -15,16 +15,15 @@ from __future__ import annotations
 
 import contextlib
 import math
-import re
 import socket
 import struct
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 from hw.errors import LostError, RefusedError
 
-PORT, DASHBOARD_PORT = 30004, 29999
+PORT = 30004
 
 FIELDS: dict[str, tuple[str, str]] = {
     "timestamp": ("DOUBLE", "d"),
@@ -35,9 +34,15 @@ FIELDS: dict[str, tuple[str, str]] = {
     "runtime_state": ("UINT32", "I"),
     "robot_status_bits": ("UINT32", "I"),
     "safety_status_bits": ("UINT32", "I"),
+    "target_speed_fraction": ("DOUBLE", "d"),
     "tcp_offset": ("VECTOR6D", "6d"),
+    "payload": ("DOUBLE", "d"),
+    "payload_cog": ("VECTOR3D", "3d"),
 }
-"""What is asked for, with the type that must come back; older controllers lack tcp_offset."""
+"""What is asked for, with the type that must come back."""
+
+_OPTIONAL = ("tcp_offset", "payload", "payload_cog")
+"""Older controllers lack these."""
 
 RUNNING_MODE = 7
 NORMAL_BITS = 0b11
@@ -54,6 +59,68 @@ def safety_text(bits: int) -> str:
     wrong = bits & ~NORMAL_BITS
     names = [name for k, name in enumerate(_SAFETY_NAMES) if wrong >> k & 1]
     return ", ".join(names) or (f"safety bits {bits:#x}" if wrong else "")
+
+
+_BOUND_TRIES, _BOUND_S, _BOUND_WITHIN_S = 5, 0.01, 0.25
+"""Tries to bound the latency, how tight, beyond two periods, is tight enough, and how long to try
+(wall s)."""
+_PAYLOAD_TOLERANCE_KG, _COG_TOLERANCE_M, _SPEED_TOLERANCE = 1e-3, 1e-4, 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class PendantSettings:
+    """What a person sets at the pendant, besides the TCP offset, and what motion depends on.
+
+    Attributes:
+        payload_kg: mass that the arm carries; None where the controller does not tell it.
+        payload_cog_m: (3,) its centre of gravity in the flange's frame; None likewise.
+        speed_fraction: of the speed slider, 0 to 1.
+    """
+
+    payload_kg: float | None = 0.0
+    payload_cog_m: tuple[float, ...] | None = (0.0, 0.0, 0.0)
+    speed_fraction: float = 1.0
+
+    def changed(self, now: PendantSettings) -> str:
+        """What is different now, by more than rounding, as a line; empty if nothing is."""
+        found = []
+        if _apart([self.payload_kg], [now.payload_kg], _PAYLOAD_TOLERANCE_KG):
+            found.append(f"the payload is {now.payload_kg} kg, not {self.payload_kg}")
+        if _apart(self.payload_cog_m, now.payload_cog_m, _COG_TOLERANCE_M):
+            found.append(
+                f"the payload's centre of gravity is {now.payload_cog_m} m, "
+                f"not {self.payload_cog_m}"
+            )
+        if _apart([self.speed_fraction], [now.speed_fraction], _SPEED_TOLERANCE):
+            found.append(
+                f"the speed slider is at {100 * now.speed_fraction:.0f} %, "
+                f"not {100 * self.speed_fraction:.0f}"
+            )
+        return "; ".join(found)
+
+    def __str__(self) -> str:
+        if self.payload_kg is None:
+            payload = "payload not told"
+        else:
+            payload = f"payload {self.payload_kg:g} kg at {_metres(self.payload_cog_m)}"
+        return f"{payload}, speed slider at {100 * self.speed_fraction:.0f} %"
+
+
+def _apart(
+    first: Sequence[float | None] | None, second: Sequence[float | None] | None, tolerance: float
+) -> bool:
+    a, b = list(first or [None]), list(second or [None])
+    if len(a) != len(b):
+        return True
+    return any(
+        (x is None) != (y is None)
+        or (x is not None and y is not None and not abs(x - y) <= tolerance)
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+def _metres(values: Sequence[float] | None) -> str:
+    return "an unknown place" if values is None else f"[{', '.join(f'{v:g}' for v in values)}] m"
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +142,7 @@ class Packet:
     safety_bits: int
     tcp_offset: tuple[float, ...] | None
     """Tool centre point in the flange's frame (m, rad); None where the controller tells none."""
+    pendant: PendantSettings
 
 
 class PacketReader:
@@ -95,6 +163,7 @@ class PacketReader:
     ) -> None:
         self.host = host
         self._data = bytearray()
+        self._pendant = PendantSettings()
         try:
             self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
         except OSError as error:
@@ -144,9 +213,16 @@ class PacketReader:
         v = self._struct.unpack_from(payload, 1)
         if not all(map(math.isfinite, v)):
             raise LostError("a packet holds NaN or Inf", device="robot")
-        return Packet(
-            now, v[0], v[1:7], v[7:13], v[13:19], v[19], v[20], v[21], v[22], v[23:29] or None
+        told = dict(zip(self._optional, (v[a:b] for a, b in self._optional_slots), strict=True))
+        pendant = PendantSettings(
+            told["payload"][0] if "payload" in told else None, told.get("payload_cog"), v[23]
         )
+        if pendant != self._pendant:
+            self._pendant = pendant
+        return Packet(
+            now, v[0], v[1:7], v[7:13], v[13:19], v[19], v[20], v[21], v[22],
+            told.get("tcp_offset"), self._pendant,
+        )  # fmt: skip
 
     def _messages(self) -> Generator[tuple[bytes, bytes]]:
         """Kind and payload of each complete message, which is then forgotten."""
@@ -175,8 +251,12 @@ class PacketReader:
         self.frequency_hz = frequency_hz or (500.0 if self.version[0] >= 5 else 125.0)
         names = list(FIELDS)
         types = self._recipe(names, deadline)
-        if types[-1] == "NOT_FOUND":
-            names.remove("tcp_offset")
+        lacking = [
+            name for name, kind in zip(names, types, strict=False)
+            if kind == "NOT_FOUND" and name in _OPTIONAL
+        ]  # fmt: skip
+        if lacking:
+            names = [name for name in names if name not in lacking]
             types = self._recipe(names, deadline)
         wrong = [n for n, kind in zip(names, types, strict=False) if FIELDS[n][0] != kind]
         if wrong or len(types) != len(names):
@@ -184,8 +264,82 @@ class PacketReader:
                 f"the controller has no {', '.join(wrong) or 'such recipe'}", device="robot"
             )
         self._struct = struct.Struct(">" + "".join(FIELDS[name][1] for name in names))
-        if self._ask(b"S", b"", deadline)[:1] != b"\x01":
-            raise RefusedError("the controller would not start sending", device="robot")
+        self._optional = [name for name in names if name in _OPTIONAL]
+        self._optional_slots = []
+        start = 24
+        for name in self._optional:
+            end = start + int(FIELDS[name][1][:-1] or 1)
+            self._optional_slots.append((start, end))
+            start = end
+        self.bound = self._begin(deadline)
+        """Bound of the way's latency, see :meth:`_begin`."""
+
+    def _begin(self, deadline: float) -> tuple[float, float]:
+        """Start the stream, a few times over, and bound how long a packet is on its way.
+
+        The first packet after the controller took a request to start was made after that request
+        was sent, but for one period, as a controller stamps a packet at its cycle's start. However
+        constant a latency is, it cannot make that packet older. Of some tries the tightest counts:
+        a busy machine delays most of them.
+
+        Returns:
+            ``time.monotonic()`` and the controller's time (s): a packet with this stamp was not
+            made before that moment.
+        """
+        period = 1.0 / self.frequency_hz
+        best: tuple[float, float, float] | None = None
+        give_up = time.monotonic() + _BOUND_WITHIN_S
+        for _ in range(_BOUND_TRIES):
+            if best is not None and time.monotonic() > give_up:
+                break
+            if best is not None:
+                # What was sent before the answer to this is read, and dropped, with it.
+                self._ask(b"P", b"", deadline)
+            asked = time.monotonic()
+            if self._ask(b"S", b"", deadline)[:1] != b"\x01":
+                raise RefusedError("the controller would not start sending", device="robot")
+            packet = self._first(deadline)
+            if packet is None:
+                break
+            late = packet.monotonic_s - asked
+            if best is None or late < best[0]:
+                best = late, asked - period, packet.timestamp_s
+            if late < _BOUND_S + 2 * period:
+                break
+        if best is None:
+            # It accepts and sends nothing: whoever reads finds that out.
+            return -math.inf, 0.0
+        return best[1:]
+
+    def _first(self, deadline: float) -> Packet | None:
+        """The first packet after a start; it is read again by :meth:`read`. None: none came."""
+        while True:
+            data = bytes(self._data)
+            if len(data) >= 3:
+                (size,) = struct.unpack_from(">H", data)
+                if size < 3:
+                    raise LostError("what came is no RTDE data", device="robot")
+                if len(data) >= size:
+                    if data[2:3] == b"U":
+                        # What is wrong with it, reading it again says.
+                        with contextlib.suppress(LostError):
+                            return self._packet(time.monotonic(), data[3:size])
+                        return None
+                    del self._data[:size]
+                    continue
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return None
+            self._socket.settimeout(left)
+            try:
+                new = self._socket.recv(65536)
+            except TimeoutError:
+                return None
+            except OSError as error:
+                raise LostError(f"the connection broke: {error}", device="robot") from error
+            if not new:
+                raise LostError("the controller closed the connection", device="robot")
+            self._data += new
 
     def _recipe(self, names: list[str], deadline: float) -> list[str]:
         payload = struct.pack(">d", self.frequency_hz) + ",".join(names).encode()
@@ -211,63 +365,3 @@ class PacketReader:
             raise LostError(f"{self.host} accepted but does not answer", device="robot") from None
         except OSError as error:
             raise LostError(f"the connection broke: {error}", device="robot") from error
-
-
-@dataclass(frozen=True)
-class Identity:
-    """Which robot it is, by its dashboard."""
-
-    serial: str
-    """Serial number; a CB-series dashboard tells none, then ``<model>@<host>``."""
-    version: str
-    """Of PolyScope."""
-    model: str
-
-
-def read_identity(host: str, *, timeout_s: float = 3.0) -> Identity:
-    """Ask the dashboard who the robot is.
-
-    Raises:
-        LostError: no connection, or no answer within ``timeout_s`` wall seconds.
-    """
-    deadline = time.monotonic() + timeout_s
-    try:
-        with socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection:
-            stream = _Lines(connection, deadline)
-            stream.line()
-            version = stream.ask("PolyscopeVersion")
-            serial = stream.ask("get serial number")
-            model = stream.ask("get robot model")
-    except TimeoutError:
-        raise LostError(f"the dashboard of {host} does not answer", device="robot") from None
-    except OSError as error:
-        text = f"no connection to the dashboard of {host}: {error}"
-        raise LostError(text, device="robot") from error
-    number = re.search(r"\d+\.\d+\.\d+(\.\d+)?", version)
-    if not re.fullmatch(r"[\w-]{1,40}", model):
-        model = "unknown"
-    if not re.fullmatch(r"\d{4,20}", serial):
-        serial = f"{model}@{host}"
-    return Identity(serial, number.group() if number else "unknown", model)
-
-
-class _Lines:
-    def __init__(self, connection: socket.socket, deadline: float) -> None:
-        self._socket, self._deadline, self._data = connection, deadline, b""
-
-    def ask(self, text: str) -> str:
-        self._socket.sendall(text.encode() + b"\n")
-        return self.line()
-
-    def line(self) -> str:
-        while b"\n" not in self._data:
-            left = self._deadline - time.monotonic()
-            if left <= 0:
-                raise TimeoutError
-            self._socket.settimeout(left)
-            data = self._socket.recv(1024)
-            if not data or len(self._data) > 1 << 14:
-                raise ConnectionError("it closed the connection" if not data else "endless line")
-            self._data += data
-        line, _, self._data = self._data.partition(b"\n")
-        return line.decode("utf-8", "replace").strip()

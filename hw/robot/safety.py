@@ -19,6 +19,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import secrets
 import threading
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -32,7 +33,7 @@ from hw.robot.feasibility import Arm, Course, check_model, follow, follow_all
 from hw.robot.kinematics import model_named, tool_of
 from hw.robot.limits import Limits, between, numbers
 from hw.robot.pose import pose_to_ur
-from hw.robot.rtde import RUNNING_MODE, safety_text
+from hw.robot.rtde import RUNNING_MODE, PendantSettings, safety_text
 from hw.robot.stream import PoseSample, offset_changed
 
 _ROTATION_TOLERANCE = 1e-6
@@ -62,10 +63,12 @@ class MotionPlan:
     tcp_offset: tuple[float, ...]
     """(6,) of the controller when the plan was made: m and rotation vector (rad)."""
     serial: str
-    """Of the robot."""
+    """Which robot: :attr:`hw.robot.identity.Identity.name`."""
     joints: tuple[float, ...] | None = None
     """(6,) rad of the arm when the plan was made, which decide the branch of its kinematics that
     the plan is checked in; None: any branch. Not part of the digest: it permits nothing."""
+    pendant: PendantSettings = field(default_factory=PendantSettings)
+    """Payload and speed slider when the plan was made."""
 
     def __post_init__(self) -> None:
         targets = _array(self.targets, "the plan's poses")
@@ -83,7 +86,12 @@ class MotionPlan:
 
     @classmethod
     def from_poses(
-        cls, poses: object, limits: Limits, tcp_offset: object, serial: object
+        cls,
+        poses: object,
+        limits: Limits,
+        tcp_offset: object,
+        serial: object,
+        pendant: PendantSettings | None = None,
     ) -> MotionPlan:
         """A plan from what somebody else made; anything that is no plan is refused.
 
@@ -93,18 +101,25 @@ class MotionPlan:
         if not isinstance(serial, str):
             raise _refuse("the plan does not say which robot it is for")
         targets = _array(poses, "the plan's poses")
-        return cls(targets, limits, numbers(tcp_offset, 6, "tcp_offset"), serial)
+        offset = numbers(tcp_offset, 6, "tcp_offset")
+        return cls(targets, limits, offset, serial, pendant=pendant or PendantSettings())
+
+    @property
+    def identified(self) -> bool:
+        """Whether the robot is known by more than its address."""
+        return "@" not in self.serial
 
     @property
     def digest(self) -> str:
-        """SHA-256 over poses, limits, TCP offset and robot; 64 hexadecimal digits."""
+        """SHA-256 over poses, limits, TCP offset, payload, speed slider and robot, 64 digits."""
         head = {
             "limits": asdict(self.limits),
             "tcp_offset": self.tcp_offset,
             "serial": self.serial,
+            "pendant": asdict(self.pendant),
             "targets": len(self.targets),
         }
-        state = hashlib.sha256(b"jaxcal motion plan 1\n")
+        state = hashlib.sha256(b"jaxcal motion plan 2\n")
         state.update(json.dumps(head, sort_keys=True).encode())
         state.update(self.targets.astype("<f8").tobytes())
         return state.hexdigest()
@@ -126,46 +141,118 @@ class MotionPlan:
             np.asarray(limits.arm_box_max_mm),
         )
 
-    @property
-    def code(self) -> str:
-        """What the operator types to confirm: the digest's first eight digits."""
-        return self.digest[:8]
-
 
 @dataclass(frozen=True)
 class Confirmation:
-    """The operator's word for one plan, one robot and one connection, for a while."""
+    """Somebody's word for one plan, one robot and one connection, which must be made in time.
+
+    Attributes:
+        digest: of the plan.
+        serial: of the robot.
+        issued_s: bench time.
+        expires_s: bench time until which motion may be started. It does not end motion that was.
+        unattended: whether nobody was asked.
+        used: set by the motion process that was started with it; a second one needs another.
+    """
 
     digest: str
     serial: str
     issued_s: float
-    """Bench time."""
     expires_s: float
-    """Bench time."""
+    unattended: bool = False
     used: threading.Event = field(default_factory=threading.Event, compare=False, repr=False)
-    """Set by the motion process that was started with it; a second one needs another."""
+
+
+@dataclass(frozen=True)
+class Challenge:
+    """A code for a person to type, for one plan and once: the next challenge has another code.
+
+    Attributes:
+        plan: it is checked first.
+        nonce: random.
+        used: set once it was answered rightly.
+
+    Raises:
+        RefusedError: the plan is not allowed.
+    """
+
+    plan: MotionPlan
+    nonce: bytes = field(default_factory=lambda: secrets.token_bytes(16))
+    used: threading.Event = field(default_factory=threading.Event, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        check_plan(self.plan)
+
+    @cached_property
+    def code(self) -> str:
+        """What must be typed: eight hexadecimal digits."""
+        return hashlib.sha256(self.nonce + self.plan.digest.encode()).hexdigest()[:8]
+
+
+_VALID_S = 600.0
 
 
 def confirm(
-    plan: MotionPlan, answer: str, *, clock: Clock, valid_s: float = 3600.0
+    challenge: Challenge, answer: str, *, clock: Clock, valid_s: float = _VALID_S
 ) -> Confirmation:
     """Take the operator's confirmation of a plan.
 
     Args:
-        plan: it is checked first.
-        answer: what the operator typed; must be ``plan.code``.
+        challenge: that the operator was shown.
+        answer: what the operator typed; must be ``challenge.code``.
         clock: bench time.
-        valid_s: bench seconds until it expires.
+        valid_s: bench seconds within which motion must be started.
 
     Raises:
-        RefusedError: the plan is not allowed, or another answer.
+        RefusedError: another answer, or a challenge that was answered before.
+    """
+    if challenge.used.is_set():
+        raise _refuse("this code was typed before; each run has a code of its own")
+    if answer.strip().lower() != challenge.code:
+        raise _refuse("not confirmed: the code typed is not the one shown")
+    challenge.used.set()
+    return _confirmation(challenge.plan, clock, valid_s, unattended=False)
+
+
+LEAST_DIGEST_DIGITS = 16
+
+
+def confirm_unattended(
+    plan: MotionPlan, digest: str, *, clock: Clock, valid_s: float = _VALID_S
+) -> Confirmation:
+    """Confirm a plan that somebody has named beforehand; nobody is asked, now or later.
+
+    What this gives up: that a person who sees the robot says, at the moment before it moves, that
+    nobody and nothing is in its way. What it keeps: the plan that moves is the one that was named.
+
+    Args:
+        plan: it is checked first.
+        digest: the plan's, at least its first :data:`LEAST_DIGEST_DIGITS` digits.
+        clock: bench time.
+        valid_s: bench seconds within which motion must be started.
+
+    Raises:
+        RefusedError: the plan is not allowed, or is another one.
     """
     check_plan(plan)
-    if answer.strip().lower() != plan.code:
-        raise _refuse("not confirmed: the code typed is not that of this plan")
+    given = digest.strip().lower()
+    if len(given) < LEAST_DIGEST_DIGITS:
+        raise _refuse(f"name the plan by at least {LEAST_DIGEST_DIGITS} digits of its digest")
+    if not plan.digest.startswith(given):
+        raise _refuse(
+            f"another plan was named: this one's digest begins with "
+            f"{plan.digest[:LEAST_DIGEST_DIGITS]} (poses, limits, robot, TCP offset, payload and "
+            "speed slider are part of it)"
+        )
+    return _confirmation(plan, clock, valid_s, unattended=True)
+
+
+def _confirmation(
+    plan: MotionPlan, clock: Clock, valid_s: float, *, unattended: bool
+) -> Confirmation:
     between("valid_s", valid_s, 0.0, 24 * 3600.0)
     now = clock.now()
-    return Confirmation(plan.digest, plan.serial, now, now + valid_s)
+    return Confirmation(plan.digest, plan.serial, now, now + valid_s, unattended)
 
 
 @dataclass(frozen=True)
@@ -203,18 +290,32 @@ class Gate:
         # The plan's arrays are read-only copies, so its digest cannot change.
         return self.plan.digest
 
-    def check_authority(self, serial: str, tcp_offset: object) -> None:
-        """Whether this plan may move this robot now.
+    def check_start(self, serial: str, tcp_offset: object, pendant: PendantSettings | None) -> None:
+        """Whether motion may begin: as :meth:`check_authority`, and in time.
+
+        Raises:
+            RefusedError: likewise, or a confirmation that is not yet, or no longer, valid.
+        """
+        self.check_authority(serial, tcp_offset, pendant)
+        given, now = self.confirmation, self.clock.now()
+        if given is None or not given.issued_s <= now < given.expires_s:
+            raise _refuse("the confirmation has expired; confirm the plan again")
+
+    def check_authority(
+        self, serial: str, tcp_offset: object, pendant: PendantSettings | None
+    ) -> None:
+        """Whether this plan may move this robot.
 
         Args:
             serial: of the robot that is connected.
             tcp_offset: of the controller now (m, rad).
+            pendant: of the controller now.
 
         Raises:
-            RefusedError: no confirmation, one of another plan or robot, not yet or no longer
-                valid, or another TCP offset than the plan was made with.
+            RefusedError: no confirmation, one of another plan or robot, or another TCP offset,
+                payload or speed slider than the plan was made with.
         """
-        given, now = self.confirmation, self.clock.now()
+        given = self.confirmation
         if given is None:
             raise _refuse("motion needs the operator's confirmation of this plan")
         if given.digest != self._digest:
@@ -224,8 +325,6 @@ class Gate:
                 f"the plan is for robot {self.plan.serial}, the confirmation for "
                 f"{given.serial}, and connected is {serial}"
             )
-        if not given.issued_s <= now < given.expires_s:
-            raise _refuse("the confirmation has expired; confirm the plan again")
         if tcp_offset is None:
             raise _refuse("the controller's TCP offset is not known")
         current = numbers(tcp_offset, 6, "TCP offset")
@@ -234,6 +333,11 @@ class Gate:
                 f"the controller's TCP offset {list(current)} is not the plan's "
                 f"{list(self.plan.tcp_offset)} (m, rad)"
             )
+        if pendant is None:
+            raise _refuse("the controller's payload and speed slider are not known")
+        changed = self.plan.pendant.changed(pendant)
+        if changed:
+            raise _refuse(f"not as it was when the plan was made: {changed}")
 
     def check_move(
         self,
@@ -243,6 +347,7 @@ class Gate:
         *,
         serial: str,
         tcp_offset: object,
+        pendant: PendantSettings | None,
         force_n: float,
     ) -> Command:
         """Allow one motion, from where the robot is now.
@@ -253,13 +358,14 @@ class Gate:
             speed_mm_s: wanted speed of TCP and tip; None for the cap.
             serial: of the robot that is connected.
             tcp_offset: (6,) of the controller now (m, rad).
+            pendant: of the controller now.
             force_n: at the TCP now.
 
         Raises:
             RefusedError: it may not be done; the text says why. Nothing was sent.
             StaleError: the newest pose is too old.
         """
-        self.check_authority(serial, tcp_offset)
+        self.check_authority(serial, tcp_offset, pendant)
         cap = self.plan.limits.max_force_n
         if not force_n <= cap:
             raise _refuse(f"a force of {force_n:.1f} N meets the tool, over the cap of {cap:g} N")

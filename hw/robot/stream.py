@@ -2,14 +2,14 @@
 
 A process of its own reads the controller, so that neither the parent's interpreter lock nor a mute
 controller delays or freezes anything; the parent can always give it up. :meth:`PoseStream.latest`
-raises rather than hand out a pose older than the limit. Age counts from arrival, plus what the pose
-was late on its way: the controller's clock against the host's, above the smallest difference of the
-last minute or so (drift is far slower).
+raises rather than hand out a pose older than the limit. Age counts from arrival, plus a bound of
+how long the pose was on its way (:class:`Lag`): a latency that was there from the start counts too.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import struct
 import subprocess
@@ -28,12 +28,13 @@ from hw.clock import REAL, Clock
 from hw.errors import LostError, RefusedError, StaleError
 from hw.rigid import rotation_vector
 from hw.robot._process import spawn
-from hw.robot._reader import ERROR, POSE, RECORD
+from hw.robot._reader import BOUND, ERROR, POSE, RECORD
+from hw.robot.identity import Identity, read_identity
 from hw.robot.pose import ur_to_pose
-from hw.robot.rtde import Identity, read_identity
+from hw.robot.rtde import PendantSettings
 
 _OFFSET_TOLERANCE = 1e-6
-_LAG_BLOCK_S = 30.0
+_MOST_DRIFT = 200e-6
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class PoseSample:
     robot_mode: int
     runtime_state: int
     lag_s: float = 0.0
-    """Bench seconds by which it came later than the promptest poses before it."""
+    """Bench seconds that it was on its way at most (:class:`Lag`)."""
     joints: tuple[float, ...] | None = None
     """(6,) rad; None where the controller's were not read."""
 
@@ -78,20 +79,31 @@ class SteadyPose:
 
 
 class Lag:
-    """How much later than the promptest ones a pose came (bench s)."""
+    """An upper bound of how long a pose was on its way (bench s).
 
-    def __init__(self) -> None:
-        self._floor = self._previous = float("inf")
-        self._until = float("-inf")
+    A pose's host time less its device time is its lag plus the offset of the two clocks. The
+    offset is known from below by one pair of times of which the pose was not made before the host
+    time (:attr:`hw.robot.rtde.PacketReader.bound`), and from then on by the smallest difference
+    that was seen. Clocks drift: what is known loses 200 ppm, more than quartz clocks differ by,
+    and a lag that creeps faster than that is seen.
+
+    Args:
+        t_host: of the pair, bench s; without one only lags above the least are seen.
+        t_device: of the pair, s.
+    """
+
+    def __init__(self, t_host: float = math.inf, t_device: float = 0.0) -> None:
+        self._floor = t_host - t_device
+        self._last = t_host
 
     def of(self, t_host: float, t_device: float) -> float:
         """Take a pose's times; returns its lag."""
         difference = t_host - t_device
-        if t_host > self._until:
-            self._previous, self._floor = self._floor, difference
-            self._until = t_host + _LAG_BLOCK_S
+        if math.isfinite(self._last):
+            self._floor += _MOST_DRIFT * max(t_host - self._last, 0.0)
+        self._last = t_host
         self._floor = min(self._floor, difference)
-        return difference - min(self._floor, self._previous)
+        return difference - self._floor
 
 
 class PoseStream:
@@ -126,6 +138,8 @@ class PoseStream:
         """Poses that nobody drained in time."""
         self.tcp_offset: tuple[float, ...] | None = None
         """[m, rad] of the tool centre point in the flange's frame; None if it is not told."""
+        self.pendant: PendantSettings | None = None
+        """The newest; None if it is not told."""
         self._client, self._frequency, self._timeout = client, frequency_hz, timeout_s
         self._samples: deque[PoseSample] = deque(maxlen=queue)
         self._latest: PoseSample | None = None
@@ -229,7 +243,7 @@ class PoseStream:
         return average(seen)
 
     def identity(self) -> Identity:
-        """Who the robot is, by its dashboard.
+        """Who the robot is.
 
         Raises:
             LostError: it does not answer.
@@ -265,16 +279,24 @@ class PoseStream:
 
     def _take(self, data: bytes) -> tuple[bytes, str | None]:
         start, size = 0, RECORD.size
+        if data[:1] == BOUND and len(data) >= 17:
+            monotonic_s, t_device = struct.unpack_from("<2d", data, 1)
+            self._lag = Lag(self.clock.at(monotonic_s), t_device)
+            start = 17
         new: list[PoseSample] = []
         error = None
+        told = ()
         while len(data) - start >= 1 + size and data[start : start + 1] == POSE:
             record = RECORD.unpack_from(data, start + 1)
             start += 1 + size
             t_host, t_device = self.clock.at(record[0]), record[1]
             lag = self._lag.of(t_host, t_device)
             new.append(PoseSample(t_host, t_device, record[2:8], *record[8:11], lag_s=lag))
-            if record[11]:
-                self._compare(record[12:])
+            if not math.isnan(record[11]):
+                self._compare(record[11:17])
+            if record[17:] != told:
+                told = record[17:]
+                self._keep_pendant(*told)
         if data[start : start + 1] == ERROR and len(data) - start >= 3:
             (length,) = struct.unpack_from("<H", data, start + 1)
             if len(data) - start >= 3 + length:
@@ -290,6 +312,14 @@ class PoseStream:
                 self._latest = new[-1]
                 self._condition.notify_all()
         return data[start:], error
+
+    def _keep_pendant(self, payload: float, x: float, y: float, z: float, speed: float) -> None:
+        if not math.isnan(speed):
+            self.pendant = PendantSettings(
+                None if math.isnan(payload) else payload,
+                None if math.isnan(x) else (x, y, z),
+                speed,
+            )
 
     def _compare(self, offset: tuple[float, ...]) -> None:
         if self.tcp_offset is None:

@@ -27,7 +27,7 @@ from hw.acquire import AcquisitionStopped, Outcome, Pause, Request, acquire
 from hw.bench.run import Bench
 from hw.emulated import BenchOracle, setup_of, start
 from hw.outcome import share_inside
-from hw.robot.safety import MotionPlan, confirm
+from hw.robot.safety import MotionPlan, confirm_unattended
 from jaxcal.cli.main import main
 
 IMAGES = 5
@@ -49,7 +49,7 @@ def run(
     setup = setup_of(bench)
 
     def agree(plan: MotionPlan):
-        return confirm(plan, plan.code, clock=setup.clock)
+        return confirm_unattended(plan, plan.digest, clock=setup.clock)
 
     return acquire(setup, path, request, agree, say=say, oracle=BenchOracle(bench), pause=pause)
 

@@ -7,12 +7,15 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from test_setup import GOOD
 
-from hw.cli import main
+from hw.cli import _plan_page, main
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import Header
+from hw.robot.limits import Limits
+from hw.robot.safety import MotionPlan
 
 
 @pytest.mark.parametrize(
@@ -27,9 +30,12 @@ from hw.recording_layout import Header
         (["acquire", "--bench", "--placement", "guess"], "'--placement'"),
         (["acquire", "--setup", "x.toml", "--speed", "2"], "need --bench"),
         (["acquire", "--setup", "missing.toml"], "no such file"),
-        (["acquire", "--bench", "--confirm", "12345678"], "--confirm needs --move"),
         (["acquire", "--bench", "--operator", "person"], "--operator needs --placement"),
         (["acquire", "--bench", "--operator", "nobody"], "'--operator'"),
+        (["acquire", "--bench", "--unattended", "0" * 16], "--unattended needs --move"),
+        (["acquire", "--bench", "--move", "--confirm", "12345678"], "No such option"),
+        (["acquire", "--setup", "x.toml", "--controller", "cb"], "need --bench"),
+        (["bench", "--controller", "ur5"], "'--controller'"),
         (["check"], "either --bench or --setup"),
         (["bench", "--speed", "0"], "'--speed'"),
         (["fly"], "No such command"),
@@ -128,3 +134,22 @@ def test_check_says_what_is_wrong_with_each_device(capsys):
     else:
         assert (status, "robot: wrong" in out) == (4, True)
         assert "nothing can be moved: rtde_control is not installed: " in out
+    assert "20195500042, calibration " in out
+    assert "payload 0 kg at [0, 0, 0] m, speed slider at 100 %" in out
+
+
+def test_who_confirms_is_told_of_an_arm_that_nothing_identifies():
+    limits = Limits.from_mapping({
+        "box_min_mm": [0, 0, 0], "box_max_mm": [1, 1, 1], "tip_mm": [0, 0, 50],
+        "cone_axis": [0, 0, -1], "cone_deg": 30, "max_step_mm": 10, "max_turn_deg": 10,
+        "max_speed_mm_s": 10,
+    })  # fmt: skip
+    poses = np.eye(4)[None]
+    known = MotionPlan(poses, limits, (0.0,) * 6, "20195500042, calibration 0123456789ab")
+    page = "\n".join(_plan_page(known))
+    assert known.serial in page
+    assert known.digest[:16] in page
+    assert "speed slider at 100 %" in page
+    assert "NOTHING IDENTIFIES" not in page
+    unknown = MotionPlan(poses, limits, (0.0,) * 6, "UR5@192.168.1.10")
+    assert "NOTHING IDENTIFIES THIS ARM" in "\n".join(_plan_page(unknown))

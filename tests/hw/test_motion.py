@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -21,17 +22,17 @@ from robots import CB_SERIES, E_SERIES, START, EmulatedRobot
 
 import hw
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
+from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.pose import ur_to_pose
-from hw.robot.rtde import read_identity
-from hw.robot.safety import MotionPlan, confirm
+from hw.robot.safety import MotionPlan, confirm_unattended
 from jaxcal.isolated import import_path
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 
 HOME = ur_to_pose(np.array(START))
-SERIAL = "20195500042"
+SERIAL = "of the robot at hand"
 OFFSET = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
 STOP_WITHIN_S = 0.2
 
@@ -68,9 +69,9 @@ PLAN = MotionPlan(np.array([HOME, beside(10.0, 5.0, 0.0), beside(50.0, 0.0, 0.0)
 def moving(
     robot: EmulatedRobot, log: list | None = None, plan: MotionPlan = PLAN, **named
 ) -> Iterator[Motion]:
-    if plan is PLAN:
-        plan = replace(PLAN, serial=read_identity(robot.host).serial)
-    confirmation = confirm(plan, plan.code, clock=robot.clock)
+    if plan.serial == SERIAL:
+        plan = replace(plan, serial=read_identity(robot.host).name)
+    confirmation = confirm_unattended(plan, plan.digest, clock=robot.clock)
     motion = Motion(
         robot.host, plan, confirmation, clock=robot.clock, dry_run=False,
         log=None if log is None else lambda *entry: log.append(entry), **named,
@@ -208,7 +209,7 @@ def test_motion_needs_its_own_unused_confirmation():
         with pytest.raises(RefusedError, match="needs the operator"):
             Motion(robot.host, PLAN, None, clock=robot.clock, dry_run=False).start()
         other = MotionPlan(PLAN.targets[:2], LIMITS, OFFSET, SERIAL)
-        wrong = confirm(other, other.code, clock=robot.clock)
+        wrong = confirm_unattended(other, other.digest, clock=robot.clock)
         for text, plan, given in [
             ("another plan", PLAN, wrong),
             ("used for an earlier connection", other, wrong),
@@ -217,7 +218,7 @@ def test_motion_needs_its_own_unused_confirmation():
                 Motion(robot.host, plan, given, clock=robot.clock, dry_run=False).start()
         another = MotionPlan(PLAN.targets, LIMITS, OFFSET, "20195500099")
         with (
-            pytest.raises(RefusedError, match="connected is 20195500042"),
+            pytest.raises(RefusedError, match="connected is 20195500042, calibration"),
             moving(robot, plan=another),
         ):
             pass
@@ -270,6 +271,8 @@ def kill_mover(motion: Motion) -> None:
         ("silent", StaleError, "the caller was silent", False),
         ("force", StoppedError, r"a force of 40.0 N", True),
         ("set_tcp_offset", RefusedError, "TCP offset was changed", True),
+        ("set_payload", RefusedError, "payload is 2.0 kg", True),
+        ("set_speed_slider", RefusedError, "speed slider is at 50 %, not 100", True),
     ],
 )
 def test_the_robot_rests_within_200_ms_of_a_fault(version, name, kind, text, ends):
@@ -299,6 +302,8 @@ def test_the_robot_rests_within_200_ms_of_a_fault(version, name, kind, text, end
             "kill": lambda: kill_mover(motion),
             "force": lambda: robot.ask("force", [0.0, 0.0, -40.0, 0.0, 0.0, 0.0]),
             "set_tcp_offset": lambda: robot.ask(name, [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]),
+            "set_payload": lambda: robot.set_payload(2.0),
+            "set_speed_slider": lambda: robot.set_speed_slider(0.5),
         }
         fault = faults.get(name, lambda: robot.ask(name))
         error, rest_s, told_s = fault_in_motion(robot, motion, fault)
@@ -340,14 +345,14 @@ _CALLER = """
 import json, sys, time
 import numpy as np
 from hw.clock import Clock
+from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
-from hw.robot.rtde import read_identity
-from hw.robot.safety import MotionPlan, confirm
+from hw.robot.safety import MotionPlan, confirm_unattended
 host, origin, targets, limits, offset, serial = json.loads(sys.argv[1])
 clock = Clock(1.0, origin)
 plan = MotionPlan.from_poses(targets, Limits.from_mapping(limits), offset, serial)
-given = confirm(plan, plan.code, clock=clock)
+given = confirm_unattended(plan, plan.digest, clock=clock)
 with Motion(host, plan, given, clock=clock, dry_run=False) as motion:
     print("ready", flush=True)
     motion.move_to(plan.targets[2])
@@ -359,7 +364,7 @@ def test_killing_the_caller_stops_the_robot(version):
     with EmulatedRobot(version=version) as robot:
         values = [
             robot.host, robot.clock.origin_s, PLAN.targets.tolist(), asdict(LIMITS), OFFSET,
-            read_identity(robot.host).serial,
+            read_identity(robot.host).name,
         ]  # fmt: skip
         caller = subprocess.Popen(
             [sys.executable, "-c", _CALLER, json.dumps(values)],
@@ -383,7 +388,7 @@ def test_killing_the_caller_stops_the_robot(version):
 
 def test_a_stop_before_the_start_or_at_rest_is_kept():
     with EmulatedRobot() as robot:
-        given = confirm(PLAN, PLAN.code, clock=robot.clock)
+        given = confirm_unattended(PLAN, PLAN.digest, clock=robot.clock)
         motion = Motion(robot.host, PLAN, given, clock=robot.clock, dry_run=False)
         motion.stop("not today")
         with pytest.raises(RefusedError, match="was stopped"):
@@ -394,6 +399,48 @@ def test_a_stop_before_the_start_or_at_rest_is_kept():
             with pytest.raises(RefusedError, match=r"the operator pressed stop.*confirm the plan"):
                 motion.move_to(HOME)
         assert sent(robot, 3) == []
+
+
+@both_series
+def test_what_is_set_at_the_pendant_is_compared_before_and_during_a_motion(version):
+    with EmulatedRobot(version=version) as robot:
+        with moving(robot) as motion:
+            motion.move_to(PLAN.targets[1])
+            robot.set_tcp_offset((0.0, 0.0, 0.2, 0.0, 0.0, 0.0))
+            time.sleep(0.1)
+            with pytest.raises(RefusedError, match="TCP offset"):
+                motion.move_to(HOME)
+        robot.set_tcp_offset(OFFSET)
+        robot.set_payload(1.5)
+        with pytest.raises(RefusedError, match=r"payload is 1\.5 kg, not 0\.0"), moving(robot):
+            pass
+        assert len(sent(robot, 3)) == 1
+
+
+def test_a_second_client_is_refused_and_the_first_goes_on():
+    with EmulatedRobot() as robot, moving(robot) as motion, ThreadPoolExecutor(1) as pool:
+        future = pool.submit(motion.move_to, PLAN.targets[2])
+        while math.hypot(*robot.state()["velocity"]) < 0.02:
+            assert not future.done()
+            time.sleep(0.002)
+        with pytest.raises(LostError, match="in use"), moving(robot):
+            pass
+        assert future.result(timeout=20.0).pose[0, 3] == pytest.approx(450.0)
+        assert robot.state()["running"]
+
+
+def test_a_plan_goes_on_after_its_confirmation_has_expired():
+    with EmulatedRobot() as robot:
+        plan = replace(PLAN, serial=read_identity(robot.host).name)
+        given = confirm_unattended(plan, plan.digest, clock=robot.clock, valid_s=6.0)
+        named = {"clock": robot.clock, "dry_run": False}
+        with Motion(robot.host, plan, given, **named) as motion:
+            motion.move_to(PLAN.targets[1])
+            robot.clock.sleep(given.expires_s - robot.clock.now() + 0.1)
+            assert motion.move_to(HOME).pose[0, 3] == pytest.approx(400.0)
+        late = replace(given, used=threading.Event())
+        with pytest.raises(RefusedError, match="expired"):
+            Motion(robot.host, plan, late, **named).start()
 
 
 @both_series

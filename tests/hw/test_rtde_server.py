@@ -7,6 +7,7 @@ import struct
 import time
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 from robots import CB_SERIES, E_SERIES, START, EmulatedRobot, address
 
@@ -16,6 +17,7 @@ from hw.bench.robot import RobotProcess
 from hw.bench.rtde import RtdeServer
 from hw.bench.rtde_fields import output_type
 from hw.clock import Clock
+from hw.robot.pose import pose_to_ur, ur_to_pose
 
 rtde_receive = pytest.importorskip("rtde_receive", reason="no wheel of ur_rtde here")
 rtde_control = pytest.importorskip("rtde_control", reason="no wheel of ur_rtde here")
@@ -136,7 +138,7 @@ def test_the_program_s_handshake():
     program.int_in[0] = 45
     program.step(2.2)
     assert not program.running
-    assert program.reason == "command 45 is not emulated"
+    assert program.reason == "movePath (command 45) is not emulated"
 
 
 def test_variables_depend_on_the_version():
@@ -214,3 +216,86 @@ def test_a_mirror_of_the_arm_follows_the_one_in_the_robot_s_process():
         control.disconnect()
     with pytest.raises(RuntimeError, match="ended"):
         robot.ask("state")
+
+
+def message(connection: socket.socket) -> tuple[int, bytes]:
+    data = b""
+    while len(data) < 3 or len(data) < struct.unpack_from(">H", data)[0]:
+        new = connection.recv(1)
+        if not new:
+            raise EOFError
+        data += new
+    return data[2], data[3:]
+
+
+def ask(connection: socket.socket, kind: str, payload: bytes = b"") -> bytes:
+    connection.sendall(struct.pack(">HB", 3 + len(payload), ord(kind)) + payload)
+    return message(connection)[1]
+
+
+def test_one_client_owns_the_registers_and_nothing_unknown_is_started_or_ignored():
+    with EmulatedRobot() as robot:
+
+        def connect() -> socket.socket:
+            return socket.create_connection((robot.host, 30004), timeout=5.0)
+
+        with connect() as first, connect() as second:
+            assert ask(first, "I", b"input_int_register_0")[0] == 1
+            told = ask(second, "I", b"input_int_register_0,input_double_register_0")
+            assert told == b"\x00IN_USE,DOUBLE"
+            # A recipe that was refused cannot be written through.
+            second.sendall(struct.pack(">HBBi", 8, ord("U"), 0, 255))
+            with pytest.raises((EOFError, ConnectionError)):
+                message(second)
+        with connect() as third:
+            until(lambda: ask(third, "I", b"input_int_register_0")[0] == 1)
+        with connect() as reader:
+            recipe = struct.pack(">d", 125.0) + b"timestamp,colour"
+            assert ask(reader, "O", recipe)[1:] == b"DOUBLE,NOT_FOUND"
+            assert ask(reader, "S") == b"\x00"
+            assert ask(reader, "O", struct.pack(">d", 125.0) + b"timestamp")[1:] == b"DOUBLE"
+            assert ask(reader, "S") == b"\x01"
+        with connect() as stranger, pytest.raises((EOFError, ConnectionError)):
+            ask(stranger, "Q")
+
+
+def test_setting_the_tcp_moves_the_pose_that_is_told_and_not_the_tool():
+    with EmulatedRobot() as robot:
+        control = rtde_control.RTDEControlInterface(robot.host)
+        receive = rtde_receive.RTDEReceiveInterface(robot.host)
+        before, true = ur_to_pose(np.array(robot.state()["raw"])), robot.arm.true_raw(0.0)
+        # 50 mm further out along the tool, and turned by a quarter about its axis.
+        assert control.setTcp([0.0, 0.0, 0.15, 0.0, 0.0, np.pi / 2])
+        expected = before @ ur_to_pose(np.array([0.0, 0.0, 0.05, 0.0, 0.0, np.pi / 2]))
+        until(lambda: abs(receive.getActualTCPPose()[2] - expected[2, 3] / 1000.0) < 1e-6)
+        told = ur_to_pose(np.array(receive.getActualTCPPose()))
+        np.testing.assert_allclose(told, expected, atol=1e-6)
+        assert robot.arm.true_raw(robot.clock.now()) == pytest.approx(true)
+        # What is commanded is the new point, and the tool follows it.
+        target = told.copy()
+        target[0, 3] += 10.0
+        assert control.moveL(pose_to_ur(target).tolist(), 0.1, 1.0)
+        moved = ur_to_pose(np.array(robot.arm.true_raw(robot.clock.now())))
+        np.testing.assert_allclose(moved[:3, 3] - before[:3, 3], [10.0, 0.0, 0.0], atol=1e-6)
+        np.testing.assert_allclose(moved[:3, :3], before[:3, :3], atol=1e-6)
+        control.disconnect()
+        receive.disconnect()
+
+
+def test_a_command_that_is_not_emulated_ends_the_program_and_says_why():
+    with EmulatedRobot() as robot:
+        with socket.create_connection((robot.host, 30001), timeout=5.0) as primary:
+            control = rtde_control.RTDEControlInterface(robot.host)
+            assert control.setPayload(0.7, [0.0, 0.0, 0.03])
+            control.speedL([0.01, 0.0, 0.0, 0.0, 0.0, 0.0], 0.5, 0.1)
+            until(lambda: not control.isProgramRunning())
+            reason = "speedL (command 10) is not emulated"
+            assert robot.state()["reason"] == reason
+            said = b""
+            while reason.encode() not in said:
+                new = primary.recv(4096)
+                assert new, said
+                said += new
+        assert not control.moveL(beside(10.0), 0.1, 1.0)
+        assert robot.state()["raw"] == pytest.approx(START)
+        control.disconnect()

@@ -15,11 +15,22 @@ from hw.clock import Clock
 from hw.errors import RefusedError, StaleError
 from hw.robot.limits import Limits
 from hw.robot.pose import pose_to_ur, ur_to_pose
-from hw.robot.safety import Command, Confirmation, Gate, MotionPlan, check_plan, confirm
+from hw.robot.rtde import PendantSettings
+from hw.robot.safety import (
+    Challenge,
+    Command,
+    Confirmation,
+    Gate,
+    MotionPlan,
+    check_plan,
+    confirm,
+    confirm_unattended,
+)
 from hw.robot.stream import PoseSample
 
 SERIAL = "20195500042"
 OFFSET = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
+PENDANT = PendantSettings()
 TIP = (0.0, 10.0, 60.0)
 LIMITS = Limits(
     box_min_mm=(300.0, -200.0, 100.0),
@@ -75,7 +86,7 @@ def move(
     force: float = 0.0,
 ):
     return gate(plan).check_move(
-        target, start, speed, serial=SERIAL, tcp_offset=OFFSET, force_n=force
+        target, start, speed, serial=SERIAL, tcp_offset=OFFSET, pendant=PENDANT, force_n=force
     )
 
 
@@ -223,7 +234,7 @@ def refused(match: str, *arguments, **named):
 
 
 def test_every_reason_has_its_line():
-    with pytest.raises(StaleError, match=r"10\d ms old"):
+    with pytest.raises(StaleError, match="ms old"):
         move(HOME, sample(HOME, age=0.101))
     with pytest.raises(StaleError, match="ms old"):
         move(HOME, sample(HOME, lag=0.12))
@@ -272,6 +283,11 @@ def test_the_tip_s_arc_is_checked_between_two_poses_inside():
         check_plan(plan_of(ends, limits))
 
 
+def confirmed(plan: MotionPlan = PLAN, **named) -> Confirmation:
+    challenge = Challenge(plan)
+    return confirm(challenge, f" {challenge.code.upper()}\n", clock=CLOCK, **named)
+
+
 def test_a_confirmation_moves_only_its_plan():
     others = [
         replace(PLAN, targets=PLAN.targets[:2]),
@@ -279,44 +295,84 @@ def test_a_confirmation_moves_only_its_plan():
         replace(PLAN, limits=replace(LIMITS, max_speed_mm_s=51.0)),
         replace(PLAN, tcp_offset=(0.0, 0.0, 0.11, 0.0, 0.0, 0.0)),
         replace(PLAN, serial="20195500043"),
+        replace(PLAN, pendant=PendantSettings(1.0)),
+        replace(PLAN, pendant=PendantSettings(0.0, (0.0, 0.0, 0.01))),
+        replace(PLAN, pendant=PendantSettings(None, None)),
+        replace(PLAN, pendant=PendantSettings(speed_fraction=0.5)),
     ]
-    mine = confirm(PLAN, PLAN.code, clock=CLOCK)
+    mine = confirmed()
     for other in others:
         assert other.digest != PLAN.digest
         with pytest.raises(RefusedError, match="for another plan"):
-            Gate(other, mine, CLOCK).check_authority(other.serial, other.tcp_offset)
+            Gate(other, mine, CLOCK).check_authority(other.serial, other.tcp_offset, other.pendant)
+        with pytest.raises(RefusedError, match="another plan was named"):
+            confirm_unattended(other, PLAN.digest, clock=CLOCK)
     assert replace(PLAN, targets=PLAN.targets.copy()).digest == PLAN.digest
 
 
-def test_a_confirmation_is_bound_to_robot_time_and_tcp_offset():
-    mine = confirm(PLAN, f" {PLAN.code.upper()}\n", clock=CLOCK)
+def test_a_code_is_of_one_run_only():
+    first, second = Challenge(PLAN), Challenge(PLAN)
+    assert first.code != second.code
+    assert PLAN.digest[:8] not in (first.code, second.code)
+    for answer in ("", "yes", PLAN.digest, PLAN.digest[:8], "0" * 8, first.code):
+        with pytest.raises(RefusedError, match="not the one shown"):
+            confirm(second, answer, clock=CLOCK)
+    assert not confirm(second, second.code, clock=CLOCK).unattended
+    with pytest.raises(RefusedError, match="was typed before"):
+        confirm(second, second.code, clock=CLOCK)
+
+
+def test_unattended_motion_names_its_plan():
+    assert confirm_unattended(PLAN, f" {PLAN.digest[:16].upper()} ", clock=CLOCK).unattended
+    for digest in ("", "yes", PLAN.digest[:15]):
+        with pytest.raises(RefusedError, match="at least 16 digits"):
+            confirm_unattended(PLAN, digest, clock=CLOCK)
+    with pytest.raises(RefusedError, match="another plan was named"):
+        confirm_unattended(PLAN, "0" * 64, clock=CLOCK)
+
+
+def test_a_confirmation_is_bound_to_robot_and_what_is_set_at_the_pendant():
+    mine = confirmed()
     good = Gate(PLAN, mine, CLOCK)
-    good.check_authority(SERIAL, OFFSET)
+    good.check_start(SERIAL, OFFSET, PENDANT)
+    heavy, slow = PendantSettings(0.5), PendantSettings(speed_fraction=0.9)
     for text, found, arguments in [
-        ("connected is 1", good, ("1", OFFSET)),
-        ("is not the plan's", good, (SERIAL, (0.0, 0.0, 0.1001, 0.0, 0.0, 0.0))),
-        ("is not known", good, (SERIAL, None)),
-        ("finite numbers", good, (SERIAL, (math.nan,) * 6)),
-        ("finite numbers", good, (SERIAL, OFFSET[:5])),
-        ("expired", Gate(PLAN, replace(mine, expires_s=CLOCK.now()), CLOCK), (SERIAL, OFFSET)),
-        ("expired", Gate(PLAN, replace(mine, issued_s=1e9), CLOCK), (SERIAL, OFFSET)),
-        ("needs the operator", Gate(PLAN, None, CLOCK), (SERIAL, OFFSET)),
+        ("connected is 1", good, ("1", OFFSET, PENDANT)),
+        ("is not the plan's", good, (SERIAL, (0.0, 0.0, 0.1001, 0.0, 0.0, 0.0), PENDANT)),
+        ("is not known", good, (SERIAL, None, PENDANT)),
+        ("finite numbers", good, (SERIAL, (math.nan,) * 6, PENDANT)),
+        ("finite numbers", good, (SERIAL, OFFSET[:5], PENDANT)),
+        ("payload is 0.5 kg, not 0.0", good, (SERIAL, OFFSET, heavy)),
+        ("speed slider is at 90 %, not 100", good, (SERIAL, OFFSET, slow)),
+        ("not known", good, (SERIAL, OFFSET, None)),
+        ("needs the operator", Gate(PLAN, None, CLOCK), (SERIAL, OFFSET, PENDANT)),
     ]:
         with pytest.raises(RefusedError, match=text):
             found.check_authority(*arguments)
-        serial, offset = arguments
+        with pytest.raises(RefusedError, match=text):
+            found.check_start(*arguments)
+        serial, offset, pendant = arguments
         with pytest.raises(RefusedError, match=text):
             found.check_move(
-                HOME, sample(HOME), None, serial=serial, tcp_offset=offset, force_n=0.0
-            )
-    for answer in ("", "yes", PLAN.digest, "0" * 8):
-        with pytest.raises(RefusedError, match="code typed"):
-            confirm(PLAN, answer, clock=CLOCK)
-    with pytest.raises(RefusedError, match="valid_s"):
-        confirm(PLAN, PLAN.code, clock=CLOCK, valid_s=1e9)
+                HOME, sample(HOME), None, serial=serial, tcp_offset=offset, pendant=pendant,
+                force_n=0.0,
+            )  # fmt: skip
     unsafe = plan_of([pose(400, -100, 700)])
-    with pytest.raises(RefusedError, match="out of the box"):
-        confirm(unsafe, unsafe.code, clock=CLOCK)
+    for ask in (Challenge, lambda plan: confirm_unattended(plan, plan.digest, clock=CLOCK)):
+        with pytest.raises(RefusedError, match="out of the box"):
+            ask(unsafe)
+    with pytest.raises(RefusedError, match="valid_s"):
+        confirmed(valid_s=1e9)
+
+
+def test_a_confirmation_that_expires_ends_no_plan_that_was_begun():
+    mine = confirmed()
+    for late in (replace(mine, expires_s=CLOCK.now()), replace(mine, issued_s=1e9)):
+        gate_of_late = Gate(PLAN, late, CLOCK)
+        with pytest.raises(RefusedError, match="expired"):
+            gate_of_late.check_start(SERIAL, OFFSET, PENDANT)
+        # Begun in time, it goes on.
+        gate_of_late.check_authority(SERIAL, OFFSET, PENDANT)
 
 
 def test_a_plan_cannot_be_changed_after_its_digest():

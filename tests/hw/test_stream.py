@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import queue
 import socket
 import struct
 import threading
@@ -13,10 +14,13 @@ import numpy as np
 import pytest
 from robots import CB_SERIES, E_SERIES, START, EmulatedRobot, address
 
+from hw.bench.arm import Arm
+from hw.bench.robot import RobotProcess
 from hw.clock import Clock
 from hw.errors import LostError, RefusedError, StaleError
+from hw.robot.identity import read_identity
 from hw.robot.pose import ur_to_pose
-from hw.robot.rtde import PacketReader, read_identity, safety_text
+from hw.robot.rtde import PacketReader, PendantSettings, safety_text
 from hw.robot.stream import Lag, PoseSample, PoseStream, average
 
 
@@ -72,8 +76,53 @@ def test_identity_and_tcp_offset():
         EmulatedRobot(version=CB_SERIES) as robot,
         PoseStream(robot.host, clock=robot.clock) as poses,
     ):
-        assert poses.identity().serial == f"UR5@{robot.host}"
+        identity = poses.identity()
+        assert (identity.serial, identity.version) == ("20195500042", "3.15.8.106339")
+        assert identity.identified
         assert poses.tcp_offset is None
+
+
+@pytest.mark.parametrize(
+    ("version", "serial", "calibrated"),
+    [((3, 15, 8, 0), True, True), ((3, 6, 0, 0), False, True), ((3, 4, 0, 0), False, False),
+     ((5, 4, 0, 0), False, True), ((5, 11, 0, 0), True, True)],
+)  # fmt: skip
+def test_an_arm_is_known_by_its_serial_number_and_calibration(version, serial, calibrated):
+    hosts = [address() for _ in range(3)]
+    robots = [
+        RobotProcess(Arm(START), host, version=version, serial=number)
+        for host, number in zip(hosts, ("2017350001", "2017350002", "2017350001"), strict=True)
+    ]
+    with contextlib.ExitStack() as stack:
+        for robot in robots:
+            stack.enter_context(robot)
+        first, other, moved = (read_identity(host) for host in hosts)
+    assert (first.serial is not None, first.calibration is not None) == (serial, calibrated)
+    assert first.identified == (serial or calibrated)
+    # Another arm is another one, and the same arm elsewhere is the same, unless nothing is told.
+    assert first.name != other.name
+    assert (first.name == moved.name) == first.identified
+    assert ("@" in first.name) != first.identified
+
+
+def test_payload_and_speed_slider_are_told():
+    with EmulatedRobot() as robot, PoseStream(robot.host, clock=robot.clock) as poses:
+        assert poses.pendant == PendantSettings(0.0, (0.0, 0.0, 0.0), 1.0)
+        robot.set_payload(0.8, (0.0, 0.0, 0.05))
+        robot.set_speed_slider(0.5)
+        expected = PendantSettings(0.8, (0.0, 0.0, 0.05), 0.5)
+        deadline = time.monotonic() + 5.0
+        while poses.pendant != expected and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert poses.pendant == expected
+    # Too old to tell the payload: then that is what is known, and 0 kg is something else.
+    with (
+        EmulatedRobot(version=(3, 10, 0, 0)) as robot,
+        PoseStream(robot.host, clock=robot.clock) as poses,
+    ):
+        assert poses.pendant == PendantSettings(None, None, 1.0)
+        assert "payload" in poses.pendant.changed(PendantSettings())
+        assert poses.pendant.changed(poses.pendant) == ""
 
 
 def test_a_mute_controller_makes_poses_stale_and_then_lost():
@@ -140,6 +189,59 @@ def test_lag_finds_late_poses_in_spite_of_drift():
     assert sample.age_s(5.01) == pytest.approx(0.21)
 
 
+def test_a_lag_that_was_there_from_the_start_or_creeps_is_seen():
+    offset = 990.0
+    constant = Lag(10.0, 10.0 + offset)
+    assert [round(constant.of(t + 0.3, t + offset), 3) for t in (10.0, 20.0)] == [0.3, 0.298]
+    creeping = Lag(10.0, 10.0 + offset)
+    seen = [creeping.of(t + 0.0015 * t, t + offset) for t in np.arange(10.0, 110.0, 0.1)]
+    assert seen[-1] > 0.13
+    # Without a first pair only what is more than the least can be seen.
+    assert Lag().of(10.3, 10.0 + offset) == 0.0
+
+
+def delaying(host: str, port: int, seconds: float) -> str:
+    """A proxy that delays everything, either way; its address."""
+    here = address()
+    listener = socket.create_server((here, port))
+
+    def carry(source: socket.socket, sink: socket.socket) -> None:
+        waiting: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
+
+        def deliver() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    due, data = waiting.get()
+                    time.sleep(max(0.0, due - time.monotonic()))
+                    sink.sendall(data)
+
+        threading.Thread(target=deliver, daemon=True).start()
+        with contextlib.suppress(OSError):
+            while data := source.recv(65536):
+                waiting.put((time.monotonic() + seconds, data))
+
+    def serve() -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                client, _ = listener.accept()
+                server = socket.create_connection((host, port))
+                for pair in ((client, server), (server, client)):
+                    threading.Thread(target=carry, args=pair, daemon=True).start()
+
+    threading.Thread(target=serve, daemon=True).start()
+    return here
+
+
+def test_poses_that_always_come_late_are_not_new():
+    with EmulatedRobot(version=CB_SERIES) as robot:
+        with PoseStream(robot.host, clock=robot.clock) as prompt:
+            prompt.latest()
+        with PoseStream(delaying(robot.host, 30004, 0.15), clock=robot.clock) as late:
+            time.sleep(0.3)
+            with pytest.raises(StaleError, match=r"is [2-4]\d\d ms old"):
+                late.latest()
+
+
 def test_safety_bits_are_named():
     assert safety_text(0b01) == safety_text(0b11) == ""
     assert safety_text(0b101) == "protective stop"
@@ -170,7 +272,8 @@ def rtde(kind: bytes, payload: bytes) -> bytes:
 
 VERSION = rtde(b"v", struct.pack(">4I", 5, 11, 0, 0))
 TYPES = b"\x01" + b",".join(
-    b"DOUBLE VECTOR6D VECTOR6D VECTOR6D INT32 UINT32 UINT32 UINT32 VECTOR6D".split()
+    b"DOUBLE VECTOR6D VECTOR6D VECTOR6D INT32 UINT32 UINT32 UINT32 DOUBLE VECTOR6D DOUBLE "
+    b"VECTOR3D".split()
 )
 
 
@@ -192,7 +295,7 @@ def test_what_is_no_controller_is_refused(messages, text):
         PacketReader(host, timeout_s=0.5)
 
 
-@pytest.mark.parametrize("payload", [b"\x01" + b"\0" * 8, b"\x01" + b"\xff" * 216])
+@pytest.mark.parametrize("payload", [b"\x01" + b"\0" * 8, b"\x01" + b"\xff" * 256])
 def test_packets_that_do_not_fit_the_recipe_end_the_connection(payload):
     opening = [rtde(b"V", b"\x01"), VERSION, rtde(b"O", TYPES), rtde(b"S", b"\x01")]
     host = answers(*opening[:-1], opening[-1] + rtde(b"M", b"text") + rtde(b"U", payload))

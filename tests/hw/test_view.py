@@ -28,7 +28,7 @@ from hw.poses import plan_poses
 from hw.recorder import Recorder
 from hw.recording_layout import Header
 from hw.robot.motion import Motion
-from hw.robot.safety import MotionPlan, confirm
+from hw.robot.safety import MotionPlan, confirm_unattended
 from hw.session import Session
 from hw.setup import Setup
 from hw.view.feed import LiveView, halved, watched
@@ -168,7 +168,7 @@ def test_a_browser_sees_the_bench_move_and_killing_the_view_changes_nothing(benc
         watched(view, session),
         browsing(tmp_path / "profile") as browser,
     ):
-        plan = a_plan(setup, session.poses.identity().serial)
+        plan = a_plan(setup, session.poses.identity().name)
         view.plan(setup, plan, [])
         browser.get(view.url)
         addresses(browser)  # those of the browser's own first page
@@ -181,7 +181,7 @@ def test_a_browser_sees_the_bench_move_and_killing_the_view_changes_nothing(benc
         wait_until(lambda: "B-mode, newest frame" in text(), 60)
         before = pixels(browser)
         with Motion(
-            setup.robot_host, plan, confirm(plan, plan.code, clock=setup.clock),
+            setup.robot_host, plan, confirm_unattended(plan, plan.digest, clock=setup.clock),
             clock=setup.clock, dry_run=False, guard=session.trouble,
         ) as motion:  # fmt: skip
             view.going(0)

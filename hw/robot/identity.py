@@ -1,0 +1,158 @@
+"""Which arm it is that answers at an address.
+
+Two things tell arms apart. The dashboard gives the serial number (PolyScope 3.12 or newer on CB
+series, 5.6 or newer on e-Series). The primary interface gives, on every connection, the factory's
+calibration of the arm's kinematics with its checksum (3.6 or newer): it belongs to the arm, not to
+the controller's box, and stays the same wherever box and arm are on the network. Where a controller
+tells neither, nothing here identifies the arm, and :attr:`Identity.name` is its address, with an
+``@`` in it; whoever shows it must say so.
+
+Sources: Universal Robots' articles on the dashboard server and the client interfaces, and their
+ur_client_library (``dashboard_client_implementation_g5.cpp``: since which version;
+``kinematics_info``: the calibration's layout).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import re
+import socket
+import struct
+import time
+from dataclasses import dataclass
+
+from hw.errors import LostError
+
+DASHBOARD_PORT, PRIMARY_PORT = 29999, 30001
+
+ROBOT_STATE, KINEMATICS_INFO = 16, 5
+"""Type of the message of the primary interface, and of the part of it, that hold the kinematics."""
+KINEMATICS = struct.Struct(">6I24dI")
+"""Checksums of the joints; DH theta, a, d, alpha (rad, m), six each; state of the calibration."""
+_MOST_MESSAGE = 1 << 16
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Which robot it is.
+
+    Attributes:
+        address: at which it answers.
+        serial: serial number, or None where the dashboard tells none.
+        calibration: 12 hexadecimal digits of SHA-256 over the kinematic calibration and its
+            checksums, or None where the controller tells none.
+        version: of PolyScope.
+        model: as the dashboard says.
+    """
+
+    address: str
+    serial: str | None
+    calibration: str | None
+    version: str
+    model: str
+
+    @property
+    def identified(self) -> bool:
+        """Whether anything but the address tells this arm from another."""
+        return self.serial is not None or self.calibration is not None
+
+    @property
+    def name(self) -> str:
+        """Serial number and calibration as far as they are known, or ``<model>@<address>``."""
+        if not self.identified:
+            return f"{self.model}@{self.address}"
+        calibration = self.calibration and f"calibration {self.calibration}"
+        return ", ".join(part for part in (self.serial, calibration) if part)
+
+
+def read_identity(host: str, *, timeout_s: float = 3.0) -> Identity:
+    """Ask the dashboard and the primary interface who the robot is.
+
+    Raises:
+        LostError: no connection, or no answer within ``timeout_s`` wall seconds.
+    """
+    deadline = time.monotonic() + timeout_s
+    try:
+        with socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection:
+            stream = _Lines(connection, deadline)
+            stream.line()
+            version = stream.ask("PolyscopeVersion")
+            serial = stream.ask("get serial number")
+            model = stream.ask("get robot model")
+    except TimeoutError:
+        raise LostError(f"the dashboard of {host} does not answer", device="robot") from None
+    except OSError as error:
+        text = f"no connection to the dashboard of {host}: {error}"
+        raise LostError(text, device="robot") from error
+    number = re.search(r"\d+\.\d+\.\d+(\.\d+)?", version)
+    return Identity(
+        address=host,
+        serial=serial if re.fullmatch(r"\d{4,20}", serial) else None,
+        calibration=_read_calibration(host, timeout_s),
+        version=number.group() if number else "unknown",
+        model=model if re.fullmatch(r"[\w-]{1,40}", model) else "unknown",
+    )
+
+
+def _read_calibration(host: str, timeout_s: float) -> str | None:
+    """From the primary interface's first messages; None where there is no such thing."""
+    deadline = time.monotonic() + timeout_s
+    data = b""
+    with (
+        contextlib.suppress(OSError),
+        socket.create_connection((host, PRIMARY_PORT), timeout=timeout_s) as connection,
+    ):
+        while (left := deadline - time.monotonic()) > 0:
+            connection.settimeout(left)
+            new = connection.recv(1 << 16)
+            if not new:
+                return None
+            data += new
+            while len(data) >= 5:
+                (size,) = struct.unpack_from(">I", data)
+                if not 5 <= size <= _MOST_MESSAGE:
+                    return None
+                if len(data) < size:
+                    break
+                message, data = data[:size], data[size:]
+                if message[4] == ROBOT_STATE:
+                    found = _calibration_in(message[5:])
+                    if found is not None:
+                        return found
+    return None
+
+
+def _calibration_in(parts: bytes) -> str | None:
+    """The calibration among the parts of a robot-state message, if it is there."""
+    while len(parts) >= 5:
+        (size,) = struct.unpack_from(">I", parts)
+        if not 5 <= size <= len(parts):
+            return None
+        if parts[4] == KINEMATICS_INFO and size >= 5 + KINEMATICS.size:
+            # All but the last word, which tells a state, not a number of the arm.
+            return hashlib.sha256(parts[5 : 5 + KINEMATICS.size - 4]).hexdigest()[:12]
+        parts = parts[size:]
+    return None
+
+
+class _Lines:
+    def __init__(self, connection: socket.socket, deadline: float) -> None:
+        self._socket, self._deadline, self._data = connection, deadline, b""
+
+    def ask(self, text: str) -> str:
+        self._socket.sendall(text.encode() + b"\n")
+        return self.line()
+
+    def line(self) -> str:
+        while b"\n" not in self._data:
+            left = self._deadline - time.monotonic()
+            if left <= 0:
+                raise TimeoutError
+            self._socket.settimeout(left)
+            data = self._socket.recv(1024)
+            if not data or len(self._data) > 1 << 14:
+                raise ConnectionError("it closed the connection" if not data else "endless line")
+            self._data += data
+        line, _, self._data = self._data.partition(b"\n")
+        return line.decode("utf-8", "replace").strip()
