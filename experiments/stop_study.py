@@ -36,7 +36,7 @@ import threading
 import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -371,13 +371,16 @@ def main() -> int:
     print(f"{machine()}; seed {SEED}, {given.robots} robots at once; {', '.join(ways)}")
     trials = []
     if each.exists() and set(ways) != set(WAYS):
-        kinds = {item.name: float if item.type == "float" else str for item in fields(Trial)}
         with each.open(newline="") as file:
             trials = [
-                Trial(**{name: kinds[name](row[name]) for name in kinds})
+                Trial(
+                    row["series"], row["way"], float(row["delay_s"]), float(row["rest_s"]),
+                    float(row["travel_mm"]), float(row["speed_mm_s"]), row["answer"],
+                    float(row["told_s"]), row["again"],
+                )
                 for row in csv.DictReader(file)
                 if row["way"] not in ways
-            ]
+            ]  # fmt: skip
     for series in SERIES:
         trials += run(series, ways, 5 if given.quick else given.trials, given.robots, SEED)
     rows = summary(trials)
