@@ -276,7 +276,7 @@ class Arm:
             found = replace(before, motion=moving)
         else:
             start = before.at(before.motion.at(moving.start)[0])
-            found = track(self.model, moving, self.tcp_offset, start)
+            found = track(self.model, moving, moving.planned_tcp, start)
         self._track = found
         return found
 
