@@ -12,6 +12,7 @@ Numpy and scipy throughout: this runs once a recording, on hundreds of samples a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -201,7 +202,8 @@ def fit_clock(
 def _theil_sen(x: np.ndarray, y: np.ndarray, most: int = 1000) -> float:
     """Median of the slopes of all pairs; n^2, so of a long recording every so many samples."""
     step = -(-len(x) // most)
-    return float(theilslopes(y[::step], x[::step]).slope)
+    fit: Any = theilslopes(y[::step], x[::step])
+    return float(fit.slope)
 
 
 def _lower_envelope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:

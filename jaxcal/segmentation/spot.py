@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -121,7 +121,8 @@ def half_maximum(
 
     Of an ellipse filled evenly the variance is a quarter of its squared half axis.
     """
-    labels, _ = ndimage.label(envelope >= 0.5 * envelope[peak], structure=np.ones((3, 3)))
+    areas: Any = ndimage.label(envelope >= 0.5 * envelope[peak], structure=np.ones((3, 3)))
+    labels = areas[0]
     shape = labels == labels[peak]
     rows, columns = np.nonzero(shape)
     v, u = (np.sqrt((4 * np.var(k) + 1 / 3) / HALF_MAXIMUM) for k in (rows, columns))
@@ -195,10 +196,11 @@ def fit_spot(
     def slope(unknowns: np.ndarray) -> np.ndarray:
         return np.concatenate([model(unknowns)[1][use] / top, hold])
 
+    derivative: Any = slope  # scipy's types know only the names of difference schemes
     with np.errstate(over="ignore", invalid="ignore"):
         try:
             fit = least_squares(
-                residual, first, jac=slope, method="trf", x_scale=steps, ftol=1e-8, xtol=1e-6,
+                residual, first, jac=derivative, method="trf", x_scale=steps, ftol=1e-8, xtol=1e-6,
                 gtol=1e-8, max_nfev=40,
             )  # fmt: skip
         except (ValueError, np.linalg.LinAlgError):
