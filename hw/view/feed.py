@@ -260,7 +260,9 @@ class LiveView:
         frame = b""
         if session is not None:
             try:
-                told["pose"] = session.poses.latest().pose[:3].ravel().tolist()
+                sample = session.poses.latest()
+                told["pose"] = sample.pose[:3].ravel().tolist()
+                told["joints"] = None if sample.joints is None else list(sample.joints)
             except DeviceError as error:
                 told["trouble"] = str(error)
             image = session.latest_image()

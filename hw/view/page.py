@@ -1,8 +1,8 @@
 """What the page shows: arm, box, image plane, target, poses, and the running estimate in words.
 
 Places are those of the robot's base frame; one unit of the scene is 100 mm. The arm is drawn
-through the joints that bring the flange to the tracked pose (:mod:`hw.robot.kinematics`), which of
-the eight ways is guessed: the nearest to the last one drawn.
+through the joints that the controller tells with the pose, or, where it tells none, through joints
+that bring the flange to the pose (:mod:`hw.robot.kinematics`).
 """
 
 from __future__ import annotations
@@ -106,6 +106,7 @@ class Page:
         # Shadows and reflections are dear where there is no graphics processor.
         server.scene.configure_default_lights(cast_shadow=False)
         server.scene.configure_environment_map(hdri=None)
+        server.scene.add_light_ambient("/light", intensity=2.5)
         server.gui.set_panel_label("jaxcal: acquisition")
         self._state = server.gui.add_markdown("Waiting for the plan.", order=0)
         self._picture: Any = None
@@ -116,6 +117,7 @@ class Page:
     def show(self, told: dict[str, Any], frame: UInt8[np.ndarray, "r c"] | None) -> None:
         """Take what the feed tells, and redraw what that changes."""
         pose, spacing = told.pop("pose", None), told.pop("frame", None)
+        joints = told.pop("joints", None)
         trouble = told.pop("trouble", None)
         changed = bool(told) or trouble != self._told.get("trouble")
         self._told.update(told, trouble=trouble)
@@ -132,7 +134,7 @@ class Page:
                 self._frame, self._spacing = frame, (spacing[2], spacing[3])
             if pose is not None:
                 self._pose = np.vstack([np.reshape(pose, (3, 4)), [0, 0, 0, 1]])
-                self._draw_arm(self._pose)
+                self._draw_arm(self._pose, joints)
             if pose is not None or frame is not None or "estimate" in told:
                 self._draw_image(frame is not None)
             if changed:
@@ -219,13 +221,15 @@ class Page:
 
     # At every message
 
-    def _draw_arm(self, pose: Float[np.ndarray, "4 4"]) -> None:
+    def _draw_arm(self, pose: Float[np.ndarray, "4 4"], measured: list[float] | None) -> None:
         told = self._told
         flange = flange_of(pose, tuple(told["tcp_offset"]))
         x = self._image_to_probe()
         tip = (pose @ x)[:3, 3]
         points = [np.zeros(3), flange[:3, 3], pose[:3, 3], tip]
-        joints = None if self._arm is None else self._joints_for(self._arm, flange)
+        joints = None if measured is None else np.array(measured)
+        if self._arm is not None and joints is None:
+            joints = self._joints_for(self._arm, flange)
         if self._arm is not None and joints is not None:
             points = [*link_frames(self._arm, joints)[:, :3, 3], pose[:3, 3], tip]
         used = list(pairwise(points))

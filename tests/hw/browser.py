@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from base64 import b64decode
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -32,7 +33,7 @@ def chromium() -> tuple[str, str]:
 
 
 @contextmanager
-def browsing(folder: Path, size: tuple[int, int] = (900, 600)) -> Iterator:
+def browsing(folder: Path, size: tuple[int, int] = (720, 480)) -> Iterator:
     """A selenium driver of a fresh profile in a folder."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
     from selenium.webdriver.chrome.service import Service
@@ -66,8 +67,14 @@ def addresses(browser) -> set[str]:
     return hosts - {None}
 
 
+def screenshot(browser) -> bytes:
+    """What the page looks like, PNG; a page drawn without a graphics processor may take long."""
+    told = browser.execute_cdp_cmd("Page.captureScreenshot", {"format": "png"})
+    return b64decode(told["data"])
+
+
 def pixels(browser) -> np.ndarray:
     """What the page looks like, (rows, columns, 3) uint8."""
     from PIL import Image
 
-    return np.asarray(Image.open(BytesIO(browser.get_screenshot_as_png())).convert("RGB"))
+    return np.asarray(Image.open(BytesIO(screenshot(browser))).convert("RGB"))

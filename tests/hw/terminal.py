@@ -53,11 +53,11 @@ class Terminal:
         """Press keys."""
         os.write(self._terminal, keys.encode())
 
-    def wait_for(self, pattern: str, timeout_s: float = 120.0) -> re.Match[str]:
+    def wait_for(self, pattern: str, timeout_s: float = 120.0, flags: int = 0) -> re.Match[str]:
         """Read until the pattern is shown after what was found last; escapes are left out."""
         deadline = time.monotonic() + timeout_s
         while True:
-            found = re.compile(pattern).search(self.shown, self._read)
+            found = re.compile(pattern, flags).search(self.shown, self._read)
             if found is not None:
                 self._read = found.end()
                 return found
