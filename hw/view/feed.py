@@ -230,7 +230,11 @@ class LiveView:
     def _feed(self) -> None:
         before = time.thread_time()
         try:
-            while not self._ending.wait(self._period_s):
+            due = time.monotonic()
+            while True:
+                due = max(due, time.monotonic() - self._period_s) + self._period_s
+                if self._ending.wait(max(due - time.monotonic(), 0.0)):
+                    return
                 if len(self._pending):
                     self.left_out += 1
                 else:
@@ -242,13 +246,17 @@ class LiveView:
             self._say("view: the viewer ended; the acquisition goes on without it")
 
     def _write(self) -> None:
-        """Hand over what fits now.
+        """Hand over what the viewer takes within half a period.
 
         Raises:
             OSError: the viewer is gone.
         """
-        with suppress(BlockingIOError):
-            while len(self._pending):
+        deadline = time.monotonic() + 0.5 * self._period_s
+        while len(self._pending):
+            left = deadline - time.monotonic()
+            if left <= 0 or not select.select([], [self._pipe], [], left)[1]:
+                return
+            with suppress(BlockingIOError):
                 written = os.write(self._pipe, self._pending)
                 self._pending = self._pending[written:]
 

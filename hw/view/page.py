@@ -8,7 +8,7 @@ that bring the flange to the pose (:mod:`hw.robot.kinematics`).
 from __future__ import annotations
 
 from html import escape
-from itertools import pairwise, product
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -32,9 +32,12 @@ _SHOWN_MM = 4.0
 """The target's ellipsoid is drawn so many powers of ten larger that it can be seen."""
 _MOST_MAGNIFIED = 1000
 _UNKNOWN_MM = 50.0
+_LABEL_MM = 70.0
+# Poses that differ by less (mm, or in a rotation matrix) look the same.
+_MOVED = 1e-4
 _PANEL_ROWS, _PANEL_COLUMNS = 240, 320
 _GREY, _ARM, _DONE, _NOW, _MISSED = (
-    (150, 150, 150), (120, 140, 165), (30, 140, 60), (230, 120, 0), (200, 40, 40),
+    (150, 150, 150), (120, 140, 165), (0, 120, 40), (240, 110, 0), (200, 0, 0),
 )  # fmt: skip
 _TARGET = (200, 0, 120)
 _LINK_RADIUS_MM = (45.0, 38.0, 30.0, 26.0, 26.0, 24.0, 12.0, 8.0)
@@ -44,18 +47,17 @@ _LEGEND = (
 )
 
 
-def quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, 4]:
-    """Unit quaternion (w, x, y, z) of a rotation matrix."""
+def quaternion(rotation: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 4"]:
+    """Unit quaternions (w, x, y, z) of rotation matrices."""
     return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
 
 
-def towards(direction: Float[np.ndarray, 3]) -> Float[np.ndarray, "3 3"]:
-    """A rotation whose z axis points along a direction."""
-    z = direction / np.linalg.norm(direction)
-    aside = np.eye(3)[int(np.argmin(np.abs(z)))]
-    x = np.cross(aside, z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
+def towards(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Rotations whose z axes point along directions."""
+    z = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z), axis=-1)], z)
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
 def ellipsoid(
@@ -97,6 +99,7 @@ class Page:
         self._server, self._scene = server, server.scene
         self._told: dict[str, Any] = {}
         self._joints: np.ndarray | None = None
+        self._drawn, self._lengths = np.zeros((4, 4)), np.zeros(0)
         self._pose: np.ndarray | None = None
         self._frame: np.ndarray | None = None
         self._spacing = (0.1, 0.1)
@@ -132,10 +135,14 @@ class Page:
                 self._draw_target()
             if frame is not None and spacing is not None:
                 self._frame, self._spacing = frame, (spacing[2], spacing[3])
+            moved = "estimate" in told
             if pose is not None:
                 self._pose = np.vstack([np.reshape(pose, (3, 4)), [0, 0, 0, 1]])
+                moved |= bool(np.abs(self._pose - self._drawn).max() > _MOVED)
+            if moved and self._pose is not None:
+                self._drawn = self._pose
                 self._draw_arm(self._pose, joints)
-            if pose is not None or frame is not None or "estimate" in told:
+            if moved or frame is not None:
                 self._draw_image(frame is not None)
             if changed:
                 self._state.content = state_words(self._told)
@@ -149,6 +156,7 @@ class Page:
             part.remove()
         self._parts.clear()
         self._joints = self._frame = None
+        self._drawn, self._lengths = np.zeros((4, 4)), np.zeros(0)
         low, high = np.array(told["box"]) / UNIT_MM
         middle = np.array(told["point"]) / UNIT_MM
         scene.add_grid(
@@ -216,7 +224,10 @@ class Page:
             wxyz=quaternion(axes), position=point / UNIT_MM, cast_shadow=False,
         )  # fmt: skip
         self._parts["target label"] = scene.add_label(
-            "/target_label", text, position=(point - [0, 0, 12.0]) / UNIT_MM, anchor="top-center"
+            "/target_label",
+            text,
+            position=(point - [0, 0, _LABEL_MM]) / UNIT_MM,
+            anchor="top-center",
         )
 
     # At every message
@@ -232,17 +243,23 @@ class Page:
             joints = self._joints_for(self._arm, flange)
         if self._arm is not None and joints is not None:
             points = [*link_frames(self._arm, joints)[:, :3, 3], pose[:3, 3], tip]
-        used = list(pairwise(points))
-        for number in range(len(_LINK_RADIUS_MM)):
-            link, joint = self._parts[f"link {number}"], self._parts[f"joint {number}"]
-            start, end = used[number] if number < len(used) else (points[0], points[0])
-            length = float(np.linalg.norm(end - start))
-            link.visible = joint.visible = length > 1.0
-            if length > 1.0:
-                link.scale = (1.0, 1.0, length / UNIT_MM)
-                link.position = 0.5 * (start + end) / UNIT_MM
-                link.wxyz = quaternion(towards(end - start))
-                joint.position = start / UNIT_MM
+        points = np.array(points)
+        ways = np.diff(points, axis=0)
+        lengths = np.linalg.norm(ways, axis=1)
+        middles = (points[:-1] + 0.5 * ways) / UNIT_MM
+        # Links shorter than a mm are left out; any direction will do for them.
+        turns = quaternion(towards(np.where(lengths[:, None] > 1.0, ways, [0.0, 0.0, 1.0])))
+        if len(lengths) != len(self._lengths) or np.abs(lengths - self._lengths).max() > 0.1:
+            self._lengths = lengths
+            for number in range(len(_LINK_RADIUS_MM)):
+                link, joint = self._parts[f"link {number}"], self._parts[f"joint {number}"]
+                length = float(lengths[number]) if number < len(lengths) else 0.0
+                link.visible = joint.visible = length > 1.0
+                link.scale = (1.0, 1.0, max(length, 1.0) / UNIT_MM)
+        for number, (start, middle, turn) in enumerate(zip(points, middles, turns, strict=False)):
+            link = self._parts[f"link {number}"]
+            link.position, link.wxyz = middle, turn
+            self._parts[f"joint {number}"].position = start / UNIT_MM
 
     def _joints_for(
         self, arm: ArmModel, flange: Float[np.ndarray, "4 4"]
@@ -266,8 +283,8 @@ class Page:
         rows, columns = self._frame.shape
         across, down = self._spacing
         x = self._pose @ self._image_to_probe()
-        # Rows go down the image: the plane's own y points back to the probe.
-        rotation = np.stack([x[:3, 0], -x[:3, 2], x[:3, 1]], axis=1)
+        # The plane's first row is where its own y is least.
+        rotation = np.stack([x[:3, 0], x[:3, 2], -x[:3, 1]], axis=1)
         middle = x[:3, 3] + 0.5 * rows * down * x[:3, 2]
         if "image" not in self._parts:
             rgb = np.repeat(self._frame[:, :, None], 3, axis=2)

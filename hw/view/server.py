@@ -33,6 +33,8 @@ def main(port: int) -> int:
     except ImportError as error:
         answer(error=f"viser cannot be imported ({error})")
         return 2
+    # viser looks for OpenCV at every picture, which takes longer than the picture.
+    sys.modules.setdefault("cv2", None)  # type: ignore[arg-type]
     with redirect_stdout(sys.stderr):
         try:
             server = viser.ViserServer(host=HOST, port=port, verbose=False)
