@@ -87,7 +87,7 @@ def measure(pages: int, seconds: float) -> list[object]:
                 clock=setup.clock,
                 dry_run=False,
                 guard=session.trouble,
-            )  # fmt: skip
+            )
         )
         view.plan(setup, plan, [])
         done = threading.Event()

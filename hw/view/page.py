@@ -35,6 +35,8 @@ _UNKNOWN_MM = 50.0
 _LABEL_MM = 70.0
 # Poses that differ by less (mm, or in a rotation matrix) look the same.
 _MOVED = 1e-4
+_PANEL_EVERY = 3
+"""Every third frame goes into the panel as well; compressing pictures is what the page costs."""
 _PANEL_ROWS, _PANEL_COLUMNS = 240, 320
 _GREY, _ARM, _DONE, _NOW, _MISSED = (
     (150, 150, 150), (120, 140, 165), (0, 120, 40), (240, 110, 0), (200, 0, 0),
@@ -113,6 +115,7 @@ class Page:
         server.gui.set_panel_label("jaxcal: acquisition")
         self._state = server.gui.add_markdown("Waiting for the plan.", order=0)
         self._picture: Any = None
+        self._pictures = 0
         self._text = server.gui.add_markdown("", order=2)
         server.gui.add_markdown(_LEGEND, order=3)
         self._parts: dict[str, Any] = {}
@@ -300,7 +303,9 @@ class Page:
         elif fresh:
             rgb = np.repeat(self._frame[:, :, None], 3, axis=2)
             self._parts["image"].image = rgb
-            self._picture.image = to_scale(self._frame, self._spacing)
+            self._pictures += 1
+            if self._pictures % _PANEL_EVERY == 0:
+                self._picture.image = to_scale(self._frame, self._spacing)
         plane = self._parts["image"]
         plane.wxyz, plane.position = quaternion(rotation), middle / UNIT_MM
 
