@@ -26,13 +26,13 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from common import arguments, machine, results_folder, write_table
 
 from hw.emulated import setup_of, start
-from hw.errors import RefusedError, StoppedError
+from hw.errors import RefusedError, StaleError, StoppedError
 from hw.midplane.bracket import Bracket, Placement
 from hw.poses import plan_poses
 from hw.recorder import Recorder
 from hw.recording_layout import Header
 from hw.robot.motion import Motion
-from hw.robot.safety import MotionPlan, confirm
+from hw.robot.safety import MotionPlan, confirm_unattended
 from hw.session import Session
 from hw.view.feed import LiveView, watched
 
@@ -77,13 +77,13 @@ def measure(pages: int, seconds: float) -> list[object]:
         stack.enter_context(watched(view, session))
         poses = plan_poses(60, setup.scene, setup.extent, SEED).poses
         offset = (0.0, 0.0, 0.12, 0.0, 0.0, 0.0)
-        serial = session.poses.identity().serial
+        serial = session.poses.identity().name
         plan = MotionPlan(poses, setup.motion_limits(), offset, serial)
         motion = stack.enter_context(
             Motion(
                 setup.robot_host,
                 plan,
-                confirm(plan, plan.code, clock=setup.clock),
+                confirm_unattended(plan, plan.digest, clock=setup.clock),
                 clock=setup.clock,
                 dry_run=False,
                 guard=session.trouble,
@@ -99,10 +99,11 @@ def measure(pages: int, seconds: float) -> list[object]:
         row = 0
         while time.monotonic() - began < seconds:
             view.going(row)
-            with suppress(StoppedError, RefusedError):  # a hiccup of a busy machine
+            with suppress(StaleError, StoppedError, RefusedError):  # a hiccup of a busy machine
+                session.wait_until_clear()
                 motion.move_to(poses[row])
             view.taken(row, PLACEMENT, None)
-            row += 1
+            row = (row + 1) % len(poses)
         wall = time.monotonic() - began
         feeder, server = view.seconds - before[0], cpu_s(view.pid) - before[1]
         sent, left_out = view.sent - before[2], view.left_out - before[3]
