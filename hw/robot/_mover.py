@@ -252,7 +252,7 @@ class Mover:
                 lag = self._lag.of(t_host, packet.timestamp_s)
                 self._sample = PoseSample(
                     t_host, packet.timestamp_s, packet.tcp_pose, packet.safety_bits,
-                    packet.robot_mode, packet.runtime_state, lag,
+                    packet.robot_mode, packet.runtime_state, lag, packet.joints,
                 )  # fmt: skip
                 self._compare(packet.tcp_offset, packet.pendant)
         if self._library in ready and self._library is not None:
@@ -388,11 +388,11 @@ class Mover:
         assert self._sample is not None
         here = self._sample
         if self._virtual is not None:
-            here = replace(here, raw=self._virtual.raw)
+            here = replace(here, raw=self._virtual.raw, joints=None)
         command = self._gate.check_geometry(pose, here, speed_mm_s)
         self._heed()
         self._log("dry run: moveL", raw=command.raw, speed_m_s=command.speed_m_s)
-        self._virtual = replace(here, raw=command.raw)
+        self._virtual = replace(here, raw=command.raw, joints=None)
         self._arrive(self._virtual)
 
     def _follow(self, command: Command) -> None:

@@ -18,9 +18,9 @@ from hw.extras import require
 from hw.robot._process import RECEIVES, be_prompt
 from hw.robot.rtde import Packet, PacketReader
 
-RECORD = struct.Struct("<8dIiI6d5d")
+RECORD = struct.Struct("<8dIiI6d5d6d")
 """Host and device s, pose (6), safety bits, mode, runtime state, TCP offset (6), payload, its
-centre of gravity (3), speed slider; NaN where the controller does not tell."""
+centre of gravity (3), speed slider, joints (6); NaN where the controller does not tell."""
 POSE, ERROR, BOUND = b"P", b"E", b"B"
 """What a record is; ``BOUND`` comes first: host and device s (:attr:`PacketReader.bound`)."""
 _NOT_TOLD = (math.nan,)
@@ -44,6 +44,7 @@ def _pack(packet: Packet) -> bytes:
         packet.robot_mode, packet.runtime_state, *(packet.tcp_offset or _NOT_TOLD * 6),
         math.nan if pendant.payload_kg is None else pendant.payload_kg,
         *(pendant.payload_cog_m or _NOT_TOLD * 3), pendant.speed_fraction,
+        *(packet.joints or _NOT_TOLD * 6),
     )  # fmt: skip
 
 
@@ -60,7 +61,7 @@ def _ur_rtde(output: int, host: str, frequency_hz: float | None) -> None:
             continue
         record = (
             *robot.getActualTCPPose(), robot.getSafetyStatusBits(), robot.getRobotMode(),
-            robot.getRuntimeState(), *_NOT_TOLD * 11,
+            robot.getRuntimeState(), *_NOT_TOLD * 17,
         )  # fmt: skip
         if robot.getTimestamp() != before:
             continue

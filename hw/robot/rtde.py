@@ -38,11 +38,12 @@ FIELDS: dict[str, tuple[str, str]] = {
     "tcp_offset": ("VECTOR6D", "6d"),
     "payload": ("DOUBLE", "d"),
     "payload_cog": ("VECTOR3D", "3d"),
+    "actual_q": ("VECTOR6D", "6d"),
 }
 """What is asked for, with the type that must come back."""
 
-_OPTIONAL = ("tcp_offset", "payload", "payload_cog")
-"""Older controllers lack these."""
+_OPTIONAL = ("tcp_offset", "payload", "payload_cog", "actual_q")
+"""Older controllers lack these; every controller that is known tells the joints, actual_q."""
 
 RUNNING_MODE = 7
 NORMAL_BITS = 0b11
@@ -143,6 +144,8 @@ class Packet:
     tcp_offset: tuple[float, ...] | None
     """Tool centre point in the flange's frame (m, rad); None where the controller tells none."""
     pendant: PendantSettings
+    joints: tuple[float, ...] | None = None
+    """Angles of the joints, rad."""
 
 
 class PacketReader:
@@ -221,7 +224,7 @@ class PacketReader:
             self._pendant = pendant
         return Packet(
             now, v[0], v[1:7], v[7:13], v[13:19], v[19], v[20], v[21], v[22],
-            told.get("tcp_offset"), self._pendant,
+            told.get("tcp_offset"), self._pendant, told.get("actual_q"),
         )  # fmt: skip
 
     def _messages(self) -> Generator[tuple[bytes, bytes]]:

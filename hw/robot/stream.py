@@ -291,11 +291,12 @@ class PoseStream:
             start += 1 + size
             t_host, t_device = self.clock.at(record[0]), record[1]
             lag = self._lag.of(t_host, t_device)
-            new.append(PoseSample(t_host, t_device, record[2:8], *record[8:11], lag_s=lag))
+            joints = None if math.isnan(record[22]) else record[22:28]
+            new.append(PoseSample(t_host, t_device, record[2:8], *record[8:11], lag, joints))
             if not math.isnan(record[11]):
                 self._compare(record[11:17])
-            if record[17:] != told:
-                told = record[17:]
+            if record[17:22] != told:
+                told = record[17:22]
                 self._keep_pendant(*told)
         if data[start : start + 1] == ERROR and len(data) - start >= 3:
             (length,) = struct.unpack_from("<H", data, start + 1)

@@ -273,7 +273,7 @@ def rtde(kind: bytes, payload: bytes) -> bytes:
 VERSION = rtde(b"v", struct.pack(">4I", 5, 11, 0, 0))
 TYPES = b"\x01" + b",".join(
     b"DOUBLE VECTOR6D VECTOR6D VECTOR6D INT32 UINT32 UINT32 UINT32 DOUBLE VECTOR6D DOUBLE "
-    b"VECTOR3D".split()
+    b"VECTOR3D VECTOR6D".split()
 )
 
 
