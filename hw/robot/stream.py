@@ -292,7 +292,12 @@ class PoseStream:
             t_host, t_device = self.clock.at(record[0]), record[1]
             lag = self._lag.of(t_host, t_device)
             joints = None if math.isnan(record[22]) else record[22:28]
-            new.append(PoseSample(t_host, t_device, record[2:8], *record[8:11], lag, joints))
+            bits, robot_mode, runtime_state = record[8:11]
+            new.append(
+                PoseSample(
+                    t_host, t_device, record[2:8], bits, robot_mode, runtime_state, lag, joints
+                )
+            )
             if not math.isnan(record[11]):
                 self._compare(record[11:17])
             if record[17:22] != told:
