@@ -17,6 +17,8 @@ __version__ = "0.1.0"
 _HOME = {
     "Calibration": "jaxcal.calibration",
     "CalibrationError": "jaxcal.errors",
+    "Certificate": "jaxcal.certificate",
+    "ClosedForm": "jaxcal.closed_form",
     "CurvilinearProbe": "jaxcal.probe",
     "FormatError": "jaxcal.errors",
     "Images": "jaxcal.recording",
@@ -34,8 +36,10 @@ _HOME = {
     "bootstrap": "jaxcal.resampling",
     "calibrate": "jaxcal.solve",
     "calibrate_batch": "jaxcal.solve",
+    "calibrate_closed_form": "jaxcal.closed_form",
     "calibrate_pivot": "jaxcal.pivot",
     "calibration_reproducibility": "jaxcal.metrics",
+    "certify": "jaxcal.certificate",
     "cross_validate": "jaxcal.resampling",
     "load": "jaxcal.io.hdf5",
     "make_images": "jaxcal.recording",
@@ -55,6 +59,10 @@ _HOME = {
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration as Calibration
     from jaxcal.calibration import Status as Status
+    from jaxcal.certificate import Certificate as Certificate
+    from jaxcal.certificate import certify as certify
+    from jaxcal.closed_form import ClosedForm as ClosedForm
+    from jaxcal.closed_form import calibrate_closed_form as calibrate_closed_form
     from jaxcal.errors import CalibrationError as CalibrationError
     from jaxcal.errors import FormatError as FormatError
     from jaxcal.errors import InputError as InputError
