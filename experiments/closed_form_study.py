@@ -12,8 +12,10 @@ starts. They share nothing with jaxcal but the data.
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -23,14 +25,19 @@ from jaxtyping import Array, Float
 
 import jaxcal
 from jaxcal.closed_form import solve
+from jaxcal.io.atomic import atomic_path
 from jaxcal.reduced_objective import CONSTRAINTS, ImageData, reduce
 
 SEED = 20261121
 PROBLEMS = 100_000
 QUICK = 2_000
+BLOCK = 2_000
 STARTS = 64
-DESCENT_STEPS = 100
-CHUNK = 200
+FIRST_STEPS = 40
+LAST_STEPS = 100
+FINISHERS = 16
+"""All descents take the first steps; those that are then lowest are run to their end."""
+CHUNK = 100
 RELATIVE = 1e-9
 """Of the objective: how much lower a descent must be to count."""
 FLOOR = 1e-18
@@ -200,7 +207,10 @@ def descents(
     q = [quaternions[:, :, k] for k in range(4)]
     ones = jnp.ones_like(q[0])
     start = (q, [ones, ones], 1e-3 * ones, value(point(q, [ones, ones])))
-    q, scales, _, now = jax.lax.fori_loop(0, DESCENT_STEPS, step, start)
+    state = jax.lax.fori_loop(0, FIRST_STEPS, step, start)
+    lowest = jnp.argsort(state[3], axis=1)[:, :FINISHERS]
+    state = jax.tree.map(lambda leaf: jnp.take_along_axis(leaf, lowest, axis=1), state)
+    q, scales, _, now = jax.lax.fori_loop(0, LAST_STEPS, step, state)
     pair = point(q, scales)
     return now, jnp.stack(pair[0] + pair[1], axis=-1)
 
@@ -208,11 +218,11 @@ def descents(
 def best_of_descents(
     rng: np.random.Generator, drawn: list[Drawn]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """For every problem all objectives and x (64 of each), the data's size, and seconds."""
+    """For every problem the lowest objectives and their x, the data's size, and the triangle."""
     parts = [eliminated(each.data) for each in drawn]
     triangles = np.stack([part[0] for part in parts])
     sizes = np.array([part[1] for part in parts])
-    values, points = np.zeros((len(drawn), STARTS)), np.zeros((len(drawn), STARTS, 6))
+    values, points = np.zeros((len(drawn), FINISHERS)), np.zeros((len(drawn), FINISHERS, 6))
     program = jax.jit(descents, static_argnums=2)
     for estimate in ESTIMATES:
         where = np.flatnonzero([each.estimate == estimate for each in drawn])
@@ -273,6 +283,22 @@ def judge(
         false_unique=certificate.unique and far,
         milliseconds=milliseconds,
     )
+
+
+def block(index: int, path: Path) -> list[Outcome]:
+    """The outcomes of one block of problems; an interrupted study goes on after the last one."""
+    rng = np.random.default_rng([SEED, index])
+    drawn = [draw(rng) for _ in range(BLOCK)]
+    names = [name for name in Outcome.__dataclass_fields__ if name != "drawn"]
+    if path.exists():
+        rows = json.loads(path.read_text())
+        return [Outcome(d, *row) for d, row in zip(drawn, rows, strict=True)]
+    parts = zip(drawn, *best_of_descents(rng, drawn), strict=True)
+    outcomes = [judge(*each) for each in parts]
+    rows = [[getattr(outcome, name) for name in names] for outcome in outcomes]
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(rows, default=lambda value: value.item()))
+    return outcomes
 
 
 HEADER = (
@@ -396,16 +422,13 @@ def main() -> None:
     options = arguments(__doc__ or "")
     jax.config.update("jax_enable_x64", True)
     folder = results_folder(options.quick)
-    rng = np.random.default_rng(SEED)
     outcomes: list[Outcome] = []
     total = QUICK if options.quick else PROBLEMS
-    block = 50 * CHUNK
-    for start in range(0, total, block):
-        drawn = [draw(rng) for _ in range(min(block, total - start))]
-        values, points, sizes, triangles = best_of_descents(rng, drawn)
-        outcomes += [
-            judge(*each) for each in zip(drawn, values, points, sizes, triangles, strict=True)
-        ]
+    name = "closed_form_quick" if options.quick else "closed_form"
+    kept = Path(__file__).parent / "studies" / name
+    kept.mkdir(parents=True, exist_ok=True)
+    for index in range(total // BLOCK):
+        outcomes += block(index, kept / f"{index}.json")
         print(f"{len(outcomes)} of {total}", flush=True)
     rows = rows_of(outcomes)
     write_table(folder / "closed_form_study.csv", HEADER, rows)

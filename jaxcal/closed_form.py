@@ -56,6 +56,12 @@ Numbers = Any
 DUAL_STEPS = 60
 DESCENT_STEPS = 60
 ARMIJO = 1e-4
+NEARLY_MET = 1e-6
+"""Constraints off by less than this share of |x|^2: the dual's maximum is inside."""
+RISE = 1e-13
+"""The dual has arrived when a step raises it by less than this share."""
+SCREENED, KEPT = 12, 20
+"""After so many steps only so many of the descents go on, the lowest ones."""
 RESTING = 1e-12
 """A descent rests when its step is below this, in radians and in shares of the scale."""
 
@@ -131,17 +137,19 @@ def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, 6], Certificate]
     constraints = reduced.constraints
     both = constraints.free == ("lateral", "axial")
     found = _scalar_root(reduced) if both else _dual_maximum(reduced)
-    best: Float[np.ndarray, 6] | None = None
+    candidates = None
     if found is not None:
         values, x = found
-        best = descend(reduced, feasible(x, constraints)[None])
-        certificate = certify_point(reduced, best, values=values)
-        if certificate.certified:
-            return best, certificate
-    candidates = _starts(reduced)
-    if best is not None:
-        candidates = np.concatenate([best[None], candidates])
-    best = descend(reduced, candidates)
+        nearest = feasible(x, constraints)
+        off = np.abs((constraints.matrices @ x) @ x - constraints.values).max()
+        if off <= NEARLY_MET * max(1.0, float(x @ x)):
+            best = descend(reduced, nearest[None])
+            certificate = certify_point(reduced, best, values=values)
+            if certificate.certified:
+                return best, certificate
+        candidates = nearest[None]
+    starts = _starts(reduced)
+    best = descend(reduced, starts if candidates is None else np.append(candidates, starts, axis=0))
     certificate = certify_point(reduced, best)
     if certificate.certified:
         return best, certificate
@@ -229,6 +237,8 @@ def _dual_maximum(
         if after is None:
             break
         values, state = values + length * step, after
+        if after[0] - value <= RISE * abs(value):
+            break
     return values * size**2, state[2]
 
 
@@ -333,7 +343,10 @@ def descend(reduced: ReducedObjective, x: Float[np.ndarray, "s 6"]) -> Float[np.
     value = reduced(x)
     damping = np.full(len(x), 1e-6)
     eye = np.eye(3)
-    for _ in range(DESCENT_STEPS):
+    for index in range(DESCENT_STEPS):
+        if index == SCREENED and len(x) > KEPT:
+            lowest = np.argsort(value)[:KEPT]
+            x, value, damping = x[lowest], value[lowest], damping[lowest]
         pairs = x.reshape(-1, 2, 3)
         weights = ((x @ factor.T + reduced.shift) @ factor).reshape(-1, 2, 3)
         scales = _scale_columns(x, free)

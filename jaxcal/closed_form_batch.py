@@ -151,8 +151,12 @@ def solve_lanes(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     deviation = mask[:, :, None] * (points - mean[:, None])
     away = mask[:, :, None] * (translations - centre[:, None])
     weights = jnp.concatenate([deviation, mask[:, :, None]], axis=2)
-    turned = jnp.einsum("bnk,bnij->bkij", weights, rotations)
-    pulled = jnp.einsum("bnk,bnij,bni->bkj", weights, rotations, away)
+    # Whole poses, and R'b plane by plane: batched products of 3x3 matrices are slow.
+    flat = used.poses.reshape(*mask.shape, 16)
+    sums = jnp.einsum("bnk,bnf->bkf", weights, flat).reshape(-1, 3, 4, 4)
+    turned = sums[:, :, :3, :3]
+    back = [sum(rotations[:, :, i, j] * away[:, :, i] for i in range(3)) for j in range(3)]
+    pulled = jnp.einsum("bnk,bnj->bkj", weights, jnp.stack(back, axis=2))
     spread = jnp.einsum("bnk,bnl->bkl", deviation, deviation)
     size = jnp.sum(away**2, axis=(1, 2)) + spread[:, 0, 0] + spread[:, 1, 1]
 

@@ -127,8 +127,8 @@ class ReducedObjective:
     mean: Float[np.ndarray, 2]
     constraints: Constraints
 
-    def __call__(self, x: Float[np.ndarray, "*starts 6"]) -> Float[np.ndarray, "*starts"]:
-        """f(x), mm^2."""
+    def __call__(self, x: Float[np.ndarray, "*starts 6"]) -> Any:
+        """f(x), mm^2: a number, or one for every start."""
         return np.sum((x @ self.factor.T + self.shift) ** 2, axis=-1) + self.rest
 
     def origin_and_target(

@@ -15,6 +15,7 @@ from jaxcal.errors import InputError
 from jaxcal.geometry import rotation_angle
 from jaxcal.metrics import reconstruction_precision
 from jaxcal.recording import Images, Recording, Truth
+from jaxcal.report.certified import certificate_record
 
 CONVENTION = {
     "units": "lengths in mm; rotations in rad where no unit is in the name",
@@ -28,6 +29,9 @@ CONVENTION = {
     "omega in rad, along and about the image's axes",
     "objective": "the minimised sum of squares: mm^2, or in SDs with the gaussian prior; with auto "
     "and uniform that of the Gaussian fit before the laws are weighed",
+    "certified": "no transform fits Eq. 7 better (one part in 1e9), which is proved: of the answer "
+    "for the conventional method, of the conventional fit of the same images for the others; "
+    "Eq. 7's minimum is at most gap_mm2 lower; null where no proof is tried",
     "offset_law": "which law the elevational offsets follow and with what probability, their mean, "
     "and which noise model is in use; null where no laws were weighed",
 }
@@ -71,6 +75,7 @@ def calibration_record(
         "covariance": answer.covariance if np.isfinite(answer.covariance).all() else None,
         "observability": result.observability,
         "rms_mm": answer.rms,
+        **certificate_record(answer, recording),
         "reconstruction_precision_mm": precision,
         "reconstruction_precision_set": precision_set,
         "scale_mm_per_px": answer.scale_mm_per_px,

@@ -8,6 +8,7 @@ from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table
 
+from jaxcal.report.certified import certificate_words
 from jaxcal.report.verdict import spread_of_transform
 
 _UNKNOWN = "-"
@@ -88,6 +89,9 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
             _number(record["reconstruction_precision_mm"], ".3f"),
         ),
     ]
+    proved = certificate_words(record)
+    if proved is not None:
+        facts.append(("global minimum", proved))
     spread = spread_of_transform(record)
     if spread is not None:
         facts.append(("SD of image_to_probe", f"{spread[0]:.3f} mm, {spread[1]:.3f} deg"))

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from jaxcal import diagnosis
+from jaxcal.report.certified import certificate_words
 from jaxcal.report.resampled import resampled_sentences
 
 GOOD = 0.5
@@ -33,6 +34,9 @@ def verdict(record: dict[str, Any]) -> list[str]:
     lines = [_headline(record)]
     if record["status"] in ("converged", "max_iterations"):
         lines += [*_certainty(record), _errors(record), *resampled_sentences(record)]
+        proved = certificate_words(record)
+        if proved is not None:
+            lines.append(f"{proved[0].upper()}{proved[1:]}.")
     if record["warnings"]:
         lines += ["Look at this:", *(f"- {text}" for text in record["warnings"])]
     todo = _advice(record)

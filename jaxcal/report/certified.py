@@ -1,0 +1,75 @@
+"""What is proved of the conventional fit, for the record of a calibration and in words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jaxcal.calibration import Calibration
+from jaxcal.certificate import Certificate, certify
+from jaxcal.closed_form import calibrate_closed_form
+from jaxcal.errors import InputError
+from jaxcal.model.parameters import EXTRA
+from jaxcal.recording import Images, Recording
+
+
+def certificate_record(result: Calibration, recording: Recording) -> dict[str, Any]:
+    """``certified`` and ``gap_mm2`` of Eq. 7's minimum on the images in use.
+
+    For the conventional method they are the answer's own; for the others, which minimise something
+    else, those of the closed form of the same images. Both are None where there is no closed form
+    (an estimated delay, raw times of flight) or no answer.
+
+    Args:
+        result: of one problem, with numpy arrays.
+        recording: what was calibrated.
+    """
+    nothing: dict[str, Any] = {"certified": None, "gap_mm2": None}
+    images = recording.calibration
+    estimate = tuple(name for name in EXTRA if name in result.blocks)
+    own = result.method == "conventional"
+    if images.kind == "time_of_flight" or not (estimate in ((), ("scale",)) or own):
+        return nothing
+    images = replace(images, mask=np.asarray(result.mask) > 0)
+    try:
+        if own:
+            found = _of_answer(result, images, recording, estimate)
+        else:
+            found = calibrate_closed_form(images, estimate=estimate)
+    except InputError:
+        return nothing
+    return {"certified": found.certified, "gap_mm2": found.gap_mm2}
+
+
+def _of_answer(
+    result: Calibration, images: Images, recording: Recording, estimate: tuple[str, ...]
+) -> Certificate:
+    factor = 1.0
+    if result.sound_speed_m_s is not None and recording.probe is not None:
+        factor = float(result.sound_speed_m_s) / recording.probe.sound_speed_m_s
+    return certify(
+        images,
+        np.asarray(result.image_to_probe, dtype=float),
+        np.asarray(result.point, dtype=float),
+        scale_mm_per_px=result.scale_mm_per_px,
+        sound_speed_factor=factor,
+        estimate=estimate,
+    )
+
+
+def certificate_words(record: dict[str, Any]) -> str | None:
+    """One line about the certificate; None where the record has none.
+
+    Args:
+        record: of :func:`jaxcal.report.record.calibration_record`.
+    """
+    certified, gap = record.get("certified"), record.get("gap_mm2")
+    if certified is None:
+        return None
+    if certified:
+        return "conventional fit certified: no transform fits Eq. 7 better"
+    if gap is None:
+        return "conventional fit not certified: no bound on Eq. 7 is known for these images"
+    return f"conventional fit not certified: Eq. 7 may have a minimum {gap:.2g} mm^2 lower"

@@ -1,0 +1,463 @@
+"""Conventional calibration in closed form, its certificate, batches of it and its derivatives."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pose_sets
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+import jaxcal
+from jaxcal.closed_form import solve
+from jaxcal.io.text import read_crosswire
+from jaxcal.reduced_objective import image_data, reduce
+from jaxcal.report.certified import certificate_record, certificate_words
+from jaxcal.rotation_relaxation import lower_bound
+
+SCALE = ("scale",)
+ESTIMATES = ((), SCALE, ("common-scale",))
+
+
+@pytest.fixture(scope="module")
+def crosswire(real_data: Path) -> jaxcal.Recording:
+    folder = real_data / "crosswire"
+    return read_crosswire(
+        folder / "crossWirePhantomTransformations.txt", folder / "crossWirePhantom2DPoints.txt"
+    )
+
+
+def drawn(
+    seed: int, count: int, *, noise: float = 1.0, offset: float = 1.0, estimate=(), kind="general"
+) -> jaxcal.Images:
+    """Random images: pixels of about 0.2 mm where a scale is unknown, else points in mm."""
+    rng = np.random.default_rng(seed)
+    axes = rng.normal(size=(count, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    axes = axes[:1] + 0 * axes if kind == "one-axis" else axes
+    angles = 0.0 if kind == "parallel" else np.radians(rng.uniform(-30, 30, (count, 1)))
+    rotations = Rotation.from_rotvec(axes * angles).as_matrix()
+    rotations = rotations @ Rotation.from_quat(rng.normal(size=4)).as_matrix()
+    depth = rng.uniform(50, 110, count)
+    seen = np.stack([rng.uniform(-25, 25, count), rng.uniform(-1, 1, count) * offset, depth], 1)
+    if kind == "collinear":
+        seen[:, 2] = 40 + 0.5 * seen[:, 0]
+    if kind == "duplicates":
+        rotations, seen = rotations[np.arange(count) % 3], seen[np.arange(count) % 3]
+    turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = rotations
+    away = np.einsum("nij,nj->ni", rotations, seen @ turn.T + 50 * rng.normal(size=3))
+    poses[:, :3, 3] = 100 * rng.normal(size=3) - away
+    points = seen[:, [0, 2]] + noise * rng.normal(size=(count, 2))
+    if not estimate:
+        return jaxcal.make_images(poses, points)
+    ratio = np.array([0.2, 0.2 if estimate == ("common-scale",) else 0.17])
+    return jaxcal.make_images(poses, points / ratio, "pixel", spacing_mm=(0.25, 0.25))
+
+
+def residuals(images: jaxcal.Images, rotation, origin, target, scale) -> np.ndarray:
+    """|c - B_i X p_i| of Eq. 7, written out."""
+    points = images.measurements * scale
+    in_plane = np.stack([points[:, 0], np.zeros(len(points)), points[:, 1]], axis=1)
+    in_plane[:, 2] += images.face_offset_mm
+    in_probe = in_plane @ rotation.T + origin
+    poses = images.poses[images.mask]
+    cloud = np.einsum("nij,nj->ni", poses[:, :3, :3], in_probe[images.mask]) + poses[:, :3, 3]
+    return target - cloud
+
+
+def objective(images: jaxcal.Images, answer) -> float:
+    scale = np.ones(2) if answer.scale_mm_per_px is None else answer.scale_mm_per_px
+    x = answer.image_to_probe
+    return float((residuals(images, x[:3, :3], x[:3, 3], answer.point_mm, scale) ** 2).sum())
+
+
+def best_of_scipy(images: jaxcal.Images, estimate, starts: int, seed: int = 0) -> float:
+    """Eq. 7's lowest value over local searches from random rotations, on all its unknowns."""
+    rng = np.random.default_rng(seed)
+    given_scale = np.ones(2) if images.spacing_mm is None else images.spacing_mm
+
+    def scales(unknowns) -> np.ndarray:
+        free = np.exp(unknowns[9:])
+        return given_scale * (free if len(free) else 1.0)
+
+    def unknown(unknowns, base):
+        rotation = base @ Rotation.from_rotvec(unknowns[:3]).as_matrix()
+        return residuals(images, rotation, unknowns[3:6], unknowns[6:9], scales(unknowns)).ravel()
+
+    count = {(): 0, SCALE: 2, ("common-scale",): 1}[tuple(estimate)]
+    best = np.inf
+    for base in Rotation.random(starts, rng=rng).as_matrix():
+        first = np.zeros(9 + count)
+        linear = least_squares(
+            lambda part, base=base, first=first: unknown(np.r_[first[:3], part, first[9:]], base),
+            np.zeros(6), method="lm",
+        )  # fmt: skip
+        first[3:9] = linear.x
+        found = least_squares(
+            unknown, first, args=(base,), method="lm", xtol=1e-12, ftol=1e-14, x_scale="jac"
+        )
+        best = min(best, float((found.fun**2).sum()))
+    return best
+
+
+# The real recording
+
+
+def test_crosswire(crosswire):
+    answer = jaxcal.calibrate_closed_form(crosswire, estimate=SCALE)
+    assert answer.rms_mm == pytest.approx(0.97991, abs=5e-6)
+    np.testing.assert_allclose(answer.scale_mm_per_px, [0.14780, 0.13978], atol=5e-6)
+    assert answer.certified
+    assert answer.unique
+    assert answer.gap_mm2 < 1e-20
+    assert objective(crosswire.calibration, answer) == pytest.approx(answer.objective_mm2, rel=1e-9)
+    # One common scale is a further constraint, so it fits less well.
+    common = jaxcal.calibrate_closed_form(crosswire, estimate=("common-scale",))
+    assert common.certified
+    assert common.rms_mm > answer.rms_mm
+    assert common.scale_mm_per_px[0] == pytest.approx(common.scale_mm_per_px[1], rel=1e-12)
+
+
+ALONE = """
+import json, sys, time
+import numpy
+from types import SimpleNamespace
+data = numpy.load(sys.argv[1])
+images = SimpleNamespace(kind="pixel", spacing_mm=None, face_offset_mm=0.0, **data)
+from jaxcal import calibrate_closed_form
+spent = []
+for _ in range(20):
+    start = time.process_time()
+    answer = calibrate_closed_form(images, estimate=("scale",))
+    spent.append(time.process_time() - start)
+print(json.dumps([answer.rms_mm, bool(answer.certified), min(spent), "jax" in sys.modules]))
+"""
+
+
+def test_crosswire_in_ten_milliseconds_without_jax(crosswire, tmp_path):
+    images = crosswire.calibration
+    path = tmp_path / "images.npz"
+    np.savez(path, poses=images.poses, measurements=images.measurements, mask=images.mask)
+    done = subprocess.run([sys.executable, "-c", ALONE, str(path)], capture_output=True, text=True)
+    assert done.stderr == ""
+    rms, certified, seconds, imported = json.loads(done.stdout)
+    assert rms == pytest.approx(0.97991, abs=5e-6)
+    assert certified
+    assert not imported
+    assert seconds < 0.010
+
+
+# Against local searches
+
+
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.integers(4, 20),
+    noise=st.sampled_from([0.1, 1.0, 10.0]),
+    offset=st.sampled_from([0.0, 5.0]),
+    estimate=st.sampled_from(ESTIMATES),
+)
+def test_never_above_local_searches(seed, count, noise, offset, estimate):
+    images = drawn(seed, count, noise=noise, offset=offset, estimate=estimate)
+    answer = jaxcal.calibrate_closed_form(images, estimate=estimate)
+    assert objective(images, answer) == pytest.approx(answer.objective_mm2, rel=1e-9)
+    best = best_of_scipy(images, estimate, starts=4, seed=seed)
+    assert answer.objective_mm2 <= best * (1 + 1e-9)
+    assert answer.objective_mm2 - answer.gap_mm2 <= best * (1 + 1e-9)
+    if count >= 8:
+        assert answer.certified
+
+
+def plain_descents(reduced, starts: int, seed: int) -> np.ndarray:
+    """Gauss-Newton's end points on known scales from random rotations, each with its objective."""
+    ends = []
+    for base in Rotation.random(starts, rng=np.random.default_rng(seed)).as_matrix():
+
+        def residual(turn, base=base):
+            rotation = base @ Rotation.from_rotvec(turn).as_matrix()
+            x = np.concatenate([rotation[:, 0], rotation[:, 2]])
+            return reduced.factor @ x + reduced.shift
+
+        found = least_squares(residual, np.zeros(3), method="lm", xtol=1e-13, ftol=1e-14)
+        rotation = base @ Rotation.from_rotvec(found.x).as_matrix()
+        ends.append([2 * found.cost + reduced.rest, *rotation[:, 0], *rotation[:, 2]])
+    return np.array(ends)
+
+
+def reduced_of(images, estimate=()):
+    return reduce(*image_data(images, estimate))
+
+
+def test_five_images_with_large_errors_need_the_relaxation_and_trap_searches():
+    """Where three multipliers prove nothing, rows and cross products do; traps are told apart."""
+    relaxed = trapped = 0
+    for seed in range(12):
+        images = drawn(seed, 5, noise=10.0, offset=5.0)
+        reduced = reduced_of(images)
+        _, certificate = solve(reduced)
+        assert certificate.certified
+        relaxed += not certificate.unique
+        ends = plain_descents(reduced, 10, seed)
+        assert certificate.objective_mm2 <= ends[:, 0].min() * (1 + 1e-9)
+        worst = ends[np.argmax(ends[:, 0])]
+        if worst[0] > 1.01 * certificate.objective_mm2:
+            trapped += 1
+            rotation = np.stack([worst[1:4], np.cross(worst[4:], worst[1:4]), worst[4:]], axis=1)
+            transform = np.eye(4)
+            transform[:3, :3] = rotation
+            transform[:3, 3] = reduced.origin_and_target(worst[1:])[0]
+            local = jaxcal.certify(images, transform)
+            assert not local.certified
+            assert local.gap_mm2 >= (worst[0] - certificate.objective_mm2) * (1 - 1e-9)
+            # The bound itself is nearly the minimum.
+            assert local.gap_mm2 <= 1.1 * (worst[0] - certificate.objective_mm2)
+    assert relaxed > 0
+    assert trapped > 0
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10_000), count=st.integers(4, 12), near=st.floats(1e-6, 2.0))
+def test_the_bound_holds_at_any_transform(seed, count, near):
+    images = drawn(seed, count, noise=3.0, offset=3.0)
+    answer = jaxcal.calibrate_closed_form(images)
+    rng = np.random.default_rng(seed)
+    moved = answer.image_to_probe.copy()
+    moved[:3, :3] = moved[:3, :3] @ Rotation.from_rotvec(near * rng.normal(size=3)).as_matrix()
+    moved[:3, 3] += near * rng.normal(size=3)
+    point = answer.point_mm + near * rng.normal(size=3)
+    found = jaxcal.certify(images, moved, point)
+    excess = found.objective_mm2 - answer.objective_mm2
+    assert excess > 0
+    assert found.gap_mm2 >= excess * (1 - 1e-6) - 1e-9
+    assert not found.certified or excess < 1e-8 * answer.objective_mm2
+
+
+# What Eq. 7 leaves open
+
+
+@pytest.mark.parametrize("kind", pose_sets.DEGENERATE)
+@pytest.mark.parametrize("estimate", [(), SCALE])
+def test_degenerate_sets_are_not_called_unique(kind, estimate):
+    # Noise in the points bends a line, and then one answer is the best.
+    noise = 0.0 if kind == "line-in-plane" else 0.5
+    sets = pose_sets.make(kind, seed=3, elevation=1.0, noise=noise)
+    images = jaxcal.make_images(
+        sets.poses, sets.points, "pixel" if estimate else "point", mask=sets.mask
+    )
+    answer = jaxcal.calibrate_closed_form(images, estimate=estimate)
+    assert np.isfinite(answer.image_to_probe).all()
+    assert not answer.unique
+    best = best_of_scipy(images, estimate, starts=3)
+    assert answer.objective_mm2 <= best * (1 + 1e-9) + 1e-6
+    assert answer.objective_mm2 - answer.gap_mm2 <= best * (1 + 1e-9) + 1e-6
+
+
+@pytest.mark.parametrize("estimate", ESTIMATES)
+def test_exact_data_give_the_truth(estimate):
+    images = drawn(7, 9, noise=0.0, offset=0.0, estimate=estimate)
+    answer = jaxcal.calibrate_closed_form(images, estimate=estimate)
+    if not estimate:
+        assert answer.rms_mm < 1e-9
+    else:
+        ratio = [0.2, 0.17 if estimate == SCALE else 0.2]
+        np.testing.assert_allclose(answer.scale_mm_per_px, ratio, rtol=1e-10)
+        assert answer.rms_mm < 1e-9
+    assert answer.certified
+    assert answer.unique
+
+
+@pytest.mark.parametrize("estimate", ESTIMATES)
+def test_the_face_offset_is_exact(estimate):
+    """With a known offset of the transducer's face the objective is Eq. 7's as well."""
+    images = drawn(11, 8, estimate=estimate or SCALE)
+    with_face = dataclasses.replace(images, face_offset_mm=12.5)
+    answer = jaxcal.calibrate_closed_form(with_face, estimate=estimate)
+    assert objective(with_face, answer) == pytest.approx(answer.objective_mm2, rel=1e-10)
+    assert answer.objective_mm2 <= best_of_scipy(with_face, estimate, starts=3) * (1 + 1e-9)
+    checked = jaxcal.certify(
+        with_face, answer.image_to_probe, answer.point_mm,
+        scale_mm_per_px=answer.scale_mm_per_px, estimate=estimate,
+    )  # fmt: skip
+    assert checked.certified
+
+
+def test_images_left_out_are_not_read():
+    images = drawn(5, 12)
+    kept = np.arange(12) % 4 != 1
+    poses, points = images.poses[kept], images.measurements[kept]
+    alone = jaxcal.calibrate_closed_form(jaxcal.make_images(poses, points))
+    spoilt = images.measurements.copy()
+    spoilt[~kept] = np.nan
+    problem = jaxcal.Problem.from_recording(images)
+    problem = dataclasses.replace(
+        problem, measurements=jnp.asarray(spoilt), mask=jnp.asarray(kept.astype(float))
+    )
+    masked = jaxcal.calibrate_closed_form(problem)
+    np.testing.assert_allclose(masked.image_to_probe, alone.image_to_probe, rtol=0, atol=1e-11)
+    assert masked.objective_mm2 == pytest.approx(alone.objective_mm2, rel=1e-12)
+
+
+def test_an_unknown_sound_speed_is_an_axial_scale():
+    """Points whose ranges are 3 % too long, with the lateral positions right."""
+    images = drawn(2, 12, noise=0.0, offset=0.0)
+    long = images.measurements * np.array([1.0, 1.03])
+    answer = jaxcal.calibrate_closed_form(
+        jaxcal.make_images(images.poses, long), estimate=("sound-speed",)
+    )
+    assert answer.certified
+    assert answer.sound_speed_factor == pytest.approx(1 / 1.03, rel=1e-10)
+
+
+def test_what_cannot_be_asked_for():
+    points = drawn(0, 6)
+    with pytest.raises(jaxcal.InputError, match="no closed form for estimate"):
+        jaxcal.calibrate_closed_form(points, estimate=("delay",))
+    with pytest.raises(jaxcal.InputError, match="no pixel scale"):
+        jaxcal.calibrate_closed_form(points, estimate=SCALE)
+    pixels = jaxcal.make_images(points.poses, points.measurements, "pixel")
+    with pytest.raises(jaxcal.InputError, match="no spacing_mm"):
+        jaxcal.calibrate_closed_form(pixels)
+    few = dataclasses.replace(points, mask=np.arange(6) < 3)
+    with pytest.raises(jaxcal.InputError, match="3 used images are too few"):
+        jaxcal.calibrate_closed_form(few)
+    with pytest.raises(jaxcal.InputError, match="no rotation"):
+        jaxcal.certify(points, np.diag([1.0, 1.0, 1.01, 1.0]))
+    with pytest.raises(jaxcal.InputError, match="give scale_mm_per_px"):
+        jaxcal.certify(pixels, np.eye(4), estimate=SCALE)
+    problem = jaxcal.Problem.from_recording(points)
+    broken = dataclasses.replace(problem, measurements=problem.measurements.at[4].set(np.nan))
+    with pytest.raises(jaxcal.InputError, match="measurements of image 4"):
+        jaxcal.calibrate_closed_form(broken)
+
+
+def test_the_relaxation_proves_a_bound_wherever_it_stops():
+    for seed in range(3):
+        reduced = reduced_of(drawn(seed, 4, noise=10.0, offset=5.0))
+        x, certificate = solve(reduced)
+        for enough in (1e3, 1.0, 1e-6):
+            relaxed = lower_bound(reduced, x, enough)
+            assert relaxed is not None
+            bound = float(reduced(x)) - relaxed.gap
+            assert bound <= plain_descents(reduced, 6, seed)[:, 0].min() * (1 + 1e-9)
+        assert certificate.certified
+
+
+# Batches and derivatives
+
+
+def problems_of(images: list[jaxcal.Images]) -> jaxcal.Problem:
+    return jaxcal.stack([jaxcal.Problem.from_recording(each) for each in images])
+
+
+def test_batches_give_the_same_answers():
+    """Six images: some of these problems need the relaxation, which batches fall back on."""
+    images = [drawn(seed, 6, noise=[0.5, 10.0][seed % 2], offset=3.0) for seed in range(12)]
+    problems = problems_of(images)
+    spoilt = problems.measurements.at[3, 2].set(np.nan)
+    spoilt = spoilt.at[4, 0].set(np.nan)
+    mask = problems.mask.at[4, 0].set(0.0)
+    problems = dataclasses.replace(problems, measurements=spoilt, mask=mask)
+    shaped = jax.tree.map(lambda leaf: leaf.reshape(3, 4, *leaf.shape[1:]), problems)
+    answers = jaxcal.calibrate_closed_form(shaped)
+    assert answers.image_to_probe.shape == (3, 4, 4, 4)
+    assert answers.scale_mm_per_px is None
+    relaxed = 0
+    for lane in range(12):
+        place = divmod(lane, 4)
+        if lane == 3:
+            assert not answers.certified[place]
+            assert np.isnan(answers.image_to_probe[place]).any()
+            continue
+        alone = jaxcal.calibrate_closed_form(jax.tree.map(lambda a, k=lane: a[k], problems))
+        assert answers.certified[place]
+        assert answers.unique[place] == alone.unique
+        relaxed += not alone.unique
+        for name in ("image_to_probe", "point_mm", "rms_mm"):
+            np.testing.assert_allclose(
+                getattr(answers, name)[place], getattr(alone, name), rtol=0, atol=1e-8
+            )
+    assert relaxed > 0
+
+
+def fourth_order(value, step: float) -> float:
+    return float(8 * (value(step) - value(-step)) - value(2 * step) + value(-2 * step)) / 12 / step
+
+
+def as_number(answer) -> jax.Array:
+    """A number that everything in an answer enters."""
+    weights = np.random.default_rng(0).normal(size=(4, 4))
+    number = (weights * answer.image_to_probe).sum() + answer.point_mm @ weights[0, :3]
+    number = number + answer.rms_mm
+    if answer.scale_mm_per_px is not None:
+        number = number + 100 * answer.scale_mm_per_px @ weights[1, :2]
+    return number
+
+
+@pytest.mark.parametrize("estimate", [(), SCALE])
+def test_derivatives_are_finite_differences(estimate):
+    problem = jaxcal.Problem.from_recording(drawn(3, 8, estimate=estimate))
+
+    def value(measurements, translations):
+        poses = problem.poses.at[:, :3, 3].set(translations)
+        return as_number(
+            jaxcal.calibrate_closed_form(
+                dataclasses.replace(problem, measurements=measurements, poses=poses),
+                estimate=estimate,
+            )
+        )
+
+    start = (problem.measurements, problem.poses[:, :3, 3])
+    slopes = jax.grad(value, argnums=(0, 1))(*start)
+    rng = np.random.default_rng(1)
+    for argument in (0, 1):
+        direction = rng.normal(size=start[argument].shape)
+
+        def along(step, argument=argument, direction=direction):
+            moved = list(start)
+            moved[argument] = moved[argument] + step * direction
+            return value(*moved)
+
+        known = float((slopes[argument] * direction).sum())
+        assert fourth_order(along, 0.02) == pytest.approx(known, rel=1e-6)
+
+
+# In the record of a calibration
+
+
+def test_the_record_tells_what_is_proved(crosswire):
+    result = jaxcal.calibrate(crosswire, method="conventional", estimate=SCALE).numpy()
+    found = certificate_record(result, crosswire)
+    assert found["certified"] is True
+    assert found["gap_mm2"] < 1e-9 * float(result.cost)
+    assert certificate_words(found) == (
+        "conventional fit certified: no transform fits Eq. 7 better"
+    )
+    # An answer that is elsewhere is refused, with the bound in words.
+    moved = result.image_to_probe.copy()
+    moved[0, 3] += 1.0
+    elsewhere = dataclasses.replace(result, image_to_probe=moved)
+    refused = certificate_record(elsewhere, crosswire)
+    assert refused["certified"] is False
+    excess = 54 * (1.0 - 1e-3)
+    assert 0 < refused["gap_mm2"] < 54 * 1.01
+    assert refused["gap_mm2"] == pytest.approx(excess, rel=0.05)
+    assert "may have a minimum" in str(certificate_words(refused))
+    assert certificate_words({"certified": None, "gap_mm2": None}) is None
+    # Other methods minimise something else; the same images' conventional fit is what is proved.
+    joint = dataclasses.replace(result, method="joint")
+    assert certificate_record(joint, crosswire)["certified"] is True
+    with_delay = dataclasses.replace(joint, blocks=(*joint.blocks, "delay"))
+    assert certificate_record(with_delay, crosswire) == {"certified": None, "gap_mm2": None}
