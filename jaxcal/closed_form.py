@@ -137,7 +137,7 @@ def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, 6], Certificate]
     constraints = reduced.constraints
     both = constraints.free == ("lateral", "axial")
     found = _scalar_root(reduced) if both else _dual_maximum(reduced)
-    candidates = None
+    first = np.zeros((0, 6))
     if found is not None:
         values, x = found
         nearest = feasible(x, constraints)
@@ -147,9 +147,8 @@ def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, 6], Certificate]
             certificate = certify_point(reduced, best, values=values)
             if certificate.certified:
                 return best, certificate
-        candidates = nearest[None]
-    starts = _starts(reduced)
-    best = descend(reduced, starts if candidates is None else np.append(candidates, starts, axis=0))
+        first = nearest[None]
+    best = descend(reduced, np.append(first, _starts(reduced), axis=0))
     certificate = certify_point(reduced, best)
     if certificate.certified:
         return best, certificate

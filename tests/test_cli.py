@@ -40,6 +40,8 @@ SCHEMA = {
     "sigma_elevation_mm": float,
     "observability": dict,
     "rms_mm": float,
+    "certified": bool,
+    "gap_mm2": float,
     "reconstruction_precision_mm": float,
     "reconstruction_precision_set": str,
     "objective": float,
@@ -206,6 +208,8 @@ def test_calibrate_json_keeps_the_contract(calibrated, simulated):
         assert isinstance(record[name], kind), name
     assert np.isfinite(numbers_in(record)).all()
     assert (record["status"], record["converged"]) == ("converged", True)
+    assert record["certified"] is True
+    assert 0 <= record["gap_mm2"] < 1e-9 * 50 * record["rms_mm"] ** 2
     assert np.shape(record["image_to_probe"]) == (4, 4)
     assert np.shape(record["covariance"]) == (6, 6)
     assert len(record["elevation_mm"]) == len(record["elevation_sd_mm"]) == record["images"] == 50

@@ -362,6 +362,14 @@ def problems_of(images: list[jaxcal.Images]) -> jaxcal.Problem:
     return jaxcal.stack([jaxcal.Problem.from_recording(each) for each in images])
 
 
+@pytest.fixture
+def float64():
+    """Whatever JAX's setting is, problems made here are in float64."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.mark.usefixtures("float64")
 def test_batches_give_the_same_answers():
     """Six images: some of these problems need the relaxation, which batches fall back on."""
     images = [drawn(seed, 6, noise=[0.5, 10.0][seed % 2], offset=3.0) for seed in range(12)]
@@ -406,6 +414,7 @@ def as_number(answer) -> jax.Array:
     return number
 
 
+@pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize("estimate", [(), SCALE])
 def test_derivatives_are_finite_differences(estimate):
     problem = jaxcal.Problem.from_recording(drawn(3, 8, estimate=estimate))
