@@ -32,6 +32,7 @@ from jaxtyping import Array, Bool, Float
 from jaxcal.certificate import SINGULAR, TOLERANCE
 from jaxcal.closed_form import ClosedForm, calibrate_closed_form
 from jaxcal.errors import InputError
+from jaxcal.precision import in_standard_promotion, own_modes, require_float64, with_dtype
 from jaxcal.problem import Problem, is_traced
 from jaxcal.reduced_objective import (
     CONSTRAINTS,
@@ -73,7 +74,7 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     """Conventional calibrations of problems with any leading axes.
 
     Args:
-        problems: concrete or traced; traced ones are solved in their own precision.
+        problems: concrete or traced.
         estimate: as for :func:`jaxcal.calibrate_closed_form`.
 
     Returns:
@@ -82,7 +83,8 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
         :func:`jaxcal.closed_form.solve`. A problem with NaN or fewer than 4 images gives NaN.
 
     Raises:
-        InputError: unknown names, or a scale where there is none.
+        InputError: unknown names, a scale where there is none, or a transformation that began
+            without JAX's 64 bits.
     """
     check_estimate(estimate, problems.pixels, problems.spacing_known)
     problems = replace(problems, covariance=None, max_elevation=None, channels=None,
@@ -90,7 +92,9 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     shape = problems.batch_shape
     flat = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
     if any(is_traced(leaf) for leaf in jax.tree.leaves(problems)):
-        answer = solve_lanes(flat, estimate)
+        with own_modes(bits_too=False):
+            require_float64("jaxcal.calibrate_closed_form")
+            answer = solve_lanes(with_dtype(flat, np.float64), estimate)
     else:
         answer = _concrete(jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), flat), estimate)
     return jax.tree.map(lambda leaf: leaf.reshape((*shape, *leaf.shape[1:])), answer)
@@ -103,7 +107,7 @@ def _concrete(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     count = len(problems.mask)
     lanes = min(LANES, count)
     parts = []
-    with jax.enable_x64(True):
+    with own_modes():
         for start in range(0, count, lanes):
             rows = slice(start, start + lanes)
             part = jax.tree.map(lambda leaf, rows=rows: leaf[rows], problems)
@@ -343,6 +347,7 @@ def _optimum(
 
 
 @_optimum.defjvp
+@in_standard_promotion
 def _optimum_jvp(estimate: tuple[str, ...], primals: tuple, tangents: tuple) -> tuple:
     constraints = CONSTRAINTS[estimate]
     matrix, vector = primals

@@ -362,14 +362,6 @@ def problems_of(images: list[jaxcal.Images]) -> jaxcal.Problem:
     return jaxcal.stack([jaxcal.Problem.from_recording(each) for each in images])
 
 
-@pytest.fixture
-def float64():
-    """Whatever JAX's setting is, problems made here are in float64."""
-    with jax.enable_x64(True):
-        yield
-
-
-@pytest.mark.usefixtures("float64")
 def test_batches_give_the_same_answers():
     """Six images: some of these problems need the relaxation, which batches fall back on."""
     images = [drawn(seed, 6, noise=[0.5, 10.0][seed % 2], offset=3.0) for seed in range(12)]
@@ -400,6 +392,18 @@ def test_batches_give_the_same_answers():
     assert relaxed > 0
 
 
+def test_callers_with_32_bits_get_64():
+    problems = problems_of([drawn(seed, 6, noise=0.5) for seed in range(12)])
+    with jax.enable_x64(False):
+        answers = jaxcal.calibrate_closed_form(problems)
+        assert answers.image_to_probe.dtype == np.float64
+        assert answers.certified.all()
+        with pytest.raises(jaxcal.InputError, match="computes in 64 bits"):
+            jax.grad(lambda p: jaxcal.calibrate_closed_form(p).rms_mm)(
+                jax.tree.map(lambda leaf: leaf[0], problems)
+            )
+
+
 def fourth_order(value, step: float) -> float:
     return float(8 * (value(step) - value(-step)) - value(2 * step) + value(-2 * step)) / 12 / step
 
@@ -414,7 +418,6 @@ def as_number(answer) -> jax.Array:
     return number
 
 
-@pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize("estimate", [(), SCALE])
 def test_derivatives_are_finite_differences(estimate):
     problem = jaxcal.Problem.from_recording(drawn(3, 8, estimate=estimate))
