@@ -54,7 +54,7 @@ Numbers = Any
 """A number, or for a batch an array of them."""
 
 DUAL_STEPS = 60
-DESCENT_STEPS = 60
+DESCENT_STEPS = 400
 ARMIJO = 1e-4
 NEARLY_MET = 1e-6
 """Constraints off by less than this share of |x|^2: the dual's maximum is inside."""
@@ -62,6 +62,8 @@ RISE = 1e-13
 """The dual has arrived when a step raises it by less than this share."""
 SCREENED, KEPT = 12, 20
 """After so many steps only so many of the descents go on, the lowest ones."""
+LEAST_FACTOR = 1e-6
+"""A step makes a scale smaller by no more than this: at zero no direction would be left."""
 RESTING = 1e-12
 """A descent rests when its step is below this, in radians and in shares of the scale."""
 
@@ -306,7 +308,7 @@ def _parity(permutation: tuple[int, ...]) -> int:
 def _scale_columns(
     x: Float[np.ndarray, "s 6"], free: tuple[str, ...]
 ) -> Float[np.ndarray, "s 6 k"]:
-    """Derivatives of x by the logarithms of the free scales."""
+    """Derivatives of x by factors on the free scales."""
     lateral, axial = x * np.repeat([1.0, 0.0], 3), x * np.repeat([0.0, 1.0], 3)
     columns = {
         (): [],
@@ -361,7 +363,6 @@ def descend(reduced: ReducedObjective, x: Float[np.ndarray, "s 6"]) -> Float[np.
             cross = (_turns(weights) @ along[..., None])[..., 0].sum(axis=1)
             hessian[:, :3, 3 + k] += cross
             hessian[:, 3 + k, :3] += cross
-            hessian[:, 3 + k, 3 + k] += np.einsum("ski,ski->s", weights, along)
         w, v = np.linalg.eigh(hessian)
         largest = np.abs(w).max(axis=1, keepdims=True) + np.finfo(float).tiny
         strength = np.maximum(np.abs(w), 1e-14 * largest) + damping[:, None] * largest
@@ -392,14 +393,18 @@ def _turns(vectors: Float[np.ndarray, "*v 3"]) -> Float[np.ndarray, "*v 3 3"]:
 def _moved(
     pairs: Float[np.ndarray, "s 2 3"], step: Float[np.ndarray, "s p"], free: tuple[str, ...]
 ) -> Float[np.ndarray, "s 6"]:
-    """Turn by Cayley's rotation and multiply free scales by the step's exponential."""
+    """Turn by Cayley's rotation and multiply free scales by one plus the step.
+
+    Degenerate images may be fitted best by a scale of zero: by factors it is reached in few steps,
+    by exponentials in hundreds.
+    """
     half = 0.5 * step[:, None, :3]
     once = _turns(pairs) @ half[..., None]
     twice = _turns(once[..., 0]) @ half[..., None]
     factor = 2 / (1 + np.sum(half**2, axis=2, keepdims=True))
     turned = pairs + factor * (once + twice)[..., 0]
     if free:
-        factors = np.exp(np.clip(step[:, 3:], -2.0, 2.0))
+        factors = 1 + np.clip(step[:, 3:], LEAST_FACTOR - 1, 2.0)
         if free == ("axial",):
             factors = np.concatenate([np.ones_like(factors), factors], axis=1)
         turned = turned * factors[:, :, None]
