@@ -62,8 +62,8 @@ RISE = 1e-13
 """The dual has arrived when a step raises it by less than this share."""
 SCREENED, KEPT = 12, 20
 """After so many steps only so many of the descents go on, the lowest ones."""
-LEAST_FACTOR = 1e-6
-"""A step makes a scale smaller by no more than this: at zero no direction would be left."""
+LEAST_SCALE = 1e-9
+"""A free scale stays above this, in units of the nominal one: at zero no direction would be left."""
 RESTING = 1e-12
 """A descent rests when its step is below this, in radians and in shares of the scale."""
 
@@ -404,7 +404,8 @@ def _moved(
     factor = 2 / (1 + np.sum(half**2, axis=2, keepdims=True))
     turned = pairs + factor * (once + twice)[..., 0]
     if free:
-        factors = 1 + np.clip(step[:, 3:], LEAST_FACTOR - 1, 2.0)
+        lengths = np.linalg.norm(pairs, axis=2)[:, -step[:, 3:].shape[1] :]
+        factors = np.maximum(1 + np.clip(step[:, 3:], -1.0, 2.0), LEAST_SCALE / lengths)
         if free == ("axial",):
             factors = np.concatenate([np.ones_like(factors), factors], axis=1)
         turned = turned * factors[:, :, None]

@@ -363,8 +363,8 @@ def problems_of(images: list[jaxcal.Images]) -> jaxcal.Problem:
 
 
 def test_batches_give_the_same_answers():
-    """Six images: some of these problems need the relaxation, which batches fall back on."""
-    images = [drawn(seed, 6, noise=[0.5, 10.0][seed % 2], offset=3.0) for seed in range(12)]
+    """Five images: some of these problems need the relaxation, which batches fall back on."""
+    images = [drawn(seed, 5, noise=[0.5, 10.0][seed % 2], offset=5.0) for seed in range(12)]
     problems = problems_of(images)
     spoilt = problems.measurements.at[3, 2].set(np.nan)
     spoilt = spoilt.at[4, 0].set(np.nan)
@@ -450,7 +450,8 @@ def test_derivatives_are_finite_differences(estimate):
 
 
 def test_the_record_tells_what_is_proved(crosswire):
-    result = jaxcal.calibrate(crosswire, method="conventional", estimate=SCALE).numpy()
+    solved = jaxcal.calibrate(crosswire, method="conventional", estimate=SCALE)
+    result = solved.numpy()
     found = certificate_record(result, crosswire)
     assert found["certified"] is True
     assert found["gap_mm2"] < 1e-9 * float(result.cost)
@@ -458,18 +459,16 @@ def test_the_record_tells_what_is_proved(crosswire):
         "conventional fit certified: no transform fits Eq. 7 better"
     )
     # An answer that is elsewhere is refused, with the bound in words.
-    moved = result.image_to_probe.copy()
-    moved[0, 3] += 1.0
-    elsewhere = dataclasses.replace(result, image_to_probe=moved)
-    refused = certificate_record(elsewhere, crosswire)
+    moved = solved.image_to_probe.at[0, 3].add(1.0)
+    elsewhere = dataclasses.replace(solved, image_to_probe=moved)
+    refused = certificate_record(elsewhere.numpy(), crosswire)
     assert refused["certified"] is False
-    excess = 54 * (1.0 - 1e-3)
-    assert 0 < refused["gap_mm2"] < 54 * 1.01
-    assert refused["gap_mm2"] == pytest.approx(excess, rel=0.05)
+    # The gap is what the move of t by 1 mm costs with c held: 54 mm^2.
+    assert refused["gap_mm2"] == pytest.approx(54, rel=1e-6)
     assert "may have a minimum" in str(certificate_words(refused))
     assert certificate_words({"certified": None, "gap_mm2": None}) is None
     # Other methods minimise something else; the same images' conventional fit is what is proved.
-    joint = dataclasses.replace(result, method="joint")
-    assert certificate_record(joint, crosswire)["certified"] is True
+    joint = dataclasses.replace(solved, method="joint")
+    assert certificate_record(joint.numpy(), crosswire)["certified"] is True
     with_delay = dataclasses.replace(joint, blocks=(*joint.blocks, "delay"))
-    assert certificate_record(with_delay, crosswire) == {"certified": None, "gap_mm2": None}
+    assert certificate_record(with_delay.numpy(), crosswire) == {"certified": None, "gap_mm2": None}
