@@ -63,7 +63,7 @@ RISE = 1e-13
 SCREENED, KEPT = 12, 20
 """After so many steps only so many of the descents go on, the lowest ones."""
 LEAST_SCALE = 1e-9
-"""A free scale stays above this, in units of the nominal one: at zero no direction would be left."""
+"""Of the nominal scale; a free one stays above this, since at zero no direction would be left."""
 RESTING = 1e-12
 """A descent rests when its step is below this, in radians and in shares of the scale."""
 
