@@ -16,6 +16,7 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -119,10 +120,10 @@ def eliminated(data: ImageData) -> tuple[np.ndarray, float]:
     columns = columns.reshape(3 * count, 7)
     for _ in range(2):
         columns = columns - rest @ (np.linalg.pinv(rest, rcond=1e-11) @ columns)
-    return np.linalg.qr(columns, mode="r"), float(np.sum(away**2) + np.sum(moved**2))
+    return np.asarray(np.linalg.qr(columns, mode="r")), float(np.sum(away**2) + np.sum(moved**2))
 
 
-def _solve(matrix: list[list[Array]], vector: list[Array]) -> list[Array]:
+def _solve(matrix: list[list[Any]], vector: list[Any]) -> list[Any]:
     """Gauss's elimination, entry by entry, for arrays of systems."""
     size = len(vector)
     rows = [[*row, value] for row, value in zip(matrix, vector, strict=True)]
@@ -393,8 +394,8 @@ def speed(folder, quick: bool) -> None:
     points = np.array([data.points for data in general])
     for estimate in ESTIMATES:
         problems = jaxcal.Problem(
-            poses=poses, measurements=points, mask=np.ones((count, 50)),
-            spacing=np.ones((count, 2)), face_offset=np.zeros(count),
+            poses=jnp.asarray(poses), measurements=jnp.asarray(points), mask=jnp.ones((count, 50)),
+            spacing=jnp.ones((count, 2)), face_offset=jnp.zeros(count),
             pixels=bool({"scale", "common-scale"} & set(estimate)),
         )  # fmt: skip
         answers = jaxcal.calibrate_closed_form(problems, estimate=estimate)

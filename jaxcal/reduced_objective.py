@@ -249,7 +249,7 @@ def reduce(data: ImageData, constraints: Constraints) -> ReducedObjective:
     others = others - left @ along
     # Once more, against rounding where the rotations hardly differ.
     others = others - left @ (left.T @ others)
-    triangle = np.linalg.qr(others, mode="r")
+    triangle = np.asarray(np.linalg.qr(others, mode="r"))
     size = float(np.sum(away**2) + np.sum(points**2))
     return ReducedObjective(
         factor=triangle[:6, :6],

@@ -46,14 +46,14 @@ def certificate_record(result: Calibration, recording: Recording) -> dict[str, A
 def _of_answer(
     result: Calibration, images: Images, recording: Recording, estimate: tuple[str, ...]
 ) -> Certificate:
-    factor = 1.0
+    factor, scale = 1.0, result.scale_mm_per_px
     if result.sound_speed_m_s is not None and recording.probe is not None:
         factor = float(result.sound_speed_m_s) / recording.probe.sound_speed_m_s
     return certify(
         images,
         np.asarray(result.image_to_probe, dtype=float),
         np.asarray(result.point, dtype=float),
-        scale_mm_per_px=result.scale_mm_per_px,
+        scale_mm_per_px=None if scale is None else np.asarray(scale, dtype=float),
         sound_speed_factor=factor,
         estimate=estimate,
     )
