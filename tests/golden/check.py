@@ -1,0 +1,164 @@
+"""Compare the present code with the golden corpus: all of it.
+
+    python tests/golden/check.py                     # everything, two processes
+    python tests/golden/check.py --family points12 --call auto
+    python tests/golden/check.py --roads             # only the recorded roads with each other
+
+Prints, for each family, call and road, the largest difference of every number in units of its
+recorded SD, where it is above the tolerance, and every decision that flipped, problem by problem.
+Exit status 1 if something is above its tolerance or a decision flipped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+"""The compiler's: those of the tests, with which it takes half of the time."""
+
+os.environ.setdefault("XLA_FLAGS", FLAGS)
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax  # noqa: E402
+import numpy as np  # noqa: E402
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from golden import corpus  # noqa: E402
+
+Task = tuple[str, str, str]
+"""Family, call, road; the road ``gradient`` is that of the derivatives."""
+
+
+def tasks(families: list[str] | None, calls: list[str] | None) -> list[Task]:
+    """What there is to check, the longest first."""
+    found = [
+        (family, call.name, road)
+        for family in corpus.CALLS
+        for call in corpus.CALLS[family]
+        for road in call.roads
+    ]
+    if (corpus.FOLDER / "gradients.npz").exists():
+        found += [(family, call, "gradient") for family, call in corpus.GRADIENTS]
+    found = [
+        task for task in found
+        if (not families or task[0] in families) and (not calls or task[1] in calls)
+    ]  # fmt: skip
+
+    def slowness(task: Task) -> tuple[bool, bool, bool]:
+        return (task[2] == "gradient", "auto" in task[1], task[2] == "batch")
+
+    return sorted(found, key=slowness, reverse=True)
+
+
+def check(task: Task) -> tuple[Task, list[str], bool, float]:
+    """One family, call and road: lines to print, whether it passes, seconds."""
+    began = time.perf_counter()
+    family_name, call_name, road = task
+    family, answers = corpus.load(family_name)
+    call = family.call(call_name)
+    if road == "gradient":
+        lines, passes = check_gradient(family, call)
+    else:
+        recorded = answers[call_name, road]
+        lines, passes = compare(family, recorded, corpus.compute(family, call, road), call, road)
+    jax.clear_caches()
+    return task, lines, passes, time.perf_counter() - began
+
+
+def check_gradient(family: corpus.Family, call: corpus.Call) -> tuple[list[str], bool]:
+    """The derivatives of one call."""
+    with np.load(corpus.FOLDER / "gradients.npz", allow_pickle=False) as stored:
+        prefix = f"{family.name}/{call.name}/"
+        recorded = {
+            key.removeprefix(prefix): stored[key] for key in stored.files if key.startswith(prefix)
+        }
+    found = corpus.gradient_arrays(family, call, recorded["rows"], recorded["weight"])
+    worst = corpus.gradient_differences(recorded, found)
+    summary = "  ".join(f"{name} {values.max():.1e}" for name, values in worst.items())
+    limit = corpus.tolerance(call.name, "gradient", "gradient")
+    return [f"  relative: {summary}"], all(values.max() <= limit for values in worst.values())
+
+
+def compare(
+    family: corpus.Family, recorded: corpus.Arrays, found: corpus.Arrays, call: corpus.Call,
+    road: str,
+) -> tuple[list[str], bool]:  # fmt: skip
+    """Lines for every number and every flip, and whether all is within its tolerance."""
+    lines, passes = [], True
+    worst = corpus.differences(recorded, found)
+    summary = []
+    for name, values in worst.items():
+        if np.isnan(values).all():
+            continue
+        row = int(np.nanargmax(values))
+        limit = corpus.tolerance(call.name, road, name)
+        summary.append(f"{name} {values[row]:.1e}")
+        if values[row] > limit:
+            passes = False
+            above = int(np.nansum(values > limit))
+            lines.append(
+                f"  {name}: {above} above {limit:.0e}, most {values[row]:.2e} in problem {row} "
+                f"({family.kinds[row]})"
+            )
+    for name, rows in corpus.flips(recorded, found).items():
+        passes = False
+        for row in rows:
+            lines.append(
+                f"  flip of {name} in problem {row} ({family.kinds[row]}): "
+                f"{np.ravel(recorded[name][row]).astype(int).tolist()} -> "
+                f"{np.ravel(found[name][row]).astype(int).tolist()}"
+            )
+    return ["  " + "  ".join(summary), *lines], passes
+
+
+def compare_roads() -> bool:
+    """The recorded answers of ``calibrate`` with those of ``calibrate_batch``."""
+    passes = True
+    for name, calls in corpus.CALLS.items():
+        family, answers = corpus.load(name)
+        for call in calls:
+            if set(call.roads) != {"one", "batch"}:
+                continue
+            rows = np.flatnonzero(family.usable())
+            one, batch = (corpus.at(answers[call.name, road], rows) for road in call.roads)
+            some = corpus.Family(name, [family.kinds[row] for row in rows], {})
+            lines, good = compare(some, one, batch, call, "both")
+            passes &= good
+            print(f"{name}, {call.name}: {'agree' if good else 'DIFFER'}", *lines, sep="\n")
+    return passes
+
+
+def main() -> int:
+    """Check and say."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--family", action="append", help="only this one")
+    parser.add_argument("--call", action="append", help="only this one")
+    parser.add_argument("--roads", action="store_true", help="the recorded roads with each other")
+    parser.add_argument("--processes", type=int, default=2)
+    chosen = parser.parse_args()
+    if chosen.roads:
+        return 0 if compare_roads() else 1
+    began, bad, seconds = time.perf_counter(), 0, 0.0
+    todo = tasks(chosen.family, chosen.call)
+    # A process that has compiled a dozen programs is let go, and its memory with it.
+    pool = ProcessPoolExecutor(
+        chosen.processes, mp_context=get_context("spawn"), max_tasks_per_child=12
+    )
+    with pool:
+        for task, lines, good, took in pool.map(check, todo):
+            bad, seconds = bad + (not good), seconds + took
+            verdict = "agrees" if good else "DIFFERS"
+            print(f"{', '.join(task)}: {verdict} ({took:.0f} s)", *lines, sep="\n", flush=True)
+    print(f"{len(todo) - bad} of {len(todo)} agree; {time.perf_counter() - began:.0f} s, "
+          f"jax {jax.__version__}, Python {sys.version.split()[0]}")  # fmt: skip
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,506 @@
+"""The golden corpus: problems with the answers that were recorded for them, and how to compare.
+
+A *family* is one file of problems that share a structure and a number of images, so that each
+method is compiled once for all of them. A *call* is one way to ask for an answer, a *road* how: by
+``jaxcal.calibrate`` problem by problem (``one``) or by ``jaxcal.calibrate_batch`` (``batch``).
+Everything goes through public calls, and inputs and answers are plain numbers in ``.npz`` files.
+
+Differences are in units of the recorded standard deviations (:func:`differences`); what is a
+decision (a status, a mean of the offsets or none, an image that stands out) is equal or it flipped.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxcal
+
+FOLDER = Path(__file__).parent
+
+Arrays = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Call:
+    """One way to ask for an answer.
+
+    Attributes:
+        name: unique within a family.
+        arguments: of ``jaxcal.calibrate``; ``options`` as a dictionary.
+        roads: which are recorded.
+    """
+
+    name: str
+    arguments: dict[str, Any]
+    roads: tuple[str, ...] = ("one", "batch")
+
+    def keywords(self) -> dict[str, Any]:
+        """The arguments as ``jaxcal.calibrate`` takes them."""
+        options = self.arguments.get("options")
+        return self.arguments | ({"options": jaxcal.Options(**options)} if options else {})
+
+
+BATCH = ("batch",)
+CONVENTIONAL = Call("conventional", {"method": "conventional"})
+ALTERNATING = Call("alternating", {"method": "alternating"})
+AUTO = Call("auto", {})
+UNIFORM = Call("uniform", {"prior": "uniform"})
+GAUSSIAN = Call("gaussian", {"prior": "gaussian"})
+BOUNDED = Call("bounded", {"prior": "bounded"}, BATCH)
+GIVEN = Call("given", {"sigma": [0.3, 0.15, 1.0]})
+TRACKER = Call("tracker", {"sigma": [0.3, 0.15, 1.0], "tracker_sd": 0.2}, BATCH)
+
+
+def of_scale(call: Call) -> Call:
+    """The call with the pixels' size unknown; recorded for batches."""
+    return Call(call.name, call.arguments | {"estimate": ["scale"]}, BATCH)
+
+
+CALLS: dict[str, tuple[Call, ...]] = {
+    "points12": (
+        CONVENTIONAL,
+        ALTERNATING,
+        AUTO,
+        UNIFORM,
+        GAUSSIAN,
+        BOUNDED,
+        GIVEN,
+        TRACKER,
+        Call("gauss-newton", {"method": "conventional", "options": {"solver": "gauss-newton"}},
+             BATCH),
+        Call("gradient", {"method": "conventional", "options": {"solver": "gradient"}}, BATCH),
+        Call("robust gaussian", {"prior": "gaussian", "robust": True}, BATCH),
+    ),
+    "points24": (
+        CONVENTIONAL,
+        ALTERNATING,
+        AUTO,
+        GAUSSIAN,
+        BOUNDED,
+        GIVEN,
+        Call("robust auto", {"robust": True}),
+        Call("robust conventional", {"method": "conventional", "robust": True}, BATCH),
+    ),
+    "points200": (Call("conventional", CONVENTIONAL.arguments, BATCH), AUTO),
+    "covariances24": (
+        AUTO,
+        Call("uniform", UNIFORM.arguments, BATCH),
+        Call("gaussian", GAUSSIAN.arguments, BATCH),
+        Call("given", GIVEN.arguments, BATCH),
+        TRACKER,
+    ),
+    "bounds24": (
+        Call("alternating", ALTERNATING.arguments, BATCH),
+        AUTO,
+        Call("uniform", UNIFORM.arguments, BATCH),
+        BOUNDED,
+    ),
+    "covariances-bounds12": (AUTO,),
+    "pixels24": tuple(
+        map(of_scale, (CONVENTIONAL, ALTERNATING, AUTO, GAUSSIAN, BOUNDED, GIVEN))
+    ),
+    "pixels-covariances12": tuple(map(of_scale, (AUTO, GAUSSIAN))),
+    "linear12": (
+        Call("auto, speed and delay", {"estimate": ["sound-speed", "delay"]}, BATCH),
+        Call("gaussian, speed", {"prior": "gaussian", "estimate": ["sound-speed"]}, BATCH),
+        Call("given, channels", {"sigma": [0.3, 1.0], "data": "channels"}, BATCH),
+        Call("auto, points", {"data": "points"}, BATCH),
+    ),
+    "curved12": (
+        Call("auto", {}, BATCH),
+        Call("gaussian", {"prior": "gaussian"}),
+        Call("gaussian, speed and delay",
+             {"prior": "gaussian", "estimate": ["sound-speed", "delay"]}, BATCH),
+        Call("conventional", {"method": "conventional"}, BATCH),
+    ),
+}  # fmt: skip
+"""What is recorded of every family."""
+
+GRADIENTS: tuple[tuple[str, str], ...] = (
+    ("points12", "conventional"),
+    ("points12", "alternating"),
+    ("points12", "bounded"),
+    ("points12", "given"),
+    ("points12", "tracker"),
+    ("points12", "gaussian"),
+    ("points12", "auto"),
+    ("pixels-covariances12", "gaussian"),
+    ("curved12", "gaussian, speed and delay"),
+)
+"""Families and calls whose derivatives are recorded."""
+
+GRADIENT_PROBLEMS = 4
+"""Of each: so many problems."""
+
+LEAST_MM, LEAST_RAD = 1e-3, 1e-5
+"""No unknown is taken to be known better than this: a micrometre, also at the end of 100 mm."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """Problems of one structure.
+
+    Attributes:
+        name: of the family.
+        kinds: what is special about each problem, in a word.
+        arrays: the inputs (leading axis: problems), by name.
+        pixels: measurements are pixels without a known spacing.
+        probe: of the times of flight: kind, elements, pitch_mm, radius_mm; None for points.
+    """
+
+    name: str
+    kinds: list[str]
+    arrays: Arrays
+    pixels: bool = False
+    probe: dict[str, Any] | None = None
+    written: dict[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.kinds)
+
+    def usable(self) -> np.ndarray:
+        """Which problems ``jaxcal.calibrate`` does not refuse: finite, with four used images."""
+        mask = self.arrays["mask"] > 0
+        finite = np.ones(len(self), bool)
+        if self.probe is None:
+            for name in ("poses", "measurements"):
+                values = self.arrays[name].reshape(*mask.shape, -1)
+                finite &= (np.isfinite(values).all(axis=2) | ~mask).all(axis=1)
+        return finite & (mask.sum(axis=1) >= 4)
+
+    def call(self, name: str) -> Call:
+        """One of the family's calls."""
+        return next(call for call in CALLS[self.name] if call.name == name)
+
+    def problems(self, rows: np.ndarray | None = None) -> jaxcal.Problem:
+        """The problems (or some of them) as a batch, in float64."""
+        rows = np.arange(len(self)) if rows is None else rows
+        with jax.enable_x64(True):
+            if self.probe is not None:
+                return jaxcal.stack([self._from_times(row) for row in rows])
+            return self._from_points(rows)
+
+    def _from_points(self, rows: np.ndarray) -> jaxcal.Problem:
+        """Arrays as they are: some hold NaN, or too few images, which a constructor refuses."""
+        arrays = {name: values[rows] for name, values in self.arrays.items()}
+        images = arrays["mask"].shape[1]
+        poses = np.tile(np.eye(4), (len(rows), images, 1, 1))
+        poses[:, :, :3] = arrays["poses"]
+        harmless = np.random.default_rng(0).uniform(20, 60, (images, 2))
+        away = np.tile(np.eye(4), (images, 1, 1))
+        away[:, :3, 3] = 10 * harmless[:, :1]
+        template = jaxcal.Problem.from_recording(
+            jaxcal.make_images(
+                away, harmless, "pixel" if self.pixels else "point",
+                covariance=np.tile(np.eye(2), (images, 1, 1)) if "covariance" in arrays else None,
+                max_elevation=1.0 if "max_elevation" in arrays else None,
+            )
+        )  # fmt: skip
+        changed = {"poses": poses}
+        changed |= {name: arrays[name] for name in ("measurements", "mask", "max_elevation")
+                    if name in arrays}  # fmt: skip
+        if "covariance" in arrays:
+            xx, xy, yy = np.moveaxis(arrays["covariance"], -1, 0)
+            changed["covariance"] = np.stack([xx, xy, xy, yy], -1).reshape(*xx.shape, 2, 2)
+        batch = jaxcal.stack([template] * len(rows))
+        return replace(
+            batch, **{name: jnp.asarray(value, jnp.float64) for name, value in changed.items()}
+        )
+
+    def _from_times(self, row: int) -> jaxcal.Problem:
+        assert self.probe is not None
+        kind, numbers = self.probe["kind"], {k: v for k, v in self.probe.items() if k != "kind"}
+        probe = (jaxcal.CurvilinearProbe if kind == "curvilinear" else jaxcal.LinearProbe)(
+            **numbers
+        )
+        images = jaxcal.make_images(
+            self.arrays["poses"][row], self.arrays["times"][row], "time_of_flight",
+            mask=self.arrays["mask"][row] > 0,
+        )  # fmt: skip
+        return jaxcal.Problem.from_recording(jaxcal.Recording(images, probe=probe))
+
+
+def load(name: str) -> tuple[Family, dict[tuple[str, str], Arrays]]:
+    """A family and its recorded answers, by call and road."""
+    with np.load(FOLDER / f"{name}.npz", allow_pickle=False) as stored:
+        arrays = {key: stored[key] for key in stored.files}
+    about = json.loads(str(arrays.pop("about")))
+    family = Family(
+        name,
+        [str(kind) for kind in arrays.pop("kinds")],
+        {key.split("/")[1]: value for key, value in arrays.items() if key.startswith("input/")},
+        about["pixels"],
+        about["probe"],
+        about["written"],
+    )
+    answers: dict[tuple[str, str], Arrays] = {}
+    for key, value in arrays.items():
+        if not key.startswith("input/"):
+            call, road, field_name = key.split("/")
+            answers.setdefault((call, road), {})[field_name] = value
+    return family, answers
+
+
+def save(family: Family, answers: dict[tuple[str, str], Arrays]) -> None:
+    """Write a family with its answers."""
+    about = {"pixels": family.pixels, "probe": family.probe, "written": family.written}
+    arrays: Arrays = {"about": np.array(json.dumps(about)), "kinds": np.array(family.kinds)}
+    arrays |= {f"input/{name}": value for name, value in family.arrays.items()}
+    for (call, road), fields in answers.items():
+        arrays |= {f"{call}/{road}/{name}": value for name, value in fields.items()}
+    np.savez_compressed(FOLDER / f"{family.name}.npz", **arrays)  # pyright: ignore[reportArgumentType]
+
+
+UPPER6, UPPER3 = np.triu_indices(6), np.triu_indices(3)
+
+DECISIONS = (
+    "status_code", "tolerance_met", "searched_start", "sigma_tuned", "differentiable", "outlier",
+    "at_bound", "has_mean", "own_covariances", "weighed",
+)  # fmt: skip
+"""Fields that are equal or not."""
+
+
+def numbers(result: jaxcal.Calibration) -> Arrays:
+    """What is recorded of an answer (or of a batch of them)."""
+
+    def get(name: str) -> np.ndarray:
+        return np.asarray(getattr(result, name))
+
+    found = {
+        "image_to_probe": get("image_to_probe")[..., :3, :],
+        "covariance": get("covariance")[(..., *UPPER6)],
+        "point_covariance": get("point_covariance")[(..., *UPPER3)],
+        "status_code": get("status_code").astype(np.int8),
+        "iterations": get("iterations").astype(np.int32),
+    }
+    for name in ("point", "elevation", "elevation_sd", "sigma", "rms", "cost", "condition",
+                 "weakest_sd"):  # fmt: skip
+        found[name] = get(name)
+    for name in ("tolerance_met", "searched_start", "sigma_tuned", "differentiable", "outlier",
+                 "at_bound"):  # fmt: skip
+        found[name] = get(name).astype(bool)
+    for name in ("scale_mm_per_px", "channel_sigma", "sound_speed_m_s", "sound_speed_sd_m_s",
+                 "delay_s", "delay_sd_s"):  # fmt: skip
+        if getattr(result, name) is not None:
+            found[name] = get(name)
+    law = result.offset_law
+    if law is not None:
+        for name in ("probability", "mean", "mean_sd", "log_odds_mean", "log_odds_own"):
+            found[name] = np.asarray(getattr(law, name))
+        for name in ("has_mean", "own_covariances", "weighed"):
+            found[name] = np.asarray(getattr(law, name)).astype(bool)
+    return found
+
+
+def compute(family: Family, call: Call, road: str, rows: np.ndarray | None = None) -> Arrays:
+    """Answers through the public calls; of road ``one``, NaN and status -1 where it refuses."""
+    rows = np.arange(len(family)) if rows is None else np.asarray(rows)
+    problems, keywords = family.problems(rows), call.keywords()
+    with jax.enable_x64(True):
+        if road == "batch":
+            return numbers(jaxcal.calibrate_batch(problems, **keywords))
+        each: list[Arrays | None] = []
+        for place, row in enumerate(rows):
+            if not family.usable()[row]:
+                each.append(None)
+                continue
+            problem = jax.tree.map(lambda leaf, place=place: leaf[place], problems)
+            each.append(numbers(jaxcal.calibrate(problem, **keywords)))
+    pattern = next(answer for answer in each if answer is not None)
+
+    def refused(name: str, like: np.ndarray) -> np.ndarray:
+        if name == "status_code":
+            return np.full_like(like, -1)
+        return np.full_like(like, np.nan if like.dtype.kind == "f" else 0)
+
+    return {
+        name: np.stack([refused(name, like) if one is None else one[name] for one in each])
+        for name, like in pattern.items()
+    }
+
+
+def at(answers: Arrays, rows: np.ndarray) -> Arrays:
+    """The answers of some problems."""
+    return {name: value[rows] for name, value in answers.items()}
+
+
+def converged(recorded: Arrays, found: Arrays) -> np.ndarray:
+    """Which problems have an answer in both: one that converged and is observable."""
+    return (recorded["status_code"] == 0) & (found["status_code"] == 0)
+
+
+def flips(recorded: Arrays, found: Arrays) -> dict[str, np.ndarray]:
+    """Decisions that differ: by field, which problems.
+
+    Of problems without an answer only the status counts: what else is said of a place where the
+    data determine nothing is rounding.
+    """
+    result = {}
+    answered = converged(recorded, found)
+    for name in DECISIONS:
+        if name in recorded:
+            differs = recorded[name] != found[name]
+            differs = differs.reshape(len(differs), -1).any(axis=1)
+            if name != "status_code":
+                differs &= answered
+            if differs.any():
+                result[name] = np.flatnonzero(differs)
+    return result
+
+
+def differences(recorded: Arrays, found: Arrays) -> Arrays:
+    """How far apart answers are, problem by problem.
+
+    In units of the recorded SDs: ``X`` (the largest of the six of X Exp(d)), ``point``,
+    ``elevation``, ``sigma`` (of which the SD is taken to be sigma / sqrt(2 n)), ``scale``,
+    ``sound_speed``, ``delay``, ``mean``. ``covariance`` and ``point_covariance``: the largest
+    |difference| over the product of the two SDs. ``probability``: absolute. ``cost``, ``rms``,
+    ``condition``, ``log_odds``: relative (the last to at least 1). NaN for problems that have no
+    answer in either (:func:`converged`) or where distributions were not weighed; infinite where
+    only one has a covariance.
+    """
+    count = len(recorded["status_code"])
+    covariance = np.zeros((count, 6, 6))
+    covariance[:, UPPER6[0], UPPER6[1]] = recorded["covariance"]
+    sd = np.sqrt(np.einsum("kii->ki", covariance))
+    known = np.isfinite(sd).all(axis=1)
+    unit = np.maximum(np.where(np.isfinite(sd), sd, np.inf), np.repeat([LEAST_MM, LEAST_RAD], 3))
+    point = np.zeros((count, 3, 3))
+    point[:, UPPER3[0], UPPER3[1]] = recorded["point_covariance"]
+    point_unit = np.maximum(np.sqrt(np.einsum("kii->ki", point)), LEAST_MM)
+    images = recorded["elevation"].shape[1]
+    tuned_unit = np.maximum(recorded["sigma"], LEAST_MM)
+    own = np.where(np.isfinite(recorded["elevation_sd"]), recorded["elevation_sd"],
+                   tuned_unit[:, 2:])  # fmt: skip
+    own = np.maximum(own, LEAST_MM)
+
+    def largest(values: np.ndarray) -> np.ndarray:
+        values = np.abs(values).reshape(count, -1)
+        return values.max(axis=1) if values.shape[1] else np.zeros(count)
+
+    def apart(name: str) -> np.ndarray:
+        return found[name] - recorded[name]
+
+    x, y = recorded["image_to_probe"], found["image_to_probe"]
+    moved = np.einsum("kji,kj->ki", x[:, :, :3], y[:, :, 3] - x[:, :, 3])
+    relative = np.einsum("kji,kjl->kil", x[:, :, :3], y[:, :, :3])
+    skew = 0.5 * (relative - np.swapaxes(relative, 1, 2))
+    turned = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
+    result = {
+        "X": largest(np.concatenate([moved, turned], axis=1) / unit),
+        "point": largest(apart("point") / point_unit),
+        "elevation": largest(apart("elevation") / own),
+        "sigma": largest(apart("sigma") / tuned_unit * np.sqrt(2 * images)),
+        "covariance": largest(
+            apart("covariance") / (unit[:, UPPER6[0]] * unit[:, UPPER6[1]])
+        ),
+        "point_covariance": largest(
+            apart("point_covariance") / (point_unit[:, UPPER3[0]] * point_unit[:, UPPER3[1]])
+        ),
+        "elevation_sd": np.nan_to_num(np.abs(apart("elevation_sd")) / own).max(axis=1),
+    }  # fmt: skip
+    for name in ("cost", "rms", "condition"):
+        floor = LEAST_MM**2 if name == "cost" else LEAST_MM
+        result[name] = np.abs(apart(name)) / np.maximum(np.abs(recorded[name]), floor)
+    if "scale_mm_per_px" in recorded:
+        result["scale"] = largest(apart("scale_mm_per_px") / recorded["scale_mm_per_px"]) / (
+            LEAST_RAD
+        )
+    for name in ("sound_speed", "delay"):
+        key = f"{name}_m_s" if name == "sound_speed" else f"{name}_s"
+        sd_key = f"{name}_sd_m_s" if name == "sound_speed" else f"{name}_sd_s"
+        if key in recorded:
+            result[name] = np.abs(apart(key)) / recorded[sd_key]
+            result[f"{name}_sd"] = np.abs(apart(sd_key)) / recorded[sd_key]
+    if "channel_sigma" in recorded:
+        relative = np.abs(apart("channel_sigma")) / recorded["channel_sigma"]
+        result["channel_sigma"] = relative * np.sqrt(2 * images)
+    if "probability" in recorded:
+        result["probability"] = largest(apart("probability"))
+        has = recorded["has_mean"] & found["has_mean"]
+        mean_sd = np.where(has, np.maximum(recorded["mean_sd"], LEAST_MM), 1.0)
+        result["mean"] = np.where(has, np.abs(apart("mean")) / mean_sd, 0.0)
+        result["mean_sd"] = np.where(has, np.abs(apart("mean_sd")) / mean_sd, 0.0)
+        odds = np.maximum(np.abs(recorded["log_odds_mean"]), 1.0)
+        result["log_odds"] = np.maximum(
+            np.abs(apart("log_odds_mean")) / odds,
+            np.abs(apart("log_odds_own")) / np.maximum(np.abs(recorded["log_odds_own"]), 1.0),
+        )
+    if "probability" in recorded:
+        weighed = recorded["weighed"] & found["weighed"]
+        for name in ("probability", "mean", "mean_sd", "log_odds"):
+            result[name] = np.where(weighed, result[name], np.nan)
+    answered = converged(recorded, found)
+    same_kind = np.isfinite(found["covariance"]).all(axis=1) == known
+    for name in result:
+        result[name] = np.where(same_kind, result[name], np.inf)
+        result[name] = np.where(answered, result[name], np.nan)
+    return result
+
+
+def gradient_arrays(family: Family, call: Call, rows: np.ndarray, weight: np.ndarray) -> Arrays:
+    """One scalar of the answer, with its derivatives by measurements and poses, of some problems.
+
+    The scalar is the sum of ``weight`` times X (12 numbers), the target (3) and the offsets. Times
+    of flight enter by their distances, which are what a problem holds of them.
+    """
+    problems, keywords = family.problems(rows), call.keywords()
+    channels = family.probe is not None
+
+    def value(measured: jax.Array, poses: jax.Array, problem: jaxcal.Problem) -> jax.Array:
+        moved = replace(problem, poses=poses)
+        if channels:
+            assert problem.channels is not None
+            moved = replace(moved, channels=replace(problem.channels, distances=measured))
+        else:
+            moved = replace(moved, measurements=measured)
+        result = jaxcal.calibrate(moved, **keywords)
+        count = result.elevation.shape[0]
+        return (
+            jnp.sum(weight[:12] * result.image_to_probe[:3].ravel())
+            + weight[12:15] @ result.point
+            + weight[15 : 15 + count] @ result.elevation
+        )
+
+    with jax.enable_x64(True):
+        measured = problems.channels.distances if channels else problems.measurements
+        program = jax.jit(jax.vmap(jax.value_and_grad(value, argnums=(0, 1))))
+        scalar, (by_measured, by_poses) = program(measured, problems.poses, problems)
+    return {
+        "rows": rows,
+        "weight": weight,
+        "value": np.asarray(scalar),
+        "by_measurements": np.asarray(by_measured),
+        "by_poses": np.asarray(by_poses)[:, :, :3],
+    }
+
+
+def gradient_differences(recorded: Arrays, found: Arrays) -> Arrays:
+    """Relative to the largest derivative of a problem's own kind, problem by problem."""
+    result = {}
+    for name in ("by_measurements", "by_poses"):
+        reference = recorded[name].reshape(len(recorded[name]), -1)
+        difference = found[name].reshape(reference.shape) - reference
+        # Derivatives by positions and by entries of rotations differ in size, so each by its own.
+        if name == "by_poses":
+            shape = recorded[name].shape
+            for part, columns in (("by_rotations", slice(0, 3)), ("by_positions", slice(3, 4))):
+                size = recorded[name][..., columns].reshape(shape[0], -1)
+                off = difference.reshape(shape)[..., columns].reshape(shape[0], -1)
+                result[part] = np.abs(off).max(axis=1) / np.abs(size).max(axis=1)
+        else:
+            result[name] = np.abs(difference).max(axis=1) / np.abs(reference).max(axis=1)
+    result["value"] = np.abs(found["value"] - recorded["value"]) / np.abs(recorded["value"])
+    return result
+
+
+def tolerance(call: str, road: str, name: str) -> float:
+    """What a difference may be, in the units of :func:`differences`."""
+    return 1e-6 if road == "gradient" else 1e-8

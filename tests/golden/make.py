@@ -1,0 +1,107 @@
+"""Record the golden corpus: the answers of the code as it stands.
+
+    python tests/golden/make.py                      # answers of all families, inputs as stored
+    python tests/golden/make.py --family points12    # of one
+    python tests/golden/make.py --inputs             # draw the inputs anew, too
+
+Each file says which commit and versions it was written by. When one may do that: README.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+
+FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+"""The compiler's: those of the tests, with which it takes half of the time."""
+
+os.environ.setdefault("XLA_FLAGS", FLAGS)
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax  # noqa: E402
+import numpy as np  # noqa: E402
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from golden import corpus, draws  # noqa: E402
+
+
+def written() -> dict[str, str]:
+    """By what a file is written."""
+    folder = Path(__file__).parent
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True)
+        return done.stdout.strip()
+
+    changed = git("status", "--porcelain", "--", str(folder.parents[1] / "jaxcal"))
+    names = ("jax", "jaxlib", "numpy", "equinox", "optimistix", "jaxlie")
+    return {
+        "commit": git("rev-parse", "HEAD") + (" with changes to jaxcal/" if changed else ""),
+        "date": date.today().isoformat(),
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "XLA_FLAGS": os.environ["XLA_FLAGS"],
+    } | {name: version(name) for name in names}
+
+
+def gradient_rows(family: corpus.Family, name: str) -> np.ndarray:
+    """Problems whose answer by that call is differentiable, as it says itself."""
+    rows = np.flatnonzero(family.usable())
+    call = family.call(name)
+    found = corpus.compute(family, call, call.roads[-1], rows)
+    good = rows[found["differentiable"] & (found["status_code"] == 0)]
+    return good[np.linspace(0, len(good) - 1, corpus.GRADIENT_PROBLEMS).astype(int)]
+
+
+def record_gradients() -> None:
+    """Write the derivatives' file."""
+    arrays: corpus.Arrays = {}
+    for name, call_name in corpus.GRADIENTS:
+        began = time.perf_counter()
+        family, _ = corpus.load(name)
+        images = family.arrays["mask"].shape[1]
+        weight = np.random.default_rng(draws.SEED).normal(size=15 + images)
+        weight[:12].reshape(3, 4)[:, :3] *= 50.0  # rotations in mm at 50 mm
+        rows = gradient_rows(family, call_name)
+        found = corpus.gradient_arrays(family, family.call(call_name), rows, weight)
+        arrays |= {f"{name}/{call_name}/{key}": value for key, value in found.items()}
+        jax.clear_caches()
+        print(f"gradient {name} {call_name}: {time.perf_counter() - began:.0f} s", flush=True)
+    np.savez_compressed(corpus.FOLDER / "gradients.npz", **arrays)  # pyright: ignore
+
+
+def main() -> None:
+    """Record."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--inputs", action="store_true", help="draw the problems anew")
+    parser.add_argument("--family", action="append", help="only this one (or gradients)")
+    chosen = parser.parse_args()
+    wanted = chosen.family or [*corpus.CALLS, "gradients"]
+    for family in draws.families():
+        if family.name not in wanted:
+            continue
+        if not chosen.inputs:
+            family, _ = corpus.load(family.name)
+        answers = {}
+        for call in corpus.CALLS[family.name]:
+            for road in call.roads:
+                began = time.perf_counter()
+                answers[call.name, road] = corpus.compute(family, call, road)
+                jax.clear_caches()
+                seconds = time.perf_counter() - began
+                print(f"{family.name} {call.name} {road}: {seconds:.0f} s", flush=True)
+        corpus.save(replace(family, written=written()), answers)
+    if "gradients" in wanted:
+        record_gradients()
+
+
+if __name__ == "__main__":
+    main()
