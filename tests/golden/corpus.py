@@ -125,7 +125,6 @@ CALLS: dict[str, tuple[Call, ...]] = {
 
 GRADIENTS: tuple[tuple[str, str], ...] = (
     ("points12", "conventional"),
-    ("points12", "alternating"),
     ("points12", "bounded"),
     ("points12", "given"),
     ("points12", "tracker"),
@@ -134,7 +133,10 @@ GRADIENTS: tuple[tuple[str, str], ...] = (
     ("pixels-covariances12", "gaussian"),
     ("curved12", "gaussian, speed and delay"),
 )
-"""Families and calls whose derivatives are recorded."""
+"""Families and calls whose derivatives are recorded.
+
+Not the alternation: it stops before it is stationary, and says that it is not differentiable.
+"""
 
 GRADIENT_PROBLEMS = 4
 """Of each: so many problems."""

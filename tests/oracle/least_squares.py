@@ -49,7 +49,7 @@ class Fit:
 def minimise(
     residual: Residual, start: Unknowns, blocks: tuple[str, ...], *, near: bool = False
 ) -> Fit:
-    """The minimum next to a start; ``near``: so near that Newton's method may begin there."""
+    """The minimum next to a start; ``near``: so near that Gauss-Newton steps may begin there."""
     count = size(blocks)
 
     def at(u: Unknowns) -> tuple[np.ndarray, np.ndarray]:
@@ -68,13 +68,16 @@ def minimise(
         def moved(step: np.ndarray) -> np.ndarray:
             return residual(start.moved(step, blocks)).ravel()
 
-        def along(step: np.ndarray) -> np.ndarray:
+        def slope(step: np.ndarray) -> np.ndarray:
             return jacobian(lambda more: moved(step + more), count)
 
-        found = least_squares(moved, np.zeros(count), jac=along, x_scale="jac", xtol=1e-9,
+        found = least_squares(moved, np.zeros(count), jac=slope, x_scale="jac", xtol=1e-9,
                               ftol=1e-12, gtol=1e-12, max_nfev=200)  # fmt: skip
         u = start.moved(found.x, blocks)
     hessian, last = None, np.inf
+    if near:
+        along = at(u)[1]
+        hessian = along.T @ along
     for _ in range(60):
         if hessian is None:
             hessian = second_derivatives(lambda step, u=u: gradient(u.moved(step, blocks)), count)
@@ -83,7 +86,7 @@ def minimise(
         if length < 1e-13 or (length < 1e-10 and length > 0.1 * last):
             break
         # The same matrix serves as long as it brings a digit a step.
-        hessian, last = (hessian if length < 0.1 * last else None), length
+        hessian, last = (hessian if length < 0.3 * last else None), length
     value, along = at(u)
     return Fit(u, float(value @ value), along, value)
 
@@ -278,6 +281,38 @@ def _active_set(
         y, free = np.clip(y, -bound, bound), ~held
     value, along = _explicit(residual, u, y, free, blocks)
     return ExplicitFit(u, float(value @ value), along, value, y, free)
+
+
+def alternate(
+    data: Data, blocks: tuple[str, ...], bound: np.ndarray, start: Unknowns,
+    tolerance_rad: float = 1e-3, tolerance_mm: float = 0.1,
+) -> tuple[Unknowns, np.ndarray]:  # fmt: skip
+    """The paper's alternation: offsets to the closest points, two Gauss-Newton steps, and again.
+
+    Until a round turns X by less than one tolerance and moves its origin by less than the other.
+    """
+    u = start
+
+    def closest(u: Unknowns) -> np.ndarray:
+        q, distance = target(data, u), points(data, u)[1]
+        most = np.minimum(bound, 0.95 * distance)
+        return np.clip(distance * q[:, 1] / np.hypot(q[:, 1], q[:, 2]), -most, most)
+
+    for _ in range(1000):
+        before, y = u, closest(u)
+        for _ in range(2):
+
+            def moved(step: np.ndarray, u: Unknowns = u, y: np.ndarray = y) -> np.ndarray:
+                return circle(data, u.moved(step, blocks), y).ravel()
+
+            along = jacobian(moved, size(blocks))
+            u = u.moved(-np.linalg.lstsq(along, moved(np.zeros(size(blocks))), rcond=None)[0],
+                        blocks)  # fmt: skip
+        turned = np.linalg.norm(u.rotation - before.rotation) / np.sqrt(8)
+        if (2 * np.arcsin(turned) < tolerance_rad
+                and np.linalg.norm(u.translation - before.translation) < tolerance_mm):  # fmt: skip
+            break
+    return u, closest(u)
 
 
 def offset_gradient(data: Data, u: Unknowns, y: np.ndarray) -> np.ndarray:

@@ -1,0 +1,476 @@
+"""The recorded public answers against an oracle that shares no code with them.
+
+``tests/golden`` holds what ``jaxcal.calibrate`` and ``jaxcal.calibrate_batch`` answer (and
+``test_golden.py`` that they still do); here the same problems are solved from the definitions, by
+``tests/oracle``: numpy and scipy, dense, with derivatives by complex steps. Differences are in the
+answers' own standard deviations.
+"""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from golden import corpus
+from oracle import least_squares, model_average, uncertainty, variance
+from oracle.model import RIGID, Data, Unknowns, jacobian, points, size, target
+from scipy.integrate import quad
+
+import jaxcal
+
+AGREE = 1e-6
+"""In SDs."""
+
+QUADRATURE = 2e-3
+"""What sixteen nodes instead of an exact quadrature move X, in SDs (7e-4 at most was seen)."""
+
+FEW_STEPS = 3e-2
+"""What the model average's few updates and sweeps leave of its fixed point, in SDs."""
+
+SCALE = (*RIGID, "scale")
+GIVEN = np.array([0.3, 0.15, 1.0])
+
+
+@cache
+def load(name: str):
+    return corpus.load(name)
+
+
+def data_of(name: str, row: int) -> Data:
+    """Plain arrays of the used images."""
+    family, _ = load(name)
+    used = family.arrays["mask"][row] > 0
+    arrays = {key: values[row][used] for key, values in family.arrays.items() if key != "mask"}
+    covariance = None
+    if "covariance" in arrays:
+        xx, xy, yy = arrays["covariance"].T
+        covariance = np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+    poses = arrays["poses"]
+    data = Data(
+        poses[:, :, :3], poses[:, :, 3], arrays.get("measurements", np.zeros((len(poses), 2))),
+        np.ones(2), covariance, arrays.get("max_elevation"),
+    )  # fmt: skip
+    if family.probe is None:
+        return data
+    # Which answers of the elements count is the segmentation's to say.
+    problem = family.problems(np.array([row]))
+    channels = problem.channels
+    assert channels is not None
+    return replace(
+        data,
+        measured=np.asarray(problem.measurements)[0][used],
+        distances=np.asarray(channels.distances)[0][used],
+        heard=np.asarray(channels.heard)[0][used],
+        elements=np.asarray(channels.elements)[0],
+    )
+
+
+def answers(name: str, call: str, row: int) -> list[corpus.Arrays]:
+    """What was recorded of a problem, by every road."""
+    _, recorded = load(name)
+    return [
+        {key: values[row] for key, values in fields.items()}
+        for (own, _), fields in recorded.items()
+        if own == call
+    ]
+
+
+def symmetric(upper: np.ndarray) -> np.ndarray:
+    count = {21: 6, 6: 3}[len(upper)]
+    full = np.zeros((count, count))
+    full[np.triu_indices(count)] = upper
+    return full + np.triu(full, 1).T
+
+
+def apart(answer: corpus.Arrays, u: Unknowns) -> float:
+    """Largest distance of X's six and the target's three unknowns, in the answer's SDs."""
+    x, sd = answer["image_to_probe"], np.sqrt(np.diag(symmetric(answer["covariance"])))
+    moved = x[:, :3].T @ (u.translation - x[:, 3])
+    turn = x[:, :3].T @ u.rotation
+    turned = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0],
+                             turn[1, 0] - turn[0, 1]])  # fmt: skip
+    point_sd = np.sqrt(np.diag(symmetric(answer["point_covariance"])))
+    point = (u.point - answer["point"]) / point_sd
+    return float(np.abs(np.concatenate([moved / sd[:3], turned / sd[3:], point])).max())
+
+
+def assert_covariances(answer: corpus.Arrays, covariance: np.ndarray, tolerance=AGREE) -> None:
+    """X's and the target's, in units of the products of SDs."""
+    for name, rows in (("covariance", slice(0, 6)), ("point_covariance", slice(6, 9))):
+        recorded, mine = symmetric(answer[name]), covariance[rows, rows]
+        sd = np.sqrt(np.diag(recorded))
+        np.testing.assert_allclose(mine / np.outer(sd, sd), recorded / np.outer(sd, sd),
+                                   atol=tolerance)  # fmt: skip
+
+
+def assert_offsets(answer: corpus.Arrays, mask: np.ndarray, elevation, sd=None) -> None:
+    unit = answer["elevation_sd"][mask]
+    np.testing.assert_allclose(elevation / unit, answer["elevation"][mask] / unit, atol=AGREE)
+    if sd is not None:
+        np.testing.assert_allclose(sd, unit, rtol=AGREE)
+
+
+def used_images(name: str, row: int) -> np.ndarray:
+    return load(name)[0].arrays["mask"][row] > 0
+
+
+def test_the_oracle_imports_numpy_and_scipy_only():
+    folder = Path(__file__).parent / "oracle"
+    allowed = {"__future__", "collections", "dataclasses", "numpy", "oracle", "scipy"}
+    for path in folder.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            assert {name.split(".")[0] for name in names} <= allowed, path.name
+
+
+ORDINARY = [("points12", row) for row in (0, 1, 2, 3, 4, 5, 34, 42)] + [
+    ("points24", row) for row in (6, 7, 8, 9)
+]
+
+
+@pytest.mark.parametrize(("name", "row"), ORDINARY)
+def test_conventional(name, row):
+    data = data_of(name, row)
+    fit = least_squares.conventional(data, RIGID)
+    spread = uncertainty.residual_variance(fit.cost, len(data), 9)
+    covariance = uncertainty.covariance(fit.jacobian, 9, spread)
+    seen = uncertainty.observability(data, fit.unknowns, RIGID, fit.jacobian, spread)
+    for answer in answers(name, "conventional", row):
+        assert apart(answer, fit.unknowns) < AGREE
+        assert answer["cost"] == pytest.approx(fit.cost, rel=1e-9)
+        assert answer["rms"] == pytest.approx(np.sqrt(fit.cost / len(data)), rel=1e-9)
+        assert_covariances(answer, covariance)
+        assert_offsets(
+            answer, used_images(name, row), target(data, fit.unknowns)[:, 1],
+            uncertainty.offset_sd(data, fit.unknowns, RIGID, covariance),
+        )  # fmt: skip
+        assert answer["condition"] == pytest.approx(seen.condition, rel=1e-6)
+        assert answer["weakest_sd"] == pytest.approx(seen.weakest_sd, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "row"),
+    [*ORDINARY[:8], *(("covariances24", row) for row in (0, 1, 2, 3)),
+     *(("pixels24", row) for row in (0, 1, 2, 3))],
+)  # fmt: skip
+def test_given_standard_deviations(name, row):
+    data, blocks = data_of(name, row), SCALE if name.startswith("pixels") else RIGID
+    shape = None if data.covariance is None else data.shape()
+    start = least_squares.conventional(data, blocks).unknowns
+    fit = least_squares.joint(data, blocks, GIVEN, start, shape)
+    covariance = uncertainty.covariance(fit.jacobian, size(blocks))
+    for answer in answers(name, "given", row):
+        assert apart(answer, fit.unknowns) < AGREE
+        assert answer["cost"] == pytest.approx(fit.cost, rel=1e-9)
+        assert_covariances(answer, covariance)
+        assert_offsets(
+            answer, used_images(name, row), target(data, fit.unknowns)[:, 1],
+            uncertainty.offset_sd(data, fit.unknowns, blocks, covariance),
+        )  # fmt: skip
+        if blocks == SCALE:
+            np.testing.assert_allclose(answer["scale_mm_per_px"], fit.unknowns.scale, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("name", "row"), [("points12", row) for row in (0, 1, 2, 3, 4, 5)])
+def test_a_tracker_that_errs(name, row):
+    """Offsets as unknowns of their own; without tracker errors they go over into q_y."""
+    data, tau = data_of(name, row), 0.2
+    start = least_squares.joint(
+        data, RIGID, GIVEN, least_squares.conventional(data, RIGID).unknowns
+    )
+    fit = least_squares.joint_explicit(data, RIGID, GIVEN, tau, start.unknowns)
+    whole = uncertainty.covariance(fit.jacobian, 9 + len(data))
+    (answer,) = answers(name, "tracker", row)
+    assert apart(answer, fit.unknowns) < AGREE
+    assert answer["cost"] == pytest.approx(fit.cost, rel=1e-9)
+    assert_covariances(answer, whole[:9, :9])
+    assert_offsets(
+        answer, used_images(name, row), fit.offset, np.sqrt(np.diag(whole)[9:])
+    )  # fmt: skip
+    none = least_squares.joint_explicit(data, RIGID, GIVEN, 1e-5, start.unknowns)
+    (eliminated, *_) = answers(name, "given", row)
+    assert apart(eliminated, none.unknowns) < 1e-5
+
+
+BOUNDED = [("points12", row) for row in (0, 1, 2, 3, 4, 6, 7, 8, 9, 10)] + [
+    ("bounds24", row) for row in (1, 4)
+]
+
+
+@pytest.mark.parametrize(("name", "row"), BOUNDED)
+def test_bounded(name, row):
+    """The same minimum from starts of the oracle's own, and the KKT conditions at the answer."""
+    data = data_of(name, row)
+    bound = np.ones(len(data)) if data.bound is None else data.bound
+    start = least_squares.conventional(data, RIGID).unknowns
+    fit = least_squares.bounded(data, RIGID, bound, start)
+    (answer,) = answers(name, "bounded", row)
+    assert answer["cost"] == pytest.approx(fit.cost, rel=1e-9)
+    x, mask = answer["image_to_probe"], used_images(name, row)
+    there = Unknowns(x[:, :3], x[:, 3], answer["point"], np.ones(2))
+    y, held = answer["elevation"][mask], answer["at_bound"][mask]
+    most = np.minimum(bound, 0.95 * points(data, there)[1])
+    assert (np.abs(y) <= most + 1e-12).all()
+    assert (np.abs(y) == most)[held].all()
+    # A residual of r mm and a slope of one: derivatives in mm, of a cost in mm^2.
+    scale = np.sqrt(fit.cost)
+    force = least_squares.offset_gradient(data, there, y)
+    assert np.abs(force[~held]).max(initial=0) < 1e-8 * scale
+    assert (np.sign(y) * force < 0)[held].all()
+
+    def residual(step: np.ndarray) -> np.ndarray:
+        return least_squares.circle(data, there.moved(step, RIGID), y).ravel()
+
+    along = jacobian(residual, 9)
+    cosine = (along.T @ residual(np.zeros(9))) / np.linalg.norm(along, axis=0)
+    assert np.abs(cosine).max() < 1e-8 * scale
+    assert np.array_equal(held, ~fit.free)
+    free = int(fit.free.sum())
+    if 3 * len(data) - 9 - free > 0 and np.isfinite(answer["covariance"]).all():
+        assert apart(answer, fit.unknowns) < AGREE
+        spread = uncertainty.residual_variance(fit.cost, len(data), 9, free)
+        assert_covariances(answer, uncertainty.covariance(fit.jacobian, 9, spread))
+
+
+@pytest.mark.parametrize(("name", "row"), ORDINARY)
+def test_alternation(name, row):
+    data = data_of(name, row)
+    start = least_squares.conventional(data, RIGID).unknowns
+    u, y = least_squares.alternate(data, RIGID, np.ones(len(data)), start)
+    for answer in answers(name, "alternating", row):
+        # Fewer than 9 active bounds leave a direction free, and its SD unknown.
+        if np.isfinite(answer["covariance"]).all():
+            assert apart(answer, u) < AGREE
+        elevation = answer["elevation"][used_images(name, row)]
+        np.testing.assert_allclose(elevation, y, atol=AGREE * max(answer["sigma"]))
+        assert answer["cost"] == pytest.approx(
+            float((least_squares.circle(data, u, y) ** 2).sum()), rel=1e-6
+        )
+
+
+def tuned(name: str, row: int, blocks=RIGID) -> tuple[Data, variance.Tuned]:
+    data = data_of(name, row)
+    start = least_squares.conventional(data, blocks).unknowns
+    return data, variance.helmert(variance.point_components(data), start, 3, blocks)
+
+
+@pytest.mark.parametrize(("name", "row"), [*ORDINARY[:6], ORDINARY[7], *ORDINARY[8:],
+                                           ("pixels24", 0), ("pixels24", 1)])  # fmt: skip
+def test_self_tuned_is_restricted_maximum_likelihood(name, row):
+    data, blocks = data_of(name, row), SCALE if name.startswith("pixels") else RIGID
+    start = least_squares.conventional(data, blocks).unknowns
+    found = variance.reml(variance.point_components(data), start, 3, blocks)
+    covariance = uncertainty.covariance(found.fit.jacobian, size(blocks))
+    for answer in answers(name, "gaussian", row):
+        np.testing.assert_allclose(answer["sigma"], found.sigma, rtol=1e-7)
+        assert apart(answer, found.fit.unknowns) < AGREE
+        assert_covariances(answer, covariance)
+
+
+@pytest.mark.parametrize("row", [0, 1, 2, 3])
+def test_self_tuned_with_correlated_errors_is_helmerts(row):
+    """Own covariances that correlate lateral position and range: an estimator of its own.
+
+    Helmert's equation for the decorrelated residuals is unbiased, but it is not the derivative of
+    the restricted likelihood, whose SDs are a few per cent off.
+    """
+    data = data_of("covariances24", row)
+    start = least_squares.conventional(data, RIGID).unknowns
+    components = variance.point_components(data, data.shape())
+    found = variance.helmert(components, start, 3, RIGID)
+    (answer,) = answers("covariances24", "gaussian", row)
+    np.testing.assert_allclose(answer["sigma"], found.sigma, rtol=1e-7)
+    assert apart(answer, found.fit.unknowns) < AGREE
+    assert_covariances(answer, uncertainty.covariance(found.fit.jacobian, 9))
+    likeliest = variance.reml(components, start, 3, RIGID)
+    assert 1e-4 < np.abs(np.log(likeliest.sigma / found.sigma)).max() < 0.2
+
+
+AVERAGED = [("points12", row) for row in (0, 1, 2, 3, 4, 42)] + [
+    *(("points24", row) for row in (1, 2, 3, 9)),
+    *(("covariances24", row) for row in (0, 1, 2, 3)),
+    *(("bounds24", row) for row in (0, 1, 2)),
+    *(("covariances-bounds12", row) for row in (0, 1)),
+    *(("pixels24", row) for row in (0, 1)),
+]
+
+
+def assert_average(answer: corpus.Arrays, found: model_average.Average, tolerance: float) -> None:
+    """X, covariance, SDs and what is said of the distributions."""
+    assert answer["weighed"]
+    assert answer["has_mean"] == found.has_mean
+    assert answer["own_covariances"] == found.own_covariances
+    assert apart(answer, found.unknowns) < tolerance
+    assert_covariances(answer, found.covariance, tolerance)
+    np.testing.assert_allclose(answer["sigma"], found.sigma, rtol=tolerance)
+    names = ("uniform", "bell", "gaussian", "student")
+    probability = [found.probability.get(name, 0.0) for name in names]
+    np.testing.assert_allclose(answer["probability"], probability, atol=tolerance)
+    unit = max(found.mean_sd, 1e-3)
+    assert abs(answer["mean"] - found.mean) / unit < tolerance
+    assert abs(answer["mean_sd"] - found.mean_sd) / unit < tolerance
+    assert answer["log_odds_mean"] == pytest.approx(found.log_odds_mean, rel=tolerance, abs=tolerance)
+    assert answer["log_odds_own"] == pytest.approx(found.log_odds_own, rel=tolerance, abs=tolerance)
+
+
+@pytest.mark.parametrize(("name", "row"), AVERAGED)
+def test_model_average(name, row):
+    blocks = SCALE if name.startswith("pixels") else RIGID
+    data, first = tuned(name, row, blocks)
+    documented = model_average.Recipe(quadrature="documented")
+    found = model_average.average(data, first.fit.unknowns, first.sigma, blocks, documented)
+    exact = model_average.average(data, first.fit.unknowns, first.sigma, blocks)
+    for answer in answers(name, "auto", row):
+        assert_average(answer, found, AGREE)
+        assert apart(answer, exact.unknowns) < QUADRATURE
+
+
+@pytest.mark.parametrize(("name", "row"), [("points12", 0), ("points12", 1), ("bounds24", 0)])
+def test_uniform_only(name, row):
+    data, first = tuned(name, row)
+    recipe = model_average.uniform_only(model_average.Recipe(quadrature="documented"))
+    found = model_average.average(data, first.fit.unknowns, first.sigma, RIGID, recipe)
+    for answer in answers(name, "uniform", row):
+        assert_average(answer, found, AGREE)
+
+
+@pytest.mark.parametrize(("name", "row"), AVERAGED[:4])
+def test_few_updates_and_sweeps_come_near_the_fixed_point(name, row):
+    """What the average takes on purpose: two rounds of SDs, three sweeps a distribution."""
+    data, first = tuned(name, row)
+    recipe = model_average.Recipe(exactly=True)
+    found = model_average.average(data, first.fit.unknowns, first.sigma, RIGID, recipe)
+    for answer in answers(name, "auto", row):
+        assert apart(answer, found.unknowns) < FEW_STEPS
+
+
+def test_moments_of_the_distributions_against_scipy():
+    rng = np.random.default_rng(4)
+    for family in ("uniform", "bell", "student", "gaussian"):
+        sd, centre, variance_ = 1.3, rng.uniform(-4, 4, 3), rng.uniform(0.05, 9, 3)
+        low, high = np.full(3, -np.inf), np.array([np.inf, 1.7, np.inf])
+        mass, mean, spread = model_average.exact_moments(
+            family, sd, centre, variance_, low, high
+        )
+        for k in range(3):
+            edge = min(model_average.support(family, sd), 60.0)
+
+            def power(u: float, order: int, k: int = k, family: str = family) -> float:
+                gauss = np.exp(-0.5 * (u - centre[k]) ** 2 / variance_[k])
+                density = float(model_average.density(family, np.array(u), sd))
+                return u**order * density * gauss / np.sqrt(2 * np.pi * variance_[k])
+
+            marks = [p for p in (centre[k], 0.0) if -edge < p < min(edge, high[k])]
+            sums = [
+                quad(power, -edge, min(edge, high[k]), args=(order,), points=marks, limit=400,
+                     epsabs=0, epsrel=1e-11)[0]
+                for order in range(3)
+            ]  # fmt: skip
+            first = sums[1] / sums[0]
+            assert mass[k] == pytest.approx(np.log(sums[0]), abs=1e-9)
+            assert mean[k] == pytest.approx(first, abs=1e-8)
+            assert spread[k] == pytest.approx(sums[2] / sums[0] - first**2, rel=1e-7)
+
+
+NOMINAL_M_S = 1490.0
+CHANNELS = (("curved12", "gaussian", RIGID, None),
+            ("curved12", "gaussian, speed and delay", (*RIGID, "sound-speed", "delay"), (20, 1e-6)),
+            ("linear12", "gaussian, speed", (*RIGID, "sound-speed"), (20, 1e-6)))  # fmt: skip
+
+
+def medium_sd(given: tuple | None) -> np.ndarray | None:
+    """Prior SDs of the log of the sound speed and of the delay in mm, from m/s and s."""
+    if given is None:
+        return None
+    return np.array([given[0] / NOMINAL_M_S, given[1] * NOMINAL_M_S * 1e3])
+
+
+@pytest.mark.parametrize("row", [0, 2, 4])
+@pytest.mark.parametrize(("name", "call", "blocks", "given"), CHANNELS)
+def test_times_of_flight(name, call, blocks, given, row):
+    data = data_of(name, row)
+    start = least_squares.conventional(data, RIGID).unknowns
+    found = variance.reml(
+        variance.channel_components(data), start, 2, blocks, medium_sd(given)
+    )
+    u, covariance = found.fit.unknowns, uncertainty.covariance(found.fit.jacobian, size(blocks))
+    for answer in answers(name, call, row):
+        assert answer["channel_sigma"] == pytest.approx(found.sigma[0], rel=1e-7)
+        assert answer["sigma"][2] == pytest.approx(found.sigma[1], rel=1e-7)
+        assert apart(answer, u) < AGREE
+        assert_covariances(answer, covariance)
+        if "sound-speed" in blocks:
+            sd = NOMINAL_M_S * u.speed * np.sqrt(covariance[9, 9])
+            assert answer["sound_speed_sd_m_s"] == pytest.approx(sd, rel=1e-6)
+            assert abs(answer["sound_speed_m_s"] - NOMINAL_M_S * u.speed) < AGREE * sd
+        if "delay" in blocks:
+            sd = np.sqrt(covariance[10, 10]) / (1e3 * NOMINAL_M_S)
+            assert answer["delay_sd_s"] == pytest.approx(sd, rel=1e-6)
+            assert abs(answer["delay_s"] - u.delay / (1e3 * NOMINAL_M_S)) < AGREE * sd
+
+
+@pytest.mark.parametrize(("name", "row"), [("curved12", 0), ("curved12", 2)])
+def test_model_average_on_times_of_flight(name, row):
+    data = data_of(name, row)
+    start = least_squares.conventional(data, RIGID).unknowns
+    first = variance.reml(variance.channel_components(data), start, 2, RIGID)
+    found = model_average.average(
+        data, first.fit.unknowns, first.sigma, RIGID,
+        model_average.Recipe(quadrature="documented"), on_channels=True,
+    )  # fmt: skip
+    for answer in answers(name, "auto", row):
+        assert answer["has_mean"] == found.has_mean
+        assert apart(answer, found.unknowns) < AGREE
+        assert_covariances(answer, found.covariance)
+
+
+def test_poses_that_determine_nothing_are_those_that_singular_values_name():
+    degenerate = ("parallel", "one axis", "one pose", "line in the plane")
+    family, recorded = load("points24")
+    seen = set()
+    for row, kind in enumerate(family.kinds):
+        if kind == "NaN" or (kind in corpus_ordinary() and row > 12):
+            continue
+        data = data_of("points24", row)
+        status = recorded["conventional", "one"]["status_code"][row]
+        if kind in degenerate:
+            assert status == jaxcal.Status.UNOBSERVABLE, (row, kind)
+        answer = answers("points24", "conventional", row)[0]
+        x = answer["image_to_probe"]
+        u = Unknowns(x[:, :3], x[:, 3], answer["point"], np.ones(2))
+        along = jacobian(
+            lambda step, data=data, u=u: least_squares.circle(
+                data, u.moved(step, RIGID), np.zeros(len(data))
+            ), 9,
+        )  # fmt: skip
+        spread = answer["cost"] / (3 * len(data) - 9)
+        found = uncertainty.observability(data, u, RIGID, along, spread)
+        lever = np.sqrt(np.mean(np.sum(np.stack(points(data, u)) ** 2, axis=0)))
+        unknown = found.degenerate or found.weakest_sd > 0.5 * lever
+        assert unknown == (status == jaxcal.Status.UNOBSERVABLE), (row, kind)
+        assert found.degenerate == (~np.isfinite(answer["weakest_sd"])), (row, kind)
+        seen.add(kind)
+    assert seen >= {*degenerate, "narrow cone", "uniform", "few"}
+
+
+def corpus_ordinary() -> tuple[str, ...]:
+    return ("uniform", "normal", "heavy-tailed", "one-sided", "masked", "small errors")
+
+
+def test_reconstruction_precision_is_equation_8():
+    family, recorded = load("points24")
+    for row in range(12):
+        poses = np.tile(np.eye(4), (24, 1, 1))
+        poses[:, :3] = family.arrays["poses"][row]
+        used = family.arrays["mask"][row] > 0
+        x = np.vstack([recorded["auto", "one"]["image_to_probe"][row], [0.0, 0.0, 0.0, 1.0]])
+        measured = family.arrays["measurements"][row]
+        mine = uncertainty.reconstruction_precision(x, poses[used], measured[used])
+        theirs = jaxcal.reconstruction_precision(x, poses[used], measured[used])
+        assert float(theirs) == pytest.approx(mine, rel=1e-12)
