@@ -73,8 +73,9 @@ CALLS: dict[str, tuple[Call, ...]] = {
         BOUNDED,
         GIVEN,
         TRACKER,
-        Call("gauss-newton", {"method": "conventional", "options": {"solver": "gauss-newton"}},
-             BATCH),
+        Call(
+            "gauss-newton", {"method": "conventional", "options": {"solver": "gauss-newton"}}, BATCH
+        ),
         Call("gradient", {"method": "conventional", "options": {"solver": "gradient"}}, BATCH),
         Call("robust gaussian", {"prior": "gaussian", "robust": True}, BATCH),
     ),
@@ -103,9 +104,7 @@ CALLS: dict[str, tuple[Call, ...]] = {
         BOUNDED,
     ),
     "covariances-bounds12": (AUTO,),
-    "pixels24": tuple(
-        map(of_scale, (CONVENTIONAL, ALTERNATING, AUTO, GAUSSIAN, BOUNDED, GIVEN))
-    ),
+    "pixels24": tuple(map(of_scale, (CONVENTIONAL, ALTERNATING, AUTO, GAUSSIAN, BOUNDED, GIVEN))),
     "pixels-covariances12": tuple(map(of_scale, (AUTO, GAUSSIAN))),
     "linear12": (
         Call("auto, speed and delay", {"estimate": ["sound-speed", "delay"]}, BATCH),
@@ -116,11 +115,14 @@ CALLS: dict[str, tuple[Call, ...]] = {
     "curved12": (
         Call("auto", {}, BATCH),
         Call("gaussian", {"prior": "gaussian"}),
-        Call("gaussian, speed and delay",
-             {"prior": "gaussian", "estimate": ["sound-speed", "delay"]}, BATCH),
+        Call(
+            "gaussian, speed and delay",
+            {"prior": "gaussian", "estimate": ["sound-speed", "delay"]},
+            BATCH,
+        ),
         Call("conventional", {"method": "conventional"}, BATCH),
     ),
-}  # fmt: skip
+}
 """What is recorded of every family."""
 
 GRADIENTS: tuple[tuple[str, str], ...] = (
@@ -200,14 +202,19 @@ class Family:
         away[:, :3, 3] = 10 * harmless[:, :1]
         template = jaxcal.Problem.from_recording(
             jaxcal.make_images(
-                away, harmless, "pixel" if self.pixels else "point",
+                away,
+                harmless,
+                "pixel" if self.pixels else "point",
                 covariance=np.tile(np.eye(2), (images, 1, 1)) if "covariance" in arrays else None,
                 max_elevation=1.0 if "max_elevation" in arrays else None,
             )
-        )  # fmt: skip
+        )
         changed = {"poses": poses}
-        changed |= {name: arrays[name] for name in ("measurements", "mask", "max_elevation")
-                    if name in arrays}  # fmt: skip
+        changed |= {
+            name: arrays[name]
+            for name in ("measurements", "mask", "max_elevation")
+            if name in arrays
+        }
         if "covariance" in arrays:
             xx, xy, yy = np.moveaxis(arrays["covariance"], -1, 0)
             changed["covariance"] = np.stack([xx, xy, xy, yy], -1).reshape(*xx.shape, 2, 2)
@@ -223,9 +230,11 @@ class Family:
             **numbers
         )
         images = jaxcal.make_images(
-            self.arrays["poses"][row], self.arrays["times"][row], "time_of_flight",
+            self.arrays["poses"][row],
+            self.arrays["times"][row],
+            "time_of_flight",
             mask=self.arrays["mask"][row] > 0,
-        )  # fmt: skip
+        )
         return jaxcal.Problem.from_recording(jaxcal.Recording(images, probe=probe))
 
 
@@ -263,9 +272,17 @@ def save(family: Family, answers: dict[tuple[str, str], Arrays]) -> None:
 UPPER6, UPPER3 = np.triu_indices(6), np.triu_indices(3)
 
 DECISIONS = (
-    "status_code", "tolerance_met", "searched_start", "sigma_tuned", "differentiable", "outlier",
-    "at_bound", "has_mean", "own_covariances", "weighed",
-)  # fmt: skip
+    "status_code",
+    "tolerance_met",
+    "searched_start",
+    "sigma_tuned",
+    "differentiable",
+    "outlier",
+    "at_bound",
+    "has_mean",
+    "own_covariances",
+    "weighed",
+)
 """Fields that are equal or not."""
 
 
@@ -282,14 +299,34 @@ def numbers(result: jaxcal.Calibration) -> Arrays:
         "status_code": get("status_code").astype(np.int8),
         "iterations": get("iterations").astype(np.int32),
     }
-    for name in ("point", "elevation", "elevation_sd", "sigma", "rms", "cost", "condition",
-                 "weakest_sd"):  # fmt: skip
+    for name in (
+        "point",
+        "elevation",
+        "elevation_sd",
+        "sigma",
+        "rms",
+        "cost",
+        "condition",
+        "weakest_sd",
+    ):
         found[name] = get(name)
-    for name in ("tolerance_met", "searched_start", "sigma_tuned", "differentiable", "outlier",
-                 "at_bound"):  # fmt: skip
+    for name in (
+        "tolerance_met",
+        "searched_start",
+        "sigma_tuned",
+        "differentiable",
+        "outlier",
+        "at_bound",
+    ):
         found[name] = get(name).astype(bool)
-    for name in ("scale_mm_per_px", "channel_sigma", "sound_speed_m_s", "sound_speed_sd_m_s",
-                 "delay_s", "delay_sd_s"):  # fmt: skip
+    for name in (
+        "scale_mm_per_px",
+        "channel_sigma",
+        "sound_speed_m_s",
+        "sound_speed_sd_m_s",
+        "delay_s",
+        "delay_sd_s",
+    ):
         if getattr(result, name) is not None:
             found[name] = get(name)
     law = result.offset_law
@@ -365,9 +402,15 @@ def differences(recorded: Arrays, found: Arrays) -> Arrays:
     ``sound_speed``, ``delay``, ``mean``. ``covariance`` and ``point_covariance``: the largest
     |difference| over the product of the two SDs. ``probability``: absolute. ``cost``, ``rms``,
     ``condition``, ``log_odds``: relative (the last to at least 1). NaN for problems that have no
-    answer in either (:func:`converged`) or where distributions were not weighed; infinite where
-    only one has a covariance.
+    answer in either (:func:`converged`) or one without a covariance, which nothing but a bound
+    confines, or where distributions were not weighed; infinite where only one has a covariance.
     """
+    # Infinities and NaN of what has no answer go out at the end.
+    with np.errstate(invalid="ignore"):
+        return _differences(recorded, found)
+
+
+def _differences(recorded: Arrays, found: Arrays) -> Arrays:
     count = len(recorded["status_code"])
     covariance = np.zeros((count, 6, 6))
     covariance[:, UPPER6[0], UPPER6[1]] = recorded["covariance"]
@@ -379,8 +422,9 @@ def differences(recorded: Arrays, found: Arrays) -> Arrays:
     point_unit = np.maximum(np.sqrt(np.einsum("kii->ki", point)), LEAST_MM)
     images = recorded["elevation"].shape[1]
     tuned_unit = np.maximum(recorded["sigma"], LEAST_MM)
-    own = np.where(np.isfinite(recorded["elevation_sd"]), recorded["elevation_sd"],
-                   tuned_unit[:, 2:])  # fmt: skip
+    own = np.where(
+        np.isfinite(recorded["elevation_sd"]), recorded["elevation_sd"], tuned_unit[:, 2:]
+    )
     own = np.maximum(own, LEAST_MM)
 
     def largest(values: np.ndarray) -> np.ndarray:
@@ -400,14 +444,12 @@ def differences(recorded: Arrays, found: Arrays) -> Arrays:
         "point": largest(apart("point") / point_unit),
         "elevation": largest(apart("elevation") / own),
         "sigma": largest(apart("sigma") / tuned_unit * np.sqrt(2 * images)),
-        "covariance": largest(
-            apart("covariance") / (unit[:, UPPER6[0]] * unit[:, UPPER6[1]])
-        ),
+        "covariance": largest(apart("covariance") / (unit[:, UPPER6[0]] * unit[:, UPPER6[1]])),
         "point_covariance": largest(
             apart("point_covariance") / (point_unit[:, UPPER3[0]] * point_unit[:, UPPER3[1]])
         ),
         "elevation_sd": np.nan_to_num(np.abs(apart("elevation_sd")) / own).max(axis=1),
-    }  # fmt: skip
+    }
     for name in ("cost", "rms", "condition"):
         floor = LEAST_MM**2 if name == "cost" else LEAST_MM
         result[name] = np.abs(apart(name)) / np.maximum(np.abs(recorded[name]), floor)
@@ -443,7 +485,7 @@ def differences(recorded: Arrays, found: Arrays) -> Arrays:
     same_kind = np.isfinite(found["covariance"]).all(axis=1) == known
     for name in result:
         result[name] = np.where(same_kind, result[name], np.inf)
-        result[name] = np.where(answered, result[name], np.nan)
+        result[name] = np.where(answered & (known | ~same_kind), result[name], np.nan)
     return result
 
 
@@ -503,6 +545,59 @@ def gradient_differences(recorded: Arrays, found: Arrays) -> Arrays:
     return result
 
 
-def tolerance(call: str, road: str, name: str) -> float:
+TIGHT = 1e-8
+"""What answers may differ by, in SDs, where nothing is said below."""
+
+LOOSER: tuple[tuple[str, str, str, float], ...] = (
+    # Least squares stops at a cosine of 1e-10 between residuals and Jacobian, which along a
+    # direction that the images hardly see is some 1e-8 SDs.
+    ("*", "conventional", "X point elevation", 5e-8),
+    ("*", "conventional", "sigma", 3e-7),
+    ("*", "gauss-newton", "X point elevation", 1e-6),
+    ("*", "gauss-newton", "sigma", 1e-6),
+    ("*", "given", "X point", 2e-8),
+    # It starts where the conventional fit stopped, and stops before it is stationary.
+    ("*", "alternating", "X point elevation sigma", 3e-7),
+    ("*", "alternating", "covariance point_covariance condition", 5e-8),
+    # Self-tuning stops where no SD changes by 1e-9; with exact data the cost is rounding.
+    ("*", "auto uniform gaussian", "X point elevation", 3e-8),
+    ("*", "auto uniform gaussian", "covariance", 3e-8),
+    ("*", "auto uniform gaussian", "cost", 3e-7),
+    # An evidence is stationary in nothing: what it is made of differs by 1e-9 and is multiplied by
+    # squared residuals in SDs. On images whose offsets rest on their floor it may be anything.
+    ("*", "auto uniform", "log_odds", 1e-5),
+    ("covariances24", "auto", "sigma covariance condition probability mean_sd", 1e-7),
+    ("covariances24", "auto", "elevation_sd", 1e-7),
+    ("bounds24", "auto", "probability", 1e-7),
+    ("covariances-bounds12", "auto", "*", 1e-5),
+)
+"""File, calls, numbers, and what is allowed: what today's two roads differ by, measured."""
+
+
+def tolerance(family: str, call: str, number: str) -> float:
     """What a difference may be, in the units of :func:`differences`."""
-    return 1e-6 if road == "gradient" else 1e-8
+    allowed = TIGHT
+    for file, calls, names, value in LOOSER:
+        of_call = any(call == one or call == f"robust {one}" for one in calls.split())
+        if file in ("*", family) and of_call and (names == "*" or number in names.split()):
+            allowed = max(allowed, value)
+    return allowed
+
+
+GRADIENT_TOLERANCE = 1e-6
+"""Relative, see :func:`gradient_differences`."""
+
+SELF_TUNED = ("auto", "uniform", "gaussian", "robust auto", "robust gaussian")
+
+
+def stopped_early(family: Family, call: str, road: str) -> np.ndarray:
+    """Problems whose recorded answer is not at its minimum, by a fault of the code of that day.
+
+    With fewer than eight used images self-tuning holds its SDs, and ``calibrate`` then stopped at a
+    cosine of 1e-3 (``calibrate_batch`` at 1e-10): X was up to 3e-3 SDs off, ``differentiable``
+    false. Their numbers are not compared on that road; those of the batch are.
+    """
+    used = (family.arrays["mask"] > 0).sum(axis=1)
+    if road != "one" or call not in SELF_TUNED or family.probe is not None:
+        return np.zeros(len(family), bool)
+    return used < 8

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import numpy as np
-from golden.corpus import Arrays, Family
 from scipy.spatial.transform import Rotation
+
+from golden.corpus import Arrays, Family
 
 SEED = 20261121
 
 ORDINARY = ("uniform", "normal", "heavy-tailed", "one-sided", "masked", "small errors")
-HARD = ("few", "exact", "in the plane", "parallel", "one axis", "one pose", "line in the plane",
-        "narrow cone", "outliers", "NaN")  # fmt: skip
+HARD = (
+    "few",
+    "exact",
+    "in the plane",
+    "parallel",
+    "one axis",
+    "one pose",
+    "line in the plane",
+    "narrow cone",
+    "outliers",
+    "NaN",
+)
 """What is special about a problem; ``few`` uses 4 to 7 images, ``NaN`` is to fail."""
 
 
@@ -31,9 +42,11 @@ class Experiment:
     def __init__(self, rng: np.random.Generator, kind: str, count: int, *, sector: float = 0.0):
         self.count = count
         law = kind if kind in ("normal", "heavy-tailed", "one-sided") else "uniform"
-        size = 0.0 if kind in ("exact", "in the plane", "line in the plane") else rng.choice(
-            [0.3, 1.0, 2.0, 4.0]
-        )  # fmt: skip
+        size = (
+            0.0
+            if kind in ("exact", "in the plane", "line in the plane")
+            else rng.choice([0.3, 1.0, 2.0, 4.0])
+        )
         self.noise = 0.0 if kind == "exact" else float(rng.choice([0.02, 0.1, 0.4]))
         if kind == "small errors":
             size, self.noise = 0.02, 0.005
@@ -140,9 +153,7 @@ def times_family(name: str, images: int, kinds: list[str], probe: dict) -> Famil
     elements = np.stack([along, 0 * along, 0 * along], axis=1)
     if curved:
         angle = along / probe["radius_mm"]
-        elements = probe["radius_mm"] * np.stack(
-            [np.sin(angle), 0 * angle, np.cos(angle)], axis=1
-        )  # fmt: skip
+        elements = probe["radius_mm"] * np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
     half_angle = 0.9 * np.abs(along).max() / probe["radius_mm"] if curved else 0.0
     poses, times, masks = [], [], []
     for index, kind in enumerate(kinds):
@@ -159,8 +170,11 @@ def times_family(name: str, images: int, kinds: list[str], probe: dict) -> Famil
         poses.append(drawn.poses)
         times.append(heard)
         masks.append(mask)
-    arrays = {"poses": np.stack(poses), "times": np.stack(times),
-              "mask": np.stack(masks).astype(np.uint8)}  # fmt: skip
+    arrays = {
+        "poses": np.stack(poses),
+        "times": np.stack(times),
+        "mask": np.stack(masks).astype(np.uint8),
+    }
     return Family(name, kinds, arrays, probe=probe)
 
 

@@ -10,6 +10,7 @@ Each file says which commit and versions it was written by. When one may do that
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import platform
 import subprocess
@@ -20,16 +21,14 @@ from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
-FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-"""The compiler's: those of the tests, with which it takes half of the time."""
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from golden.flags import set_flags
 
-os.environ.setdefault("XLA_FLAGS", FLAGS)
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
+set_flags()
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
 from golden import corpus, draws  # noqa: E402
 
 
@@ -75,6 +74,7 @@ def record_gradients() -> None:
         arrays |= {f"{name}/{call_name}/{key}": value for key, value in found.items()}
         jax.clear_caches()
         print(f"gradient {name} {call_name}: {time.perf_counter() - began:.0f} s", flush=True)
+    arrays["about"] = np.array(json.dumps(written()))
     np.savez_compressed(corpus.FOLDER / "gradients.npz", **arrays)  # pyright: ignore
 
 

@@ -4,7 +4,7 @@
 gradient, with second derivatives from its differences. The objectives:
 
 - conventional: sum |q - p(0)|^2;
-- joint, offsets eliminated: (lateral / s1)^2 + (range / s2)^2 + (q_y / s3)^2, pairs of the first two
+- joint, offsets eliminated: (lateral / s1)^2 + (range / s2)^2 + (q_y / s3)^2, the first two
   decorrelated where an image has a covariance of its own;
 - joint, explicit: with an offset y_i of the target and a tracker error of SD tau on each axis, the
   squares of (q_x - x) / hypot(s1, tau), (hypot(y, q_z) - r) / hypot(s2, tau), (y - q_y) / tau and
@@ -19,6 +19,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
+
 from oracle.model import (
     Data,
     Unknowns,
@@ -31,7 +33,6 @@ from oracle.model import (
     size,
     target,
 )
-from scipy.optimize import least_squares
 
 Residual = Callable[[Unknowns], np.ndarray]
 
@@ -71,8 +72,16 @@ def minimise(
         def slope(step: np.ndarray) -> np.ndarray:
             return jacobian(lambda more: moved(step + more), count)
 
-        found = least_squares(moved, np.zeros(count), jac=slope, x_scale="jac", xtol=1e-9,
-                              ftol=1e-12, gtol=1e-12, max_nfev=200)  # fmt: skip
+        found = least_squares(
+            moved,
+            np.zeros(count),
+            jac=slope,
+            x_scale="jac",
+            xtol=1e-9,
+            ftol=1e-12,
+            gtol=1e-12,
+            max_nfev=200,
+        )
         u = start.moved(found.x, blocks)
     hessian, last = None, np.inf
     if near:
@@ -134,9 +143,12 @@ def joint(
 
 
 def joint_channels(
-    data: Data, blocks: tuple[str, ...], sigma: np.ndarray, start: Unknowns,
+    data: Data,
+    blocks: tuple[str, ...],
+    sigma: np.ndarray,
+    start: Unknowns,
     medium_sd: np.ndarray | None = None,
-) -> Fit:  # fmt: skip
+) -> Fit:
     """Given SDs of an element's distance and of the offset."""
 
     def residual(u: Unknowns) -> np.ndarray:
@@ -160,9 +172,12 @@ class ExplicitFit(Fit):
 
 
 def _explicit(
-    residual: Callable[[Unknowns, np.ndarray], np.ndarray], u: Unknowns, y: np.ndarray,
-    free: np.ndarray, blocks: tuple[str, ...],
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    residual: Callable[[Unknowns, np.ndarray], np.ndarray],
+    u: Unknowns,
+    y: np.ndarray,
+    free: np.ndarray,
+    blocks: tuple[str, ...],
+) -> tuple[np.ndarray, np.ndarray]:
     """Residuals and their Jacobian by the shared unknowns and the free offsets."""
     count, rows = size(blocks), np.flatnonzero(free)
 
@@ -175,9 +190,13 @@ def _explicit(
 
 
 def _newton(
-    residual: Callable[[Unknowns, np.ndarray], np.ndarray], u: Unknowns, y: np.ndarray,
-    free: np.ndarray, blocks: tuple[str, ...], rounds: int,
-) -> tuple[Unknowns, np.ndarray]:  # fmt: skip
+    residual: Callable[[Unknowns, np.ndarray], np.ndarray],
+    u: Unknowns,
+    y: np.ndarray,
+    free: np.ndarray,
+    blocks: tuple[str, ...],
+    rounds: int,
+) -> tuple[Unknowns, np.ndarray]:
     """Newton's method on the shared unknowns and the free offsets."""
     count, rows = size(blocks), np.flatnonzero(free)
 
@@ -211,12 +230,14 @@ def joint_explicit(
     def residual(u: Unknowns, y: np.ndarray) -> np.ndarray:
         q = target(data, u)
         lateral, distance = points(data, u)
-        return np.stack([
-            (q[:, 0] - lateral) / np.hypot(sigma[0], tau),
-            (np.sqrt(y**2 + q[:, 2] ** 2) - distance) / np.hypot(sigma[1], tau),
-            (y - q[:, 1]) / tau,
-            y / sigma[2],
-        ])  # fmt: skip
+        return np.stack(
+            [
+                (q[:, 0] - lateral) / np.hypot(sigma[0], tau),
+                (np.sqrt(y**2 + q[:, 2] ** 2) - distance) / np.hypot(sigma[1], tau),
+                (y - q[:, 1]) / tau,
+                y / sigma[2],
+            ]
+        )
 
     u, y = start, target(data, start)[:, 1].real / (1 + (tau / sigma[2]) ** 2)
     everything = np.ones(len(data), bool)
@@ -254,11 +275,19 @@ def bounded(data: Data, blocks: tuple[str, ...], bound: np.ndarray, start: Unkno
             return jacobian(lambda step: residual(v + step, here), len(v))
 
         found = least_squares(
-            residual, np.concatenate([np.zeros(count), y]), jac=along, bounds=(low, -low),
-            x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-14, max_nfev=500,
-        )  # fmt: skip
-        fits.append(_active_set(data, blocks, bound, here.moved(found.x[:count], blocks),
-                                found.x[count:]))  # fmt: skip
+            residual,
+            np.concatenate([np.zeros(count), y]),
+            jac=along,
+            bounds=(low, -low),
+            x_scale="jac",
+            xtol=1e-15,
+            ftol=1e-15,
+            gtol=1e-14,
+            max_nfev=500,
+        )
+        fits.append(
+            _active_set(data, blocks, bound, here.moved(found.x[:count], blocks), found.x[count:])
+        )
     return min(fits, key=lambda fit: fit.cost)
 
 
@@ -284,9 +313,13 @@ def _active_set(
 
 
 def alternate(
-    data: Data, blocks: tuple[str, ...], bound: np.ndarray, start: Unknowns,
-    tolerance_rad: float = 1e-3, tolerance_mm: float = 0.1,
-) -> tuple[Unknowns, np.ndarray]:  # fmt: skip
+    data: Data,
+    blocks: tuple[str, ...],
+    bound: np.ndarray,
+    start: Unknowns,
+    tolerance_rad: float = 1e-3,
+    tolerance_mm: float = 0.1,
+) -> tuple[Unknowns, np.ndarray]:
     """The paper's alternation: offsets to the closest points, two Gauss-Newton steps, and again.
 
     Until a round turns X by less than one tolerance and moves its origin by less than the other.
@@ -306,11 +339,14 @@ def alternate(
                 return circle(data, u.moved(step, blocks), y).ravel()
 
             along = jacobian(moved, size(blocks))
-            u = u.moved(-np.linalg.lstsq(along, moved(np.zeros(size(blocks))), rcond=None)[0],
-                        blocks)  # fmt: skip
+            u = u.moved(
+                -np.linalg.lstsq(along, moved(np.zeros(size(blocks))), rcond=None)[0], blocks
+            )
         turned = np.linalg.norm(u.rotation - before.rotation) / np.sqrt(8)
-        if (2 * np.arcsin(turned) < tolerance_rad
-                and np.linalg.norm(u.translation - before.translation) < tolerance_mm):  # fmt: skip
+        if (
+            2 * np.arcsin(turned) < tolerance_rad
+            and np.linalg.norm(u.translation - before.translation) < tolerance_mm
+        ):
             break
     return u, closest(u)
 

@@ -122,8 +122,9 @@ def errors(data: Data, u: Unknowns) -> np.ndarray:
     """(n, 3): lateral error, range error, offset."""
     q = target(data, u)
     lateral, distance = points(data, u)
-    return np.stack([q[:, 0] - lateral, np.sqrt(q[:, 1] ** 2 + q[:, 2] ** 2) - distance, q[:, 1]],
-                    axis=1)  # fmt: skip
+    return np.stack(
+        [q[:, 0] - lateral, np.sqrt(q[:, 1] ** 2 + q[:, 2] ** 2) - distance, q[:, 1]], axis=1
+    )
 
 
 def circle(data: Data, u: Unknowns, y: np.ndarray) -> np.ndarray:
@@ -169,11 +170,11 @@ def linear_start(data: Data, blocks: tuple[str, ...]) -> Unknowns:
     rotation = np.stack([first, np.cross(third, first), third], axis=1)
     u = Unknowns(rotation, found[6:9], found[9:12], scale)
     # The rest of the linear unknowns, with the rotation held.
-    q_part = np.einsum("nij,nj->ni", data.rotation,
-                       np.stack([lateral * scale[0], 0 * lateral, distance * scale[1]], 1)
-                       @ rotation.T)  # fmt: skip
+    q_part = np.einsum(
+        "nij,nj->ni",
+        data.rotation,
+        np.stack([lateral * scale[0], 0 * lateral, distance * scale[1]], 1) @ rotation.T,
+    )
     known = np.concatenate([data.rotation, np.tile(-np.eye(3), (count, 1, 1))], axis=2)
-    rest = np.linalg.lstsq(
-        known.reshape(-1, 6), -(q_part + data.origin).ravel(), rcond=None
-    )[0]  # fmt: skip
+    rest = np.linalg.lstsq(known.reshape(-1, 6), -(q_part + data.origin).ravel(), rcond=None)[0]
     return replace(u, translation=rest[:3], point=rest[3:])

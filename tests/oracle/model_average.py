@@ -20,8 +20,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from oracle.model import Data, Unknowns, channels, errors, jacobian, size, target
 from scipy.special import logsumexp, roots_legendre
+
+from oracle.model import Data, Unknowns, channels, errors, jacobian, size, target
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,12 @@ class Distribution:
 
 
 UNIFORM = tuple(Distribution("uniform", np.exp(0.14 - 0.055 * k), 0.08) for k in range(5))
-ALL = (*UNIFORM, Distribution("bell", 1.05, 0.2), Distribution("gaussian", 1.0, 0.2),
-       Distribution("student", 1.10, 0.2))  # fmt: skip
+ALL = (
+    *UNIFORM,
+    Distribution("bell", 1.05, 0.2),
+    Distribution("gaussian", 1.0, 0.2),
+    Distribution("student", 1.10, 0.2),
+)
 
 
 @dataclass(frozen=True)
@@ -81,9 +86,13 @@ Moments = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def exact_moments(
-    family: str, sd: float, centre: np.ndarray, variance: np.ndarray, low: np.ndarray,
+    family: str,
+    sd: float,
+    centre: np.ndarray,
+    variance: np.ndarray,
+    low: np.ndarray,
     high: np.ndarray,
-) -> Moments:  # fmt: skip
+) -> Moments:
     """Of the density times N(u; centre, variance) between low and high, by Gauss-Legendre."""
     node, weight = roots_legendre(24)
     width = np.sqrt(variance)
@@ -103,15 +112,21 @@ def exact_moments(
     mass = half[:, None] * weight[:, None] * density(family, u, sd)
     mass = mass * np.exp(-0.5 * (u - centre) ** 2 / variance + reference)
     total = mass.sum(axis=(0, 1))
-    mean = (u * mass).sum(axis=(0, 1)) / total
-    spread = ((u - mean) ** 2 * mass).sum(axis=(0, 1)) / total
+    # Where the cut leaves nothing of the density there is no mass, and the mean is the edge.
+    shares = np.where(total > 0, mass, 1.0)
+    mean = (u * shares).sum(axis=(0, 1)) / shares.sum(axis=(0, 1))
+    spread = ((u - mean) ** 2 * shares).sum(axis=(0, 1)) / shares.sum(axis=(0, 1))
     return np.log(total) - reference - 0.5 * np.log(2 * np.pi * variance), mean, spread
 
 
 def documented_moments(
-    family: str, sd: float, centre: np.ndarray, variance: np.ndarray, low: np.ndarray,
+    family: str,
+    sd: float,
+    centre: np.ndarray,
+    variance: np.ndarray,
+    low: np.ndarray,
     high: np.ndarray,
-) -> Moments:  # fmt: skip
+) -> Moments:
     """The same by sixteen equidistant nodes within 4.5 SDs of the Gaussian.
 
     Gregory's end weights where the integrand may end abruptly: always but for an uncut Student's t.
@@ -153,8 +168,9 @@ def documented_moments(
 
 
 QUADRATURES: dict[str, Callable[..., Moments]] = {
-    "exact": exact_moments, "documented": documented_moments,
-}  # fmt: skip
+    "exact": exact_moments,
+    "documented": documented_moments,
+}
 
 
 # --- Evidence of the Gaussian models -----------------------------------------------------------
@@ -202,8 +218,13 @@ class Linear:
     offset: np.ndarray
 
 
-def tune(model: Model, start: Unknowns, blocks: tuple[str, ...], recipe: Recipe,
-         medium: Callable[[Unknowns], np.ndarray] | None) -> Linear:  # fmt: skip
+def tune(
+    model: Model,
+    start: Unknowns,
+    blocks: tuple[str, ...],
+    recipe: Recipe,
+    medium: Callable[[Unknowns], np.ndarray] | None,
+) -> Linear:
     """Unknowns, mean and SDs from nearby ones, and the Laplace evidence there."""
     count = size(blocks)
     least = max(1e-3 * model.sigma.max(), 1e-6)
@@ -344,9 +365,7 @@ def propagate(linear: Linear, sd: float, recipe: Recipe, bound: np.ndarray | Non
             evidence = site.sum() + 0.5 * right @ before - 0.5 * np.linalg.slogdet(information)[1]
             crowded = bool((tau * without > 990).any())
             new = sites(found, centre, without)
-            tau, nu = (
-                tau + recipe.damping * (new[0] - tau), nu + recipe.damping * (new[1] - nu)
-            )  # fmt: skip
+            tau, nu = (tau + recipe.damping * (new[0] - tau), nu + recipe.damping * (new[1] - nu))
             covariance, mean, information, _ = belief(tau, nu)
             change = float(np.sqrt((mean - before) @ information @ (mean - before)))
             result[k] = Belief(mean, covariance, evidence, np.inf if crowded else change)
@@ -409,19 +428,39 @@ def models(data: Data, sigma: np.ndarray, on_channels: bool) -> list[Model]:
 
 
 def average(
-    data: Data, start: Unknowns, sigma: np.ndarray, blocks: tuple[str, ...],
-    recipe: Recipe | None = None, *, on_channels: bool = False,
+    data: Data,
+    start: Unknowns,
+    sigma: np.ndarray,
+    blocks: tuple[str, ...],
+    recipe: Recipe | None = None,
+    *,
+    on_channels: bool = False,
     medium: Callable[[Unknowns], np.ndarray] | None = None,
-) -> Average:  # fmt: skip
+) -> Average:
     """Weigh the models and average the distributions' answers, from the self-tuned Gaussian fit."""
-    recipe = Recipe() if recipe is None else recipe
+    # A distribution whose edges exclude an image runs into zeros and NaN, and does not count.
+    with np.errstate(all="ignore"):
+        return _average(data, start, sigma, blocks, recipe or Recipe(), on_channels, medium)
+
+
+def _average(
+    data: Data,
+    start: Unknowns,
+    sigma: np.ndarray,
+    blocks: tuple[str, ...],
+    recipe: Recipe,
+    on_channels: bool,
+    medium: Callable[[Unknowns], np.ndarray] | None,
+) -> Average:
     weighed = models(data, sigma, on_channels)
     tuned = [tune(model, start, blocks, recipe, medium) for model in weighed]
     # One more SD that is tuned costs half the logarithm of the number of images.
-    scores = np.array([
-        linear.log_evidence + 0.5 * model.tied * np.log(len(data))
-        for linear, model in zip(tuned, weighed, strict=True)
-    ])  # fmt: skip
+    scores = np.array(
+        [
+            linear.log_evidence + 0.5 * model.tied * np.log(len(data))
+            for linear, model in zip(tuned, weighed, strict=True)
+        ]
+    )
     chosen = int(np.argmax(scores - recipe.log_odds * np.array([m.mean for m in weighed])))
     pair = scores[chosen - chosen % 2 :][:2]
     gaussian_odds = float(pair[1] - pair[0])
@@ -435,6 +474,12 @@ def average(
     good = np.isfinite(evidence) & (changes < recipe.largest_change)
     means = np.stack([belief.mean for belief in beliefs])
     within = np.stack([belief.covariance for belief in beliefs])
+    # Those that do not count weigh nothing, whatever they hold.
+    evidence = np.where(good, evidence, -np.inf)
+    means, within = (
+        np.where(good[:, None], means, 0.0),
+        np.where(good[:, None, None], within, np.eye(means.shape[1])),
+    )
     # Savage and Dickey: evidence with b over that without is N(0; 0, (2 s)^2) over the density of
     # b = 0 afterwards.
     b, variance = means[:, -1] + linear.b, within[:, -1, -1]
@@ -467,8 +512,11 @@ def average(
         covariance=total[:-1, :-1],
         sigma=linear.sigma,
         probability={
-            name: float(sum(w for w, d in zip(weight, recipe.distributions, strict=True)
-                            if d.family == name))
+            name: float(
+                sum(
+                    w for w, d in zip(weight, recipe.distributions, strict=True) if d.family == name
+                )
+            )
             for name in families
         },
         mean=float(linear.b + answer[-1]) if has_mean else 0.0,
@@ -478,7 +526,7 @@ def average(
         log_odds_mean=min(gaussian_odds, odds) if asked else gaussian_odds,
         log_odds_own=own_odds,
         changes=changes,
-    )  # fmt: skip
+    )
 
 
 def uniform_only(recipe: Recipe) -> Recipe:

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+
 from oracle.least_squares import Fit, medium, minimise, standardised
 from oracle.model import Data, Unknowns, channels, jacobian, size, target
 
@@ -40,15 +41,18 @@ def point_components(data: Data, shape: np.ndarray | None = None) -> Components:
 def channel_components(data: Data) -> Components:
     """Element distances and offset."""
     heard = np.asarray(data.heard) > 0
-    return lambda u, sigma: [
-        channels(data, u)[heard] / sigma[0], target(data, u)[:, 1] / sigma[1]
-    ]  # fmt: skip
+    return lambda u, sigma: [channels(data, u)[heard] / sigma[0], target(data, u)[:, 1] / sigma[1]]
 
 
 def solve(
-    components: Components, u: Unknowns, sigma: np.ndarray, blocks: tuple[str, ...],
-    medium_sd: np.ndarray | None, *, near: bool = True,
-) -> Fit:  # fmt: skip
+    components: Components,
+    u: Unknowns,
+    sigma: np.ndarray,
+    blocks: tuple[str, ...],
+    medium_sd: np.ndarray | None,
+    *,
+    near: bool = True,
+) -> Fit:
     """The weighted fit."""
 
     def residual(u: Unknowns) -> np.ndarray:
@@ -65,17 +69,21 @@ def _first(components: Components, u: Unknowns, count: int) -> np.ndarray:
 
 
 def helmert(
-    components: Components, start: Unknowns, count: int, blocks: tuple[str, ...],
-    medium_sd: np.ndarray | None = None, rounds: int = 400,
-) -> Tuned:  # fmt: skip
+    components: Components,
+    start: Unknowns,
+    count: int,
+    blocks: tuple[str, ...],
+    medium_sd: np.ndarray | None = None,
+    rounds: int = 400,
+) -> Tuned:
     """Helmert's iteration to its fixed point; no SD below a thousandth of the largest."""
     sigma, u = _first(components, start, count), start
     change = np.inf
     for _ in range(rounds):
         fit = solve(components, u, sigma, blocks, medium_sd, near=change < 0.03)
         u = fit.unknowns
-        leverage = np.einsum("ra,ab,rb->r", fit.jacobian, np.linalg.inv(fit.jacobian.T @ fit.jacobian),
-                             fit.jacobian)  # fmt: skip
+        along = fit.jacobian
+        leverage = np.einsum("ra,ab,rb->r", along, np.linalg.inv(along.T @ along), along)
         new, at = sigma.copy(), 0
         for which, part in enumerate(components(u, sigma)):
             rows = slice(at, at + len(part))
@@ -89,9 +97,12 @@ def helmert(
 
 
 def reml(
-    components: Components, start: Unknowns, count: int, blocks: tuple[str, ...],
+    components: Components,
+    start: Unknowns,
+    count: int,
+    blocks: tuple[str, ...],
     medium_sd: np.ndarray | None = None,
-) -> Tuned:  # fmt: skip
+) -> Tuned:
     """Restricted maximum likelihood, by Newton's method on the logarithms of the SDs."""
     log_sigma, u = np.log(_first(components, start, count)), start
     change = np.inf
@@ -140,7 +151,7 @@ def reml(
             values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
             # Uphill curvature is turned about: a descent step always.
             step = -vectors @ ((vectors.T @ slope(log_sigma)) / np.maximum(np.abs(values), 1e-3))
-            step *= min(1.0, 1.0 / np.abs(step).max())
+            step /= max(1.0, np.abs(step).max())
             log_sigma = log_sigma + step
             if np.abs(step).max() < 1e-12:
                 break
