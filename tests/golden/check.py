@@ -40,8 +40,8 @@ def tasks(families: list[str] | None, calls: list[str] | None) -> list[Task]:
         for call in corpus.CALLS[family]
         for road in call.roads
     ]
-    if (corpus.FOLDER / "gradients.npz").exists():
-        found += [(family, call, "gradient") for family, call in corpus.GRADIENTS]
+    recorded = corpus.recorded_gradients()
+    found += [(*which, "gradient") for which in corpus.GRADIENTS if "/".join(which) in recorded]
     found = [
         task
         for task in found
@@ -71,11 +71,7 @@ def check(task: Task) -> tuple[Task, list[str], bool, float]:
 
 def check_gradient(family: corpus.Family, call: corpus.Call) -> tuple[list[str], bool]:
     """The derivatives of one call."""
-    with np.load(corpus.FOLDER / "gradients.npz", allow_pickle=False) as stored:
-        prefix = f"{family.name}/{call.name}/"
-        recorded = {
-            key.removeprefix(prefix): stored[key] for key in stored.files if key.startswith(prefix)
-        }
+    recorded = corpus.recorded_gradients()[f"{family.name}/{call.name}"]
     found = corpus.gradient_arrays(family, call, recorded["rows"], recorded["weight"])
     worst = corpus.gradient_differences(recorded, found)
     summary = "  ".join(f"{name} {values.max():.1e}" for name, values in worst.items())

@@ -526,6 +526,18 @@ def gradient_arrays(family: Family, call: Call, rows: np.ndarray, weight: np.nda
     }
 
 
+def recorded_gradients() -> dict[str, Arrays]:
+    """The recorded derivatives, by ``family/call``."""
+    path, found = FOLDER / "gradients.npz", {}
+    if path.exists():
+        with np.load(path, allow_pickle=False) as stored:
+            for key in stored.files:
+                if "/" in key:
+                    which, _, name = key.rpartition("/")
+                    found.setdefault(which, {})[name] = stored[key]
+    return found
+
+
 def gradient_differences(recorded: Arrays, found: Arrays) -> Arrays:
     """Relative to the largest derivative of a problem's own kind, problem by problem."""
     result = {}

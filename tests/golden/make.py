@@ -60,10 +60,16 @@ def gradient_rows(family: corpus.Family, name: str) -> np.ndarray:
     return good[np.linspace(0, len(good) - 1, corpus.GRADIENT_PROBLEMS).astype(int)]
 
 
-def record_gradients() -> None:
-    """Write the derivatives' file."""
-    arrays: corpus.Arrays = {}
+def record_gradients(again: bool) -> None:
+    """Write the derivatives' file, after each call; those that are there already stay.
+
+    Args:
+        again: record them all.
+    """
+    recorded = {} if again else corpus.recorded_gradients()
     for name, call_name in corpus.GRADIENTS:
+        if f"{name}/{call_name}" in recorded:
+            continue
         began = time.perf_counter()
         family, _ = corpus.load(name)
         images = family.arrays["mask"].shape[1]
@@ -71,11 +77,14 @@ def record_gradients() -> None:
         weight[:12].reshape(3, 4)[:, :3] *= 50.0  # rotations in mm at 50 mm
         rows = gradient_rows(family, call_name)
         found = corpus.gradient_arrays(family, family.call(call_name), rows, weight)
-        arrays |= {f"{name}/{call_name}/{key}": value for key, value in found.items()}
+        recorded[f"{name}/{call_name}"] = found
+        arrays = {
+            f"{which}/{key}": v for which, each in recorded.items() for key, v in each.items()
+        }
+        arrays["about"] = np.array(json.dumps(written()))
+        np.savez_compressed(corpus.FOLDER / "gradients.npz", **arrays)  # pyright: ignore
         jax.clear_caches()
         print(f"gradient {name} {call_name}: {time.perf_counter() - began:.0f} s", flush=True)
-    arrays["about"] = np.array(json.dumps(written()))
-    np.savez_compressed(corpus.FOLDER / "gradients.npz", **arrays)  # pyright: ignore
 
 
 def main() -> None:
@@ -83,6 +92,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--inputs", action="store_true", help="draw the problems anew")
     parser.add_argument("--family", action="append", help="only this one (or gradients)")
+    parser.add_argument("--again", action="store_true", help="gradients: also those recorded")
     chosen = parser.parse_args()
     wanted = chosen.family or [*corpus.CALLS, "gradients"]
     for family in draws.families():
@@ -100,7 +110,7 @@ def main() -> None:
                 print(f"{family.name} {call.name} {road}: {seconds:.0f} s", flush=True)
         corpus.save(replace(family, written=written()), answers)
     if "gradients" in wanted:
-        record_gradients()
+        record_gradients(chosen.again)
 
 
 if __name__ == "__main__":

@@ -89,9 +89,12 @@ def turn(w: np.ndarray) -> np.ndarray:
     """exp of the cross product matrix, by its series (complex w allowed)."""
     cross = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
     total = term = np.eye(3, dtype=cross.dtype)
-    for k in range(1, 30):
+    largest = np.abs(w).max()
+    for k in range(1, 40):
         term = term @ cross / k
         total = total + term
+        if np.abs(term).max() <= 1e-18 * largest:
+            break
     return total
 
 
