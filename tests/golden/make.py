@@ -41,7 +41,7 @@ def written() -> dict[str, str]:
         return done.stdout.strip()
 
     changed = git("status", "--porcelain", "--", str(folder.parents[1] / "jaxcal"))
-    names = ("jax", "jaxlib", "numpy", "equinox", "optimistix", "jaxlie")
+    names = ("jax", "jaxlib", "numpy", "equinox", "optimistix")
     return {
         "commit": git("rev-parse", "HEAD") + (" with changes to jaxcal/" if changed else ""),
         "date": date.today().isoformat(),
