@@ -31,8 +31,9 @@ from common import arguments, machine, results_folder, write_table
 
 from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.io.atomic import atomic_path
-from jaxcal.study.cluster import compute_from_text, core_groups
+from jaxcal.study.cluster import compute_from_text
 from jaxcal.study.spec import Spec, parse_spec
+from jaxcal.study.workers import core_groups
 
 SEED, WORKERS = 20261124, 2
 TOLERANCE_MM = 1e-6

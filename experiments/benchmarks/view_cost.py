@@ -114,7 +114,7 @@ def measure(pages: int, seconds: float) -> list[object]:
 
 
 def main() -> None:
-    options = arguments(__doc__)
+    options = arguments(__doc__ or "")
     seconds = QUICK_SECONDS if options.quick else SECONDS
     rows = [measure(pages, seconds) for pages in (0, 1, 2)]
     write_table(results_folder(options.quick) / "view_cost.csv", HEADER, rows)
