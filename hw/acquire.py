@@ -18,6 +18,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from hw.acquire_live import Estimator
+from hw.choices import OPERATORS, PLACEMENTS
 from hw.errors import DeviceError, RefusedError
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
@@ -44,8 +45,6 @@ from hw.view.feed import Audience, Nobody, watched
 from jaxcal.cli.common import ExitCode
 from jaxcal.errors import CalibrationError, InputError
 
-PLACEMENTS = ("amplitude-scan", "threshold-climb", "pattern-injection", "none")
-OPERATORS = ("person", "window", "simulated")
 MOST_IMAGES = 1000
 _MOST_GIVEN_UP = 3
 _FURTHEST_START_MM = 3.0

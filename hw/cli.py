@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from hw.choices import OPERATORS, PLACEMENTS
 from jaxcal import __version__
 from jaxcal.cli.common import POSITIVE, ExitCode, exit_code
 from jaxcal.cli.run import run
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 
 _RESUMED_BY_ITSELF = 30
 _POSE_HZ = {"cb": 125, "e": 500}
-PLACEMENTS = ("amplitude-scan", "threshold-climb", "pattern-injection", "none")
-OPERATORS = ("person", "window", "simulated")
 
 
 @click.group(

@@ -8,6 +8,7 @@ uncertainty at the solution; and all of it put together as a :class:`Calibration
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -194,29 +195,18 @@ def _run_method(problem: Problem, given: Given, plan: Plan) -> Solution:
             translation_change=done.translation_change,
         )  # fmt: skip
 
+    common: dict[str, Any] = {
+        "max_steps": options.max_iterations,
+        "trace": options.trace,
+        "solver": other,
+    }
     if plan.self_tuning and isinstance(prior, AbstractSelfTuned):
-        tuned = self_tuned(
-            start,
-            prior,
-            problem,
-            blocks,
-            max_steps=options.max_iterations,
-            trace=options.trace,
-            solver=other,
-        )
+        tuned = self_tuned(start, prior, problem, blocks, **common)
         return solution(
             tuned.fit, prior.with_sigma(tuned.sigma), tuned.fit.settled & tuned.settled,
             sigma_floored=tuned.floored, variance_rounds=tuned.rounds,
         )  # fmt: skip
-    fit = joint(
-        start,
-        prior,
-        problem,
-        blocks,
-        max_steps=options.max_iterations,
-        trace=options.trace,
-        solver=other,
-    )
+    fit = joint(start, prior, problem, blocks, **common)
     return solution(fit, prior, fit.settled)
 
 
