@@ -41,7 +41,11 @@ def main(port: int) -> int:
         except OSError as error:
             answer(error=f"no page on port {port}: {error.strerror or error}")
             return 2
-        ignore_browsers(server)
+        try:
+            ignore_browsers(server)
+        except NotImplementedError as error:
+            answer(error=str(error))
+            return 2
         from hw.view.page import Page
 
         page = Page(server)
@@ -59,12 +63,21 @@ def ignore_browsers(server: Any) -> None:
 
     viser acts on some messages by itself: it would open a tunnel through a public server when a
     page asks for a link to share, and tell all pages what one of them put into a panel.
+
+    Raises:
+        NotImplementedError: a viser whose messages cannot be dropped; it must not be shown.
     """
+    # viser has no public way; a version that renamed this must not be served with an open ear.
+    listener = getattr(server, "_websock_server", None)
+    if not callable(getattr(listener, "_handle_incoming_message", None)):
+        raise NotImplementedError(
+            "this viser takes messages of browsers in a way that is not known: install viser 1.x"
+        )
 
     async def dropped(client_id: int, message: object) -> None:
         return None
 
-    server._websock_server._handle_incoming_message = dropped
+    listener._handle_incoming_message = dropped  # pyright: ignore[reportOptionalMemberAccess]
 
 
 def messages(source: RawIOBase) -> Iterator[tuple[dict[str, Any], np.ndarray | None]]:
