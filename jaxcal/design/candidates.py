@@ -1,0 +1,235 @@
+"""Poses to choose from: what a probe can do over a region, or what a recording can be added to.
+
+Candidates run through one Sobol sequence over the five numbers of
+:mod:`jaxcal.design.constraints`, turned round by a seed: tilts uniform over the cone's cap, turns
+and places even. Those that the constraints do not allow are passed over.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.design.constraints import Constraints, Region
+from jaxcal.design.information import Model
+from jaxcal.design.noise import Noise
+from jaxcal.errors import InputError
+from jaxcal.geometry import check_poses, nearest_rotations
+from jaxcal.probe import Probe
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+    from jaxcal.recording import Recording
+
+COUNT = 5000
+"""Candidates of a plan; twice as many change the predicted error by less than 1 %."""
+MOST_CANDIDATES = 200_000
+_TRIES_PER_POSE = 50
+_LEAST_CONE_DEG, _LEAST_TURN_DEG = 30.0, 60.0
+_WIDER = 0.15
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Poses to choose from.
+
+    Attributes:
+        poses: (m, 4, 4) probe -> tracker, mm.
+        model: X, target and SDs.
+        constraints: what polished poses must keep.
+        taken: (k, 4, 4) poses of the images that there are already.
+        used: (k,) which of these a calibration used.
+    """
+
+    poses: Float[np.ndarray, "m 4 4"]
+    model: Model
+    constraints: Constraints
+    taken: Float[np.ndarray, "k 4 4"] | None = None
+    used: np.ndarray | None = None
+    _checked: bool = field(default=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self._checked:
+            return
+        if not 1 <= len(self.poses) <= MOST_CANDIDATES:
+            raise InputError(
+                f"there must be 1 to {MOST_CANDIDATES} candidates, not {len(self.poses)}"
+            )
+        object.__setattr__(self, "poses", check_poses(self.poses, what="candidate pose"))
+        # Copies with other SDs, or with some of the poses, need not look again.
+        object.__setattr__(self, "_checked", True)
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    @property
+    def numbers(self) -> Float[np.ndarray, "m 5"]:
+        """The five numbers of each pose."""
+        model = self.model
+        return self.constraints.coordinates(self.poses, model.image_to_probe, model.point)
+
+
+def sobol_numbers(count: int, constraints: Constraints, seed: int) -> Float[np.ndarray, "n 5"]:
+    """The first ``count`` points of the sequence (rounded up to a power of two)."""
+    from scipy.stats import qmc
+
+    sequence = qmc.Sobol(5, scramble=False)
+    draws = sequence.random_base2(int(np.ceil(np.log2(max(count, 2)))))
+    # Sobol points are balanced in powers of two; turned round in the unit cube, they stay even.
+    fraction = (draws + np.random.default_rng(seed).random(5)) % 1.0
+    return numbers_of(fraction, constraints)
+
+
+def numbers_of(
+    fraction: Float[np.ndarray, "n 5"], constraints: Constraints
+) -> Float[np.ndarray, "n 5"]:
+    """Five numbers of points of the unit cube: tilt and azimuth, turn, lateral, depth."""
+    tilt = np.arccos(1 - fraction[:, 0] * (1 - np.cos(np.radians(constraints.cone_deg))))
+    azimuth = 2 * np.pi * fraction[:, 1]
+    return np.column_stack([
+        2 * fraction[:, 3] - 1, 2 * fraction[:, 4] - 1,
+        tilt * np.cos(azimuth), tilt * np.sin(azimuth),
+        np.radians(constraints.turn_deg) * (2 * fraction[:, 2] - 1),
+    ])  # fmt: skip
+
+
+def sobol_poses(
+    count: int, model: Model, constraints: Constraints, seed: int = 0
+) -> tuple[Float[np.ndarray, "n 4 4"], int]:
+    """The first ``count`` allowed poses of the sequence, and how many were passed over before.
+
+    Fewer where the constraints leave fewer of 50 tries a pose.
+    """
+    x, point = model.image_to_probe, model.point
+    found: list[np.ndarray] = []
+    passed = first = 0
+    # A part of the sequence is nearly always enough, and a check may be dear.
+    for tries in (2 * count, 8 * count, _TRIES_PER_POSE * count):
+        numbers = sobol_numbers(tries, constraints, seed)[first:]
+        first += len(numbers)
+        poses = constraints.poses(numbers, x, point)
+        good = np.flatnonzero(constraints.keeps(poses, x, point))
+        good = good[: count - sum(map(len, found))]
+        found.append(poses[good])
+        if sum(map(len, found)) == count:
+            return np.concatenate(found), passed + int(good[-1]) + 1 - len(good)
+        passed += len(poses) - len(good)
+    return np.concatenate(found), passed
+
+
+def make_candidates(
+    probe: Probe | None = None,
+    region: Region | None = None,
+    *,
+    count: int = COUNT,
+    constraints: Constraints | None = None,
+    model: Model | None = None,
+    seed: int = 0,
+) -> Candidates:
+    """Candidates from nothing but a probe and a region.
+
+    X and the target's place need not be known: which poses tell most depends on where the target is
+    in the image and on how the image is turned, not on where the probe's frame is on the probe.
+
+    Args:
+        probe: the transducer, for the region and for the SDs; a linear one without.
+        region: of the image, for the target; by default most of what lies in front of the probe.
+        count: how many candidates.
+        constraints: cone, turns, box, reach; its region counts where ``region`` is None.
+        model: X, target and SDs as far as they are known.
+        seed: another one gives other candidates of the same quality.
+
+    Raises:
+        InputError: constraints that leave too few poses.
+    """
+    if constraints is None:
+        default = Region() if probe is None else Region.of_probe(probe)
+        constraints = Constraints(region=default)
+    if region is not None:
+        constraints = replace(constraints, region=region)
+    if model is None:
+        model = Model() if probe is None else Model(noise=Noise.of_probe(probe))
+    poses, _ = sobol_poses(count, model, constraints, seed)
+    if len(poses) < count:
+        raise InputError(
+            f"only {len(poses)} of {count} candidate poses stay inside the constraints: widen box "
+            "or reach, or narrow the cone"
+        )
+    return Candidates(poses, model, constraints)
+
+
+def candidates_around(
+    recording: Recording,
+    result: Calibration,
+    *,
+    count: int = COUNT,
+    region: Region | None = None,
+    cone_deg: float | None = None,
+    turn_deg: float | None = None,
+    constraints: Constraints | None = None,
+    seed: int = 0,
+) -> Candidates:
+    """Candidates for what to add to a recording: about the mean orientation of its images.
+
+    Args:
+        recording: what was calibrated.
+        result: its calibration; it may be an unobservable one.
+        count: how many.
+        region: of the image; by default where the target was, and the probe's face over that depth.
+        cone_deg: half angle of the cone; by default what the images covered, at least 30 degrees.
+        turn_deg: turns either way; by default what they covered, at least 60 degrees.
+        constraints: instead of the three before, and of the mean orientation.
+        seed: see :func:`make_candidates`.
+
+    Raises:
+        InputError: a calibration that failed.
+    """
+    answer = result.numpy()
+    x, point = np.asarray(answer.image_to_probe, float), np.asarray(answer.point, float)
+    if not (np.isfinite(x).all() and np.isfinite(point).all()):
+        raise InputError("the calibration failed: there is nothing to plan from")
+    poses = recording.calibration.poses
+    used = np.asarray(answer.mask) > 0
+    model = Model(x, point, scale="scale" in result.blocks)
+    targets = model.targets(poses)
+    sigma = np.asarray(answer.sigma, float)
+    if np.isfinite(sigma).all():
+        model = replace(model, noise=Noise.learned(result, targets))
+    if constraints is None:
+        images = poses[used, :3, :3] @ x[:3, :3]
+        reference, _ = nearest_rotations(images.mean(axis=0)[None])
+        constraints = Constraints(
+            region=_seen_region(recording, targets[used]) if region is None else region,
+            reference=reference[0],
+        )
+        seen = constraints.coordinates(poses[used], x, point)
+        spread = np.degrees(np.abs(np.stack([np.hypot(seen[:, 2], seen[:, 3]), seen[:, 4]])))
+        cone, turn = spread.max(axis=1)
+        constraints = replace(
+            constraints,
+            cone_deg=min(max(cone, _LEAST_CONE_DEG), 85.0) if cone_deg is None else cone_deg,
+            turn_deg=min(max(turn, _LEAST_TURN_DEG), 180.0) if turn_deg is None else turn_deg,
+        )
+    found, _ = sobol_poses(count, model, constraints, seed)
+    return Candidates(found, model, constraints, poses, used)
+
+
+def _seen_region(recording: Recording, targets: Float[np.ndarray, "n 3"]) -> Region:
+    """Where the target was, somewhat wider; at least most of the probe's face where it is known."""
+    probe = recording.probe
+    whole = Region() if probe is None else Region.of_probe(probe)
+    if probe is not None and whole.radius_mm is not None:
+        unit = whole.unit(targets)
+        far = whole.depth_mm[0] + 0.5 * (unit[:, 1].max() + 1) * np.ptp(whole.depth_mm)
+        return replace(whole, depth_mm=(whole.depth_mm[0], max(far, whole.depth_mm[0] + 20.0)))
+    left, right = targets[:, 0].min(), targets[:, 0].max()
+    near, far = targets[:, 2].min(), targets[:, 2].max()
+    aside, deeper = _WIDER * max(right - left, 20.0), _WIDER * max(far - near, 20.0)
+    lateral, depth = (left - aside, right + aside), (max(near - deeper, 5.0), far + deeper)
+    if probe is not None:
+        lateral = (min(left, whole.lateral_mm[0]), max(right, whole.lateral_mm[1]))
+    depth = (min(depth), max(depth))
+    return Region(tuple(map(float, lateral)), tuple(map(float, depth)))  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,169 @@
+"""What a plan is for: the weight matrices W, and what a further pose gains.
+
+TRE. At an image point p the error of X Exp(d) p is J_p d with J_p = [I, -[p]x] (mm), so its mean
+square over an image region is tr(W S), W = mean of J_p'J_p.
+
+RP (Eq. 8). The reconstructed points B_i X p_i scatter by J_i d about their mean, J_i = R_i R_X J_p;
+the expected square is tr(W S), W = sum_i (J_i - mean J)'(J_i - mean J) / (n - 1) over the test set.
+
+D. ln det S: the volume of the confidence ellipsoid of all unknowns.
+
+Gain. With G of one more pose, A = G S G' and Woodbury's identity, tr(W S) falls by
+
+    tr((I + A)^-1 G S W S G'),
+
+and ln det S by ln det(I + A): matrices of 3x3.
+
+SDs that nobody has tuned may be wrong. A criterion is then the mean of ln tr(W S) over a few sets
+of SDs (:func:`hypotheses`), of which only the ratios matter.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxcal.design.information import Model
+from jaxcal.errors import InputError
+from jaxcal.geometry import AnyArray
+
+Criterion = Literal["tre", "rp", "d"]
+_PIECE = 800
+"""Poses whose products are computed at once."""
+
+CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
+
+
+def check_criterion(criterion: str) -> None:
+    """Raise InputError for a name that is no criterion."""
+    if criterion not in CRITERIA:
+        raise InputError(f"criterion must be {', '.join(CRITERIA[:-1])} or {CRITERIA[-1]}, "
+                         f"not {criterion!r}")  # fmt: skip
+
+
+def tre_weight(points: Float[np.ndarray, "m 3"], size: int = 9) -> Float[np.ndarray, "p p"]:
+    """W of the mean squared TRE over image points [lateral, 0, axial], mm."""
+    moved = _point_jacobian(points)
+    weight = np.zeros((size, size))
+    weight[:6, :6] = np.einsum("mia,mib->ab", moved, moved) / len(points)
+    return weight
+
+
+def rp_weight(
+    poses: Float[np.ndarray, "m 4 4"],
+    points: Float[np.ndarray, "m 3"],
+    image_to_probe: Float[np.ndarray, "4 4"],
+    size: int = 9,
+) -> Float[np.ndarray, "p p"]:
+    """W of the expected square of Eq. 8 over a test set.
+
+    Args:
+        poses: of the test images, probe -> tracker.
+        points: where the target is in them, mm.
+        image_to_probe: X.
+        size: number of unknowns.
+    """
+    moved = poses[:, :3, :3] @ image_to_probe[:3, :3] @ _point_jacobian(points)
+    moved = moved - moved.mean(axis=0)
+    weight = np.zeros((size, size))
+    weight[:6, :6] = np.einsum("mia,mib->ab", moved, moved) / max(len(points) - 1, 1)
+    return weight
+
+
+def _point_jacobian(points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3 6"]:
+    """[I, -[p]x]."""
+    x, y, z = points.T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
+    eye = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    return np.concatenate([eye, cross], axis=2)
+
+
+def hypotheses(doubt: float) -> Float[np.ndarray, "k 3"]:
+    """Factors on the SDs (lateral, range, elevational) between which a plan must not choose.
+
+    The SDs as they are, and range and elevational ones larger or smaller by the doubt, each alone.
+    """
+    if doubt < 1.5:
+        return np.ones((1, 3))
+    factors = np.ones((5, 3))
+    factors[1:3, 1] = factors[3:5, 2] = doubt, 1 / doubt
+    return factors
+
+
+def gain(
+    pose: Float[AnyArray, "4 4"],
+    covariance: Float[AnyArray, "p p"],
+    weight: Float[AnyArray, "p p"],
+    model: Model,
+) -> Float[Array, ""]:
+    """By how much one more image at a pose lowers tr(W S), mm^2 (JAX; differentiable in the pose).
+
+    Args:
+        pose: probe -> tracker, mm.
+        covariance: S before.
+        weight: W.
+        model: X, target and SDs.
+    """
+    rows = model.jacobian(jnp.asarray(pose))
+    spread = rows @ jnp.asarray(covariance)
+    around = jnp.eye(3) + spread @ rows.T
+    return jnp.trace(jnp.linalg.solve(around, spread @ jnp.asarray(weight) @ spread.T))
+
+
+def gains(
+    rows: Float[np.ndarray, "m 3 p"],
+    covariance: Float[np.ndarray, "p p"],
+    weight: Float[np.ndarray, "p p"] | None,
+) -> Float[np.ndarray, " m"]:
+    """:func:`gain` of many poses (numpy), as a share of tr(W S); without W that of ln det S.
+
+    Args:
+        rows: G of every pose.
+        covariance: S.
+        weight: W; None: the D criterion.
+
+    Returns:
+        -ln(1 - gain / tr(W S)), or ln det(I + A) / p: both fall in logarithms.
+    """
+    size = rows.shape[2]
+    spread = _times(rows, covariance)
+    a = _symmetric(spread, rows)
+    a[:3] += 1.0
+    determinant, adjugate = _adjugate(a)
+    if weight is None:
+        return np.log(determinant) / size
+    b = _symmetric(_times(spread, weight), spread)
+    gained = (adjugate[:3] * b[:3]).sum(axis=0) + 2 * (adjugate[3:] * b[3:]).sum(axis=0)
+    share = gained / (determinant * np.sum(weight * covariance))
+    return -np.log1p(-np.clip(share, 0.0, 1.0 - 1e-12))
+
+
+def _times(
+    rows: Float[np.ndarray, "m 3 p"], matrix: Float[np.ndarray, "p p"]
+) -> Float[np.ndarray, "m 3 p"]:
+    """Product with a matrix, in pieces: for a larger one BLAS starts threads, which take longer."""
+    pieces = range(0, len(rows), _PIECE)
+    flat = [rows[k : k + _PIECE].reshape(-1, len(matrix)) @ matrix for k in pieces]
+    return np.concatenate(flat).reshape(rows.shape)
+
+
+def _symmetric(first: np.ndarray, second: np.ndarray) -> Float[np.ndarray, "6 m"]:
+    """Entries 11, 22, 33, 23, 13, 12 of first @ second' where that is symmetric."""
+    pairs = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+    return np.stack([np.einsum("mp,mp->m", first[:, i], second[:, j]) for i, j in pairs])
+
+
+def _adjugate(
+    a: Float[np.ndarray, "6 m"],
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "6 m"]]:
+    """Determinant and adjugate of symmetric 3x3 matrices, entries as in :func:`_symmetric`."""
+    a11, a22, a33, a23, a13, a12 = a
+    adjugate = np.stack([
+        a22 * a33 - a23**2, a11 * a33 - a13**2, a11 * a22 - a12**2,
+        a12 * a13 - a11 * a23, a12 * a23 - a13 * a22, a13 * a23 - a12 * a33,
+    ])  # fmt: skip
+    return a11 * adjugate[0] + a12 * adjugate[5] + a13 * adjugate[4], adjugate

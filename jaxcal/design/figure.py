@@ -1,0 +1,61 @@
+"""The figure of a plan: where the target goes, how the probe is held, how many images it takes."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxcal.design.planning import Plan
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_BLUE, _ORANGE, _GREY = "#0072B2", "#D55E00", "#666666"
+
+
+def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
+    """Places in the image, tilts, and predicted errors against the number of images.
+
+    Args:
+        plan: what to draw.
+        wanted_mm: a wanted TRE, to mark.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12.5, 4.2), dpi=130, layout="constrained")
+    image, cone, errors = (
+        figure.add_subplot(1, 3, 1), figure.add_subplot(1, 3, 2, projection="polar"),
+        figure.add_subplot(1, 3, 3),
+    )  # fmt: skip
+    bounds, model = plan.candidates.constraints, plan.candidates.model
+    numbers = bounds.coordinates(plan.poses, model.image_to_probe, model.point)
+    filling = plan.filling
+    edge = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], float)
+    steps = np.linspace(0, 1, 20)[:, None]
+    outline = np.concatenate([a + steps * (b - a) for a, b in pairwise(edge)])
+    outline = bounds.region.place(outline)
+    image.plot(outline[:, 0], outline[:, 2], color=_GREY, linewidth=0.8)
+    for which, colour, label in ((~filling, _BLUE, "chosen"), (filling, _ORANGE, "fills space")):
+        places = plan.targets[which]
+        image.plot(places[:, 0], places[:, 2], "o", color=colour, markersize=4, label=label)
+        azimuth = np.arctan2(numbers[which, 3], numbers[which, 2])
+        tilt = np.degrees(np.hypot(numbers[which, 2], numbers[which, 3]))
+        cone.plot(azimuth, tilt, "o", color=colour, markersize=4)
+    image.set(xlabel="lateral (mm)", ylabel="depth (mm)", title="target in the image",
+              aspect="equal")  # fmt: skip
+    image.invert_yaxis()
+    image.legend(fontsize="small")
+    cone.set_title("tilt (degrees)")
+    count = plan.known.images + np.arange(len(plan.tre_mm))
+    seen = count >= 6
+    errors.plot(count[seen], plan.tre_mm[seen], color=_BLUE, label="TRE")
+    errors.plot(count[seen], plan.rp_mm[seen], color=_ORANGE, label="reconstruction precision")
+    if wanted_mm is not None:
+        errors.axhline(wanted_mm, color=_GREY, linewidth=0.8, linestyle="--")
+    errors.set(xlabel="images", ylabel="predicted error (mm)", yscale="log",
+               title="how many images?")  # fmt: skip
+    errors.grid(alpha=0.3, which="both")
+    errors.legend(fontsize="small")
+    return figure

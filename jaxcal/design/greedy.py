@@ -1,0 +1,212 @@
+"""A plan pose by pose: each the one that gains most after those before it.
+
+Every fifth pose fills space instead: the one that brings the candidates nearest to the poses so
+far, on average. The optimum sits on a few poses, which would not show that the model is wrong
+elsewhere. Replicates are capped, since errors that belong to a pose (the response of the target,
+the tracker's field) do not average out over replicates of that pose.
+
+Cost: for m candidates and k sets of SDs a pose costs k products of 3m x 9 with 9 x 9.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxcal.design.candidates import Candidates
+from jaxcal.design.criteria import gains
+from jaxcal.design.information import covariance_of
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What a plan keeps beside the constraints.
+
+    Attributes:
+        space_filling: share of the poses that fill space.
+        replicates: most poses that are alike.
+        apart_deg: orientations less than this apart,
+        apart_mm: with the target less than this apart in the image, are alike.
+    """
+
+    space_filling: float = 0.2
+    replicates: int = 2
+    apart_deg: float = 5.0
+    apart_mm: float = 8.0
+
+
+@dataclass
+class Search:
+    """What greedy, exchange and polish share: candidates, information and what was chosen.
+
+    Attributes:
+        rows: (k, m, 3, p) G of the candidates under every set of SDs.
+        factors: (k, 3) of the SDs.
+        known: (k, p, p) information before.
+        weight: W, or None for the D criterion.
+        rules: see there.
+        numbers: (m, 5) of the candidates.
+        rotations: (m, 9) and
+        places: (m, 3) of the target in the image, for what is alike.
+        taken_rotations: (t, 9) of images that there are already.
+        taken_places: (t, 3).
+    """
+
+    rows: Float[np.ndarray, "k m 3 p"]
+    factors: Float[np.ndarray, "k 3"]
+    known: Float[np.ndarray, "k p p"]
+    weight: Float[np.ndarray, "p p"] | None
+    rules: Rules
+    rotations: Float[np.ndarray, "m 9"]
+    places: Float[np.ndarray, "m 3"]
+    taken_rotations: Float[np.ndarray, "t 9"]
+    taken_places: Float[np.ndarray, "t 3"]
+
+    def information_of(self, index: int) -> Float[np.ndarray, "k p p"]:
+        """G'G of a candidate under every set of SDs."""
+        return np.einsum("kia,kib->kab", self.rows[:, index], self.rows[:, index])
+
+    def scores(
+        self, information: Float[np.ndarray, "k p p"], chosen: slice | np.ndarray = slice(None)
+    ) -> Float[np.ndarray, " m"]:
+        """What each candidate gains, the mean over the sets of SDs."""
+        total = 0.0
+        for rows, covariance in zip(self.rows, covariance_of(information), strict=True):
+            total = total + gains(rows[chosen], covariance, self.weight)
+        return np.asarray(total) / len(self.rows)
+
+    def alike(
+        self, rotation: Float[np.ndarray, " 9"], place: Float[np.ndarray, 3]
+    ) -> Bool[np.ndarray, " m"]:
+        """Which candidates are replicates of a pose."""
+        return are_alike(self.rotations, self.places, rotation, place, self.rules)
+
+    def counts(self, rows: Sequence[int]) -> Float[np.ndarray, " m"]:
+        """How many poses, taken or of these rows, each candidate is alike."""
+        found = np.zeros(len(self.rotations))
+        for rotation, place in zip(self.taken_rotations, self.taken_places, strict=True):
+            found += self.alike(rotation, place)
+        for row in rows:
+            found += self.alike(self.rotations[row], self.places[row])
+        return found
+
+
+def are_alike(
+    rotations: Float[np.ndarray, "m 9"],
+    places: Float[np.ndarray, "m 3"],
+    rotation: Float[np.ndarray, " 9"],
+    place: Float[np.ndarray, 3],
+    rules: Rules,
+) -> Bool[np.ndarray, " m"]:
+    """Which poses are alike one other pose."""
+    cosine = 0.5 * (rotations @ rotation - 1)
+    near = cosine > np.cos(np.radians(rules.apart_deg))
+    return near & (((places - place) ** 2).sum(axis=1) < rules.apart_mm**2)
+
+
+def space_features(candidates: Candidates) -> Float[np.ndarray, "m 5"]:
+    """The five numbers in shares of what the constraints allow, for distances between poses."""
+    bounds = candidates.constraints
+    scale = np.array([1.0, 1.0, *np.radians([bounds.cone_deg] * 2), np.radians(bounds.turn_deg)])
+    return candidates.numbers / np.maximum(scale, 1e-3)
+
+
+class Cover:
+    """How near every part of the candidates' space is to a pose.
+
+    Args:
+        features: (m, 5) of the candidates.
+    """
+
+    _REFERENCES = 400
+
+    def __init__(self, features: Float[np.ndarray, "m 5"]) -> None:
+        self._references = features[:: max(len(features) // self._REFERENCES, 1)]
+        self._apart = _apart(features, self._references)
+        self._nearest = np.full(len(self._references), np.inf)
+
+    @property
+    def begun(self) -> bool:
+        """Whether there is a pose."""
+        return bool(np.isfinite(self._nearest[0]))
+
+    def add(self, feature: Float[np.ndarray, " 5"]) -> None:
+        """Take a pose."""
+        self._nearest = np.minimum(self._nearest, _apart(feature[None], self._references)[0])
+
+    def gains(self) -> Float[np.ndarray, " m"]:
+        """By how much each candidate would bring the references nearer, summed."""
+        return np.maximum(self._nearest - self._apart, 0.0).sum(axis=1)
+
+
+def _apart(
+    first: Float[np.ndarray, "m 5"], second: Float[np.ndarray, "r 5"]
+) -> Float[np.ndarray, "m r"]:
+    square = (first**2).sum(1)[:, None] + (second**2).sum(1) - 2 * first @ second.T
+    return np.sqrt(np.maximum(square, 0.0))
+
+
+@dataclass
+class Chosen:
+    """What greedy chose.
+
+    Attributes:
+        rows: candidates, in order.
+        filling: which of them fill space.
+        information: (k, p, p) with all of them.
+    """
+
+    rows: list[int]
+    filling: list[bool]
+    information: Float[np.ndarray, "k p p"]
+
+
+def choose(
+    search: Search,
+    features: Float[np.ndarray, "m 5"],
+    taken_features: Float[np.ndarray, "t 5"],
+    count: int,
+    cost_s: Float[np.ndarray, " m"] | None = None,
+) -> Chosen:
+    """Choose ``count`` candidates one after the other.
+
+    Args:
+        search: candidates and what is known.
+        features: of the candidates (:func:`space_features`).
+        taken_features: of the images that there are.
+        count: how many.
+        cost_s: seconds that each candidate takes; gains are then compared a second.
+    """
+    information = search.known.copy()
+    chosen = Chosen([], [], information)
+    alike = search.counts([])
+    cover = Cover(features) if search.rules.space_filling > 0 and count > 1 else None
+    if cover is not None:
+        for other in taken_features:
+            cover.add(other)
+    free = np.ones(len(search.places), bool)
+    share = search.rules.space_filling
+    for k in range(count):
+        filling = int((k + 1) * share + 1e-9) > int(k * share + 1e-9)
+        open_to = free & (alike < search.rules.replicates)
+        if not open_to.any():
+            # Few candidates: better alike than none.
+            open_to = free if free.any() else np.ones_like(free)
+        if filling and cover is not None and cover.begun:
+            value = cover.gains()
+        else:
+            value, filling = search.scores(information), False
+            value = value if cost_s is None else value / cost_s
+        row = int(np.argmax(np.where(open_to, value, -np.inf)))
+        information = information + search.information_of(row)
+        alike += search.alike(search.rotations[row], search.places[row])
+        if cover is not None:
+            cover.add(features[row])
+        free[row] = False
+        chosen.rows.append(row)
+        chosen.filling.append(filling)
+    chosen.information = information
+    return chosen

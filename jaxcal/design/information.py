@@ -1,0 +1,176 @@
+"""What an image at a pose tells: its whitened Jacobian, and what a calibration already knows.
+
+With q = X^-1 B^-1 c the target in the image of a probe at pose B, and X Exp([v, omega]), c + u
+(mm, rad, mm), to first order
+
+    dq = -v + [q]x omega + M u,    M = R_X' R_B',
+
+and the image's errors are dq's lateral, axial (range) and elevational components over their SDs:
+three rows, the 3x9 matrix G. Near the plane the range's derivative is the axial one. With unknown
+pixel scales two columns follow, of the logarithms of the lateral and the axial scale.
+
+Information adds up: after n images it is J = prior + sum_i G_i'G_i, and S = J^-1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import brentq
+
+from jaxcal.design.noise import Noise
+from jaxcal.errors import InputError
+from jaxcal.geometry import AnyArray
+from jaxcal.model.parameters import RIGID
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+
+BELIEVED_SD = (50.0, 0.5, 50.0, 0.3)
+"""What is believed before any image (ours): SDs of X's translation (mm) and rotation (rad), of the
+target (mm) and of a pixel scale's logarithm. Weak: five images know more."""
+
+_EFFICIENCY = (0.2, 5.0)
+
+
+@dataclass(frozen=True)
+class Model:
+    """What the Jacobian of a pose depends on beside the pose.
+
+    Attributes:
+        image_to_probe: X as far as it is known, mm.
+        point: the target in the tracker's frame, mm.
+        noise: SDs.
+        scale: whether the two pixel scales are unknown too.
+    """
+
+    image_to_probe: Float[AnyArray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    point: Float[AnyArray, " 3"] = field(default_factory=lambda: np.zeros(3))
+    noise: Noise = field(default_factory=lambda: Noise.constant((0.5, 0.3, 1.0)))
+    scale: bool = False
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns p: 9, or 11 with scales."""
+        return 11 if self.scale else 9
+
+    @property
+    def blocks(self) -> tuple[str, ...]:
+        """The unknowns by name, in order."""
+        return (*RIGID, "scale") if self.scale else RIGID
+
+    def targets(self, poses: Float[AnyArray, "*n 4 4"]) -> Float[AnyArray, "*n 3"]:
+        """Where the target is in the images of a probe at these poses, mm (traceable)."""
+        rotation, x = poses[..., :3, :3], self.image_to_probe
+        in_probe = ((self.point - poses[..., :3, 3])[..., None, :] @ rotation)[..., 0, :]
+        return (in_probe - x[:3, 3]) @ x[:3, :3]
+
+    def jacobian(self, poses: Float[AnyArray, "*n 4 4"]) -> Float[AnyArray, "*n 3 p"]:
+        """G of poses probe -> tracker (mm); numpy or JAX, traceable, differentiable in the pose."""
+        xp = poses.__array_namespace__()
+        q = self.targets(poses)
+        turned = xp.swapaxes(poses[..., :3, :3] @ self.image_to_probe[:3, :3], -1, -2)
+        x, y, z = q[..., 0], q[..., 1], q[..., 2]
+        zero, one = xp.zeros_like(x), xp.ones_like(x)
+        # Rows lateral, range, elevational of [-I, [q]x].
+        rigid = [
+            [-one, zero, zero, zero, -z, y],
+            [zero, zero, -one, -y, x, zero],
+            [zero, -one, zero, z, zero, -x],
+        ]
+        scales = [[-x, zero], [zero, -z], [zero, zero]]
+        rows = []
+        for k, axis in enumerate((0, 2, 1)):
+            columns = rigid[k] + [turned[..., axis, j] for j in range(3)]
+            rows.append(xp.stack(columns + (scales[k] if self.scale else []), axis=-1))
+        return xp.stack(rows, axis=-2) / self.noise.sigma(q)[..., None]
+
+    def information(self, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "p p"]:
+        """Sum of G'G over poses."""
+        rows = self.jacobian(poses).reshape(-1, self.size)
+        return rows.T @ rows
+
+    def beliefs(self) -> Float[np.ndarray, "p p"]:
+        """Information before any image (:data:`BELIEVED_SD`)."""
+        sd = np.repeat(BELIEVED_SD, (3, 3, 3, 2))[: self.size]
+        return np.diag(1.0 / sd**2)
+
+
+def covariance_of(information: Float[np.ndarray, "*k p p"]) -> Float[np.ndarray, "*k p p"]:
+    """Inverse of information, scaled to a unit diagonal first: mm and rad differ in size."""
+    size = 1.0 / np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
+    inverse = np.linalg.inv(information * size[..., :, None] * size[..., None, :])
+    found = inverse * size[..., :, None] * size[..., None, :]
+    return 0.5 * (found + np.swapaxes(found, -1, -2))
+
+
+def known_information(
+    result: Calibration, model: Model, poses: Float[np.ndarray, "n 4 4"]
+) -> Float[np.ndarray, "p p"]:
+    """Information of a calibration about all unknowns, its weak directions included.
+
+    The images tell how the target hangs together with X; the calibration's covariance tells what is
+    known of X (offsets' law, their mean, tuned SDs). Both hold with the images' information J whose
+    block of X is changed by C^-1 - (J / J_target), the inverse of the calibration's covariance less
+    the Schur complement: X's marginal covariance is then exactly C. Where C is not known (X is not
+    observable), it is what the images' poses tell, with the beliefs that any plan begins with.
+
+    Args:
+        result: of one problem.
+        model: with the calibration's X and target.
+        poses: of the images, probe -> tracker, mm.
+    """
+    answer = result.numpy()
+    used = np.asarray(answer.mask) > 0
+    if len(used) != len(poses):
+        raise InputError(f"the calibration is of {len(used)} images, {len(poses)} poses were given")
+    found = model.information(poses[used]) + model.beliefs()
+    covariance = np.asarray(answer.covariance, float)
+    if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0:
+        return found
+    rest = found[6:, 6:]
+    schur = found[:6, :6] - found[:6, 6:] @ np.linalg.solve(rest, found[6:, :6])
+    found[:6, :6] += covariance_of(covariance) - schur
+    return 0.5 * (found + found.T)
+
+
+def effective_elevational(
+    result: Calibration,
+    model: Model,
+    poses: Float[np.ndarray, "n 4 4"],
+    weight: Float[np.ndarray, "p p"],
+) -> float:
+    """Factor on the elevational SD after which the images tell as much as the calibration says.
+
+    An offset from a law with edges tells more than its SD does, one with a mean to be found tells
+    less; what further images of the same kind will bring follows this factor.
+
+    Args:
+        result: of one problem.
+        model: with the calibration's X, target and SDs.
+        poses: of the images.
+        weight: W of what counts.
+    """
+    answer = result.numpy()
+    covariance = np.asarray(answer.covariance, float)
+    used = np.asarray(answer.mask) > 0
+    if not np.isfinite(covariance).all():
+        return 1.0
+    said = float(np.sum(weight[:6, :6] * covariance))
+    rows = model.jacobian(poses[used])
+
+    def excess(log_factor: float) -> float:
+        scaled = rows / np.array([1.0, 1.0, np.exp(log_factor)])[:, None]
+        flat = scaled.reshape(-1, model.size)
+        told = float(np.sum(weight * covariance_of(flat.T @ flat + model.beliefs())))
+        return float(np.log(told / said))
+
+    low, high = np.log(_EFFICIENCY)
+    if not (said > 0 and excess(low) < 0 < excess(high)):
+        return (
+            1.0 if not said > 0 else float(_EFFICIENCY[0] if excess(low) >= 0 else _EFFICIENCY[1])
+        )
+    return float(np.exp(brentq(excess, low, high, xtol=1e-6)))

@@ -1,0 +1,175 @@
+"""SDs of lateral position, range and elevational offset as functions of where the target is.
+
+Beams are worst in the corners of an image, which is where a plan for equal SDs puts most of its
+poses. The logarithm of each SD is a polynomial of the target's place,
+
+    ln s_k = a_k0 + a_k1 d + a_k2 d^2 + a_k3 x^2,   d = depth / 50 mm - 1,  x = lateral / 25 mm,
+
+learned from a calibration's residuals where there are enough images, and from the geometry of the
+probe before. The elevational SD is that of the target's distance from the mid-plane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.errors import InputError
+from jaxcal.geometry import AnyArray
+from jaxcal.probe import Probe
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+
+FEWEST_TO_LEARN = 20
+"""Images from which on SDs are learned as functions of the place."""
+
+_DEPTH_MM, _LATERAL_MM = 50.0, 25.0
+_PRIOR_SD = 0.3
+"""Of the coefficients beyond the first (ours): a factor of e^0.3 for 50 mm of depth is common."""
+_SCORING_STEPS = 30
+_LEAST_SD_MM = 1e-3
+UNKNOWN_BY = 3.0
+"""A factor by which SDs that nobody has tuned may be wrong."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """A noise model.
+
+    Attributes:
+        coefficients: (3, 4), a of the head; rows lateral, range, elevational.
+        doubt: factor by which the ratios of the three SDs may be wrong; 1: known.
+    """
+
+    coefficients: Float[AnyArray, "3 4"]
+    doubt: float = UNKNOWN_BY
+
+    def __post_init__(self) -> None:
+        given = isinstance(self.coefficients, np.ndarray)
+        if given and not np.isfinite(self.coefficients).all():
+            raise InputError("the noise model's coefficients must be finite")
+        if not 1 <= self.doubt <= 100:
+            raise InputError(f"doubt is a factor between 1 and 100, not {self.doubt}")
+
+    @classmethod
+    def constant(
+        cls, sigma_mm: tuple[float, float, float] | np.ndarray, doubt: float = UNKNOWN_BY
+    ) -> Noise:
+        """The same SDs everywhere: lateral, range, elevational, mm."""
+        sigma = np.asarray(sigma_mm, float)
+        if sigma.shape != (3,) or not (np.isfinite(sigma).all() and (sigma > 0).all()):
+            raise InputError(f"SDs must be three positive mm, not {sigma_mm}")
+        coefficients = np.zeros((3, 4))
+        coefficients[:, 0] = np.log(sigma)
+        return cls(coefficients, doubt)
+
+    @classmethod
+    def of_probe(
+        cls,
+        probe: Probe,
+        channel_mm: float = 0.5,
+        elevational_mm: float = 0.5,
+        focus_mm: float = 40.0,
+        doubt: float = UNKNOWN_BY,
+    ) -> Noise:
+        """What a probe's geometry says before there are images.
+
+        Lateral position and range are least-squares fits of the distances to all elements (Eq. 5),
+        each with the same SD; the elevational SD grows away from the focus like the beam's width.
+
+        Args:
+            probe: the transducer.
+            channel_mm: SD of an element's distance.
+            elevational_mm: SD of the elevational offset at the focus.
+            focus_mm: range at which the beam is thinnest.
+            doubt: see the class.
+        """
+        lateral, depth = np.meshgrid(
+            np.linspace(-0.4, 0.4, 9) * probe.width_mm, np.linspace(15.0, 90.0, 12)
+        )
+        place = np.stack([lateral.ravel(), np.zeros(lateral.size), depth.ravel()], axis=1)
+        apart = place[:, None, ::2] - probe.element_positions()[None, :, ::2]
+        slope = apart / np.linalg.norm(apart, axis=-1, keepdims=True)
+        inverse = np.linalg.inv(np.einsum("nka,nkb->nab", slope, slope))
+        # A beam of 0.8 mm at its focus that spreads by 0.03 mm a mm.
+        width = np.hypot(1.0, 0.03 / 0.8 * (place[:, 2] - focus_mm))
+        sigma = np.stack(
+            [channel_mm * np.sqrt(inverse[:, 0, 0]), channel_mm * np.sqrt(inverse[:, 1, 1]),
+             elevational_mm * width], axis=1,
+        )  # fmt: skip
+        basis = _basis(place)
+        found, *_ = np.linalg.lstsq(basis, np.log(sigma))
+        return cls(found.T, doubt)
+
+    @classmethod
+    def learned(cls, result: Calibration, targets: Float[np.ndarray, "n 3"]) -> Noise:
+        """From a calibration's SDs and residuals.
+
+        The variance of each error is a Gamma regression with a logarithmic link (Fisher scoring) on
+        the place, its coefficients held near zero by a normal prior; at the images' mean it is the
+        calibration's own. With fewer than :data:`FEWEST_TO_LEARN` images the SDs are equal
+        everywhere; so they are for conventional calibration, which weighs them alike.
+
+        Args:
+            result: of one problem.
+            targets: (n, 3) where the target was in every image, mm.
+        """
+        answer = result.numpy()
+        sigma = np.maximum(np.asarray(answer.sigma, float), _LEAST_SD_MM)
+        if not np.isfinite(sigma).all():
+            raise InputError("this calibration has no SDs: plan with a noise model of your own")
+        used = np.asarray(answer.mask) > 0
+        count = int(used.sum())
+        if result.method == "conventional":
+            # It weighs all errors alike, and so must what is predicted of it.
+            return cls.constant(np.full(3, np.sqrt(np.mean(sigma**2))), 1.0)
+        # A tuned SD is off by a factor of about 1 + 1 / sqrt(2 n).
+        left = max(count - 3, 1)
+        tuned = bool(answer.sigma_tuned) and count >= 8
+        doubt = float(np.exp(1.0 / np.sqrt(2.0 * left))) if tuned else UNKNOWN_BY
+        model = cls.constant(sigma, doubt)
+        if count < FEWEST_TO_LEARN:
+            return model
+        basis = _basis(targets[used])
+        basis[:, 1:] -= (mean := basis[:, 1:].mean(axis=0))
+        squared = np.asarray(answer.residual, float)[used][:, [0, 2, 1]] ** 2
+        coefficients = model.coefficients.copy()
+        for row in range(3):
+            slopes = _gamma_slopes(basis, squared[:, row] / max(squared[:, row].mean(), 1e-12))
+            coefficients[row, 1:] = 0.5 * slopes
+            coefficients[row, 0] -= 0.5 * slopes @ mean
+        return replace(model, coefficients=coefficients)
+
+    def sigma(self, target: Float[AnyArray, "*n 3"]) -> Float[AnyArray, "*n 3"]:
+        """SDs (lateral, range, elevational; mm) of targets in the image frame (traceable)."""
+        xp = target.__array_namespace__()
+        return xp.exp(_basis(target) @ self.coefficients.T)
+
+
+def _basis(target: Float[AnyArray, "*n 3"]) -> Float[AnyArray, "*n 4"]:
+    xp = target.__array_namespace__()
+    deeper = target[..., 2] / _DEPTH_MM - 1.0
+    aside = target[..., 0] / _LATERAL_MM
+    return xp.stack([xp.ones_like(deeper), deeper, deeper**2, aside**2], axis=-1)
+
+
+def _gamma_slopes(
+    basis: Float[np.ndarray, "n 4"], ratio: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, 3]:
+    """Slopes of the log variance: maximises sum(-ln v - r / v) / 2 with the normal prior."""
+    precision = np.diag([0.0, *np.full(3, 0.25 / _PRIOR_SD**2)])
+    slopes = np.zeros(4)
+    for _ in range(_SCORING_STEPS):
+        part = ratio * np.exp(-basis @ slopes)
+        # Fisher's information of a squared normal's log variance is a half.
+        step = np.linalg.solve(
+            0.5 * basis.T @ basis + precision, 0.5 * basis.T @ (part - 1) - precision @ slopes
+        )
+        slopes += np.clip(step, -1.0, 1.0)
+        if np.abs(step).max() < 1e-10:
+            break
+    return slopes[1:]

@@ -1,0 +1,337 @@
+"""Plans: which poses, from nothing or to add to images that there are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxcal import diagnosis
+from jaxcal.design.candidates import Candidates
+from jaxcal.design.criteria import (
+    Criterion,
+    check_criterion,
+    hypotheses,
+    rp_weight,
+    tre_weight,
+)
+from jaxcal.design.exchange import exchange
+from jaxcal.design.greedy import Chosen, Rules, Search, choose, space_features
+from jaxcal.design.information import (
+    Model,
+    covariance_of,
+    effective_elevational,
+    known_information,
+)
+from jaxcal.design.noise import Noise
+from jaxcal.design.polish import polish as polished
+from jaxcal.errors import InputError
+from jaxcal.recording import MINIMUM_IMAGES
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+
+MOST_POSES = 2000
+_SINGULAR = 1e-10
+"""Eigenvalue ratio (scaled units, equal SDs) below which candidates determine nothing."""
+_TRIED_RAD, _TRIED_SHARE = 0.4, 0.6
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known before a plan.
+
+    Attributes:
+        information: (p, p) about the unknowns; includes what any plan begins with.
+        images: that it rests on.
+    """
+
+    information: Float[np.ndarray, "p p"]
+    images: int = 0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Chosen poses and what they promise.
+
+    Attributes:
+        poses: (n, 4, 4) probe -> tracker, mm, in the order of gain.
+        targets: (n, 3) where the target should then be in the image, mm.
+        filling: which of them fill space.
+        rows: (n,) the candidates that they come from.
+        criterion: ``tre``, ``rp`` or ``d``.
+        candidates: chosen from; their model has the SDs that the promises rest on.
+        known: before the plan.
+        tre_mm: (n + 1,) predicted root mean square TRE over the region with 0, 1, ... n of the
+            poses, mm.
+        rp_mm: (n + 1,) predicted reconstruction precision, likewise.
+        rules: see there.
+    """
+
+    poses: Float[np.ndarray, "n 4 4"]
+    targets: Float[np.ndarray, "n 3"]
+    filling: Bool[np.ndarray, " n"]
+    rows: np.ndarray
+    criterion: Criterion
+    candidates: Candidates
+    known: Known
+    tre_mm: Float[np.ndarray, " n1"]
+    rp_mm: Float[np.ndarray, " n1"]
+    rules: Rules
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    @property
+    def information(self) -> Float[np.ndarray, "p p"]:
+        """With all poses of the plan."""
+        return self.known.information + self.candidates.model.information(self.poses)
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "p p"]:
+        """Predicted, of X (v mm, omega rad), the target (mm) and, if unknown, the scales' logs."""
+        return covariance_of(self.information)
+
+
+def plan(
+    candidates: Candidates,
+    n: int,
+    criterion: Criterion = "tre",
+    prior: Known | Plan | Calibration | np.ndarray | None = None,
+    *,
+    polish: bool = True,
+    swap: bool = True,
+    cost_s: Float[np.ndarray, " m"] | None = None,
+    rules: Rules | None = None,
+) -> Plan:
+    """The n poses that leave the smallest error.
+
+    Args:
+        candidates: to choose from.
+        n: how many.
+        criterion: ``tre``: target registration error over the region; ``rp``: reconstruction
+            precision over poses like the candidates; ``d``: volume of the confidence ellipsoid.
+        prior: what is known already: a calibration of the images ``candidates.taken`` (its weak
+            directions are what further poses aim at), an earlier plan, information (p, p), or None.
+        polish: move the poses off the grid, along the gradient.
+        swap: exchange poses after greedy.
+        cost_s: (m,) seconds that each candidate takes; greedy then compares gains a second.
+        rules: space filling and replicates.
+
+    Raises:
+        InputError: candidates from which nothing can be calibrated (it says what is missing), or a
+            number of poses that is none.
+    """
+    check_criterion(criterion)
+    known = known_before(prior, candidates)
+    least = MINIMUM_IMAGES if known.images == 0 else 1
+    if not least <= n <= MOST_POSES:
+        raise InputError(f"a plan has {least} to {MOST_POSES} poses, not {n}")
+    if cost_s is not None and not (len(cost_s) == len(candidates) and (cost_s > 0).all()):
+        raise InputError("cost_s must have a positive number of seconds for each candidate")
+    check_candidates(candidates)
+    rules = Rules() if rules is None else rules
+    if isinstance(prior, Plan):
+        candidates = _with_taken(candidates, prior)
+    candidates = with_effective_noise(prior, candidates)
+    search = make_search(candidates, known, criterion, rules)
+    features = space_features(candidates) if rules.space_filling > 0 else np.zeros((0, 5))
+    chosen = choose(search, features, _taken_features(candidates), n, cost_s)
+    if swap and cost_s is None:
+        chosen = exchange(search, chosen)
+    poses = candidates.poses[chosen.rows]
+    if polish:
+        poses, _ = polished(search, candidates, chosen)
+    return _finished(candidates, known, criterion, rules, chosen, poses)
+
+
+def next_poses(
+    result: Calibration | Plan | Known,
+    candidates: Candidates,
+    k: int = 1,
+    criterion: Criterion = "tre",
+    *,
+    polish: bool = False,
+    cost_s: Float[np.ndarray, " m"] | None = None,
+) -> Plan:
+    """The k poses that would help most after a calibration; milliseconds.
+
+    Args:
+        result: a calibration of the images ``candidates.taken``
+            (:func:`jaxcal.design.candidates_around`), or a plan to go on with.
+        candidates: to choose from.
+        k: how many.
+        criterion: see :func:`plan`.
+        polish: move them off the grid.
+        cost_s: see :func:`plan`.
+
+    Returns:
+        A plan of k poses; ``tre_mm[0]`` is the error now, ``tre_mm[-1]`` with all of them.
+    """
+    filling = Rules(space_filling=0.0)
+    return plan(
+        candidates, k, criterion, result, polish=polish, swap=False, cost_s=cost_s, rules=filling
+    )
+
+
+def known_before(
+    prior: Known | Plan | Calibration | np.ndarray | None, candidates: Candidates
+) -> Known:
+    """What a prior says about the unknowns of the candidates' model."""
+    size = candidates.model.size
+    if prior is None:
+        return Known(candidates.model.beliefs())
+    if isinstance(prior, Known):
+        return prior
+    if isinstance(prior, Plan):
+        return Known(prior.information, prior.known.images + len(prior))
+    if isinstance(prior, np.ndarray):
+        if prior.shape != (size, size) or not np.isfinite(prior).all():
+            raise InputError(f"information must be a finite {size} x {size} matrix")
+        return Known(prior + candidates.model.beliefs())
+    if candidates.taken is None:
+        raise InputError(
+            "a calibration tells how the target hangs together with X only along with its images: "
+            "make the candidates with candidates_around(recording, result), or give the images' "
+            "poses as their 'taken'"
+        )
+    model = with_effective_noise(prior, candidates).model
+    used = int(np.sum(np.asarray(prior.numpy().mask) > 0))
+    return Known(known_information(prior, model, candidates.taken), used)
+
+
+def with_effective_noise(prior: object, candidates: Candidates) -> Candidates:
+    """Candidates whose elevational SD is what the calibration got out of its images."""
+    from jaxcal.calibration import Calibration
+
+    if not isinstance(prior, Calibration) or candidates.taken is None:
+        return candidates
+    model = candidates.model
+    weight = tre_weight(candidates.constraints.region.grid(), model.size)
+    factor = effective_elevational(prior, model, candidates.taken, weight)
+    coefficients = np.array(model.noise.coefficients)
+    coefficients[2, 0] += np.log(factor)
+    return replace(
+        candidates, model=replace(model, noise=replace(model.noise, coefficients=coefficients))
+    )
+
+
+def _with_taken(candidates: Candidates, before: Plan) -> Candidates:
+    parts = [poses for poses in (before.candidates.taken, before.poses) if poses is not None]
+    return replace(candidates, taken=np.concatenate(parts), used=None)
+
+
+def make_search(candidates: Candidates, known: Known, criterion: Criterion, rules: Rules) -> Search:
+    """What greedy, exchange and polish need."""
+    model = candidates.model
+    factors = hypotheses(model.noise.doubt)
+    rows = model.jacobian(candidates.poses)
+    before = np.repeat(known.information[None], len(factors), axis=0)
+    if known.images == 0:
+        taken = np.zeros((0, 4, 4))
+    else:
+        taken = candidates.taken if candidates.taken is not None else np.zeros((0, 4, 4))
+    x = model.image_to_probe[:3, :3]
+    return Search(
+        rows=rows[None] / factors[:, None, :, None],
+        factors=factors,
+        known=before,
+        weight=weight_of(criterion, candidates),
+        rules=rules,
+        rotations=(candidates.poses[:, :3, :3] @ x).reshape(-1, 9),
+        places=model.targets(candidates.poses),
+        taken_rotations=(taken[:, :3, :3] @ x).reshape(-1, 9),
+        taken_places=model.targets(taken),
+    )
+
+
+def weight_of(criterion: Criterion, candidates: Candidates) -> Float[np.ndarray, "p p"] | None:
+    """W of a criterion over the candidates' region; None for D."""
+    model = candidates.model
+    if criterion == "d":
+        return None
+    if criterion == "tre":
+        return tre_weight(candidates.constraints.region.grid(), model.size)
+    targets = model.targets(candidates.poses)
+    in_plane = targets * np.array([1.0, 0.0, 1.0])
+    return rp_weight(candidates.poses, in_plane, model.image_to_probe, model.size)
+
+
+def _taken_features(candidates: Candidates) -> Float[np.ndarray, "t 5"]:
+    """Of the images that there are."""
+    if candidates.taken is None or not len(candidates.taken):
+        return np.zeros((0, 5))
+    return space_features(replace(candidates, poses=candidates.taken))
+
+
+def _finished(
+    candidates: Candidates,
+    known: Known,
+    criterion: Criterion,
+    rules: Rules,
+    chosen: Chosen,
+    poses: Float[np.ndarray, "n 4 4"],
+) -> Plan:
+    from jaxcal.design.predict import curve
+
+    tre, rp = curve(candidates, known, poses)
+    return Plan(
+        poses, candidates.model.targets(poses), np.array(chosen.filling, bool),
+        np.array(chosen.rows), criterion, candidates, known, tre, rp, rules,
+    )  # fmt: skip
+
+
+def check_candidates(candidates: Candidates) -> None:
+    """Whether images at all candidates, with those taken, would determine the unknowns.
+
+    Raises:
+        InputError: they would not; the direction, and what kind of pose would show it.
+    """
+    model = replace(candidates.model, noise=Noise.constant((1.0, 1.0, 1.0)))
+    every = candidates.poses
+    if candidates.taken is not None:
+        every = np.concatenate([every, candidates.taken])
+    lever = float(np.sqrt(np.mean(np.sum(model.targets(every) ** 2, axis=1))))
+    scale = np.repeat([1.0, lever, 1.0, lever], (3, 3, 3, 2))[: model.size]
+    found = model.information(every) / (scale[:, None] * scale)
+    values, vectors = np.linalg.eigh(found)
+    if values[0] > _SINGULAR * values[-1]:
+        return
+    null = vectors[:, values <= _SINGULAR * values[-1]]
+    weakest = diagnosis.direction_in_words(_purest(null), model.blocks)
+    raise InputError(
+        f"images at all {len(candidates)} candidate poses would not determine {weakest}: "
+        f"{_missing(candidates, model, null / scale[:, None])}"
+    )
+
+
+def _purest(null: Float[np.ndarray, "p j"]) -> Float[np.ndarray, " p"]:
+    """The vector of a null space that lies closest to one unknown."""
+    projector = null @ null.T
+    column = projector[:, int(np.argmax(np.diagonal(projector)))]
+    return column / np.linalg.norm(column)
+
+
+def _missing(candidates: Candidates, model: Model, null: Float[np.ndarray, "p j"]) -> str:
+    """Kinds of poses that would notice the directions that the candidates leave open."""
+    bounds = candidates.constraints
+    x, point = model.image_to_probe, model.point
+    middle = np.median(candidates.numbers, axis=0)
+    kinds = {
+        "tilted about the image's lateral axis": (2, _TRIED_RAD),
+        "tilted about its elevational axis": (3, _TRIED_RAD),
+        "turned about its axial axis": (4, _TRIED_RAD),
+        "with the target farther to the sides": (0, _TRIED_SHARE),
+        "with the target nearer and farther": (1, _TRIED_SHARE),
+    }
+    noticed = {}
+    for name, (axis, size) in kinds.items():
+        numbers = np.repeat(middle[None], 2, axis=0)
+        numbers[:, axis] += [size, -size]
+        rows = model.jacobian(bounds.poses(numbers, x, point)).reshape(-1, model.size)
+        noticed[name] = float(np.linalg.norm(rows @ null))
+    most = max(noticed.values())
+    named = [name for name, value in noticed.items() if value > 0.3 * most]
+    return f"add poses {', '.join(named[:-1])}{' and ' * bool(named[1:])}{named[-1]}"

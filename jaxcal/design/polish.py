@@ -1,0 +1,164 @@
+"""Off the grid: each chosen pose climbs along the gradient of its gain, inside the constraints.
+
+A pose moves in the five numbers of :mod:`jaxcal.design.constraints`, in which region, cone and turn
+are cut off exactly; a step that leaves box, reach or what else is asked for, or becomes a replicate
+too many, is halved and, in the end, not taken. So a polished pose keeps whatever its candidate
+kept.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxcal.design.candidates import Candidates
+from jaxcal.design.constraints import Region
+from jaxcal.design.greedy import Chosen, Search, are_alike
+from jaxcal.design.information import Model, covariance_of
+from jaxcal.design.noise import Noise
+from jaxcal.geometry import matrix_from_rotation, rotation_from_vector
+from jaxcal.precision import in_own_modes
+
+_STEPS = 8
+_HALVINGS = 5
+_FIRST_STEP = 0.25
+"""In units of :func:`_scale`: an eighth of the region, of the cone, of the turns."""
+_LEAST_GAIN = 1e-6
+
+
+def pose_of(
+    numbers: Float[Array, " 5"],
+    reference: Float[Array, "3 3"],
+    image_to_probe: Float[Array, "4 4"],
+    point: Float[Array, " 3"],
+    region: Region,
+) -> Float[Array, "4 4"]:
+    """Pose probe -> tracker (mm) of five numbers (JAX, differentiable)."""
+    zero = jnp.zeros_like(numbers[4])
+    tilt = rotation_from_vector(jnp.stack([numbers[2], numbers[3], zero]))
+    turn = rotation_from_vector(jnp.stack([zero, zero, numbers[4]]))
+    rotation = reference @ tilt @ turn @ image_to_probe[:3, :3].T
+    place = image_to_probe[:3, :3] @ region.place(numbers[:2]) + image_to_probe[:3, 3]
+    return matrix_from_rotation(rotation, point - rotation @ place)
+
+
+@partial(jax.jit, static_argnames=("region", "scale"))
+def _scored(numbers, known, weight, factors, reference, x, point, coefficients, *, region, scale):
+    """The score of a pose as in :func:`jaxcal.design.criteria.gains`, and its gradient."""
+
+    def score(numbers: Float[Array, " 5"]) -> Float[Array, ""]:
+        pose = pose_of(numbers, reference, x, point, region)
+        rows = Model(x, point, Noise(coefficients), scale).jacobian(pose)
+
+        def one(covariance: Float[Array, "p p"], factor: Float[Array, " 3"]) -> Float[Array, ""]:
+            own = rows / factor[:, None]
+            spread = own @ covariance
+            around = jnp.eye(3) + spread @ own.T
+            if weight is None:
+                return jnp.linalg.slogdet(around)[1] / covariance.shape[0]
+            gained = jnp.trace(jnp.linalg.solve(around, spread @ weight @ spread.T))
+            return -jnp.log1p(-gained / jnp.sum(weight * covariance))
+
+        return jnp.mean(jax.vmap(one)(known, factors))
+
+    return jax.value_and_grad(score)(numbers)
+
+
+def _scale(candidates: Candidates) -> Float[np.ndarray, 5]:
+    bounds = candidates.constraints
+    cone, turn = np.radians([max(bounds.cone_deg, 1e-3), max(bounds.turn_deg, 1e-3)])
+    return np.array([1.0, 1.0, cone, cone, turn])
+
+
+def _cut_off(numbers: Float[np.ndarray, 5], candidates: Candidates) -> Float[np.ndarray, 5]:
+    """The nearest numbers inside region, cone and turn."""
+    bounds = candidates.constraints
+    inside = numbers.copy()
+    inside[:2] = np.clip(inside[:2], -1, 1)
+    tilt, cone = float(np.hypot(*inside[2:4])), np.radians(bounds.cone_deg)
+    if tilt > cone:
+        inside[2:4] *= cone / tilt
+    inside[4] = np.clip(inside[4], -np.radians(bounds.turn_deg), np.radians(bounds.turn_deg))
+    return inside
+
+
+@in_own_modes
+def polish(
+    search: Search, candidates: Candidates, chosen: Chosen
+) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "k p p"]]:
+    """Move the chosen poses, one after the other; those that fill space stay.
+
+    Args:
+        search: as chosen from.
+        candidates: likewise.
+        chosen: which.
+
+    Returns:
+        the poses, and the information with all of them under every set of SDs.
+    """
+    model, bounds = candidates.model, candidates.constraints
+    x, point = np.asarray(model.image_to_probe), np.asarray(model.point)
+    poses = candidates.poses[chosen.rows].copy()
+    numbers = candidates.numbers[chosen.rows]
+    rotations = search.rotations[chosen.rows].copy()
+    places = search.places[chosen.rows].copy()
+    information = chosen.information.copy()
+    scale = _scale(candidates)
+
+    def evaluate(at: np.ndarray, known: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = _scored(
+            at, known, search.weight, search.factors, bounds.reference, x, point,
+            np.asarray(model.noise.coefficients), region=bounds.region, scale=model.scale,
+        )  # fmt: skip
+        return float(value), np.asarray(slope)
+
+    def among_too_many(k: int, pose: np.ndarray) -> bool:
+        turn, place = (pose[:3, :3] @ x[:3, :3]).reshape(9), model.targets(pose)
+        others = np.arange(len(poses)) != k
+        near = are_alike(rotations[others], places[others], turn, place, search.rules).sum()
+        near += are_alike(
+            search.taken_rotations, search.taken_places, turn, place, search.rules
+        ).sum()
+        return bool(near >= search.rules.replicates)
+
+    for k, filling in enumerate(chosen.filling):
+        if filling:
+            continue
+        own = _outer(model, poses[k], search.factors)
+        known = covariance_of(information - own)
+        here = _cut_off(numbers[k], candidates)
+        value, slope = evaluate(here, known)
+        step = _FIRST_STEP
+        for _ in range(_STEPS):
+            direction = slope * scale
+            length = float(np.linalg.norm(direction))
+            if length < 1e-9:
+                break
+            moved = False
+            for _ in range(_HALVINGS):
+                there = _cut_off(here + step * scale * direction / length, candidates)
+                pose = bounds.poses(there[None], x, point)
+                if bounds.keeps(pose, x, point)[0] and not among_too_many(k, pose[0]):
+                    better, steeper = evaluate(there, known)
+                    if better > value + _LEAST_GAIN:
+                        here, value, slope, moved = there, better, steeper, True
+                        poses[k] = pose[0]
+                        break
+                step *= 0.5
+            if not moved:
+                break
+        rotations[k] = (poses[k, :3, :3] @ x[:3, :3]).reshape(9)
+        places[k] = model.targets(poses[k])
+        information = information + _outer(model, poses[k], search.factors) - own
+    return poses, information
+
+
+def _outer(
+    model: Model, pose: Float[np.ndarray, "4 4"], factors: Float[np.ndarray, "k 3"]
+) -> Float[np.ndarray, "k p p"]:
+    rows = model.jacobian(pose) / factors[:, :, None]
+    return np.einsum("kia,kib->kab", rows, rows)

@@ -1,0 +1,108 @@
+"""What poses promise: predicted errors, and how many images a wanted error takes.
+
+The prediction is the Cramer-Rao bound under the model's SDs, times Student's factor: SDs are tuned
+from the same images, and with few of them the errors are larger than with known ones
+(:mod:`jaxcal.intervals`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.design.candidates import Candidates
+from jaxcal.design.criteria import rp_weight, tre_weight
+from jaxcal.design.information import covariance_of
+from jaxcal.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+    from jaxcal.design.planning import Known, Plan
+
+MOST_IMAGES = 1000
+_ENOUGH = 1000
+"""Candidates from which images are counted: more change the count by less than one in a hundred."""
+
+
+def student_factor(images: int, size: int = 9) -> float:
+    """Variance of Student's distribution for SDs tuned from so many images, at most 3."""
+    left = max(images - size / 3, 3.0)
+    return left / (left - 2.0)
+
+
+def curve(
+    candidates: Candidates, known: Known, poses: Float[np.ndarray, "n 4 4"]
+) -> tuple[Float[np.ndarray, " n1"], Float[np.ndarray, " n1"]]:
+    """Predicted TRE and RP with the first 0, 1, ... n of the poses, mm."""
+    model = candidates.model
+    rows = model.jacobian(poses)
+    steps = np.einsum("nia,nib->nab", rows, rows)
+    total = known.information + np.concatenate([np.zeros((1, *steps.shape[1:])), steps.cumsum(0)])
+    covariance = covariance_of(total)
+    targets = model.targets(candidates.poses) * np.array([1.0, 0.0, 1.0])
+    weights = (
+        tre_weight(candidates.constraints.region.grid(), model.size),
+        rp_weight(candidates.poses, targets, model.image_to_probe, model.size),
+    )
+    factor = np.array([student_factor(known.images + k, model.size) for k in range(len(total))])
+    tre, rp = (np.sqrt(factor * np.einsum("ab,nab->n", weight, covariance)) for weight in weights)
+    return tre, rp
+
+
+def images_to(
+    result: Calibration | Plan,
+    tre_mm: float,
+    candidates: Candidates | None = None,
+) -> int:
+    """How many more images a wanted target registration error takes.
+
+    Args:
+        result: a plan, whose poses are the next ones and which is gone on with after them; or a
+            calibration of the images ``candidates.taken``.
+        tre_mm: wanted root mean square TRE over the region, mm.
+        candidates: to choose further poses from; a plan's own by default.
+
+    Returns:
+        The number of images; 0 where it is reached already.
+
+    Raises:
+        InputError: more than 1000 would be needed.
+    """
+    from jaxcal.design.planning import MOST_POSES, Plan, next_poses
+
+    if not (np.isfinite(tre_mm) and tre_mm > 0):
+        raise InputError(f"the wanted error must be a positive number of mm, not {tre_mm}")
+    first = 0
+    if isinstance(result, Plan):
+        reached = np.flatnonzero(result.tre_mm <= tre_mm)
+        if len(reached):
+            return int(reached[0])
+        candidates = result.candidates if candidates is None else candidates
+        first = len(result)
+    elif candidates is None:
+        raise InputError(
+            "how many images a calibration lacks depends on the poses to choose from: give "
+            "candidates_around(recording, result)"
+        )
+    assert candidates is not None
+    candidates = replace(candidates, poses=candidates.poses[:: -(-len(candidates) // _ENOUGH)])
+    size, now = 16, math.inf
+    while size <= min(MOST_IMAGES, MOST_POSES):
+        more = next_poses(result, candidates, size)
+        reached = np.flatnonzero(more.tre_mm <= tre_mm)
+        if len(reached):
+            return first + int(reached[0])
+        now = float(more.tre_mm[-1])
+        # The square falls as 1 / n: jump to where that is enough.
+        wanted = size * min(8.0, max(2.0, 1.3 * (now / tre_mm) ** 2))
+        if size < MOST_IMAGES < wanted:
+            wanted = MOST_IMAGES
+        size = int(wanted)
+    raise InputError(
+        f"{tre_mm:g} mm would take more than {MOST_IMAGES} images ({now:.3g} mm with so many): "
+        "tilt the probe farther, or make each image better"
+    )

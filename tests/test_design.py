@@ -1,0 +1,402 @@
+"""Which poses: gains against brute force, plans inside their constraints, promises kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import jaxcal
+from jaxcal import design
+from jaxcal.design import Constraints, Model, Noise, Region
+from jaxcal.design.candidates import sobol_poses
+from jaxcal.design.criteria import check_criterion, gains, rp_weight, tre_weight
+from jaxcal.design.greedy import Rules, are_alike
+from jaxcal.design.information import covariance_of, known_information
+from jaxcal.design.noise import _basis, _gamma_slopes
+from jaxcal.design.planning import Known, weight_of
+from jaxcal.design.predict import curve
+from jaxcal.errors import InputError
+from jaxcal.recording import Recording, make_images
+
+MOUNT = np.eye(4)
+MOUNT[:3, :3] = Rotation.from_rotvec([0.4, -0.8, 1.1]).as_matrix()
+MOUNT[:3, 3] = [20.0, -35.0, 60.0]
+TARGET = np.array([250.0, -120.0, 80.0])
+EQUAL = Noise.constant((0.5, 0.5, 0.5), doubt=1.0)
+MODEL = Model(MOUNT, TARGET, EQUAL)
+
+
+def some(count: int = 400, seed: int = 0, model: Model = MODEL, **constraints) -> design.Candidates:
+    return design.make_candidates(
+        count=count, constraints=Constraints(**constraints), model=model, seed=seed
+    )
+
+
+def measured(model: Model, pose: np.ndarray) -> np.ndarray:
+    """Lateral position, range, elevational offset."""
+    q = model.targets(pose)
+    return np.array([q[0], np.hypot(q[1], q[2]), q[1]])
+
+
+@pytest.mark.parametrize("scale", [False, True])
+def test_jacobian_is_that_of_the_measurements(scale):
+    noise = Noise(np.random.default_rng(0).normal(0, 0.2, (3, 4)))
+    model = Model(MOUNT, TARGET, noise, scale)
+    for pose in some(5, model=model).poses:
+        columns = []
+        for k in range(9):
+            step = np.zeros(9)
+            step[k] = 1e-5 if 3 <= k < 6 else 1e-4
+
+            def moved(sign, step=step, pose=pose):
+                x = MOUNT.copy()
+                x[:3, 3] += MOUNT[:3, :3] @ (sign * step[:3])
+                x[:3, :3] = MOUNT[:3, :3] @ Rotation.from_rotvec(sign * step[3:6]).as_matrix()
+                return measured(Model(x, TARGET + sign * step[6:]), pose)
+
+            columns.append((moved(1) - moved(-1)) / (2 * step[k]))
+        sigma = noise.sigma(model.targets(pose))
+        if scale:
+            lateral, depth, _ = measured(model, pose)
+            columns += [np.array([-lateral, 0, 0]), np.array([0, -depth, 0])]
+        wanted = np.array(columns).T / sigma[:, None]
+        np.testing.assert_allclose(model.jacobian(pose), wanted, rtol=1e-6, atol=1e-5)
+
+
+def test_gain_is_that_of_brute_force_and_its_gradient_that_of_differences():
+    model = Model(MOUNT, TARGET, Noise.of_probe(jaxcal.LinearProbe()))
+    candidates = some(60, model=model)
+    information = model.information(candidates.poses[:9]) + model.beliefs()
+    covariance = covariance_of(information)
+    weight = tre_weight(candidates.constraints.region.grid())
+    rows = model.jacobian(candidates.poses)
+    quick = gains(rows, covariance, weight)
+    volume = gains(rows, covariance, None)
+    before = np.sum(weight * covariance)
+    for k in range(9, 60, 7):
+        after = np.linalg.inv(information + rows[k].T @ rows[k])
+        told = float(design.gain(candidates.poses[k], covariance, weight, model))
+        assert told == pytest.approx(before - np.sum(weight * after), rel=1e-7)
+        assert quick[k] == pytest.approx(-np.log(np.sum(weight * after) / before), rel=1e-6)
+        drop = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(after)[1]
+        assert volume[k] == pytest.approx(drop / 9, rel=1e-6)
+
+    pose = jnp.asarray(candidates.poses[20])
+
+    def along(tangent):
+        turn = jaxcal.geometry.rotation_from_vector(tangent[3:])
+        moved = jaxcal.geometry.matrix_from_rotation(
+            pose[:3, :3] @ turn, pose[:3, 3] + pose[:3, :3] @ tangent[:3]
+        )
+        return design.gain(moved, covariance, weight, model)
+
+    along = jax.jit(along)
+    slope = np.asarray(jax.grad(along)(jnp.zeros(6)))
+    for k in range(6):
+        size = 1e-4 if k >= 3 else 1e-2
+        values = [float(along(size * m * jnp.eye(6)[k])) for m in (-2, -1, 1, 2)]
+        wanted = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * size)
+        assert slope[k] == pytest.approx(wanted, rel=1e-6, abs=1e-6 * np.abs(slope).max())
+
+
+def test_weights_are_the_errors_that_they_stand_for():
+    rng = np.random.default_rng(3)
+    spread = rng.normal(size=(6, 6)) * np.array([0.3] * 3 + [0.004] * 3)[:, None]
+    covariance = np.zeros((9, 9))
+    covariance[:6, :6] = spread @ spread.T
+    candidates = some(40)
+    points = candidates.constraints.region.grid()
+    draws = rng.normal(size=(4000, 6)) @ spread.T
+    poses = candidates.poses
+    places = MODEL.targets(poses)
+    squared, precision = [], []
+    for draw in draws:
+        x = MOUNT.copy()
+        x[:3, 3] += MOUNT[:3, :3] @ draw[:3]
+        x[:3, :3] = MOUNT[:3, :3] @ Rotation.from_rotvec(draw[3:]).as_matrix()
+        apart = points @ (x - MOUNT)[:3, :3].T + (x - MOUNT)[:3, 3]
+        squared.append((apart**2).sum(axis=1).mean())
+        cloud = np.einsum("nij,nj->ni", poses[:, :3, :3], places @ x[:3, :3].T + x[:3, 3])
+        precision.append((cloud + poses[:, :3, 3]).var(axis=0, ddof=1).sum())
+    assert np.mean(squared) == pytest.approx(np.sum(tre_weight(points) * covariance), rel=0.05)
+    wanted = np.sum(rp_weight(poses, places, MOUNT) * covariance)
+    assert np.mean(precision) == pytest.approx(wanted, rel=0.05)
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    cone=st.floats(2, 60), turn=st.floats(2, 180), seed=st.integers(0, 1000),
+    half=st.floats(20, 80), near=st.floats(100, 250), tilted=st.booleans(),
+    criterion=st.sampled_from(["tre", "rp", "d"]),
+)  # fmt: skip
+def test_no_pose_of_a_plan_leaves_the_constraints(cone, turn, seed, half, near, tilted, criterion):
+    box = (tuple((TARGET - half).tolist()), tuple((TARGET + half + 20).tolist()))
+
+    def allowed(poses):
+        """What only a pose can tell, such as an arm's kinematics."""
+        return poses[:, 0, 2] > -0.9 if tilted else np.ones(len(poses), bool)
+
+    bounds = Constraints(
+        cone_deg=cone, turn_deg=turn, box_mm=box, reach_mm=(near, 400.0), allowed=allowed,
+        reference=Rotation.from_rotvec([0.1, 2.8, 0.4]).as_matrix(),
+    )  # fmt: skip
+    model = replace(MODEL, noise=Noise.constant((0.4, 0.3, 1.0), doubt=1.0))
+    poses, _ = sobol_poses(100, model, bounds, seed)
+    assume(len(poses) >= 20)
+    candidates = design.Candidates(poses, model, bounds)
+    plan = design.plan(candidates, 10, criterion)
+    assert bounds.keeps(plan.poses, MOUNT, TARGET).all()
+    numbers = bounds.coordinates(plan.poses, MOUNT, TARGET)
+    np.testing.assert_allclose(bounds.poses(numbers, MOUNT, TARGET), plan.poses, atol=1e-9)
+    np.testing.assert_allclose(plan.targets[:, 1], 0.0, atol=1e-9)
+    tips = plan.poses[:, :3, :3] @ MOUNT[:3, 3] + plan.poses[:, :3, 3]
+    assert (tips >= np.array(box[0])).all()
+    assert (tips <= np.array(box[1])).all()
+    axial = plan.poses[:, :3, :3] @ MOUNT[:3, 2]
+    assert (
+        np.degrees(np.arccos(np.clip(axial @ bounds.reference[:, 2], -1, 1))).max() <= cone + 1e-4
+    )
+    assert allowed(plan.poses).all()
+    if criterion == "tre":
+        unpolished = design.plan(candidates, 10, criterion, polish=False)
+        assert plan.tre_mm[-1] <= unpolished.tre_mm[-1] * (1 + 1e-9)
+
+
+def test_exchange_and_polish_each_improve_and_five_numbers_are_a_pose():
+    candidates = some(1000)
+    greedy = design.plan(candidates, 12, polish=False, swap=False)
+    swapped = design.plan(candidates, 12, polish=False)
+    polished = design.plan(candidates, 12)
+    assert polished.tre_mm[-1] < swapped.tre_mm[-1] <= greedy.tre_mm[-1]
+    assert polished.tre_mm[-1] < 0.99 * greedy.tre_mm[-1]
+
+
+def test_a_fifth_fills_space_and_replicates_are_capped():
+    rules = Rules(replicates=1, apart_deg=8.0, apart_mm=1e6)
+    candidates = some(1500)
+    plan = design.plan(candidates, 25, rules=rules)
+    assert plan.filling.sum() == 5
+    turns = (plan.poses[:, :3, :3] @ MOUNT[:3, :3]).reshape(-1, 9)
+    for k in range(25):
+        assert are_alike(turns, plan.targets, turns[k], plan.targets[k], rules).sum() == 1
+    free = design.plan(candidates, 25, rules=Rules(space_filling=0.0, replicates=100))
+    assert not free.filling.any()
+    assert free.tre_mm[-1] < plan.tre_mm[-1]
+    numbers = np.abs(candidates.numbers[plan.rows[plan.filling], :2])
+    assert numbers.min() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("constraints", "words"),
+    [({"cone_deg": 0.0, "turn_deg": 0.0}, ["tilted about the image's lateral axis"]),
+     ({"cone_deg": 0.0}, ["tilted about"]),
+     ({"region": Region((3.0, 3.0), (40.0, 40.0))}, ["nearer and farther"])],
+)  # fmt: skip
+def test_candidates_that_determine_nothing_are_no_plan(constraints, words):
+    candidates = some(200, **constraints)
+    with pytest.raises(InputError, match=r"would not determine .*: add poses") as caught:
+        design.plan(candidates, 10)
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_cannot_be_asked():
+    candidates = some(50)
+    for call, match in (
+        (lambda: design.plan(candidates, 3), "4 to"),
+        (lambda: check_criterion("volume"), "criterion must be"),
+        (lambda: design.plan(candidates, 10, prior=np.eye(6)), "9 x 9"),
+        (lambda: some(50, cone_deg=99.0), "cone_deg"),
+        (lambda: Region((5.0, -5.0)), "lateral_mm"),
+        (lambda: Noise.constant((1.0, 0.0, 1.0)), "three positive"),
+        (lambda: Noise(np.full((3, 4), np.nan)), "finite"),
+        (lambda: design.images_to(design.plan(candidates, 5), -1.0), "positive"),
+        (lambda: design.images_to(design.plan(candidates, 5), 1e-4), "more than 1000"),
+        (lambda: some(50, box_mm=((0.0,) * 3, (1.0,) * 3)), "widen"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=match):
+            call()
+
+
+def test_with_sds_wrong_by_three_a_plan_is_nearly_as_good():
+    true = Noise.constant((0.4, 0.3, 1.0), doubt=1.0)
+    pool = some(500, model=replace(MODEL, noise=true))
+    nothing = Known(MODEL.beliefs())
+
+    def error(poses):
+        return curve(pool, nothing, poses)[0][-1]
+
+    right = error(design.plan(pool, 20, polish=False).poses)
+    random = np.mean([error(pool.poses[k : k + 20]) for k in range(0, 200, 20)])
+    for factors in ((1, 3, 1), (1, 1 / 3, 1), (1, 1, 3), (1, 1, 1 / 3), (3, 1, 3), (1, 3, 1 / 3)):
+        wrong = Noise.constant(np.array([0.4, 0.3, 1.0]) * factors)
+        candidates = replace(pool, model=replace(MODEL, noise=wrong))
+        assert error(design.plan(candidates, 20, polish=False).poses) < 1.1 * right
+    assert right < 0.8 * random
+
+
+def test_sds_that_grow_with_depth_are_learned_and_moved_away_from():
+    rng = np.random.default_rng(1)
+    count = 3000
+    places = np.column_stack(
+        [rng.uniform(-25, 25, count), np.zeros(count), rng.uniform(15, 85, count)]
+    )
+    basis = _basis(places)
+    basis[:, 1:] -= basis[:, 1:].mean(axis=0)
+    squared = np.exp(basis @ [0.0, 1.6, 0.0, 0.0]) * rng.chisquare(1, count)
+    slopes = _gamma_slopes(basis, squared / squared.mean())
+    assert slopes[0] == pytest.approx(1.6, abs=0.2)
+    assert np.abs(slopes[1:]).max() < 0.3
+    noise = Noise.of_probe(jaxcal.LinearProbe())
+    shallow, deep = noise.sigma(np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 80.0]]))
+    assert deep[0] > 1.4 * shallow[0]
+    assert deep[2] > 1.4 * shallow[2]
+    growing = Noise(EQUAL.coefficients + np.array([0.0, 1.5, 0.0, 0.0]), 1.0)
+    usual = design.plan(some(800), 20).targets[:, 2].mean()
+    assert (
+        design.plan(some(800, model=replace(MODEL, noise=growing)), 20).targets[:, 2].mean() < usual
+    )
+
+
+def simulated(candidates: design.Candidates, poses: np.ndarray, rng: np.random.Generator):
+    """A recording at these poses: every image errs by the model's SDs in all three directions."""
+    model = candidates.model
+    true = model.targets(poses)
+    error = rng.normal(size=true.shape) * model.noise.sigma(true)[:, [0, 2, 1]]
+    moved = poses.copy()
+    moved[:, :3, 3] += np.einsum("nij,nj->ni", poses[:, :3, :3] @ MOUNT[:3, :3], error)
+    return Recording(make_images(moved, true[:, [0, 2]]))
+
+
+def actual(candidates: design.Candidates, poses: np.ndarray, trials: int, seed: int) -> np.ndarray:
+    """Root mean square TRE of conventional calibration, in closed form."""
+    rng = np.random.default_rng(seed)
+    points = candidates.constraints.region.grid()
+    squared = []
+    for _ in range(trials):
+        found = jaxcal.calibrate_closed_form(simulated(candidates, poses, rng)).image_to_probe
+        apart = points @ (found - MOUNT)[:3, :3].T + (found - MOUNT)[:3, 3]
+        squared.append((apart**2).sum(axis=1).mean())
+    return np.sqrt(np.mean(squared))
+
+
+def test_optimal_poses_beat_random_ones_as_promised_and_in_fact():
+    """Conventional: with equal SDs its error is the bound that plans promise."""
+    pool = some(1000)
+    known = Known(MODEL.beliefs())
+    plan = design.plan(pool, 12)
+    sets = {"optimal": plan.poses, "random": pool.poses[:12]}
+    told, seen = {}, {}
+    for name, poses in sets.items():
+        covariance = covariance_of(known.information + MODEL.information(poses))
+        told[name] = np.sqrt(np.sum(weight_of("tre", pool) * covariance))
+        seen[name] = actual(pool, poses, 120, 5)
+        assert seen[name] == pytest.approx(told[name], rel=0.12)
+    assert told["optimal"] < 0.75 * told["random"]
+    assert seen["optimal"] < 0.8 * seen["random"]
+
+
+def test_next_poses_go_on_with_a_plan_and_images_to_counts_them():
+    pool = some(800)
+    first = design.plan(pool, 10)
+    more = design.next_poses(first, pool, 6)
+    assert more.tre_mm[0] == pytest.approx(first.tre_mm[-1])
+    assert (np.diff(more.tre_mm) < 0).all()
+    wanted = float(more.tre_mm[4])
+    assert 10 <= design.images_to(first, wanted) <= 16
+    assert design.images_to(first, float(first.tre_mm[-1])) == 10
+    assert design.images_to(first, 0.5 * wanted) > 30
+
+
+@pytest.fixture(scope="module")
+def flat():
+    """Twelve images without a tilt or a turn about two of the axes, and their calibration."""
+    rng = np.random.default_rng(2)
+    constraints = Constraints(cone_deg=30.0, turn_deg=0.0)
+    numbers = np.column_stack([rng.uniform(-1, 1, (12, 2)), np.zeros((12, 3))])
+    numbers[:, 2] = rng.uniform(-0.5, 0.5, 12)
+    poses = constraints.poses(numbers, MOUNT, TARGET)
+    recording = simulated(some(50), poses, rng)
+    return recording, jaxcal.calibrate(recording, "conventional")
+
+
+def test_a_plan_from_an_unobservable_recording_aims_at_the_unseen_direction(flat):
+    recording, result = flat
+    assert result.status == "unobservable"
+    candidates = design.candidates_around(recording, result, count=800)
+    more = design.next_poses(result, candidates, 3)
+    x, point = candidates.model.image_to_probe, candidates.model.point
+    numbers = candidates.constraints.coordinates(more.poses, x, point)
+    # All images tilt about the lateral axis alone; what is missing are the other two.
+    assert np.hypot(numbers[:, 3], numbers[:, 4]).max() > np.radians(25)
+    assert more.tre_mm[-1] < 0.2 * more.tre_mm[0]
+    along = known_information(result, candidates.model, recording.calibration.poses)
+    same = candidates.constraints.poses(
+        np.column_stack([np.zeros((3, 2)), [[-0.4], [0.0], [0.4]], np.zeros((3, 2))]), x, point
+    )
+    alike = covariance_of(along + candidates.model.information(same))
+    weight = weight_of("tre", candidates)
+    assert np.sum(weight * alike) > 10 * np.sum(weight * more.covariance)
+
+
+def test_what_a_calibration_knows_is_its_covariance():
+    pool = some(50)
+    recording = simulated(pool, pool.poses[:12], np.random.default_rng(4))
+    result = jaxcal.calibrate(recording, "conventional")
+    assert result.status == "converged"
+    candidates = design.candidates_around(recording, result, count=500)
+    information = known_information(result, candidates.model, recording.calibration.poses)
+    found = covariance_of(information)[:6, :6]
+    np.testing.assert_allclose(found, np.asarray(result.covariance), rtol=1e-6, atol=1e-12)
+    plan = design.next_poses(result, candidates, 2)
+    assert plan.known.images == 12
+    assert (np.diff(plan.tre_mm) < 0).all()
+    assert design.images_to(result, float(plan.tre_mm[0]) / 2, candidates) > 8
+    with pytest.raises(InputError, match="candidates_around"):
+        design.plan(some(50), 5, prior=result)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [((-0.9, 0.9, 0.0, -np.radians(20), 0.0),
+      "tilt 20 degrees towards the marker, target in the lower left corner"),
+     ((0.9, -0.9, np.radians(32), 0.0, np.radians(41)),
+      "tilt 30 degrees towards you, turn 40 degrees clockwise, target in the upper right corner"),
+     ((0.0, 0.0, 0.0, 0.0, 0.0), "hold it straight, target in the middle of the image"),
+     ((0.0, 0.8, -0.3, 0.3, -0.3),
+      "tilt 25 degrees away from the marker and away from you, turn 15 degrees counter-clockwise, "
+      "target in the middle of the lower part")],
+)  # fmt: skip
+def test_poses_in_words(numbers, words):
+    bounds = Constraints(reference=Rotation.from_rotvec([2.0, 0.3, 0.1]).as_matrix())
+    pose = bounds.poses(np.array([numbers]), MOUNT, TARGET)[0]
+    assert design.pose_in_words(pose, bounds, MOUNT, TARGET) == words
+    # The handle is behind the image: towards the marker is along the lateral axis.
+    straight = bounds.reference
+    handle = -(pose[:3, :3] @ MOUNT[:3, :3])[:, 2] @ straight
+    if "tilt" in words and "marker" in words:
+        assert (handle[0] > 0) == ("towards the marker" in words)
+
+
+def test_curvilinear_regions_are_sectors():
+    region = Region.of_probe(jaxcal.CurvilinearProbe())
+    unit = np.random.default_rng(0).uniform(-1, 1, (50, 2))
+    np.testing.assert_allclose(region.unit(region.place(unit)), unit, atol=1e-12)
+    place = region.place(unit)
+    assert jaxcal.CurvilinearProbe().contains(place, 90.0).all()
+    candidates = design.make_candidates(jaxcal.CurvilinearProbe(), count=300)
+    plan = design.plan(candidates, 8)
+    assert (np.abs(region.unit(plan.targets)) <= 1 + 1e-9).all()
+
+
+def test_the_figure_is_a_figure(tmp_path):
+    plan = design.plan(some(200), 10)
+    design.plan_figure(plan, 0.3).savefig(tmp_path / "plan.png")
+    assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
