@@ -22,6 +22,7 @@ from dataclasses import asdict
 from hw.bench.arm import Arm, Motion
 from hw.bench.rtde import RtdeServer
 from hw.clock import REAL, Clock
+from hw.robot._process import ANSWERS, be_prompt
 from jaxcal.isolated import python_command
 
 START = (0.4, -0.1, 0.3, 0.0, 3.0, 0.2)
@@ -254,6 +255,9 @@ def main() -> None:
     """Serve until the input ends."""
     setup = json.loads(sys.argv[1])
     lines: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
+    # Every thread: one that holds the interpreter's lock must not wait behind other programs while
+    # the controller's own thread waits for that lock.
+    be_prompt(ANSWERS)
 
     def write() -> None:
         # Whoever does not read must not hold the controller up.

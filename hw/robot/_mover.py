@@ -50,7 +50,7 @@ from hw.rigid import turn_deg
 from hw.robot._process import ASKS, RECEIVES, be_prompt
 from hw.robot.identity import read_identity
 from hw.robot.limits import Limits, numbers
-from hw.robot.rtde import Packet, PacketReader, PendantSettings, safety_text
+from hw.robot.rtde import Packet, PacketReader, PendantSettings, safety_text, too_late
 from hw.robot.safety import (
     Command,
     Confirmation,
@@ -164,6 +164,10 @@ class Mover:
         asked_s, stamp_s = self._reader.bound
         if math.isfinite(asked_s):
             self._lag = Lag(self._clock.at(asked_s), stamp_s)
+        oldest = self._clock.patience(self._plan.limits.max_pose_age_s)
+        problem = too_late(self._reader.latency_s * self._clock.speed, oldest)
+        if problem is not None:
+            raise problem
         self._wait_for_packet()
         if self._dry_run:
             self._tell("ready", serial=self._serial, tcp_offset=self._offset)
@@ -445,7 +449,7 @@ class Mover:
         limits, now = self._plan.limits, self._clock.now()
         age = sample.age_s(now)
         if age > self._clock.patience(limits.max_pose_age_s):
-            text = f"no fresh pose for {age * 1000:.0f} ms: the motion was stopped"
+            text = f"no fresh pose: the newest is {sample.age_text(now)}; the motion was stopped"
             return StaleError(text, device="robot"), False
         force = math.hypot(*packet.tcp_force[:3])
         if force > limits.max_force_n:

@@ -22,14 +22,14 @@ RECORD = struct.Struct("<8dIiI6d5d6d")
 """Host and device s, pose (6), safety bits, mode, runtime state, TCP offset (6), payload, its
 centre of gravity (3), speed slider, joints (6); NaN where the controller does not tell."""
 POSE, ERROR, BOUND = b"P", b"E", b"B"
-"""What a record is; ``BOUND`` comes first: host and device s (:attr:`PacketReader.bound`)."""
+"""What a record is; ``BOUND`` comes first: :attr:`PacketReader.bound` and ``latency_s``."""
 _NOT_TOLD = (math.nan,)
 
 
 def _packets(output: int, host: str, frequency_hz: float | None, timeout_s: float) -> None:
     reader = PacketReader(host, frequency_hz=frequency_hz, timeout_s=timeout_s)
     if math.isfinite(reader.bound[0]):
-        _write(output, BOUND + struct.pack("<2d", *reader.bound))
+        _write(output, BOUND + struct.pack("<3d", *reader.bound, reader.latency_s))
     while True:
         if not select.select([reader], [], [], timeout_s)[0]:
             raise LostError(f"the controller was silent for {timeout_s:g} s", device="robot")

@@ -62,9 +62,9 @@ def safety_text(bits: int) -> str:
     return ", ".join(names) or (f"safety bits {bits:#x}" if wrong else "")
 
 
-_BOUND_TRIES, _BOUND_S, _BOUND_WITHIN_S = 5, 0.01, 0.25
-"""Tries to bound the latency, how tight, beyond two periods, is tight enough, and how long to try
-(wall s)."""
+_BOUND_TRIES, _LEAST_TRIES, _BOUND_S, _BOUND_WITHIN_S = 5, 3, 0.01, 0.25
+"""Tries to bound the latency, how many of them whatever they take, how tight, beyond two periods,
+is tight enough, and how long the others may take (wall s)."""
 _PAYLOAD_TOLERANCE_KG, _COG_TOLERANCE_M, _SPEED_TOLERANCE = 1e-3, 1e-4, 1e-3
 
 
@@ -146,6 +146,23 @@ class Packet:
     pendant: PendantSettings
     joints: tuple[float, ...] | None = None
     """Angles of the joints, rad."""
+
+
+def too_late(latency_s: float, limit_s: float) -> LostError | None:
+    """Why poses of this connection will not do, where all of them look older than the limit.
+
+    Args:
+        latency_s: of :attr:`PacketReader.latency_s`, bench s.
+        limit_s: of a pose's age, bench s.
+    """
+    if latency_s <= limit_s:
+        return None
+    return LostError(
+        f"the poses may be on their way for {latency_s * 1000:.0f} ms, over the limit of "
+        f"{limit_s * 1000:.0f} ms: connect by a shorter way (a cable, no tunnel), or give this "
+        "computer less other work",
+        device="robot",
+    )
 
 
 class PacketReader:
@@ -274,28 +291,32 @@ class PacketReader:
             end = start + int(FIELDS[name][1][:-1] or 1)
             self._optional_slots.append((start, end))
             start = end
-        self.bound = self._begin(deadline)
-        """Bound of the way's latency, see :meth:`_begin`."""
+        self.bound, self.latency_s = self._begin(deadline)
+        """``bound``: ``time.monotonic()`` and the controller's time (s); a packet with this stamp
+        was not made before that moment. ``latency_s``: how long the promptest packet so far was on
+        its way at most (wall s). See :meth:`_begin`."""
 
-    def _begin(self, deadline: float) -> tuple[float, float]:
+    def _begin(self, deadline: float) -> tuple[tuple[float, float], float]:
         """Start the stream, a few times over, and bound how long a packet is on its way.
 
         The first packet after the controller took a request to start was made after that request
         was sent, but for one period, as a controller stamps a packet at its cycle's start. However
-        constant a latency is, it cannot make that packet older. Of some tries the tightest counts:
-        a busy machine delays most of them.
+        constant a latency is, it cannot make that packet older. So each try bounds the offset of
+        the two clocks, host less controller: from below by the moment of the request, from above by
+        the packet's arrival. A busy machine delays any of these, so the tightest of some tries
+        count; a single slow one (the machine was held up while connecting) must not make every
+        pose of this connection look old.
 
         Returns:
-            ``time.monotonic()`` and the controller's time (s): a packet with this stamp was not
-            made before that moment.
+            The bound and the latency, see the attributes.
         """
         period = 1.0 / self.frequency_hz
-        best: tuple[float, float, float] | None = None
+        best, above = (-math.inf, 0.0), math.inf
         give_up = time.monotonic() + _BOUND_WITHIN_S
-        for _ in range(_BOUND_TRIES):
-            if best is not None and time.monotonic() > give_up:
+        for attempt in range(_BOUND_TRIES):
+            if attempt >= _LEAST_TRIES and time.monotonic() > give_up:
                 break
-            if best is not None:
+            if attempt:
                 # What was sent before the answer to this is read, and dropped, with it.
                 self._ask(b"P", b"", deadline)
             asked = time.monotonic()
@@ -303,16 +324,14 @@ class PacketReader:
                 raise RefusedError("the controller would not start sending", device="robot")
             packet = self._first(deadline)
             if packet is None:
+                # It accepts and sends nothing: whoever reads finds that out.
                 break
-            late = packet.monotonic_s - asked
-            if best is None or late < best[0]:
-                best = late, asked - period, packet.timestamp_s
-            if late < _BOUND_S + 2 * period:
+            stamp = packet.timestamp_s
+            above = min(above, packet.monotonic_s - stamp)
+            best = max(best, (asked - period, stamp), key=lambda pair: pair[0] - pair[1])
+            if above - (best[0] - best[1]) < _BOUND_S + 3 * period:
                 break
-        if best is None:
-            # It accepts and sends nothing: whoever reads finds that out.
-            return -math.inf, 0.0
-        return best[1:]
+        return best, max(above - (best[0] - best[1]), 0.0) if math.isfinite(above) else 0.0
 
     def _first(self, deadline: float) -> Packet | None:
         """The first packet after a start; it is read again by :meth:`read`. None: none came."""

@@ -528,7 +528,7 @@ def check_sample(sample: PoseSample, limits: Limits, clock: Clock) -> None:
     """
     age, oldest = sample.age_s(clock.now()), clock.patience(limits.max_pose_age_s)
     if not age <= oldest:
-        raise StaleError(f"the newest pose is {age * 1000:.0f} ms old", device="robot")
+        raise StaleError(f"the newest pose is {sample.age_text(clock.now())}", device="robot")
     if age < -oldest:
         raise _refuse("the newest pose is of another clock: it lies in the future")
     problem = safety_text(sample.safety_bits)

@@ -31,7 +31,7 @@ from hw.robot._process import spawn
 from hw.robot._reader import BOUND, ERROR, POSE, RECORD
 from hw.robot.identity import Identity, read_identity
 from hw.robot.pose import ur_to_pose
-from hw.robot.rtde import PendantSettings
+from hw.robot.rtde import PendantSettings, too_late
 
 _OFFSET_TOLERANCE = 1e-6
 _MOST_DRIFT = 200e-6
@@ -63,6 +63,13 @@ class PoseSample:
     def age_s(self, now: float) -> float:
         """Bench seconds since the controller measured it, as far as that can be known."""
         return now - self.t_host + self.lag_s
+
+    def age_text(self, now: float) -> str:
+        """Its age in words, and what of it is silence and what the way's latency."""
+        return (
+            f"{1000 * self.age_s(now):.0f} ms old: it came {1000 * (now - self.t_host):.0f} ms ago "
+            f"and was on its way for up to {1000 * self.lag_s:.0f} ms"
+        )
 
 
 @dataclass(frozen=True)
@@ -155,7 +162,8 @@ class PoseStream:
         """Connect, and wait for the first pose.
 
         Raises:
-            LostError: nothing came in time; the text says what the controller did.
+            LostError: nothing came in time, or what comes is on its way for too long; the text says
+            what the controller did.
         """
         if self._process is not None:
             raise LostError("the stream was already started", device="robot")
@@ -206,8 +214,8 @@ class PoseStream:
         age = sample.age_s(self.clock.now())
         if age > self.max_age_s:
             raise StaleError(
-                f"the newest pose is {age * 1000:.0f} ms old (at most "
-                f"{self.max_age_s * 1000:.0f} ms)",
+                f"the newest pose is {sample.age_text(self.clock.now())}; at most "
+                f"{self.max_age_s * 1000:.0f} ms are allowed",
                 device="robot",
             )
         return sample
@@ -279,10 +287,13 @@ class PoseStream:
 
     def _take(self, data: bytes) -> tuple[bytes, str | None]:
         start, size = 0, RECORD.size
-        if data[:1] == BOUND and len(data) >= 17:
-            monotonic_s, t_device = struct.unpack_from("<2d", data, 1)
+        if data[:1] == BOUND and len(data) >= 25:
+            monotonic_s, t_device, latency_s = struct.unpack_from("<3d", data, 1)
             self._lag = Lag(self.clock.at(monotonic_s), t_device)
-            start = 17
+            start = 25
+            problem = too_late(latency_s * self.clock.speed, self.max_age_s)
+            if problem is not None:
+                return b"", problem.args[0]
         new: list[PoseSample] = []
         error = None
         told = ()

@@ -234,8 +234,16 @@ def fault_in_motion(
     """What the caller was told, and how long robot and caller took (bench s)."""
     with ThreadPoolExecutor(1) as pool:
         future = pool.submit(motion.move_to, PLAN.targets[2])
+        hesitations = 0
         while math.hypot(*robot.state()["velocity"]) < 0.04:
-            assert not future.done(), f"over before the fault: {future.exception()}"
+            if future.done():
+                error = future.exception()
+                assert type(error) is StaleError, f"over before the fault: {error}"
+                assert not motion.ended
+                # A busy machine held one of the processes up: asked for again, as the stage does.
+                hesitations += 1
+                assert hesitations < 5, f"over before the fault: {error}"
+                future = pool.submit(motion.move_to, PLAN.targets[2])
             time.sleep(0.002)
         before = robot.state()["t"]
         fault()
@@ -463,6 +471,19 @@ def test_danger_or_force_before_a_request_sends_no_motion(version):
         assert sent(robot, 3) == []
         assert robot.state()["raw"] == pytest.approx(START)
     assert "moveL" not in [entry[1] for entry in log]
+
+
+def test_no_thread_of_the_emulated_controller_waits_behind_other_programs():
+    """One that does may hold the interpreter's lock, and the controller then stands still."""
+    with EmulatedRobot() as robot:
+        robot.state()
+        assert robot.process is not None
+        of_threads = [
+            (os.sched_getscheduler(int(name)), os.sched_getparam(int(name)).sched_priority)
+            for name in os.listdir(f"/proc/{robot.process.pid}/task")
+        ]
+    # The main thread, the controller's, and the one that writes; numpy's run no Python.
+    assert of_threads.count(max(of_threads)) >= 3
 
 
 def test_nobody_answers():

@@ -8,7 +8,8 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -131,7 +132,7 @@ def test_a_mute_controller_makes_poses_stale_and_then_lost():
             poses.latest()
             robot.ask("mute")
             time.sleep(0.15)
-            with pytest.raises(StaleError, match=r"ms old \(at most 100 ms\)"):
+            with pytest.raises(StaleError, match=r"ms old: it came 1\d\d ms ago .* at most 100 ms"):
                 poses.latest()
             with pytest.raises((StaleError, LostError)):
                 poses.steady(0.1)
@@ -200,8 +201,9 @@ def test_a_lag_that_was_there_from_the_start_or_creeps_is_seen():
     assert Lag().of(10.3, 10.0 + offset) == 0.0
 
 
-def delaying(host: str, port: int, seconds: float) -> str:
-    """A proxy that delays everything, either way; its address."""
+@contextmanager
+def delaying(host: str, port: int, seconds: Callable[[bytes], float]) -> Iterator[str]:
+    """A proxy that delays what passes, either way, by what a function says; its address."""
     here = address()
     listener = socket.create_server((here, port))
 
@@ -209,16 +211,19 @@ def delaying(host: str, port: int, seconds: float) -> str:
         waiting: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
 
         def deliver() -> None:
-            with contextlib.suppress(OSError):
-                while True:
-                    due, data = waiting.get()
-                    time.sleep(max(0.0, due - time.monotonic()))
-                    sink.sendall(data)
+            with sink, contextlib.suppress(OSError):
+                while (come := waiting.get())[1]:
+                    time.sleep(max(0.0, come[0] - time.monotonic()))
+                    sink.sendall(come[1])
+                sink.shutdown(socket.SHUT_RDWR)
 
         threading.Thread(target=deliver, daemon=True).start()
-        with contextlib.suppress(OSError):
-            while data := source.recv(65536):
-                waiting.put((time.monotonic() + seconds, data))
+        data = b"more"
+        while data:
+            data = b""
+            with contextlib.suppress(OSError):
+                data = source.recv(65536)
+            waiting.put((time.monotonic() + seconds(data), data))
 
     def serve() -> None:
         with contextlib.suppress(OSError):
@@ -229,17 +234,46 @@ def delaying(host: str, port: int, seconds: float) -> str:
                     threading.Thread(target=carry, args=pair, daemon=True).start()
 
     threading.Thread(target=serve, daemon=True).start()
-    return here
+    with listener:
+        yield here
+        listener.shutdown(socket.SHUT_RDWR)
 
 
-def test_poses_that_always_come_late_are_not_new():
+def test_poses_that_come_late_are_not_new():
+    delay = [0.15]
     with EmulatedRobot(version=CB_SERIES) as robot:
         with PoseStream(robot.host, clock=robot.clock) as prompt:
             prompt.latest()
-        with PoseStream(delaying(robot.host, 30004, 0.15), clock=robot.clock) as late:
-            time.sleep(0.3)
-            with pytest.raises(StaleError, match=r"is [2-4]\d\d ms old"):
-                late.latest()
+        with delaying(robot.host, 30004, lambda data: delay[0]) as host:
+            too_late = r"on their way for [2-4]\d\d ms, over the limit of 100"
+            with pytest.raises(LostError, match=too_late):
+                PoseStream(host, clock=robot.clock).start()
+            delay[0] = 0.0
+            with PoseStream(host, clock=robot.clock) as late:
+                delay[0] = 0.15
+                time.sleep(0.3)
+                with pytest.raises(StaleError, match=r"was on its way for up to [12]\d\d ms"):
+                    late.latest()
+
+
+def test_one_slow_start_does_not_make_every_later_pose_look_old():
+    starts = []
+
+    def hold(data: bytes) -> float:
+        """A request to start, three bytes, on its way to the controller."""
+        starts.append(data == rtde(b"S", b""))
+        return 0.6 if starts[-1] and sum(starts) == 1 else 0.0
+
+    with (
+        EmulatedRobot(version=CB_SERIES) as robot,
+        delaying(robot.host, 30004, hold) as host,
+    ):
+        with contextlib.closing(PacketReader(host)) as reader:
+            assert sum(starts) >= 2
+            assert reader.latency_s < 0.3
+        starts.clear()
+        with PoseStream(host, clock=robot.clock, max_age_s=0.3) as poses:
+            assert min(sample.lag_s for sample in poses.drain()) < 0.3
 
 
 def test_safety_bits_are_named():
