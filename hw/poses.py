@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.rigid import looking_rotation, rotation_matrix
 from hw.scene import Scene
+from hw.shapes import Float
 from jaxcal.errors import InputError
 from jaxcal.geometry import check_poses
 from jaxcal.io.atomic import atomic_path

@@ -8,7 +8,8 @@ small processes that talk to devices start without JAX and scipy.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+
+from hw.shapes import Float
 
 _SMALL_ANGLE = 1e-6
 """Below this angle (rad) sines are taken from their series, which are exact to 1e-24 there."""

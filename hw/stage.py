@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.errors import RefusedError, StaleError
 from hw.midplane.search import Echoes
@@ -18,6 +17,7 @@ from hw.rigid import turn_deg
 from hw.robot.motion import Motion
 from hw.robot.stream import PoseSample
 from hw.session import Session
+from hw.shapes import Float
 
 _MOST_HESITATIONS = 10
 

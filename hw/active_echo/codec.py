@@ -56,9 +56,9 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt16
 
 from hw.extras import require
+from hw.shapes import UInt16
 
 NO_RESPONSE = 0xFFFF
 """Time of flight (ticks) of a line without a response."""

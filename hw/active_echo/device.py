@@ -21,7 +21,6 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt16
 
 from hw.active_echo.codec import (
     MAXIMUM_LINES,
@@ -36,6 +35,7 @@ from hw.active_echo.codec import (
 from hw.active_echo.transport import BAUD, DEVICE, open_transport
 from hw.clock import REAL, Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError
+from hw.shapes import Float, UInt16
 
 COMMAND_TIMEOUT_S = 1.0
 """A command that is not answered for so long (bench time) has failed."""

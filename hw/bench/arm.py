@@ -328,6 +328,10 @@ def _six(values: Sequence[float]) -> Vector:
     return result
 
 
+# As in hw.rigid, in plain numbers: the controller asks a thousand times a second, and what takes
+# 6 us here takes 76 us by numpy's calls on arrays of four numbers.
+
+
 def _quaternion(vector: Sequence[float]) -> Vector:
     angle = math.hypot(*vector)
     scale = 0.5 - angle**2 / 48 if angle < 1e-6 else math.sin(angle / 2) / angle

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.bench.active_echo import AuspisEmulator
 from hw.bench.arm import Arm
@@ -23,6 +22,7 @@ from hw.clock import Clock
 from hw.rigid import looking_rotation
 from hw.robot.pose import pose_to_ur, ur_to_pose
 from hw.scene import Scene
+from hw.shapes import Float
 from jaxcal.errors import InputError
 
 VERSIONS = {125: CB_SERIES, 500: E_SERIES}

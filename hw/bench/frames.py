@@ -15,9 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
 
 from hw.bench.world import World
+from hw.shapes import Float, UInt8
 from jaxcal.errors import InputError
 
 ROWS, COLUMNS = 480, 640

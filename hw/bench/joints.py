@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.rigid import quaternion_to_matrix, rigid
 from hw.robot.kinematics import (
@@ -27,6 +26,7 @@ from hw.robot.kinematics import (
     nearest_turn,
 )
 from hw.robot.pose import ur_to_pose
+from hw.shapes import Float
 
 if TYPE_CHECKING:
     from hw.bench.arm import Motion

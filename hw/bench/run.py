@@ -18,12 +18,12 @@ import threading
 from dataclasses import asdict
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.bench.assembly import Assembly, Options
 from hw.bench.control import ControlClient
 from hw.clock import Clock
 from hw.scene import Scene
+from hw.shapes import Float
 from jaxcal.errors import InputError
 from jaxcal.isolated import python_command
 from jaxcal.probe import LinearProbe

@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.bench.world import World
 from hw.midplane.search import Echoes
+from hw.shapes import Float
 
 
 @dataclass(frozen=True)

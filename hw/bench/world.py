@@ -24,10 +24,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from hw.rigid import looking_rotation, rigid, rotation_matrix
 from hw.scene import Scene
+from hw.shapes import Bool, Float
 from jaxcal.errors import InputError
 from jaxcal.probe import L14_5, LinearProbe
 

@@ -13,10 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.midplane.bracket import Bracket, Placement, widened
 from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
+from hw.shapes import Float
 
 LEAST_FRACTION = 0.4
 """Samples below this part of the loudest say more of the beam's skirts than of its middle."""

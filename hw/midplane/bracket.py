@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
+from hw.shapes import Float
 from jaxcal.errors import InputError
 
 

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import UInt8
 
 from hw.errors import DeviceError
 from hw.midplane.bracket import Placement
 from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
+from hw.shapes import UInt8
 from jaxcal.errors import InputError
 
 LONGEST = 31

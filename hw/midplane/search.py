@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from hw.errors import Device, DeviceError
 from hw.midplane.bracket import Placement, widened
+from hw.shapes import Bool, Float
 from jaxcal.errors import InputError
 
 _TOP_LINES = 8

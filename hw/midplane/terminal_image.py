@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import UInt8
+
+from hw.shapes import UInt8
 
 COLUMNS, ROWS = 64, 20
 _GREYS = 24

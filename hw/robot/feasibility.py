@@ -19,7 +19,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.errors import RefusedError
 from hw.rigid import cross_matrix, rotation_vector, straight_way
@@ -40,6 +39,7 @@ from hw.robot.kinematics import (
     scaled_jacobian,
     tool_of,
 )
+from hw.shapes import Float
 
 _COARSE_MM = 20.0
 """First distance between samples, of the flange and ANGLE_MM per rad."""

@@ -32,11 +32,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from hw.errors import RefusedError
 from hw.rigid import inverse as inverse_transform
 from hw.rigid import rigid
+from hw.shapes import Bool, Float, Int
 
 ANGLE_MM = 100.0
 """A turn of one rad counts as this many mm in the Jacobian's singular values: about the distance

@@ -18,10 +18,10 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.errors import RefusedError
 from hw.robot.kinematics import model_named
+from hw.shapes import Float
 from jaxcal.errors import FormatError
 from jaxcal.io.toml import load_toml
 

@@ -6,9 +6,9 @@ Numpy only: the processes that talk to the robot start without JAX.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.rigid import rigid, rotation_vector
+from hw.shapes import Float
 
 MM_PER_M = 1000.0
 

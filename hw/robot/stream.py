@@ -22,7 +22,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.clock import REAL, Clock
 from hw.errors import LostError, RefusedError, StaleError
@@ -32,6 +31,7 @@ from hw.robot._reader import BOUND, ERROR, POSE, RECORD
 from hw.robot.identity import Identity, read_identity
 from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import PendantSettings, too_late
+from hw.shapes import Float
 
 _OFFSET_TOLERANCE = 1e-6
 _MOST_DRIFT = 200e-6

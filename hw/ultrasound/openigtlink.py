@@ -22,7 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from fastcrc import crc64
-from jaxtyping import Float, Int16, UInt8
+
+from hw.shapes import Float, Int16, UInt8
 
 HEADER_SIZE = 58
 RF_DEVICE = "RF"

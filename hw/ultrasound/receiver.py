@@ -15,10 +15,10 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from hw.clock import REAL, Clock
 from hw.errors import Device, DeviceError, LostError, StaleError
+from hw.shapes import Float
 from hw.ultrasound.framing import MessageDecoder
 from hw.ultrasound.openigtlink import RF_DEVICE, Message, Picture, Pixels, Status, Tracked
 

@@ -12,7 +12,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from hw.robot.kinematics import (
@@ -24,6 +23,7 @@ from hw.robot.kinematics import (
     model_named,
     nearest,
 )
+from hw.shapes import Float, UInt8
 
 UNIT_MM = 100.0
 _CHI_95 = 7.8147
