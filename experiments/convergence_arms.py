@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import same_objective as same
+from jaxcal.uncertainty import assess
 from jaxtyping import Array, Float
 
-from jaxcal.metrics import reconstruction_precision
+from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.model.parameters import RIGID, Parameters, retract
 from jaxcal.model.priors import AbstractPrior, Bounded
 from jaxcal.model.residuals import circle_residual
@@ -23,7 +24,6 @@ from jaxcal.solvers.alternating import alternate
 from jaxcal.solvers.conventional import from_scratch
 from jaxcal.solvers.joint import joint
 from jaxcal.solvers.least_squares import linearise, minimise
-from jaxcal.uncertainty import assess
 
 SEED = 20261122
 CHUNK = 50

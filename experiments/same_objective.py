@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from common import arguments, machine, results_folder, write_table
+from jaxcal.uncertainty import assess
 from jaxtyping import Array
 
 from jaxcal.geometry import rotation_angle
@@ -25,7 +26,6 @@ from jaxcal.simulation import Protocol, simulate
 from jaxcal.solvers.alternating import alternate
 from jaxcal.solvers.conventional import from_scratch
 from jaxcal.solvers.joint import joint
-from jaxcal.uncertainty import assess
 
 SEED = 20261120
 IMAGES = 50

@@ -38,13 +38,13 @@ _HOME = {
     "calibrate_batch": "jaxcal.solve",
     "calibrate_closed_form": "jaxcal.closed_form",
     "calibrate_pivot": "jaxcal.pivot",
-    "calibration_reproducibility": "jaxcal.metrics",
+    "calibration_reproducibility": "jaxcal.diagnostics.metrics",
     "certify": "jaxcal.certificate",
     "cross_validate": "jaxcal.resampling",
     "load": "jaxcal.io.hdf5",
     "make_images": "jaxcal.recording",
-    "predicted_tre": "jaxcal.intervals",
-    "reconstruction_precision": "jaxcal.metrics",
+    "predicted_tre": "jaxcal.diagnostics.intervals",
+    "reconstruction_precision": "jaxcal.diagnostics.metrics",
     "save": "jaxcal.io.hdf5",
     "segment": "jaxcal.segmentation.segment",
     "segment_recording": "jaxcal.segmentation.segment",
@@ -52,7 +52,7 @@ _HOME = {
     "simulate_recording": "jaxcal.simulation",
     "sound_speed_in_water": "jaxcal.sound",
     "stack": "jaxcal.problem",
-    "transform_intervals": "jaxcal.intervals",
+    "transform_intervals": "jaxcal.diagnostics.intervals",
 }
 
 
@@ -63,17 +63,19 @@ if TYPE_CHECKING:
     from jaxcal.certificate import certify as certify
     from jaxcal.closed_form import ClosedForm as ClosedForm
     from jaxcal.closed_form import calibrate_closed_form as calibrate_closed_form
+    from jaxcal.diagnostics.intervals import predicted_tre as predicted_tre
+    from jaxcal.diagnostics.intervals import transform_intervals as transform_intervals
+    from jaxcal.diagnostics.metrics import (
+        calibration_reproducibility as calibration_reproducibility,
+    )
+    from jaxcal.diagnostics.metrics import reconstruction_precision as reconstruction_precision
     from jaxcal.errors import CalibrationError as CalibrationError
     from jaxcal.errors import FormatError as FormatError
     from jaxcal.errors import InputError as InputError
     from jaxcal.errors import MissingExtraError as MissingExtraError
     from jaxcal.errors import OutputError as OutputError
-    from jaxcal.intervals import predicted_tre as predicted_tre
-    from jaxcal.intervals import transform_intervals as transform_intervals
     from jaxcal.io.hdf5 import load as load
     from jaxcal.io.hdf5 import save as save
-    from jaxcal.metrics import calibration_reproducibility as calibration_reproducibility
-    from jaxcal.metrics import reconstruction_precision as reconstruction_precision
     from jaxcal.options import Options as Options
     from jaxcal.pivot import Pivot as Pivot
     from jaxcal.pivot import calibrate_pivot as calibrate_pivot

@@ -13,20 +13,21 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
+from jaxcal import answer
 from jaxcal.calibration import Calibration
-from jaxcal.fused_findings import find
 from jaxcal.model.parameters import RIGID
 from jaxcal.model.priors import Bounded, Gaussian
 from jaxcal.options import Given, Plan
-from jaxcal.pipeline import Solution, agreeing, assemble, belief, finish
+from jaxcal.pipeline import Solution, agreeing, belief, finish, solved_by
 from jaxcal.precision import in_standard_promotion
 from jaxcal.problem import Problem
-from jaxcal.solvers.fused import Images, Measured
+from jaxcal.solvers.fused import Guess, Images, Measured
 from jaxcal.solvers.fused_auto import average_abreast
 from jaxcal.solvers.fused_methods import Begun, alternate, from_scratch
 from jaxcal.solvers.fused_variance import self_tuned
 from jaxcal.solvers.lanes import minimise
 from jaxcal.solvers.variance import RELATIVE_FLOOR
+from jaxcal.solvers.views import matrices
 
 
 def plain(problem: Problem, given: Given, plan: Plan) -> bool:
@@ -72,13 +73,11 @@ def finish_batch(
     if plan.laws and isinstance(prior, Gaussian):
         averaged = average_abreast(parameters, prior, problems, plan.laws)
         parameters, prior = averaged.parameters, averaged.belief
-    found = find(solution, parameters, solution.offset, prior, averaged, problems, everything, plan)
-    law = None if averaged is None else averaged.law
-
-    def one(solution, parameters, prior, found, law, problem) -> Calibration:
-        return assemble(solution, parameters, prior, found, law, problem, given, plan)
-
-    return jax.vmap(one)(solution, parameters, prior, found, law, problems)
+    information, design = matrices(
+        Guess.of(parameters), Images.of(problems), prior, solution.offset
+    )
+    solved = solved_by(solution, parameters, solution.offset, prior, information, design, plan)
+    return answer.assemble(solved, averaged, problems, given, plan)
 
 
 @finish_batch.defjvp

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import enum
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -10,13 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal import diagnosis
 from jaxcal.errors import CalibrationError
 from jaxcal.geometry import AnyArray
-from jaxcal.inspection import Inspection
 from jaxcal.model.parameters import Blocks
-from jaxcal.problem import is_traced
+from jaxcal.problem import Problem, is_traced
 from jaxcal.solvers.auto import OffsetLaw
+
+if TYPE_CHECKING:
+    from jaxcal.diagnostics.residual_checks import Inspection
+    from jaxcal.diagnostics.summary import Summary
 
 
 class Status(enum.IntEnum):
@@ -28,56 +33,105 @@ class Status(enum.IntEnum):
     FAILED = 3
 
 
+class Convergence(eqx.Module):
+    """How the method ended.
+
+    Attributes:
+        cost: the minimised sum of squares, mm^2 (equal weights) or whitened.
+        stationarity: scaled KKT residual of that objective.
+        tolerance_met: the method's own stopping rule was met.
+        iterations: linearisations (joint, conventional) or rounds (alternating).
+        variance_rounds: variance updates of the self-tuning; 0 without.
+        searched_start: the closed-form start was unsound and one was searched for.
+        sigma_floored: which SDs rest on their floor.
+        rotation_change: X's last move in rad (alternating), else 0.
+        translation_change: X's last move in mm (alternating), else 0.
+        trace: objective after each of the first iterations, NaN beyond the last; None where none
+            was asked for.
+    """
+
+    cost: Float[Array, "*batch"]
+    stationarity: Float[Array, "*batch"]
+    tolerance_met: Bool[Array, "*batch"]
+    iterations: Int[Array, "*batch"]
+    variance_rounds: Int[Array, "*batch"]
+    searched_start: Bool[Array, "*batch"]
+    sigma_floored: Bool[Array, "*batch 3"]
+    rotation_change: Float[Array, "*batch"]
+    translation_change: Float[Array, "*batch"]
+    trace: Float[Array, "*batch trace"] | None
+
+
+class Medium(eqx.Module):
+    """Sound speed and delay, each None where it was not estimated.
+
+    Attributes:
+        sound_speed_m_s: estimate, m/s.
+        sound_speed_sd_m_s: its SD, m/s.
+        sound_speed_prior_m_s: SD that was believed before, m/s; None without such a belief.
+        delay_s: electronic delay, s.
+        delay_sd_s: its SD, s.
+        delay_prior_s: SD that was believed before, s; None without such a belief.
+    """
+
+    sound_speed_m_s: Float[Array, "*batch"] | None = None
+    sound_speed_sd_m_s: Float[Array, "*batch"] | None = None
+    sound_speed_prior_m_s: Float[Array, "*batch"] | None = None
+    delay_s: Float[Array, "*batch"] | None = None
+    delay_sd_s: Float[Array, "*batch"] | None = None
+    delay_prior_s: Float[Array, "*batch"] | None = None
+
+
+class Linearisation(eqx.Module):
+    """The normal matrices at the answer; tangents are in the order of ``Calibration.blocks``.
+
+    Attributes:
+        information: of the whitened residuals, offsets eliminated (mm, rad, log units).
+        design: of the unweighted residuals, offsets known.
+        variance: of the residuals that ``information`` is of: 1 where they are whitened, else mm^2.
+        tracker_sd: SD of the tracked position, mm, or None.
+        average_elevation_sd: SDs of the offsets under the average over distributions, mm, or None.
+    """
+
+    information: Float[Array, "*batch p p"]
+    design: Float[Array, "*batch p p"]
+    variance: Float[Array, "*batch"]
+    tracker_sd: Float[Array, "*batch"] | None
+    average_elevation_sd: Float[Array, "*batch n"] | None
+
+
 class Calibration(eqx.Module):
     """A calibration of one problem, or of a batch (then every array has the batch axes in front).
 
     Units are mm and rad; X's perturbations are right ones, X Exp([v, omega]), so they are along and
     about the image's axes (lateral, elevational, axial).
 
+    The attributes below are arrays of the solve, also under jit, vmap and grad. The properties are
+    computed on the host when they are first read, for the whole batch at once, with numpy
+    (:mod:`jaxcal.diagnostics`); reading one of them inside a transformation is an error.
+
     Attributes:
-        image_to_probe: X.
+        image_to_probe: X, mm.
         point: target in the tracker's frame, mm.
         elevation: estimated elevational offset of the target in every image (q_iy), mm; 0 where an
             image was left out.
-        elevation_sd: its standard deviation, mm; NaN where it rests on a bound or is not known.
         sigma: SDs of lateral position, range and elevational offset, mm.
-        channel_sigma: SD of an element's distance, mm; None for solves on points.
         offset_law: what the data say of the offsets' law, their mean and the noise; None where no
             laws were weighed.
+        channel_sigma: SD of an element's distance, mm; None for solves on points.
         covariance: of X (v mm, omega rad); NaN where X is not observable.
         point_covariance: of the target, mm^2.
         scale_mm_per_px: [lateral, axial], or None for points in mm.
-        sound_speed_m_s: where it was estimated, else None; so are the following.
-        sound_speed_sd_m_s: its standard deviation.
-        delay_s: electronic delay, s.
-        delay_sd_s: its standard deviation.
-        sound_speed_prior_m_s: SD that was believed before; None without such a belief.
-        delay_prior_s: SD that was believed before, likewise.
-        residual: q_i - p_i with p_i in the plane (y = 0), in the image frame, mm.
-        rms: root mean square length of those residuals over the used images, mm.
+        medium: sound speed and delay, or None where neither was estimated.
+        rms: root mean square of ``residual``'s length over the used images, mm.
         mask: 1 for used images.
-        at_bound: 1 where the offset rests on its bound.
         status_code: a :class:`Status`.
-        iterations: linearisations (joint, conventional) or rounds (alternating).
-        variance_rounds: variance updates of the self-tuning; 0 without.
-        cost: the minimised sum of squares: mm^2 (equal weights) or whitened.
-        stationarity: scaled KKT residual of that objective.
-        condition: of the information about all unknowns, in scaled units (largest / smallest).
-        weakest: unit vector (scaled units) of the least known direction of all unknowns.
-        weakest_sd: standard deviation along it, mm at the lever arm; NaN where it has none.
-        prior_direction: direction that the measurements alone, without the offset's prior or bound,
-            leave undetermined; zeros where there is none.
-        searched_start: the closed-form start was unsound and one was searched for.
-        inspection: images that stand out, the noise model's fit, and which poses to add.
-        sigma_tuned: the SDs were estimated from the data.
-        sigma_floored: (3,) which SDs rest on their floor.
-        tolerance_met: the method's own stopping rule was met.
         differentiable: gradients through this answer by the implicit function theorem are valid: a
             stationary point, well determined, and no offset about to reach or leave its bound.
-        rotation_change: X's last move in rad (alternating), else 0.
-        translation_change: X's last move in mm (alternating), else 0.
-        trace: objective after each of the first iterations; NaN beyond the last;
-            None where none was asked for.
+        sigma_tuned: the SDs were estimated from the data.
+        convergence: how the method ended.
+        linearisation: the normal matrices, from which the properties are computed.
+        problem: the data that were solved, images left out included.
         method: ``conventional``, ``alternating`` or ``joint`` (static).
         prior: ``none``, ``bounded``, ``gaussian``, or, where laws of the offsets were weighed,
             ``auto`` or ``uniform`` (static).
@@ -89,41 +143,21 @@ class Calibration(eqx.Module):
     image_to_probe: Float[Array, "*batch 4 4"]
     point: Float[Array, "*batch 3"]
     elevation: Float[Array, "*batch n"]
-    elevation_sd: Float[Array, "*batch n"]
     sigma: Float[Array, "*batch 3"]
     offset_law: OffsetLaw | None
     channel_sigma: Float[Array, "*batch"] | None
     covariance: Float[Array, "*batch 6 6"]
     point_covariance: Float[Array, "*batch 3 3"]
     scale_mm_per_px: Float[Array, "*batch 2"] | None
-    sound_speed_m_s: Float[Array, "*batch"] | None
-    sound_speed_sd_m_s: Float[Array, "*batch"] | None
-    delay_s: Float[Array, "*batch"] | None
-    delay_sd_s: Float[Array, "*batch"] | None
-    sound_speed_prior_m_s: Float[Array, "*batch"] | None
-    delay_prior_s: Float[Array, "*batch"] | None
-    residual: Float[Array, "*batch n 3"]
+    medium: Medium | None
     rms: Float[Array, "*batch"]
     mask: Float[Array, "*batch n"]
-    at_bound: Float[Array, "*batch n"]
     status_code: Int[Array, "*batch"]
-    iterations: Int[Array, "*batch"]
-    variance_rounds: Int[Array, "*batch"]
-    cost: Float[Array, "*batch"]
-    stationarity: Float[Array, "*batch"]
-    condition: Float[Array, "*batch"]
-    weakest: Float[Array, "*batch p"]
-    weakest_sd: Float[Array, "*batch"]
-    prior_direction: Float[Array, "*batch p"]
-    searched_start: Bool[Array, "*batch"]
-    inspection: Inspection
-    sigma_tuned: Bool[Array, "*batch"]
-    sigma_floored: Bool[Array, "*batch 3"]
-    tolerance_met: Bool[Array, "*batch"]
     differentiable: Bool[Array, "*batch"]
-    rotation_change: Float[Array, "*batch"]
-    translation_change: Float[Array, "*batch"]
-    trace: Float[Array, "*batch trace"] | None
+    sigma_tuned: Bool[Array, "*batch"]
+    convergence: Convergence
+    linearisation: Linearisation
+    problem: Problem | None
     method: str = eqx.field(static=True)
     prior: str = eqx.field(static=True)
     data: str = eqx.field(static=True)
@@ -136,8 +170,98 @@ class Calibration(eqx.Module):
         return jnp.asarray(self.status_code == Status.CONVERGED)
 
     @property
+    def images_used(self) -> Int[Array, "*batch"]:
+        """Number of used images (traceable)."""
+        return jnp.sum(self.mask > 0, axis=-1)
+
+    @property
+    def information(self) -> Float[Array, "*batch p p"]:
+        """Information of all unknowns, offsets eliminated, per ``linearisation.variance``."""
+        return self.linearisation.information
+
+    @property
+    def cost(self) -> Float[Array, "*batch"]:
+        """The minimised sum of squares: mm^2 (equal weights) or whitened."""
+        return self.convergence.cost
+
+    @property
+    def stationarity(self) -> Float[Array, "*batch"]:
+        """Scaled KKT residual of the objective."""
+        return self.convergence.stationarity
+
+    @property
+    def tolerance_met(self) -> Bool[Array, "*batch"]:
+        """The method's own stopping rule was met."""
+        return self.convergence.tolerance_met
+
+    @property
+    def iterations(self) -> Int[Array, "*batch"]:
+        """Linearisations (joint, conventional) or rounds (alternating)."""
+        return self.convergence.iterations
+
+    @property
+    def variance_rounds(self) -> Int[Array, "*batch"]:
+        """Variance updates of the self-tuning; 0 without."""
+        return self.convergence.variance_rounds
+
+    @property
+    def searched_start(self) -> Bool[Array, "*batch"]:
+        """The closed-form start was unsound and one was searched for."""
+        return self.convergence.searched_start
+
+    @property
+    def sigma_floored(self) -> Bool[Array, "*batch 3"]:
+        """Which SDs rest on their floor."""
+        return self.convergence.sigma_floored
+
+    @property
+    def rotation_change(self) -> Float[Array, "*batch"]:
+        """X's last move in rad (alternating), else 0."""
+        return self.convergence.rotation_change
+
+    @property
+    def translation_change(self) -> Float[Array, "*batch"]:
+        """X's last move in mm (alternating), else 0."""
+        return self.convergence.translation_change
+
+    @property
+    def trace(self) -> Float[Array, "*batch trace"] | None:
+        """Objective after each of the first iterations; None where none was asked for."""
+        return self.convergence.trace
+
+    @property
+    def sound_speed_m_s(self) -> Float[Array, "*batch"] | None:
+        """Estimated sound speed, m/s; None where it was not estimated."""
+        return None if self.medium is None else self.medium.sound_speed_m_s
+
+    @property
+    def sound_speed_sd_m_s(self) -> Float[Array, "*batch"] | None:
+        """Its standard deviation, m/s."""
+        return None if self.medium is None else self.medium.sound_speed_sd_m_s
+
+    @property
+    def sound_speed_prior_m_s(self) -> Float[Array, "*batch"] | None:
+        """SD of the sound speed that was believed before, m/s; None without such a belief."""
+        return None if self.medium is None else self.medium.sound_speed_prior_m_s
+
+    @property
+    def delay_s(self) -> Float[Array, "*batch"] | None:
+        """Estimated electronic delay, s; None where it was not estimated."""
+        return None if self.medium is None else self.medium.delay_s
+
+    @property
+    def delay_sd_s(self) -> Float[Array, "*batch"] | None:
+        """Its standard deviation, s."""
+        return None if self.medium is None else self.medium.delay_sd_s
+
+    @property
+    def delay_prior_s(self) -> Float[Array, "*batch"] | None:
+        """SD of the delay that was believed before, s; None without such a belief."""
+        return None if self.medium is None else self.medium.delay_prior_s
+
+    @property
     def status(self) -> str | np.ndarray:
-        """converged, max_iterations, unobservable or failed; an array of such for a batch.
+        """converged, max_iterations, unobservable or failed; an array of these for a batch.
 
         Raises:
             CalibrationError: under jit, vmap or grad, where text cannot be: use ``status_code``.
@@ -146,30 +270,98 @@ class Calibration(eqx.Module):
         chosen = names[self._concrete(self.status_code)]
         return str(chosen) if chosen.ndim == 0 else chosen
 
+    @cached_property
+    def _summary(self) -> Summary:
+        """Everything that is computed when it is read."""
+        from jaxcal.diagnostics.summary import summarise
+
+        if any(is_traced(leaf) for leaf in jax.tree.leaves(self)):
+            raise CalibrationError(
+                "diagnostics are computed on the host and are not there under jit, vmap or grad: "
+                "read them outside; status_code, converged and covariance are there"
+            )
+        return summarise(self)
+
     @property
-    def outlier(self) -> Float[AnyArray, "*batch n"]:
+    def elevation_sd(self) -> Float[np.ndarray, "*batch n"]:
+        """SD of ``elevation``, mm; NaN where an offset rests on its bound or is not known."""
+        return self._summary.elevation_sd
+
+    @property
+    def residual(self) -> Float[np.ndarray, "*batch n 3"]:
+        """q_i - p_i with p_i in the plane (y = 0), in the image frame, mm."""
+        return self._summary.residual
+
+    @property
+    def at_bound(self) -> Float[np.ndarray, "*batch n"]:
+        """1 where the offset rests on its bound."""
+        return self._summary.at_bound
+
+    @property
+    def condition(self) -> Float[np.ndarray, "*batch"]:
+        """Of the information about all unknowns, in scaled units (largest / smallest)."""
+        return self._summary.condition
+
+    @property
+    def weakest(self) -> Float[np.ndarray, "*batch p"]:
+        """Unit vector (scaled units) of the least known direction of all unknowns."""
+        return self._summary.weakest
+
+    @property
+    def weakest_sd(self) -> Float[np.ndarray, "*batch"]:
+        """Standard deviation along it, mm at the lever arm; NaN where it has none."""
+        return self._summary.weakest_sd
+
+    @property
+    def prior_direction(self) -> Float[np.ndarray, "*batch p"]:
+        """Direction that the measurements alone, without the offset's prior or bound, leave open.
+
+        A unit vector in scaled units; zeros where there is none.
+        """
+        return self._summary.prior_direction
+
+    @property
+    def inspection(self) -> Inspection:
+        """Images that stand out, the noise model's fit, and which poses to add."""
+        return self._summary.inspection
+
+    @property
+    def outlier(self) -> Float[np.ndarray, "*batch n"]:
         """1 where an image does not fit the rest; a robust solve leaves it out."""
-        return self.inspection.outlier
+        return self._summary.inspection.outlier
 
     @property
-    def departure(self) -> Float[AnyArray, "*batch n 3"]:
+    def departure(self) -> Float[np.ndarray, "*batch n 3"]:
         """Each image's lateral, range and elevational errors in robust SDs of those in use."""
-        return self.inspection.departure
-
-    @property
-    def images_used(self) -> Int[Array, "*batch"]:
-        """Number of used images."""
-        return jnp.sum(self.mask > 0, axis=-1)
+        return self._summary.inspection.departure
 
     @property
     def warnings(self) -> list[str]:
-        """What a person should know before using this answer, in words (one problem, concrete)."""
-        return diagnosis.warnings(self.numpy())
+        """What a person should know before using this answer, in words (one problem)."""
+        from jaxcal.diagnostics import messages
+
+        return messages.warnings(self)
 
     @property
     def observability(self) -> dict[str, float | str | None]:
         """condition, weakest_direction (text), weakest_sd_mm, known_only_from_prior (text)."""
-        return diagnosis.observability(self.numpy())
+        from jaxcal.diagnostics import messages
+
+        return messages.observability(self)
+
+    def __getitem__(self, index: Any) -> Calibration:
+        """Some calibrations of a batch.
+
+        Raises:
+            IndexError: beyond the batch, or for one calibration.
+        """
+        # As numpy indexes: it raises where jax would clip.
+        np.empty(self.mask.shape[:-1])[index]
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+    def with_problem(self, problem: Problem) -> Calibration:
+        """The same with the data that were solved."""
+        return replace(self, problem=problem)
 
     def numpy(self) -> Calibration:
         """The same with numpy arrays (concrete values).
@@ -177,10 +369,13 @@ class Calibration(eqx.Module):
         Raises:
             CalibrationError: under a JAX transformation.
         """
-        return jax.tree.map(self._concrete, self)
+        found = jax.tree.map(self._concrete, self)
+        if "_summary" in vars(self):
+            vars(found)["_summary"] = self._summary
+        return found
 
     @staticmethod
-    def _concrete(value: Array | np.ndarray) -> np.ndarray:
+    def _concrete(value: AnyArray) -> np.ndarray:
         if is_traced(value):
             raise CalibrationError(
                 "text is not available under jit, vmap or grad; use the arrays (status_code, "

@@ -10,13 +10,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jaxcal.calibration import Calibration, Status
-from jaxcal.findings import Findings, Solution, find
-from jaxcal.model.parameters import Blocks, Parameters, block_slice, retract
+from jaxcal import answer
+from jaxcal.answer import nominal_sound_speed
+from jaxcal.calibration import Calibration, Convergence
+from jaxcal.model.parameters import RIGID, Blocks, Parameters, retract
 from jaxcal.model.priors import (
     AbstractPrior,
     AbstractSelfTuned,
@@ -29,21 +31,39 @@ from jaxcal.model.priors import (
 from jaxcal.options import DEFAULT_MAX_ELEVATION_MM, Given, Plan
 from jaxcal.precision import in_standard_promotion
 from jaxcal.problem import Problem
+from jaxcal.solvers import arrow as arrows
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import alternate
-from jaxcal.solvers.auto import OffsetLaw, average_over_laws
+from jaxcal.solvers.auto import average_over_laws
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.solvers.conventional import from_scratch, pairwise_gradient
 from jaxcal.solvers.joint import joint
-from jaxcal.solvers.least_squares import minimise
-from jaxcal.solvers.variance import MINIMUM_SELF_TUNING, self_tuned
-from jaxcal.sound import WATER_M_S
+from jaxcal.solvers.least_squares import linearise, minimise
+from jaxcal.solvers.variance import self_tuned
 
 HELD_SIGMA = (0.5, 0.5, 1.0)
 """SDs of lateral position, range and offset (mm), where too few images leave them unknown."""
 
 HELD_CHANNEL_SIGMA = (0.5, 1.0)
 """SDs of an element's distance and of the offset (mm), likewise."""
+
+
+class Solution(eqx.Module):
+    """What the methods have in common when they are done."""
+
+    parameters: Parameters
+    offset: Float[Array, " k"]
+    prior: AbstractPrior
+    sigma_floored: Bool[Array, " components"]
+    cost: Float[Array, ""]
+    stationarity: Float[Array, ""]
+    arrived: Bool[Array, ""]
+    iterations: Array
+    variance_rounds: Array
+    rotation_change: Float[Array, ""]
+    translation_change: Float[Array, ""]
+    trace: Float[Array, " trace"] | None
+    searched_start: Bool[Array, ""]
 
 
 def solve_problem(
@@ -108,9 +128,53 @@ def finish(
     if plan.laws and isinstance(prior, AbstractSelfTuned):
         averaged = average_over_laws(parameters, prior, problem, plan.blocks, plan.laws)
         parameters, prior = averaged.parameters, averaged.belief
-    found = find(solution, parameters, offset, prior, averaged, problem, everything, plan)
-    law = None if averaged is None else averaged.law
-    return assemble(solution, parameters, prior, found, law, problem, given, plan)
+    whole = linearise(parameters, offset, prior, problem, plan.blocks)[0]
+    design = whole.shared
+    if plan.prior == "gaussian" or plan.blocks != RIGID:
+        design = _design(*jax.lax.stop_gradient((parameters, problem)), plan)
+    solved = solved_by(solution, parameters, offset, prior, arrows.schur(whole)[0], design, plan)
+    return answer.assemble(solved, averaged, problem, given, plan)
+
+
+def _design(parameters: Parameters, problem: Problem, plan: Plan) -> Float[Array, "p p"]:
+    """The information of the unweighted residuals, offsets taken as known."""
+    none = jnp.zeros(0, problem.mask.dtype)
+    unweighted = ChannelGaussian(jnp.ones(2, none.dtype)) if plan.channels else InPlane()
+    return linearise(parameters, none, unweighted, problem, plan.blocks)[0].shared
+
+
+def solved_by(
+    solution: Solution,
+    parameters: Parameters,
+    offset: Float[Array, "*batch k"],
+    prior: AbstractPrior,
+    information: Float[Array, "*batch p p"],
+    design: Float[Array, "*batch p p"],
+    plan: Plan,
+) -> answer.Solved:
+    """What :func:`jaxcal.answer.assemble` is told of a solution."""
+    floored = solution.sigma_floored
+    return answer.Solved(
+        parameters=parameters,
+        offset=offset,
+        sigma=prior.sigma if isinstance(prior, AbstractSelfTuned) else None,
+        bound=prior.bound if isinstance(prior, Bounded) else None,
+        information=information,
+        design=design,
+        convergence=Convergence(
+            cost=solution.cost,
+            stationarity=solution.stationarity,
+            tolerance_met=solution.arrived,
+            iterations=solution.iterations,
+            variance_rounds=solution.variance_rounds,
+            searched_start=solution.searched_start,
+            # Of an element's distance come both SDs of a point.
+            sigma_floored=floored[..., jnp.asarray([0, 0, 1])] if plan.channels else floored,
+            rotation_change=solution.rotation_change,
+            translation_change=solution.translation_change,
+            trace=solution.trace,
+        ),
+    )
 
 
 def belief(problem: Problem, given: Given, plan: Plan) -> AbstractPrior:
@@ -134,13 +198,6 @@ def belief(problem: Problem, given: Given, plan: Plan) -> AbstractPrior:
     # Where laws are weighed, so are the covariances, and the first fit does without.
     covariance = None if plan.laws else covariance_shape(problem)
     return Gaussian(sigma, covariance, given.tracker_sd, medium)
-
-
-def nominal_sound_speed(problem: Problem) -> Float[Array, ""]:
-    """By which the problem's times of flight became distances, m/s; water's where unknown."""
-    if problem.sound_speed is None:
-        return jnp.full((), WATER_M_S, problem.mask.dtype)
-    return problem.sound_speed
 
 
 def _run_method(problem: Problem, given: Given, plan: Plan) -> Solution:
@@ -227,90 +284,3 @@ def _attach(
         return retract(reference, tangent, plan.blocks), offset, prior.with_sigma(sigma)
     tangent, offset = implicit.optimum(plan.blocks, reference, offset, prior, problem)
     return retract(reference, tangent, plan.blocks), offset, prior
-
-
-def assemble(
-    solution: Solution,
-    parameters: Parameters,
-    prior: AbstractPrior,
-    found: Findings,
-    law: OffsetLaw | None,
-    problem: Problem,
-    given: Given,
-    plan: Plan,
-) -> Calibration:
-    """All that was found, as a calibration: nothing is computed any more."""
-    uncertainty = found.uncertainty
-    usable = found.status != Status.UNOBSERVABLE
-    covariance = jnp.where(usable, uncertainty.covariance, jnp.nan)
-    point = block_slice(plan.blocks, "point")
-    floored = solution.sigma_floored
-    enough = jnp.sum(problem.mask) >= MINIMUM_SELF_TUNING
-    return Calibration(
-        image_to_probe=parameters.matrix(),
-        point=parameters.point,
-        elevation=found.elevation,
-        elevation_sd=uncertainty.elevation_sd,
-        sigma=found.sigma,
-        offset_law=law,
-        channel_sigma=prior.sigma[0] if isinstance(prior, ChannelGaussian) else None,
-        covariance=covariance[:6, :6],
-        point_covariance=covariance[point, point],
-        scale_mm_per_px=problem.spacing * parameters.scale if problem.pixels else None,
-        **_medium(parameters, covariance, problem, given, plan),
-        residual=found.residual,
-        rms=found.rms,
-        mask=problem.mask,
-        at_bound=uncertainty.at_bound,
-        status_code=found.status,
-        iterations=solution.iterations,
-        variance_rounds=solution.variance_rounds,
-        cost=solution.cost,
-        stationarity=solution.stationarity,
-        condition=uncertainty.condition,
-        weakest=uncertainty.weakest,
-        weakest_sd=uncertainty.weakest_sd,
-        prior_direction=uncertainty.prior_direction,
-        searched_start=solution.searched_start,
-        inspection=found.inspection,
-        sigma_tuned=jnp.asarray(plan.self_tuning) & enough,
-        sigma_floored=floored[jnp.asarray([0, 0, 1])] if plan.channels else floored,
-        tolerance_met=solution.arrived,
-        differentiable=found.differentiable & plan.options.differentiate,
-        rotation_change=solution.rotation_change,
-        translation_change=solution.translation_change,
-        trace=solution.trace,
-        method=plan.method,
-        prior=plan.reported_prior,
-        data="channels" if plan.channels else "points",
-        blocks=plan.blocks,
-        robust=plan.robust,
-    )
-
-
-def _medium(
-    parameters: Parameters,
-    covariance: Float[Array, "p p"],
-    problem: Problem,
-    given: Given,
-    plan: Plan,
-) -> dict[str, Array | None]:
-    """Sound speed and delay in their units, with SDs; None where they were not estimated."""
-    speed = nominal_sound_speed(problem)
-    found: dict[str, Array | None] = dict.fromkeys(
-        ("sound_speed_m_s", "sound_speed_sd_m_s", "sound_speed_prior_m_s",
-         "delay_s", "delay_sd_s", "delay_prior_s")
-    )  # fmt: skip
-    if "sound-speed" in plan.blocks:
-        at = block_slice(plan.blocks, "sound-speed").start
-        estimate = speed * parameters.sound_speed
-        found["sound_speed_m_s"] = estimate
-        found["sound_speed_sd_m_s"] = estimate * jnp.sqrt(covariance[at, at])
-        found["sound_speed_prior_m_s"] = None if given.medium_sd is None else given.medium_sd[0]
-    if "delay" in plan.blocks:
-        at = block_slice(plan.blocks, "delay").start
-        before = 0.0 if problem.delay is None else problem.delay
-        found["delay_s"] = before + parameters.delay / (1e3 * speed)
-        found["delay_sd_s"] = jnp.sqrt(covariance[at, at]) / (1e3 * speed)
-        found["delay_prior_s"] = None if given.medium_sd is None else given.medium_sd[1]
-    return found

@@ -18,11 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal import compiler, diagnosis
+from jaxcal import compiler
+from jaxcal.answer import covariance_and_observability
 from jaxcal.calibration import Status
+from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.errors import InputError
 from jaxcal.geometry import check_poses
-from jaxcal.metrics import root_mean_square
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.priors import InPlane
 from jaxcal.model.residuals import circle_residual
@@ -31,8 +33,7 @@ from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import FEWEST_IMAGES, Model, departures, find_consensus, stands_out
-from jaxcal.solvers.least_squares import minimise
-from jaxcal.uncertainty import LARGEST_SD, assess
+from jaxcal.solvers.least_squares import linearise, minimise
 
 BLOCKS = ("translation", "point")
 AXES = ("x", "y", "z")
@@ -54,8 +55,7 @@ class Pivot(eqx.Module):
         outlier: 1 where a pose does not fit the rest; a robust solve leaves it out.
         departure: errors in robust SDs of the used poses', those of poses left out included.
         status_code: a :class:`jaxcal.calibration.Status`.
-        weakest: unit vector of the least known direction of the tip, in the tool's frame.
-        weakest_sd: SD along it, mm; NaN where it has none.
+        information: of (tip, point) for errors with an SD of 1 mm.
         robust: poses that do not fit the rest were left out (static).
     """
 
@@ -69,8 +69,7 @@ class Pivot(eqx.Module):
     outlier: Float[Array, "*batch n"]
     departure: Float[Array, "*batch n 3"]
     status_code: Int[Array, "*batch"]
-    weakest: Float[Array, "*batch 3"]
-    weakest_sd: Float[Array, "*batch"]
+    information: Float[Array, "*batch 6 6"]
     robust: bool = eqx.field(static=True, default=True)
 
     @property
@@ -84,6 +83,24 @@ class Pivot(eqx.Module):
         return Status(int(self.status_code)).name.lower()
 
     @property
+    def weakest(self) -> Float[np.ndarray, "*batch 3"]:
+        """Unit vector of the least known direction of the tip, in the tool's frame (concrete)."""
+        weakest = self._weakest()[0][..., :3]
+        length = np.linalg.norm(weakest, axis=-1, keepdims=True)
+        return weakest / np.maximum(length, 1e-30)
+
+    @property
+    def weakest_sd(self) -> Float[np.ndarray, "*batch"]:
+        """SD along the least known direction of tip and point, mm; NaN where it has none."""
+        return self._weakest()[1]
+
+    def _weakest(self) -> tuple[np.ndarray, np.ndarray]:
+        information, sigma = np.asarray(self.information), np.asarray(self.sigma)
+        flat = information.reshape(-1, 6, 6)
+        found = Spectra.of(flat, flat, sigma.reshape(-1) ** 2, float(np.finfo(flat.dtype).eps))
+        return found.weakest.reshape(*sigma.shape, 6), found.weakest_sd.reshape(sigma.shape)
+
+    @property
     def warnings(self) -> list[str]:
         """What a person should know before using this answer (one calibration, concrete)."""
         found = []
@@ -95,9 +112,9 @@ class Pivot(eqx.Module):
                 f"not observable: these poses do not determine the tip along ({direction}) of the "
                 "tool's frame; tilt the tool about a further axis"
             )
-        named = diagnosis.images_that_stand_out(self)
+        named = messages.images_that_stand_out(self)
         if named:
-            told = diagnosis.listed_departures(self, AXES)
+            told = messages.listed_departures(self, AXES)
             verb = "left out" if self.robust else "kept"
             found.append(f"{verb} {len(named)} poses that do not fit the rest: {told}")
         return found
@@ -166,10 +183,6 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
     start = jax.tree.map(lambda leaf: leaf[0], _proposals(problem, keep[None]))
     fit = minimise(start, InPlane(), problem, BLOCKS)
     parameters = fit.parameters
-    none = jnp.zeros(0, poses.dtype)
-    uncertainty = assess(
-        parameters, none, InPlane(), problem, BLOCKS, whitened=False, uses_prior=False
-    )
     _, departure = departures(parameters, everything, keep, model)
     outlier = mask * (1 - keep)
     if not robust:
@@ -181,25 +194,30 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
     length = jnp.sqrt(jnp.sum(parameters.translation**2))
     finite = jnp.all(jnp.isfinite(parameters.translation)) & jnp.isfinite(fit.cost)
     failed = jnp.logical_not(finite) | (jnp.sum(mask) < MINIMUM_IMAGES)
-    unknown = uncertainty.degenerate | (
-        uncertainty.weakest_sd > LARGEST_SD * jnp.maximum(length, _spread(problem))
+    none = jnp.zeros(0, poses.dtype)
+    information = linearise(parameters, none, InPlane(), problem, BLOCKS)[0].shared
+    covariance, observed = covariance_and_observability(
+        information,
+        information,
+        variance,
+        jnp.ones(6, poses.dtype),
+        LARGEST_SD * jnp.maximum(length, _spread(problem)),
     )
+    unknown = observed.degenerate | observed.weak
     status = jnp.where(fit.settled, Status.CONVERGED, Status.MAX_ITERATIONS)
     status = jnp.where(unknown, Status.UNOBSERVABLE, status)
-    weakest = uncertainty.weakest[:3]
     return Pivot(
         tip=parameters.translation,
         point=parameters.point,
-        covariance=jnp.where(unknown, jnp.nan, uncertainty.covariance),
+        covariance=jnp.where(unknown, jnp.nan, covariance),
         sigma=jnp.sqrt(variance),
-        rms=root_mean_square(residual, keep),
+        rms=jnp.sqrt(jnp.sum(residual**2) / used),
         residual=residual,
         mask=keep,
         outlier=outlier,
         departure=departure,
         status_code=jnp.where(failed, Status.FAILED, status).astype(jnp.int32),
-        weakest=weakest / jnp.maximum(jnp.sqrt(jnp.sum(weakest**2)), 1e-30),
-        weakest_sd=uncertainty.weakest_sd,
+        information=information,
         robust=robust,
     )
 

@@ -20,12 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from jaxcal.answer import nominal_sound_speed
 from jaxcal.calibration import Calibration
+from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.errors import InputError
-from jaxcal.metrics import calibration_reproducibility
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points, measurement_residual
-from jaxcal.pipeline import nominal_sound_speed
 from jaxcal.precision import in_own_modes
 from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES, Recording
@@ -200,7 +200,7 @@ def bootstrap(
         image_to_probe=fits.image_to_probe,
         converged=converged,
         spread=1.4826 * jnp.nanmedian(moved, axis=0),
-        reproducibility=calibration_reproducibility(transforms, points) / share,
+        reproducibility=jnp.asarray(calibration_reproducibility(transforms, points)) / share,
         image_points=points,
     )
 

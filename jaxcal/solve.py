@@ -114,7 +114,7 @@ def calibrate(
     platform = _devices(problem)[0].platform if alone else None
     # A program of its own, which serves every method and prior.
     agreed = _agreement(platform)(seen(problem), plan.blocks) if plan.robust else None
-    return _one_problem(platform)(problem, given, plan, agreed)
+    return _one_problem(platform)(problem, given, plan, agreed).with_problem(problem)
 
 
 @in_own_modes
@@ -211,7 +211,8 @@ def _solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None)
         rows = jnp.arange(pieces * lanes) % count
         flat = jax.tree.map(lambda leaf: leaf[rows], flat)
     result = program(flat, given, plan, lanes)
-    return jax.tree.map(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
+    result = jax.tree.map(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
+    return result.with_problem(problems)
 
 
 @cache

@@ -12,8 +12,15 @@ from conftest import problem
 from scipy import stats
 
 import jaxcal
-from jaxcal import diagnosis
-from jaxcal.inspection import MISFITS, check_noise_model, kurtosis_score, skewness_score
+from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.residual_checks import (
+    MISFITS,
+    check_noise_model,
+    kurtosis_score,
+    skewness_score,
+)
+from jaxcal.diagnostics.uncertainty import inverses, quadratic
 from jaxcal.model.parameters import RIGID, Parameters
 from jaxcal.model.priors import Gaussian
 from jaxcal.model.residuals import target_in_image
@@ -26,14 +33,15 @@ SIGMA = np.array([0.4, 0.3, 1.0])
 def test_scores_are_those_of_scipy(count):
     values = np.random.default_rng(count).standard_t(5, (4, count))
     kurtosis = stats.kurtosis(values, axis=1, fisher=False)
+    many = np.full(4, float(count))
     np.testing.assert_allclose(
-        kurtosis_score(jnp.asarray(kurtosis), jnp.asarray(float(count))),
-        stats.kurtosistest(values, axis=1).statistic, rtol=1e-9,
-    )  # fmt: skip
+        kurtosis_score(kurtosis, many), stats.kurtosistest(values, axis=1).statistic, rtol=1e-9
+    )
     np.testing.assert_allclose(
-        skewness_score(jnp.asarray(stats.skew(values, axis=1)), jnp.asarray(float(count))),
-        stats.skewtest(values, axis=1).statistic, rtol=1e-9,
-    )  # fmt: skip
+        skewness_score(stats.skew(values, axis=1), many),
+        stats.skewtest(values, axis=1).statistic,
+        rtol=1e-9,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -55,10 +63,21 @@ def scores():
         poses = base.poses.at[:, :3, 3].add(-(offset - q[:, 1])[:, None] * elevational)
         points = jnp.stack([q[:, 0], jnp.hypot(offset, q[:, 2])], axis=1) + errors[:, :2]
         data = replace(base, poses=poses, measurements=points)
-        found = minimise(truth, belief, data, RIGID)
-        return check_noise_model(found.parameters, found.offset, belief, data, RIGID)
+        return minimise(truth, belief, data, RIGID).parameters, data
 
-    return jax.jit(jax.vmap(one)), np.asarray(q[:, 2])
+    fit = jax.jit(jax.vmap(one))
+
+    def run(errors):
+        parameters, data = jax.tree.map(np.asarray, fit(errors))
+        unknowns = Unknowns(**vars(parameters))
+        seen = ImageErrors.of(unknowns, data, RIGID)
+        rows = (seen.rows / SIGMA[:, None]).reshape(len(errors), -1, 9)
+        inverse = inverses(np.swapaxes(rows, 1, 2) @ rows, np.finfo(float).eps)
+        leverage = quadratic(rows, inverse).reshape(seen.errors.shape)
+        standardised = seen.errors / SIGMA / np.sqrt(np.maximum(1 - leverage, 0.05))
+        return check_noise_model(standardised, seen.distance, seen.mask)
+
+    return run, np.asarray(q[:, 2])
 
 
 def test_few_false_alarms_and_true_ones(scores):
@@ -66,7 +85,7 @@ def test_few_false_alarms_and_true_ones(scores):
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(200, 40, 3))
     _, misfit = run(normal)
-    limit = diagnosis.MISFIT_SCORE
+    limit = messages.MISFIT_SCORE
     alarms = (np.abs(misfit) > limit).any(axis=(1, 2))
     # 0.7 % expected: more than 6 of 200 in one of a thousand such tests.
     assert alarms.sum() <= 6
@@ -97,4 +116,4 @@ def test_complaints_are_warnings_in_words():
     )
     few = jaxcal.calibrate(replace(data, mask=data.mask.at[12:].set(0.0)), "conventional")
     assert not few.inspection.misfit.any()
-    assert not diagnosis.noise_model(few)["checked"]
+    assert not messages.noise_model(few)["checked"]

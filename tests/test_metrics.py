@@ -4,7 +4,7 @@ import numpy as np
 from test_geometry import random_poses
 
 from jaxcal import calibration_reproducibility, reconstruction_precision
-from jaxcal.metrics import image_corners, root_mean_square
+from jaxcal.diagnostics.metrics import image_corners, root_mean_square
 
 
 def test_reconstruction_precision_is_the_norm_of_unbiased_sds():

@@ -51,14 +51,18 @@ def record(result, recording):
 @pytest.fixture(scope="module")
 def failed(result):
     """What a solve full of NaN comes back as."""
-    lost = {
-        name: jnp.full_like(getattr(result, name), jnp.nan)
-        for name in (
-            "image_to_probe", "point", "elevation", "elevation_sd", "sigma", "covariance",
-            "residual", "rms", "cost", "stationarity", "condition", "weakest", "weakest_sd",
-        )
-    }  # fmt: skip
-    return dataclasses.replace(result, **lost, status_code=jnp.asarray(int(Status.FAILED)))
+
+    def lost(part, names):
+        return {name: jnp.full_like(getattr(part, name), jnp.nan) for name in names}
+
+    lines, ended = result.linearisation, result.convergence
+    return dataclasses.replace(
+        result,
+        **lost(result, ("image_to_probe", "point", "elevation", "sigma", "covariance", "rms")),
+        linearisation=dataclasses.replace(lines, **lost(lines, ("information", "variance"))),
+        convergence=dataclasses.replace(ended, **lost(ended, ("cost", "stationarity"))),
+        status_code=jnp.asarray(int(Status.FAILED)),
+    )
 
 
 def with_status(result, status):

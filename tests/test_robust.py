@@ -12,9 +12,9 @@ import pytest
 from conftest import problem
 
 import jaxcal
-from jaxcal import diagnosis
 from jaxcal.cli.main import main
 from jaxcal.contamination import OUTLIER_KINDS, contaminate
+from jaxcal.diagnostics import messages
 from jaxcal.model.parameters import RIGID
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 
@@ -84,8 +84,8 @@ def test_robust_solve_is_that_of_the_good_images():
     np.testing.assert_array_equal(robust.mask, 1 - outlier)
     first = jax.tree.map(lambda leaf: leaf[0], robust)
     named = np.flatnonzero(outlier[0]).tolist()
-    assert diagnosis.outliers(first) == named
-    reasons = diagnosis.outlier_reasons(first)
+    assert messages.outliers(first) == named
+    reasons = messages.outlier_reasons(first)
     assert [reason["image"] for reason in reasons] == named
     assert all(abs(reason["sds"] or 0) > 6 and reason["left_out"] for reason in reasons)
     assert any("left out 15 of 50 images" in text for text in first.warnings)
@@ -97,12 +97,12 @@ def test_a_wrong_echo_is_told_by_its_range():
     spoilt = replace(data, measurements=data.measurements.at[7, 1].add(40.0))
     plain = jaxcal.calibrate(spoilt, "conventional", robust=False)
     robust = jaxcal.calibrate(spoilt, "conventional", robust=True)
-    reason = diagnosis.outlier_reasons(robust)
+    reason = messages.outlier_reasons(robust)
     assert [(r["image"], r["component"], r["left_out"]) for r in reason] == [(7, "range", True)]
     assert (reason[0]["sds"] or 0) < -100
     assert robust.status == "converged"
     assert float(robust.rms) < 0.2 * float(plain.rms)
-    assert 7 in diagnosis.outliers(plain)
+    assert 7 in messages.outliers(plain)
     assert any("--robust" in text for text in plain.warnings)
 
 

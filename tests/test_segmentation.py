@@ -14,8 +14,8 @@ from scipy.optimize import least_squares
 
 import jaxcal
 from jaxcal.cli.main import main
+from jaxcal.diagnostics.metrics import reconstruct
 from jaxcal.errors import InputError
-from jaxcal.metrics import reconstruct
 from jaxcal.probe import C5_2, L14_5, LinearProbe
 from jaxcal.recording import Recording, make_images
 from jaxcal.segmentation.segment import OutOfPlane, compiled_fit, segment, segment_recording

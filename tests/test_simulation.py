@@ -9,7 +9,7 @@ import pytest
 from conftest import experiment
 
 from jaxcal import InputError, Protocol, simulate
-from jaxcal.metrics import reconstruct
+from jaxcal.diagnostics.metrics import reconstruct
 from jaxcal.simulation import draw
 
 

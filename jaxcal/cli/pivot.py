@@ -41,7 +41,7 @@ def pivot(poses: str, no_robust: bool, as_json: bool) -> int:
 def _record(result: Pivot) -> dict[str, Any]:
     import numpy as np
 
-    from jaxcal import diagnosis
+    from jaxcal.diagnostics import messages
     from jaxcal.pivot import AXES
     from jaxcal.report.record import plain
 
@@ -57,8 +57,8 @@ def _record(result: Pivot) -> dict[str, Any]:
         "sigma_mm": float(result.sigma),
         "rms_mm": float(result.rms),
         "robust": result.robust,
-        "outliers": diagnosis.images_that_stand_out(result),
-        "outlier_reasons": diagnosis.outlier_reasons(result, AXES),
+        "outliers": messages.images_that_stand_out(result),
+        "outlier_reasons": messages.outlier_reasons(result, AXES),
         "warnings": result.warnings,
     })  # fmt: skip
 

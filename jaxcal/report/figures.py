@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from jaxcal import diagnosis
 from jaxcal.calibration import Calibration
+from jaxcal.diagnostics import messages
 from jaxcal.recording import Recording
 from jaxcal.report.convergence import Curve
 
@@ -22,7 +22,7 @@ def residual_figure(result: Calibration) -> Figure:
     """Each image's residual from the plane (mm), in lateral, elevational and axial panels."""
     answer = result.numpy()
     used = np.flatnonzero(answer.mask > 0)
-    named = np.intersect1d(diagnosis.outliers(answer), used)
+    named = np.intersect1d(messages.outliers(answer), used)
     figure = _figure(3.0 * 2.2)
     panels = figure.subplots(3, 1, sharex=True)
     for axis, (panel, name) in enumerate(

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxcal
-from jaxcal import diagnosis
 from jaxcal.calibration import Calibration
+from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.errors import InputError
 from jaxcal.geometry import rotation_angle
-from jaxcal.metrics import reconstruction_precision
 from jaxcal.recording import Images, Recording, Truth
 from jaxcal.report.certified import certificate_record
 
@@ -68,7 +68,7 @@ def calibration_record(
         "point_mm": answer.point,
         "elevation_mm": answer.elevation,
         "elevation_sd_mm": answer.elevation_sd,
-        "offset_law": diagnosis.offset_law(answer),
+        "offset_law": messages.offset_law(answer),
         "sigma_lateral_mm": answer.sigma[0],
         "sigma_range_mm": answer.sigma[1],
         "sigma_elevation_mm": answer.sigma[2],
@@ -88,9 +88,9 @@ def calibration_record(
         "objective": answer.cost,
         "scaled_kkt_residual": answer.stationarity,
         "robust": result.robust,
-        "noise_model": diagnosis.noise_model(answer),
-        "outliers": diagnosis.outliers(answer),
-        "outlier_reasons": diagnosis.outlier_reasons(answer),
+        "noise_model": messages.noise_model(answer),
+        "outliers": messages.outliers(answer),
+        "outlier_reasons": messages.outlier_reasons(answer),
         "warnings": result.warnings,
     }
     if recording.truth is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jaxcal import diagnosis
+from jaxcal.diagnostics import messages
 from jaxcal.report.certified import certificate_words
 from jaxcal.report.resampled import resampled_sentences
 
@@ -89,7 +89,7 @@ def _certainty(record: dict[str, Any]) -> list[str]:
         f"{_AXES[about]} axis (one standard deviation)."
     ]
     unseen = record["observability"]["known_only_from_prior"]
-    if unseen and record["prior"] in diagnosis.TUNED:
+    if unseen and record["prior"] in messages.TUNED:
         lines.append(
             f"The images do not show {unseen}: it rests on the assumption that the target lay "
             "evenly on both sides of the image plane."

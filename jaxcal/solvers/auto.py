@@ -31,7 +31,7 @@ What to expect. The answer is nearly the posterior median over these laws, so it
 conventional calibration on average, whatever the offsets' law; in a single trial it can be worse.
 Small samples do not tell the laws apart: there the answer stays near the Gaussian one.
 The cut at an image's bound is taken at the mean that step 2 found, and intervals take the tuned
-SDs for known, but for Student's factor (:mod:`jaxcal.intervals`).
+SDs for known, but for Student's factor (:mod:`jaxcal.diagnostics.intervals`).
 """
 
 from __future__ import annotations

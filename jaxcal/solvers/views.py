@@ -1,9 +1,4 @@
-"""What many solutions say of every image, in planes (lanes, images): errors, their rows, leverage.
-
-The rows are those of the Jacobian of one image's lateral error, range error and offset with
-respect to the nine unknowns (v, w, d), as in :mod:`jaxcal.solvers.fused`; a quadratic form of a row
-with the inverse of an information matrix is a leverage, or the variance of what the row tells.
-"""
+"""Information matrices of many solutions, from planes (lanes, images)."""
 
 from __future__ import annotations
 
@@ -13,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxcal.model.priors import AbstractPrior, Bounded, Gaussian
+from jaxcal.model.residuals import LARGEST_ELEVATION
 from jaxcal.solvers import unrolled
 from jaxcal.solvers.fused import (
     PAIRS,
@@ -59,23 +56,6 @@ class View(eqx.Module):
         errors = [images.mask * error for error in errors]
         return cls(images, q, turned, [q[1] * inverse, q[2] * inverse], errors)
 
-    def rows(self) -> tuple[Vector, Vector, Vector]:
-        """Derivatives of lateral position, range and offset."""
-        lever = unrolled.cross(self.q)
-        axes = [
-            [*(-1 if i == j else 0 for j in range(3)), *lever[i], *self.turned[i]] for i in range(3)
-        ]
-        distance = [
-            unrolled.add(unrolled.times(self.along[0], y), unrolled.times(self.along[1], z))
-            for y, z in zip(axes[1], axes[2], strict=True)
-        ]
-        return axes[0], distance, axes[1]
-
-    def axial_row(self) -> Vector:
-        """Derivatives of q_z."""
-        lever = unrolled.cross(self.q)
-        return [0, 0, -1, *lever[2], *self.turned[2]]
-
     def information(self, weights: list[Matrix]) -> list[Float[Array, "9 9 lanes"]]:
         """J' K J, summed over the images, for several K, of :meth:`curvature` or likewise.
 
@@ -106,14 +86,80 @@ class View(eqx.Module):
         ]
 
 
-def variance(matrix: Float[Array, "9 9 lanes"], row: Vector) -> Float[Array, "lanes n"]:
-    """Quadratic form r' C r of every image's row r."""
-    wide = [[matrix[i, j][:, None] for j in range(UNKNOWNS)] for i in range(UNKNOWNS)]
-    # Each pair of different unknowns counts twice.
-    terms = []
-    for i in range(UNKNOWNS):
-        later = unrolled.dot(wide[i][i + 1 :], row[i + 1 :])
-        own = unrolled.times(wide[i][i], row[i])
-        inner = unrolled.add(own, unrolled.times(2, later))
-        terms.append(unrolled.times(inner, row[i]))
-    return unrolled.add(*terms)
+def matrices(
+    guess: Guess, images: Images, prior: AbstractPrior, y: Float[Array, "lanes k"]
+) -> tuple[Float[Array, "lanes 9 9"], Float[Array, "lanes 9 9"]]:
+    """The information with the offsets eliminated, and the unweighted design.
+
+    Args:
+        guess: the solutions.
+        images: the data.
+        prior: the objective.
+        y: bounded offsets, mm; of no use otherwise.
+    """
+    view, mask = View.of(guess, images), images.mask
+    weights: list[Matrix] = [[[mask if i == j else 0 for j in range(3)] for i in range(3)]]
+    if isinstance(prior, Gaussian):
+        weights.append(_gaussian_weight(view, prior))
+    elif isinstance(prior, Bounded):
+        weights.append(Resting.of(view, prior.bound, y).weight(mask))
+    found = [jnp.moveaxis(matrix, -1, 0) for matrix in view.information(weights)]
+    return found[-1], found[0]
+
+
+class Resting(eqx.Module):
+    """The bounded offsets' part, in planes; see :class:`jaxcal.solvers.arrow.Arrow`.
+
+    Attributes:
+        free: 0 where an offset rests on its bound.
+        slope: y / z of the measured point.
+        diagonal: D_i.
+    """
+
+    free: Float[Array, "lanes n"]
+    slope: Float[Array, "lanes n"]
+    diagonal: Float[Array, "lanes n"]
+
+    @classmethod
+    def of(cls, view: View, bound: Float[Array, "lanes n"], y: Float[Array, "lanes n"]) -> Resting:
+        """At offsets y, mm."""
+        distance, mask = view.images.distance, view.images.mask
+        axial = jnp.sqrt(jnp.maximum(distance**2 - y**2, (1e-6 * distance) ** 2))
+        slope = y / axial
+        errors = [view.q[0] - view.images.lateral, view.q[1] - y, view.q[2] - axial]
+        errors = [mask * error for error in errors]
+        force = slope * errors[2] - errors[1]
+        limit = jnp.minimum(bound, LARGEST_ELEVATION * jnp.abs(distance))
+        held = ((y >= limit) & (force <= 0)) | ((y <= -limit) & (force >= 0))
+        free = jnp.where(held, 0.0, 1.0).astype(mask.dtype)
+        return cls(free, slope, 1 + slope * slope)
+
+    def weight(self, mask: Float[Array, "lanes n"]) -> Matrix:
+        """K of the information that is left of an image when its offset is eliminated."""
+        out = mask * self.free / self.diagonal
+        return [
+            [mask, 0, 0],
+            [0, mask - out, out * self.slope],
+            [0, out * self.slope, mask - out * self.slope * self.slope],
+        ]
+
+
+def _gaussian_weight(view: View, prior: Gaussian) -> Matrix:
+    """K of a Gaussian belief, in planes."""
+    mask = view.images.mask
+    inverse = [(1 / sd)[:, None] for sd in prior.sigma.T]
+    if prior.covariance is None:
+        first, second, mixed = jnp.ones_like(mask), jnp.ones_like(mask), jnp.zeros_like(mask)
+        cross = 0
+    else:
+        used = mask > 0
+        c = prior.covariance
+        first = 1 / jnp.sqrt(jnp.where(used, c[..., 0, 0], 1.0))
+        mixed = jnp.where(used, c[..., 1, 0], 0.0) * first
+        second = 1 / jnp.sqrt(jnp.where(used, c[..., 1, 1], 1.0) - mixed * mixed)
+        cross = -mask * mixed * first * second * second * inverse[0] * inverse[1]
+    a, b = first * inverse[0], second * inverse[1]
+    mixed = mixed * second
+    return view.curvature(
+        mask * (a * a + (mixed * a) ** 2), mask * b * b, mask * inverse[2] ** 2, cross
+    )

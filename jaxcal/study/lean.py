@@ -1,18 +1,8 @@
 """Plain methods of a study, computed for what a study stores and nothing else.
 
-A study keeps X's errors, SDs, status and iterations of millions of solves. Covariances, intervals
-and the inspection of every image, which a :class:`jaxcal.Calibration` has as well, would take
-longer than the solves. Here experiments stay what :mod:`jaxcal.solvers.fused` reads, planes of
-numbers with the images minor; the conventional fit is made once for all methods; and a status needs
-no spectrum:
-
-- poses are not degenerate where the scaled design D has no eigenvalue below 1e-11 of its largest;
-  that is certain where D - 1e-11 tr(D) 1 has a Cholesky factor, since tr(D) is no less;
-- a direction is known where the scaled information S has no eigenvalue below variance / L^2, L half
-  the lever arm: where S - variance / L^2 1 has a Cholesky factor.
-
-A trial where either factor fails is not certain, and whoever asked has to take the long road
-(:func:`jaxcal.pipeline.finish`), whose verdicts these are wherever they are given.
+A study keeps X's errors, SDs, status and iterations of millions of solves. Here experiments stay
+what :mod:`jaxcal.solvers.fused` reads, planes of numbers with the images minor; the conventional
+fit is made once for all methods; and of each calibration only what is stored is computed.
 """
 
 from __future__ import annotations
@@ -23,12 +13,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from jaxcal import abreast
-from jaxcal.calibration import Status
 from jaxcal.errors import InputError
-from jaxcal.model.priors import Bounded, Gaussian, InPlane
 from jaxcal.options import (
     Given,
     Method,
@@ -39,24 +27,18 @@ from jaxcal.options import (
     prepare,
     with_bound,
 )
-from jaxcal.pipeline import Solution
 from jaxcal.problem import Problem
 from jaxcal.segmentation.deviations import fit_deviations
 from jaxcal.simulation import Protocol, arrange, draw, draw_noise
 from jaxcal.solvers import unrolled
-from jaxcal.solvers.fused import UNKNOWNS, Guess, Held, Images, Normal, accumulate, targets, total
-from jaxcal.solvers.fused import Measured as MeasuredBelief
+from jaxcal.solvers.fused import Guess, Images, targets, total
 from jaxcal.solvers.fused_methods import Begun, from_scratch
-from jaxcal.uncertainty import LARGEST_SD, SINGULAR
 
 Kind = tuple[Method, PriorName]
 """A method and its prior."""
 
 SEGMENTED = 16
 """Trials whose distances are fitted side by side."""
-
-_MARGIN = 1.001
-"""Thresholds are certified with this to spare, against rounding."""
 
 
 class Measured(eqx.Module):
@@ -177,7 +159,7 @@ def solve(
     kind: Kind,
     options: Options,
     bound: Array | None,
-) -> tuple[Measured, Bool[Array, " trials"]]:
+) -> Measured:
     """One method on a batch.
 
     Args:
@@ -187,9 +169,6 @@ def solve(
         kind: a method that is :func:`served`.
         options: its options.
         bound: on the offsets, mm, for methods that take one.
-
-    Returns:
-        What it measures, and where the status is certain; elsewhere it is not to be used.
     """
     images = batch.images
     problems = problems_of(images)
@@ -200,66 +179,21 @@ def solve(
     problems = with_bound(problems, given)
     solution = abreast.run_method(begun, images, problems, given, plan)
     guess = Guess.of(solution.parameters)
-    certain = _certain(solution, guess, images)
-    ended = jnp.where(solution.arrived, Status.CONVERGED, Status.MAX_ITERATIONS)
-    finite = jnp.isfinite(solution.cost) & jnp.isfinite(sum(unrolled.rows_of(guess.point)))
+    # What is not used of the calibration is not computed.
+    found = abreast.finish_batch(plan, solution, problems, problems, given)
     chord = jnp.sqrt(jnp.sum((guess.rotation - truth.rotation) ** 2, axis=(0, 1)))
-    apart = [
-        jnp.sqrt(jnp.sum((one - true) ** 2, axis=0))
-        for one, true in (
-            (guess.translation, truth.translation), (guess.point, truth.point),
-        )
-    ]  # fmt: skip
-    measured = Measured(
+    pairs = ((guess.translation, truth.translation), (guess.point, truth.point))
+    apart = [jnp.sqrt(jnp.sum((one - true) ** 2, axis=0)) for one, true in pairs]
+    return Measured(
         rp=_precision(guess, truth, batch.test),
         # 2 asin(|R1 - R2| / sqrt 8), the angle, keeps its digits where acos would lose them.
         rotation_error=2 * jnp.arcsin(jnp.minimum(chord / np.sqrt(8.0), 1.0)),
         translation_error=apart[0],
         point_error=apart[1],
-        sigma=_sigma(solution, guess, images),
-        status=ended.astype(jnp.int8),
+        sigma=found.sigma,
+        status=found.status_code.astype(jnp.int8),
         iterations=solution.iterations.astype(jnp.int32),
     )
-    return measured, certain & finite
-
-
-def _certain(solution: Solution, guess: Guess, images: Images) -> Bool[Array, " trials"]:
-    """Where the solution is observable beyond doubt."""
-    none = jnp.zeros_like(images.used)
-    design = accumulate(guess, Held(jnp.zeros_like(images.mask)), images, none)
-    squares = images.mask * (images.lateral**2 + images.distance**2)
-    lever = jnp.sqrt(jnp.sum(squares, axis=1) / images.used)
-    scaled = _scaled(design, lever)
-    least = _MARGIN * max(SINGULAR, 100 * float(jnp.finfo(lever.dtype).eps))
-    trace = unrolled.add(*(scaled[k][k] for k in range(UNKNOWNS)))
-    certain = _exceeds(scaled, least * trace)
-    prior = solution.prior
-    if isinstance(prior, InPlane):
-        variance = design.cost / jnp.maximum(3 * images.used - UNKNOWNS, 1.0)
-    elif isinstance(prior, Gaussian):
-        information = accumulate(guess, MeasuredBelief(prior.sigma.T), images, none)
-        scaled, variance = _scaled(information, lever), jnp.ones_like(lever)
-    else:
-        # Bounds confine every direction.
-        return certain
-    return certain & _exceeds(scaled, _MARGIN * variance / (LARGEST_SD * lever) ** 2)
-
-
-def _scaled(normal: Normal, lever: Float[Array, " lanes"]) -> unrolled.Matrix:
-    """The curvature with every unknown in mm at the target, as in :mod:`jaxcal.uncertainty`."""
-    matrix, inverse = normal.matrix(), 1 / lever
-    scale = [inverse if 3 <= k < 6 else jnp.ones_like(inverse) for k in range(UNKNOWNS)]
-    return [[matrix[i][j] * scale[i] * scale[j] for j in range(UNKNOWNS)] for i in range(UNKNOWNS)]
-
-
-def _exceeds(matrix: unrolled.Matrix, least: Float[Array, " lanes"]) -> Bool[Array, " lanes"]:
-    """Whether all eigenvalues of a symmetric matrix certainly exceed a number; NaN never do."""
-    shifted = [
-        [value - least if i == j else value for j, value in enumerate(row)]
-        for i, row in enumerate(matrix)
-    ]
-    _, inverse = unrolled.cholesky(shifted)
-    return jnp.isfinite(sum(inverse[1:], inverse[0]))
 
 
 def _mean_squares(guess: Guess, images: Images) -> Float[Array, "3 lanes"]:
@@ -270,23 +204,8 @@ def _mean_squares(guess: Guess, images: Images) -> Float[Array, "3 lanes"]:
     return jnp.stack(total([images.mask * error * error for error in errors])) / images.used
 
 
-def _sigma(solution: Solution, guess: Guess, images: Images) -> Float[Array, "lanes 3"]:
-    """SDs of lateral position, range and offset, mm: the belief's own or those of the residuals."""
-    prior = solution.prior
-    if isinstance(prior, Gaussian):
-        return prior.sigma
-    # The unknowns' degrees of freedom are shared equally by the three components.
-    freedom = jnp.maximum(images.used - UNKNOWNS / 3, 1.0) / images.used
-    squares = _mean_squares(guess, images) / freedom
-    if isinstance(prior, Bounded):
-        # Offsets within a bound have a root mean square within it, too.
-        offset = jnp.sum(images.mask * solution.offset**2, axis=1) / images.used
-        squares = squares.at[2].set(offset)
-    return jnp.sqrt(squares).T
-
-
 def _precision(guess: Guess, truth: Guess, test: Images) -> Float[Array, " lanes"]:
-    """Eq. 8, as :func:`jaxcal.metrics.reconstruction_precision`, mm.
+    """Eq. 8, as :func:`jaxcal.diagnostics.metrics.reconstruction_precision`, mm.
 
     Reconstructed points are taken from the true target, near which they are: their mean and spread
     then come from one pass without loss of digits.

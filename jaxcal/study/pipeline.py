@@ -6,8 +6,8 @@ noise, bounds and all other numbers are arguments, so that a whole grid runs thr
 programs. They take blocks of a fixed number of trials, whatever the chunks; a short last block is
 filled up, and what was filled in dropped.
 
-Plain methods are computed by :mod:`jaxcal.study.lean`; the others, and trials whose status it does
-not know, by :func:`jaxcal.calibrate_batch`.
+Plain methods are computed by :mod:`jaxcal.study.lean`; the others by
+:func:`jaxcal.calibrate_batch`.
 
 The programs are compiled for one thread each: trials are independent, so that processes, one for
 each group of cores (:mod:`jaxcal.study.cluster`), use several cores better than XLA's thread pool
@@ -29,7 +29,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
 from jaxcal.compiler import fast_to_run, single_threaded
-from jaxcal.metrics import reconstruction_precision
+from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.offsets import OffsetLaw, nominal_bound
 from jaxcal.precision import in_own_modes
 from jaxcal.probe import LinearProbe
@@ -150,11 +150,7 @@ class Block:
             return self._in_full(kind, options, bound)
         program = lean_program(kind, options, self._devices)
         begun = self.begun(options.max_iterations)
-        measured, certain = program(self.batch, self.truth, begun, bound)
-        found = _as_numpy(measured)
-        if not np.all(certain):
-            found["status"] = self._in_full(kind, options, bound)["status"]
-        return found
+        return _as_numpy(program(self.batch, self.truth, begun, bound))
 
     def _in_full(
         self, kind: Kind, options: Options, bound: np.ndarray | None
@@ -314,9 +310,10 @@ def _in_full(kind: Kind, options: Options, drawn: Experiment, bound: Array | Non
         problems, *kind, max_elevation=bound, options=options, chunk=drawn.points.shape[0]
     )
     x, truth = result.image_to_probe, drawn.image_to_probe
+    precision = jax.vmap(reconstruction_precision)
     chord = jnp.linalg.norm(x[:, :3, :3] - truth[:, :3, :3], axis=(1, 2))
     return Measured(
-        rp=jax.vmap(reconstruction_precision)(x, drawn.test_poses, drawn.test_points),
+        rp=jnp.asarray(precision(x, drawn.test_poses, drawn.test_points)),
         rotation_error=2 * jnp.arcsin(jnp.minimum(chord / np.sqrt(8.0), 1.0)),
         translation_error=jnp.linalg.norm(x[:, :3, 3] - truth[:, :3, 3], axis=1),
         point_error=jnp.linalg.norm(result.point - drawn.point, axis=1),

@@ -1,6 +1,6 @@
 """What the numbers mean, in words: weak directions, outliers, and everything worth a warning.
 
-Takes a :class:`jaxcal.Calibration` whose arrays are numpy's.
+All functions take one calibration, with concrete values.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Protocol, TypedDict, runtime_checkable
 
 import numpy as np
 
+from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK, MISFITS
+from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.geometry import AnyArray
-from jaxcal.inspection import FEWEST_TO_CHECK, MISFITS
 from jaxcal.model.parameters import BLOCK_SIZE
 from jaxcal.model.shapes import FAMILIES
 
@@ -28,7 +29,7 @@ class OutlierReason(TypedDict):
 
 
 @runtime_checkable
-class Judged(Protocol):
+class HasOutliers(Protocol):
     """What has images that may stand out."""
 
     @property
@@ -70,9 +71,6 @@ _OBLIQUE = {
     "point": "target position along the tracker's ({:.2f}, {:.2f}, {:.2f})",
     "scale": "both pixel scales ({:.2f}, {:.2f})",
 }
-
-TUNED = ("gaussian", "auto", "uniform")
-"""Priors with SDs of lateral position, range and offset."""
 
 COMPONENTS = ("lateral", "range", "elevational")
 STEADY = 1e-3
@@ -237,13 +235,13 @@ def outliers(result: Calibration) -> list[int]:
     return images_that_stand_out(result)
 
 
-def images_that_stand_out(result: Judged) -> list[int]:
+def images_that_stand_out(result: HasOutliers) -> list[int]:
     """Indices of the images marked as outliers."""
     return [int(image) for image in np.flatnonzero(np.asarray(result.outlier) > 0)]
 
 
 def outlier_reasons(
-    result: Judged, components: tuple[str, ...] = COMPONENTS
+    result: HasOutliers, components: tuple[str, ...] = COMPONENTS
 ) -> list[OutlierReason]:
     """For every outlier: the component that stands out most, by how many SDs, and if it was used.
 
@@ -254,16 +252,17 @@ def outlier_reasons(
     found: list[OutlierReason] = []
     for image in images_that_stand_out(result):
         worst = int(np.argmax(np.abs(departure[image])))
-        found.append({
+        reason: OutlierReason = {
             "image": image,
             "component": components[worst],
             "sds": _finite(departure[image, worst]),
             "left_out": bool(np.asarray(result.mask)[image] == 0),
-        })  # fmt: skip
+        }
+        found.append(reason)
     return found
 
 
-def listed_departures(result: Judged, components: tuple[str, ...] = COMPONENTS) -> str:
+def listed_departures(result: HasOutliers, components: tuple[str, ...] = COMPONENTS) -> str:
     """The outliers with component and SDs, the first ten of them, in words."""
     reasons = outlier_reasons(result, components)
     told = [
@@ -370,11 +369,12 @@ def _weak_direction(result: Calibration) -> list[str]:
 def _medium_warnings(result: Calibration) -> list[str]:
     """Sound speed and delay that only their priors tell, or that the data can hardly see."""
     found = []
-    for name, value, sd, believed, unit in (
-        ("sound speed", result.sound_speed_m_s, result.sound_speed_sd_m_s,
-         result.sound_speed_prior_m_s, "m/s"),
-        ("delay", result.delay_s, result.delay_sd_s, result.delay_prior_s, "us"),
-    ):  # fmt: skip
+    speed = (result.sound_speed_m_s, result.sound_speed_sd_m_s, result.sound_speed_prior_m_s)
+    delay = (result.delay_s, result.delay_sd_s, result.delay_prior_s)
+    for name, (value, sd, believed), unit in (
+        ("sound speed", speed, "m/s"),
+        ("delay", delay, "us"),
+    ):
         if value is None or sd is None or not np.isfinite(sd):
             continue
         factor = 1e6 if unit == "us" else 1.0

@@ -14,26 +14,30 @@ References: Fitzpatrick, West and Maurer 1998 (TRE as a root mean square); Stude
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+from typing import TYPE_CHECKING
+
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy import stats
 
-from jaxcal.calibration import Calibration
-from jaxcal.diagnosis import TUNED
+from jaxcal.diagnostics.arrays import array_module, traceable
+from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.errors import InputError
 from jaxcal.geometry import AnyArray
 from jaxcal.model.parameters import size
-from jaxcal.precision import in_own_modes
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
 
 
-@in_own_modes
-def degrees_of_freedom(calibration: Calibration) -> Float[Array, "*batch"]:
+@traceable
+def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     """What the used images leave for the noise's SDs (traceable); inf where SDs were given."""
-    left = calibration.images_used - size(calibration.blocks) / 3
-    tunable = calibration.prior in TUNED
-    told = jnp.asarray(tunable) & jnp.logical_not(calibration.sigma_tuned)
-    return jnp.where(told, jnp.inf, jnp.maximum(left, 1.0))
+    xp = array_module(calibration)
+    left = xp.sum(calibration.mask > 0, axis=-1) - size(calibration.blocks) / 3
+    if calibration.prior not in TUNED:
+        return xp.maximum(left, 1.0)
+    return xp.where(calibration.sigma_tuned, xp.maximum(left, 1.0), np.inf)
 
 
 def transform_intervals(
@@ -54,16 +58,15 @@ def transform_intervals(
     """
     if not 0 < level < 1:
         raise InputError(f"level must be between 0 and 1, not {level}")
-    result = calibration.numpy()
-    factor = stats.t.ppf(0.5 + 0.5 * level, np.asarray(degrees_of_freedom(result)))
-    variance = np.diagonal(result.covariance, axis1=-2, axis2=-1)
+    factor = stats.t.ppf(0.5 + 0.5 * level, np.asarray(degrees_of_freedom(calibration)))
+    variance = np.diagonal(calibration.numpy().covariance, axis1=-2, axis2=-1)
     return factor[..., None] * np.sqrt(variance)
 
 
-@in_own_modes
+@traceable
 def predicted_tre(
     calibration: Calibration, points: Float[AnyArray, "*points 2"]
-) -> Float[Array, "*shape"]:
+) -> Float[AnyArray, "*shape"]:
     """Root mean square target registration error that the covariance predicts, mm (traceable).
 
     Args:
@@ -73,19 +76,21 @@ def predicted_tre(
     Returns:
         (*batch, *points) mm; NaN where X is not observable.
     """
-    points = jnp.asarray(points)
+    xp = array_module(calibration, points)
+    points = xp.asarray(points)
     lateral, axial = points[..., 0].ravel(), points[..., 1].ravel()
-    zero, one = jnp.zeros_like(lateral), jnp.ones_like(lateral)
-    # omega x p with p = (lateral, 0, axial).
-    jacobian = jnp.stack([
-        jnp.stack([one, zero, zero, zero, axial, zero], axis=-1),
-        jnp.stack([zero, one, zero, -axial, zero, lateral], axis=-1),
-        jnp.stack([zero, zero, one, zero, -lateral, zero], axis=-1),
-    ])  # fmt: skip
-    covariance = jnp.asarray(calibration.covariance)
+    zero, one = xp.zeros_like(lateral), xp.ones_like(lateral)
+    # I and omega x p with p = (lateral, 0, axial).
+    rows = (
+        (one, zero, zero, zero, axial, zero),
+        (zero, one, zero, -axial, zero, lateral),
+        (zero, zero, one, zero, -lateral, zero),
+    )
+    jacobian = xp.stack([xp.stack(row, axis=-1) for row in rows])
     left = degrees_of_freedom(calibration)
     # Student's variance exceeds the normal one's by this factor.
-    factor = jnp.where(jnp.isfinite(left), left / jnp.maximum(left - 2, 1.0), 1.0)
-    square = jnp.einsum("kma,...ab,kmb->...m", jacobian, covariance, jacobian)
-    found = jnp.sqrt(factor[..., None] * square)
+    factor = xp.where(xp.isfinite(left), left / xp.maximum(left - 2, 1.0), 1.0)
+    covariance = xp.asarray(calibration.covariance)
+    square = xp.einsum("kma,...ab,kmb->...m", jacobian, covariance, jacobian)
+    found = xp.sqrt(factor[..., None] * square)
     return found.reshape(*found.shape[:-1], *points.shape[:-1])

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxcal.geometry import AnyArray, transform_points
-from jaxcal.precision import in_own_modes
+from jaxcal.diagnostics.arrays import array_module, traceable
+from jaxcal.geometry import AnyArray
 
 
-@in_own_modes
+@traceable
 def reconstruction_precision(
     image_to_probe: Float[AnyArray, "4 4"],
     poses: Float[AnyArray, "n 4 4"],
     points: Float[AnyArray, "n columns"],
     mask: Float[AnyArray, " n"] | None = None,
-) -> Float[Array, ""]:
+) -> Float[AnyArray, ""]:
     """Point reconstruction precision, Eq. 8: norm of the SD of B_i X p_i over the images, mm.
 
     Args:
@@ -27,33 +26,41 @@ def reconstruction_precision(
     Returns:
         sqrt(sum over x, y, z of the unbiased variance (n - 1)), mm.
     """
-    poses, points = jnp.asarray(poses), jnp.asarray(points)
+    xp = array_module(image_to_probe, poses, points, mask)
+    poses, points = xp.asarray(poses), xp.asarray(points)
     cloud = reconstruct(image_to_probe, poses, points)
-    weight = jnp.ones(poses.shape[0], cloud.dtype) if mask is None else jnp.asarray(mask)
+    weight = xp.ones(poses.shape[0], cloud.dtype) if mask is None else xp.asarray(mask)
     weight = weight.astype(cloud.dtype)[:, None]
-    count = jnp.sum(weight)
-    mean = jnp.sum(weight * cloud, axis=0) / count
-    return jnp.sqrt(jnp.sum(weight * (cloud - mean) ** 2) / (count - 1))
+    count = xp.sum(weight)
+    mean = xp.sum(weight * cloud, axis=0) / count
+    return xp.asarray(xp.sqrt(xp.sum(weight * (cloud - mean) ** 2) / (count - 1)))
 
 
-@in_own_modes
+@traceable
 def reconstruct(
     image_to_probe: Float[AnyArray, "4 4"],
     poses: Float[AnyArray, "n 4 4"],
     points: Float[AnyArray, "n columns"],
-) -> Float[Array, "n 3"]:
+) -> Float[AnyArray, "n 3"]:
     """B_i X p_i: image points in the tracker's frame, mm; (n, 2) points lie in the plane."""
-    points = jnp.asarray(points)
+    xp = array_module(image_to_probe, poses, points)
+    points = xp.asarray(points)
     if points.shape[1] == 2:
-        points = jnp.stack([points[:, 0], jnp.zeros_like(points[:, 0]), points[:, 1]], axis=1)
-    return transform_points(jnp.asarray(poses), transform_points(jnp.asarray(image_to_probe),
-                                                                 points))  # fmt: skip
+        points = xp.stack([points[:, 0], xp.zeros_like(points[:, 0]), points[:, 1]], axis=1)
+    in_probe = _transformed(xp.asarray(image_to_probe), points)
+    return _transformed(xp.asarray(poses), in_probe)
 
 
-@in_own_modes
+def _transformed(transform: AnyArray, points: AnyArray) -> AnyArray:
+    """Points (..., 3) by transforms (..., 4, 4)."""
+    rotation, translation = transform[..., :3, :3], transform[..., :3, 3]
+    return (rotation @ points[..., None])[..., 0] + translation
+
+
+@traceable
 def calibration_reproducibility(
     transforms: Float[AnyArray, "k 4 4"], image_points: Float[AnyArray, "m 2"]
-) -> Float[Array, " m"]:
+) -> Float[AnyArray, " m"]:
     """How far repeated calibrations scatter at image points: mean distance from their mean, mm.
 
     Args:
@@ -65,27 +72,29 @@ def calibration_reproducibility(
 
     Source: calibration reproducibility, e.g. Hsu et al. 2009, section 6.2.
     """
-    transforms, image_points = jnp.asarray(transforms), jnp.asarray(image_points)
-    zero = jnp.zeros_like(image_points[:, 0])
-    points = jnp.stack([image_points[:, 0], zero, image_points[:, 1]], axis=1)
-    images = transform_points(transforms[:, None], points[None])
-    return jnp.mean(jnp.linalg.norm(images - jnp.mean(images, axis=0), axis=-1), axis=0)
+    xp = array_module(transforms, image_points)
+    transforms, image_points = xp.asarray(transforms), xp.asarray(image_points)
+    zero = xp.zeros_like(image_points[:, 0])
+    points = xp.stack([image_points[:, 0], zero, image_points[:, 1]], axis=1)
+    images = _transformed(transforms[:, None], points[None])
+    return xp.mean(xp.linalg.norm(images - xp.mean(images, axis=0), axis=-1), axis=0)
 
 
-@in_own_modes
-def image_corners(width_mm: float, depth_mm: float) -> Float[Array, "5 2"]:
+@traceable
+def image_corners(width_mm: float, depth_mm: float) -> Float[AnyArray, "5 2"]:
     """The four corners of a linear probe's image and its centre, [lateral, axial] mm."""
     half = 0.5 * width_mm
-    return jnp.asarray(
+    return array_module(half, depth_mm).asarray(
         [[-half, 0.0], [half, 0.0], [-half, depth_mm], [half, depth_mm], [0.0, 0.5 * depth_mm]]
     )
 
 
-@in_own_modes
+@traceable
 def root_mean_square(
     residual: Float[AnyArray, "n 3"], mask: Float[AnyArray, " n"] | None = None
-) -> Float[Array, ""]:
+) -> Float[AnyArray, ""]:
     """Root mean square length of residual vectors (mm) over the used images."""
-    residual = jnp.asarray(residual)
-    weight = jnp.ones(residual.shape[0], residual.dtype) if mask is None else jnp.asarray(mask)
-    return jnp.sqrt(jnp.sum(weight[:, None] * residual**2) / jnp.sum(weight))
+    xp = array_module(residual, mask)
+    residual = xp.asarray(residual)
+    weight = xp.ones(residual.shape[0], residual.dtype) if mask is None else xp.asarray(mask)
+    return xp.asarray(xp.sqrt(xp.sum(weight[:, None] * residual**2) / xp.sum(weight)))

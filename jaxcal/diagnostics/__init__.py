@@ -1,0 +1,12 @@
+"""What is said about an answer, computed with numpy on the host when somebody reads it.
+
+    image_errors     every image's errors and their derivatives: what the rest is computed from
+    uncertainty      offsets' SDs, weakest direction, what only the prior tells
+    residual_checks  images that stand out, the fit of the noise model, which poses to add
+    summary          all of these for a calibration or a batch
+    messages         the same in words
+    intervals        confidence intervals and target registration error
+    metrics          reconstruction precision, reproducibility, residual RMS
+
+A solve itself leaves X, target, offsets, SDs, covariance and status (:mod:`jaxcal.answer`).
+"""

@@ -1,0 +1,42 @@
+"""Numpy for values, jax.numpy inside somebody's jit, vmap or grad."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def is_traced(*values: object) -> bool:
+    """Whether a jit, vmap or grad looks at one of these values (pytrees)."""
+    # Where JAX was not imported nothing is traced.
+    jax = sys.modules.get("jax")
+    if jax is None:
+        return False
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def array_module(*values: object) -> Any:
+    """What to compute with: jax.numpy where one of the values is traced, otherwise numpy."""
+    return sys.modules["jax"].numpy if is_traced(*values) else np
+
+
+def traceable(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a function of :func:`array_module`: traced, it runs in JAX's standard modes."""
+
+    @wraps(function)
+    def in_standard_modes(*args: P.args, **kwargs: P.kwargs) -> T:
+        if not is_traced(args, kwargs):
+            return function(*args, **kwargs)
+        from jaxcal.precision import own_modes
+
+        with own_modes(bits_too=False):
+            return function(*args, **kwargs)
+
+    return in_standard_modes

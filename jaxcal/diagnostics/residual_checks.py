@@ -1,0 +1,296 @@
+"""A look at the residuals: which images stand out, does the noise model fit, what to add.
+
+*Images.* Each image's departure from what the images in use say, in robust SDs; lateral errors of
+deep images count less, as those of an array grow with the range (:mod:`jaxcal.solvers.consensus`).
+
+*Noise model.* If lateral, range and elevational errors are Gaussian, independent and of one size,
+then statistics of the standardised residuals follow known laws, whatever the data. Four are taken
+for each component and turned into standard normal scores: kurtosis (heavy tails), skewness (one
+side), correlation of the magnitude with the range (errors that grow with depth), and correlation of
+successive images (drift).
+
+*Poses to add.* The weakest direction is a motion of X, the target and the rest that the images
+hardly notice. For a few kinds of further images it is computed by how many SDs they would.
+
+References: Anscombe and Glynn 1983 (kurtosis), D'Agostino 1970 (skewness): transformations to
+normality; Gelman et al. 2013, chapter 6 (posterior predictive checks).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxcal.diagnostics.uncertainty import TUNED, Uncertainty, Whitened, inverses, quadratic
+from jaxcal.model.parameters import block_slice
+from jaxcal.solvers.consensus import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+    from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+    from jaxcal.model.parameters import Blocks
+    from jaxcal.problem import Problem
+
+Array = np.ndarray
+
+MISFITS = ("tails", "skewness", "depth", "drift")
+"""Rows of ``misfit``."""
+
+FEWEST_TO_CHECK = 20
+"""With fewer used images the noise model is not judged."""
+
+ADDITIONS = ("tilt lateral", "tilt elevational", "tilt axial", "depth", "sideways")
+"""Kinds of further images: the probe tilted about an image axis, or the target elsewhere in it."""
+
+TILT_RAD = 0.4363
+SIDEWAYS_MM = 25.0
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What the residuals show.
+
+    Attributes:
+        outlier: 1 where an image does not fit the rest.
+        departure: errors of lateral position, range and elevational offset in robust SDs of the
+            images in use; 0 where the caller masked the image.
+        kurtosis: of the standardised residuals; 3 for Gaussian ones.
+        misfit: standard normal scores of :data:`MISFITS` for each component; 0 with fewer than 20
+            images in use.
+        gain: SDs by which one more image of each of :data:`ADDITIONS` would notice one unit (1 mm
+            at the lever arm) along the weakest direction.
+    """
+
+    outlier: Float[Array, "*batch n"]
+    departure: Float[Array, "*batch n 3"]
+    kurtosis: Float[Array, "*batch 3"]
+    misfit: Float[Array, "*batch 4 3"]
+    gain: Float[Array, "*batch 5"]
+
+
+def inspect(
+    answer: Calibration,
+    seen: ImageErrors,
+    shifted: ImageErrors,
+    unknowns: Unknowns,
+    problem: Problem,
+    uncertainty: Uncertainty,
+    eps: float,
+) -> Inspection:
+    """Look at the residuals of calibrations with one leading axis.
+
+    Args:
+        answer: the calibrations.
+        seen: all images that the caller wanted to use, those left out as outliers included.
+        shifted: the same with what the tracker's own error is taken to be.
+        unknowns: the unknowns.
+        problem: the data.
+        uncertainty: of the calibrations.
+        eps: relative rounding of the arithmetic that solved them.
+    """
+    kept = np.asarray(answer.mask, float)
+    departure = departures(seen, problem, kept, answer.blocks, eps)
+    if answer.robust:
+        outlier = seen.mask * (1 - kept)
+    else:
+        judged = (seen.mask.sum(axis=1) >= FEWEST_IMAGES) & np.isfinite(departure).all(axis=(1, 2))
+        outlier = seen.mask * judged[:, None] * stands_out(departure, kept)
+    residual = seen.errors
+    if answer.prior in TUNED and answer.data == "points":
+        whitened = Whitened.of(answer, shifted, problem)
+        left = np.maximum(1 - whitened.leverage(uncertainty.inverse), 0.05)
+        residual = whitened.errors / np.sqrt(left)
+    kurtosis, misfit = check_noise_model(residual, seen.distance, kept)
+    gain = gains(answer, seen, unknowns, problem, uncertainty)
+    return Inspection(outlier, departure, kurtosis, misfit, gain)
+
+
+def departures(
+    seen: ImageErrors, problem: Problem, kept: Float[Array, "k n"], blocks: Blocks, eps: float
+) -> Float[Array, "k n 3"]:
+    """How far every image is from what the kept ones say, in robust SDs, leverage allowed for."""
+    rigid = [name for name in blocks if name in ("translation", "rotation", "point", "scale")]
+    columns = np.concatenate([np.r_[block_slice(blocks, name)] for name in rigid])
+    # The unknowns' own effect on the range is beside the point: it is that of nominal ones.
+    axial = np.where(seen.mask > 0, np.asarray(problem.measurements)[..., 1], 1.0)
+    distance = axial * np.asarray(problem.spacing)[:, 1:] + np.asarray(problem.face_offset)[:, None]
+    beyond = np.maximum(distance / medians(distance[..., None], seen.mask), 1.0)
+    by = np.stack([np.where(seen.mask > 0, beyond, 1.0), *[np.ones_like(beyond)] * 2], axis=-1)
+    errors, rows = seen.errors / by, seen.rows[..., columns] / by[..., None]
+
+    # The unknowns' degrees of freedom are shared equally by the three components.
+    freedom = np.maximum(1 - len(columns) / (3 * kept.sum(axis=1, keepdims=True)), 0.1)
+    sigma = MAD * medians(np.abs(errors), kept) / np.sqrt(freedom)
+    least = np.maximum(RELATIVE_FLOOR * sigma.max(axis=1, keepdims=True), 1e-6)
+    sigma = np.maximum(sigma, least)[:, None]
+    rows = (rows / sigma[..., None]).reshape(len(rows), -1, len(columns))
+    used = rows * np.repeat(kept, 3, axis=1)[..., None]
+    inverse = inverses(np.swapaxes(used, 1, 2) @ used, eps)
+    leverage = quadratic(rows, inverse).reshape(errors.shape)
+    # An image in use pulls the fit towards itself; one that is not, is predicted by the fit.
+    left = np.where(kept[..., None] > 0, np.maximum(1 - leverage, 0.05), 1 + leverage)
+    return errors / np.sqrt(left) / sigma
+
+
+def medians(values: Float[Array, "k n c"], weight: Float[Array, "k n"]) -> Float[Array, "k c"]:
+    """The least value that at least half of the used ones do not exceed; NaN counts as infinite."""
+    used = weight > 0
+    values = np.where(used[..., None] & ~np.isnan(values), values, np.inf)
+    middle = np.maximum((used.sum(axis=1) + 1) // 2 - 1, 0)
+    return np.take_along_axis(np.sort(values, axis=1), middle[:, None, None], axis=1)[:, 0]
+
+
+def stands_out(departure: Float[Array, "k n 3"], kept: Float[Array, "k n"]) -> Bool[Array, "k n"]:
+    """Whether an image departs by more than the images in use can explain.
+
+    A median of a dozen images is itself uncertain: with few of them the limit is wider; for images
+    that were left out it is not (:func:`jaxcal.solvers.consensus.stands_out`).
+    """
+    count = np.maximum(kept.sum(axis=1, keepdims=True), 1.0)
+    few = np.sqrt(np.maximum(FEW_IMAGES / count, 1.0))
+    limit = CUT * np.where(kept > 0, few, 1.0)
+    return np.any(np.abs(departure) > limit[..., None], axis=2)
+
+
+def check_noise_model(
+    residual: Float[Array, "k n 3"], distance: Float[Array, "k n"], mask: Float[Array, "k n"]
+) -> tuple[Float[Array, "k 3"], Float[Array, "k 4 3"]]:
+    """Kurtosis of standardised residuals, and the scores of :data:`MISFITS`.
+
+    Args:
+        residual: of lateral position, range and offset, each in SDs of its own or of one SD.
+        distance: the range, mm.
+        mask: 1 for images in use.
+    """
+    used = mask[..., None]
+    count = used.sum(axis=1)
+
+    def mean(values: Float[Array, "k n c"]) -> Float[Array, "k c"]:
+        return np.sum(used * values, axis=1) / count
+
+    centred = used * (residual - mean(residual)[:, None])
+    second = mean(centred**2)
+    centred = centred / np.sqrt(np.where(second > 0, second, 1.0))[:, None]
+    kurtosis = mean(centred**4)
+    tails = kurtosis_score(kurtosis, count)
+    skewed = skewness_score(mean(centred**3), count)
+
+    away = distance[..., None]
+    away = used * (away - mean(away)[:, None])
+    magnitude = used * (np.abs(centred) - mean(np.abs(centred))[:, None])
+    lengths = np.sqrt(np.sum(away**2, axis=1) * np.sum(magnitude**2, axis=1))
+    joint = np.sum(away * magnitude, axis=1)
+    deeper = joint / np.where(lengths > 0, lengths, 1.0) * np.sqrt(count - 1)
+
+    both = used[:, 1:] * used[:, :-1]
+    successive = np.sum(both * centred[:, 1:] * centred[:, :-1], axis=1)
+    drift = successive / np.sqrt(np.maximum(both.sum(axis=1), 1.0))
+    scores = np.stack([tails, skewed, deeper, drift], axis=1)
+    judged = (count >= FEWEST_TO_CHECK)[:, None] & np.isfinite(scores) & (second > 0)[:, None]
+    return kurtosis, np.where(judged, scores, 0.0)
+
+
+def kurtosis_score(
+    kurtosis: Float[Array, "*#b"], count: Float[Array, "*#b"]
+) -> Float[Array, "*b"]:
+    """Standard normal score of a sample kurtosis (Anscombe and Glynn 1983)."""
+    n = count
+    expected = 3 * (n - 1) / (n + 1)
+    variance = 24 * n * (n - 2) * (n - 3) / ((n + 1) ** 2 * (n + 3) * (n + 5))
+    x = (kurtosis - expected) / np.sqrt(variance)
+    third = 6 * (n**2 - 5 * n + 2) / ((n + 7) * (n + 9))
+    third = third * np.sqrt(6 * (n + 3) * (n + 5) / (n * (n - 2) * (n - 3)))
+    a = 6 + 8 / third * (2 / third + np.sqrt(1 + 4 / third**2))
+    inner = (1 - 2 / a) / (1 + x * np.sqrt(2 / (a - 4)))
+    return (1 - 2 / (9 * a) - np.cbrt(inner)) / np.sqrt(2 / (9 * a))
+
+
+def skewness_score(
+    skewness: Float[Array, "*#b"], count: Float[Array, "*#b"]
+) -> Float[Array, "*b"]:
+    """Standard normal score of a sample skewness (D'Agostino 1970)."""
+    n = count
+    y = skewness * np.sqrt((n + 1) * (n + 3) / (6 * (n - 2)))
+    fourth = 3 * (n**2 + 27 * n - 70) * (n + 1) * (n + 3)
+    fourth = fourth / ((n - 2) * (n + 5) * (n + 7) * (n + 9))
+    w2 = np.sqrt(2 * (fourth - 1)) - 1
+    delta = 1 / np.sqrt(0.5 * np.log(w2))
+    alpha = np.sqrt(2 / (w2 - 1))
+    return delta * np.arcsinh(y / alpha)
+
+
+def gains(
+    answer: Calibration,
+    seen: ImageErrors,
+    unknowns: Unknowns,
+    problem: Problem,
+    uncertainty: Uncertainty,
+) -> Float[Array, "k 5"]:
+    """How much one more image of each of :data:`ADDITIONS` would notice of the weakest direction.
+
+    Tilts are of 25 degrees either way about the image's axes, from the pose nearest to the mean of
+    those in use and with the target at the middle of the used points; then the target half as deep
+    or half as deep again, and 25 mm to either side. An image whose pose puts the target at
+    q = (x, 0, z) sees it move by -v + [q]x w + M d.
+    """
+    blocks, kept = answer.blocks, np.asarray(answer.mask, float)
+    count = kept.sum(axis=1)
+    middle = np.stack(
+        [
+            np.sum(np.where(kept > 0, plane, 0.0), axis=1) / count
+            for plane in (seen.lateral, seen.distance)
+        ],
+        axis=1,
+    )
+    # M of the pose whose rotation is nearest to the mean of those in use.
+    mean = np.einsum("kn,knij->kij", kept, seen.turned)
+    closeness = np.where(kept > 0, np.einsum("knij,kij->kn", seen.turned, mean), -np.inf)
+    usual = seen.turned[np.arange(len(kept)), np.argmax(closeness, axis=1)]
+
+    half, aside = np.array([1.0, 0.5]), np.array([SIDEWAYS_MM, 0.0])
+    elsewhere = [middle * half, middle * (2 - half), middle + aside, middle - aside]
+    places = np.stack([*[middle] * 6, *elsewhere], axis=1)
+    turned = np.concatenate(
+        [_TILTS @ usual[:, None], np.broadcast_to(usual[:, None], (len(kept), 4, 3, 3))], axis=1
+    )
+    q = np.stack([places[..., 0], np.zeros_like(places[..., 0]), places[..., 1]], axis=-1)
+
+    step = uncertainty.weakest / uncertainty.scale
+    from jaxcal.diagnostics.image_errors import motion
+
+    errors = np.einsum("kmip,kp->kmi", motion(q, turned, blocks), step)
+    errors = errors[..., [0, 2, 1]]
+    # The same places with unknowns between a measurement and mm.
+    speed, delay = unknowns.sound_speed[:, None], unknowns.delay[:, None]
+    face = np.asarray(problem.face_offset)[:, None]
+    if "scale" in blocks:
+        lateral, axial = step[:, block_slice(blocks, "scale")].T[..., None]
+        errors[..., 0] -= places[..., 0] * lateral
+        errors[..., 1] -= (places[..., 1] - face) * speed * axial
+    if "sound-speed" in blocks:
+        change = step[:, block_slice(blocks, "sound-speed")]
+        errors[..., 1] -= (places[..., 1] - delay) * speed * change
+    if "delay" in blocks:
+        errors[..., 1] += speed * step[:, block_slice(blocks, "delay")]
+    sigma = np.maximum(np.asarray(answer.sigma), 1e-9)[:, None]
+    noticed = np.sqrt(np.sum((errors / sigma) ** 2, axis=2))
+    return noticed.reshape(-1, 5, 2).max(axis=2)
+
+
+def _tilts() -> Float[Array, "6 3 3"]:
+    """Transposed rotations by the tilt, either way about each image axis."""
+    found = []
+    for axis in range(3):
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        for sine in (np.sin(TILT_RAD), -np.sin(TILT_RAD)):
+            turn = np.eye(3)
+            turn[first, first] = turn[second, second] = np.cos(TILT_RAD)
+            turn[first, second], turn[second, first] = sine, -sine
+            found.append(turn)
+    return np.array(found)
+
+
+_TILTS = _tilts()

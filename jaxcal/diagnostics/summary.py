@@ -1,0 +1,113 @@
+"""Everything that is computed of an answer when it is read, for one problem or a batch at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.residual_checks import Inspection, inspect
+from jaxcal.diagnostics.uncertainty import assess
+from jaxcal.errors import CalibrationError
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+
+Array = np.ndarray
+
+CHUNK = 64
+"""Problems at a time: their derivatives stay in the processor's caches."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Diagnostics of a calibration, or of a batch with leading axes.
+
+    Attributes:
+        elevation_sd: SDs of the offsets, mm; NaN where one rests on its bound or is not known.
+        at_bound: 1 where an offset rests on its bound.
+        residual: q_i - p_i with p_i in the plane, in the image frame, mm; 0 where left out.
+        condition: largest over smallest eigenvalue of the scaled information.
+        weakest: unit vector (scaled units) of the least known direction of all unknowns.
+        weakest_sd: SD along it, mm at the lever arm; NaN where it has none.
+        prior_direction: unit vector (scaled units) that the measurements alone leave open; zeros
+            where there is none.
+        inspection: what the residuals show.
+    """
+
+    elevation_sd: Float[Array, "*batch n"]
+    at_bound: Float[Array, "*batch n"]
+    residual: Float[Array, "*batch n 3"]
+    condition: Float[Array, "*batch"]
+    weakest: Float[Array, "*batch p"]
+    weakest_sd: Float[Array, "*batch"]
+    prior_direction: Float[Array, "*batch p"]
+    inspection: Inspection
+
+
+def summarise(calibration: Calibration) -> Summary:
+    """Compute the diagnostics.
+
+    Args:
+        calibration: one or a batch, with concrete values and its problem.
+
+    Raises:
+        CalibrationError: a calibration without the problem that it is of.
+    """
+    import jax
+
+    if calibration.problem is None:
+        raise CalibrationError(
+            "this calibration does not hold its problem, without which there are no diagnostics: "
+            "add it with calibration.with_problem(problem)"
+        )
+    batch = np.shape(calibration.mask)[:-1]
+    axes = len(batch)
+    eps = float(np.finfo(np.asarray(calibration.covariance).dtype).eps)
+
+    def flat(leaf: Any) -> Array:
+        values = np.asarray(leaf)
+        values = values.astype(float) if values.dtype.kind == "f" else values
+        return values.reshape(-1, *values.shape[axes:])
+
+    whole = jax.tree.map(flat, calibration)
+    pieces = []
+    with np.errstate(all="ignore"):
+        for start in range(0, max(len(whole.mask), 1), CHUNK):
+            rows = slice(start, start + CHUNK)
+            pieces.append(_piece(jax.tree.map(lambda leaf, rows=rows: leaf[rows], whole), eps))
+    found = {
+        name: np.concatenate([piece[name] for piece in pieces]).reshape(batch + each.shape[1:])
+        for name, each in pieces[0].items()
+    }
+    inspection = {field.name: found.pop(field.name) for field in fields(Inspection)}
+    return Summary(**found, inspection=Inspection(**inspection))
+
+
+def _piece(answer: Calibration, eps: float) -> dict[str, Array]:
+    """Of calibrations with one leading axis."""
+    problem = answer.problem
+    assert problem is not None
+    unknowns = Unknowns.of(answer, problem)
+    seen = ImageErrors.of(unknowns, problem, answer.blocks)
+    shifted = seen
+    if answer.linearisation.tracker_sd is not None:
+        # What the tracker's own error is taken to be moves the target's elevation.
+        shift = np.where(answer.mask > 0, answer.elevation - seen.q[..., 1], 0.0)
+        shifted = ImageErrors.of(unknowns, problem, answer.blocks, shift)
+    uncertainty = assess(answer, shifted, unknowns, problem, eps)
+    inspection = inspect(answer, seen, shifted, unknowns, problem, uncertainty, eps)
+    residual, _ = seen.from_circle(np.zeros_like(seen.mask))
+    return {
+        "elevation_sd": uncertainty.elevation_sd,
+        "at_bound": uncertainty.at_bound,
+        "residual": np.where(answer.mask[..., None] > 0, residual, 0.0),
+        "condition": uncertainty.condition,
+        "weakest": uncertainty.weakest,
+        "weakest_sd": uncertainty.weakest_sd,
+        "prior_direction": uncertainty.prior_direction,
+        **{field.name: getattr(inspection, field.name) for field in fields(Inspection)},
+    }

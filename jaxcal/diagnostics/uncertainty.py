@@ -1,0 +1,385 @@
+"""How certain an answer is, and which directions the data do not see.
+
+The information S of the shared unknowns (:class:`jaxcal.calibration.Linearisation`) tells how well
+each direction is known: eigenvectors with small eigenvalues are directions that the images barely
+determine. To compare mm with rad and log units, rotations, scales and sound speed are multiplied by
+the lever arm, the root mean square distance of the measured points from the image origin: all are
+then mm at the target.
+
+An offset that is an unknown of its own (bounded, or beside a tracker that errs) was eliminated from
+S. With k_i the derivative of image i's residuals by it, J_i that by the shared unknowns, D_i =
+k_i'k_i and E_i = J_i'k_i, a function of both with derivatives (a, b) has the variance
+
+    (a - b E_i / D_i)' S^-1 (a - b E_i / D_i) + b^2 / D_i.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxcal.model.parameters import BLOCK_SIZE, block_slice
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+    from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+    from jaxcal.model.parameters import Blocks
+    from jaxcal.problem import Problem
+
+Array = np.ndarray
+
+SINGULAR = 1e-11
+"""Smallest eigenvalue over the trace of the unweighted design below which poses are degenerate."""
+
+LARGEST_SD = 0.5
+"""A direction whose SD exceeds this fraction of the lever arm is not known in any useful sense."""
+
+LARGEST_ELEVATION = 0.95
+"""Bounds are cut at this fraction of the range (:mod:`jaxcal.model.residuals`)."""
+
+AT_BOUND = 1e-12
+"""An offset is on its bound where it is nearer than this part of it: that is rounding."""
+
+DEFAULT_BOUND_MM = 1.0
+"""The bound on the offsets where none was given (:mod:`jaxcal.options`)."""
+
+TUNED = ("gaussian", "auto", "uniform")
+"""Priors with SDs of lateral position, range and offset."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Of a batch (one leading axis, k).
+
+    Attributes:
+        elevation_sd: mm; NaN where an offset rests on its bound or an image is left out.
+        at_bound: 1 where an offset rests on its bound.
+        condition: largest over smallest eigenvalue of the scaled information.
+        weakest: unit vector of the smallest, in scaled units.
+        weakest_sd: SD along it, mm; NaN where it has none.
+        prior_direction: unit vector that the measurements alone leave open; zeros where none is.
+        inverse: of the information.
+        scale: what makes every unknown's tangent mm at the target.
+    """
+
+    elevation_sd: Float[Array, "k n"]
+    at_bound: Float[Array, "k n"]
+    condition: Float[Array, " k"]
+    weakest: Float[Array, "k p"]
+    weakest_sd: Float[Array, " k"]
+    prior_direction: Float[Array, "k p"]
+    inverse: Float[Array, "k p p"]
+    scale: Float[Array, "k p"]
+
+
+def assess(
+    answer: Calibration,
+    seen: ImageErrors,
+    unknowns: Unknowns,
+    problem: Problem,
+    eps: float,
+) -> Uncertainty:
+    """Uncertainty of calibrations with one leading axis.
+
+    Args:
+        answer: the calibrations, arrays in float64.
+        seen: their images.
+        unknowns: their unknowns.
+        problem: their data.
+        eps: relative rounding of the arithmetic that solved them.
+    """
+    blocks, kept = answer.blocks, np.asarray(answer.mask)
+    lines = answer.linearisation
+    information = np.asarray(lines.information)
+    variance = np.asarray(lines.variance)
+    scale = mm_at_target(seen.lever(kept), blocks)
+    both = scale[:, :, None] * scale[:, None]
+    whitened = answer.prior in TUNED
+    found = Spectra.of(
+        information / both, np.asarray(lines.design) / both, variance, eps, whitened=whitened
+    )
+    inverse = inverses(information, eps)
+    size = np.where(np.isnan(found.weakest_sd), np.nan, variance)
+    at_bound, elevation_sd = _offsets(answer, seen, problem, inverse, size)
+    if lines.average_elevation_sd is not None:
+        assert answer.offset_law is not None
+        better = np.asarray(answer.offset_law.weighed)[:, None] & np.isfinite(elevation_sd)
+        elevation_sd = np.where(better, lines.average_elevation_sd, elevation_sd)
+    return Uncertainty(
+        elevation_sd=elevation_sd,
+        at_bound=at_bound,
+        condition=found.condition,
+        weakest=found.weakest,
+        weakest_sd=found.weakest_sd,
+        prior_direction=_known_from_prior(answer, seen, unknowns, problem, scale, eps),
+        inverse=inverse,
+        scale=scale,
+    )
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """What the spectra of a scaled information and design tell.
+
+    Attributes:
+        condition: largest over smallest eigenvalue of the information.
+        weakest: unit vector of the smallest; of degenerate poses, one that they leave open.
+        weakest_sd: SD along it; NaN where it has none.
+    """
+
+    condition: Float[Array, " k"]
+    weakest: Float[Array, "k p"]
+    weakest_sd: Float[Array, " k"]
+
+    @classmethod
+    def of(
+        cls,
+        information: Float[Array, "k p p"],
+        design: Float[Array, "k p p"],
+        variance: Float[Array, " k"],
+        eps: float,
+        *,
+        whitened: bool = False,
+    ) -> Spectra:
+        """Of matrices per mm at the target.
+
+        Args:
+            information: with the offsets eliminated.
+            design: of unweighted residuals, offsets known.
+            variance: of the residuals that ``information`` is of.
+            eps: relative rounding.
+            whitened: the residuals are in SDs.
+        """
+        values, vectors = spectrum(information)
+        plain, unseen = spectrum(design)
+        null = plain < threshold(eps) * plain.sum(axis=1, keepdims=True)
+        unknown = degenerate = null[:, 0]
+        if not whitened:
+            unknown = degenerate | (values[:, 0] < threshold(eps) * values.sum(axis=1))
+        smallest = np.maximum(values[:, 0], eps * values[:, -1])
+        weakest = vectors[:, :, 0]
+        if degenerate.any():
+            weakest = np.where(degenerate[:, None], nearest_unknown(unseen, null), weakest)
+        sd = np.where(unknown, np.nan, np.sqrt(variance / smallest))
+        return cls(values[:, -1] / smallest, weakest, sd)
+
+
+def threshold(eps: float) -> float:
+    """Smallest eigenvalue over the trace below which a matrix is taken to be singular."""
+    return max(SINGULAR, 100 * eps)
+
+
+def mm_at_target(lever: Float[Array, " k"], blocks: Blocks) -> Float[Array, "k p"]:
+    """What makes each unknown's tangent mm at the target: 1 for mm, the lever arm otherwise."""
+    turning = ("rotation", "scale", "sound-speed")
+    one = np.ones_like(lever)
+    each = [lever if name in turning else one for name in blocks for _ in range(BLOCK_SIZE[name])]
+    return np.stack(each, axis=1)
+
+
+def spectrum(
+    matrix: Float[Array, "k p p"],
+) -> tuple[Float[Array, "k p"], Float[Array, "k p p"]]:
+    """Eigenvalues, ascending, and eigenvectors (columns); NaN of matrices that are not finite."""
+    finite = np.all(np.isfinite(matrix), axis=(1, 2))
+    values, vectors = np.linalg.eigh(np.where(finite[:, None, None], matrix, np.eye(len(matrix.T))))
+    lost = ~finite
+    values[lost], vectors[lost] = np.nan, np.nan
+    return values, vectors
+
+
+def inverses(matrix: Float[Array, "k p p"], eps: float) -> Float[Array, "k p p"]:
+    """Inverses of positive definite matrices; NaN of others.
+
+    Scaled to a unit diagonal, with a ridge at the level of rounding.
+    """
+    count = matrix.shape[-1]
+    diagonal = np.einsum("kii->ki", matrix)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    both = scale[:, :, None] * scale[:, None]
+    scaled = matrix * both + 16 * eps * np.eye(count)
+    finite = np.all(np.isfinite(scaled), axis=(1, 2))
+    scaled = np.where(finite[:, None, None], scaled, np.eye(count))
+    try:
+        found = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:
+        found = np.full_like(scaled, np.nan)
+        for row, each in enumerate(scaled):
+            if np.linalg.matrix_rank(each) == count:
+                found[row] = np.linalg.inv(each)
+    found = 0.5 * (found + np.swapaxes(found, 1, 2)) * both
+    good = finite & (np.einsum("kii->ki", found) > 0).all(axis=1)
+    return np.where(good[:, None, None], found, np.nan)
+
+
+def nearest_unknown(
+    vectors: Float[Array, "k p p"], null: Bool[Array, "k p"]
+) -> Float[Array, "k p"]:
+    """The unit vector of a null space that lies closest to one single unknown, X's shift first.
+
+    Where the space has several dimensions its eigenvectors are any mixture; this one has a name.
+    """
+    chosen = np.where(null[:, None], vectors, 0.0)
+    projector = chosen @ np.swapaxes(vectors, 1, 2)
+    purity = np.einsum("kii->ki", projector)
+    first = np.argmax(purity > 0.5 * purity.max(axis=1, keepdims=True), axis=1)
+    picked = projector[np.arange(len(first)), :, first]
+    length = np.linalg.norm(picked, axis=1, keepdims=True)
+    return picked / np.where(length > 0, length, 1.0)
+
+
+def bound_of(answer: Calibration, problem: Problem) -> Float[Array, "k n"] | None:
+    """The bounds on the offsets of calibrations that have bounds, mm."""
+    if answer.prior != "bounded":
+        return None
+    if problem.max_elevation is None:
+        return np.full_like(answer.mask, DEFAULT_BOUND_MM)
+    return np.asarray(problem.max_elevation)
+
+
+def quadratic(rows: Float[Array, "k m p"], matrix: Float[Array, "k p p"]) -> Float[Array, "k m"]:
+    """R' C r of every row."""
+    return np.einsum("kmp,kmp->km", rows @ matrix, rows)
+
+
+def _offsets(
+    answer: Calibration,
+    seen: ImageErrors,
+    problem: Problem,
+    inverse: Float[Array, "k p p"],
+    variance: Float[Array, " k"],
+) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
+    """Which offsets rest on their bound, and the SDs of the others, mm."""
+    kept = np.asarray(answer.mask) > 0
+    bound, size = bound_of(answer, problem), variance[:, None]
+    at_bound = np.zeros(kept.shape)
+    if bound is not None:
+        y = np.asarray(answer.elevation)
+        residual, axial = seen.from_circle(y)
+        slope = y / axial
+        limit = np.minimum(bound, LARGEST_ELEVATION * np.abs(seen.distance))
+        # Half the derivative of the cost by y; it pushes outwards where an offset rests.
+        force = slope * residual[..., 2] - residual[..., 1]
+        near = np.abs(y) >= (1 - AT_BOUND) * limit
+        at_bound = (kept & near & (np.sign(y) * force <= 0)).astype(float)
+        rows = seen.circle_rows(y, axial, answer.blocks)
+        through = slope[..., None] * rows[..., 2, :] - rows[..., 1, :]
+        weight = 1 + slope**2
+        total = size * (quadratic(through, inverse) / weight + 1) / weight
+        kept = kept & (at_bound == 0)
+    elif answer.linearisation.tracker_sd is not None:
+        whitened = Whitened.of(answer, seen, problem)
+        assert whitened.offset is not None
+        tau = answer.linearisation.tracker_sd[:, None]
+        along = seen.rows[..., 2, :] - tau[..., None] * whitened.pull
+        total = size * (quadratic(along, inverse) + tau**2 / whitened.weight)
+    else:
+        total = size * quadratic(seen.rows[..., 2, :], inverse)
+    return at_bound, np.where(kept, np.sqrt(np.where(kept, total, 1.0)), np.nan)
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """A Gaussian belief's errors in SDs, decorrelated where images have own covariances.
+
+    Attributes:
+        errors: of lateral position, range and offset.
+        rows: their derivatives by the shared unknowns.
+        offset: their derivatives by the image's own offset unknown (a tracker that errs), or None.
+        weight: D, of that unknown; 1 without.
+        pull: E / D, by which that unknown follows the shared ones; zeros without.
+    """
+
+    errors: Float[Array, "k n 3"]
+    rows: Float[Array, "k n 3 p"]
+    offset: Float[Array, "k n 3"] | None
+    weight: Float[Array, "k n"]
+    pull: Float[Array, "k n p"]
+
+    @classmethod
+    def of(cls, answer: Calibration, seen: ImageErrors, problem: Problem) -> Whitened:
+        """Of calibrations on points with Gaussian errors."""
+        sigma, tau = np.asarray(answer.sigma), answer.linearisation.tracker_sd
+        offset, shape = None, _own_covariance(answer, problem)
+        if tau is not None:
+            sigma = np.hypot(sigma, tau[:, None] * [1.0, 1.0, 0.0])
+            far = np.hypot(seen.errors[..., 2], seen.q[..., 2])
+            one = np.ones_like(far)
+            offset = np.stack([0 * one, seen.errors[..., 2] / far, one], axis=-1)
+            offset = tau[:, None, None] * seen.mask[..., None] * offset
+        parts: list[Array] = [seen.errors[..., None], seen.rows]
+        parts += [] if offset is None else [offset[..., None]]
+        parts = [_decorrelated(np.asarray(p / sigma[:, None, :, None]), shape) for p in parts]
+        errors, rows = parts[0][..., 0], parts[1]
+        weight, pull = np.ones(seen.mask.shape), np.zeros_like(rows[..., 0, :])
+        if offset is not None:
+            offset = parts[2][..., 0]
+            weight = np.sum(offset**2, axis=-1) + 1
+            pull = np.einsum("knm,knmp->knp", offset, rows) / weight[..., None]
+        return cls(errors, rows, offset, weight, pull)
+
+    def leverage(self, inverse: Float[Array, "k p p"]) -> Float[Array, "k n 3"]:
+        """What of each error's variance the unknowns take up."""
+        rows, own = self.rows, 0.0
+        if self.offset is not None:
+            rows = rows - self.offset[..., None] * self.pull[:, :, None]
+            own = self.offset**2 / self.weight[..., None]
+        flat = rows.reshape(len(rows), -1, rows.shape[-1])
+        return quadratic(flat, inverse).reshape(rows.shape[:-1]) + own
+
+
+def _own_covariance(answer: Calibration, problem: Problem) -> Float[Array, "k n 2 2"] | None:
+    """The shape of the images' own covariances where they whiten the errors, or None."""
+    if problem.covariance is None:
+        return None
+    kept = np.asarray(answer.mask)[..., None] > 0
+    covariance = np.where(kept[..., None], problem.covariance, np.eye(2))
+    variances = np.where(kept, np.diagonal(covariance, axis1=-2, axis2=-1), 0.0)
+    mean = variances.sum(axis=1) / kept.sum(axis=1)
+    shaped = (mean > 0).all(axis=1)
+    if answer.offset_law is not None:
+        shaped = shaped & np.asarray(answer.offset_law.own_covariances)
+    scale = 1 / np.sqrt(np.where(mean > 0, mean, 1.0))
+    shape = covariance * (scale[:, :, None] * scale[:, None])[:, None]
+    return np.where(shaped[:, None, None, None], shape, np.eye(2))
+
+
+def _decorrelated(
+    values: Float[Array, "k n 3 c"], shape: Float[Array, "k n 2 2"] | None
+) -> Float[Array, "k n 3 c"]:
+    """Rows multiplied by the inverse Cholesky factor of every image's 2x2 covariance."""
+    if shape is None:
+        return values
+    first = np.sqrt(shape[..., 0, 0])[..., None]
+    mixed = shape[..., 1, 0][..., None] / first
+    second = np.sqrt(shape[..., 1, 1][..., None] - mixed**2)
+    lateral = values[..., 0, :] / first
+    distance = (values[..., 1, :] - mixed * lateral) / second
+    return np.stack([lateral, distance, values[..., 2, :]], axis=-2)
+
+
+def _known_from_prior(
+    answer: Calibration,
+    seen: ImageErrors,
+    unknowns: Unknowns,
+    problem: Problem,
+    scale: Float[Array, "k p"],
+    eps: float,
+) -> Float[Array, "k p"]:
+    """The direction that the measurements do not see without a belief about the offsets."""
+    from jaxcal.diagnostics.image_errors import channel_rows
+
+    found = np.zeros_like(scale)
+    if answer.prior == "none":
+        return found
+    if answer.data == "points":
+        # A turn about the element line, the lateral axis, moves no lateral position and no range.
+        found[:, block_slice(answer.blocks, "rotation").start] = np.isfinite(scale).all(axis=1)
+        return found
+    rows = channel_rows(seen, unknowns, problem, answer.blocks) / scale[:, None]
+    values, vectors = spectrum(np.swapaxes(rows, 1, 2) @ rows)
+    null = values < threshold(eps) * values.sum(axis=1, keepdims=True)
+    return np.where(null[:, :1], nearest_unknown(vectors, null), found)
