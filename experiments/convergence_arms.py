@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import same_objective as same
-from jaxcal.uncertainty import assess
 from jaxtyping import Array, Float
 
 from jaxcal.diagnostics.metrics import reconstruction_precision
@@ -161,12 +160,11 @@ class Bench:
         def one(problem: Problem, parameters: Parameters, bound: Array) -> Array:
             prior = Bounded(bound)
             offset = prior.start(parameters, problem)
-            return assess(
-                parameters, offset, prior, problem, RIGID, whitened=False, uses_prior=True
-            ).singular
+            return same.information_of(problem, parameters, offset, bound)
 
         lane = (self.problems, parameters, self.bound)
-        return np.asarray(same.chunked(one, *lane, chunk=CHUNK)(*lane)[0])
+        information, _ = same.chunked(one, *lane, chunk=CHUNK)(*lane)
+        return same.spectra(np.asarray(information), self.problems)[0]
 
 
 class Walk:

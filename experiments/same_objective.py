@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from common import arguments, machine, results_folder, write_table
-from jaxcal.uncertainty import assess
 from jaxtyping import Array
 
+from jaxcal.diagnostics.uncertainty import mm_at_target, spectrum, threshold
 from jaxcal.geometry import rotation_angle
 from jaxcal.io.atomic import atomic_path
 from jaxcal.model.parameters import RIGID, Parameters, retract
@@ -24,8 +24,10 @@ from jaxcal.model.priors import Bounded
 from jaxcal.problem import Problem
 from jaxcal.simulation import Protocol, simulate
 from jaxcal.solvers.alternating import alternate
+from jaxcal.solvers.arrow import schur
 from jaxcal.solvers.conventional import from_scratch
 from jaxcal.solvers.joint import joint
+from jaxcal.solvers.least_squares import linearise
 
 SEED = 20261120
 IMAGES = 50
@@ -62,6 +64,21 @@ def draw(count: int) -> tuple[Problem, np.ndarray, np.ndarray]:
         lambda *leaves: jnp.concatenate(leaves)[order], *[made for _, made in problems]
     )
     return together, np.array(settings), np.array([BOUNDS[k] for k in choice[:, 2]])
+
+
+def information_of(problem: Problem, parameters: Parameters, offset: Array, bound: Array) -> Array:
+    """Information of X and the target with the free offsets eliminated."""
+    return schur(linearise(parameters, offset, Bounded(bound), problem, RIGID)[0])[0]
+
+
+def spectra(information: np.ndarray, problems: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Whether each information matrix is singular, and its condition, all unknowns in mm."""
+    lever = np.sqrt(np.mean(np.sum(np.asarray(problems.measurements) ** 2, axis=2), axis=1))
+    scale, eps = mm_at_target(lever, RIGID), float(np.finfo(float).eps)
+    values, _ = spectrum(information / (scale[:, :, None] * scale[:, None]))
+    smallest, largest = values[:, 0], values[:, -1]
+    singular = smallest < threshold(eps) * values.sum(axis=1)
+    return singular, largest / np.maximum(smallest, eps * largest)
 
 
 def chunked(function, *arguments, chunk: int = 64):
@@ -126,14 +143,10 @@ def main() -> None:
     fit, _ = solve(problems, starts, per_image)
     joint_times = [solve(problems, starts, per_image)[1] for _ in range(3)]
 
-    def assessed(problem: Problem, parameters: Parameters, offset: Array, bound: Array):
-        return assess(
-            parameters, offset, Bounded(bound), problem, RIGID, whitened=False, uses_prior=True
-        )
-
-    sight, _ = chunked(assessed, problems, fit.parameters, fit.offset, per_image)(
+    information, _ = chunked(information_of, problems, fit.parameters, fit.offset, per_image)(
         problems, fit.parameters, fit.offset, per_image
     )
+    singular, condition = spectra(np.asarray(information), problems)
 
     def segment(problem: Problem, start: Parameters, bound: Array, rounds: Array):
         return alternate(
@@ -164,7 +177,6 @@ def main() -> None:
     reached = costs <= joint_cost * (1 + 1e-8) + 1e-12 * squares
     rounds_needed = np.array([ROUNDS[np.argmax(r)] if r.any() else -1 for r in reached.T])
 
-    singular, condition = np.asarray(sight.singular), np.asarray(sight.condition)
     peers = []
     for index in np.linspace(0, count - 1, compared).astype(int):
         pick = jax.tree.map(lambda leaf, i=index: leaf[i], (problems, starts, fit.parameters))

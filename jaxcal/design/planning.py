@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxcal import diagnosis
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import (
     Criterion,
@@ -27,6 +26,7 @@ from jaxcal.design.information import (
 )
 from jaxcal.design.noise import Noise
 from jaxcal.design.polish import polish as polished
+from jaxcal.diagnostics.messages import direction_in_words
 from jaxcal.errors import InputError
 from jaxcal.recording import MINIMUM_IMAGES
 
@@ -300,7 +300,7 @@ def check_candidates(candidates: Candidates) -> None:
     if values[0] > _SINGULAR * values[-1]:
         return
     null = vectors[:, values <= _SINGULAR * values[-1]]
-    weakest = diagnosis.direction_in_words(_purest(null), model.blocks)
+    weakest = direction_in_words(_purest(null), model.blocks)
     raise InputError(
         f"images at all {len(candidates)} candidate poses would not determine {weakest}: "
         f"{_missing(candidates, model, null / scale[:, None])}"

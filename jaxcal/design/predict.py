@@ -2,7 +2,7 @@
 
 The prediction is the Cramer-Rao bound under the model's SDs, times Student's factor: SDs are tuned
 from the same images, and with few of them the errors are larger than with known ones
-(:mod:`jaxcal.intervals`).
+(:mod:`jaxcal.diagnostics.intervals`).
 """
 
 from __future__ import annotations

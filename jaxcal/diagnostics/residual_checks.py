@@ -193,9 +193,7 @@ def check_noise_model(
     return kurtosis, np.where(judged, scores, 0.0)
 
 
-def kurtosis_score(
-    kurtosis: Float[Array, "*#b"], count: Float[Array, "*#b"]
-) -> Float[Array, "*b"]:
+def kurtosis_score(kurtosis: Float[Array, "*#b"], count: Float[Array, "*#b"]) -> Float[Array, "*b"]:
     """Standard normal score of a sample kurtosis (Anscombe and Glynn 1983)."""
     n = count
     expected = 3 * (n - 1) / (n + 1)
@@ -208,9 +206,7 @@ def kurtosis_score(
     return (1 - 2 / (9 * a) - np.cbrt(inner)) / np.sqrt(2 / (9 * a))
 
 
-def skewness_score(
-    skewness: Float[Array, "*#b"], count: Float[Array, "*#b"]
-) -> Float[Array, "*b"]:
+def skewness_score(skewness: Float[Array, "*#b"], count: Float[Array, "*#b"]) -> Float[Array, "*b"]:
     """Standard normal score of a sample skewness (D'Agostino 1970)."""
     n = count
     y = skewness * np.sqrt((n + 1) * (n + 3) / (6 * (n - 2)))
