@@ -174,9 +174,10 @@ def check_noise_model(
     centred = used * (residual - mean(residual)[:, None])
     second = mean(centred**2)
     centred = centred / np.sqrt(np.where(second > 0, second, 1.0))[:, None]
-    kurtosis = mean(centred**4)
+    square = centred * centred
+    kurtosis = mean(square * square)
     tails = kurtosis_score(kurtosis, count)
-    skewed = skewness_score(mean(centred**3), count)
+    skewed = skewness_score(mean(square * centred), count)
 
     away = distance[..., None]
     away = used * (away - mean(away)[:, None])

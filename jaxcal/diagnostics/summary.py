@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-CHUNK = 64
+CHUNK = 128
 """Problems at a time: their derivatives stay in the processor's caches."""
 
 
