@@ -27,15 +27,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.calibration import Calibration, Convergence, Linearisation, Medium, Status
 from jaxcal.diagnostics.uncertainty import AT_BOUND, LARGEST_SD, threshold
+from jaxcal.model.observations import LARGEST_ELEVATION
 from jaxcal.model.parameters import BLOCK_SIZE, Blocks, Parameters, block_slice, size
-from jaxcal.model.priors import channels_of
-from jaxcal.model.residuals import LARGEST_ELEVATION
 from jaxcal.options import Given, Plan
 from jaxcal.problem import Problem
 from jaxcal.recording import MINIMUM_IMAGES
 from jaxcal.solvers.auto import OffsetLaw
 from jaxcal.solvers.dense import inverse_abreast
-from jaxcal.solvers.variance import MINIMUM_SELF_TUNING
+from jaxcal.solvers.reml import MINIMUM_SELF_TUNING
 from jaxcal.sound import WATER_M_S
 
 LEAST_GAP_MM = 1e-6
@@ -430,7 +429,8 @@ def _point_sd(errors: Errors, problem: Problem) -> Float[Array, "*batch 2"]:
 
     The inverse of the 2x2 information of Eq. 5 (or 6) with the offset held.
     """
-    channels, mask = channels_of(problem), problem.mask
+    assert problem.channels is not None
+    channels, mask = problem.channels, problem.mask
     target = jnp.stack(errors.q, axis=-1)[..., :, None, :]
     apart = target - channels.elements[..., None, :, :]
     distance = jnp.sqrt(jnp.sum(apart**2, axis=-1))

@@ -1,12 +1,17 @@
 """The engine's pieces, for those who bring a solver or a problem of their own.
 
 A calibration of jaxcal is least squares: unknowns that step on a manifold (:class:`Parameters`,
-:func:`retract`), residuals of an observation model (:class:`InPlane`, :class:`Gaussian`,
-:class:`Bounded`, :class:`ChannelGaussian`, or :func:`measurement_residual` and
-:func:`circle_residual` by themselves), a minimiser of them (:func:`minimise`), and the derivative
-of the minimum by the implicit function theorem (:func:`implicit_tangent`). :func:`initial_fit` is
-where every method begins. :func:`arrow_least_squares` is the same Levenberg-Marquardt method for
-other people's problems with shared unknowns and one local unknown a row.
+:func:`retract`), residuals (:func:`measurement_residual`, :func:`circle_residual`,
+:func:`channel_residual`), a minimiser of them, and the derivative of the minimum by the implicit
+function theorem. :func:`initial_fit` is where every method begins.
+
+In batches, laid out as planes with the problems last, the same are :class:`Images` (the data),
+:class:`Iterate` (the unknowns), an :class:`Observation` (:class:`Points`, :class:`OwnCovariances`,
+:class:`TrackedPoints`, :class:`InPlane`, :class:`BoundedOffsets`, :class:`Channels`, or one of your
+own), :func:`accumulate` (the normal equations in one pass over the images), :func:`minimise` and
+:func:`implicit_tangent`. :class:`LevenbergMarquardt` is the same loop behind optimistix's interface
+for residuals of any shape, :func:`arrow_least_squares` that for problems with shared unknowns and
+one local unknown a row.
 
 Unlike :func:`jaxcal.calibrate`, these functions compute in the caller's modes: switch 64 bits on
 (``jax.enable_x64``) before making a problem's arrays. ``docs/api.md`` has worked examples. Names
@@ -16,31 +21,58 @@ for one minor version.
 
 from __future__ import annotations
 
+import jax
+
+from jaxcal.model.batch import Images, Iterate
+from jaxcal.model.observations import (
+    BoundedOffsets,
+    Channels,
+    Component,
+    Further,
+    InPlane,
+    LocalUnknown,
+    Observation,
+    OwnCovariances,
+    Points,
+    TrackedPoints,
+)
 from jaxcal.model.parameters import RIGID, Blocks, Parameters, retract, size
-from jaxcal.model.priors import AbstractPrior, Bounded, ChannelGaussian, Gaussian, InPlane
 from jaxcal.model.residuals import (
+    channel_residual,
     circle_residual,
     measured_points,
     measurement_residual,
     target_in_image,
 )
 from jaxcal.problem import Problem
-from jaxcal.solvers.conventional import from_scratch
+from jaxcal.solvers.general import LevenbergMarquardt, arrow_least_squares
 from jaxcal.solvers.implicit import optimum as implicit_tangent
-from jaxcal.solvers.least_squares import Fit, Unknowns, arrow_least_squares, minimise
+from jaxcal.solvers.levenberg_marquardt import minimise
+from jaxcal.solvers.normal_equations import Normal, accumulate
+from jaxcal.solvers.start import conventional
 
 __all__ = [
     "RIGID",
-    "AbstractPrior",
     "Blocks",
-    "Bounded",
-    "ChannelGaussian",
-    "Fit",
-    "Gaussian",
+    "BoundedOffsets",
+    "Channels",
+    "Component",
+    "Further",
+    "Images",
     "InPlane",
+    "Iterate",
+    "LevenbergMarquardt",
+    "LocalUnknown",
+    "Normal",
+    "Observation",
+    "OwnCovariances",
     "Parameters",
-    "Unknowns",
+    "Points",
+    "Problem",
+    "TrackedPoints",
+    "accumulate",
     "arrow_least_squares",
+    "channel_residual",
     "circle_residual",
     "implicit_tangent",
     "initial_fit",
@@ -60,4 +92,6 @@ def initial_fit(problem: Problem, blocks: Blocks = RIGID) -> Parameters:
         problem: one problem (vmap for a batch).
         blocks: the free unknowns.
     """
-    return from_scratch(problem, blocks).fit.parameters
+    images = Images.of(jax.tree.map(lambda leaf: leaf[None], problem))
+    found = conventional(images, blocks).fit.place.parameters()
+    return jax.tree.map(lambda leaf: leaf[0], found)

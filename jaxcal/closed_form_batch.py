@@ -32,6 +32,8 @@ from jaxtyping import Array, Bool, Float
 from jaxcal.certificate import SINGULAR, TOLERANCE
 from jaxcal.closed_form import ClosedForm, calibrate_closed_form
 from jaxcal.errors import InputError
+from jaxcal.model import unrolled
+from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.precision import in_standard_promotion, own_modes, require_float64, with_dtype
 from jaxcal.problem import Problem, is_traced
 from jaxcal.reduced_objective import (
@@ -41,8 +43,6 @@ from jaxcal.reduced_objective import (
     Constraints,
     check_estimate,
 )
-from jaxcal.solvers import unrolled
-from jaxcal.solvers.unrolled import Matrix, Vector
 
 LANES = 256
 """Problems in one call of the compiled program."""

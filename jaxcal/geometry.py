@@ -145,6 +145,15 @@ def _series(squared: Float[Array, ""], order: int) -> Float[Array, ""]:
     return total
 
 
+def chord_angle(difference: Float[Array, "3 3 *lanes"]) -> Float[Array, "*lanes"]:
+    """Angle (rad) between two rotations, from their difference; lanes last.
+
+    2 asin(|R1 - R2| / sqrt 8) keeps its digits near zero, where acos of the trace loses half.
+    """
+    chord = jnp.sqrt(jnp.sum(difference**2, axis=(0, 1)))
+    return 2 * jnp.arcsin(jnp.minimum(chord / math.sqrt(8.0), 1.0))
+
+
 def rotation_angle(first: np.ndarray, second: np.ndarray) -> float:
     """Angle (rad) between the rotations of two 4x4 transforms."""
     relative = np.asarray(first)[:3, :3].T @ np.asarray(second)[:3, :3]

@@ -128,6 +128,11 @@ class Plan:
         return solver if isinstance(solver, optx.AbstractLeastSquaresSolver) else None
 
     @property
+    def one_by_one(self) -> bool:
+        """Whether the solver takes one problem at a time: somebody else's and the historical do."""
+        return self.other_solver is not None or self.options.solver == "gradient"
+
+    @property
     def reported_prior(self) -> str:
         """The prior's name in the result: that of the laws which were weighed, if any were."""
         names = [name for name, laws in LAWS.items() if laws == self.laws]

@@ -25,15 +25,13 @@ from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.errors import InputError
 from jaxcal.geometry import check_poses
-from jaxcal.model.parameters import Parameters
-from jaxcal.model.priors import InPlane
-from jaxcal.model.residuals import circle_residual
+from jaxcal.model.parameters import Parameters, retract
+from jaxcal.model.residuals import target_in_image
 from jaxcal.precision import in_own_modes, require_float64
 from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import FEWEST_IMAGES, Model, departures, find_consensus, stands_out
-from jaxcal.solvers.least_squares import linearise, minimise
 
 BLOCKS = ("translation", "point")
 AXES = ("x", "y", "z")
@@ -180,22 +178,26 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
     model = Model(BLOCKS, _errors, _proposals, isotropic=True, subset=_SUBSET)
     keep = find_consensus(everything, model).keep if robust else mask
     problem = eqx.tree_at(lambda p: p.mask, everything, keep)
-    start = jax.tree.map(lambda leaf: leaf[0], _proposals(problem, keep[None]))
-    fit = minimise(start, InPlane(), problem, BLOCKS)
-    parameters = fit.parameters
+    parameters = jax.tree.map(lambda leaf: leaf[0], _proposals(problem, keep[None]))
+    # The problem is linear: two steps take what the moments' rounding has left.
+    information, gradient = _normal(parameters, problem)
+    diagonal = jnp.diagonal(information)
+    step = dense.solve_symmetric(information, gradient, diagonal)
+    parameters = retract(parameters, -step, BLOCKS)
+    _, gradient = _normal(parameters, problem)
+    step = dense.solve_symmetric(information, gradient, diagonal)
+    parameters = retract(parameters, -step, BLOCKS)
     _, departure = departures(parameters, everything, keep, model)
     outlier = mask * (1 - keep)
     if not robust:
         judged = jnp.sum(mask) >= FEWEST_IMAGES
         outlier = mask * judged * stands_out(departure, keep)
-    residual = circle_residual(parameters, jnp.zeros_like(mask), problem)
+    residual = _errors(parameters, problem)
     used = jnp.sum(keep)
     variance = jnp.sum(residual**2) / jnp.maximum(3 * used - 6, 1.0)
     length = jnp.sqrt(jnp.sum(parameters.translation**2))
-    finite = jnp.all(jnp.isfinite(parameters.translation)) & jnp.isfinite(fit.cost)
+    finite = jnp.all(jnp.isfinite(parameters.translation))
     failed = jnp.logical_not(finite) | (jnp.sum(mask) < MINIMUM_IMAGES)
-    none = jnp.zeros(0, poses.dtype)
-    information = linearise(parameters, none, InPlane(), problem, BLOCKS)[0].shared
     covariance, observed = covariance_and_observability(
         information,
         information,
@@ -204,8 +206,7 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
         LARGEST_SD * jnp.maximum(length, _spread(problem)),
     )
     unknown = observed.degenerate | observed.weak
-    status = jnp.where(fit.settled, Status.CONVERGED, Status.MAX_ITERATIONS)
-    status = jnp.where(unknown, Status.UNOBSERVABLE, status)
+    status = jnp.where(unknown, Status.UNOBSERVABLE, Status.CONVERGED)
     return Pivot(
         tip=parameters.translation,
         point=parameters.point,
@@ -223,7 +224,22 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
 
 
 def _errors(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:
-    return circle_residual(parameters, jnp.zeros_like(problem.mask), problem)
+    # The tip is the origin of a tool's "image".
+    return problem.mask[:, None] * target_in_image(parameters, problem)
+
+
+def _normal(
+    parameters: Parameters, problem: Problem
+) -> tuple[Float[Array, "6 6"], Float[Array, 6]]:
+    """The normal matrix of tip and point, and the gradient."""
+
+    def errors(tangent: Float[Array, 6]) -> Float[Array, "n 3"]:
+        return _errors(retract(parameters, tangent, BLOCKS), problem)
+
+    value, push = jax.linearize(errors, jnp.zeros(6, problem.mask.dtype))
+    jacobian = jax.vmap(push)(jnp.eye(6, dtype=problem.mask.dtype))
+    information = jnp.einsum("anm,bnm->ab", jacobian, jacobian)
+    return information, jnp.einsum("anm,nm->a", jacobian, value)
 
 
 def _spread(problem: Problem) -> Float[Array, ""]:

@@ -26,6 +26,7 @@ from jaxcal import draws
 from jaxcal.compiler import computed_once, quick_to_compile
 from jaxcal.errors import InputError
 from jaxcal.geometry import matrix_from_rotation
+from jaxcal.model import unrolled
 from jaxcal.offsets import OffsetLaw, check_law, standard_offsets
 from jaxcal.precision import in_own_modes, require_float64
 from jaxcal.probe import L14_5, CurvilinearProbe, Probe
@@ -33,7 +34,6 @@ from jaxcal.problem import Channels, Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES, Recording, Truth, make_images
 from jaxcal.segmentation.deviations import fit_deviations, halves
 from jaxcal.segmentation.time_of_flight import fit_in_plane
-from jaxcal.solvers import unrolled
 
 Scalar = float | Float[Array, ""]
 """A number of a protocol: a plain one, or one that is traced and so shared by a compiled program

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from jaxcal import abreast, compiler
+from jaxcal import compiler
 from jaxcal.calibration import Calibration
 from jaxcal.errors import InputError
 from jaxcal.options import (
@@ -33,7 +33,7 @@ from jaxcal.options import (
     prepare,
     with_bound,
 )
-from jaxcal.pipeline import agreed_images, seen, solve_problem
+from jaxcal.pipeline import agreed_images, seen_by_agreement, solve_problems
 from jaxcal.precision import in_own_modes, require_float64, with_dtype
 from jaxcal.problem import Problem
 from jaxcal.recording import Recording
@@ -109,11 +109,10 @@ def calibrate(
         return _solve_batch(problem, given, plan, None)
     check_values(problem)
     problem = with_bound(problem, given)
-    # One problem alone gains nothing on the fused pass, and the general road compiles faster.
     alone = compiler.is_whole_program(problem, given)
     platform = _devices(problem)[0].platform if alone else None
     # A program of its own, which serves every method and prior.
-    agreed = _agreement(platform)(seen(problem), plan.blocks) if plan.robust else None
+    agreed = _agreement(platform)(seen_by_agreement(problem), plan.blocks) if plan.robust else None
     return _one_problem(platform)(problem, given, plan, agreed).with_problem(problem)
 
 
@@ -215,11 +214,20 @@ def _solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None)
     return result.with_problem(problems)
 
 
+def solve_one(
+    problem: Problem, given: Given, plan: Plan, agreed: Float[Array, " n"] | None
+) -> Calibration:
+    """One problem is a batch of one (traceable)."""
+    alone = jax.tree.map(lambda leaf: leaf[None], (problem, agreed))
+    result = solve_problems(alone[0], given, plan, alone[1])
+    return jax.tree.map(lambda leaf: leaf[0], result)
+
+
 @cache
 def _one_problem(platform: str | None):
     """The compiled solve of one problem; with a platform, as a program of its own."""
     flags = None if platform is None else compiler.quick_to_compile(platform)
-    return jax.jit(solve_problem, static_argnums=2, compiler_options=flags)
+    return jax.jit(solve_one, static_argnums=2, compiler_options=flags)
 
 
 @cache
@@ -231,23 +239,18 @@ def _agreement(platform: str | None):
 
 def solve_chunks(problems: Problem, given: Given, plan: Plan, chunk: int) -> Calibration:
     """Solve a batch whose size is a multiple of the chunk's (traceable)."""
-    if not abreast.plain(problems, given, plan):
-        return jax.lax.map(
-            lambda problem: solve_problem(problem, given, plan), problems, batch_size=chunk
-        )
     count = problems.mask.shape[0]
     if count == chunk:
-        return abreast.solve_problems(problems, given, plan)
-    apart = jax.tree.map(lambda leaf: leaf.reshape((-1, chunk, *leaf.shape[1:])), problems)
-    result = jax.lax.map(lambda part: abreast.solve_problems(part, given, plan), apart)
+        return solve_problems(problems, given, plan)
+    chunks = jax.tree.map(lambda leaf: leaf.reshape((-1, chunk, *leaf.shape[1:])), problems)
+    result = jax.lax.map(lambda part: solve_problems(part, given, plan), chunks)
     return jax.tree.map(lambda leaf: leaf.reshape((count, *leaf.shape[2:])), result)
 
 
 @cache
-def _chunks(devices: tuple[Any, ...], alone: bool, fused: bool):
+def _chunks(devices: tuple[Any, ...], alone: bool):
     """The compiled solve of chunks, which several devices share; alone: a program of its own."""
-    flags = compiler.fast_to_run if fused else compiler.quick_to_compile
-    options = flags(devices[0].platform) if alone else None
+    options = compiler.fast_to_run(devices[0].platform) if alone else None
     if len(devices) == 1:
         return jax.jit(solve_chunks, static_argnums=(2, 3), compiler_options=options)
     mesh, cut = Mesh(np.asarray(devices), ("problems",)), PartitionSpec("problems")
@@ -266,7 +269,6 @@ def _chunks(devices: tuple[Any, ...], alone: bool, fused: bool):
 def _chunks_program(problems: Problem, given: Given, plan: Plan, *, spread: bool = True):
     """The compiled form, and the devices that it runs on."""
     alone = compiler.is_whole_program(problems, given)
-    fused = abreast.plain(problems, given, plan)
     devices = _devices(problems) if alone else tuple(jax.local_devices())
-    devices = devices if alone and fused and spread else devices[:1]
-    return _chunks(devices, alone, fused), devices
+    devices = devices if alone and spread else devices[:1]
+    return _chunks(devices, alone), devices

@@ -29,22 +29,24 @@ RIGID: Blocks = ("translation", "rotation", "point")
 
 
 class Parameters(eqx.Module):
-    """A value of the unknowns.
+    """A value of the unknowns, or a batch of them (then every array has the batch axes in front).
 
     Attributes:
         rotation: of X; its columns are the lateral, elevational and axial axes in the probe's
-            frame. translation: of X, mm. point: the target c in the tracker's frame, mm. scale:
-            factors on the problem's [lateral, axial] spacing. sound_speed: factor on the speed by
-            which times became distances. delay: what the system adds to a distance, mm at that
-            speed.
+            frame.
+        translation: of X, mm.
+        point: the target c in the tracker's frame, mm.
+        scale: factors on the problem's [lateral, axial] spacing.
+        sound_speed: factor on the speed by which times became distances.
+        delay: what the system adds to a distance, mm at that speed.
     """
 
-    rotation: Float[Array, "3 3"]
-    translation: Float[Array, 3]
-    point: Float[Array, 3]
-    scale: Float[Array, 2]
-    sound_speed: Float[Array, ""]
-    delay: Float[Array, ""]
+    rotation: Float[Array, "*batch 3 3"]
+    translation: Float[Array, "*batch 3"]
+    point: Float[Array, "*batch 3"]
+    scale: Float[Array, "*batch 2"]
+    sound_speed: Float[Array, "*batch"]
+    delay: Float[Array, "*batch"]
 
     @classmethod
     def of(

@@ -16,7 +16,7 @@ from jaxcal.calibration import Calibration
 from jaxcal.options import Options
 from jaxcal.problem import Problem
 from jaxcal.solve import calibrate
-from jaxcal.solvers.joint import WARM_UP_ROUNDS
+from jaxcal.solvers.alternating import WARM_UP_ROUNDS
 
 KEPT = 200
 """Iterations that are drawn."""

@@ -1,11 +1,17 @@
-"""The paper's alternation (Fig. 4): closest points on the arcs, then a new X and c, and again.
+"""The paper's alternation (Fig. 4), and the joint solve of the objective that it descends.
 
-From the conventional X and c, each round (1) moves every p_i to the point of its arc |y| <= m_i
-that is closest to where X and c put the target, and (2) improves X and c with those points held, by
-a few Gauss-Newton steps of Eq. 7. It stops when a round moves X by less than a tolerance. Both
-half-rounds lower the same sum of squares as the joint ``bounded`` problem; like every ICP it
-converges linearly, and where the arcs can slide along themselves (rotation about the lateral axis)
-at a rate near 1.
+From the conventional X and c, each round of the alternation (1) moves every p_i to the point of its
+arc |y| <= m_i that is closest to where X and c put the target, and (2) improves X and c with those
+points held, by a few Gauss-Newton steps of Eq. 7. It stops when a round moves X by less than a
+tolerance. Like every ICP it converges linearly, and where the arcs can slide along themselves
+(rotation about the lateral axis) at a rate near 1.
+
+The joint solve takes the same objective to full precision, every offset eliminated in its image. It
+can have more than one local minimum along the direction that lateral position and range do not see,
+rotation about the lateral axis: the offsets slide along their arcs together until one set of bounds
+or another stops them. So it begins at three starts, the conventional one and that turned either way
+by what the bounds allow, each after a few rounds of the alternation, which descend gently; the
+lowest of the three is the answer.
 """
 
 from __future__ import annotations
@@ -15,130 +21,196 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.model.parameters import Blocks, Parameters, retract
-from jaxcal.model.priors import Bounded, Fixed
-from jaxcal.problem import Problem
-from jaxcal.solvers import arrow as arrows
-from jaxcal.solvers.least_squares import linearise
+from jaxcal.geometry import chord_angle
+from jaxcal.model import unrolled
+from jaxcal.model.batch import Images, Iterate, barrier, choose
+from jaxcal.model.observations import BoundedOffsets, Further, HeldOffsets, local_unknowns
+from jaxcal.solvers.levenberg_marquardt import Descent, Rounding, gradient_cosine, minimise
+from jaxcal.solvers.normal_equations import accumulate
+
+WARM_UP_ROUNDS = 10
+TURNS = (0.0, 1.0, -1.0)
+"""Starts, in units of the rotation that moves a target at mean range by the mean bound."""
 
 
 class Alternation(eqx.Module):
     """Where the alternation stopped.
 
     Attributes:
-        parameters: the shared unknowns.
-        offset: (n,) y_i, mm.
+        place: X and c.
+        offset: y_i, mm.
         cost: sum of squared distances, mm^2.
-        stationarity: scaled KKT residual of the bounded joint problem there.
+        cosine: gradient cosine of the bounded joint problem there.
         iterations: rounds.
-        tolerance_met: True when it stopped because X had stopped moving, False at the round limit.
+        tolerance_met: it stopped because X had stopped moving, not at the round limit.
         rotation_change: X's rotation in the last round, rad.
         translation_change: X's translation in the last round, mm.
-        trace: (trace,) cost after each of the first rounds, NaN beyond the last; None if none was
-            asked for.
+        trace: cost after each of the first rounds, NaN beyond the last; None: not kept.
     """
 
-    parameters: Parameters
-    offset: Float[Array, " n"]
-    cost: Float[Array, ""]
-    stationarity: Float[Array, ""]
-    iterations: Int[Array, ""]
-    tolerance_met: Bool[Array, ""]
-    rotation_change: Float[Array, ""]
-    translation_change: Float[Array, ""]
-    trace: Float[Array, " trace"] | None
+    place: Iterate
+    offset: Float[Array, "lanes n"]
+    cost: Float[Array, " lanes"]
+    cosine: Float[Array, " lanes"]
+    iterations: Int[Array, " lanes"]
+    tolerance_met: Bool[Array, " lanes"]
+    rotation_change: Float[Array, " lanes"]
+    translation_change: Float[Array, " lanes"]
+    trace: Float[Array, "trace lanes"] | None
 
 
 class _State(eqx.Module):
-    parameters: Parameters
-    offset: Float[Array, " n"]
-    rounds: Int[Array, ""]
-    rotation_change: Float[Array, ""]
-    translation_change: Float[Array, ""]
-    trace: Float[Array, " trace"]
+    place: Iterate
+    rounds: Int[Array, " lanes"]
+    rotation_change: Float[Array, " lanes"]
+    translation_change: Float[Array, " lanes"]
+    trace: Float[Array, "trace lanes"] | None
 
 
 def alternate(
-    start: Parameters,
-    prior: Bounded,
-    problem: Problem,
-    blocks: Blocks,
+    start: Iterate,
+    observation: BoundedOffsets,
+    images: Images,
     *,
-    tolerance_rad: float = 1e-3,
-    tolerance_mm: float = 0.1,
-    max_rounds: int | Int[Array, ""] = 1000,
-    inner_steps: int = 2,
+    tolerance_rad: float,
+    tolerance_mm: float,
+    max_rounds: int | Int[Array, ""],
+    inner_steps: int,
     trace: int = 0,
 ) -> Alternation:
-    """Alternate from a (conventional) start.
+    """Alternate from (conventional) starts.
 
     Args:
         start: the unknowns to start from.
-        prior: the bounds m_i.
-        problem: one problem.
-        blocks: the free unknowns.
+        observation: the bounds.
+        images: the data.
         tolerance_rad: stop when a round turns X by less than this and
         tolerance_mm: moves its origin by less than this.
         max_rounds: most rounds.
         inner_steps: Gauss-Newton steps on X and c in every round.
         trace: how many values of the objective to keep.
     """
-    dtype = problem.mask.dtype
-    none = jnp.zeros(0, dtype)
+    none = jnp.zeros_like(images.mask[:, 0])
+    eps = jnp.finfo(none.dtype).eps
 
-    def unfinished(state: _State) -> Bool[Array, ""]:
-        moving = (state.rotation_change >= tolerance_rad) | (
-            state.translation_change >= tolerance_mm
-        )
-        return moving & (state.rounds < max_rounds)
+    def gauss_newton(_: Array, carry: tuple) -> tuple:
+        place, held = carry
+        normal = barrier(accumulate(place, held, images, None))
+        matrix = normal.matrix()
+        for k in range(len(matrix)):
+            matrix[k][k] = matrix[k][k] * (1 + 16 * eps)
+        move = unrolled.solve(matrix, [-value for value in unrolled.rows_of(normal.gradient)])
+        return barrier(place.moved(unrolled.rows_of(barrier(jnp.stack(move))))), held
 
     def one_round(state: _State) -> _State:
-        offset = prior.start(state.parameters, problem)
-        held = Fixed(offset)
-
-        def step(parameters: Parameters, _: object) -> tuple[Parameters, Float[Array, ""]]:
-            arrow, _, _ = linearise(parameters, none, held, problem, blocks)
-            move, _ = arrows.solve(arrow, jnp.zeros((), dtype))
-            return retract(parameters, move, blocks), arrow.cost
-
-        parameters, _ = jax.lax.scan(step, state.parameters, length=inner_steps)
-        turned = state.parameters.rotation - parameters.rotation
-        moved = state.parameters.translation - parameters.translation
+        held = HeldOffsets.of(barrier(local_unknowns(state.place, observation, images)), images)
+        after, _ = jax.lax.fori_loop(0, inner_steps, gauss_newton, (state.place, held))
         recorded = state.trace
-        if trace:
-            cost = jnp.sum(held.residual(parameters, none, problem) ** 2)
-            recorded = jnp.where(jnp.arange(trace) == state.rounds, cost, recorded)
-        return _State(
-            parameters,
-            offset,
+        if recorded is not None:
+            rows = jnp.arange(recorded.shape[0])[:, None]
+            cost = accumulate(after, held, images, None).cost
+            recorded = jnp.where(rows == state.rounds, cost, recorded)
+        moved = _State(
+            after,
             state.rounds + 1,
-            # 2 asin(|R1 - R2| / sqrt 8), the angle, keeps its digits where acos would lose them.
-            2 * jnp.arcsin(jnp.minimum(jnp.linalg.norm(turned) / jnp.sqrt(8.0).astype(dtype), 1)),
-            jnp.linalg.norm(moved),
+            chord_angle(state.place.rotation - after.rotation),
+            jnp.sqrt(jnp.sum((state.place.translation - after.translation) ** 2, axis=0)),
             recorded,
         )
+        return choose(active(state), moved, state)
 
-    infinite = jnp.asarray(jnp.inf, dtype)
+    def active(state: _State) -> Bool[Array, " lanes"]:
+        moving = state.rotation_change >= tolerance_rad
+        moving = moving | (state.translation_change >= tolerance_mm)
+        return moving & (state.rounds < max_rounds)
+
     state = _State(
-        start, jnp.zeros(problem.images, dtype), jnp.zeros((), jnp.int32), infinite, infinite,
-        jnp.full(trace, jnp.nan, dtype),
-    )  # fmt: skip
-    state = jax.lax.while_loop(unfinished, one_round, state)
-    offset = prior.start(state.parameters, problem)
-    arrow, _, _ = linearise(state.parameters, offset, prior, problem, blocks)
-    # A residual that is nothing but rounding points nowhere.
-    reach = jnp.max(jnp.abs(problem.poses[:, :3, 3]) * problem.mask[:, None])
-    rounding = 2 * jnp.finfo(dtype).eps * jnp.maximum(reach, jnp.max(jnp.abs(start.point)))
-    vanished = arrow.cost <= 3 * problem.images * rounding**2
+        start,
+        jnp.zeros(none.shape, jnp.int32),
+        none + jnp.inf,
+        none + jnp.inf,
+        jnp.full((trace, *none.shape), jnp.nan, none.dtype) if trace else None,
+    )
+    state = jax.lax.while_loop(lambda state: jnp.any(active(state)), one_round, state)
+    normal = barrier(accumulate(state.place, observation, images, None))
+    rounding = Rounding.of(start, observation, images)
     return Alternation(
-        parameters=state.parameters,
-        offset=offset,
-        cost=arrow.cost,
-        stationarity=jnp.where(vanished, 0.0, arrows.stationarity(arrow)),
+        place=state.place,
+        offset=local_unknowns(state.place, observation, images),
+        cost=normal.cost,
+        cosine=gradient_cosine(normal, rounding.vanished),
         iterations=state.rounds,
         tolerance_met=(state.rotation_change < tolerance_rad)
         & (state.translation_change < tolerance_mm),
         rotation_change=state.rotation_change,
         translation_change=state.translation_change,
-        trace=state.trace if trace else None,
+        trace=state.trace,
     )
+
+
+def bounded(
+    start: Iterate,
+    observation: BoundedOffsets,
+    images: Images,
+    *,
+    max_steps: int = 100,
+    trace: int = 0,
+) -> Descent:
+    """The joint solve with bounded offsets.
+
+    Args:
+        start: conventional fits.
+        observation: the bounds.
+        images: the data.
+        max_steps: most passes from each start.
+        trace: how many values of the objective to keep (of the joint steps from the best start).
+
+    Returns:
+        The fits; their iterations are those from all starts and their warm-up.
+    """
+    still = [jnp.zeros_like(images.mask[:, :1])] * start.extras.shape[0]
+    further = Further.of(start, still)
+    bound = jnp.sum(images.mask * observation.limit(further, images), axis=1)
+    turn = bound / jnp.sum(images.mask * further.points(images)[1], axis=1)
+    zero = jnp.zeros_like(turn)
+
+    def turned(by: float) -> Iterate:
+        step = [zero] * start.unknowns
+        step[3] = by * turn
+        return start.moved(step)
+
+    # All three at once, as so many lanes more.
+    starts = jax.tree.map(
+        lambda *leaves: jnp.concatenate(leaves, axis=-1), *(turned(by) for by in TURNS)
+    )
+    wide, limits = images.repeated(len(TURNS)), jnp.tile(observation.bound, (len(TURNS), 1))
+    everywhere = BoundedOffsets.of(limits, wide)
+    warm = alternate(
+        starts,
+        everywhere,
+        wide,
+        tolerance_rad=0.0,
+        tolerance_mm=0.0,
+        max_rounds=WARM_UP_ROUNDS,
+        inner_steps=2,
+    )
+    fits = minimise(warm.place, everywhere, wide, max_steps=max_steps, trace=trace)
+    lanes = images.lanes
+    parts = [
+        jax.tree.map(lambda leaf, k=k: leaf[..., k * lanes : (k + 1) * lanes], fits)
+        for k in range(len(TURNS))
+    ]
+    costs = jnp.stack([jnp.where(jnp.isfinite(fit.cost), fit.cost, jnp.inf) for fit in parts])
+    # Where minimisers form an interval all starts reach the same cost, and the conventional one's
+    # is the answer to keep: another must be lower by more than rounding.
+    eps = jnp.finfo(costs.dtype).eps
+    size = jnp.max(jnp.abs(images.origin), axis=(0, 2))
+    floor = images.used * (100 * eps * size) ** 2
+    first = costs[0] <= jnp.min(costs, axis=0) * (1 + 1e-9) + floor
+    best = jnp.where(first, 0, jnp.argmin(costs, axis=0))
+    fit = parts[0]
+    for k, other in enumerate(parts[1:], start=1):
+        fit = choose(best == k, other, fit)
+    taken = jnp.sum(jnp.stack([part.iterations for part in parts]), axis=0)
+    taken = taken + WARM_UP_ROUNDS * len(TURNS)
+    return eqx.tree_at(lambda descent: descent.iterations, fit, taken.astype(jnp.int32))

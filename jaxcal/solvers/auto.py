@@ -1,6 +1,6 @@
 """The estimator behind ``--method joint``: nothing to choose, and it says what it chose.
 
-What the plain self-tuned fit (:mod:`jaxcal.solvers.variance`) takes for granted is asked of the
+What the plain self-tuned fit (:mod:`jaxcal.solvers.reml`) takes for granted is asked of the
 data here: that the offsets are Gaussian, that their mean is zero, and that errors are alike in all
 images. All of it matters because lateral position and range leave rotation about the lateral axis
 open, and only the offsets' law closes it: the edges of bounded offsets tell X twice as well as
@@ -21,11 +21,9 @@ their SD does, heavy tails must not pull it, and a mean that is denied bends it.
    probability; the covariance is the laws' average, with their spread about that answer added.
    A law under which the propagation does not settle (its edges exclude some image) has weight zero.
 
-This is the readable form, and the one whose derivatives are taken; batches of plain problems take
-the same steps side by side (:mod:`jaxcal.solvers.fused_auto`), several times faster. Each is a
-fixed number of array operations, so gradients go through (REML's by the implicit function
-theorem). With fewer than eight used images, with given SDs, or where no law settles, the plain
-Gaussian answer stands, and the result says so.
+Each step is a fixed number of array operations, so gradients go through (REML's by the implicit
+function theorem). With fewer than eight used images, with given SDs, or where no law settles, the
+plain Gaussian answer stands, and the result says so.
 
 What to expect. The answer is nearly the posterior median over these laws, so it is better than
 conventional calibration on average, whatever the offsets' law; in a single trial it can be worse.
@@ -36,22 +34,29 @@ SDs for known, but for Student's factor (:mod:`jaxcal.diagnostics.intervals`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxcal.model.parameters import Blocks, Parameters, retract
-from jaxcal.model.priors import AbstractSelfTuned, Gaussian, covariance_shape
-from jaxcal.model.shapes import FAMILIES, Shape
-from jaxcal.problem import Problem
-from jaxcal.solvers.evidence import MEAN_SD, Tuned, tune
-from jaxcal.solvers.expectation_propagation import Linear, propagate
-from jaxcal.solvers.variance import MINIMUM_SELF_TUNING
+from jaxcal.model import unrolled
+from jaxcal.model.batch import Images, Iterate, barrier, choose, targets
+from jaxcal.model.observations import Medium, Observation, OwnCovariances, Points, unit_shape
+from jaxcal.model.parameters import retract
+from jaxcal.model.shapes import FAMILIES, Family, Shape
+from jaxcal.solvers.evidence import (
+    MEAN_SD,
+    V_Y,
+    Evidence,
+    judged,
+    mean_precision,
+    pass_over,
+    row_of,
+    tune,
+)
+from jaxcal.solvers.expectation_propagation import SEEN, Sites, marginal, propagate, seen
+from jaxcal.solvers.reml import MINIMUM_SELF_TUNING
 
 UNIFORM: tuple[Shape, ...] = tuple(
     Shape("uniform", float(np.exp(0.14 - 0.055 * k)), 0.08) for k in range(5)
@@ -110,119 +115,176 @@ class OffsetLaw(eqx.Module):
 
 
 class Averaged(eqx.Module):
-    """The estimate over all laws.
+    """The estimate over all laws, lanes last but for the law.
 
     Attributes:
-        parameters: the unknowns.
-        belief: the noise model in use, with its tuned SDs.
+        place: the unknowns.
+        sigma: tuned SDs of the noise model in use, mm.
         covariance: of the unknowns' tangent.
-        elevation_sd: of every image's offset, mm.
-        law: what was found out.
+        elevation_sd: of every image's offset, mm; NaN for images left out.
+        law: what was found out, with a leading axis.
+        own_covariances: where the images' own covariances are in use.
     """
 
-    parameters: Parameters
-    belief: AbstractSelfTuned
-    covariance: Float[Array, "p p"]
-    elevation_sd: Float[Array, " n"]
+    place: Iterate
+    sigma: Float[Array, "components lanes"]
+    covariance: Float[Array, "p p lanes"]
+    elevation_sd: Float[Array, "lanes n"]
     law: OffsetLaw
+    own_covariances: Bool[Array, " lanes"]
 
 
 def average_over_laws(
-    parameters: Parameters,
-    belief: AbstractSelfTuned,
-    problem: Problem,
-    blocks: Blocks,
-    shapes: Sequence[Shape] = SHAPES,
+    place: Iterate,
+    observation: Observation,
+    images: Images,
+    shapes: tuple[Shape, ...],
+    *,
+    variances: Float[Array, "3 lanes n"] | None,
+    bound: Float[Array, "lanes n"] | None,
+    medium: Medium | None,
 ) -> Averaged:
     """Weigh offset means, noise models and laws of the offsets, and average the answers.
 
     Args:
-        parameters: the self-tuned Gaussian solution.
-        belief: its belief, with the tuned SDs.
-        problem: one problem; ``max_elevation`` cuts the laws.
-        blocks: the free unknowns.
+        place: the self-tuned Gaussian solutions.
+        observation: with common SDs, tuned.
+        images: the data.
         shapes: the laws to weigh.
+        variances: the images' own: lateral variance, covariance, range variance, mm^2; or None.
+        bound: on the offsets, mm, which cuts the laws; or None.
+        medium: what is known of sound speed and delay besides.
     """
-    models = candidates(belief, problem)
-    tuned = jax.vmap(lambda b, mean, tied: tune(parameters, b, problem, blocks, mean, tied))(
-        models.belief, models.with_mean, models.tied
-    )
-    evidence = jnp.where(jnp.isfinite(tuned.log_evidence), tuned.log_evidence, -jnp.inf)
-    # One more SD that is tuned costs half the log of the number of images.
-    used = jnp.sum(problem.mask)
-    pairs = (evidence + 0.5 * models.tied * jnp.log(used)).reshape(-1, 2)
-    chosen = jnp.argmax(pairs - jnp.asarray([0.0, LOG_ODDS_OF_MEAN]))
-    best: Tuned = jax.tree.map(lambda leaf: leaf[chosen], tuned)
-    used_belief = jax.tree.map(lambda leaf: leaf[chosen], models.belief).with_sigma(best.sigma)
-    asked = chosen % 2 == 1
-    weighed = weigh(best.linear, best.sigma[-1], shapes, best.mean, asked)
-    mean, covariance = weighed.mean, weighed.covariance
-    gaussian = pairs[chosen // 2, 1] - pairs[chosen // 2, 0]
+    used = images.used
+    models = candidates(place, observation, images, variances, medium)
+    pairs = jnp.stack([model.log_evidence for model in models])
+    pairs = jnp.where(jnp.isfinite(pairs), pairs, -jnp.inf).reshape(-1, 2, len(used))
+    wanted = pairs - jnp.asarray([0.0, LOG_ODDS_OF_MEAN])[:, None]
+    chosen = jnp.argmax(wanted.reshape(len(models), -1), axis=0)
+    model = models[0]
+    for k, other in enumerate(models[1:], start=1):
+        model = choose(chosen == k, other, model)
+    asked, which = chosen % 2 == 1, chosen // 2
+    best = barrier(answered(barrier(model), asked, images, bound, shapes))
+    pair = jnp.where(which > 0, pairs[-1], pairs[0])
+    gaussian = pair[1] - pair[0]
+    # fmin: where no law settles, the Gaussian's odds stand.
+    log_odds = jnp.where(asked, jnp.fmin(gaussian, best.log_odds), gaussian)
+    step, unknowns = best.step, place.unknowns
 
-    enough = (used >= MINIMUM_SELF_TUNING) & weighed.settled
-    enough = enough & jnp.all(jnp.isfinite(mean))
-    shared = covariance[:-1, :-1]
-    along = best.linear.direction[:, :-1]
-    variance = jnp.einsum("np,pq,nq->n", along, shared, along)
-    moved = retract(best.parameters, mean[:-1], blocks)
+    enough = (used >= MINIMUM_SELF_TUNING) & best.settled
+    enough = enough & jnp.all(jnp.isfinite(step), axis=0)
+    # From the linearisation the answer may be a hundredth of a radian away: turn by Exp, and not
+    # by the solvers' rotation, which is another one in the eighth digit.
+    moved = jax.vmap(lambda here, by: retract(here, by, place.blocks))(
+        model.place.parameters(), step[:unknowns].T
+    )
     member = jnp.asarray([[shape.family == name for shape in shapes] for name in FAMILIES])
-    has_mean = enough & asked & jnp.logical_not(weighed.denied)
-    own = jnp.asarray(False)
-    log_odds_own = jnp.zeros((), problem.mask.dtype)
-    if pairs.shape[0] > 1:
-        own = enough & (chosen >= 2)
-        log_odds_own = jnp.max(pairs[1]) - jnp.max(pairs[0])
+    has_mean = enough & asked & jnp.logical_not(best.denied)
+    own, log_odds_own = jnp.zeros_like(enough), jnp.zeros_like(log_odds)
+    if variances is not None:
+        own = enough & (which > 0)
+        log_odds_own = jnp.max(pairs[1], axis=0) - jnp.max(pairs[0], axis=0)
+    mean_sd = jnp.sqrt(jnp.maximum(best.covariance[-1, -1], 0.0))
     law = OffsetLaw(
-        probability=member @ weighed.weight,
-        mean=jnp.where(has_mean, best.mean + mean[-1], 0.0),
-        mean_sd=jnp.where(has_mean, jnp.sqrt(jnp.maximum(covariance[-1, -1], 0.0)), 0.0),
+        probability=(member @ best.weight).T,
+        mean=jnp.where(has_mean, model.mean + step[-1], 0.0),
+        mean_sd=jnp.where(has_mean, mean_sd, 0.0),
         has_mean=has_mean,
         own_covariances=own,
-        # fmin: where no law settles, the Gaussian's odds stand.
-        log_odds_mean=jnp.where(asked, jnp.fmin(gaussian, weighed.log_odds), gaussian),
+        log_odds_mean=log_odds,
         log_odds_own=log_odds_own,
         weighed=enough,
     )
-
-    def either(new: Array, old: Array) -> Array:
-        return jnp.where(enough, new, old)
-
+    place, sigma = choose(
+        enough, (Iterate.of(moved, place.blocks), model.sigma), (place, observation.sigma)
+    )
     return Averaged(
-        parameters=jax.tree.map(either, moved, parameters),
-        belief=used_belief.with_sigma(either(best.sigma, belief.sigma)),
-        covariance=shared,
-        elevation_sd=jnp.sqrt(jnp.where(problem.mask > 0, variance, jnp.nan)),
-        law=law,
+        place,
+        sigma,
+        best.covariance[:unknowns, :unknowns],
+        jnp.sqrt(jnp.where(images.mask > 0, best.variance.T, jnp.nan)),
+        law,
+        which > 0,
     )
 
 
-class Weighed(eqx.Module):
-    """What the laws say together, linearised.
+class Candidate(eqx.Module):
+    """A noise model, with or without a mean, tuned and linearised; lanes last.
 
     Attributes:
-        mean: of the unknowns: the laws' median.
+        place: X, c and the further unknowns.
+        mean: b, mm.
+        with_mean: 1 where there may be one.
+        sigma: SDs of the components of the common noise model, mm.
+        log_evidence: ln Z, up to a constant that all share.
+        information: of the unknowns in the measurements, upper triangle.
+        gradient: of half the measurements' cost.
+        squares: sum of h_i h_i', upper triangle.
+        pull: sum of h_i (q_iy - b).
+    """
+
+    place: Iterate
+    mean: Float[Array, " lanes"]
+    with_mean: Float[Array, " lanes"]
+    sigma: Float[Array, "components lanes"]
+    log_evidence: Float[Array, " lanes"]
+    information: Float[Array, "triangle lanes"]
+    gradient: Float[Array, "p lanes"]
+    squares: Float[Array, "triangle lanes"]
+    pull: Float[Array, "p lanes"]
+
+    @classmethod
+    def of(cls, tuned: Evidence, sigma: Array, log_evidence: Array) -> Candidate:
+        """From a tuned noise model."""
+        sums = tuned.sums
+        # The offsets are left to their law.
+        weight = jnp.concatenate([1 / tuned.sigma[:-1] ** 2, jnp.zeros_like(tuned.sigma[:1])])
+        measured = sums.weighed(weight)
+        # h_i has -1 at v_y, so the sum of h_i is what v_y has in common with the others.
+        along = row_of(sums.matrix[-1], V_Y)
+        return cls(
+            tuned.place,
+            tuned.mean,
+            tuned.with_mean,
+            sigma,
+            log_evidence,
+            measured.curvature,
+            measured.gradient,
+            sums.matrix[-1],
+            sums.gradient[-1] + tuned.mean * along,
+        )
+
+
+class Answer(eqx.Module):
+    """What the laws say together about a noise model's unknowns; lanes last.
+
+    Attributes:
+        step: of all unknowns and b, to the laws' median.
         covariance: about it.
         weight: the laws' probabilities.
         settled: at least one of them counts.
-        log_odds: ln of how much more probable they make the data with a mean of the offsets.
+        variance: of the images' offsets, mm^2.
+        log_odds: ln of how much more probable they make the data with a mean.
         denied: a mean was asked for, and all laws together do not believe in it.
     """
 
-    mean: Float[Array, " p"]
-    covariance: Float[Array, "p p"]
-    weight: Float[Array, " k"]
-    settled: Bool[Array, ""]
-    log_odds: Float[Array, ""]
-    denied: Bool[Array, ""]
+    step: Float[Array, "q lanes"]
+    covariance: Float[Array, "q q lanes"]
+    weight: Float[Array, "k lanes"]
+    settled: Bool[Array, " lanes"]
+    variance: Float[Array, "n lanes"]
+    log_odds: Float[Array, " lanes"]
+    denied: Bool[Array, " lanes"]
 
 
-def weigh(
-    linear: Linear,
-    sd: Float[Array, ""],
-    shapes: Sequence[Shape],
-    mean: Float[Array, ""],
-    asked: Bool[Array, ""],
-) -> Weighed:
+def answered(
+    model: Candidate,
+    asked: Bool[Array, " lanes"],
+    images: Images,
+    bound: Float[Array, "lanes n"] | None,
+    shapes: tuple[Shape, ...],
+) -> Answer:
     """Weigh the laws on a linearised problem.
 
     A law with edges says of the mean b what a Gaussian does not see, so where the Gaussian asks for
@@ -230,39 +292,92 @@ def weigh(
     that without is the density of b at zero before the data over that after (Savage and Dickey),
     and where the laws deny the mean, their beliefs are conditioned on b = 0.
 
-    Args:
-        linear: the problem; b is the last unknown.
-        sd: the offsets' SD that REML found, mm.
-        shapes: the laws.
-        mean: b where the problem is linearised, mm.
-        asked: the Gaussian believes in a mean.
-
     Reference: Dickey 1971.
     """
-    stretch = jnp.asarray([shape.stretch for shape in shapes], sd.dtype)
-    prior = jnp.asarray([shape.prior for shape in shapes], sd.dtype)
-    found = propagate(linear, tuple(shape.family for shape in shapes), stretch * sd)
+    q, turned = targets(model.place, images)
+    sites = barrier(Sites.of(q, turned, images.mask, model.mean, bound))
+    precision = mean_precision(model.sigma[-1], model.with_mean)
+    known = marginal(model.information, model.gradient, precision, model.mean, model.with_mean)
+    stretch = jnp.asarray([shape.stretch for shape in shapes], images.mask.dtype)
+    prior = jnp.asarray([shape.prior for shape in shapes], images.mask.dtype)
+    families: list[Family] = [shape.family for shape in shapes]
+    sd = model.sigma[-1]
+    squares, pull = barrier(seen(model.squares, model.pull))
+    found = propagate(known, sites, squares, pull, families, stretch[:, None] * sd)
     weight, good = weights(found.log_evidence, found.change, prior)
-    means = jnp.where(good[:, None], found.mean, 0.0)
-    within = jnp.where(good[:, None, None], found.covariance, jnp.eye(found.mean.shape[1]))
+    means = jnp.where(good, found.mean, 0.0)
+    within = jnp.where(good, found.covariance, jnp.eye(len(SEEN))[:, :, None, None])
+    means, within, weight = barrier((means, within, weight))
 
-    gain, pull = without_mean(means[:, -1] + mean, within[:, -1, -1], sd)
-    log_odds = odds_of_mean(found.log_evidence, gain, good, prior)
+    expected, variance, along = barrier(known.of_mean(means, within))
+    gain, away = without_mean(expected + model.mean, variance, sd)
+    log_odds = barrier(odds_of_mean(found.log_evidence, gain, good, prior))
     denied = asked & jnp.logical_not(log_odds > LOG_ODDS_OF_MEAN)
     fewer, _ = weights(found.log_evidence - gain, found.change, prior)
-    along = within[:, -1]
-    conditioned = within - along[:, :, None] * along[:, None] / within[:, -1, -1, None, None]
-    means = jnp.where(denied, means - along * pull[:, None], means)
-    within = jnp.where(denied, conditioned, within)
-    weight = jnp.where(denied, fewer, weight)
+    conditioned = within - along[:, None] * along[None] / variance
+    means, within, weight = barrier(
+        choose(denied, (means - along * away, conditioned, fewer), (means, within, weight))
+    )
+    known = choose(denied, known.held(-model.mean), known)
 
-    squares = linear.direction.T @ (linear.used[:, None] * linear.direction)
-    spread = jnp.einsum("pq,kpq->k", squares, within)
-    answer = means.T @ median(means.T, spread, weight, squares)
-    off = means - answer
-    covariance = jnp.einsum("k,kpq->pq", weight, within)
-    covariance = covariance + jnp.einsum("k,kp,kq->pq", weight, off, off)
-    return Weighed(answer, covariance, weight, jnp.any(good), log_odds, denied)
+    spread = jnp.sum(squares[:, :, None] * within, axis=(0, 1))
+    share = median(means, barrier(spread), weight, squares)
+    mean = jnp.sum(barrier(share) * means, axis=1)
+    off = means - mean[:, None]
+    covariance = jnp.sum(weight * (within + off[:, None] * off[None]), axis=2)
+    step, covariance = barrier(known.lifted(*barrier((mean, covariance))))
+    across = [[covariance[i, j][:, None] for j in SEEN] for i in SEEN]
+    offset = unrolled.dot(sites.direction, unrolled.apply(across, sites.direction))
+    return Answer(
+        step, covariance, weight, jnp.any(good, axis=0), offset.T, log_odds, denied
+    )  # fmt: skip
+
+
+def candidates(
+    place: Iterate,
+    observation: Observation,
+    images: Images,
+    variances: Float[Array, "3 lanes n"] | None,
+    medium: Medium | None,
+) -> list[Candidate]:
+    """Common SDs and, where there are some, own covariances; each without and with a mean."""
+    used, sigma, count = images.used, observation.sigma, observation.count(images)
+    zero, one = jnp.zeros_like(used), jnp.ones_like(used)
+    sums_at = pass_over(observation, images, medium)
+    # Common SDs without a mean are REML's own model, which has been tuned already.
+    plain = judged(sums_at, place, sigma, zero, zero, count)
+    shifted = tune(sums_at, place, sigma, one, count)
+    found = [Candidate.of(each, each.sigma, each.log_evidence) for each in (plain, shifted)]
+    if variances is None or not isinstance(observation, Points):
+        return found
+    shape, mean = unit_shape(variances, images)
+    ratio = jnp.sqrt(mean / jnp.mean(mean, axis=0))
+    by = jnp.stack([ratio[0] * ratio[0], ratio[0] * ratio[1], ratio[1] * ratio[1]])
+    shape = jnp.where(
+        images.mask > 0, shape * by[..., None], jnp.asarray([1.0, 0, 1])[:, None, None]
+    )
+    start = jnp.sqrt(0.5 * jnp.sum((sigma[:2] / ratio) ** 2, axis=0))
+    # Both at once, as so many lanes more.
+    twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf], axis=-1), place)
+    wide = images.repeated(2)
+    scale = jnp.stack([jnp.tile(start, 2), jnp.tile(sigma[2], 2)])
+    tied = OwnCovariances(scale, jnp.tile(shape, (1, 2, 1)), jnp.ones_like(scale[0]), tied=True)
+    medium = None if medium is None else medium.repeated(2)
+    tuned = tune(
+        pass_over(tied, wide, medium),
+        twice,
+        scale,
+        jnp.concatenate([zero, one]),
+        tied.count(wide),
+    )
+    determinant = shape[0] * shape[2] - shape[1] ** 2
+    # One more SD that is tuned costs half the log of the number of images.
+    penalty = 0.5 * jnp.sum(images.mask * jnp.log(determinant), axis=1) - 0.5 * jnp.log(used)
+    for half in (slice(None, len(used)), slice(len(used), None)):
+        each = jax.tree.map(lambda leaf, half=half: leaf[..., half], tuned)
+        three = jnp.concatenate([ratio * each.sigma[0], each.sigma[1:]])
+        found.append(Candidate.of(each, three, each.log_evidence - penalty))
+    return found
 
 
 def without_mean(off: Array, variance: Array, sd: Array) -> tuple[Array, Array]:
@@ -352,42 +467,3 @@ def weights(
     # Where no law is good the weights must still be numbers: a lane's NaN poisons its gradient.
     score = jnp.where(jnp.any(good, axis=0), score, 0.0)
     return jax.nn.softmax(score, axis=0) * good, good
-
-
-class Candidates(eqx.Module):
-    """The noise models to compare, along a leading axis.
-
-    Attributes:
-        belief: each model, with SDs to start from.
-        with_mean: 1 where the offsets may have a mean.
-        tied: 1 where the images' own covariances fix the ratios of the measurements' SDs.
-    """
-
-    belief: AbstractSelfTuned
-    with_mean: Float[Array, " m"]
-    tied: Float[Array, " m"]
-
-
-def candidates(belief: AbstractSelfTuned, problem: Problem) -> Candidates:
-    """Common SDs and, where the images have them, own covariances; each without and with a mean."""
-    dtype = problem.mask.dtype
-    shape = covariance_shape(problem) if isinstance(belief, Gaussian) else None
-    if shape is None or problem.covariance is None:
-        twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), belief)
-        return Candidates(twice, jnp.asarray([0.0, 1.0], dtype), jnp.zeros(2, dtype))
-    same = jnp.broadcast_to(jnp.eye(2, dtype=dtype), shape.shape)
-    variances = jnp.diagonal(problem.covariance, axis1=1, axis2=2)
-    mean = problem.mask @ variances / jnp.sum(problem.mask)
-    mean = jnp.where(jnp.all(mean > 0), mean, 1.0)
-    # Own covariances count up to one factor, for a start that which explains both SDs on average.
-    factor = jnp.mean(belief.sigma[:2] ** 2 / mean)
-    sigma = jnp.sqrt(jnp.append(factor * mean, belief.sigma[2] ** 2))
-    assert isinstance(belief, Gaussian)
-    both = [
-        replace(belief, covariance=same),
-        replace(belief, covariance=shape, sigma=sigma),
-    ]
-    stacked = jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves), 2, axis=0), *both)
-    return Candidates(
-        stacked, jnp.asarray([0.0, 1.0, 0.0, 1.0], dtype), jnp.asarray([0.0, 0.0, 1.0, 1.0], dtype)
-    )

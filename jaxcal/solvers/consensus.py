@@ -42,7 +42,7 @@ from jaxtyping import Array, Bool, Float
 from jaxcal.model.parameters import Blocks, Parameters, retract, size
 from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.problem import Problem
-from jaxcal.solvers import arrow as arrows
+from jaxcal.solvers import dense
 from jaxcal.solvers.proposals import SUBSET, linear_proposals, nominal, subset_weights
 
 SUBSET_STEPS = 2
@@ -317,7 +317,7 @@ def _step(
         "anm,nm->a", jacobian, jnp.where(weight[:, None] > 0, errors / sigma**2, 0.0)
     )
     diagonal = jnp.diagonal(matrix)
-    step = arrows.solve_symmetric(matrix + jnp.diag(1e-4 * diagonal), gradient, diagonal)
+    step = dense.solve_symmetric(matrix + jnp.diag(1e-4 * diagonal), gradient, diagonal)
     return retract(parameters, -step, model.blocks)
 
 
@@ -325,7 +325,7 @@ def _leverage(
     jacobian: Float[Array, "p n 3"], sigma: Float[Array, 3], weight: Float[Array, " n"]
 ) -> Float[Array, "n 3"]:
     matrix = _information(jacobian, sigma, weight)
-    inverse = arrows.inverse_symmetric(matrix, jnp.diagonal(matrix))
+    inverse = dense.inverse_symmetric(matrix, jnp.diagonal(matrix))
     whitened = jacobian / sigma
     return jnp.einsum("anm,ab,bnm->nm", whitened, inverse, whitened)
 

@@ -46,6 +46,35 @@ def solve_positive(matrix: Float[Array, "p p"], rhs: Float[Array, "p k"]) -> Flo
     return jax.lax.fori_loop(0, size, eliminate, work)[:, size:]
 
 
+def solve_symmetric(
+    matrix: Float[Array, "p p"], vector: Float[Array, " p"], diagonal: Float[Array, " p"]
+) -> Float[Array, " p"]:
+    """Solve a positive semidefinite system, scaled by the given diagonal of its unreduced matrix.
+
+    A singular matrix (an unobservable direction) is met by a ridge at the rounding level of the
+    scaled system, so the step there stays finite and small, and the other directions are exact.
+    """
+    scale, scaled = _ridged(matrix, diagonal)
+    return scale * solve_positive(scaled, (scale * vector)[:, None])[:, 0]
+
+
+def inverse_symmetric(
+    matrix: Float[Array, "p p"], diagonal: Float[Array, " p"]
+) -> Float[Array, "p p"]:
+    """The inverse, by the same scaling and ridge as :func:`solve_symmetric`."""
+    scale, scaled = _ridged(matrix, diagonal)
+    return scale[:, None] * solve_positive(scaled, jnp.diag(scale))
+
+
+def _ridged(
+    matrix: Float[Array, "p p"], diagonal: Float[Array, " p"]
+) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
+    eps = jnp.finfo(matrix.dtype).eps
+    scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+    scaled = matrix * scale[:, None] * scale[None, :]
+    return scale, scaled + 16 * eps * jnp.eye(len(scale), dtype=matrix.dtype)
+
+
 def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
     """Inverse of a square matrix by Gauss-Jordan elimination with partial pivoting.
 
@@ -231,7 +260,7 @@ def inverse_abreast(
 ) -> tuple[Float[Array, "p p lanes"], Float[Array, " lanes"]]:
     """:func:`inverse_positive` of many matrices, lanes last.
 
-    Written out scalar by scalar (:mod:`jaxcal.solvers.unrolled`) ten rows are no faster and take a
+    Written out scalar by scalar (:mod:`jaxcal.model.unrolled`) ten rows are no faster and take a
     hundred times longer to compile.
     """
     size = matrix.shape[0]

@@ -1,33 +1,40 @@
-"""How probable the data are under a Gaussian belief, with its SDs and the offsets' mean tuned.
+"""How probable the data are under Gaussian errors, with their SDs and the offsets' mean tuned.
 
 Two questions are put to the data before any law of the offsets is: do the covariances that came
 with the measurements describe their errors better than common SDs do, and do the offsets have a
 mean other than zero? Own covariances fix the ratios of all measurements' SDs, so one factor is
 tuned for them, and one SD for the offsets; common SDs are tuned separately. Each combination is
-tuned by a few rounds of Gauss-Newton with Helmert variance updates (:mod:`jaxcal.solvers.variance`)
-from the plain self-tuned fit, and judged by its Laplace evidence
+tuned by a few rounds of Gauss-Newton with Helmert's updates (:mod:`jaxcal.solvers.reml`) from the
+self-tuned fit, and judged by its Laplace evidence
 
-    ln Z = -1/2 sum r' W r - 1/2 sum (q_y - b)^2 / sigma_y^2 + 1/2 sum ln |W| - n ln sigma_y
+    ln Z = -1/2 sum r' W r - 1/2 sum (q_y - b)^2 / s_y^2 + 1/2 sum ln |W| - n ln s_y
            + 1/2 ln tau - 1/2 tau b^2 - 1/2 ln |H|,
 
 W_i the information of image i's measurements, H the curvature with respect to all unknowns, and
-b ~ N(0, 1/tau) with 1/tau = (2 sigma_y)^2 where there is a mean.
+b ~ N(0, 1/tau) with 1/tau = (2 s_y)^2 where there is a mean.
+
+Everything happens on the sums that one pass over the images leaves for each component
+(:func:`jaxcal.solvers.normal_equations.component_sums`). A mean b needs no further sum: it moves
+q_iy - b as v_y does, so its row of N_y is that of v_y, and
+
+    rss_y(b) = rss_y - 2 b sum q_iy + n b^2,      sum q_iy = -g_y[v_y],      n = N_y[v_y, v_y].
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxcal.model.parameters import Blocks, Parameters, retract
-from jaxcal.model.priors import AbstractSelfTuned, Gaussian
-from jaxcal.problem import Problem
+from jaxcal.model.batch import Images, Iterate, barrier
+from jaxcal.model.observations import Medium, Observation
 from jaxcal.solvers import dense
-from jaxcal.solvers.expectation_propagation import Linear
-from jaxcal.solvers.least_squares import linearise
-from jaxcal.solvers.variance import least_sigma
+from jaxcal.solvers.normal_equations import ComponentSums, component_sums, pairs
+from jaxcal.solvers.reml import helmert, least_sigma
 
 ROUNDS = 2
 """Linearisations."""
@@ -38,132 +45,168 @@ UPDATES = 2
 MEAN_SD = 2.0
 """SD of the offsets' mean before the data are seen, in SDs of the offsets."""
 
+V_Y = 1
+"""The unknown that moves every q_iy by -1."""
 
-class Tuned(eqx.Module):
-    """A Gaussian belief tuned to the data.
+Pass = Callable[[Iterate], ComponentSums]
+"""One pass over the images; the offsets are the last component."""
+
+
+class Evidence(eqx.Module):
+    """A Gaussian noise model tuned to the data; lanes last.
 
     Attributes:
-        parameters: the unknowns.
+        place: X, c and the further unknowns.
         mean: b, mm.
         sigma: SD of each component, mm.
-        log_evidence: ln Z, up to a constant.
-        linear: the problem linearised there; the last unknown is b's deviation.
+        sums: of the images there.
+        with_mean: 1 where the offsets may have a mean.
+        log_evidence: ln Z, up to a constant and the covariances' determinants.
     """
 
-    parameters: Parameters
-    mean: Float[Array, ""]
-    sigma: Float[Array, " components"]
-    log_evidence: Float[Array, ""]
-    linear: Linear
+    place: Iterate
+    mean: Float[Array, " lanes"]
+    sigma: Float[Array, "k lanes"]
+    sums: ComponentSums
+    with_mean: Float[Array, " lanes"]
+    log_evidence: Float[Array, " lanes"]
+
+
+def pass_over(observation: Observation, images: Images, medium: Medium | None) -> Pass:
+    """The pass for an observation."""
+
+    def sums(place: Iterate) -> ComponentSums:
+        return component_sums(place, observation, images, None, medium)
+
+    return sums
+
+
+class _System(eqx.Module):
+    """Every component's normal equations about a mean b, which is the last unknown.
+
+    Attributes:
+        sums: of the images.
+        border: b's row, of the offsets alone.
+        gradient: of every component, b's last.
+        squares: rss_k.
+    """
+
+    sums: ComponentSums
+    border: Float[Array, "q lanes"]
+    gradient: Float[Array, "k q lanes"]
+    squares: Float[Array, "k lanes"]
+
+    @classmethod
+    def of(cls, sums: ComponentSums, mean: Array, with_mean: Array) -> _System:
+        """From what a pass left."""
+        only = np.eye(len(sums.squares))[-1][:, None]
+        along = row_of(sums.matrix[-1], V_Y)
+        squares = mean * (2 * sums.gradient[-1, V_Y] + mean * along[V_Y])
+        gradient = sums.gradient + only[:, None] * mean * along
+        last = only * with_mean * gradient[:, V_Y]
+        border = with_mean * jnp.concatenate([along, along[V_Y, None]])
+        gradient = jnp.concatenate([gradient, last[:, None]], axis=1)
+        return barrier(cls(sums, border, gradient, sums.squares + only * squares))
+
+    def solved(self, sigma: Array, precision: Array, mean: Array) -> tuple[Array, ...]:
+        """Inverse and step with given SDs and belief about b, and ln Z but for the SDs."""
+        weight = 1 / sigma**2
+        normal = self.sums.weighed(weight)
+        unknowns = normal.gradient.shape[0]
+        last = (np.arange(unknowns + 1) == unknowns)[:, None]
+        border = weight[-1] * self.border + jnp.where(last, precision, 0.0)
+        gradient = jnp.sum(weight[:, None] * self.gradient, axis=0)
+        gradient = gradient + jnp.where(last, precision * mean, 0.0)
+        cost = jnp.sum(weight * self.squares, axis=0) + precision * mean**2
+        if self.sums.known is not None:
+            away, slope, _ = self.sums.known
+            gradient = gradient + jnp.concatenate([slope, jnp.zeros_like(slope[:1])])
+            cost = cost + away
+        flat, border, gradient = barrier((normal.curvature, border, gradient))
+        rows = [jnp.concatenate([row_of(flat, k), border[k, None]]) for k in range(unknowns)]
+        inverse, log_determinant = dense.inverse_abreast(jnp.stack([*rows, border]))
+        step = -dense.product_abreast(inverse, gradient)
+        # At the minimum, which is a small step away.
+        cost = cost + jnp.sum(gradient * step, axis=0)
+        return inverse, step, 0.5 * (jnp.log(precision) - cost - log_determinant)
+
+    def traces(self, matrix: Float[Array, "q q lanes"]) -> Float[Array, "k lanes"]:
+        """tr(A N_k) of every component, A symmetric."""
+        last = matrix.shape[0] - 1
+        twice = [(1 if i == j else 2) * matrix[i, j] for i, j in pairs(last)]
+        found = jnp.sum(barrier(jnp.stack(twice)) * self.sums.matrix, axis=1)
+        crossed = jnp.sum(2 * matrix[last, :last] * self.border[:last], axis=0)
+        own = crossed + matrix[last, last] * self.border[last]
+        return found + np.eye(len(found))[-1][:, None] * own
+
+
+def row_of(flat: Float[Array, "triangle lanes"], k: int) -> Float[Array, "p lanes"]:
+    """A row of a symmetric matrix from its upper triangle."""
+    size = int((2 * flat.shape[0]) ** 0.5)
+    places = pairs(size)
+    return jnp.stack([flat[places.index((min(k, j), max(k, j)))] for j in range(size)])
+
+
+def mean_precision(offset_sd: Array, with_mean: Array) -> Array:
+    """1 / (2 s_y)^2; without a mean, its unknown is held at zero by a precision of one."""
+    return jnp.where(with_mean > 0, (MEAN_SD * offset_sd) ** -2.0, 1.0)
 
 
 def tune(
-    parameters: Parameters,
-    belief: AbstractSelfTuned,
-    problem: Problem,
-    blocks: Blocks,
-    with_mean: Float[Array, ""],
-    tied: Float[Array, ""],
+    sums_at: Pass,
+    place: Iterate,
+    sigma: Float[Array, "k lanes"],
+    with_mean: Float[Array, " lanes"],
+    count: Float[Array, "k lanes"],
     rounds: int = ROUNDS,
-) -> Tuned:
-    """Tune the belief's SDs, the unknowns and the offsets' mean from a nearby solution.
+) -> Evidence:
+    """Tune the SDs, the unknowns and the mean from a nearby solution.
 
     Args:
-        parameters: to start from.
-        belief: with SDs to start from.
-        problem: one problem.
-        blocks: the free unknowns.
-        with_mean: 1 where the offsets may have a mean, else 0.
-        tied: 1 where the measurements' SDs keep their ratio and only a common factor is tuned.
-        rounds: how many.
+        sums_at: the pass over the images.
+        place: to start from.
+        sigma: SDs to start from, mm.
+        with_mean: 1 where the offsets may have a mean.
+        count: residuals of each component.
+        rounds: passes before the last.
     """
-    columns = belief.columns(problem)
-    at = columns[-1].start
-    none = jnp.zeros(0, problem.mask.dtype)
-    count = belief.count(problem)
     # One floor for all models: one that followed each model's own offset SD would count a gain in
     # that SD three times in the evidence, where data are exact.
-    floor = least_sigma(belief.sigma)
-
-    def system(parameters: Parameters, mean: Array, sigma: Array):
-        prior = belief.with_sigma(sigma)
-        _, jacobian, residual = linearise(parameters, none, prior, problem, blocks)
-        residual = residual.at[:, at].add(-problem.mask * mean / sigma[-1])
-        along = jnp.zeros_like(residual).at[:, at].set(-with_mean * problem.mask / sigma[-1])
-        return jnp.concatenate([jacobian, along[None]]), residual
-
-    def mean_precision(sigma: Array) -> Array:
-        # Without a mean its unknown is held at zero.
-        return jnp.where(with_mean > 0, (MEAN_SD * sigma[-1]) ** -2.0, 1.0)
-
-    def curvature(jacobian: Array, precision: Array) -> Array:
-        return jnp.einsum("anm,bnm->ab", jacobian, jacobian).at[-1, -1].add(precision)
+    floor = least_sigma(sigma)
 
     def one_round(_: Array, state: tuple) -> tuple:
-        parameters, mean, sigma = state
-        here = system(parameters, mean, sigma)
+        place, mean, sigma = state
+        system = _System.of(barrier(sums_at(place)), mean, with_mean)
 
         def update(_: Array, state: tuple) -> tuple:
-            now, _ = state
-            ratio = jnp.ones_like(here[1][0])
-            for k, part in enumerate(columns):
-                ratio = ratio.at[part].set(sigma[k] / now[k])
-            jacobian, residual = ratio * here[0], ratio * here[1]
-            precision = mean_precision(now)
-            inverse, _ = dense.inverse_positive(curvature(jacobian, precision))
-            gradient = jnp.einsum("anm,nm->a", jacobian, residual).at[-1].add(precision * mean)
-            step = -inverse @ gradient
-            residual = residual + jnp.einsum("a,anm->nm", step, jacobian)
-            leverage = jnp.einsum("anm,ab,bnm->nm", jacobian, inverse, jacobian)
-            freedom = jnp.maximum(count - _sums(leverage, columns), 0.05 * count)
-            squares = _sums(residual**2, columns)
-            factor = squares / freedom
-            pooled = jnp.sum(squares[:-1]) / jnp.sum(freedom[:-1])
-            factor = factor.at[:-1].set(jnp.where(tied > 0, pooled, factor[:-1]))
-            return jnp.maximum(now * jnp.sqrt(factor), floor), step
+            sigma, _ = state
+            precision = mean_precision(sigma[-1], with_mean)
+            inverse, step, _ = barrier(system.solved(sigma, precision, mean))
+            bent = system.traces(step[:, None] * step)
+            left = system.squares + 2 * jnp.sum(system.gradient * step, axis=1) + bent
+            updated = helmert(left, system.traces(inverse), count, sigma)
+            return jnp.maximum(updated, floor), step
 
-        none = jnp.zeros(here[0].shape[0], sigma.dtype)
+        none = jnp.zeros((place.unknowns + 1, mean.shape[0]), mean.dtype)
         sigma, step = jax.lax.fori_loop(0, UPDATES, update, (sigma, none))
-        return retract(parameters, step[:-1], blocks), mean + step[-1], sigma
+        return barrier((place.moved(list(step[:-1])), mean + step[-1], sigma))
 
-    zero = jnp.zeros((), problem.mask.dtype)
-    state = (parameters, zero, belief.sigma)
-    parameters, mean, sigma = jax.lax.fori_loop(0, rounds, one_round, state)
-
-    jacobian, residual = system(parameters, mean, sigma)
-    precision = mean_precision(sigma)
-    inverse, log_determinant = dense.inverse_positive(curvature(jacobian, precision))
-    gradient = jnp.einsum("anm,nm->a", jacobian, residual).at[-1].add(precision * mean)
-    # The minimum is still a small step away.
-    cost = jnp.sum(residual**2) + precision * mean**2 - gradient @ inverse @ gradient
-    evidence = 0.5 * (jnp.log(precision) - cost - log_determinant)
-    evidence = evidence - jnp.sum(count * jnp.log(sigma))
-    evidence = evidence - 0.5 * _log_shape(belief, problem)
-    # The measurements' part, and the offsets in mm.
-    direction = sigma[-1] * jacobian[:, :, at].T
-    offset = sigma[-1] * residual[:, at]
-    noise_jacobian = jacobian.at[:, :, at].set(0.0)
-    downhill = -jnp.einsum("anm,nm->a", noise_jacobian, residual)
-    gradient = downhill.at[-1].add(-precision * mean)
-    lower, upper = None, None
-    if problem.max_elevation is not None:
-        lower, upper = -problem.max_elevation - mean, problem.max_elevation - mean
-    linear = Linear(
-        curvature(noise_jacobian, precision), gradient, direction, offset, problem.mask,
-        lower, upper,
-    )  # fmt: skip
-    return Tuned(parameters, mean, sigma, evidence, linear)
+    state = (place, jnp.zeros_like(with_mean), sigma)
+    place, mean, sigma = jax.lax.fori_loop(0, rounds, one_round, state)
+    return judged(sums_at, place, sigma, mean, with_mean, count)
 
 
-def _sums(values: Float[Array, "n columns"], columns: tuple[slice, ...]) -> Array:
-    over_images = jnp.sum(values, axis=0)
-    return jnp.stack([jnp.sum(over_images[part]) for part in columns])
-
-
-def _log_shape(belief: AbstractSelfTuned, problem: Problem) -> Float[Array, ""]:
-    """Log determinants of the covariances' shapes, over the used images."""
-    if not isinstance(belief, Gaussian) or belief.covariance is None:
-        return jnp.zeros((), problem.mask.dtype)
-    shape = belief.covariance
-    determinant = shape[:, 0, 0] * shape[:, 1, 1] - shape[:, 0, 1] ** 2
-    return jnp.sum(problem.mask * jnp.log(jnp.where(problem.mask > 0, determinant, 1.0)))
+def judged(
+    sums_at: Pass,
+    place: Iterate,
+    sigma: Float[Array, "k lanes"],
+    mean: Float[Array, " lanes"],
+    with_mean: Float[Array, " lanes"],
+    count: Float[Array, "k lanes"],
+) -> Evidence:
+    """A noise model with its Laplace evidence, but for the covariances' determinants."""
+    sums = barrier(sums_at(place))
+    system = _System.of(sums, mean, with_mean)
+    _, _, evidence = system.solved(sigma, mean_precision(sigma[-1], with_mean), mean)
+    evidence = evidence - jnp.sum(count * jnp.log(sigma), axis=0)
+    return Evidence(place, mean, sigma, sums, with_mean, evidence)

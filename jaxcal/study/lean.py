@@ -1,38 +1,36 @@
 """Plain methods of a study, computed for what a study stores and nothing else.
 
 A study keeps X's errors, SDs, status and iterations of millions of solves. Here experiments stay
-what :mod:`jaxcal.solvers.fused` reads, planes of numbers with the images minor; the conventional
+what :mod:`jaxcal.model.batch` has, planes of numbers with the images minor; the conventional
 fit is made once for all methods; and of each calibration only what is stored is computed.
 """
 
 from __future__ import annotations
 
-from functools import cache
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from jaxcal import abreast
-from jaxcal.errors import InputError
+from jaxcal.geometry import chord_angle
+from jaxcal.model import unrolled
+from jaxcal.model.batch import Images, Iterate, targets, total
+from jaxcal.model.parameters import RIGID
 from jaxcal.options import (
-    Given,
     Method,
     Options,
-    Plan,
     PriorName,
     Request,
     prepare,
     with_bound,
 )
+from jaxcal.pipeline import solve_problems
 from jaxcal.problem import Problem
 from jaxcal.segmentation.deviations import fit_deviations
 from jaxcal.simulation import Protocol, arrange, draw, draw_noise
-from jaxcal.solvers import unrolled
-from jaxcal.solvers.fused import Guess, Images, targets, total
-from jaxcal.solvers.fused_methods import Begun, from_scratch
+from jaxcal.solvers.start import ConventionalStart, conventional
 
 Kind = tuple[Method, PriorName]
 """A method and its prior."""
@@ -75,26 +73,9 @@ class Experiments(eqx.Module):
     test: Images
 
 
-@cache
-def served(kind: Kind, options: Options) -> bool:
-    """Whether a method is computed here."""
-    one = jnp.ones((1, 4))
-    images = Images(jnp.zeros((9, 1, 4)), jnp.zeros((3, 1, 4)), one, one, one)
-    return _plan(problems_of(images), kind, options, None) is not None
-
-
-def _plan(
-    problems: Problem, kind: Kind, options: Options, bound: Array | None
-) -> tuple[Plan, Given] | None:
-    """What a method does, or None where it is not a plain one."""
-    plan, given = prepare(problems, Request(*kind, max_elevation=bound, options=options))
-    plain = abreast.plain(problems, given, plan) and not plan.laws
-    return (plan, given) if plain else None
-
-
 def experiments(
     keys: Key[Array, " trials"], protocol: Protocol
-) -> tuple[Experiments, Guess, Float[Array, "trials 3"]]:
+) -> tuple[Experiments, Iterate, Float[Array, "trials 3"]]:
     """Simulate a batch: its experiments, their truth, and the errors in them.
 
     They are those of :func:`jaxcal.simulation.simulate`. The errors are root mean squares of the
@@ -115,7 +96,13 @@ def experiments(
     lateral, distance = (value.reshape(len(keys), -1) for value in points)
     images = _images(one.rotation, one.origin, lateral, distance)
     test = _images(one.test_rotation, one.test_origin, one.test_point[:, 0], one.test_point[:, 1])
-    truth = Guess(jnp.moveaxis(one.true_rotation, 0, -1), one.true_translation.T, one.target.T)
+    truth = Iterate(
+        jnp.moveaxis(one.true_rotation, 0, -1),
+        one.true_translation.T,
+        one.target.T,
+        jnp.zeros((0, len(keys)), one.target.dtype),
+        RIGID,
+    )
     return Experiments(images, test), truth, jnp.sqrt(_mean_squares(truth, images)).T
 
 
@@ -128,7 +115,7 @@ def _grouped(values: Array) -> Array:
 def _images(rotation: Array, origin: Array, lateral: Array, distance: Array) -> Images:
     return Images(
         rotation=jnp.moveaxis(rotation, 1, 0), origin=jnp.moveaxis(origin, 1, 0),
-        lateral=lateral, distance=distance, mask=jnp.ones_like(lateral),
+        lateral=lateral, axial=distance, face=jnp.zeros(len(lateral)), mask=jnp.ones_like(lateral),
     )  # fmt: skip
 
 
@@ -147,15 +134,15 @@ def problems_of(images: Images) -> Problem:
     )
 
 
-def begin(batch: Experiments, max_steps: int) -> Begun:
+def begin(batch: Experiments, max_steps: int) -> ConventionalStart:
     """The conventional fits from which every method starts."""
-    return from_scratch(batch.images, max_steps=max_steps)
+    return conventional(batch.images, RIGID, max_steps=max_steps)
 
 
 def solve(
     batch: Experiments,
-    truth: Guess,
-    begun: Begun,
+    truth: Iterate,
+    begun: ConventionalStart,
     kind: Kind,
     options: Options,
     bound: Array | None,
@@ -166,55 +153,55 @@ def solve(
         batch: the experiments.
         truth: theirs.
         begun: their conventional fits.
-        kind: a method that is :func:`served`.
+        kind: the method.
         options: its options.
         bound: on the offsets, mm, for methods that take one.
     """
     images = batch.images
     problems = problems_of(images)
-    planned = _plan(problems, kind, options, bound)
-    if planned is None:
-        raise InputError(f"method {kind[0]} with prior {kind[1]} is no plain one")
-    plan, given = planned
-    problems = with_bound(problems, given)
-    solution = abreast.run_method(begun, images, problems, given, plan)
-    guess = Guess.of(solution.parameters)
+    options = replace(options, differentiate=False)
+    plan, given = prepare(problems, Request(*kind, max_elevation=bound, options=options))
     # What is not used of the calibration is not computed.
-    found = abreast.finish_batch(plan, solution, problems, problems, given)
-    chord = jnp.sqrt(jnp.sum((guess.rotation - truth.rotation) ** 2, axis=(0, 1)))
-    pairs = ((guess.translation, truth.translation), (guess.point, truth.point))
-    apart = [jnp.sqrt(jnp.sum((one - true) ** 2, axis=0)) for one, true in pairs]
+    found = solve_problems(with_bound(problems, given), given, plan, begun=begun)
+    place = Iterate(
+        jnp.moveaxis(found.image_to_probe[:, :3, :3], 0, -1),
+        found.image_to_probe[:, :3, 3].T,
+        found.point.T,
+        truth.extras,
+        truth.blocks,
+    )
+    pairs = ((place.translation, truth.translation), (place.point, truth.point))
+    away = [jnp.sqrt(jnp.sum((one - true) ** 2, axis=0)) for one, true in pairs]
     return Measured(
-        rp=_precision(guess, truth, batch.test),
-        # 2 asin(|R1 - R2| / sqrt 8), the angle, keeps its digits where acos would lose them.
-        rotation_error=2 * jnp.arcsin(jnp.minimum(chord / np.sqrt(8.0), 1.0)),
-        translation_error=apart[0],
-        point_error=apart[1],
+        rp=_precision(place, truth, batch.test),
+        rotation_error=chord_angle(place.rotation - truth.rotation),
+        translation_error=away[0],
+        point_error=away[1],
         sigma=found.sigma,
         status=found.status_code.astype(jnp.int8),
-        iterations=solution.iterations.astype(jnp.int32),
+        iterations=found.iterations.astype(jnp.int32),
     )
 
 
-def _mean_squares(guess: Guess, images: Images) -> Float[Array, "3 lanes"]:
-    """Of lateral error, range error and elevational offset at a guess, mm^2."""
-    q, _ = targets(guess, images)
+def _mean_squares(place: Iterate, images: Images) -> Float[Array, "3 lanes"]:
+    """Of lateral error, range error and elevational offset at a place, mm^2."""
+    q, _ = targets(place, images)
     far = jnp.sqrt(q[1] * q[1] + q[2] * q[2])
     errors = [q[0] - images.lateral, far - images.distance, q[1]]
     return jnp.stack(total([images.mask * error * error for error in errors])) / images.used
 
 
-def _precision(guess: Guess, truth: Guess, test: Images) -> Float[Array, " lanes"]:
+def _precision(place: Iterate, truth: Iterate, test: Images) -> Float[Array, " lanes"]:
     """Eq. 8, as :func:`jaxcal.diagnostics.metrics.reconstruction_precision`, mm.
 
     Reconstructed points are taken from the true target, near which they are: their mean and spread
     then come from one pass without loss of digits.
     """
-    rows = [[entry[:, None] for entry in row] for row in guess.rotation]
+    rows = [[entry[:, None] for entry in row] for row in place.rotation]
     flat = [test.lateral, 0, test.distance]
     in_probe = [
         value + origin[:, None]
-        for value, origin in zip(unrolled.apply(rows, flat), guess.translation, strict=True)
+        for value, origin in zip(unrolled.apply(rows, flat), place.translation, strict=True)
     ]
     poses = [[test.rotation[3 * i + j] for j in range(3)] for i in range(3)]
     away = [

@@ -19,7 +19,7 @@ Where a host has several devices each takes its share of a block.
 from __future__ import annotations
 
 import dataclasses
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import jax
@@ -29,15 +29,14 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
 from jaxcal.compiler import fast_to_run, single_threaded
-from jaxcal.diagnostics.metrics import reconstruction_precision
+from jaxcal.model.batch import Iterate
 from jaxcal.offsets import OffsetLaw, nominal_bound
 from jaxcal.precision import in_own_modes
 from jaxcal.probe import LinearProbe
-from jaxcal.simulation import Experiment, Protocol, simulate
-from jaxcal.solve import Options, calibrate_batch
-from jaxcal.solvers.fused import Guess
-from jaxcal.solvers.fused_methods import Begun
-from jaxcal.study.lean import Experiments, Kind, Measured, begin, experiments, served, solve
+from jaxcal.simulation import Protocol
+from jaxcal.solve import Options
+from jaxcal.solvers.start import ConventionalStart
+from jaxcal.study.lean import Experiments, Kind, Measured, begin, experiments, solve
 from jaxcal.study.spec import Chunk, Condition, MethodSpec, Spec
 
 LANES = {"cpu": 64}
@@ -132,9 +131,9 @@ class Block:
         self._numbers = numbers_of(condition)
         drawn = draw_program(self._shape, devices)(indices, self._seed, self._numbers)
         self.batch, self.truth, self.realised = drawn
-        self._begun: dict[int, Begun] = {}
+        self._begun: dict[int, ConventionalStart] = {}
 
-    def begun(self, max_steps: int) -> Begun:
+    def begun(self, max_steps: int) -> ConventionalStart:
         """The conventional fits, made once."""
         if max_steps not in self._begun:
             program = begin_program(max_steps, self._devices)
@@ -146,18 +145,9 @@ class Block:
         bound = np.asarray(bound_mm(method, self._condition)) if method.bounded else None
         kind: Kind = (method.method, method.prior)
         options = _options(method)
-        if not served(kind, options):
-            return self._in_full(kind, options, bound)
         program = lean_program(kind, options, self._devices)
         begun = self.begun(options.max_iterations)
         return _as_numpy(program(self.batch, self.truth, begun, bound))
-
-    def _in_full(
-        self, kind: Kind, options: Options, bound: np.ndarray | None
-    ) -> dict[str, np.ndarray]:
-        simulated = simulate_program(self._shape, self._devices)
-        drawn = simulated(self._indices, self._seed, self._numbers)
-        return _as_numpy(full_program(kind, options, self._devices)(drawn, bound))
 
 
 def device_name() -> str:
@@ -270,17 +260,6 @@ def trial_keys(indices: Array, seed: Array) -> Array:
 
 
 @cache
-def simulate_program(shape: Shape, devices: Devices) -> Any:
-    """From (trial indices, seed, the condition's numbers) to the same experiments in full."""
-
-    def program(indices: Array, seed: Array, numbers: dict[str, Any]) -> Experiment:
-        given = shape.protocol(jax.tree.map(jnp.asarray, numbers))
-        return jax.vmap(lambda key: simulate(key, given))(trial_keys(indices, seed))
-
-    return compile_pieces(program, devices, pieces=1)
-
-
-@cache
 def begin_program(max_steps: int, devices: Devices) -> Any:
     """From experiments to their conventional fits, compiled."""
     return compile_pieces(lambda batch: begin(batch, max_steps), devices, pieces=1)
@@ -290,34 +269,9 @@ def begin_program(max_steps: int, devices: Devices) -> Any:
 def lean_program(kind: Kind, options: Options, devices: Devices) -> Any:
     """From experiments, truth, conventional fits and bound to :func:`jaxcal.study.lean.solve`."""
 
-    def program(batch: Experiments, truth: Guess, begun: Begun, bound: Array | None) -> Any:
+    def program(
+        batch: Experiments, truth: Iterate, begun: ConventionalStart, bound: Array | None
+    ) -> Any:
         return solve(batch, truth, begun, kind, options, bound)
 
     return compile_pieces(program, devices, pieces=3)
-
-
-@cache
-def full_program(kind: Kind, options: Options, devices: Devices) -> Any:
-    """From experiments in full and bound to what whole calibrations say, compiled."""
-    # The joint bounded method takes the general road, whose rounding is left as it was tested.
-    fast = kind != ("joint", "bounded")
-    return compile_pieces(partial(_in_full, kind, options), devices, pieces=1, fast=fast)
-
-
-def _in_full(kind: Kind, options: Options, drawn: Experiment, bound: Array | None) -> Measured:
-    problems = jax.vmap(lambda experiment: experiment.problem())(drawn)
-    result = calibrate_batch(
-        problems, *kind, max_elevation=bound, options=options, chunk=drawn.points.shape[0]
-    )
-    x, truth = result.image_to_probe, drawn.image_to_probe
-    precision = jax.vmap(reconstruction_precision)
-    chord = jnp.linalg.norm(x[:, :3, :3] - truth[:, :3, :3], axis=(1, 2))
-    return Measured(
-        rp=jnp.asarray(precision(x, drawn.test_poses, drawn.test_points)),
-        rotation_error=2 * jnp.arcsin(jnp.minimum(chord / np.sqrt(8.0), 1.0)),
-        translation_error=jnp.linalg.norm(x[:, :3, 3] - truth[:, :3, 3], axis=1),
-        point_error=jnp.linalg.norm(result.point - drawn.point, axis=1),
-        sigma=result.sigma,
-        status=result.status_code.astype(jnp.int8),
-        iterations=result.iterations.astype(jnp.int32),
-    )

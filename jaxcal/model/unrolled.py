@@ -39,7 +39,10 @@ def add(*terms: Entry) -> Entry:
 
 def times(first: Entry, second: Entry) -> Entry:
     """Product; 0 where either is a structural zero."""
-    return 0 if is_zero(first) or is_zero(second) else first * second
+    if is_zero(first) or is_zero(second):
+        return 0
+    # 1 needs no multiplication either.
+    return second if isinstance(first, int) and first == 1 else first * second
 
 
 def dot(first: Vector, second: Vector) -> Entry:

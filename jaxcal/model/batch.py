@@ -1,0 +1,279 @@
+"""A batch of problems as planes: the one place where data change their layout.
+
+Public arrays have the problems first and small matrices last. The solvers want the opposite: one
+plane (lanes, images) for every number of an image, and everything else with the lanes last, so
+that XLA vectorises over images and over problems. A *lane* is one problem of a batch.
+
+Tracker poses are B_i = (R_i, b_i), X = (R, t), the target is c, and q_i = X^-1 B_i^-1 c is the
+target in image i's frame.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxcal.model import unrolled
+from jaxcal.model.parameters import EXTRA, Blocks, Parameters, block_slice, size
+from jaxcal.model.unrolled import Matrix, Vector
+from jaxcal.problem import Problem
+
+RIGID_UNKNOWNS = 9
+"""X and the target; further unknowns follow them."""
+
+
+class ElementPlanes(eqx.Module):
+    """What every element heard.
+
+    Attributes:
+        distances: one-way distances at the nominal sound speed and delay, mm.
+        heard: 1 where an element's time of flight is used.
+        elements: positions in the image frame [lateral, elevational, axial], mm.
+    """
+
+    distances: Float[Array, "lanes n elements"]
+    heard: Float[Array, "lanes n elements"]
+    elements: Float[Array, "3 lanes elements"]
+
+
+class Images(eqx.Module):
+    """What was measured, one plane (lanes, images) for every number.
+
+    Attributes:
+        rotation: R_i by rows.
+        origin: b_i, mm.
+        lateral: lateral position at the nominal scale, mm.
+        axial: range from pixel row 0 at the nominal scale, mm.
+        face: range of pixel row 0, mm.
+        mask: 1 for used images; the others hold harmless numbers.
+        channels: the times of flight, or None.
+    """
+
+    rotation: Float[Array, "9 lanes n"]
+    origin: Float[Array, "3 lanes n"]
+    lateral: Float[Array, "lanes n"]
+    axial: Float[Array, "lanes n"]
+    face: Float[Array, " lanes"]
+    mask: Float[Array, "lanes n"]
+    channels: ElementPlanes | None = None
+
+    @classmethod
+    def of(cls, problems: Problem, *, channels: bool = False) -> Images:
+        """The planes of a batch of problems (one leading axis).
+
+        Args:
+            problems: the batch.
+            channels: take the times of flight along.
+        """
+        used = problems.mask > 0
+
+        def plane(values: Array, instead: float) -> Array:
+            return jnp.where(used, values, jnp.asarray(instead, problems.mask.dtype))
+
+        poses, points = problems.poses, problems.measurements * problems.spacing[:, None, :]
+        rotation = [plane(poses[..., i, j], float(i == j)) for i in range(3) for j in range(3)]
+        elements = None
+        if channels and problems.channels is not None:
+            known = used[..., None]
+            elements = ElementPlanes(
+                jnp.where(known, problems.channels.distances, 0.0),
+                jnp.where(known, problems.channels.heard, 0.0),
+                jnp.moveaxis(problems.channels.elements, -1, 0),
+            )
+        return cls(
+            rotation=jnp.stack(rotation),
+            origin=jnp.stack([plane(poses[..., i, 3], 0.0) for i in range(3)]),
+            lateral=plane(points[..., 0], 0.0),
+            axial=jnp.where(used, points[..., 1], 1.0 - problems.face_offset[:, None]),
+            face=problems.face_offset,
+            mask=problems.mask,
+            channels=elements,
+        )
+
+    @property
+    def distance(self) -> Float[Array, "lanes n"]:
+        """Range at the nominal scale, sound speed and delay, mm."""
+        return self.axial + self.face[:, None]
+
+    @property
+    def used(self) -> Float[Array, " lanes"]:
+        """Number of used images."""
+        return jnp.sum(self.mask, axis=1)
+
+    def padded(self) -> Images:
+        """With unused images up to whole vectors: a loop over them leaves no rest."""
+        if self.channels is not None:
+            return self
+        added = whole(self.mask).shape[1] - self.mask.shape[1]
+        return Images(
+            whole(self.rotation),
+            whole(self.origin),
+            whole(self.lateral),
+            whole(self.axial),
+            self.face,
+            jnp.pad(self.mask, [(0, 0), (0, added)]),
+        )
+
+    def repeated(self, times: int) -> Images:
+        """The same points (no times of flight) in so many times the lanes."""
+        return Images(
+            jnp.tile(self.rotation, (1, times, 1)),
+            jnp.tile(self.origin, (1, times, 1)),
+            jnp.tile(self.lateral, (times, 1)),
+            jnp.tile(self.axial, (times, 1)),
+            jnp.tile(self.face, times),
+            jnp.tile(self.mask, (times, 1)),
+        )
+
+    @property
+    def lanes(self) -> int:
+        """Number of problems."""
+        return self.mask.shape[0]
+
+
+class Iterate(eqx.Module):
+    """A value of every lane's unknowns, lanes last.
+
+    Attributes:
+        rotation: of X.
+        translation: of X, mm.
+        point: c, mm.
+        extras: further unknowns: factors of scale and sound speed, delay in mm, in the order of
+            the blocks.
+        blocks: which unknowns are free (static).
+    """
+
+    rotation: Float[Array, "3 3 lanes"]
+    translation: Float[Array, "3 lanes"]
+    point: Float[Array, "3 lanes"]
+    extras: Float[Array, "extras lanes"]
+    blocks: Blocks = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, parameters: Parameters, blocks: Blocks) -> Iterate:
+        """From parameters with a leading axis."""
+        values = {
+            "scale": parameters.scale.T,
+            "sound-speed": parameters.sound_speed[None],
+            "delay": parameters.delay[None],
+        }
+        none = jnp.zeros((0, parameters.point.shape[0]), parameters.point.dtype)
+        extras = jnp.concatenate([none, *(values[name] for name in EXTRA if name in blocks)])
+        rotation = jnp.moveaxis(parameters.rotation, 0, -1)
+        return cls(rotation, parameters.translation.T, parameters.point.T, extras, blocks)
+
+    @property
+    def unknowns(self) -> int:
+        """How many unknowns a lane has."""
+        return size(self.blocks)
+
+    def extra(self, name: str) -> Float[Array, "k lanes"] | None:
+        """The values of a further unknown, or None where it is not free."""
+        if name not in self.blocks:
+            return None
+        at = block_slice(self.blocks, name)
+        return self.extras[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
+
+    def parameters(self) -> Parameters:
+        """With a leading axis; what is not free is nominal."""
+        rotation = jnp.moveaxis(self.rotation, -1, 0)
+        found = jax.vmap(Parameters.of)(rotation, self.translation.T, self.point.T)
+        scale, speed, delay = (self.extra(name) for name in EXTRA)
+        return Parameters(
+            found.rotation,
+            found.translation,
+            found.point,
+            found.scale if scale is None else scale.T,
+            found.sound_speed if speed is None else speed[0],
+            found.delay if delay is None else delay[0],
+        )
+
+    def moved(self, step: Vector) -> Iterate:
+        """The step taken, as :func:`jaxcal.model.parameters.retract` takes it to third order.
+
+        The turn is Cayley's, which is a rotation for any step and needs no sine.
+        """
+        here = [unrolled.rows_of(row) for row in self.rotation]
+        turned = unrolled.product(here, unrolled.rotation(step[3:6]))
+        along = unrolled.apply(here, step[:3])
+        extras = self.extras
+        if self.unknowns > RIGID_UNKNOWNS:
+            at = RIGID_UNKNOWNS
+            parts = []
+            for value, name in zip(extras, _extra_names(self.blocks), strict=True):
+                parts.append(value + step[at] if name == "delay" else value * jnp.exp(step[at]))
+                at += 1
+            extras = jnp.stack(parts)
+        return Iterate(
+            jnp.stack([jnp.stack(row) for row in turned]),
+            self.translation + jnp.stack(along),
+            self.point + jnp.stack(step[6:9]),
+            extras,
+            self.blocks,
+        )
+
+
+def _extra_names(blocks: Blocks) -> list[str]:
+    """The block of every further unknown, in order."""
+    return [name for name in EXTRA if name in blocks for _ in range(size((name,)))]
+
+
+def targets(iterate: Iterate, images: Images) -> tuple[Vector, Matrix]:
+    """q_i, and M_i = R' R_i' by which a step of the target moves it, as planes."""
+    inverse = [[iterate.rotation[k, a][:, None] for k in range(3)] for a in range(3)]
+    back = [[images.rotation[3 * j + i] for j in range(3)] for i in range(3)]
+    from_probe = [iterate.point[j][:, None] - images.origin[j] for j in range(3)]
+    # Not by M_i: who needs q_i alone shall not have to wait for it in memory.
+    in_probe = [
+        value - shift[:, None]
+        for value, shift in zip(unrolled.apply(back, from_probe), iterate.translation, strict=True)
+    ]
+    return unrolled.apply(inverse, in_probe), unrolled.product(inverse, back)
+
+
+def choose(which: Bool[Array, "*lanes"], first, second):
+    """Lane by lane one of two pytrees whose last axis counts the lanes."""
+    return jax.tree.map(lambda a, b: jnp.where(which, a, b), first, second)
+
+
+def barrier(values):
+    """Keep XLA from fusing across here: it would repeat what belongs to a lane for every image."""
+    return jax.lax.optimization_barrier(values)
+
+
+@jax.custom_jvp
+def _sums(planes: tuple[Array, ...]) -> tuple[Array, ...]:
+    none = tuple(jnp.zeros((), plane.dtype) for plane in planes)
+
+    def plus(a: tuple, b: tuple) -> tuple:
+        return tuple(x + y for x, y in zip(a, b, strict=True))
+
+    return tuple(jax.lax.reduce(planes, none, plus, (planes[0].ndim - 1,)))
+
+
+@_sums.defjvp
+def _sums_jvp(primals: tuple, tangents: tuple) -> tuple:
+    # JAX cannot differentiate a reduction of several arrays at once; a sum is its own derivative.
+    (planes,), (moved,) = primals, tangents
+    return _sums(planes), tuple(jnp.sum(plane, axis=-1) for plane in moved)
+
+
+def total(planes: Vector) -> Vector:
+    """Sum every plane over its images (last), all in one reduction; structural zeros are zeros.
+
+    XLA compiles the variadic reduction to one loop over the images, in which nothing that belongs
+    to one image is stored.
+    """
+    given = [plane for plane in planes if not unrolled.is_zero(plane)]
+    shape = jnp.broadcast_shapes(*(plane.shape for plane in given))
+    found = iter(_sums(tuple(jnp.broadcast_to(plane, shape) for plane in given)))
+    zero = jnp.zeros(shape[:-1], given[0].dtype)
+    return [zero if unrolled.is_zero(plane) else next(found) for plane in planes]
+
+
+def whole(planes: Float[Array, "*planes n"]) -> Float[Array, "*planes padded"]:
+    """Planes continued by their last image, up to whole vectors of 64 bytes."""
+    extra = -planes.shape[-1] % (64 // planes.dtype.itemsize)
+    return jnp.pad(planes, [(0, 0)] * (planes.ndim - 1) + [(0, extra)], mode="edge")

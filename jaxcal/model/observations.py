@@ -1,0 +1,483 @@
+"""What an image measures: its residuals, as functions of where the target is in it.
+
+With q = (q_x, q_y, q_z) the target in the image's frame (lateral, elevational, axial; mm), (x, r)
+the measured lateral position and range, the target lies on a circle about the element line (the
+paper's Eq. 5):
+
+    p(y) = (x, y, sqrt(r^2 - y^2)).
+
+An *observation* turns q, and further unknowns such as the pixels' scale, into residual planes, in
+groups (*components*) that share one SD. Nothing else in the package knows residuals: derivatives
+are derived from these functions (:mod:`jaxcal.model.derivatives`), sums over the images are made
+by :mod:`jaxcal.solvers.normal_equations`, and every method is a loop on those. A further
+observation is one class here and a line where :mod:`jaxcal.options` chooses.
+
+- :class:`Points`: errors of lateral position and range, and the offset itself (y_i = q_y), each
+  with its SD; :class:`OwnCovariances`: the same with a covariance for every image.
+- :class:`Channels`: what each element should have heard less what it heard (Eqs. 5 and 6).
+- :class:`InPlane`: q - p(0), equally weighted: the conventional Eq. 7.
+- :class:`HeldOffsets`: q - p(y) with given y: a half-round of the alternation.
+- :class:`BoundedOffsets`: q - p(y) with |y| <= bound unknown: what the alternation descends.
+- :class:`TrackedPoints`: points whose tracker has errors of its own.
+
+The last two have one more unknown in each image, which is eliminated there.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxcal.model.batch import RIGID_UNKNOWNS, Images, Iterate, targets, whole
+from jaxcal.model.parameters import EXTRA, Blocks, block_slice
+from jaxcal.model.unrolled import Vector, add
+
+LARGEST_ELEVATION = 0.95
+"""Offsets are kept below this fraction of the range: at 1 the circle's tangent turns axial."""
+
+TRACKER_STEPS = 4
+"""Newton steps to a tracker's elevational error: the range bends so little that two suffice."""
+
+
+class Further(eqx.Module):
+    """The further unknowns as an image sees them, one plane (lanes, 1) each; None: not free.
+
+    Attributes:
+        scale: factors on lateral and axial spacing, or None.
+        sound_speed: factor on the speed by which times became distances, or None.
+        delay: what the system adds to a distance, mm, or None.
+    """
+
+    scale: Vector | None
+    sound_speed: Array | None
+    delay: Array | None
+
+    @classmethod
+    def of(cls, iterate: Iterate, tangent: Vector) -> Further:
+        """The iterate's, moved by tangents (log units, mm)."""
+        scale, speed, delay = (_moved(iterate, name, tangent) for name in EXTRA)
+        return cls(scale, None if speed is None else speed[0], None if delay is None else delay[0])
+
+    def points(self, images: Images) -> tuple[Array, Array]:
+        """Lateral position and range of every image, mm.
+
+        Pixels are multiplied by their scale; a range is a time of flight in disguise and follows
+        sound speed and delay, while lateral positions come from where the elements are.
+        """
+        lateral, axial = images.lateral, images.axial
+        if self.scale is not None:
+            lateral, axial = lateral * self.scale[0], axial * self.scale[1]
+        distance = axial + images.face[:, None]
+        if self.delay is not None:
+            distance = distance - self.delay
+        if self.sound_speed is not None:
+            distance = distance * self.sound_speed
+        return lateral, distance
+
+
+def _moved(iterate: Iterate, name: str, tangent: Vector) -> Vector | None:
+    values = iterate.extra(name)
+    if values is None:
+        return None
+    at = block_slice(iterate.blocks, name)
+    steps = tangent[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
+    if name == "delay":
+        return [value[:, None] + step for value, step in zip(values, steps, strict=True)]
+    return [value[:, None] * jnp.exp(step) for value, step in zip(values, steps, strict=True)]
+
+
+class Component(eqx.Module):
+    """Residual planes that share one SD.
+
+    Attributes:
+        errors: planes (lanes, n), or (lanes, n, elements), mm.
+        present: 1 where there is a residual, beside the images' mask; None for everywhere.
+    """
+
+    errors: Vector
+    present: Array | None = None
+
+
+class Observation(eqx.Module):
+    """The interface.
+
+    Attributes:
+        sigma: SD of each component, mm; ones where residuals are not in SDs.
+    """
+
+    sigma: eqx.AbstractVar[Float[Array, "components lanes"]]
+    whitened: ClassVar[bool] = True
+    """Whether residuals are in SDs; otherwise their variance is estimated from them."""
+
+    @abc.abstractmethod
+    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+        """Residuals of every image; one entry for each SD."""
+
+    def count(self, images: Images) -> Float[Array, "components lanes"]:
+        """How many residuals each component has."""
+        return jnp.broadcast_to(images.used, self.sigma.shape)
+
+    def with_sigma(self, sigma: Float[Array, "components lanes"]) -> Observation:
+        """The same with other SDs."""
+        return eqx.tree_at(lambda observation: observation.sigma, self, sigma)
+
+    def largest_weight(self) -> Float[Array, " lanes"]:
+        """How much a mm of error can be in a whitened residual, 1/mm."""
+        return 1 / jnp.min(self.sigma, axis=0)
+
+    def padded(self) -> Observation:
+        """For images that are padded."""
+        return self
+
+    def in_units(self, sigma: Float[Array, "components lanes"]) -> Observation:
+        """The residuals whose SDs are about to be tuned, at their present values."""
+        del sigma
+        return self
+
+    def planar_weight(self) -> Float[Array, "3 lanes"] | None:
+        """Weights of q - p(0), 1/mm^2, with which this is nearly the same; None for none."""
+        return None
+
+
+class Points(Observation):
+    """Lateral position, range and elevational offset, each with its SD (mm); y_i is q_y itself."""
+
+    sigma: Float[Array, "3 lanes"]
+
+    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+        lateral, distance = errors(q, further, images)
+        return [Component([lateral]), Component([distance]), Component([q[1]])]
+
+    def planar_weight(self) -> Float[Array, "3 lanes"]:
+        lateral, axial, across = self.sigma
+        return 1 / jnp.stack([lateral**2, across**2, axial**2])
+
+
+def errors(q: Vector, further: Further, images: Images) -> tuple[Array, Array]:
+    """Error of lateral position and of range, mm, of every image."""
+    lateral, distance = further.points(images)
+    square = q[1] * q[1] + q[2] * q[2]
+    return q[0] - lateral, square * jax.lax.rsqrt(square) - distance
+
+
+class OwnCovariances(Observation):
+    """Points whose errors have a covariance of their own in every image.
+
+    Attributes:
+        sigma: SDs of lateral position, range and offset, mm; with ``tied``, of the measurements'
+            common factor and of the offset.
+        shape: lateral variance, covariance, range variance of every image; without ``tied`` their
+            mean variances are 1, with it they are in mm^2 up to one factor.
+        ratio: range SD over lateral SD, as far as whitening needs it.
+        tied: whether one factor is the SD of both measurements (static).
+    """
+
+    sigma: Float[Array, "components lanes"]
+    shape: Float[Array, "3 lanes n"]
+    ratio: Float[Array, " lanes"]
+    tied: bool = eqx.field(static=True, default=False)
+
+    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+        lateral, distance = errors(q, further, images)
+        # The 2x2 Cholesky factor written out; a mm of lateral error is ratio mm of range error.
+        first = jnp.sqrt(self.shape[0])
+        mixed = self.shape[1] / first
+        second = jnp.sqrt(self.shape[2] - mixed * mixed)
+        one = lateral / first
+        other = (distance - self.ratio[:, None] * mixed * one) / second
+        if self.tied:
+            return [Component([one, other]), Component([q[1]])]
+        return [Component([one]), Component([other]), Component([q[1]])]
+
+    def count(self, images: Images) -> Float[Array, "components lanes"]:
+        used = images.used
+        return jnp.stack([2 * used, used] if self.tied else [used] * 3)
+
+    def in_units(self, sigma: Float[Array, "components lanes"]) -> OwnCovariances:
+        if self.tied:
+            return self
+        ratio = sigma[1] / sigma[0]
+        # Before the first pass SDs are infinite, and say nothing of their ratio.
+        ratio = jnp.where(jnp.isfinite(ratio), ratio, self.ratio)
+        return eqx.tree_at(lambda o: o.ratio, self, ratio)
+
+    def with_sigma(self, sigma: Float[Array, "components lanes"]) -> Observation:
+        return super().with_sigma(sigma).in_units(sigma)
+
+    def padded(self) -> OwnCovariances:
+        return eqx.tree_at(lambda o: o.shape, self, whole(self.shape))
+
+
+def variance_planes(covariance: Float[Array, "lanes n 2 2"]) -> Float[Array, "3 lanes n"]:
+    """Lateral variance, covariance and range variance as planes."""
+    return jnp.stack([covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]])
+
+
+def unit_shape(
+    variances: Float[Array, "3 lanes n"], images: Images
+) -> tuple[Float[Array, "3 lanes n"], Float[Array, "2 lanes"]]:
+    """Covariances scaled so that the used images' mean variances are 1, and those means, mm^2.
+
+    Covariances of zero (exact data) have no shape: they become unit matrices of mean 1.
+    """
+    mean = jnp.sum(images.mask * variances[::2], axis=2) / images.used
+    known = jnp.all(mean > 0, axis=0)
+    mean = jnp.where(known, mean, 1.0)
+    scale = 1 / jnp.sqrt(mean)
+    by = jnp.stack([scale[0] * scale[0], scale[0] * scale[1], scale[1] * scale[1]])
+    unit = jnp.asarray([1.0, 0.0, 1.0], variances.dtype)[:, None, None]
+    shaped = known[:, None] & (images.mask > 0)
+    return jnp.where(shaped, variances * by[..., None], unit), mean
+
+
+class Channels(Observation):
+    """Distance of the target from every element that heard it, and the elevational offset.
+
+    With the sound speed s times the nominal one, and a delay worth d mm, an element at distance
+    |q - e| measures |q - e| / s + d. On a curvilinear probe an image's distances say something of
+    |y_i|, through Eq. 6, and nothing of its sign; poses that share one X and one target settle it.
+
+    Attributes:
+        sigma: SDs of an element's distance and of the offset, mm.
+    """
+
+    sigma: Float[Array, "2 lanes"]
+
+    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+        channels = images.channels
+        assert channels is not None
+        square = 0.0
+        for value, element in zip(q, channels.elements, strict=True):
+            square = square + (value[..., None] - element[:, None, :]) ** 2
+        exact = jnp.sqrt(square)
+        if further.sound_speed is not None:
+            exact = exact / further.sound_speed[..., None]
+        if further.delay is not None:
+            exact = exact + further.delay[..., None]
+        return [Component([exact - channels.distances], channels.heard), Component([q[1]])]
+
+    def count(self, images: Images) -> Float[Array, "2 lanes"]:
+        assert images.channels is not None
+        heard = jnp.sum(images.mask[..., None] * images.channels.heard, axis=(1, 2))
+        return jnp.stack([heard, images.used])
+
+
+def _unit(images: Images) -> Float[Array, "1 lanes"]:
+    return jnp.ones((1, images.lanes), images.mask.dtype)
+
+
+def on_circle(q: Vector, y: Array, further: Further, images: Images) -> Vector:
+    """Q - p(y), mm: the residuals of Eq. 7 at a given offset."""
+    lateral, distance = further.points(images)
+    return [q[0] - lateral, q[1] - y, q[2] - jnp.sqrt(distance * distance - y * y)]
+
+
+class InPlane(Observation):
+    """q - p(0), every target taken to lie in the image plane: the conventional Eq. 7, mm.
+
+    Attributes:
+        sigma: one.
+    """
+
+    sigma: Float[Array, "1 lanes"]
+    whitened: ClassVar[bool] = False
+
+    @classmethod
+    def of(cls, images: Images) -> InPlane:
+        """For these images."""
+        return cls(_unit(images))
+
+    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+        lateral, distance = further.points(images)
+        return [Component([q[0] - lateral, q[1], q[2] - distance])]
+
+
+class HeldOffsets(Observation):
+    """q - p(y) with the offsets y held, mm.
+
+    Attributes:
+        sigma: one.
+        offset: y, mm.
+    """
+
+    sigma: Float[Array, "1 lanes"]
+    offset: Float[Array, "lanes n"]
+    whitened: ClassVar[bool] = False
+
+    @classmethod
+    def of(cls, offset: Float[Array, "lanes n"], images: Images) -> HeldOffsets:
+        """For these images."""
+        return cls(_unit(images), offset)
+
+    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+        return [Component(on_circle(q, self.offset, further, images))]
+
+    def padded(self) -> HeldOffsets:
+        # A padded image's range is that of the last one, and so is its offset.
+        return eqx.tree_at(lambda o: o.offset, self, whole(self.offset))
+
+
+class LocalUnknown(Observation):
+    """An observation with one more unknown in every image, which is eliminated there."""
+
+    @abc.abstractmethod
+    def local(self, q: Vector, further: Further, images: Images) -> tuple[Array, Array]:
+        """The best value for given q, and 1 where it may move (0 where it rests on a bound)."""
+
+    @abc.abstractmethod
+    def components_at(
+        self, q: Vector, local: Array, further: Further, images: Images
+    ) -> list[Component]:
+        """:meth:`components` at a value of that unknown."""
+
+    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+        return self.components_at(q, self.local(q, further, images)[0], further, images)
+
+
+def local_unknowns(
+    iterate: Iterate, observation: LocalUnknown, images: Images
+) -> Float[Array, "lanes n"]:
+    """Every image's own unknown at its best; 0 for images left out."""
+    q, _ = targets(iterate, images)
+    still = [jnp.zeros_like(images.mask[:, :1])] * iterate.extras.shape[0]
+    return images.mask * observation.local(q, Further.of(iterate, still), images)[0]
+
+
+class BoundedOffsets(LocalUnknown):
+    """|y_i| <= bound_i and equal weights: the objective that the paper's alternation descends.
+
+    Attributes:
+        sigma: one.
+        bound: m_i, mm; above 0.95 of an image's range it is taken as that.
+    """
+
+    sigma: Float[Array, "1 lanes"]
+    bound: Float[Array, "lanes n"]
+    whitened: ClassVar[bool] = False
+
+    @classmethod
+    def of(cls, bound: Float[Array, "lanes n"], images: Images) -> BoundedOffsets:
+        """For these images."""
+        return cls(_unit(images), bound)
+
+    def limit(self, further: Further, images: Images) -> Array:
+        """The largest |y_i|, mm."""
+        return jnp.minimum(self.bound, LARGEST_ELEVATION * jnp.abs(further.points(images)[1]))
+
+    def local(self, q: Vector, further: Further, images: Images) -> tuple[Array, Array]:
+        """The y_i of the point closest to q_i on the arc |y| <= bound (section 2.4), mm.
+
+        On the circle the distance grows with the angle away from q_i, so the closest point of the
+        arc is the closest point of the circle where that lies on the arc, else its nearer end.
+        """
+        limit, distance = self.limit(further, images), further.points(images)[1]
+        square = q[1] * q[1] + q[2] * q[2]
+        closest = distance * q[1] * jax.lax.rsqrt(square)
+        # Behind the transducer the arc's nearer end is the one on q's side.
+        behind = jnp.where(q[1] < 0, -limit, limit)
+        free = jnp.where(q[2] > 0, closest, behind)
+        return jnp.clip(free, -limit, limit), jnp.where(jnp.abs(free) < limit, 1.0, 0.0)
+
+    def components_at(
+        self, q: Vector, local: Array, further: Further, images: Images
+    ) -> list[Component]:
+        return [Component(on_circle(q, local, further, images))]
+
+    def padded(self) -> BoundedOffsets:
+        return eqx.tree_at(lambda o: o.bound, self, whole(self.bound))
+
+
+class TrackedPoints(LocalUnknown):
+    """Points whose tracker has isotropic errors of SD tau beside those of the measurements.
+
+    The tracker's error moves the target along all three axes. Along the lateral axis and the range
+    it adds to the SDs; along the elevational axis it tells q_y from the offset y_i = q_y + tau u_i,
+    with u_i ~ N(0, 1) the unknown of the image, which stays well scaled as tau goes to 0.
+
+    Attributes:
+        sigma: SDs of lateral position, range and offset, mm.
+        tracker_sd: tau, mm.
+        shape: as in :class:`OwnCovariances`, or None.
+    """
+
+    sigma: Float[Array, "3 lanes"]
+    tracker_sd: Float[Array, " lanes"]
+    shape: Float[Array, "3 lanes n"] | None = None
+
+    def components_at(
+        self, q: Vector, local: Array, further: Further, images: Images
+    ) -> list[Component]:
+        # Each residual in units of its component's SD, which do not hold the tracker's share.
+        tau = self.tracker_sd[:, None]
+        offset = q[1] + tau * local
+        lateral, distance = errors([q[0], offset, q[2]], further, images)
+        sigma = [value[:, None] for value in self.sigma]
+        wide = [jnp.hypot(sigma[0], tau), jnp.hypot(sigma[1], tau)]
+        one, other = lateral / wide[0], distance / wide[1]
+        if self.shape is not None:
+            first = jnp.sqrt(self.shape[0])
+            mixed = self.shape[1] / first
+            one = one / first
+            other = (other - mixed * one) / jnp.sqrt(self.shape[2] - mixed * mixed)
+        return [
+            Component([one * sigma[0]]),
+            Component([other * sigma[1]]),
+            Component([offset, local * sigma[2]]),
+        ]
+
+    def local(self, q: Vector, further: Further, images: Images) -> tuple[Array, Array]:
+        def halved(local: Array) -> Array:
+            parts = self.components_at(q, local, further, images)
+            weighed = [
+                (error / sd[:, None]) ** 2
+                for part, sd in zip(parts, self.sigma, strict=True)
+                for error in part.errors
+            ]
+            return 0.5 * add(*weighed)
+
+        def slope(local: Array) -> Array:
+            return jax.jvp(halved, (local,), (jnp.ones_like(local),))[1]
+
+        # Where the offset alone would put it: the range moves that by little.
+        tau, across = self.tracker_sd[:, None], self.sigma[2][:, None]
+        local = -tau * q[1] / (across * across + tau * tau)
+        for _ in range(TRACKER_STEPS):
+            force, bend = jax.jvp(slope, (local,), (jnp.ones_like(local),))
+            local = local - force / jnp.maximum(bend, 1.0)
+        return local, jnp.ones_like(local)
+
+    def padded(self) -> TrackedPoints:
+        if self.shape is None:
+            return self
+        return eqx.tree_at(lambda o: o.shape, self, whole(self.shape))
+
+
+class Medium(eqx.Module):
+    """What is known of sound speed and delay before the data are seen.
+
+    Attributes:
+        sd: of the sound speed (relative) and of the delay (mm) about their nominal values.
+        blocks: the free unknowns (static).
+    """
+
+    sd: Float[Array, "2 lanes"]
+    blocks: Blocks = eqx.field(static=True)
+
+    def repeated(self, times: int) -> Medium:
+        """The same in so many times the lanes."""
+        return Medium(jnp.tile(self.sd, (1, times)), self.blocks)
+
+    def deviations(self, iterate: Iterate) -> list[tuple[int, Array, Array]]:
+        """Place, deviation from nominal and its precision, of every further unknown there is."""
+        found = []
+        for name, sd in zip(("sound-speed", "delay"), self.sd, strict=True):
+            value = iterate.extra(name)
+            if value is not None:
+                away = jnp.log(value[0]) if name == "sound-speed" else value[0]
+                found.append((block_slice(self.blocks, name).start, away, 1 / (sd * sd)))
+        return found

@@ -1,0 +1,256 @@
+"""Our Levenberg-Marquardt for other people's problems, behind optimistix's interface.
+
+The loop is that of :mod:`jaxcal.solvers.levenberg_marquardt`, which wants normal equations and a
+step; here they come from residuals of any shape by forward tangents, one for each unknown.
+:class:`LevenbergMarquardt` goes into ``optimistix.least_squares`` like any solver of optimistix,
+which then also has the derivatives of the solution. :func:`arrow_least_squares` is for problems
+with shared unknowns and one local unknown a row: one tangent of ones reads the derivatives by all
+local unknowns, since row i sees its own only, and they are eliminated by scalar divisions,
+
+    S = A - sum_i E_i E_i' / D_i,     S dx = -(g - sum_i E_i d_i / D_i),
+    dy_i = -(d_i + E_i' dx) / D_i,
+
+with A, g of the shared unknowns, D_i, d_i of the local ones and E_i between them: O(n p^2) a step
+where a dense solver takes O(n (n + p)^2).
+
+Reference: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment: a modern synthesis", 2000,
+section 6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jaxcal.geometry import AnyArray
+from jaxcal.model import unrolled
+from jaxcal.model.unrolled import Vector
+from jaxcal.solvers.levenberg_marquardt import (
+    Descent,
+    Rounding,
+    default_tolerance,
+    iterate_once,
+)
+from jaxcal.solvers.normal_equations import Normal
+
+
+class Flat(eqx.Module):
+    """Unknowns of one lane as a vector, and a local unknown a row where there are some.
+
+    Attributes:
+        shared: the unknowns.
+        local: a row's own; None where there are none.
+        slope: how the local unknowns follow a step: by dy = -(rest + slope dx).
+        rest: see there.
+        limit: largest magnitude of the local unknowns.
+    """
+
+    shared: Float[Array, "p 1"]
+    local: Float[Array, "n 1"] | None = None
+    slope: Float[Array, "n p 1"] | None = None
+    rest: Float[Array, "n 1"] | None = None
+    limit: Float[Array, "n 1"] | None = None
+
+    def moved(self, step: Vector) -> Flat:
+        """After a step of the shared unknowns."""
+        by = jnp.stack(step)
+        local = self.local
+        if local is not None:
+            assert self.slope is not None
+            assert self.rest is not None
+            assert self.limit is not None
+            along = local - self.rest - jnp.sum(self.slope * by, axis=1)
+            local = jnp.clip(along, -self.limit, self.limit)
+        return Flat(self.shared + by, local, self.slope, self.rest, self.limit)
+
+
+class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """The package's Levenberg-Marquardt as a solver of optimistix, for dense residuals.
+
+    Attributes:
+        tolerance: gradient cosine to stop at: the largest between the residuals and a column of
+            their Jacobian.
+        damping: first lambda, relative to the diagonal.
+    """
+
+    tolerance: float = 1e-10
+    damping: float = 1e-3
+    # What optimistix asks every solver for; ours stops by its own rule.
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable[[PyTree], Array] = optx.max_norm
+
+    def init(
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
+    ) -> tuple[Descent, Rounding, Any]:
+        flat, _ = ravel_pytree(y)
+        start = Flat(flat[:, None])
+        state = Descent.before(start, jnp.zeros(1, flat.dtype), self.damping)
+        value, aux = fn(y, args)
+        size = jnp.max(jnp.abs(ravel_pytree(value)[0]))[None]
+        rounding = jnp.finfo(flat.dtype).eps * size
+        return state, Rounding(rounding, 0.0 * rounding), aux
+
+    def step(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> tuple:
+        descent, rounding, aux = state
+        _, unravel = ravel_pytree(y)
+
+        def equations(place: Flat, exact: Array) -> Normal:
+            def residual(shared: Array) -> Array:
+                return ravel_pytree(fn(unravel(shared), args)[0])[0]
+
+            return _normal(residual, place.shared[:, 0])
+
+        after = iterate_once(descent, equations, rounding, self.tolerance, 2**30, exact_below=0.0)
+        found = unravel(after.place.shared[:, 0])
+        return found, (after, rounding, aux), aux
+
+    def terminate(
+        self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        descent, _, _ = state
+        done = jnp.logical_not(descent.active[0])
+        lost = done & jnp.logical_not(descent.settled[0])
+        result = optx.RESULTS.where(
+            lost, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+        )
+        return done, result
+
+    def postprocess(
+        self,
+        fn: Any,
+        y: Any,
+        aux: Any,
+        args: Any,
+        options: Any,
+        state: Any,
+        tags: Any,
+        result: optx.RESULTS,
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        return y, fn(y, args)[1], {}
+
+
+def _normal(residual: Callable[[Array], Array], here: Float[Array, " p"]) -> Normal:
+    """Gauss-Newton's normal equations of dense residuals, as those of one lane."""
+    value, push = jax.linearize(residual, here)
+    jacobian = jax.vmap(push)(jnp.eye(here.shape[0], dtype=here.dtype))
+    return _packed(jacobian @ jacobian.T, jacobian @ value, jnp.sum(value**2), None)
+
+
+def _packed(matrix: Array, gradient: Array, cost: Array, squares: Array | None) -> Normal:
+    rows = [[matrix[i, j][None] for j in range(len(matrix))] for i in range(len(matrix))]
+    wide = None if squares is None else squares[:, None]
+    return Normal(jnp.stack(unrolled.upper(rows)), gradient[:, None], cost[None], wide)
+
+
+def arrow_least_squares(
+    residual: Callable[[Any, Float[Array, " n"], Any], Float[Array, "n columns"]],
+    shared: Any,
+    local: Float[AnyArray, " n"],
+    args: Any = None,
+    *,
+    limit: Float[AnyArray, " n"] | float = jnp.inf,
+    damping: float = 1e-3,
+    tolerance: float | None = None,
+    max_steps: int = 100,
+    throw: bool = True,
+) -> optx.Solution:
+    """Minimise any sum of squares with shared unknowns and one local unknown a row.
+
+    Args:
+        residual: from (shared, local, args) to (n, columns); row i depends on local[i] only.
+        shared: first value of the shared unknowns, any pytree of floating arrays.
+        local: first value of the local unknowns, one a row.
+        args: what the residuals are differentiable in: derivatives of the solution with respect to
+            it are optimistix's implicit ones.
+        limit: bound on the magnitude of the local unknowns; inf where there is none.
+        damping: first Levenberg-Marquardt lambda relative to the diagonal.
+        tolerance: gradient cosine to stop at; by default 1e-10 in float64, 1e-4 in float32.
+        max_steps: most linearisations.
+        throw: raise where ``max_steps`` do not suffice; else the solution's ``result`` says so.
+
+    Returns:
+        optimistix's solution; its ``value`` is (shared, local).
+    """
+    flat, unravel = ravel_pytree(shared)
+    first = (flat, jnp.asarray(local, flat.dtype))
+    bound = jnp.broadcast_to(jnp.asarray(limit, flat.dtype), first[1].shape)
+
+    def function(unknowns: tuple[Array, Array], args: Any) -> Float[Array, "n columns"]:
+        return residual(unravel(unknowns[0]), unknowns[1], args)
+
+    solver = _ArrowSolver(
+        tolerance=default_tolerance(flat.dtype) if tolerance is None else tolerance,
+        damping=damping,
+        limit=bound,
+    )
+    solution = optx.least_squares(function, solver, first, args, max_steps=max_steps, throw=throw)
+    found = solution.value
+    return eqx.tree_at(lambda s: s.value, solution, (unravel(found[0]), found[1]))
+
+
+class _ArrowSolver(LevenbergMarquardt):
+    """The same for unknowns (shared, local)."""
+
+    limit: Float[Array, " n"] = eqx.field(default=None)  # pyright: ignore[reportAssignmentType]
+
+    def init(
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
+    ) -> tuple[Descent, Rounding, Any]:
+        value, aux = fn(y, args)
+        place = self._at(fn, y, args)[0]
+        state = Descent.before(place, jnp.zeros(1, place.shared.dtype), self.damping)
+        rounding = jnp.finfo(place.shared.dtype).eps * jnp.max(jnp.abs(value))[None]
+        return state, Rounding(rounding, 0.0 * rounding), aux
+
+    def step(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> tuple:
+        descent, rounding, aux = state
+        here = descent.candidate
+        candidate, normal = self._at(fn, (here.shared[:, 0], here.local[:, 0]), args)
+        # The candidate's own derivatives say how its local unknowns follow the next step.
+        descent = eqx.tree_at(lambda state: state.candidate, descent, candidate)
+        after = iterate_once(
+            descent, lambda place, exact: normal, rounding, self.tolerance, 2**30, exact_below=0.0
+        )
+        place = after.place
+        return (place.shared[:, 0], place.local[:, 0]), (after, rounding, aux), aux
+
+    def _at(self, fn: Any, y: tuple[Array, Array], args: Any) -> tuple[Flat, Normal]:
+        """The place with its derivatives, and the normal equations without local unknowns."""
+
+        def residual(shared: Array, local: Array) -> Array:
+            return fn((shared, local), args)[0]
+
+        value, push = jax.linearize(residual, *y)
+        ones, still = jnp.ones_like(y[1]), jnp.zeros_like(y[0])
+        jacobian = jax.vmap(lambda unit: push(unit, 0 * ones))(
+            jnp.eye(len(still), dtype=still.dtype)
+        )
+        own = push(still, ones)
+        diagonal, pull = jnp.sum(own**2, axis=1), jnp.sum(own * value, axis=1)
+        coupling = jnp.einsum("anm,nm->na", jacobian, own)
+        held = (y[1] >= self.limit) & (pull <= 0) | (y[1] <= -self.limit) & (pull >= 0)
+        give = jnp.where(held | (diagonal <= 0), 0.0, 1 / jnp.where(diagonal > 0, diagonal, 1.0))
+        shared = jnp.einsum("anm,bnm->ab", jacobian, jacobian)
+        gradient = jnp.einsum("anm,nm->a", jacobian, value)
+        normal = _packed(
+            shared - (coupling * give[:, None]).T @ coupling,
+            gradient - (give * pull) @ coupling,
+            jnp.sum(value**2),
+            jnp.diagonal(shared),
+        )
+        place = Flat(
+            y[0][:, None],
+            y[1][:, None],
+            (give[:, None] * coupling)[..., None],
+            (give * pull)[:, None],
+            self.limit[:, None],
+        )
+        return place, normal

@@ -1,0 +1,104 @@
+"""The paper's first step: gradient descent on the Euclidean group over all pairs of images.
+
+It minimises sum_{i<j} |B_i X p_i - B_j X p_j|^2; the target is no unknown there. Since
+sum_{i<j} |a_i - a_j|^2 = n sum_i |a_i - mean a|^2, the pairs cost no more than the points, and the
+minimiser is that of Eq. 7 with c the mean; the path to it is not. It is kept for comparison.
+
+Reference: Ackerman, Cheng, Boctor, Chirikjian, "Online ultrasound sensor calibration using gradient
+descent on the Euclidean group", ICRA 2014.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from jaxcal.model.batch import Images, Iterate
+from jaxcal.model.observations import Further, InPlane
+from jaxcal.model.unrolled import rows_of
+from jaxcal.options import Options
+from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
+from jaxcal.solvers.normal_equations import accumulate
+from jaxcal.solvers.other import Fit
+
+
+class SteepestDescent(optx.AbstractGradientDescent):
+    """optimistix's gradient descent with an Armijo search in place of a fixed step."""
+
+    rtol: float
+    atol: float
+    norm: Callable
+    descent: optx.SteepestDescent  # pyright: ignore[reportIncompatibleVariableOverride]
+    search: optx.BacktrackingArmijo  # pyright: ignore[reportIncompatibleVariableOverride]
+    verbose: Callable[..., None] = eqx.field(static=True, default=lambda **_: None)
+
+
+def reconstructed(place: Iterate, images: Images) -> Float[Array, "3 lanes n"]:
+    """B_i X p_i, the target as reconstructed from every image, in the tracker's frame, mm."""
+    still = [jnp.zeros_like(images.mask[:, :1])] * place.extras.shape[0]
+    lateral, distance = Further.of(place, still).points(images)
+    in_probe = place.rotation[:, 0, :, None] * lateral + place.rotation[:, 2, :, None] * distance
+    in_probe = in_probe + place.translation[..., None]
+    poses = images.rotation.reshape(3, 3, *images.mask.shape)
+    return jnp.sum(poses * in_probe, axis=1) + images.origin
+
+
+def pairwise_gradient(start: Iterate, images: Images, options: Options) -> Fit:
+    """The historical gradient descent of one problem, from a start.
+
+    Args:
+        start: first value of the unknowns; pixel scales are held.
+        images: the data, of one lane.
+        options: a step that lowers the objective by less than ``gradient_tolerance`` of it and
+            moves X by less than that fraction of a radian, or of the lever arm, is the last.
+    """
+    count = images.used
+    # In units of the lever arm a radian moves the target as far as a millimetre of translation
+    # does; without it steepest descent zigzags for tens of thousands of steps.
+    squares = images.mask * (images.lateral**2 + images.distance**2)
+    lever = jnp.sqrt(jnp.sum(squares, axis=1) / count)
+    unit = jnp.concatenate([jnp.broadcast_to(lever, (3,)), jnp.ones(3, lever.dtype)])
+    rest = jnp.zeros(start.unknowns - 6, lever.dtype)
+
+    def moved(tangent: Float[Array, 6]) -> Iterate:
+        return start.moved(rows_of(jnp.concatenate([unit * tangent, rest])[:, None]))
+
+    def target(place: Iterate) -> Float[Array, "3 lanes"]:
+        return jnp.sum(images.mask * reconstructed(place, images), axis=2) / count
+
+    def cost(tangent: Float[Array, 6], _: None) -> Float[Array, ""]:
+        place = moved(tangent)
+        away = reconstructed(place, images) - target(place)[..., None]
+        # The mean over pairs in units of the lever arm: an objective of order one.
+        return jnp.sum(images.mask * away**2) / jnp.sum(count * lever**2)
+
+    solver = SteepestDescent(
+        rtol=options.gradient_tolerance,
+        atol=options.gradient_tolerance,
+        norm=optx.max_norm,
+        descent=optx.SteepestDescent(),
+        search=optx.BacktrackingArmijo(step_init=1.0),
+    )
+    steps = 100 * options.max_iterations
+    found = optx.minimise(cost, solver, jnp.zeros(6, lever.dtype), max_steps=steps, throw=False)
+    place = moved(found.value)
+    place = eqx.tree_at(lambda it: it.point, place, target(place))
+    observation = InPlane.of(images)
+    normal = accumulate(place, observation, images, None)
+    rounding = Rounding.of(start, observation, images)
+    trace = None
+    if options.trace:
+        trace = jnp.full((options.trace, images.lanes), jnp.nan, lever.dtype)
+    return Fit(
+        place,
+        normal.cost,
+        gradient_cosine(normal, rounding.vanished),
+        (found.result == optx.RESULTS.successful)[None],
+        jnp.asarray(found.stats["num_steps"], jnp.int32)[None],
+        observation.sigma,
+        trace,
+    )

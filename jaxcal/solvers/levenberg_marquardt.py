@@ -1,0 +1,420 @@
+"""Levenberg-Marquardt on many problems side by side, one pass over the images an iteration.
+
+Every lane has its own damping, gate and stopping rule; a lane that has arrived waits for its
+neighbours with its answer kept. An iteration looks at the lanes' candidates: the cost decides
+whether a candidate is taken, and the same sums are already the normal equations for the next. The
+first candidate is the start, so that one loop body is all there is to compile.
+
+The acceptance rule is that of More (1978) with Nielsen's (1999) constants: a step is taken where
+the cost falls by a ten-thousandth of what the quadratic model predicts, the damping falls where it
+falls by a quarter of it, and grows tenfold where a step is refused. :func:`judge_step` has it, for
+every loop of the package. Steps are Gauss-Newton's where the gradient cosine is above
+:data:`EXACT_BELOW`, and exact Newton steps below it; where the exact matrix is indefinite the same
+place is looked at again without second derivatives.
+
+A lane stops when the largest cosine between its residual and a column of its Jacobian is below the
+tolerance, when its residuals are nothing but rounding, or when steps no longer gain more than that.
+Newton's steps square what is left: from a cosine whose square is well below the tolerance, the
+last step is taken and not looked at again.
+
+The loop needs normal equations and a retraction, not residuals; :mod:`jaxcal.solvers.general` puts
+it behind optimistix's interface for residuals of any shape.
+
+References: More, "The Levenberg-Marquardt algorithm: implementation and theory", 1978; Nielsen,
+"Damping parameter in Marquardt's method", 1999.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxcal.model import unrolled
+from jaxcal.model.batch import Images, Iterate, barrier, choose
+from jaxcal.model.observations import LocalUnknown, Medium, Observation
+from jaxcal.model.unrolled import Vector
+from jaxcal.solvers.normal_equations import Normal, accumulate
+
+ENOUGH = 1e-4
+"""Share of the predicted decrease that a step has to bring to be taken."""
+
+GOOD = 0.25
+"""Share of the predicted decrease above which the damping falls."""
+
+LESS, LESS_EXACT, MORE = 0.1, 1e-4, 10.0
+"""Factors of the damping after a good Gauss-Newton step, a good exact one, a refused one."""
+
+LEAST_DAMPING, LARGEST_DAMPING = 1e-8, 1e12
+"""Least damping after a refused step, and that above which a lane gives up."""
+
+EXACT_BELOW = 0.2
+"""Gradient cosine below which second derivatives are exact."""
+
+SQUARED = 100.0
+"""The cosine after an exact Newton step, over the square of that before it, is taken to be below
+this. From below 1e-6, the worst of 1,024 simulated problems came to 2.3e-12."""
+
+SMALL = 1e-11
+"""Predicted relative decrease of the cost above which no step is the last unseen one."""
+
+IDLE = 4
+"""Steps in a row without a gain above rounding before a lane is called settled."""
+
+
+class Place(Protocol):
+    """A value of the unknowns, lanes last; a pytree."""
+
+    def moved(self, step: Vector) -> Any:
+        """The same after a step."""
+        ...
+
+
+Equations = Callable[[Any, Float[Array, " lanes"]], Normal]
+"""Normal equations at a place, with exact second derivatives where a gate is 1."""
+
+
+class Judged(eqx.Module):
+    """What a step brought.
+
+    Attributes:
+        accept: it is taken.
+        damping: Marquardt's lambda for the next.
+        idle: steps in a row without a gain.
+    """
+
+    accept: Bool[Array, " lanes"]
+    damping: Float[Array, " lanes"]
+    idle: Int[Array, " lanes"]
+
+
+def judge_step(
+    decrease: Float[Array, " lanes"],
+    predicted: Float[Array, " lanes"],
+    half_cost: Float[Array, " lanes"],
+    rounding: Float[Array, " lanes"],
+    damping: Float[Array, " lanes"],
+    idle: Int[Array, " lanes"],
+    *,
+    exact: Bool[Array, " lanes"],
+    retry: Bool[Array, " lanes"],
+    less_exact: float = LESS_EXACT,
+) -> Judged:
+    """The acceptance rule.
+
+    Args:
+        decrease: of half the cost.
+        predicted: what the quadratic model said.
+        half_cost: before the step.
+        rounding: of one whitened residual.
+        damping: of the step.
+        idle: steps in a row without a gain before it.
+        exact: it came from exact second derivatives.
+        retry: it was no step, but the same place once more.
+        less_exact: factor of the damping after a good exact step.
+    """
+    # Each residual is off by its rounding, so half their sum of squares by this much.
+    noise = 8 * jnp.finfo(half_cost.dtype).eps * half_cost + 2 * rounding * jnp.sqrt(half_cost)
+    accept = (decrease >= ENOUGH * predicted - noise) | retry
+    good = (decrease >= GOOD * predicted - noise) & jnp.logical_not(retry)
+    # The exact matrix needs no damping; a Gauss-Newton one is wanted less and less.
+    factor = jnp.where(good, jnp.where(exact, less_exact, LESS), 1.0)
+    raised = jnp.maximum(MORE * damping, LEAST_DAMPING)
+    gained = jnp.where(decrease > noise, 0, idle + 1)
+    return Judged(
+        accept,
+        jnp.where(accept, factor * damping, raised),
+        jnp.where(accept & jnp.logical_not(retry), gained, idle),
+    )
+
+
+class Descent(eqx.Module):
+    """The state of every lane.
+
+    Attributes:
+        place: the best so far.
+        cost: there; sum of squared (whitened) residuals.
+        cosine: the gradient cosine there; after a last step that was not looked at, its bound.
+        candidate: the place to look at next.
+        retry: that is the place once more, with more damping or without second derivatives.
+        exact_used: 1 where the step to the candidate came from an exact curvature.
+        exact_next: 1 where the candidate's curvature is to be exact.
+        damping: Marquardt's lambda.
+        predicted: decrease of half the cost by the step.
+        idle: steps in a row without a gain.
+        iterations: places looked at.
+        settled: arrived, as far as rounding allows.
+        active: the lane goes on.
+        trace: best cost after each of the first looks; NaN beyond the last; None: not kept.
+    """
+
+    place: Any
+    cost: Float[Array, " lanes"]
+    cosine: Float[Array, " lanes"]
+    candidate: Any
+    retry: Bool[Array, " lanes"]
+    exact_used: Float[Array, " lanes"]
+    exact_next: Float[Array, " lanes"]
+    damping: Float[Array, " lanes"]
+    predicted: Float[Array, " lanes"]
+    idle: Int[Array, " lanes"]
+    iterations: Int[Array, " lanes"]
+    settled: Bool[Array, " lanes"]
+    active: Bool[Array, " lanes"]
+    trace: Float[Array, "trace lanes"] | None = None
+
+    @classmethod
+    def before(
+        cls, start: Any, number: Float[Array, " lanes"], damping: float, *, trace: int = 0
+    ) -> Descent:
+        """Nothing looked at yet.
+
+        Args:
+            start: the first candidate.
+            number: zeros of the lanes' shape.
+            damping: first lambda, relative to the diagonal.
+            trace: how many values of the cost to keep.
+        """
+        no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
+        return cls(
+            place=start,
+            cost=number + jnp.inf,
+            cosine=number + jnp.inf,
+            candidate=start,
+            retry=~no,
+            exact_used=number,
+            exact_next=number,
+            damping=number + damping,
+            predicted=number,
+            idle=count,
+            iterations=count,
+            settled=no,
+            active=~no,
+            trace=jnp.full((trace, *number.shape), jnp.nan, number.dtype) if trace else None,
+        )
+
+
+class Rounding(eqx.Module):
+    """What rounding of the coordinates leaves of residuals, in each lane.
+
+    Attributes:
+        residual: of one whitened residual.
+        vanished: the cost below which it is all there is.
+    """
+
+    residual: Float[Array, " lanes"]
+    vanished: Float[Array, " lanes"]
+
+    @classmethod
+    def of(cls, iterate: Iterate, observation: Observation, images: Images) -> Rounding:
+        """From the size of the coordinates."""
+        return cls.at(reach(iterate, images), observation.largest_weight(), images)
+
+    @classmethod
+    def at(cls, reach: Array, weight: Array, images: Images) -> Rounding:
+        """From that size and the largest weight of a mm."""
+        one = jnp.finfo(reach.dtype).eps * reach * weight
+        return cls(one, 3 * images.mask.shape[1] * (2 * one) ** 2)
+
+
+def reach(iterate: Iterate, images: Images) -> Float[Array, " lanes"]:
+    """The largest coordinate of a lane's poses and target, mm."""
+    away = jnp.max(images.mask * jnp.max(jnp.abs(images.origin), axis=0), axis=1)
+    return jnp.maximum(away, jnp.max(jnp.abs(iterate.point), axis=0))
+
+
+def gradient_cosine(normal: Normal, vanished: Float[Array, " lanes"]) -> Float[Array, " lanes"]:
+    """max_k |g_k| / (|J_k| |r|), 0 where the residuals vanish; NaN in a lost lane."""
+    length = jnp.sqrt(jnp.abs(normal.diagonal()) * normal.cost)
+    cosine = jnp.max(jnp.abs(normal.gradient) / jnp.where(length > 0, length, 1.0), axis=0)
+    cosine = jnp.where(jnp.isfinite(normal.cost), cosine, jnp.nan)
+    return jnp.where(normal.cost <= vanished, 0.0, cosine)
+
+
+def damped_step(
+    normal: Normal, damping: Float[Array, " lanes"]
+) -> tuple[Vector, Float[Array, " lanes"], Bool[Array, " lanes"]]:
+    """The damped step, the decrease of half the cost that it predicts, and whether it is lost.
+
+    It is lost where the matrix is not positive definite; the step is zero there.
+    """
+    matrix, gradient = normal.matrix(), unrolled.rows_of(normal.gradient)
+    damping = damping + 16 * jnp.finfo(damping.dtype).eps
+    diagonal = [jnp.where(entry > 0, entry, 1.0) for entry in normal.diagonal()]
+    for k, entry in enumerate(diagonal):
+        matrix[k][k] = matrix[k][k] + damping * entry
+    move = unrolled.solve(matrix, [-value for value in gradient])
+    move = unrolled.rows_of(barrier(jnp.stack(move)))
+    lost = jnp.logical_not(jnp.isfinite(sum(move)))
+    move = [jnp.where(lost, 0.0, value) for value in move]
+    heavy = sum(d * m * m for d, m in zip(diagonal, move, strict=True))
+    predicted = 0.5 * (damping * heavy - unrolled.dot(gradient, move))
+    return unrolled.rows_of(barrier(jnp.stack(move))), predicted, lost
+
+
+def iterate_once(
+    state: Descent,
+    equations: Equations,
+    rounding: Rounding,
+    tolerance: float,
+    max_steps: int,
+    *,
+    undamped: bool = False,
+    less_exact: float = LESS_EXACT,
+    exact_below: float = EXACT_BELOW,
+) -> Descent:
+    """Every active lane's candidate looked at, and the next one chosen.
+
+    Normal equations are used where they are made and then forgotten: it is cheaper to look at a
+    place again, where a step from there has failed, than to keep them for every lane.
+    """
+    normal = barrier(equations(state.candidate, state.exact_next))
+
+    half = 0.5 * jnp.where(state.retry, normal.cost, state.cost)
+    judged = judge_step(
+        half - 0.5 * normal.cost,
+        state.predicted,
+        half,
+        rounding.residual,
+        state.damping,
+        state.idle,
+        exact=state.exact_used > 0,
+        retry=state.retry,
+        less_exact=less_exact,
+    )
+    accept, damping, idle = judged.accept, judged.damping, judged.idle
+    if undamped:
+        accept, damping = jnp.isfinite(normal.cost), jnp.zeros_like(damping)
+
+    place = choose(accept & state.active, state.candidate, state.place)
+    cost = jnp.where(accept, normal.cost, state.cost)
+    cosine = jnp.where(accept, gradient_cosine(normal, rounding.vanished), state.cosine)
+    move, predicted, lost = damped_step(normal, damping)
+    lost = lost & accept
+    # Indefinite: the same place again without second derivatives, or with more damping.
+    more = jnp.maximum(MORE * damping, LEAST_DAMPING)
+    damping = jnp.where(lost & (state.exact_next == 0), more, damping)
+    retry = lost | jnp.logical_not(accept)
+    candidate = choose(retry, place, state.candidate.moved(move))
+
+    iterations = state.iterations + 1
+    stuck = (idle >= IDLE) | (damping > LARGEST_DAMPING) | (iterations >= max_steps)
+    left = SQUARED * cosine * cosine
+    last = (
+        (state.exact_next > 0)
+        & (damping < 1e-6)
+        & jnp.logical_not(retry)
+        & (left <= tolerance)
+        & (predicted <= SMALL * cost)
+        & (cosine > tolerance)
+    )
+    exact_next = (cosine < exact_below) & jnp.logical_not(lost | undamped)
+    trace = state.trace
+    if trace is not None:
+        rows = jnp.arange(trace.shape[0])[:, None]
+        trace = jnp.where(rows == state.iterations, cost, trace)
+    after = Descent(
+        place=place,
+        cost=cost,
+        cosine=jnp.where(last, left, cosine),
+        candidate=candidate,
+        retry=retry,
+        exact_used=jnp.where(accept, state.exact_next, state.exact_used),
+        exact_next=jnp.where(exact_next, 1.0, 0.0).astype(half.dtype),
+        damping=damping,
+        predicted=predicted,
+        idle=idle,
+        iterations=iterations,
+        settled=(cosine <= 10 * tolerance) | last | (idle >= IDLE),
+        active=(cosine > tolerance) & jnp.logical_not(stuck | last),
+        trace=trace,
+    )
+    after = choose(state.active, after, eqx.tree_at(lambda old: old.place, state, place))
+    return eqx.tree_at(
+        lambda new: new.place, after, choose(last & state.active, candidate, after.place)
+    )
+
+
+def descend(
+    begun: Descent,
+    equations: Equations,
+    rounding: Rounding,
+    tolerance: float,
+    max_steps: int,
+    *,
+    undamped: bool = False,
+    less_exact: float = LESS_EXACT,
+) -> Descent:
+    """Steps until no lane is active."""
+
+    def one(state: Descent) -> Descent:
+        return iterate_once(
+            state,
+            equations,
+            rounding,
+            tolerance,
+            max_steps,
+            undamped=undamped,
+            less_exact=less_exact,
+        )
+
+    return jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun)
+
+
+def minimise(
+    start: Iterate,
+    observation: Observation,
+    images: Images,
+    *,
+    medium: Medium | None = None,
+    damping: float = 1e-3,
+    tolerance: float | None = None,
+    max_steps: int = 100,
+    trace: int = 0,
+) -> Descent:
+    """Minimise every lane's objective.
+
+    Args:
+        start: unknowns to start from.
+        observation: the objective.
+        images: the data.
+        medium: what is known of sound speed and delay besides.
+        damping: first lambda, relative to the diagonal; 0 for Gauss-Newton, which takes every step.
+        tolerance: gradient cosine to stop at; by default 1e-10 in float64, 1e-4 in float32.
+        max_steps: most passes.
+        trace: how many values of the cost to keep.
+
+    Returns:
+        Where every lane stopped.
+    """
+    if tolerance is None:
+        tolerance = default_tolerance(images.mask.dtype)
+    images, observation = barrier((images.padded(), observation.padded()))
+    rounding = barrier(Rounding.of(start, observation, images))
+    undamped = damping == 0
+
+    def equations(iterate: Iterate, exact: Array) -> Normal:
+        return accumulate(iterate, observation, images, None if undamped else exact, medium)
+
+    begun = Descent.before(start, jnp.zeros_like(images.mask[:, 0]), damping, trace=trace)
+    # Where offsets reach or leave their bounds the curvature jumps: an exact step says little of
+    # the next one.
+    less_exact = LESS if isinstance(observation, LocalUnknown) else LESS_EXACT
+    return descend(
+        begun,
+        equations,
+        rounding,
+        tolerance,
+        max_steps,
+        undamped=undamped,
+        less_exact=less_exact,
+    )
+
+
+def default_tolerance(dtype: jnp.dtype) -> float:
+    """Gradient cosine that a precision can reach."""
+    return 1e-10 if float(jnp.finfo(dtype).eps) < 1e-10 else 1e-4

@@ -1,0 +1,309 @@
+"""Every method on a batch of problems, as one pure function of arrays.
+
+The conventional fit from the closed-form start; the method itself from there; derivatives by the
+implicit function theorem; the average over the offsets' laws where they are to be weighed. One
+problem is a batch of one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxcal.model.batch import Images, Iterate
+from jaxcal.model.observations import (
+    BoundedOffsets,
+    Channels,
+    InPlane,
+    Medium,
+    Observation,
+    OwnCovariances,
+    Points,
+    TrackedPoints,
+    local_unknowns,
+    unit_shape,
+    variance_planes,
+)
+from jaxcal.model.parameters import MEDIUM
+from jaxcal.options import DEFAULT_MAX_ELEVATION_MM, Given, Plan
+from jaxcal.problem import Problem
+from jaxcal.solvers import implicit
+from jaxcal.solvers.alternating import alternate, bounded
+from jaxcal.solvers.auto import OffsetLaw, average_over_laws
+from jaxcal.solvers.gradient_descent import pairwise_gradient
+from jaxcal.solvers.levenberg_marquardt import minimise
+from jaxcal.solvers.other import minimise_with, self_tuned_with
+from jaxcal.solvers.reml import floored, self_tuned
+from jaxcal.solvers.start import ConventionalStart, conventional
+from jaxcal.sound import WATER_M_S
+
+HELD_SIGMA = (0.5, 0.5, 1.0)
+"""SDs of lateral position, range and offset (mm), where too few images leave them unknown."""
+
+HELD_CHANNEL_SIGMA = (0.5, 1.0)
+"""SDs of an element's distance and of the offset (mm), likewise."""
+
+
+class Solution(eqx.Module):
+    """Where a method stopped; lanes last, but for the law.
+
+    Attributes:
+        place: X, c and the further unknowns.
+        observation: the objective there, with its SDs.
+        medium: what was known of sound speed and delay besides, or None.
+        offset: y_i, mm, where offsets are bounded unknowns of their own; else None.
+        cost: sum of squared (whitened) residuals.
+        cosine: gradient cosine.
+        arrived: it stopped because it had arrived.
+        iterations: passes over the images, or rounds of the alternation.
+        variance_rounds: of these, passes that updated SDs.
+        sigma_floored: which SDs rest on their floor.
+        rotation_change: of the alternation's last round, rad.
+        translation_change: likewise, mm.
+        trace: the objective's values; None: not kept.
+        searched: whether the start had to be searched for.
+        covariance: of the unknowns over all laws of the offsets, where they were weighed.
+        elevation_sd: likewise, of the offsets, mm.
+        law: likewise, what was found out.
+    """
+
+    place: Iterate
+    observation: Observation
+    medium: Medium | None
+    offset: Float[Array, "lanes n"] | None
+    cost: Float[Array, " lanes"]
+    cosine: Float[Array, " lanes"]
+    arrived: Bool[Array, " lanes"]
+    iterations: Int[Array, " lanes"]
+    variance_rounds: Int[Array, " lanes"]
+    sigma_floored: Bool[Array, "components lanes"]
+    rotation_change: Float[Array, " lanes"]
+    translation_change: Float[Array, " lanes"]
+    trace: Float[Array, "trace lanes"] | None
+    searched: Bool[Array, " lanes"]
+    covariance: Float[Array, "p p lanes"] | None = None
+    elevation_sd: Float[Array, "lanes n"] | None = None
+    law: OffsetLaw | None = None
+
+
+def solve(
+    problems: Problem, given: Given, plan: Plan, begun: ConventionalStart | None = None
+) -> Solution:
+    """Solve a batch (one leading axis) whose images left out hold harmless values.
+
+    Args:
+        problems: the batch.
+        given: numbers that came with the request.
+        plan: what is static about it.
+        begun: their conventional fits, where they have been made before.
+    """
+    # The solvers see constants; their answers become functions of the data again afterwards.
+    frozen, numbers = jax.lax.stop_gradient((problems, given))
+    begun = begin(frozen, plan) if begun is None else begun
+    found = run(begun, frozen, numbers, plan)
+    images = Images.of(problems, channels=plan.channels)
+    if plan.options.differentiate:
+        found = _attached(found, images, problems, given, plan)
+    if not plan.laws:
+        return found
+    return _averaged(found, images, problems, plan)
+
+
+def begin(problems: Problem, plan: Plan) -> ConventionalStart:
+    """The conventional fits from which every method starts."""
+    alone = plan.method == "conventional"
+    return conventional(
+        Images.of(problems),
+        plan.blocks,
+        max_steps=plan.options.max_iterations,
+        undamped=alone and plan.options.solver == "gauss-newton",
+        trace=plan.options.trace if alone else 0,
+    )
+
+
+def observe(
+    problems: Problem, images: Images, given: Given, plan: Plan
+) -> tuple[Observation, Medium | None]:
+    """The plan's objective; where SDs are tuned, with those to hold instead."""
+    if plan.prior == "none":
+        return InPlane.of(images), None
+    if plan.prior == "bounded":
+        bound = problems.max_elevation
+        if bound is None:
+            bound = jnp.full_like(images.mask, DEFAULT_MAX_ELEVATION_MM)
+        return BoundedOffsets.of(bound, images), None
+    held = HELD_CHANNEL_SIGMA if plan.channels else HELD_SIGMA
+    dtype = images.mask.dtype
+    sigma = jnp.asarray(held, dtype) if given.sigma is None else given.sigma
+    sigma = jnp.broadcast_to(sigma[:, None], (len(held), images.lanes))
+    medium = None
+    if given.medium_sd is not None and any(name in plan.blocks for name in MEDIUM):
+        speed = nominal_sound_speed(problems)
+        # A delay in s is a distance in mm at the nominal speed.
+        sd = jnp.stack([given.medium_sd[0] / speed, given.medium_sd[1] * speed * 1e3])
+        medium = Medium(sd, plan.blocks)
+    if plan.channels:
+        return Channels(sigma), medium
+    shape = None
+    # Where laws are weighed, so are the covariances, and the first fit does without.
+    if problems.covariance is not None and not plan.laws:
+        shape, _ = unit_shape(variance_planes(problems.covariance), images)
+    if given.tracker_sd is not None:
+        tracker = jnp.broadcast_to(given.tracker_sd, sigma.shape[1:])
+        return TrackedPoints(sigma, tracker, shape), medium
+    if shape is not None:
+        return OwnCovariances(sigma, shape, sigma[1] / sigma[0]), medium
+    return Points(sigma), medium
+
+
+def nominal_sound_speed(problem: Problem) -> Float[Array, "*batch"]:
+    """By which the problem's times of flight became distances, m/s; water's where unknown."""
+    if problem.sound_speed is None:
+        return jnp.full(problem.batch_shape, WATER_M_S, problem.mask.dtype)
+    return problem.sound_speed
+
+
+def run(begun: ConventionalStart, problems: Problem, given: Given, plan: Plan) -> Solution:
+    """The plan's method from conventional fits."""
+    options, other = plan.options, plan.other_solver
+    images = Images.of(problems, channels=plan.channels)
+    observation, medium = observe(problems, images, given, plan)
+    zero = jnp.zeros_like(images.mask[:, 0])
+    components = observation.sigma.shape[0]
+
+    def solution(found: Any, arrived: Array, **others: Any) -> Solution:
+        common = {
+            "place": found.place,
+            "observation": observation,
+            "medium": medium,
+            "offset": None,
+            "cost": found.cost,
+            "cosine": found.cosine,
+            "arrived": arrived,
+            "iterations": found.iterations,
+            "variance_rounds": jnp.zeros(zero.shape, jnp.int32),
+            "sigma_floored": jnp.zeros((components, *zero.shape), bool),
+            "rotation_change": zero,
+            "translation_change": zero,
+            "trace": getattr(found, "trace", None),
+            "searched": begun.searched,
+        }
+        return Solution(**(common | others))
+
+    start = begun.fit.place
+    if plan.method == "conventional":
+        fit = begun.fit
+        if options.solver == "gradient":
+            fit = pairwise_gradient(begun.start, images, options)
+        if other is not None:
+            fit = minimise_with(other, begun.start, observation, images, None, options)
+        return solution(fit, fit.settled)
+    if isinstance(observation, BoundedOffsets):
+        if plan.method == "alternating":
+            done = alternate(
+                start,
+                observation,
+                images,
+                tolerance_rad=options.tolerance_rad,
+                tolerance_mm=options.tolerance_mm,
+                max_rounds=options.max_rounds,
+                inner_steps=options.inner_steps,
+                trace=options.trace,
+            )
+            return solution(
+                done,
+                done.tolerance_met,
+                offset=done.offset,
+                rotation_change=done.rotation_change,
+                translation_change=done.translation_change,
+            )
+        fit = bounded(
+            start, observation, images, max_steps=options.max_iterations, trace=options.trace
+        )
+        return solution(fit, fit.settled, offset=local_unknowns(fit.place, observation, images))
+    if not plan.self_tuning:
+        if other is not None:
+            fit = minimise_with(other, start, observation, images, medium, options)
+        else:
+            fit = minimise(
+                start,
+                observation,
+                images,
+                medium=medium,
+                damping=1e-6,
+                max_steps=options.max_iterations,
+                trace=options.trace,
+            )
+        return solution(fit, fit.settled)
+    if other is not None:
+        tuned = self_tuned_with(other, start, observation, images, medium, options)
+    else:
+        tuned = self_tuned(
+            start,
+            observation,
+            images,
+            medium=medium,
+            max_rounds=options.max_iterations,
+            trace=options.trace,
+        )
+    return solution(
+        tuned,
+        tuned.settled,
+        observation=observation.with_sigma(tuned.updated),
+        sigma_floored=floored(tuned.updated),
+        variance_rounds=tuned.iterations,
+    )
+
+
+def _attached(
+    found: Solution, images: Images, problems: Problem, given: Given, plan: Plan
+) -> Solution:
+    """The solution as a differentiable function of the problems (and of given numbers)."""
+    observation, medium = observe(problems, images, given, plan)
+    if plan.self_tuning:
+        step, sigma = implicit.self_tuned_optimum(
+            found.place, found.observation.sigma, observation, images, medium
+        )
+        observation = observation.with_sigma(sigma)
+    else:
+        step = implicit.optimum(found.place, observation, images, medium)
+    place = found.place.moved([*step])
+    offset = found.offset
+    if isinstance(observation, BoundedOffsets):
+        offset = local_unknowns(place, observation, images)
+    return replace(found, place=place, observation=observation, medium=medium, offset=offset)
+
+
+def _averaged(found: Solution, images: Images, problems: Problem, plan: Plan) -> Solution:
+    """The average over the laws that the plan has."""
+    variances = None
+    if problems.covariance is not None and not plan.channels:
+        variances = variance_planes(problems.covariance)
+    over = average_over_laws(
+        found.place,
+        found.observation,
+        images,
+        plan.laws,
+        variances=variances,
+        bound=problems.max_elevation,
+        medium=found.medium,
+    )
+    observation = found.observation.with_sigma(over.sigma)
+    if variances is not None:
+        shape, _ = unit_shape(variances, images)
+        unit = jnp.asarray([1.0, 0.0, 1.0], shape.dtype)[:, None, None]
+        shape = jnp.where(over.own_covariances[:, None], shape, unit)
+        observation = OwnCovariances(over.sigma, shape, over.sigma[1] / over.sigma[0])
+    return replace(
+        found,
+        place=over.place,
+        observation=observation,
+        covariance=over.covariance,
+        elevation_sd=over.elevation_sd,
+        law=over.law,
+    )

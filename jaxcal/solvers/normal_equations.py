@@ -1,0 +1,463 @@
+"""One pass over the images: the normal equations of many problems in one fused reduction.
+
+Every objective here is a sum over images of phi_i(q_i, e), with q_i = X^-1 B_i^-1 c the target in
+image i's frame and e the further unknowns. What is particular to an observation
+(:mod:`jaxcal.model.observations`) ends at (q_i, e): it gives phi, its gradient g and its curvature
+K there. What remains is the same for all. With X = (R, t), B_i = (R_i, b_i), the right perturbation
+(v, w) of X and the step d of c,
+
+    q_i -> Exp(-w) (q_i - v + M_i d),     M_i = R' R_i',     q_i = M_i (c - b_i) - R' t,
+    dq/dv = -1,     dq/dw = [q]x,     dq/dd = M_i,
+
+so with J_i = (-1, [q]x, M_i) the gradient is sum J_i' g_i and the curvature sum J_i' K_i J_i, plus
+second derivatives of q itself: the symmetric part of g q' - (g.q) 1 in (w, w), [g]x M in (w, d),
+and [g]x in (v, w). All these sums and the cost come from one variadic reduction over the images,
+which XLA compiles to one loop: images are the minor axis, so it vectorises over them; nothing that
+belongs to an image is ever stored.
+
+An unknown y of the image itself is eliminated inside the pass: with D = phi_yy and b = phi_qy, the
+Schur complement of this image is K = phi_qq - b b' / D (the shared unknowns' part of the
+arrow-shaped system that X, c and all offsets make together; its cost is O(n p^2)).
+
+The curvature is Gauss-Newton's where a lane's ``gate`` is 0, and exact where it is 1: far from the
+optimum the exact one is indefinite, and near it Gauss-Newton crawls along what the data barely see.
+
+Reference: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment: a modern synthesis", 2000.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxcal.model import derivatives, unrolled
+from jaxcal.model.batch import RIGID_UNKNOWNS, Images, Iterate, targets, total
+from jaxcal.model.observations import Component, Further, LocalUnknown, Medium, Observation
+from jaxcal.model.unrolled import Entry, Matrix, Vector
+
+IN_IMAGE = 3
+"""Coordinates of q."""
+
+
+@cache
+def pairs(unknowns: int) -> list[tuple[int, int]]:
+    """Places of the upper triangle in a flat row."""
+    return [(i, j) for i in range(unknowns) for j in range(i, unknowns)]
+
+
+class Term(eqx.Module):
+    """phi_i of every image: twice its value, its gradient and its curvature in (q, e).
+
+    Attributes:
+        cost: planes, or 0.
+        gradient: by q and then e.
+        curvature: likewise, symmetric.
+    """
+
+    cost: Entry
+    gradient: Vector
+    curvature: Matrix
+
+
+class _Derived(eqx.Module):
+    """An observation's residuals with their derivatives by (q, e) and the image's own unknown.
+
+    Attributes:
+        components: the residuals.
+        slopes: of every component the rows of first derivatives.
+        bends: of every component the second derivatives, by (row, i, j).
+        free: 1 where the image's own unknown may move; None where there is none.
+    """
+
+    components: list[Component]
+    slopes: list[Matrix]
+    bends: list[dict[tuple[int, int, int], Entry]]
+    free: Array | None
+
+
+def _derive(
+    observation: Observation, q: Vector, iterate: Iterate, images: Images, *, exact: bool
+) -> _Derived:
+    """Look at an observation at the places q."""
+    still = jnp.zeros((images.lanes, 1), images.mask.dtype)
+    further = [still] * (iterate.unknowns - RIGID_UNKNOWNS)
+    arguments, free = [*q, *further], None
+    if isinstance(observation, LocalUnknown):
+        local, free = observation.local(q, Further.of(iterate, further), images)
+        arguments.append(local)
+
+    def evaluate(*at: Array) -> list[Component]:
+        beside = Further.of(iterate, list(at[IN_IMAGE : IN_IMAGE + len(further)]))
+        if isinstance(observation, LocalUnknown):
+            return observation.components_at(list(at[:IN_IMAGE]), at[-1], beside, images)
+        return observation.components(list(at[:IN_IMAGE]), beside, images)
+
+    components = evaluate(*arguments)
+    slopes, bends = [], []
+    for k in range(len(components)):
+
+        def errors(*at: Array, k=k) -> Vector:
+            return evaluate(*at)[k].errors
+
+        slopes.append(derivatives.first(errors, arguments)[1])
+        bends.append(derivatives.second(errors, arguments) if exact else {})
+    return _Derived(components, slopes, bends, free)
+
+
+def _over_elements(plane: Entry) -> Entry:
+    """A plane with an axis of elements summed over them."""
+    return plane if unrolled.is_zero(plane) or plane.ndim < 3 else jnp.sum(plane, axis=2)
+
+
+def _weight(component: Component, images: Images) -> Array:
+    """1 for every residual that is there."""
+    if component.errors[0].ndim < 3:
+        return images.mask if component.present is None else images.mask * component.present
+    mask = images.mask[..., None]
+    return mask if component.present is None else mask * component.present
+
+
+def _plain(derived: _Derived, k: int, images: Images) -> Term:
+    """Component k alone, unweighted, with Gauss-Newton's curvature."""
+    component, slopes = derived.components[k], derived.slopes[k]
+    width, weight = len(slopes[0]), _weight(component, images)
+    cost: Entry = 0
+    gradient: Vector = [0] * width
+    curvature: Matrix = [[0] * width for _ in range(width)]
+    for error, slope in zip(component.errors, slopes, strict=True):
+        pull = weight * error
+        heavy = [unrolled.times(weight, entry) for entry in slope]
+        cost = unrolled.add(cost, _over_elements(pull * error))
+        for i in range(width):
+            along = _over_elements(unrolled.times(pull, slope[i]))
+            gradient[i] = unrolled.add(gradient[i], along)
+            for j in range(i, width):
+                entry = _over_elements(unrolled.times(heavy[i], slope[j]))
+                curvature[i][j] = unrolled.add(curvature[i][j], entry)
+                curvature[j][i] = curvature[i][j]
+    return Term(cost, gradient, curvature)
+
+
+def _bent(derived: _Derived, k: int, images: Images) -> Matrix:
+    """What second derivatives of component k's residuals add to its curvature."""
+    component, width = derived.components[k], len(derived.slopes[k][0])
+    weight = _weight(component, images)
+    found: Matrix = [[0] * width for _ in range(width)]
+    for (row, i, j), bend in derived.bends[k].items():
+        entry = _over_elements(weight * component.errors[row] * bend)
+        found[i][j] = unrolled.add(found[i][j], entry)
+        found[j][i] = found[i][j]
+    return found
+
+
+def _summed(matrices: list[Matrix], weights: Vector) -> Matrix:
+    """The sum of symmetric matrices times planes."""
+    width = len(matrices[0])
+    found: Matrix = [[0] * width for _ in range(width)]
+    for i in range(width):
+        for j in range(i, width):
+            found[i][j] = found[j][i] = unrolled.add(
+                *(
+                    unrolled.times(weight, matrix[i][j])
+                    for weight, matrix in zip(weights, matrices, strict=True)
+                )
+            )
+    return found
+
+
+def _weighed(terms: list[Term], weights: list[Array]) -> Term:
+    """The sum of terms times planes."""
+    return Term(
+        unrolled.dot(weights, [term.cost for term in terms]),
+        [
+            unrolled.dot(weights, [term.gradient[i] for term in terms])
+            for i in range(len(terms[0].gradient))
+        ],
+        _summed([term.curvature for term in terms], weights),
+    )
+
+
+def _eliminated(term: Term, plain: Entry, free: Array) -> Term:
+    """A term without the image's own unknown, which is the last.
+
+    What is left of its slope makes one more Newton step, to first order.
+
+    Args:
+        term: with that unknown.
+        plain: its curvature by Gauss and Newton, for where the exact one is not positive.
+        free: 1 where it may move.
+    """
+    last = len(term.gradient) - 1
+    bend = jnp.where(term.curvature[last][last] > 0, term.curvature[last][last], plain)
+    give = jnp.where((free > 0) & (bend > 0), 1 / jnp.where(bend > 0, bend, 1.0), 0.0)
+    meets, slope = term.curvature[last][:last], term.gradient[last]
+    held = [unrolled.times(give, entry) for entry in meets]
+
+    def less(entry: Entry, by: Entry, other: Entry) -> Entry:
+        return unrolled.add(entry, unrolled.times(-1, unrolled.times(by, other)))
+
+    return Term(
+        less(term.cost, give * slope, slope),
+        [less(term.gradient[i], held[i], slope) for i in range(last)],
+        [[less(term.curvature[i][j], held[i], meets[j]) for j in range(last)] for i in range(last)],
+    )
+
+
+def _shared(term: Term) -> Term:
+    """A term without the image's own unknown, which is held."""
+    return Term(term.cost, term.gradient[:-1], [row[:-1] for row in term.curvature[:-1]])
+
+
+def contributions(
+    q: Vector, turned: Matrix, term: Term, gate: Float[Array, "lanes 1"] | int
+) -> tuple[Vector, Vector]:
+    """An image's part of the curvature (upper triangle) and the gradient, as planes or 0.
+
+    The gate says how much of the second derivatives of q there is to be; 0 for none. They come
+    with A = [q]x' K + [g]x in the place of [q]x' K: A M has all of (w, d), and A [q]x has (w, w)
+    but for an antisymmetric part that :func:`with_twist` takes from the summed gradient.
+    """
+    width = len(term.gradient)
+    unknowns = RIGID_UNKNOWNS + width - IN_IMAGE
+    g = term.gradient[:IN_IMAGE]
+    k = [row[:IN_IMAGE] for row in term.curvature[:IN_IMAGE]]
+    lever = unrolled.cross(q)
+    across, forth = unrolled.product(k, lever), unrolled.product(k, turned)
+    inverse = unrolled.transpose(turned)
+    bent = unrolled.cross([unrolled.times(gate, value) for value in g])
+    back = [
+        [unrolled.add(a, b) for a, b in zip(*rows, strict=True)]
+        for rows in zip(unrolled.transpose(across), bent, strict=True)
+    ]
+    about, mixed = unrolled.product(back, lever), unrolled.product(back, turned)
+    point = unrolled.product(inverse, forth)
+    full: Matrix = [[0] * unknowns for _ in range(unknowns)]
+    for i in range(3):
+        for j in range(3):
+            full[i][j] = k[i][j]
+            full[i][3 + j] = unrolled.times(-1, across[i][j])
+            full[i][6 + j] = unrolled.times(-1, forth[i][j])
+            full[3 + i][3 + j] = about[i][j]
+            full[3 + i][6 + j] = mixed[i][j]
+            full[6 + i][6 + j] = point[i][j]
+
+    def in_rigid(values: Vector) -> Vector:
+        """J' of a vector over q."""
+        found = [unrolled.times(-1, value) for value in values]
+        found += unrolled.apply(unrolled.transpose(lever), values)
+        return found + unrolled.apply(inverse, values)
+
+    for a in range(IN_IMAGE, width):
+        place = RIGID_UNKNOWNS + a - IN_IMAGE
+        column = in_rigid([term.curvature[i][a] for i in range(IN_IMAGE)])
+        for i in range(RIGID_UNKNOWNS):
+            full[i][place] = column[i]
+        for b in range(a, width):
+            full[place][RIGID_UNKNOWNS + b - IN_IMAGE] = term.curvature[a][b]
+    gradient = in_rigid(g) + term.gradient[IN_IMAGE:]
+    return [full[i][j] for i, j in pairs(unknowns)], gradient
+
+
+def with_twist(flat: Vector, gradient: Vector, unknowns: int) -> Vector:
+    """A flat curvature completed by what the summed gradient knows of q's second derivatives.
+
+    Args:
+        flat: sums of :func:`contributions`.
+        gradient: summed along v and w, times the gate. The first is -sum g: (v, w) gets [sum g]x.
+            The second is sum g x q: the upper half of A [q]x has q_i g_j where (w, w) has the mean
+            of that and q_j g_i.
+        unknowns: how many there are.
+    """
+    twist = unrolled.cross([-value for value in gradient[:3]])
+    skew = unrolled.cross([0.5 * value for value in gradient[3:6]])
+    flat, places = list(flat), pairs(unknowns)
+    for i in range(3):
+        for j in range(3):
+            place = places.index((i, 3 + j))
+            flat[place] = unrolled.add(flat[place], twist[i][j])
+            if j > i:
+                place = places.index((3 + i, 3 + j))
+                flat[place] = unrolled.add(flat[place], unrolled.times(-1, skew[i][j]))
+    return flat
+
+
+class Normal(eqx.Module):
+    """The normal equations of every lane at an iterate, lanes last.
+
+    Attributes:
+        curvature: upper triangle, in the order of :func:`pairs`.
+        gradient: of half the cost.
+        cost: sum of squared (whitened) residuals.
+        squares: |J_k|^2 of the unknowns' columns where images have unknowns of their own, whose
+            elimination leaves less than that on the diagonal; None where they are the same.
+    """
+
+    curvature: Float[Array, "triangle lanes"]
+    gradient: Float[Array, "p lanes"]
+    cost: Float[Array, " lanes"]
+    squares: Float[Array, "p lanes"] | None = None
+
+    def matrix(self) -> Matrix:
+        """The full matrix, as rows of lanes."""
+        return unrolled.symmetric(unrolled.rows_of(self.curvature))
+
+    def stacked(self) -> Float[Array, "p p lanes"]:
+        """The full matrix as one array."""
+        return stacked(self.curvature)
+
+    def diagonal(self) -> Float[Array, "p lanes"]:
+        """|J_k|^2 of every unknown: what damping and the gradient cosine are relative to."""
+        if self.squares is not None:
+            return self.squares
+        places = diagonal_places(self.gradient.shape[0])
+        return jnp.stack([self.curvature[k] for k in places])
+
+
+def stacked(flat: Float[Array, "triangle lanes"]) -> Float[Array, "p p lanes"]:
+    """A symmetric matrix from its upper triangle."""
+    return jnp.stack([jnp.stack(row) for row in unrolled.symmetric(unrolled.rows_of(flat))])
+
+
+def diagonal_places(unknowns: int) -> tuple[int, ...]:
+    """Where a flat upper triangle has the diagonal."""
+    return tuple(pairs(unknowns).index((k, k)) for k in range(unknowns))
+
+
+def accumulate(
+    iterate: Iterate,
+    observation: Observation,
+    images: Images,
+    gate: Float[Array, " lanes"] | None,
+    medium: Medium | None = None,
+) -> Normal:
+    """One pass: the normal equations at an iterate.
+
+    Args:
+        iterate: X, c and the further unknowns of every lane.
+        observation: whose residuals.
+        images: the data.
+        gate: 1 for exact second derivatives, 0 for Gauss-Newton's; None for the latter everywhere.
+        medium: what is known of sound speed and delay besides.
+    """
+    q, turned = targets(iterate, images)
+    wide = None if gate is None else gate[:, None]
+    derived = _derive(observation, q, iterate, images, exact=gate is not None)
+    weights = [(1 / (sd * sd))[:, None] for sd in observation.sigma]
+    count = len(derived.components)
+    term = _weighed([_plain(derived, k, images) for k in range(count)], weights)
+    whole, own_bend = term, term.curvature[-1][-1]
+    if wide is not None:
+        bent = [_bent(derived, k, images) for k in range(count)]
+        gated = [wide * weight for weight in weights]
+        term = Term(term.cost, term.gradient, _summed([term.curvature, *bent], [1, *gated]))
+    places = diagonal_places(iterate.unknowns)
+    columns: Vector = []
+    if derived.free is not None:
+        every, _ = contributions(q, turned, _shared(whole), 0)
+        columns = [every[k] for k in places]
+        term = _eliminated(term, own_bend, derived.free)
+    curvature, gradient = contributions(q, turned, term, 0 if wide is None else wide)
+    cost, *sums = total([term.cost, *curvature, *gradient, *columns])
+    flat, gradient = sums[: len(curvature)], sums[len(curvature) : len(curvature) + len(gradient)]
+    squares = sums[len(curvature) + len(gradient) :]
+    if gate is not None:
+        twist = [gate * value for value in gradient[:6]]
+        flat = with_twist(flat, twist, iterate.unknowns)
+    if medium is not None:
+        for k, away, precision in medium.deviations(iterate):
+            flat[places[k]] = flat[places[k]] + precision
+            gradient[k] = gradient[k] + precision * away
+            cost = cost + precision * away * away
+    lengths = jnp.stack(squares) if squares else None
+    return Normal(jnp.stack(flat), jnp.stack(gradient), cost, lengths)
+
+
+class ComponentSums(eqx.Module):
+    """What one pass leaves of the images for each component by itself, unweighted; lanes last.
+
+    Attributes:
+        squares: rss_k, mm^2.
+        gradient: g_k.
+        matrix: N_k, Gauss-Newton's, upper triangles.
+        rest: of the exact curvature with the SDs given, beside sum N_k / s_k^2; zeros without SDs.
+        known: what is known of the medium: cost, gradient, diagonal of the curvature.
+    """
+
+    squares: Float[Array, "k lanes"]
+    gradient: Float[Array, "k p lanes"]
+    matrix: Float[Array, "k triangle lanes"]
+    rest: Float[Array, "triangle lanes"]
+    known: tuple[Float[Array, " lanes"], Float[Array, "p lanes"], Float[Array, "p lanes"]] | None
+
+    def weighed(self, weight: Float[Array, "k lanes"]) -> Normal:
+        """Gauss-Newton's normal equations with weights 1/s_k^2."""
+        flat = jnp.sum(weight[:, None] * self.matrix, axis=0)
+        gradient = jnp.sum(weight[:, None] * self.gradient, axis=0)
+        cost = jnp.sum(weight * self.squares, axis=0)
+        if self.known is not None:
+            away, slope, diagonal = self.known
+            rows, places = unrolled.rows_of(flat), diagonal_places(slope.shape[0])
+            for place, entry in zip(places, diagonal, strict=True):
+                rows[place] = rows[place] + entry
+            flat, gradient, cost = jnp.stack(rows), gradient + slope, cost + away
+        return Normal(flat, gradient, cost)
+
+
+def component_sums(
+    iterate: Iterate,
+    observation: Observation,
+    images: Images,
+    sigma: Float[Array, "k lanes"] | None,
+    medium: Medium | None = None,
+) -> ComponentSums:
+    """One pass that keeps the components apart.
+
+    Args:
+        iterate: where.
+        observation: one without an unknown in every image.
+        images: the data.
+        sigma: SDs for the rest of the exact curvature, mm; None: it is left out.
+        medium: what is known of sound speed and delay besides.
+    """
+    q, turned = targets(iterate, images)
+    derived = _derive(observation, q, iterate, images, exact=sigma is not None)
+    count, unknowns = len(derived.components), iterate.unknowns
+    terms = [_plain(derived, k, images) for k in range(count)]
+    planes: Vector = [term.cost for term in terms]
+    each = unknowns + len(pairs(unknowns))
+    for term in terms:
+        matrix, gradient = contributions(q, turned, term, 0)
+        planes += [*gradient, *matrix]
+    if sigma is not None:
+        weights = [(1 / (sd * sd))[:, None] for sd in sigma]
+        weighed = _weighed(terms, weights)
+        bent = _summed([_bent(derived, k, images) for k in range(count)], weights)
+        # Of q's own second derivatives the weighted gradient knows.
+        planes += contributions(q, turned, Term(0, weighed.gradient, bent), 1)[0]
+    sums = total(planes)
+    squares, sums = sums[:count], sums[count:]
+    parts = [sums[k * each : (k + 1) * each] for k in range(count)]
+    gradient = jnp.stack([jnp.stack(part[:unknowns]) for part in parts])
+    if sigma is None:
+        rest = [jnp.zeros_like(squares[0])] * len(pairs(unknowns))
+    else:
+        twist = jnp.sum((1 / sigma**2)[:, None] * gradient[:, :6], axis=0)
+        rest = with_twist(sums[count * each :], unrolled.rows_of(twist), unknowns)
+    known = None
+    if medium is not None:
+        zero = jnp.zeros_like(squares[0])
+        away, slope, diagonal = zero, [zero] * unknowns, [zero] * unknowns
+        for k, value, precision in medium.deviations(iterate):
+            away = away + precision * value * value
+            slope[k], diagonal[k] = precision * value, precision + zero
+        known = (away, jnp.stack(slope), jnp.stack(diagonal))
+    return ComponentSums(
+        jnp.stack(squares),
+        gradient,
+        jnp.stack([jnp.stack(part[unknowns:]) for part in parts]),
+        jnp.stack(rest),
+        known,
+    )

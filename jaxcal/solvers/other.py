@@ -1,0 +1,172 @@
+"""Somebody else's optimistix solver in the place of ours, on the same residuals.
+
+Such a solver takes one problem at a time, here a batch of one, and stops by a rule of its own; a
+batch of many is a map over it. SDs are tuned as the historical method does: a whole weighted solve
+between two of Helmert's updates.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxcal.model.batch import Images, Iterate, choose, targets
+from jaxcal.model.observations import Further, Medium, Observation
+from jaxcal.model.unrolled import rows_of
+from jaxcal.options import Options
+from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
+from jaxcal.solvers.normal_equations import accumulate, component_sums
+from jaxcal.solvers.reml import MINIMUM_SELF_TUNING, update_at, with_floor
+
+
+class Fit(eqx.Module):
+    """Where the solver stopped; lanes last.
+
+    Attributes:
+        place: X, c and the further unknowns.
+        cost: sum of squared (whitened) residuals.
+        cosine: gradient cosine there.
+        settled: the solver says that it arrived.
+        iterations: the solver's steps.
+        updated: SDs after the last update, mm; those given where none are tuned.
+        trace: NaN: what the solver saw is not known.
+    """
+
+    place: Iterate
+    cost: Float[Array, " lanes"]
+    cosine: Float[Array, " lanes"]
+    settled: Bool[Array, " lanes"]
+    iterations: Int[Array, " lanes"]
+    updated: Float[Array, "k lanes"]
+    trace: Float[Array, "trace lanes"] | None
+
+
+def whitened_residuals(
+    place: Iterate, observation: Observation, images: Images, medium: Medium | None
+) -> Float[Array, "residuals lanes"]:
+    """All residuals of every lane in SDs, zeros where an image is left out; lanes last."""
+    q, _ = targets(place, images)
+    still = [jnp.zeros_like(images.mask[:, :1])] * place.extras.shape[0]
+    parts = []
+    found = observation.components(q, Further.of(place, still), images)
+    for component, sd in zip(found, observation.sigma, strict=True):
+        for error in component.errors:
+            present = images.mask if error.ndim == 2 else images.mask[..., None]
+            if component.present is not None:
+                present = present * component.present
+            white = present * error / sd.reshape(-1, *(1,) * (error.ndim - 1))
+            parts.append(white.reshape(images.lanes, -1).T)
+    if medium is not None:
+        parts += [
+            (away * jnp.sqrt(precision))[None] for _, away, precision in medium.deviations(place)
+        ]
+    return jnp.concatenate(parts)
+
+
+def minimise_with(
+    solver: optx.AbstractLeastSquaresSolver,
+    start: Iterate,
+    observation: Observation,
+    images: Images,
+    medium: Medium | None,
+    options: Options,
+) -> Fit:
+    """Minimise the objective of one problem.
+
+    Args:
+        solver: of optimistix.
+        start: unknowns to start from.
+        observation: the objective.
+        images: the data, of one lane.
+        medium: what is known of sound speed and delay besides.
+        options: with the most steps and the length of the trace.
+    """
+
+    def residual(step: Array, _: None) -> Array:
+        moved = start.moved(rows_of(step[:, None]))
+        return whitened_residuals(moved, observation, images, medium)[:, 0]
+
+    still = jnp.zeros(start.unknowns, images.mask.dtype)
+    found = optx.least_squares(
+        residual, solver, still, max_steps=options.max_iterations, throw=False
+    )
+    place = start.moved(rows_of(found.value[:, None]))
+    normal = accumulate(place, observation, images, None, medium)
+    rounding = Rounding.of(start, observation, images)
+    trace = None
+    if options.trace:
+        trace = jnp.full((options.trace, images.lanes), jnp.nan, images.mask.dtype)
+    return Fit(
+        place,
+        normal.cost,
+        gradient_cosine(normal, rounding.vanished),
+        (found.result == optx.RESULTS.successful)[None],
+        jnp.asarray(found.stats["num_steps"], jnp.int32)[None],
+        observation.sigma,
+        trace,
+    )
+
+
+def self_tuned_with(
+    solver: optx.AbstractLeastSquaresSolver,
+    start: Iterate,
+    observation: Observation,
+    images: Images,
+    medium: Medium | None,
+    options: Options,
+    *,
+    tolerance: float = 1e-9,
+    max_rounds: int = 60,
+) -> Fit:
+    """Weighted solves with Helmert's updates between them, until the SDs stand still.
+
+    Args:
+        solver: of optimistix.
+        start: the conventional fit.
+        observation: with the SDs to hold where there are too few images to estimate them.
+        images: the data, of one lane.
+        medium: what is known of sound speed and delay besides.
+        options: with the most steps of each solve.
+        tolerance: relative change of the SDs to stop at.
+        max_rounds: most updates.
+    """
+    enough = images.used >= MINIMUM_SELF_TUNING
+    squares = component_sums(start, observation, images, None, medium).squares
+    crude = with_floor(jnp.sqrt(squares / observation.count(images)))
+    first = jnp.where(enough, crude, observation.sigma)
+
+    def solve(place: Iterate, sigma: Array) -> Fit:
+        observed = observation.with_sigma(sigma)
+        fit = minimise_with(solver, place, observed, images, medium, options)
+        updated = update_at(fit.place, sigma, observation, images, medium)[1]
+        return eqx.tree_at(lambda f: f.updated, fit, updated)
+
+    def unfinished(state: tuple) -> Array:
+        _, _, rounds, change, _ = state
+        return jnp.any(change > tolerance) & (rounds < max_rounds)
+
+    def one_round(state: tuple) -> tuple:
+        fit, sigma, rounds, change, taken = state
+        after = solve(fit.place, sigma)
+        moving = change > tolerance
+        moved = jnp.max(jnp.abs(jnp.log(after.updated / sigma)), axis=0)
+        # A lane that is lost (NaN) must stop, not hold up its neighbours.
+        moved = jnp.where(jnp.isfinite(moved), moved, 0.0)
+        after, sigma, change, taken = choose(
+            moving,
+            (after, after.updated, moved, taken + after.iterations),
+            (fit, sigma, change, taken),
+        )
+        return after, sigma, rounds + 1, change, taken
+
+    shapes = jax.eval_shape(solve, start, first)
+    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    empty = eqx.tree_at(lambda fit: fit.place, empty, start)
+    one = jnp.ones_like(first[0])
+    state = (empty, first, jnp.zeros((), jnp.int32), one, jnp.zeros(one.shape, jnp.int32))
+    fit, _, _, change, taken = jax.lax.while_loop(unfinished, one_round, state)
+    done = fit.settled & (change <= tolerance)
+    return eqx.tree_at(lambda f: (f.settled, f.iterations), fit, (done, taken))

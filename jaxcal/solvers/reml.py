@@ -1,0 +1,399 @@
+"""Self-tuning: the SDs of the measurements and of the elevational offset from the data themselves.
+
+Restricted maximum likelihood (REML) by Helmert's iteration for variance components,
+
+    s_k^2 = |residual_k|^2 / (n_k - leverage_k),      leverage_k = tr(S^-1 N_k) / s_k^2,
+
+where leverage_k is the number of degrees of freedom that the unknowns take from component k. So no
+noise level and no maximum elevational distance is chosen by hand. The components are those of the
+observation in use: lateral position, range and offset, or the elements' distances and the offset.
+
+The pass keeps the components apart (:func:`jaxcal.solvers.normal_equations.component_sums`). To
+first order in the step d these sums are all there is to know, whatever the SDs:
+
+    H(s) = sum N_k / s_k^2,      d(s) = -(H(s) + C)^-1 sum g_k / s_k^2,
+    rss_k(d) = rss_k + 2 g_k' d + d' N_k d,
+    s_k^2 <- rss_k(d) / (n_k - tr(H(s)^-1 N_k) / s_k^2),
+
+so the SDs are updated a few times on these sums alone, the step that belongs to them is taken, and
+the next pass tells the truth. Steps are accepted by the decrease of the weighted cost with the new
+SDs, and damped as everywhere. A lane has arrived when, at one and the same place, the update leaves
+the SDs and the gradient leaves the unknowns where they are: the fixed point of Helmert's iteration.
+
+A component whose error truly vanishes (no noise, or every target in the plane) would drive its SD
+to zero and the weights to infinity; it is held at a thousandth of the largest SD, which is as good
+as exact for X. With too few images the SDs are held where they are given.
+
+References: Helmert 1924; Patterson and Thompson 1971 (REML); Foerstner 1979.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxcal.model import unrolled
+from jaxcal.model.batch import Images, Iterate, barrier, choose
+from jaxcal.model.observations import Medium, Observation
+from jaxcal.model.unrolled import Matrix, Vector, symmetric
+from jaxcal.solvers.levenberg_marquardt import (
+    IDLE,
+    LARGEST_DAMPING,
+    LEAST_DAMPING,
+    MORE,
+    Rounding,
+    default_tolerance,
+    gradient_cosine,
+    judge_step,
+    reach,
+)
+from jaxcal.solvers.normal_equations import (
+    ComponentSums,
+    Normal,
+    component_sums,
+    pairs,
+)
+
+MINIMUM_SELF_TUNING = 8
+"""With fewer used images the residuals cannot tell three SDs apart from nine unknowns."""
+
+RELATIVE_FLOOR = 1e-3
+ABSOLUTE_FLOOR_MM = 1e-6
+
+LEAST_FREEDOM = 0.05
+"""Least degrees of freedom of a component, as a share of its residuals."""
+
+EXACT_BELOW = 0.03
+"""Gradient cosine below which second derivatives are exact."""
+
+UPDATES = 3
+"""Updates of the SDs on the sums of one pass."""
+
+
+def least_sigma(sigma: Float[Array, " components ..."]) -> Float[Array, " ..."]:
+    """The floor of SDs, mm: a thousandth of the largest."""
+    return jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma, axis=0), ABSOLUTE_FLOOR_MM)
+
+
+def with_floor(sigma: Float[Array, " components ..."]) -> Float[Array, " components ..."]:
+    """The SDs, none below a thousandth of the largest."""
+    return jnp.maximum(sigma, least_sigma(sigma))
+
+
+def floored(sigma: Float[Array, " components ..."]) -> Bool[Array, " components ..."]:
+    """Which SDs rest on their floor."""
+    return sigma <= 1.001 * RELATIVE_FLOOR * jnp.max(sigma, axis=0)
+
+
+def helmert(
+    squares: Array, leverage: Array, count: Array, sigma: Float[Array, "k lanes"]
+) -> Float[Array, "k lanes"]:
+    """One update of the SDs, mm, without floor.
+
+    Args:
+        squares: sums of squared residuals, mm^2.
+        leverage: tr(S^-1 N_k), mm^2.
+        count: numbers of residuals.
+        sigma: the SDs with which S was made, mm.
+    """
+    freedom = jnp.maximum(count - leverage / sigma**2, LEAST_FREEDOM * count)
+    return jnp.sqrt(jnp.maximum(squares, 0.0) / freedom)
+
+
+class SelfTuned(eqx.Module):
+    """The state of every lane; at the end, its answer.
+
+    Attributes:
+        place: X, c and the further unknowns.
+        sigma: the SDs, mm.
+        updated: the SDs after one more update there.
+        cost: of the weighted residuals.
+        change: largest relative change of the SDs by that update.
+        cosine: gradient cosine.
+        candidate: the place to look at next.
+        proposed: the SDs there.
+        retry: that is the place once more, with more damping.
+        weighed: the SDs that belong to the step to the candidate.
+        half: half the cost before it, with these.
+        predicted: how much less it should be after it.
+        exact_used: 1 where the step came from exact second derivatives.
+        damping: Marquardt's lambda.
+        idle: steps in a row without a gain.
+        iterations: passes.
+        settled: arrived, as far as rounding allows.
+        active: the lane goes on.
+        trace: best cost after each of the first passes; NaN beyond the last; None: not kept.
+    """
+
+    place: Iterate
+    sigma: Float[Array, "k lanes"]
+    updated: Float[Array, "k lanes"]
+    cost: Float[Array, " lanes"]
+    change: Float[Array, " lanes"]
+    cosine: Float[Array, " lanes"]
+    candidate: Iterate
+    proposed: Float[Array, "k lanes"]
+    retry: Bool[Array, " lanes"]
+    weighed: Float[Array, "k lanes"]
+    half: Float[Array, " lanes"]
+    predicted: Float[Array, " lanes"]
+    exact_used: Float[Array, " lanes"]
+    damping: Float[Array, " lanes"]
+    idle: Int[Array, " lanes"]
+    iterations: Int[Array, " lanes"]
+    settled: Bool[Array, " lanes"]
+    active: Bool[Array, " lanes"]
+    trace: Float[Array, "trace lanes"] | None
+
+    @classmethod
+    def before(cls, start: Iterate, held: Float[Array, "k lanes"], trace: int) -> SelfTuned:
+        """Nothing looked at yet; with infinite SDs, the rest of the curvature vanishes."""
+        number = jnp.zeros_like(start.point[0])
+        no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
+        sigma = jnp.zeros_like(held) + jnp.inf
+        return cls(
+            place=start,
+            sigma=sigma,
+            updated=sigma,
+            cost=number,
+            change=number,
+            cosine=number,
+            candidate=start,
+            proposed=sigma,
+            retry=~no,
+            weighed=sigma,
+            half=number,
+            predicted=number,
+            exact_used=number,
+            damping=number + 1e-6,
+            idle=count,
+            iterations=count,
+            settled=no,
+            active=~no,
+            trace=jnp.full((trace, *number.shape), jnp.nan, number.dtype) if trace else None,
+        )
+
+
+class _Model(eqx.Module):
+    """The sums as rows of lanes."""
+
+    squares: Vector
+    gradient: list[Vector]
+    matrix: list[Vector]
+    rest: Vector
+
+    @classmethod
+    def of(cls, sums: ComponentSums) -> _Model:
+        """Unpack."""
+        return cls(
+            unrolled.rows_of(sums.squares),
+            [unrolled.rows_of(row) for row in sums.gradient],
+            [unrolled.rows_of(row) for row in sums.matrix],
+            unrolled.rows_of(sums.rest),
+        )
+
+    def step(self, normal: Normal, damping: Array, exact: Array) -> tuple[Vector, Matrix]:
+        """The step and Gauss-Newton's matrix with given weights; NaN where indefinite."""
+        flat = once(unrolled.rows_of(normal.curvature))
+        gradient = once(unrolled.rows_of(normal.gradient))
+        full = symmetric([h + exact * c for h, c in zip(flat, self.rest, strict=True)])
+        plain = symmetric(flat)
+        for k in range(len(full)):
+            full[k][k] = full[k][k] + damping * jnp.where(plain[k][k] > 0, plain[k][k], 1.0)
+        flat = once(unrolled.upper(full))
+        return once(unrolled.solve(symmetric(flat), [-g for g in gradient])), plain
+
+    def updated(
+        self,
+        sigma: Float[Array, "k lanes"],
+        move: Vector,
+        plain: Matrix,
+        count: Float[Array, "k lanes"],
+    ) -> Float[Array, "k lanes"]:
+        """Helmert's update after a step."""
+        unknowns, eps = len(move), jnp.finfo(count.dtype).eps
+        places = pairs(unknowns)
+        scale = once(
+            [jax.lax.rsqrt(jnp.where(plain[k][k] > 0, plain[k][k], 1.0)) for k in range(unknowns)]
+        )
+
+        def scaled(flat: Vector) -> Matrix:
+            return symmetric(
+                [v * scale[i] * scale[j] for (i, j), v in zip(places, flat, strict=True)]
+            )
+
+        unit = symmetric(once(unrolled.upper(scaled(unrolled.upper(plain)))))
+        for k in range(unknowns):
+            unit[k][k] = unit[k][k] + 16 * eps
+        leverage = unrolled.traces(unit, [scaled(matrix) for matrix in self.matrix])
+        left = []
+        for k, matrix in enumerate(self.matrix):
+            bent = [
+                (1 if i == j else 2) * entry * move[i] * move[j]
+                for (i, j), entry in zip(places, matrix, strict=True)
+            ]
+            left.append(self.squares[k] + 2 * unrolled.dot(self.gradient[k], move) + sum(bent))
+        return with_floor(helmert(jnp.stack(left), jnp.stack(leverage), count, sigma))
+
+
+def once(entries: Vector) -> Vector:
+    """The same entries, computed here and once."""
+    return unrolled.rows_of(barrier(jnp.stack(entries)))
+
+
+def self_tuned(
+    start: Iterate,
+    observation: Observation,
+    images: Images,
+    *,
+    medium: Medium | None = None,
+    tolerance: float | None = None,
+    max_rounds: int = 100,
+    trace: int = 0,
+) -> SelfTuned:
+    """Solve every lane, its SDs estimated by REML.
+
+    Args:
+        start: a conventional fit.
+        observation: with the SDs of lanes with too few images (fewer than 8 used ones) to
+            estimate them.
+        images: the data.
+        medium: what is known of sound speed and delay besides.
+        tolerance: relative change of the SDs to stop at; 1e-9 in float64, 1e-4 in float32. The
+            gradient cosine stops at a tenth of it (at the same in float32).
+        max_rounds: most passes.
+        trace: how many values of the objective to keep.
+    """
+    held, count = observation.sigma, observation.count(images)
+    enough = images.used >= MINIMUM_SELF_TUNING
+    eps = jnp.finfo(held.dtype).eps
+    standing = default_tolerance(images.mask.dtype)
+    if tolerance is None:
+        tolerance = 10 * standing if standing < 1e-9 else standing
+    images, observation = barrier((images.padded(), observation.padded()))
+    coordinates = barrier(reach(start, images))
+
+    def update(
+        sums: ComponentSums, sigma: Array, damping: Array, exact: Array
+    ) -> tuple[Array, Array, Array]:
+        """The step that belongs to SDs, the SDs after it, and where the matrix was indefinite."""
+        model = _Model.of(sums)
+        move, plain = model.step(sums.weighed(1 / sigma**2), damping, exact)
+        lost = jnp.logical_not(jnp.isfinite(sum(move)))
+        move = [jnp.where(lost, 0.0, value) for value in move]
+        after = barrier(model.updated(sigma, move, plain, count))
+        after = jnp.where(enough & jnp.isfinite(after), after, jnp.where(enough, sigma, held))
+        return jnp.stack(move), after, lost
+
+    def propose(sums: ComponentSums, sigma: Array, damping: Array, exact: Array) -> tuple:
+        """What the sums of a place say of the next: a few updates of the SDs and their step."""
+
+        def again(carry: tuple) -> tuple:
+            count, sigma, _, _, first, exact, _ = carry
+            move, after, lost = update(sums, sigma, damping, exact)
+            first = jnp.where(count == 0, after, first)
+            return count + 1, after, sigma, move, first, jnp.where(lost, 0.0, exact), lost
+
+        none = jnp.zeros_like(sums.gradient[0])
+        carry = (jnp.zeros((), jnp.int32), sigma, sigma, none, sigma, exact, exact > 1)
+        carry = jax.lax.while_loop(lambda carry: carry[0] < UPDATES, again, carry)
+        _, after, weighed, move, first, exact, lost = carry
+        normal = sums.weighed(1 / weighed**2)
+        held_back = damping * normal.diagonal() * move
+        predicted = 0.5 * jnp.sum(move * (held_back - normal.gradient), axis=0)
+        return move, after, weighed, first, exact, lost, 0.5 * normal.cost, predicted
+
+    def iterate_once(state: SelfTuned) -> SelfTuned:
+        observed = observation.in_units(state.proposed)
+        sums = barrier(component_sums(state.candidate, observed, images, state.proposed, medium))
+        crude = jnp.where(enough, with_floor(jnp.sqrt(sums.squares / count)), held)
+        proposed = jnp.where(state.iterations == 0, crude, state.proposed)
+        normal = sums.weighed(1 / proposed**2)
+        rounding = Rounding.at(coordinates, 1 / jnp.min(proposed, axis=0), images)
+        cosine = gradient_cosine(normal, rounding.vanished)
+
+        judged = judge_step(
+            state.half - 0.5 * sums.weighed(1 / state.weighed**2).cost,
+            state.predicted,
+            state.half,
+            rounding.residual,
+            state.damping,
+            state.idle,
+            exact=state.exact_used > 0,
+            retry=state.retry,
+        )
+        accept, damping, idle = judged.accept, judged.damping, judged.idle
+        place, sigma, cost, cosine = barrier(
+            choose(
+                accept & state.active,
+                (state.candidate, proposed, normal.cost, cosine),
+                (state.place, state.sigma, state.cost, state.cosine),
+            )
+        )
+
+        # Where the place was not taken, what its sums propose is not used.
+        exact = jnp.where(cosine <= EXACT_BELOW, 1.0, 0.0).astype(coordinates.dtype)
+        move, after, weighed, first, exact, bad, half, predicted = propose(
+            sums, sigma, damping + 16 * eps, exact
+        )
+        change = jnp.where(accept, jnp.max(jnp.abs(jnp.log(first / sigma)), axis=0), state.change)
+        there = (cosine <= standing) | (idle >= IDLE)
+        done = there & (change <= tolerance) & accept
+        more = jnp.maximum(MORE * damping, LEAST_DAMPING)
+        damping = jnp.where(bad & accept, more, damping)
+        iterations = state.iterations + 1
+        over = (damping > LARGEST_DAMPING) | (iterations >= max_rounds)
+        over = over | jnp.logical_not(jnp.isfinite(cost))
+        retry = bad | jnp.logical_not(accept)
+        recorded = state.trace
+        if recorded is not None:
+            rows = jnp.arange(recorded.shape[0])[:, None]
+            recorded = jnp.where(rows == state.iterations, cost, recorded)
+        new = SelfTuned(
+            place=place,
+            sigma=sigma,
+            updated=jnp.where(accept, first, state.updated),
+            cost=cost,
+            change=change,
+            cosine=cosine,
+            candidate=choose(retry, place, place.moved(unrolled.rows_of(barrier(move)))),
+            proposed=jnp.where(retry, sigma, after),
+            retry=retry,
+            weighed=weighed,
+            half=half,
+            predicted=predicted,
+            exact_used=exact,
+            damping=damping,
+            idle=idle,
+            iterations=iterations,
+            settled=done,
+            active=jnp.logical_not(done | over),
+            trace=recorded,
+        )
+        return choose(state.active, new, state)
+
+    begun = SelfTuned.before(barrier(start), held, trace)
+    return jax.lax.while_loop(lambda state: jnp.any(state.active), iterate_once, begun)
+
+
+def update_at(
+    place: Iterate,
+    sigma: Float[Array, "k lanes"],
+    observation: Observation,
+    images: Images,
+    medium: Medium | None,
+) -> tuple[Normal, Float[Array, "k lanes"]]:
+    """The normal equations with SDs, and the SDs after one update, at a place.
+
+    Both are functions whose fixed point :func:`self_tuned` finds; derivatives go through them
+    (:mod:`jaxcal.solvers.implicit`).
+    """
+    observed = observation.with_sigma(sigma)
+    sums = component_sums(place, observed, images, None, medium)
+    normal, model = sums.weighed(1 / sigma**2), _Model.of(sums)
+    still: Vector = [jnp.zeros_like(sigma[0])] * place.unknowns
+    updated = model.updated(sigma, still, normal.matrix(), observation.count(images))
+    enough = images.used >= MINIMUM_SELF_TUNING
+    return normal, jnp.where(enough, updated, observation.sigma)
