@@ -88,8 +88,11 @@ class Options:
             if not (np.isfinite(value) and value > 0):
                 raise InputError(f"{name} must be a positive number, not {value!r}")
         for name, least in (
-            ("max_rounds", 1), ("inner_steps", 1), ("max_iterations", 1), ("trace", 0)
-        ):  # fmt: skip
+            ("max_rounds", 1),
+            ("inner_steps", 1),
+            ("max_iterations", 1),
+            ("trace", 0),
+        ):
             if getattr(self, name) < least:
                 raise InputError(f"{name} must be at least {least}, not {getattr(self, name)}")
 
@@ -200,10 +203,12 @@ def prepare(problem: Problem, request: Request) -> tuple[Plan, Given]:
     blocks = RIGID + tuple(name for name in EXTRA if name in request.estimate)
     medium = None
     if kind == "gaussian" and any(name in blocks for name in MEDIUM):
-        medium = jnp.stack([jnp.asarray(request.sound_speed_sd, dtype),
-                            jnp.asarray(request.delay_sd, dtype)])  # fmt: skip
-    given = Given(array(request.sigma), array(request.tracker_sd), array(request.max_elevation),
-                  medium)  # fmt: skip
+        medium = jnp.stack(
+            [jnp.asarray(request.sound_speed_sd, dtype), jnp.asarray(request.delay_sd, dtype)]
+        )
+    given = Given(
+        array(request.sigma), array(request.tracker_sd), array(request.max_elevation), medium
+    )
     components = 2 if channels else 3
     if given.sigma is not None and given.sigma.shape != (components,):
         names = "element distance, offset" if channels else "lateral, range, elevational"

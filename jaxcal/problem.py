@@ -101,7 +101,7 @@ class Problem(eqx.Module):
         if channels is not None:
             channels = Channels(
                 keep(channels.distances, 0.0), keep(channels.heard, 0.0), channels.elements
-            )  # fmt: skip
+            )
         return replace(
             self,
             poses=keep(self.poses, np.eye(4)),
@@ -192,9 +192,14 @@ class Problem(eqx.Module):
             InputError: whatever cannot be a calibration problem, with the row named.
         """
         images = make_images(
-            poses, measurements, kind, mask=mask, covariance=covariance,
-            max_elevation=max_elevation, spacing_mm=spacing_mm,
-        )  # fmt: skip
+            poses,
+            measurements,
+            kind,
+            mask=mask,
+            covariance=covariance,
+            max_elevation=max_elevation,
+            spacing_mm=spacing_mm,
+        )
         return cls.from_recording(images, dtype=dtype)
 
 

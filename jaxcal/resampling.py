@@ -128,8 +128,9 @@ def cross_validate(
     mask = problem.mask
     used = jnp.sum(mask)
     mean = jnp.sum(mask[:, None] * cloud, axis=0) / used
-    moved = jax.vmap(relative_twist, (None, 0))(jnp.asarray(result.image_to_probe),
-                                                held.image_to_probe)  # fmt: skip
+    moved = jax.vmap(relative_twist, (None, 0))(
+        jnp.asarray(result.image_to_probe), held.image_to_probe
+    )
     moved = mask[:, None] * moved
     density = -0.5 * jnp.sum((errors / held.sigma) ** 2 + jnp.log(2 * jnp.pi * held.sigma**2), 1)
     return CrossValidation(
@@ -213,9 +214,12 @@ def relative_twist(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> F
     rotation = first[:3, :3].T @ second[:3, :3]
     shift = first[:3, :3].T @ (second[:3, 3] - first[:3, 3])
     turn = 0.5 * jnp.stack(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0],
-         rotation[1, 0] - rotation[0, 1]]
-    )  # fmt: skip
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    )
     return jnp.concatenate([shift, turn])
 
 
@@ -260,9 +264,10 @@ def _drawn(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Problem:
     if problem.channels is not None:
         assert many.channels is not None
         changed["channels"] = replace(
-            many.channels, distances=pick(problem.channels.distances),
+            many.channels,
+            distances=pick(problem.channels.distances),
             heard=pick(problem.channels.heard),
-        )  # fmt: skip
+        )
     assert rows.shape[1] == count
     return replace(many, **changed)
 
@@ -314,6 +319,11 @@ def _corners(problem: Problem, result: Calibration) -> Float[Array, "5 2"]:
     high = jnp.max(jnp.where(seen, points, -jnp.inf), axis=0)
     ends = jnp.stack([low, high])
     return jnp.stack(
-        [ends[0], jnp.stack([high[0], low[1]]), jnp.stack([low[0], high[1]]), ends[1],
-         0.5 * (low + high)]
-    )  # fmt: skip
+        [
+            ends[0],
+            jnp.stack([high[0], low[1]]),
+            jnp.stack([low[0], high[1]]),
+            ends[1],
+            0.5 * (low + high),
+        ]
+    )

@@ -102,8 +102,19 @@ def calibrate(
     if isinstance(problem, Recording):
         problem = Problem.from_recording(problem)
     problem = _in_asked_precision(problem, options, "jaxcal.calibrate")
-    request = Request(method, prior, max_elevation, sigma, tracker_sd, estimate, data,
-                      sound_speed_sd, delay_sd, options, robust)  # fmt: skip
+    request = Request(
+        method,
+        prior,
+        max_elevation,
+        sigma,
+        tracker_sd,
+        estimate,
+        data,
+        sound_speed_sd,
+        delay_sd,
+        options,
+        robust,
+    )
     plan, given = prepare(problem, request)
     if problem.batch_shape:
         return _solve_batch(problem, given, plan, None)
@@ -167,8 +178,19 @@ def calibrate_batch(
     if chunk is not None and chunk < 1:
         raise InputError(f"chunk must be at least 1, not {chunk}")
     problems = _in_asked_precision(problems, options, "jaxcal.calibrate_batch")
-    request = Request(method, prior, max_elevation, sigma, tracker_sd, estimate, data,
-                      sound_speed_sd, delay_sd, options, robust)  # fmt: skip
+    request = Request(
+        method,
+        prior,
+        max_elevation,
+        sigma,
+        tracker_sd,
+        estimate,
+        data,
+        sound_speed_sd,
+        delay_sd,
+        options,
+        robust,
+    )
     plan, given = prepare(problems, request)
     return _solve_batch(problems, given, plan, chunk)
 

@@ -69,8 +69,10 @@ CURVATURE: dict[Family, float] = {"uniform": 0.0, "bell": -1 / 7, "student": 0.5
 """-+ 1/a^2 at unit SD."""
 
 HEIGHT: dict[Family, float] = {
-    "uniform": 1 / (2 * 3**0.5), "bell": 15 / (16 * 7**0.5), "student": 0.375 * 2**0.5,
-}  # fmt: skip
+    "uniform": 1 / (2 * 3**0.5),
+    "bell": 15 / (16 * 7**0.5),
+    "student": 0.375 * 2**0.5,
+}
 """Density of unit SD at its centre."""
 
 
@@ -187,9 +189,11 @@ def _sums(family: Family, abrupt: bool, window: Window) -> tuple[Array, Array, A
     halves = (total, sign * (0.5 * total - line), 2 * (parabola - line) + 0.25 * total)
     zero = jnp.zeros((), step.dtype)
     return jax.lax.reduce(
-        halves, (zero, zero, zero),
-        lambda a, b: tuple(x + y for x, y in zip(a, b, strict=True)), (0,),
-    )  # fmt: skip
+        halves,
+        (zero, zero, zero),
+        lambda a, b: tuple(x + y for x, y in zip(a, b, strict=True)),
+        (0,),
+    )
 
 
 def _sums_at_once(family: Family, abrupt: bool, window: Window) -> tuple[Array, Array, Array]:

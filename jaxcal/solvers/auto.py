@@ -328,9 +328,7 @@ def answered(
     step, covariance = barrier(known.lifted(*barrier((mean, covariance))))
     across = [[covariance[i, j][:, None] for j in SEEN] for i in SEEN]
     offset = unrolled.dot(sites.direction, unrolled.apply(across, sites.direction))
-    return Answer(
-        step, covariance, weight, jnp.any(good, axis=0), offset.T, log_odds, denied
-    )  # fmt: skip
+    return Answer(step, covariance, weight, jnp.any(good, axis=0), offset.T, log_odds, denied)
 
 
 def candidates(

@@ -211,9 +211,11 @@ def _side_by_side(matrix: Array) -> SingularValues:
         return first, second, largest, sweeps + 1
 
     start = (
-        together[:, 0::2], together[:, 1::2], jnp.ones(lanes, matrix.dtype),
+        together[:, 0::2],
+        together[:, 1::2],
+        jnp.ones(lanes, matrix.dtype),
         jnp.zeros((), jnp.int32),
-    )  # fmt: skip
+    )
     first, second, _, _ = jax.lax.while_loop(unfinished, sweep, start)
     # After whole sweeps every column is where it was, so the padding is the last one again.
     together = jnp.stack([first, second], axis=2).reshape(together.shape)[:, :columns]

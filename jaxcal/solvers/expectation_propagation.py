@@ -254,7 +254,7 @@ def propagate(
         at = [k for k, name in enumerate(families) if name == family]
         found = _in_turn(
             family, jnp.stack([sd[k] for k in at]), sites, known, (squares, pull), ahead, sweeps
-        )  # fmt: skip
+        )
         parts.append([jnp.moveaxis(each, 0, -2) for each in found])
         order += at
     back = [order.index(k) for k in range(len(order))]

@@ -70,9 +70,15 @@ def linear_proposals(problem: Problem, subsets: Float[Array, "k n"], *, scaled: 
     eye = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype), rotations.shape)
     rhs = (centre - translations) / length
     rows = jnp.concatenate(
-        [deviation[:, :1, None] * rotations, deviation[:, 1:, None] * rotations, rotations, -eye,
-         rhs[..., None]], axis=2,
-    )  # fmt: skip
+        [
+            deviation[:, :1, None] * rotations,
+            deviation[:, 1:, None] * rotations,
+            rotations,
+            -eye,
+            rhs[..., None],
+        ],
+        axis=2,
+    )
     rows = jnp.where(used[:, None, None] > 0, rows, 0.0)
     # In units of the points' spread all 12 unknowns and all moments are of order one.
     moments = jnp.einsum("nia,nib->nab", rows, rows).reshape(len(used), -1)
@@ -96,10 +102,13 @@ def linear_proposals(problem: Problem, subsets: Float[Array, "k n"], *, scaled: 
             matrix[6:, 6:], (system[6:12, 12] - system[6:12, :6] @ known)[:, None]
         )[:, 0]
         rotation = jnp.stack(
-            [lateral / jnp.sqrt(jnp.sum(lateral**2)),
-             jnp.cross(axial, lateral) / jnp.sqrt(jnp.sum(axial**2) * jnp.sum(lateral**2)),
-             axial / jnp.sqrt(jnp.sum(axial**2))], axis=1,
-        )  # fmt: skip
+            [
+                lateral / jnp.sqrt(jnp.sum(lateral**2)),
+                jnp.cross(axial, lateral) / jnp.sqrt(jnp.sum(axial**2) * jnp.sum(lateral**2)),
+                axial / jnp.sqrt(jnp.sum(axial**2)),
+            ],
+            axis=1,
+        )
         translation = length * rest[:3] - mean[0] * lateral - mean[1] * axial
         scale = sizes if scaled else jnp.ones_like(sizes)
         # A pixel's row 0 need not be the face: the face's range is not scaled.

@@ -151,9 +151,8 @@ def from_rotation(rotation: Matrix, sums: ImageSums, blocks: Blocks) -> Iterate:
         scale = [jnp.maximum(jnp.abs(value), tiny) for value in found[6:]]
     depth = scale[1] * (z - sums.face) + sums.face
     shift = [
-        t - scale[0] * x * a - depth * b
-        for t, a, b in zip(found[:3], lateral, axial, strict=True)
-    ]  # fmt: skip
+        t - scale[0] * x * a - depth * b for t, a, b in zip(found[:3], lateral, axial, strict=True)
+    ]
     nominal = {"scale": scale, "sound-speed": [one], "delay": [zero]}
     extras = [value for name, values in nominal.items() if name in blocks for value in values]
     return Iterate(

@@ -114,9 +114,13 @@ def _grouped(values: Array) -> Array:
 
 def _images(rotation: Array, origin: Array, lateral: Array, distance: Array) -> Images:
     return Images(
-        rotation=jnp.moveaxis(rotation, 1, 0), origin=jnp.moveaxis(origin, 1, 0),
-        lateral=lateral, axial=distance, face=jnp.zeros(len(lateral)), mask=jnp.ones_like(lateral),
-    )  # fmt: skip
+        rotation=jnp.moveaxis(rotation, 1, 0),
+        origin=jnp.moveaxis(origin, 1, 0),
+        lateral=lateral,
+        axial=distance,
+        face=jnp.zeros(len(lateral)),
+        mask=jnp.ones_like(lateral),
+    )
 
 
 def problems_of(images: Images) -> Problem:

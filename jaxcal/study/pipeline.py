@@ -70,9 +70,12 @@ class Shape:
         if not self.tracked:
             numbers = numbers | {"tracker_mm": 0.0, "tracker_rad": 0.0}
         return Protocol(
-            images=self.images, test_images=self.test_images,
-            elevation_distribution=self.law, probe=self.probe, **numbers,
-        )  # fmt: skip
+            images=self.images,
+            test_images=self.test_images,
+            elevation_distribution=self.law,
+            probe=self.probe,
+            **numbers,
+        )
 
 
 @in_own_modes
