@@ -18,7 +18,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from hw.acquire_live import Estimator
-from hw.choices import OPERATORS, PLACEMENTS
+from hw.choices import OPERATORS, PLACEMENTS, PLANS
 from hw.errors import DeviceError, RefusedError
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
@@ -30,7 +30,9 @@ from hw.midplane.pattern_injection import (
 )
 from hw.midplane.search import PlacementError, first_seen
 from hw.midplane.threshold_climb import threshold_climb
-from hw.poses import plan_poses
+from hw.planner import Planner
+from hw.pool import allowed_by, plan_pool
+from hw.poses import PosePlan, plan_poses
 from hw.recorder import Recorder
 from hw.recording_check import Progress, read_progress
 from hw.recording_file import RecordingWriter
@@ -91,13 +93,15 @@ class Request:
     """What to acquire.
 
     Attributes:
-        images: poses of the plan.
+        images: poses of the plan; with ``optimal`` the most images.
         placement: one of :data:`PLACEMENTS`.
         seed: of the plan.
         every_frame: record every ultrasound frame, not one an image.
         bench: seed of the emulated bench; None for a real one.
         operator: one of :data:`OPERATORS`: who follows the injected pattern, a person at the
             terminal or before a window, or a rule.
+        plan: one of :data:`PLANS`; ``optimal`` chooses from a pool as the images tell.
+        until_tre_mm: with ``optimal``: stop once the predicted TRE is no larger than this.
     """
 
     images: int = 60
@@ -106,8 +110,17 @@ class Request:
     every_frame: bool = False
     bench: int | None = None
     operator: str = "simulated"
+    plan: str = "sobol"
+    until_tre_mm: float | None = None
 
     def __post_init__(self) -> None:
+        if self.plan not in PLANS:
+            raise InputError(f"plan must be one of {', '.join(PLANS)}")
+        wanted = self.until_tre_mm
+        if wanted is not None and not (np.isfinite(wanted) and wanted > 0):
+            raise InputError(f"until_tre_mm must be a positive number of mm, not {wanted}")
+        if wanted is not None and self.plan != "optimal":
+            raise InputError("until_tre_mm needs the plan optimal")
         if self.placement not in PLACEMENTS:
             raise InputError(f"placement must be one of {', '.join(PLACEMENTS)}")
         if self.operator not in OPERATORS:
@@ -171,6 +184,16 @@ class _Job:
         taken = set() if self.progress is None else set(self.progress.taken.tolist())
         return [row for row in range(len(self.targets)) if row not in taken]
 
+    @property
+    def images(self) -> int:
+        """Most images of the whole recording."""
+        return min(self.request.images, len(self.targets))
+
+    @property
+    def to_take(self) -> int:
+        """Images that are still to be taken, at most."""
+        return self.images - (len(self.targets) - len(self.missing))
+
 
 Confirm = Callable[[MotionPlan], Confirmation]
 
@@ -212,9 +235,10 @@ def acquire(
         OutputError: the recording cannot be made; nothing moved.
     """
     job = _prepare(setup, path, request)
-    estimator = Estimator(len(job.targets), setup, job.progress)
-    say(f"plan: {len(job.targets)} poses, {len(job.missing)} to go; compiling the estimate")
-    estimator.warm_up(job.targets)
+    estimator = Estimator(job.images, setup, job.progress)
+    pool = "" if job.images == len(job.targets) else f" from a pool of {len(job.targets)}"
+    say(f"plan: {job.images} poses{pool}, {job.to_take} to go; compiling the estimate")
+    estimator.warm_up(job.targets[: job.images])
     recorder = _open_recorder(path, job)
     with _closing(recorder):
         try:
@@ -233,7 +257,7 @@ def acquire(
         # Everything else that went wrong came of it.
         reason = str(recorder.error)
     raise AcquisitionStopped(
-        f"{reason}; {estimator.count} of {len(job.targets)} images are in {recorder.kept}; put it "
+        f"{reason}; {estimator.count} of {job.images} images are in {recorder.kept}; put it "
         f"right, then: jaxcal-hw acquire --resume {recorder.kept}",
         interrupted=interrupted,
         by_itself=recorder.error is None,
@@ -250,10 +274,21 @@ def _closing(recorder: Recorder) -> Iterator[None]:
             recorder.close()
 
 
+def planned(setup: Setup, request: Request) -> PosePlan:
+    """The poses of a request: a plan in the order of travel, or the pool of an optimal one.
+
+    Raises:
+        InputError: box, reach and limits leave too few poses.
+    """
+    if request.plan == "sobol":
+        return plan_poses(request.images, setup.scene, setup.extent, request.seed)
+    allowed = allowed_by(setup.motion_limits(), setup.tcp_offset)
+    return plan_pool(request.images, setup.scene, setup.extent, request.seed, allowed)
+
+
 def _prepare(setup: Setup, path: str | os.PathLike[str], request: Request | None) -> _Job:
     if request is not None:
-        plan = plan_poses(request.images, setup.scene, setup.extent, request.seed)
-        return _Job(setup, request, plan.poses, None)
+        return _Job(setup, request, planned(setup, request).poses, None)
     # Cut back to whole rows first, so that what is read is what is there.
     RecordingWriter.resume(path).close()
     progress = read_progress(path)
@@ -304,7 +339,7 @@ def _run(
         recorder.add_event(kind, text, clock.now())
         say(f"{kind}: {text}")
 
-    note("resumed" if job.progress else "started", f"{len(job.missing)} images to take")
+    note("resumed" if job.progress else "started", f"{job.to_take} images to take")
     for change in job.changes:
         note("changed", change)
     session = Session(setup, recorder, watch=watch, every_frame=job.request.every_frame)
@@ -330,7 +365,8 @@ def _run(
         )  # fmt: skip
         with motion:
             stage = ProbeStage(session, motion, job.targets, note)
-            for row in job.missing:
+            failures = 0
+            for row in _rows(job, estimator, session, note):
                 if pause is not None and pause.held:
                     note("paused", "before the next image")
                     pause.wait()
@@ -349,14 +385,14 @@ def _run(
                     view.given_up(row)
                     note("given up", f"pose {row + 1}: {error}")
                     session.check()
-                    if len(given_up) >= _MOST_GIVEN_UP and given_up[-_MOST_GIVEN_UP:] == list(
-                        range(row - _MOST_GIVEN_UP + 1, row + 1)
-                    ):
+                    failures += 1
+                    if failures == _MOST_GIVEN_UP:
                         raise
                     continue
+                failures = 0
                 _take(job, row, stage, session, recorder, estimator, placement, oracle, began)
                 view.taken(row, placement, estimator.answer)
-                say(estimator.line(len(job.targets), placement))
+                say(estimator.line(job.images, placement))
     if oracle is not None:
         _write_truth(recorder, oracle)
     note("finished", f"{estimator.count} images")
@@ -364,6 +400,26 @@ def _run(
     return Outcome(
         estimator.count, tuple(sorted(given_up + skipped)), digest, clock.now() - started
     )
+
+
+def _rows(
+    job: _Job, estimator: Estimator, session: Session, note: Callable[[str, str], None]
+) -> Iterator[int]:
+    """The poses to visit, one after the other; those that were given up are not asked for again."""
+    if job.request.plan == "sobol":
+        yield from job.missing
+        return
+    planner = Planner(job.targets, job.setup, job.request.until_tre_mm)
+    left = job.missing
+    while left and estimator.count < job.images:
+        here = session.poses.latest().pose
+        choice = planner.choose(left, estimator.poses, here, estimator.answer)
+        if choice.text:
+            note("planned", choice.text)
+        if choice.row is None:
+            return
+        left.remove(choice.row)
+        yield choice.row
 
 
 def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:

@@ -46,6 +46,11 @@ class Estimator:
         return len(self._live) + self._left_out
 
     @property
+    def poses(self) -> np.ndarray:
+        """(n, 4, 4) of the images that the calibration takes, mm, in the order of its arrays."""
+        return self._live.poses
+
+    @property
     def answer(self) -> Calibration | None:
         """The calibration from the images so far; None with too few."""
         return self._result

@@ -5,3 +5,6 @@ PLACEMENTS = ("amplitude-scan", "threshold-climb", "pattern-injection", "none")
 
 OPERATORS = ("person", "window", "simulated")
 """Who follows the injected pattern."""
+
+PLANS = ("sobol", "optimal")
+"""How poses are planned: spread evenly beforehand, or chosen as the images tell."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hw.choices import OPERATORS, PLACEMENTS
+from hw.choices import OPERATORS, PLACEMENTS, PLANS
 from jaxcal import __version__
 from jaxcal.cli.common import POSITIVE, ExitCode, exit_code
 from jaxcal.cli.run import run
@@ -69,6 +69,18 @@ _bench_seed = click.option(
 @_setup
 @click.option("--images", type=click.IntRange(4, 1000), help="Poses of the plan.  [default: 60]")
 @click.option(
+    "--plan",
+    type=click.Choice(PLANS),
+    help="How poses are planned: spread evenly beforehand, or chosen from a confirmed pool as the "
+    "images tell; then --images is the most.  [default: sobol]",
+)
+@click.option(
+    "--until-tre",
+    type=POSITIVE,
+    metavar="MM",
+    help="With --plan optimal: stop once the predicted error over the image is this small.",
+)
+@click.option(
     "--placement",
     type=click.Choice(PLACEMENTS),
     help="How the target is brought into the mid-plane.  [default: amplitude-scan]",
@@ -100,6 +112,8 @@ def acquire(
     bench: bool,
     setup_path: str | None,
     images: int | None,
+    plan: str | None,
+    until_tre: float | None,
     placement: str | None,
     operator: str | None,
     seed: int | None,
@@ -122,7 +136,8 @@ def acquire(
     if not bench and (speed, controller, bench_seed) != (None, None, None):
         raise InputError("--speed, --controller and --bench-seed need --bench")
     given = [name for name, value in (
-        ("--images", images), ("--placement", placement), ("--operator", operator),
+        ("--images", images), ("--plan", plan), ("--until-tre", until_tre),
+        ("--placement", placement), ("--operator", operator),
         ("--seed", seed),
         ("--every-frame", every_frame or None), ("--bench-seed", bench_seed),
     ) if value is not None]  # fmt: skip
@@ -132,6 +147,8 @@ def acquire(
         raise InputError("--resume needs the RECORDING to go on with")
     if operator is not None and not resume and placement != "pattern-injection":
         raise InputError("--operator needs --placement pattern-injection")
+    if until_tre is not None and plan != "optimal" and not resume:
+        raise InputError("--until-tre needs --plan optimal")
     if unattended is not None and not move:
         raise InputError("--unattended needs --move")
     from hw.recording_check import check_resumable, settings_of
@@ -156,7 +173,7 @@ def acquire(
         request = Request(
             images or 60, placement or PLACEMENTS[0], seed or 0, every_frame,
             (bench_seed or 0) if bench else None,
-            operator,
+            operator, plan or PLANS[0], until_tre,
         )  # fmt: skip
     with ExitStack() as stack:
         emulated = _started(stack, bench, bench_seed, speed, controller)

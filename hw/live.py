@@ -62,6 +62,11 @@ class LiveCalibration:
         return self._count
 
     @property
+    def poses(self) -> np.ndarray:
+        """(n, 4, 4) of the images taken, mm."""
+        return self._poses[: self._count].copy()
+
+    @property
     def capacity(self) -> int:
         """Most images."""
         return len(self._mask)

@@ -9,8 +9,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hw.acquire import Outcome, Request
-from hw.poses import plan_poses, preview
+from hw.acquire import Outcome, Request, planned
+from hw.poses import preview
 from hw.robot.limits import Limits
 from hw.robot.safety import MotionPlan, check_plan, plan_lines
 from hw.setup import Setup
@@ -26,7 +26,7 @@ def dry_run(setup: Setup, path: str, request: Request | None, figure: str | None
     """
     if request is None:
         raise InputError("--resume needs --move: a dry run has nothing to resume")
-    plan = plan_poses(request.images, setup.scene, setup.extent, request.seed)
+    plan = planned(setup, request)
     motion = MotionPlan(plan.poses, _dry_limits(setup), setup.tcp_offset or (0.0,) * 6, "dry run")
     course = check_plan(motion)
     if figure is not None:
@@ -40,8 +40,8 @@ def dry_run(setup: Setup, path: str, request: Request | None, figure: str | None
     else:
         arm = f"a {motion.limits.arm_model} reaches every pose on every way: {course.text}"
     return [
-        f"dry run: {len(plan)} poses, {request.placement}, the tip travels {plan.travel_mm:.0f} mm "
-        f"({plan.passed_over} poses passed over)",
+        f"dry run: {_poses(request, len(plan))}, {request.placement}, the tip travels "
+        f"{plan.travel_mm:.0f} mm ({plan.passed_over} poses passed over)",
         *plan_lines(motion, tcp_offset_known=setup.tcp_offset is not None),
         "every pose and every way between two lies within the limits",
         arm,
@@ -49,6 +49,12 @@ def dry_run(setup: Setup, path: str, request: Request | None, figure: str | None
         "shown and confirmed with --move (jaxcal-hw check shows them now)",
         f"nothing moved and {path} was not made; add --move to acquire",
     ]
+
+
+def _poses(request: Request, count: int) -> str:
+    if request.plan == "sobol":
+        return f"{count} poses"
+    return f"at most {request.images} images from a pool of {count} poses, all of them"
 
 
 def _dry_limits(setup: Setup) -> Limits:
@@ -59,7 +65,7 @@ def _dry_limits(setup: Setup) -> Limits:
 
 def draw(setup: Setup, request: Request, figure: str) -> None:
     """Write the plan's figure."""
-    preview(plan_poses(request.images, setup.scene, setup.extent, request.seed), Path(figure))
+    preview(planned(setup, request), Path(figure))
 
 
 def calibrate_and_print(path: str, outcome: Outcome, speed: float) -> dict[str, Any]:

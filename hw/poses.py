@@ -2,8 +2,12 @@
 
 Orientations cover a cone about the direction in which the probe looks, with turns about it; the
 target is spread over the image. All five numbers of a pose run through one Sobol sequence, turned
-round by the seed. A pose whose tip leaves the box, or whose tool centre point is out of the arm's
-reach, is passed over for the next of the sequence.
+round by the seed (:mod:`jaxcal.design.candidates`). A pose whose tip leaves the box, or whose tool
+centre point is out of the arm's reach, is passed over for the next of the sequence.
+
+A plan may also be a pool to choose from while the experiment runs (:mod:`hw.pool`). The whole pool
+is checked and confirmed before anything moves; which of its poses are visited, and in which order,
+follows from the images (:mod:`hw.planner`).
 
 The planner knows a drawing of the probe's mount and roughly where the target is, not the truth: the
 target will stand off the mid-plane by some millimetres, which the search of :mod:`hw.midplane`
@@ -17,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hw.rigid import looking_rotation, rotation_matrix
+from hw.rigid import looking_rotation
 from hw.scene import Scene
 from hw.shapes import Float
 from jaxcal.errors import InputError
@@ -25,7 +29,6 @@ from jaxcal.geometry import check_poses
 from jaxcal.io.atomic import atomic_path
 
 MOST_POSES = 10_000
-_TRIES_PER_POSE = 50
 # A turn of one degree takes the arm about as long as this many mm.
 _MM_PER_DEGREE = 1.0
 
@@ -124,59 +127,25 @@ def plan_poses(count: int, scene: Scene, extent: Extent | None = None, seed: int
     if looking.shape != (3,) or not np.linalg.norm(looking) > 0:
         raise InputError("the looking direction must be three numbers, not all zero")
 
-    from scipy.stats import qmc
+    from hw.pool import constraints_of
+    from jaxcal.design.candidates import sobol_poses
+    from jaxcal.design.information import Model
 
-    # Sobol points are balanced in powers of two; turned round in the unit cube, they stay even.
-    sequence = qmc.Sobol(5, scramble=False)
-    draws = sequence.random_base2(int(np.ceil(np.log2(_TRIES_PER_POSE * count))))
-    draws = (draws + np.random.default_rng(seed).random(5)) % 1.0
-    poses, expected, passed = [], [], 0
-    for fraction in draws:
-        rotation = _orientation(fraction[:3], looking, nominal, extent)
-        lateral = extent.lateral_mm * (2 * fraction[3] - 1)
-        shallow, deep = extent.depth_mm
-        depth = shallow + (deep - shallow) * fraction[4]
-        pose = np.eye(4)
-        pose[:3, :3] = rotation
-        place = nominal[:3, :3] @ [lateral, 0.0, depth] + nominal[:3, 3]
-        pose[:3, 3] = point - rotation @ place
-        if not _allowed(pose, nominal[:3, 3], extent):
-            passed += 1
-            continue
-        poses.append(pose)
-        expected.append([lateral, depth])
-        if len(poses) == count:
-            break
-    else:
+    bounds = constraints_of(scene, extent)
+    poses, passed = sobol_poses(count, Model(nominal, point), bounds, seed)
+    if len(poses) < count:
         raise InputError(
             f"only {len(poses)} of {count} poses stay inside the box and the reach: widen them, or "
             "narrow the cone"
         )
-    tour = _short_tour(np.array(poses), nominal[:3, 3])
-    return PosePlan(np.array(poses)[tour], np.array(expected)[tour], scene, extent, passed)
+    return in_order(poses, scene, extent, passed)
 
 
-def _orientation(
-    fraction: np.ndarray, looking: np.ndarray, nominal: np.ndarray, extent: Extent
-) -> Float[np.ndarray, "3 3"]:
-    """Rotation tool centre point -> base: uniform over the cone's cap, then a turn."""
-    image = looking_rotation(looking)
-    tilt = np.arccos(1 - fraction[0] * (1 - np.cos(np.radians(extent.cone_deg))))
-    azimuth = 2 * np.pi * fraction[1]
-    turn = np.radians(extent.turn_deg) * (2 * fraction[2] - 1)
-    tilted = rotation_matrix(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
-    return image @ tilted @ rotation_matrix(np.array([0.0, 0.0, turn])) @ nominal[:3, :3].T
-
-
-def _allowed(pose: np.ndarray, tip: np.ndarray, extent: Extent) -> bool:
-    distance = np.linalg.norm(pose[:3, 3])
-    if not extent.reach_mm[0] <= distance <= extent.reach_mm[1]:
-        return False
-    if extent.box_mm is None:
-        return True
-    place = pose[:3, :3] @ tip + pose[:3, 3]
-    low, high = np.asarray(extent.box_mm, float)
-    return bool((place >= low).all() and (place <= high).all())
+def in_order(poses: np.ndarray, scene: Scene, extent: Extent, passed: int) -> PosePlan:
+    """A plan of poses in an order of short travel."""
+    tour = _short_tour(poses, scene.tip_mm)
+    expected = np.array([scene.expected(pose)[[0, 2]] for pose in poses])
+    return PosePlan(poses[tour], expected[tour], scene, extent, passed)
 
 
 def _short_tour(poses: np.ndarray, tip: np.ndarray) -> np.ndarray:

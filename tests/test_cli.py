@@ -565,3 +565,53 @@ def test_numbers_are_positive_and_finite():
     for text in ("0", "-1", "nan", "inf", "1_000x", ""):
         with pytest.raises(click.BadParameter):
             common.POSITIVE.convert(text, None, None)
+
+
+def test_calibrate_ends_with_the_images_that_would_help_most(calibrated, simulated):
+    done, _ = calibrated
+    found = json.loads(done.stdout)["next_poses"]
+    assert len(found["poses"]) == 3
+    assert 0 < found["tre_then_mm"] < found["tre_now_mm"] < 1
+    assert 10 < found["images_to_half"] < 300
+    recording = jaxcal.load(simulated)
+    for pose in found["poses"]:
+        matrix = np.array(pose["pose"])
+        np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-9)
+        assert "target" in pose["words"]
+        # Seen through the true X, the target lies where the plan says.
+        place = np.linalg.inv(matrix @ recording.truth.image_to_probe)
+        seen = (place @ np.append(recording.truth.point, 1.0))[:3]
+        assert np.linalg.norm(seen[[0, 2]] - pose["target_mm"]) < 2
+
+
+def test_plan_from_a_recording_says_what_to_add(simulated, calibrated, jaxcal_process, shared):
+    figure = shared / "plan.png"
+    done = jaxcal_process("plan", simulated, "--images", 4, "--json", "--figure", figure)
+    assert (done.returncode, done.stderr) == (0, "")
+    found = json.loads(done.stdout)
+    assert (found["images_before"], len(found["poses"]), len(found["tre_mm"])) == (50, 4, 5)
+    assert found["tre_mm"] == sorted(found["tre_mm"], reverse=True)
+    assert figure.read_bytes().startswith(b"\x89PNG")
+
+
+def test_plan_from_nothing_is_words_and_counts(capfd):
+    assert main(["plan", "--images", "6", "--cone", "20", "--seed", "1"]) == 0
+    out, _ = capfd.readouterr()
+    assert "tilt 20 degrees" in out
+    assert "How many images an error takes" in out
+    assert out.count("target") >= 6
+
+
+def test_plans_that_cannot_be(capfd, tmp_path):
+    for arguments, match in (
+        (["--images", 10, "--until-tre", 0.2], "either --images or"),
+        (["--images", 10, "--cone", 0, "--turn", 0], "would not determine"),
+        (["--estimate", "scale"], "needs a recording"),
+        (["--depth", 80, 20], "in order"),
+        (["--images", 2], "4 to"),
+        ([tmp_path / "absent.h5"], "absent"),
+        (["--images", 5, "--figure", tmp_path / "no" / "p.png"], "folder does not exist"),
+        (["--images", 5, "--figure", tmp_path / "p.xyz"], "not supported"),
+    ):
+        assert match in refused(capfd, "plan", *arguments)
+    assert list(tmp_path.iterdir()) == []

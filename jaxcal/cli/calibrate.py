@@ -168,6 +168,7 @@ def calibrate(
     import_engine()
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.io.hdf5 import load
+    from jaxcal.report.next_poses import next_poses_record
     from jaxcal.report.record import calibration_record, check_test_images
     from jaxcal.report.write import prepare_folder, write_report
 
@@ -181,6 +182,7 @@ def calibrate(
             result = _solve(measured, request, traced=traced)
             record = calibration_record(result, measured, test_data)
             record["warnings"] += notes
+            record["next_poses"] = next_poses_record(result, measured)
         if cross_validate or bootstrap is not None:
             with progress("calibrating over and over"):
                 record |= _resampled(measured, request, result, cross_validate, bootstrap)
@@ -335,8 +337,9 @@ def _curves(recording: Recording, request: _Request, result: Calibration) -> lis
 
 
 def _print(record: dict[str, Any], out: str | None) -> None:
+    from jaxcal.report.next_poses import next_poses_sentences
     from jaxcal.report.tables import calibration_table
     from jaxcal.report.verdict import verdict
 
     report = [] if out is None else ["", f"report: {out}"]
-    print_page(calibration_table(record), *verdict(record), *report)
+    print_page(calibration_table(record), *verdict(record), *next_poses_sentences(record), *report)

@@ -12,6 +12,7 @@ from jaxcal.cli.calibrate import calibrate
 from jaxcal.cli.demo import demo
 from jaxcal.cli.import_ import import_
 from jaxcal.cli.pivot import pivot
+from jaxcal.cli.plan import plan
 from jaxcal.cli.run import run
 from jaxcal.cli.segment import segment
 from jaxcal.cli.simulate import simulate
@@ -29,7 +30,7 @@ def commands() -> None:
     """Calibrate a tracked or robotic ultrasound probe from images of one small fixed target."""
 
 
-for _command in (demo, simulate, import_, segment, calibrate, pivot, study):
+for _command in (demo, simulate, import_, segment, calibrate, plan, pivot, study):
     commands.add_command(_command)
 
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from jaxcal.design.constraints import Region as Region
     from jaxcal.design.criteria import gain as gain
     from jaxcal.design.figure import plan_figure as plan_figure
+    from jaxcal.design.greedy import Rules as Rules
     from jaxcal.design.information import Model as Model
     from jaxcal.design.information import known_information as known_information
     from jaxcal.design.noise import Noise as Noise
@@ -46,6 +47,7 @@ _HOME = {
     "Noise": "noise",
     "Plan": "planning",
     "Region": "constraints",
+    "Rules": "greedy",
     "candidates_around": "candidates",
     "gain": "criteria",
     "images_to": "predict",

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from jaxcal.errors import InputError
-from jaxcal.geometry import AnyArray
 from jaxcal.probe import CurvilinearProbe, Probe
 
 _INSIDE = 1e-9
@@ -68,7 +68,7 @@ class Region:
         radius = probe.radius_mm if isinstance(probe, CurvilinearProbe) else None
         return cls((-half, half) if lateral_mm is None else lateral_mm, depth_mm, radius)
 
-    def place(self, unit: Float[AnyArray, "*n 2"]) -> Float[AnyArray, "*n 3"]:
+    def place(self, unit: Float[Any, "*n 2"]) -> Float[Any, "*n 3"]:
         """[lateral, 0, axial] (mm) of numbers between -1 and 1; numpy or JAX (traceable)."""
         xp = unit.__array_namespace__()
         (left, right), (near, far) = self.lateral_mm, self.depth_mm

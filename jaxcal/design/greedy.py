@@ -166,7 +166,7 @@ class Chosen:
 
 def choose(
     search: Search,
-    features: Float[np.ndarray, "m 5"],
+    features: Float[np.ndarray, "f 5"],
     taken_features: Float[np.ndarray, "t 5"],
     count: int,
     cost_s: Float[np.ndarray, " m"] | None = None,
@@ -175,7 +175,7 @@ def choose(
 
     Args:
         search: candidates and what is known.
-        features: of the candidates (:func:`space_features`).
+        features: of the candidates (:func:`space_features`); none where nothing fills space.
         taken_features: of the images that there are.
         count: how many.
         cost_s: seconds that each candidate takes; gains are then compared a second.

@@ -15,7 +15,7 @@ Information adds up: after n images it is J = prior + sum_i G_i'G_i, and S = J^-
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -23,7 +23,6 @@ from scipy.optimize import brentq
 
 from jaxcal.design.noise import Noise
 from jaxcal.errors import InputError
-from jaxcal.geometry import AnyArray
 from jaxcal.model.parameters import RIGID
 
 if TYPE_CHECKING:
@@ -47,8 +46,8 @@ class Model:
         scale: whether the two pixel scales are unknown too.
     """
 
-    image_to_probe: Float[AnyArray, "4 4"] = field(default_factory=lambda: np.eye(4))
-    point: Float[AnyArray, " 3"] = field(default_factory=lambda: np.zeros(3))
+    image_to_probe: Float[Any, "4 4"] = field(default_factory=lambda: np.eye(4))
+    point: Float[Any, " 3"] = field(default_factory=lambda: np.zeros(3))
     noise: Noise = field(default_factory=lambda: Noise.constant((0.5, 0.3, 1.0)))
     scale: bool = False
 
@@ -62,13 +61,13 @@ class Model:
         """The unknowns by name, in order."""
         return (*RIGID, "scale") if self.scale else RIGID
 
-    def targets(self, poses: Float[AnyArray, "*n 4 4"]) -> Float[AnyArray, "*n 3"]:
+    def targets(self, poses: Float[Any, "*n 4 4"]) -> Float[Any, "*n 3"]:
         """Where the target is in the images of a probe at these poses, mm (traceable)."""
         rotation, x = poses[..., :3, :3], self.image_to_probe
         in_probe = ((self.point - poses[..., :3, 3])[..., None, :] @ rotation)[..., 0, :]
         return (in_probe - x[:3, 3]) @ x[:3, :3]
 
-    def jacobian(self, poses: Float[AnyArray, "*n 4 4"]) -> Float[AnyArray, "*n 3 p"]:
+    def jacobian(self, poses: Float[Any, "*n 4 4"]) -> Float[Any, "*n 3 p"]:
         """G of poses probe -> tracker (mm); numpy or JAX, traceable, differentiable in the pose."""
         xp = poses.__array_namespace__()
         q = self.targets(poses)
@@ -173,4 +172,5 @@ def effective_elevational(
         return (
             1.0 if not said > 0 else float(_EFFICIENCY[0] if excess(low) >= 0 else _EFFICIENCY[1])
         )
-    return float(np.exp(brentq(excess, low, high, xtol=1e-6)))
+    root: Any = brentq(excess, low, high, xtol=1e-6)
+    return float(np.exp(root))

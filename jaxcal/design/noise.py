@@ -12,13 +12,12 @@ probe before. The elevational SD is that of the target's distance from the mid-p
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxcal.errors import InputError
-from jaxcal.geometry import AnyArray
 from jaxcal.probe import Probe
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ class Noise:
         doubt: factor by which the ratios of the three SDs may be wrong; 1: known.
     """
 
-    coefficients: Float[AnyArray, "3 4"]
+    coefficients: Float[Any, "3 4"]
     doubt: float = UNKNOWN_BY
 
     def __post_init__(self) -> None:
@@ -112,7 +111,7 @@ class Noise:
         The variance of each error is a Gamma regression with a logarithmic link (Fisher scoring) on
         the place, its coefficients held near zero by a normal prior; at the images' mean it is the
         calibration's own. With fewer than :data:`FEWEST_TO_LEARN` images the SDs are equal
-        everywhere; so they are for conventional calibration, which weighs them alike.
+        everywhere; so they are for methods other than joint, which weigh all errors alike.
 
         Args:
             result: of one problem.
@@ -124,8 +123,8 @@ class Noise:
             raise InputError("this calibration has no SDs: plan with a noise model of your own")
         used = np.asarray(answer.mask) > 0
         count = int(used.sum())
-        if result.method == "conventional":
-            # It weighs all errors alike, and so must what is predicted of it.
+        if result.method != "joint":
+            # They weigh all errors alike, and so must what is predicted of them.
             return cls.constant(np.full(3, np.sqrt(np.mean(sigma**2))), 1.0)
         # A tuned SD is off by a factor of about 1 + 1 / sqrt(2 n).
         left = max(count - 3, 1)
@@ -144,13 +143,13 @@ class Noise:
             coefficients[row, 0] -= 0.5 * slopes @ mean
         return replace(model, coefficients=coefficients)
 
-    def sigma(self, target: Float[AnyArray, "*n 3"]) -> Float[AnyArray, "*n 3"]:
+    def sigma(self, target: Float[Any, "*n 3"]) -> Float[Any, "*n 3"]:
         """SDs (lateral, range, elevational; mm) of targets in the image frame (traceable)."""
         xp = target.__array_namespace__()
         return xp.exp(_basis(target) @ self.coefficients.T)
 
 
-def _basis(target: Float[AnyArray, "*n 3"]) -> Float[AnyArray, "*n 4"]:
+def _basis(target: Float[Any, "*n 3"]) -> Float[Any, "*n 4"]:
     xp = target.__array_namespace__()
     deeper = target[..., 2] / _DEPTH_MM - 1.0
     aside = target[..., 0] / _LATERAL_MM

@@ -155,6 +155,7 @@ def next_poses(
     *,
     polish: bool = False,
     cost_s: Float[np.ndarray, " m"] | None = None,
+    rules: Rules | None = None,
 ) -> Plan:
     """The k poses that would help most after a calibration; milliseconds.
 
@@ -166,13 +167,14 @@ def next_poses(
         criterion: see :func:`plan`.
         polish: move them off the grid.
         cost_s: see :func:`plan`.
+        rules: likewise; by default none of them fills space.
 
     Returns:
         A plan of k poses; ``tre_mm[0]`` is the error now, ``tre_mm[-1]`` with all of them.
     """
-    filling = Rules(space_filling=0.0)
+    rules = Rules(space_filling=0.0) if rules is None else rules
     return plan(
-        candidates, k, criterion, result, polish=polish, swap=False, cost_s=cost_s, rules=filling
+        candidates, k, criterion, result, polish=polish, swap=False, cost_s=cost_s, rules=rules
     )
 
 

@@ -114,6 +114,35 @@ def test_a_short_run_ends_in_a_recording_that_calibrate_takes(tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_an_optimal_run_plans_on_and_stops_by_itself(tmp_path):
+    path, lines = tmp_path / "rec.h5", []
+    wanted = 0.4
+    request: Request | None = Request(30, "amplitude-scan", 2, bench=3, plan="optimal",
+                                      until_tre_mm=wanted)  # fmt: skip
+    with a_bench() as bench:
+        outcome = None
+        for _ in range(ATTEMPTS):
+            try:
+                outcome = run(bench, path, request, lines.append)
+                break
+            except AcquisitionStopped as error:
+                print(error)
+                request = None
+        truth = bench.world_truth()["image_to_probe"]
+    assert outcome is not None
+    assert 8 <= outcome.images < 30
+    told = [line for line in lines if line.startswith("planned: ")]
+    assert "one more image would bring it to" in told[-1]
+    assert float(re.search(r"image ([0-9.]+) mm", told[-1])[1]) <= wanted
+    assert float(re.search(r"image ([0-9.]+) mm", told[0])[1]) > wanted
+    recording = jaxcal.load(path)
+    found = np.asarray(jaxcal.calibrate(recording).image_to_probe)
+    points = np.array([[x, 0.0, z, 1.0] for x in (-24, 0, 24) for z in (15, 50, 82)])
+    apart = np.linalg.norm(points @ (found - truth)[:3].T, axis=1)
+    assert np.sqrt(np.mean(apart**2)) < 3 * wanted
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("placement", ["threshold-climb", "amplitude-scan", "pattern-injection"])
 def test_every_placement_brackets_the_truth(tmp_path, placement):
     path = tmp_path / "rec.h5"

@@ -8,8 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hw.bench.world import make_world
+from hw.planner import Planner
+from hw.pool import allowed_by, plan_pool
 from hw.poses import Extent, plan_poses, preview
+from hw.rigid import turn_deg
+from hw.robot.kinematics import flange_of, inverse, model_named
+from hw.robot.safety import out_of_box_mm
 from hw.scene import Scene
+from hw.setup import Setup
 from jaxcal.errors import InputError
 
 SCENE = make_world(0).scene
@@ -100,3 +106,67 @@ def test_preview_is_a_figure(tmp_path):
     path = tmp_path / "plan.png"
     preview(plan_poses(12, SCENE), path)
     assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def a_setup(**changes) -> Setup:
+    x, y, z = (float(value) for value in SCENE.point_mm)
+    limits = {
+        "box_min_mm": [x - 140.0, y - 140.0, z - 20.0],
+        "box_max_mm": [x + 140.0, y + 140.0, z + 170.0],
+        "cone_axis": [0.0, 0.0, -1.0], "cone_deg": 38.0, "max_step_mm": 250.0,
+        "max_turn_deg": 120.0, "max_speed_mm_s": 100.0, "arm_model": "UR5", "search_mm": 5.0,
+    }  # fmt: skip
+    return Setup("nowhere", "nowhere", SCENE, {**limits, **changes}, tcp_offset=(0.0,) * 6)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    setup = a_setup()
+    limits = setup.motion_limits()
+    return setup, limits, plan_pool(8, SCENE, Extent(), 1, allowed_by(limits, setup.tcp_offset))
+
+
+def test_a_pool_keeps_box_cone_and_the_arms_reach(pool):
+    setup, limits, plan = pool
+    assert 16 <= len(plan) <= 24
+    assert setup.tcp_offset is not None
+    for pose in plan.poses:
+        assert out_of_box_mm(pose, limits) <= -5.0
+        tilt = np.degrees(np.arccos(np.clip(pose[:3, 2] @ limits.cone_axis, -1, 1)))
+        assert tilt <= 38.0
+        assert inverse(model_named("UR5"), flange_of(pose, setup.tcp_offset)).reached.any()
+    # The Sobol plan of the same extent does not keep them by itself.
+    every = plan_poses(60, SCENE, Extent(), 1).poses
+    assert not allowed_by(limits, setup.tcp_offset)(every).all()
+    far = a_setup(box_min_mm=[900.0, 0.0, 0.0], box_max_mm=[1000.0, 100.0, 100.0])
+    with pytest.raises(InputError, match="widen"):
+        plan_pool(8, SCENE, Extent(), 1, allowed_by(far.motion_limits(), setup.tcp_offset))
+
+
+def test_optimal_poses_of_a_pool_are_turned_apart():
+    poses = plan_pool(6, SCENE, Extent(), 2).poses
+    apart = [turn_deg(a, b) for k, a in enumerate(poses) for b in poses[:k]]
+    assert np.quantile(apart, 0.1) > 15
+    assert np.sum(np.array(apart) < 4.0) <= 6
+
+
+def test_a_planner_visits_each_pose_once_and_prefers_what_is_near(pool):
+    setup, _, plan = pool
+    planner = Planner(plan.poses, setup)
+    left, taken = list(range(len(plan))), np.zeros((0, 4, 4))
+    here = plan.poses[0]
+    for _ in range(10):
+        choice = planner.choose(left, taken, here, None)
+        assert choice.text == ""
+        left.remove(choice.row)
+        here = plan.poses[choice.row]
+        taken = np.concatenate([taken, here[None]])
+    chosen = sorted(set(range(len(plan))) - set(left))
+    assert len(chosen) == 10
+    # What ten chosen poses tell, against the first ten of the tour.
+    nominal = planner._nominal.model
+    told = [
+        np.linalg.slogdet(nominal.beliefs() + nominal.information(plan.poses[rows]))[1]
+        for rows in (chosen, list(range(10)))
+    ]
+    assert told[0] > told[1]

@@ -1,0 +1,151 @@
+"""Which pose of a confirmed pool comes next, and whether another image is worth it.
+
+Up to the eighth image, and as long as the running calibration has not converged, poses are chosen
+for the SDs that a bench begins with; from then on for what the calibration so far knows and with
+the SDs that were tuned. Gains are compared a second: the way there and what a placement takes both
+count. Every fifth image fills space.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hw.pool import BENCH_RULES, BENCH_SDS_MM, constraints_of
+from hw.rigid import turn_deg
+from hw.setup import Setup
+from hw.shapes import Float
+from jaxcal.calibration import Calibration
+from jaxcal.design import Candidates, Model, Noise, images_to, next_poses
+from jaxcal.design.greedy import Cover, space_features
+from jaxcal.design.planning import Known
+from jaxcal.errors import InputError
+
+FEWEST_TO_TRUST = 8
+"""Images from which on a calibration's own covariance says what is known."""
+_PLACEMENT_S = 8.0
+"""Bench seconds that an image takes beside the way there."""
+_TURN_DEG_S = 30.0
+_FILL = 5
+_MOST_IMAGES = 1000
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The next pose.
+
+    Attributes:
+        row: of the pool; None: the wanted error is reached.
+        tre_now_mm: predicted with the images so far; None where nothing is known yet.
+        tre_then_mm: with one more at this pose.
+        more: images that the wanted error still takes; None: not asked for, not known, or more
+            than 1000.
+    """
+
+    row: int | None
+    tre_now_mm: float | None = None
+    tre_then_mm: float | None = None
+    more: int | None = None
+
+    @property
+    def text(self) -> str:
+        """One line for a person; empty where nothing is known yet."""
+        if self.tre_now_mm is None or self.tre_then_mm is None:
+            return ""
+        line = (
+            f"predicted error over the image {self.tre_now_mm:.3f} mm; one more image would bring "
+            f"it to {self.tre_then_mm:.3f} mm"
+        )
+        return line if self.more is None else f"{line}; about {self.more} to what is wanted"
+
+
+class Planner:
+    """Chooses from a pool.
+
+    Args:
+        targets: (n, 4, 4) the pool, mm.
+        setup: the bench, for scene and extent.
+        until_tre_mm: wanted predicted TRE; None: go on.
+    """
+
+    def __init__(
+        self, targets: Float[np.ndarray, "n 4 4"], setup: Setup, until_tre_mm: float | None = None
+    ) -> None:
+        scene = setup.scene
+        self._targets, self._wanted = targets, until_tre_mm
+        self._speed = float(setup.limits.get("max_speed_mm_s", 50.0))
+        self._tip = scene.tip_mm
+        model = Model(scene.image_to_probe, scene.point_mm, Noise.constant(BENCH_SDS_MM))
+        self._nominal = Candidates(targets, model, constraints_of(scene, setup.extent))
+
+    def choose(
+        self,
+        open_rows: list[int],
+        taken: Float[np.ndarray, "k 4 4"],
+        here: Float[np.ndarray, "4 4"] | None,
+        answer: Calibration | None,
+    ) -> Choice:
+        """The next pose of the pool, or none where the wanted error is reached.
+
+        Args:
+            open_rows: poses that were neither taken nor given up; at least one.
+            taken: (k, 4, 4) tracked poses of the images that the calibration takes.
+            here: where the tool centre point is; None: not known.
+            answer: the calibration from these images.
+        """
+        left = replace(self._nominal, poses=self._targets[open_rows], taken=taken)
+        known, left = self._known(answer, left)
+        cost = None if here is None else self._seconds(here, left.poses)
+        rules = replace(BENCH_RULES, space_filling=0.0)
+        found = next_poses(known, left, 1, cost_s=cost, rules=rules)
+        filling = self._filling(open_rows, left, len(taken))
+        row = open_rows[int(found.rows[0])] if filling is None else filling
+        if not isinstance(known, Calibration):
+            return Choice(row)
+        now, then = (float(value) for value in found.tre_mm)
+        if self._wanted is None:
+            return Choice(row, now, then)
+        if now <= self._wanted:
+            return Choice(None, now, then, 0)
+        try:
+            more = images_to(known, self._wanted, left)
+        except InputError:
+            more = None
+        return Choice(row, now, then, more)
+
+    def _known(
+        self, answer: Calibration | None, left: Candidates
+    ) -> tuple[Calibration | Known, Candidates]:
+        """What is known, and the candidates with the X, target and SDs that go with it."""
+        taken = left.taken
+        assert taken is not None
+        enough = len(taken) >= FEWEST_TO_TRUST
+        if answer is not None and enough and answer.status == "converged":
+            found = answer.numpy()
+            model = Model(np.asarray(found.image_to_probe), np.asarray(found.point))
+            noise = Noise.learned(answer, model.targets(taken))
+            return answer, replace(left, model=replace(model, noise=noise))
+        model = left.model
+        return Known(model.beliefs() + model.information(taken), max(len(taken), 1)), left
+
+    def _filling(self, open_rows: list[int], left: Candidates, count: int) -> int | None:
+        """The pose that fills space, where this image is one of those."""
+        if (count + 1) % _FILL or count == 0:
+            return None
+        assert left.taken is not None
+        cover = Cover(space_features(self._nominal))
+        for feature in space_features(replace(left, poses=left.taken)):
+            cover.add(feature)
+        gains = cover.gains()[open_rows]
+        return open_rows[int(np.argmax(gains))]
+
+    def _seconds(
+        self, here: Float[np.ndarray, "4 4"], poses: Float[np.ndarray, "n 4 4"]
+    ) -> Float[np.ndarray, " n"]:
+        """From here to each pose, and the placement there."""
+        tip = here[:3, :3] @ self._tip + here[:3, 3]
+        tips = poses[:, :3, :3] @ self._tip + poses[:, :3, 3]
+        way = np.linalg.norm(tips - tip, axis=1) / self._speed
+        turn = np.array([turn_deg(here, pose) for pose in poses]) / _TURN_DEG_S
+        return _PLACEMENT_S + np.maximum(way, turn)

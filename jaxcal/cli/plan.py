@@ -1,0 +1,243 @@
+"""``jaxcal plan``: which poses, from nothing but a probe and a region, or to add to a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from jaxcal.cli.calibrate import _segmented, _unknowns
+from jaxcal.cli.common import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    ExitCode,
+    import_engine,
+    print_json,
+    print_page,
+    progress,
+)
+from jaxcal.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxcal.design import Candidates, Plan
+    from jaxcal.design.constraints import Region
+
+_COUNTED = (0.5, 0.3, 0.2, 0.1)
+"""Errors (mm) for which the images are counted, where none is asked for."""
+
+
+@click.command()
+@click.argument("recording", type=click.Path(), metavar="[REC]", required=False)
+@click.option("--images", type=click.IntRange(1, 2000), metavar="N", help="Poses.  [default: 30; "
+              "with REC 10]")  # fmt: skip
+@click.option("--until-tre", type=POSITIVE, metavar="MM", help="As many poses as this predicted "
+              "error over the image takes.")  # fmt: skip
+@click.option(
+    "--criterion",
+    type=click.Choice(["tre", "rp", "d"]),
+    default="tre",
+    show_default=True,
+    help="What shall be small: target registration error, reconstruction precision, or the volume "
+    "of the confidence ellipsoid.",
+)
+@click.option(
+    "--probe",
+    type=click.Choice(["linear", "curvilinear"]),
+    default="linear",
+    show_default=True,
+    help="Transducer where the recording names none: L14-5 or C5-2.",
+)
+@click.option("--depth", type=POSITIVE, nargs=2, metavar="NEAR FAR", help="Range of the target, "
+              "mm.  [default: 15 82; with REC where it was]")  # fmt: skip
+@click.option("--lateral", type=POSITIVE, metavar="MM", help="Lateral position of the target, up "
+              "to this either way.")  # fmt: skip
+@click.option("--cone", type=NOT_NEGATIVE, metavar="DEG", help="Largest tilt.  [default: 40]")
+@click.option("--turn", type=NOT_NEGATIVE, metavar="DEG", help="Largest turn about the beam's "
+              "direction.  [default: 90]")  # fmt: skip
+@click.option(
+    "--sigma",
+    type=POSITIVE,
+    nargs=3,
+    metavar="LATERAL RANGE ELEVATIONAL",
+    help="SDs of the errors, mm, without REC. They may be wrong by a factor of three.",
+)
+@click.option("--estimate", metavar="LIST", help="With REC: further unknowns (scale), as for "
+              "calibrate.")  # fmt: skip
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
+              help="Of the candidate poses.")  # fmt: skip
+@click.option("--figure", type=click.Path(), metavar="PNG", help="Draw the plan.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+def plan(
+    recording: str | None,
+    images: int | None,
+    until_tre: float | None,
+    criterion: Literal["tre", "rp", "d"],
+    probe: str,
+    depth: tuple[float, float] | None,
+    lateral: float | None,
+    cone: float | None,
+    turn: float | None,
+    sigma: tuple[float, float, float] | None,
+    estimate: str | None,
+    seed: int,
+    figure: str | None,
+    as_json: bool,
+) -> int:
+    """Plan which poses to take images from, and say how many a wanted error takes.
+
+    Without REC from a probe and a region alone; with REC it calibrates (joint) and says what to
+    add. Poses are told in words for a hand-held probe; --json has them as matrices.
+    """
+    if images is not None and until_tre is not None:
+        raise InputError("give either --images or --until-tre")
+    if recording is None and estimate is not None:
+        raise InputError("--estimate needs a recording")
+    if recording is not None and sigma is not None:
+        raise InputError("--sigma does not go with a recording: its images tell the SDs")
+    import_engine()
+    from jaxcal import design
+    from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.design.predict import MOST_IMAGES
+
+    enable_compilation_cache()
+    region = None if depth is None and lateral is None else _region(probe, depth, lateral)
+    result = None
+    if recording is None:
+        candidates = _from_nothing(probe, region, cone, turn, sigma, seed)
+    else:
+        result, candidates = _from_recording(recording, estimate, region, cone, turn, seed)
+    with progress("planning"):
+        count = images or (30 if result is None else 10)
+        if until_tre is not None:
+            if result is None:
+                first = design.plan(candidates, 8, criterion, polish=False)
+                count = max(design.images_to(first, until_tre), 8)
+            else:
+                count = max(design.images_to(result, until_tre, candidates), 1)
+        found = design.plan(candidates, min(count, MOST_IMAGES), criterion, result)
+        if figure is not None:
+            _draw(found, until_tre, figure)
+        record = _record(found, recording)
+    if as_json:
+        print_json(record)
+    else:
+        _print(found, record, figure)
+    return ExitCode.CONVERGED
+
+
+def _region(probe: str, depth: tuple[float, float] | None, lateral: float | None) -> Region:
+    from jaxcal.design import Region
+    from jaxcal.probe import PRESETS
+
+    across = None if lateral is None else (-lateral, lateral)
+    return Region.of_probe(PRESETS[probe], depth or (15.0, 82.0), across)
+
+
+def _from_nothing(
+    probe: str,
+    region: Region | None,
+    cone: float | None,
+    turn: float | None,
+    sigma: tuple[float, float, float] | None,
+    seed: int,
+) -> Candidates:
+    from jaxcal import design
+    from jaxcal.probe import PRESETS
+
+    transducer = PRESETS[probe]
+    region = design.Region.of_probe(transducer) if region is None else region
+    bounds = design.Constraints(
+        region=region, cone_deg=40.0 if cone is None else cone,
+        turn_deg=90.0 if turn is None else turn,
+    )  # fmt: skip
+    noise = design.Noise.of_probe(transducer) if sigma is None else design.Noise.constant(sigma)
+    return design.make_candidates(
+        transducer, constraints=bounds, model=design.Model(noise=noise), seed=seed
+    )
+
+
+def _from_recording(
+    path: str,
+    estimate: str | None,
+    region: Region | None,
+    cone: float | None,
+    turn: float | None,
+    seed: int,
+) -> tuple[Any, Candidates]:
+    from jaxcal import design
+    from jaxcal.io.hdf5 import load
+    from jaxcal.solve import calibrate
+
+    measured, _ = _segmented(load(path))
+    with progress("calibrating"):
+        result = calibrate(measured, estimate=_unknowns(estimate))
+    if result.status == "failed":
+        raise InputError(f"{path}: the calibration failed: there is nothing to plan from")
+    candidates = design.candidates_around(
+        measured, result, region=region, cone_deg=cone, turn_deg=turn, seed=seed
+    )
+    return result, candidates
+
+
+def _draw(found: Plan, wanted: float | None, path: str) -> None:
+    from jaxcal.design import plan_figure
+    from jaxcal.io.atomic import atomic_path
+
+    with atomic_path(path) as temporary:
+        kind = Path(path).suffix.lstrip(".") or "png"
+        try:
+            plan_figure(found, wanted).savefig(temporary, format=kind)
+        except ValueError as error:
+            raise InputError(f"{path}: {error}") from None
+
+
+def _record(found: Plan, recording: str | None) -> dict[str, Any]:
+    from jaxcal.design import images_to
+    from jaxcal.report.next_poses import pose_records
+
+    counted = {}
+    for wanted in _COUNTED:
+        try:
+            counted[f"{wanted:g}"] = found.known.images + images_to(found, wanted)
+        except InputError:
+            counted[f"{wanted:g}"] = None
+    return {
+        "source": recording,
+        "criterion": found.criterion,
+        "images_before": found.known.images,
+        "tre_mm": found.tre_mm.tolist(),
+        "rp_mm": found.rp_mm.tolist(),
+        "images_to_tre_mm": counted,
+        "poses": pose_records(found),
+    }
+
+
+def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE)
+    for heading in ("", "how to hold the probe", "lateral, depth\n(mm)", "error then\n(mm)"):
+        table.add_column(heading, justify="left" if "hold" in heading else "right")
+    for k, pose in enumerate(record["poses"]):
+        lateral, depth = pose["target_mm"]
+        sign = " (fills space)" if pose["fills_space"] else ""
+        table.add_row(
+            str(found.known.images + k + 1), pose["words"] + sign, f"{lateral:.0f}, {depth:.0f}",
+            f"{pose['tre_mm']:.3g}",
+        )  # fmt: skip
+    counts = [
+        f"{wanted} mm: {'over 1000' if count is None else count}"
+        for wanted, count in record["images_to_tre_mm"].items()
+    ]
+    before = "" if not found.known.images else f" after the {found.known.images} that there are"
+    print_page(
+        table,
+        "Tilts and turns from the middle orientation, with the marker to your right; left is where "
+        "the lateral position is smallest. Take them in any order.",
+        f"Predicted with these {len(found)} images{before}: error over the image "
+        f"{found.tre_mm[-1]:.2g} mm, reconstruction precision {found.rp_mm[-1]:.2g} mm.",
+        *([f"How many images an error takes: {'; '.join(counts)}."] if counts else []),
+        *([] if figure is None else [f"figure: {figure}"]),
+    )

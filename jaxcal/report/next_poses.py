@@ -1,0 +1,83 @@
+"""Which images would help most after a calibration, for a program and for a person."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jaxcal import design
+from jaxcal.calibration import Calibration
+from jaxcal.errors import InputError
+from jaxcal.recording import Recording
+
+COUNT = 3
+_CANDIDATES = 2000
+
+
+def next_poses_record(result: Calibration, recording: Recording) -> dict[str, Any] | None:
+    """The three images that would help most; None where nothing can be said.
+
+    Args:
+        result: of one problem.
+        recording: what was calibrated, with points or pixels.
+
+    Returns:
+        ``tre_now_mm`` and ``tre_then_mm`` (predicted, root mean square over the image),
+        ``images_to_half`` (how many would halve the error; None: over 1000) and ``poses``: of each
+        ``words``, ``target_mm`` [lateral, axial], ``pose`` (4x4, probe -> tracker) and ``tre_mm``
+        once it and those before it are taken.
+    """
+    if result.status == "failed":
+        return None
+    try:
+        candidates = design.candidates_around(recording, result, count=_CANDIDATES)
+        plan = design.next_poses(result, candidates, COUNT)
+    except InputError:
+        return None
+    if not np.isfinite(plan.tre_mm).all():
+        return None
+    try:
+        half = design.images_to(result, 0.5 * float(plan.tre_mm[0]), candidates)
+    except InputError:
+        half = None
+    return {
+        "tre_now_mm": float(plan.tre_mm[0]),
+        "tre_then_mm": float(plan.tre_mm[-1]),
+        "images_to_half": half,
+        "poses": pose_records(plan),
+    }
+
+
+def pose_records(plan: design.Plan) -> list[dict[str, Any]]:
+    """Each pose of a plan as plain values."""
+    model, bounds = plan.candidates.model, plan.candidates.constraints
+    return [
+        {
+            "words": design.pose_in_words(pose, bounds, model.image_to_probe, model.point),
+            "target_mm": [float(target[0]), float(target[2])],
+            "pose": pose.tolist(),
+            "fills_space": bool(filling),
+            "tre_mm": float(tre),
+        }
+        for pose, target, filling, tre in zip(
+            plan.poses, plan.targets, plan.filling, plan.tre_mm[1:], strict=True
+        )
+    ]
+
+
+def next_poses_sentences(record: dict[str, Any]) -> list[str]:
+    """The same for a person, from the record of a calibration; nothing where there is nothing."""
+    found = record.get("next_poses")
+    if found is None:
+        return []
+    now, then = found["tre_now_mm"], found["tre_then_mm"]
+    lines = [
+        f"What would help most: {len(found['poses'])} images that bring the predicted error over "
+        f"the image from {now:.2g} to {then:.2g} mm. From the middle orientation, marker to your "
+        "right:",
+        *(f"- {pose['words']}" for pose in found["poses"]),
+    ]
+    if found["images_to_half"] is not None:
+        lines.append(f"Half the error would take {found['images_to_half']} chosen images more.")
+    return lines
