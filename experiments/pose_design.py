@@ -35,6 +35,7 @@ import time
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -298,7 +299,7 @@ def crosswire(folder: Path, halves: int) -> list[list[object]]:
     batch = jaxcal.stack([replace(data, mask=jnp.asarray(mask)) for mask in masks])
     rows: list[list[object]] = []
     for method in ("joint", "conventional"):
-        arguments = {"prior": "gaussian"} if method == "joint" else {}
+        arguments: dict[str, Any] = {"prior": "gaussian"} if method == "joint" else {}
         result = jaxcal.calibrate_batch(batch, method, estimate=("scale",), **arguments)
         scored = []
         for k, mask in enumerate(masks):
