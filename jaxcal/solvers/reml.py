@@ -273,7 +273,8 @@ def self_tuned(
     if tolerance is None:
         tolerance = 10 * standing if standing < 1e-9 else standing
     images, observation = barrier((images.padded(), observation.padded()))
-    coordinates = barrier(reach(start, images))
+    # What belongs to a lane is made once, and not again for every image.
+    coordinates, held, count, enough = barrier((reach(start, images), held, count, enough))
 
     def update(
         sums: ComponentSums, sigma: Array, damping: Array, exact: Array
