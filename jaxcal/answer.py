@@ -26,9 +26,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.calibration import Calibration, Convergence, Linearisation, Medium, Status
-from jaxcal.diagnostics.uncertainty import AT_BOUND, LARGEST_SD, threshold
+from jaxcal.diagnostics.uncertainty import AT_BOUND, LARGEST_SD, mm_at_target, threshold
 from jaxcal.model.observations import LARGEST_ELEVATION
-from jaxcal.model.parameters import BLOCK_SIZE, Blocks, Parameters, block_slice, size
+from jaxcal.model.parameters import Parameters, block_slice, size
 from jaxcal.options import Given, Plan
 from jaxcal.problem import Problem
 from jaxcal.recording import MINIMUM_IMAGES
@@ -120,7 +120,7 @@ def assemble(
         solved.information,
         solved.design,
         variance,
-        unit_scale(lever, blocks),
+        mm_at_target(lever, blocks),
         LARGEST_SD * lever,
         bounded=plan.prior == "bounded",
     )
@@ -287,14 +287,6 @@ class Observability(eqx.Module):
     degenerate: Bool[Array, "*batch"]
     weak: Bool[Array, "*batch"]
     singular: Bool[Array, "*batch"]
-
-
-def unit_scale(lever: Float[Array, "*batch"], blocks: Blocks) -> Float[Array, "*batch p"]:
-    """What makes each unknown's tangent mm at the target: 1 for mm, the lever arm otherwise."""
-    one = jnp.ones_like(lever)
-    turning = ("rotation", "scale", "sound-speed")
-    each = [lever if name in turning else one for name in blocks for _ in range(BLOCK_SIZE[name])]
-    return jnp.stack(each, axis=-1)
 
 
 def covariance_and_observability(

@@ -175,87 +175,87 @@ class Calibration(eqx.Module):
         return jnp.sum(self.mask > 0, axis=-1)
 
     @property
-    def information(self) -> Float[Array, "*batch p p"]:
+    def information(self) -> Float[AnyArray, "*batch p p"]:
         """Information of all unknowns, offsets eliminated, per ``linearisation.variance``."""
         return self.linearisation.information
 
     @property
-    def cost(self) -> Float[Array, "*batch"]:
+    def cost(self) -> Float[AnyArray, "*batch"]:
         """The minimised sum of squares: mm^2 (equal weights) or whitened."""
         return self.convergence.cost
 
     @property
-    def stationarity(self) -> Float[Array, "*batch"]:
+    def stationarity(self) -> Float[AnyArray, "*batch"]:
         """Scaled KKT residual of the objective."""
         return self.convergence.stationarity
 
     @property
-    def tolerance_met(self) -> Bool[Array, "*batch"]:
+    def tolerance_met(self) -> Bool[AnyArray, "*batch"]:
         """The method's own stopping rule was met."""
         return self.convergence.tolerance_met
 
     @property
-    def iterations(self) -> Int[Array, "*batch"]:
+    def iterations(self) -> Int[AnyArray, "*batch"]:
         """Linearisations (joint, conventional) or rounds (alternating)."""
         return self.convergence.iterations
 
     @property
-    def variance_rounds(self) -> Int[Array, "*batch"]:
+    def variance_rounds(self) -> Int[AnyArray, "*batch"]:
         """Variance updates of the self-tuning; 0 without."""
         return self.convergence.variance_rounds
 
     @property
-    def searched_start(self) -> Bool[Array, "*batch"]:
+    def searched_start(self) -> Bool[AnyArray, "*batch"]:
         """The closed-form start was unsound and one was searched for."""
         return self.convergence.searched_start
 
     @property
-    def sigma_floored(self) -> Bool[Array, "*batch 3"]:
+    def sigma_floored(self) -> Bool[AnyArray, "*batch 3"]:
         """Which SDs rest on their floor."""
         return self.convergence.sigma_floored
 
     @property
-    def rotation_change(self) -> Float[Array, "*batch"]:
+    def rotation_change(self) -> Float[AnyArray, "*batch"]:
         """X's last move in rad (alternating), else 0."""
         return self.convergence.rotation_change
 
     @property
-    def translation_change(self) -> Float[Array, "*batch"]:
+    def translation_change(self) -> Float[AnyArray, "*batch"]:
         """X's last move in mm (alternating), else 0."""
         return self.convergence.translation_change
 
     @property
-    def trace(self) -> Float[Array, "*batch trace"] | None:
+    def trace(self) -> Float[AnyArray, "*batch trace"] | None:
         """Objective after each of the first iterations; None where none was asked for."""
         return self.convergence.trace
 
     @property
-    def sound_speed_m_s(self) -> Float[Array, "*batch"] | None:
+    def sound_speed_m_s(self) -> Float[AnyArray, "*batch"] | None:
         """Estimated sound speed, m/s; None where it was not estimated."""
         return None if self.medium is None else self.medium.sound_speed_m_s
 
     @property
-    def sound_speed_sd_m_s(self) -> Float[Array, "*batch"] | None:
+    def sound_speed_sd_m_s(self) -> Float[AnyArray, "*batch"] | None:
         """Its standard deviation, m/s."""
         return None if self.medium is None else self.medium.sound_speed_sd_m_s
 
     @property
-    def sound_speed_prior_m_s(self) -> Float[Array, "*batch"] | None:
+    def sound_speed_prior_m_s(self) -> Float[AnyArray, "*batch"] | None:
         """SD of the sound speed that was believed before, m/s; None without such a belief."""
         return None if self.medium is None else self.medium.sound_speed_prior_m_s
 
     @property
-    def delay_s(self) -> Float[Array, "*batch"] | None:
+    def delay_s(self) -> Float[AnyArray, "*batch"] | None:
         """Estimated electronic delay, s; None where it was not estimated."""
         return None if self.medium is None else self.medium.delay_s
 
     @property
-    def delay_sd_s(self) -> Float[Array, "*batch"] | None:
+    def delay_sd_s(self) -> Float[AnyArray, "*batch"] | None:
         """Its standard deviation, s."""
         return None if self.medium is None else self.medium.delay_sd_s
 
     @property
-    def delay_prior_s(self) -> Float[Array, "*batch"] | None:
+    def delay_prior_s(self) -> Float[AnyArray, "*batch"] | None:
         """SD of the delay that was believed before, s; None without such a belief."""
         return None if self.medium is None else self.medium.delay_prior_s
 

@@ -21,7 +21,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxcal.diagnostics.arrays import array_module
+from jaxcal.geometry import AnyArray
 from jaxcal.model.parameters import BLOCK_SIZE, block_slice
+from jaxcal.model.observations import LARGEST_ELEVATION
+from jaxcal.options import DEFAULT_MAX_ELEVATION_MM
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
@@ -37,14 +41,8 @@ SINGULAR = 1e-11
 LARGEST_SD = 0.5
 """A direction whose SD exceeds this fraction of the lever arm is not known in any useful sense."""
 
-LARGEST_ELEVATION = 0.95
-"""Bounds are cut at this fraction of the range (:mod:`jaxcal.model.residuals`)."""
-
 AT_BOUND = 1e-12
 """An offset is on its bound where it is nearer than this part of it: that is rounding."""
-
-DEFAULT_BOUND_MM = 1.0
-"""The bound on the offsets where none was given (:mod:`jaxcal.options`)."""
 
 TUNED = ("gaussian", "auto", "uniform")
 """Priors with SDs of lateral position, range and offset."""
@@ -172,12 +170,12 @@ def threshold(eps: float) -> float:
     return max(SINGULAR, 100 * eps)
 
 
-def mm_at_target(lever: Float[Array, " k"], blocks: Blocks) -> Float[Array, "k p"]:
-    """What makes each unknown's tangent mm at the target: 1 for mm, the lever arm otherwise."""
+def mm_at_target(lever: Float[AnyArray, "*batch"], blocks: Blocks) -> Float[AnyArray, "*batch p"]:
+    """What makes each unknown's tangent mm at the target (traceable): 1, or the lever arm."""
+    xp, one = array_module(lever), 0 * lever + 1
     turning = ("rotation", "scale", "sound-speed")
-    one = np.ones_like(lever)
     each = [lever if name in turning else one for name in blocks for _ in range(BLOCK_SIZE[name])]
-    return np.stack(each, axis=1)
+    return xp.stack(each, axis=-1)
 
 
 def spectrum(
@@ -236,7 +234,7 @@ def bound_of(answer: Calibration, problem: Problem) -> Float[Array, "k n"] | Non
     if answer.prior != "bounded":
         return None
     if problem.max_elevation is None:
-        return np.full_like(answer.mask, DEFAULT_BOUND_MM)
+        return np.full_like(answer.mask, DEFAULT_MAX_ELEVATION_MM)
     return np.asarray(problem.max_elevation)
 
 
