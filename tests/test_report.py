@@ -146,8 +146,17 @@ def test_pixel_test_images_are_brought_to_mm(result, recording, record):
 
 
 def test_an_estimated_scale_replaces_the_written_one(result, recording, record):
+    def widened(matrix):
+        return jnp.eye(11).at[:9, :9].set(matrix)
+
+    lines = result.linearisation
     scaled = dataclasses.replace(
-        result, scale_mm_per_px=jnp.array([0.1, 0.2]), blocks=(*result.blocks, "scale")
+        result,
+        scale_mm_per_px=jnp.array([0.1, 0.2]),
+        blocks=(*result.blocks, "scale"),
+        linearisation=dataclasses.replace(
+            lines, information=widened(lines.information), design=widened(lines.design)
+        ),
     )
     test = pixels(recording.test, (0.1, 0.2), 0.0)
     for written in (None, np.array([5.0, 5.0])):
