@@ -23,8 +23,8 @@ from jaxtyping import Bool, Float
 
 from jaxcal.diagnostics.arrays import array_module
 from jaxcal.geometry import AnyArray
-from jaxcal.model.parameters import BLOCK_SIZE, block_slice
 from jaxcal.model.observations import LARGEST_ELEVATION
+from jaxcal.model.parameters import BLOCK_SIZE, block_slice
 from jaxcal.options import DEFAULT_MAX_ELEVATION_MM
 
 if TYPE_CHECKING:
