@@ -29,15 +29,14 @@ from common import ELEVATIONS_MM, NOISES_MM, arguments, machine, results_folder,
 from jaxtyping import Array
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision
+from jaxcal.backend import RIGID, BoundedOffsets, Images, Iterate, Parameters
 from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.compiler import fast_to_run
 from jaxcal.io.atomic import atomic_path
-from jaxcal.model.parameters import Parameters
 from jaxcal.offsets import OFFSET_LAWS, OffsetLaw, nominal_bound
 from jaxcal.options import Options
 from jaxcal.simulation import Experiment, simulate
-from jaxcal.solvers.fused import Guess, Images
-from jaxcal.solvers.fused_methods import alternate
+from jaxcal.solvers.alternating import alternate
 
 SEED = 20261124
 TRIALS, AGAIN = 200, 4000
@@ -99,7 +98,8 @@ def draw(law: OffsetLaw, images: int, indices: Array, elevation: Array, noise: A
 @jax.jit
 def precision(x: Array, experiments: Experiment) -> Array:
     """Eq. 8 of every trial."""
-    return jax.vmap(reconstruction_precision)(x, experiments.test_poses, experiments.test_points)
+    found = jax.vmap(reconstruction_precision)(x, experiments.test_poses, experiments.test_points)
+    return jnp.asarray(found)
 
 
 def hindsight(begun, problems: Problem, experiments: Experiment, bounds: Array) -> Array:
@@ -114,29 +114,40 @@ def hindsight(begun, problems: Problem, experiments: Experiment, bounds: Array) 
             return jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), tree)
 
         lanes, x, point = each(problems), each(x), each(point)
-        limit = jnp.tile(bounds, len(test_poses))[:, None] * lanes.mask
         images = Images.of(lanes)
-        start = Guess.of(jax.vmap(Parameters.of)(x[:, :3, :3], x[:, :3, 3], point))
+        limit = jnp.tile(bounds, len(test_poses))[:, None] * lanes.mask
+        bounded = BoundedOffsets.of(limit, images)
+        start = Iterate.of(jax.vmap(Parameters.of)(x[:, :3, :3], x[:, :3, 3], point), RIGID)
         test_poses, test_points = each(test_poses), each(test_points)
 
-        def judged(guess: Guess) -> Array:
-            matrix = jax.vmap(lambda found: found.matrix())(guess.parameters())
-            return jax.vmap(reconstruction_precision)(matrix, test_poses, test_points)
+        def judged(place: Iterate) -> Array:
+            matrix = jax.vmap(Parameters.matrix)(place.parameters())
+            return jnp.asarray(jax.vmap(reconstruction_precision)(matrix, test_poses, test_points))
 
-        def go_on(guess: Guess, rounds: Array) -> tuple[Guess, Array]:
+        def go_on(place: Iterate, rounds: Array) -> tuple[Iterate, Array]:
             done = alternate(
-                guess, limit, images, tolerance_rad=0.0, tolerance_mm=0.0, max_rounds=rounds,
+                place,
+                bounded,
+                images,
+                tolerance_rad=0.0,
+                tolerance_mm=0.0,
+                max_rounds=rounds,
                 inner_steps=rule.inner_steps,
-            )  # fmt: skip
-            return done.guess, judged(done.guess)
+            )
+            return done.place, judged(done.place)
 
         steps = jnp.asarray(np.diff(ROUNDS, prepend=0))
         by_rounds = jax.lax.scan(go_on, start, steps)[1]
         by_rule = alternate(
-            start, limit, images, tolerance_rad=rule.tolerance_rad, tolerance_mm=rule.tolerance_mm,
-            max_rounds=rule.max_rounds, inner_steps=rule.inner_steps,
-        )  # fmt: skip
-        found = jnp.concatenate([by_rounds, judged(by_rule.guess)[None]])
+            start,
+            bounded,
+            images,
+            tolerance_rad=rule.tolerance_rad,
+            tolerance_mm=rule.tolerance_mm,
+            max_rounds=rule.max_rounds,
+            inner_steps=rule.inner_steps,
+        )
+        found = jnp.concatenate([by_rounds, judged(by_rule.place)[None]])
         return found.T.reshape(-1, count, len(ROUNDS) + 1)
 
     batch = (begun.image_to_probe, begun.point, problems, experiments.test_poses,

@@ -72,7 +72,8 @@ def draw(law: OffsetLaw, images: int, indices: Array, elevation: Array, noise: A
 @jax.jit
 def precision(x: Array, experiments) -> Array:
     """Eq. 8 of every trial."""
-    return jax.vmap(reconstruction_precision)(x, experiments.test_poses, experiments.test_points)
+    found = jax.vmap(reconstruction_precision)(x, experiments.test_poses, experiments.test_points)
+    return jnp.asarray(found)
 
 
 def limits(

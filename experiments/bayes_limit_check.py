@@ -22,9 +22,7 @@ import numpy as np
 from common import arguments, machine, results_folder, write_table
 from jaxtyping import Array
 
-from jaxcal.model.parameters import RIGID, Parameters, retract
-from jaxcal.model.priors import whiten
-from jaxcal.model.residuals import measurement_residual
+from jaxcal.backend import RIGID, Parameters, measurement_residual, retract
 from jaxcal.offsets import DEGREES_OF_FREEDOM, OffsetLaw, standard_deviation
 
 SEED = 20261127
@@ -53,7 +51,14 @@ def log_law(law: OffsetLaw, u: Array) -> Array:
 def whitened(start: Parameters, tangent: Array, problem) -> tuple[Array, Array]:
     """Whitened lateral and range residuals, and the offsets in mm."""
     errors = measurement_residual(retract(start, tangent, RIGID), problem)
-    return whiten(errors, problem.covariance)[:, :2].ravel(), errors[:, 2]
+    # The inverse Cholesky factor of each image's 2x2 covariance.
+    covariance = problem.covariance
+    first = jnp.sqrt(covariance[:, 0, 0])
+    mixed = covariance[:, 1, 0] / first
+    second = jnp.sqrt(covariance[:, 1, 1] - mixed**2)
+    lateral = errors[:, 0] / first
+    distance = (errors[:, 1] - mixed * lateral) / second
+    return jnp.concatenate([lateral, distance]), errors[:, 2]
 
 
 @jax.jit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,20 +12,34 @@ import numpy as np
 import same_objective as same
 from jaxtyping import Array, Float
 
-from jaxcal.diagnostics.metrics import reconstruction_precision
-from jaxcal.model.parameters import RIGID, Parameters, retract
-from jaxcal.model.priors import AbstractPrior, Bounded
-from jaxcal.model.residuals import circle_residual
-from jaxcal.problem import Problem
+from jaxcal import Problem, reconstruction_precision
+from jaxcal.backend import (
+    RIGID,
+    BoundedOffsets,
+    Component,
+    Further,
+    Images,
+    Iterate,
+    Normal,
+    Observation,
+    Parameters,
+    accumulate,
+    retract,
+)
+from jaxcal.model.observations import on_circle
 from jaxcal.simulation import Protocol, simulate
-from jaxcal.solvers import arrow as arrows
-from jaxcal.solvers.alternating import alternate
-from jaxcal.solvers.conventional import from_scratch
-from jaxcal.solvers.joint import joint
-from jaxcal.solvers.least_squares import linearise, minimise
+from jaxcal.solvers.alternating import bounded
+from jaxcal.solvers.levenberg_marquardt import (
+    EXACT_BELOW,
+    LESS,
+    Descent,
+    Rounding,
+    gradient_cosine,
+    iterate_once,
+)
 
 SEED = 20261122
-CHUNK = 50
+CHUNK = same.CHUNK
 TEST_IMAGES = 50
 TOLERANCES = tuple(10.0**-k for k in range(1, 11))
 STEPS = 300
@@ -42,45 +56,73 @@ COLORS = {
 }  # fmt: skip
 
 
-class Eliminated(AbstractPrior):
+class Eliminated(Observation):
     """The bounded objective as a function of X and c alone: offsets in closed form.
 
+    Its derivatives know how the closest point of the arc moves with X and c.
+
     Attributes:
-        bound: (n,) m_i, mm.
+        sigma: one.
+        bounds: the same with offsets that are unknowns of their own.
     """
 
-    bound: Float[Array, " n"]
+    sigma: Float[Array, "1 lanes"]
+    bounds: BoundedOffsets
+    whitened: ClassVar[bool] = False
 
-    def residual(
-        self, parameters: Parameters, offset: Float[Array, " k"], problem: Problem
-    ) -> Float[Array, "n 3"]:
-        """q_i - p_i(y_i) at the closest point of the arc, which moves with the parameters."""
-        return circle_residual(parameters, self.elevation(parameters, offset, problem), problem)
+    def components(self, q: list, further: Further, images: Images) -> list[Component]:
+        """q_i - p_i(y_i) at the closest point of the arc."""
+        offset, _ = self.bounds.local(q, further, images)
+        return [Component(on_circle(q, offset, further, images))]
 
-    def elevation(
-        self, parameters: Parameters, offset: Float[Array, " k"], problem: Problem
-    ) -> Float[Array, " n"]:
-        """The optimal offsets, mm."""
-        return Bounded(self.bound).start(parameters, problem)
+    def padded(self) -> Eliminated:
+        """For images that are padded."""
+        return Eliminated(self.sigma, self.bounds.padded())
 
 
-ARMS: dict[str, tuple[Callable[[Array], AbstractPrior], bool]] = {
-    "joint": (Bounded, True),
-    "joint, Gauss-Newton only": (Bounded, False),
-    "variable projection": (Eliminated, False),
-    "variable projection, exact": (Eliminated, True),
+def with_offsets(bound: Array, images: Images) -> Observation:
+    """Every offset an unknown of its own."""
+    return BoundedOffsets.of(bound, images)
+
+
+def without_offsets(bound: Array, images: Images) -> Observation:
+    """Variable projection."""
+    bounds = BoundedOffsets.of(bound, images)
+    return Eliminated(bounds.sigma, bounds)
+
+
+ARMS: dict[str, tuple[Callable[[Array, Images], Observation], bool]] = {
+    "joint": (with_offsets, True),
+    "joint, Gauss-Newton only": (with_offsets, False),
+    "variable projection": (without_offsets, False),
+    "variable projection, exact": (without_offsets, True),
 }
 """Each second-order arm's objective, and whether it takes exact second derivatives."""
 
 
 class Outcome(NamedTuple):
-    """What is kept of a fit (lax.map cannot chunk the empty offsets of variable projection)."""
+    """What is kept of a fit, with leading axes."""
 
     parameters: Parameters
     cost: Array
     stationarity: Array
     iterations: Array
-    trace: Array | None
+    trace: Array | None = None
+
+    @classmethod
+    def of(cls, fit: Descent) -> Outcome:
+        """Of a batch of fits."""
+        trace = None if fit.trace is None else fit.trace.T
+        return cls(fit.place.parameters(), fit.cost, fit.cosine, fit.iterations, trace)
+
+
+class Moved(NamedTuple):
+    """What is kept of the alternation, with leading axes."""
+
+    parameters: Parameters
+    iterations: Array
+    rotation_change: Array
+    translation_change: Array
 
 
 @dataclass(frozen=True)
@@ -109,23 +151,15 @@ class Bench:
         self.problems, self.settings, self.bounds = same.draw(count)
         self.bound = jnp.asarray(self.bounds)[:, None] * jnp.ones(same.IMAGES)
         self.tests = tests_of(self.problems, self.settings)
-        begin = same.chunked(
-            lambda problem: from_scratch(problem, RIGID).fit.parameters, self.problems, chunk=CHUNK
-        )
-        self.starts, _ = begin(self.problems)
+        self.starts = same.conventional_starts(self.problems)
         lane = (self.problems, self.starts, self.bound)
         self._solve = {
-            name: same.chunked(_arm(*arm), *lane, jnp.ones(count), chunk=CHUNK)
-            for name, arm in ARMS.items()
+            name: same.chunked(_arm(*arm), *lane, jnp.ones(count)) for name, arm in ARMS.items()
         }
         steps = jnp.ones(count, jnp.int32)
-        self._alternate = same.chunked(
-            _alternation, *lane, jnp.ones(count), jnp.ones(count), steps, chunk=CHUNK
-        )
-        self._three = same.chunked(
-            lambda p, start, bound: joint(start, Bounded(bound), p, RIGID), *lane, chunk=CHUNK
-        )
-        self._judge = same.chunked(_judgement, *lane, *self.tests, chunk=CHUNK)
+        self._alternate = same.chunked(_alternation, *lane, jnp.ones(count), jnp.ones(count), steps)
+        self._three = same.chunked(_three_starts, *lane)
+        self._judge = same.chunked(_judgement, *lane, *self.tests)
 
     def solve(self, name: str, starts: Parameters, tolerance: float) -> tuple[Any, float]:
         """A second-order arm's fits from the starts, and the seconds that they took."""
@@ -157,14 +191,12 @@ class Bench:
     def has_interval(self, parameters: Parameters) -> np.ndarray:
         """Whether the objective is flat along a direction there, to rounding."""
 
-        def one(problem: Problem, parameters: Parameters, bound: Array) -> Array:
-            prior = Bounded(bound)
-            offset = prior.start(parameters, problem)
-            return same.information_of(problem, parameters, offset, bound)
+        def information(problems: Problem, parameters: Parameters, bound: Array) -> Array:
+            return jnp.moveaxis(_normal(problems, parameters, bound)[0].stacked(), -1, 0)
 
         lane = (self.problems, parameters, self.bound)
-        information, _ = same.chunked(one, *lane, chunk=CHUNK)(*lane)
-        return same.spectra(np.asarray(information), self.problems)[0]
+        found, _ = same.chunked(information, *lane)(*lane)
+        return same.spectra(np.asarray(found), self.problems)[0]
 
 
 class Walk:
@@ -194,34 +226,70 @@ class Walk:
         return self.bench.judge(self.here, self.rounds, self.stopped(tolerance))
 
 
-def _arm(make: Callable[[Array], AbstractPrior], exact: bool) -> Callable:
-    def solve(problem: Problem, start: Parameters, bound: Array, tolerance: Array) -> Outcome:
-        fit = minimise(
-            start, make(bound), problem, RIGID, tolerance=tolerance, max_steps=STEPS, exact=exact,
-            trace=STEPS,
-        )  # fmt: skip
-        return Outcome(fit.parameters, fit.cost, fit.stationarity, fit.iterations, fit.trace)
+def _arm(make: Callable[[Array, Images], Observation], exact: bool) -> Callable:
+    def solve(problems: Problem, starts: Parameters, bound: Array, tolerance: Any) -> Outcome:
+        """As :func:`jaxcal.backend.minimise`, which always is exact near the optimum."""
+        images = Images.of(problems)
+        observation, place = make(bound, images), Iterate.of(starts, RIGID)
+        images, observation = images.padded(), observation.padded()
+        rounding = Rounding.of(place, observation, images)
+
+        def equations(place: Iterate, gate: Array) -> Normal:
+            return accumulate(place, observation, images, gate if exact else None)
+
+        def one(state: Descent) -> Descent:
+            return iterate_once(
+                state,
+                equations,
+                rounding,
+                tolerance,
+                STEPS,
+                less_exact=LESS,
+                exact_below=EXACT_BELOW if exact else 0.0,
+            )
+
+        begun = Descent.before(place, jnp.zeros_like(images.mask[:, 0]), 1e-3, trace=STEPS)
+        return Outcome.of(jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun))
 
     return solve
 
 
+def _three_starts(problems: Problem, starts: Parameters, bound: Array) -> Outcome:
+    images = Images.of(problems)
+    return Outcome.of(bounded(Iterate.of(starts, RIGID), BoundedOffsets.of(bound, images), images))
+
+
 def _alternation(
-    problem: Problem, start: Parameters, bound: Array, radians: Array, millimetres: Array,
+    problems: Problem,
+    starts: Parameters,
+    bound: Array,
+    radians: Array,
+    millimetres: Array,
     rounds: Array,
-):  # fmt: skip
-    return alternate(
-        start, Bounded(bound), problem, RIGID, tolerance_rad=radians,  # pyright: ignore[reportArgumentType]
-        tolerance_mm=millimetres, max_rounds=rounds,  # pyright: ignore[reportArgumentType]
-    )  # fmt: skip
+) -> Moved:
+    done = same.advance(problems, starts, bound, radians, millimetres, rounds)
+    return Moved(
+        done.place.parameters(), done.iterations, done.rotation_change, done.translation_change
+    )
 
 
-def _judgement(problem: Problem, parameters: Parameters, bound: Array, poses: Array, points: Array):
-    prior = Bounded(bound)
-    offset = prior.start(parameters, problem)
-    arrow, _, _ = linearise(parameters, offset, prior, problem, RIGID)
-    matrix = parameters.matrix()
-    precision = reconstruction_precision(matrix, poses, points)
-    return arrow.cost, arrows.stationarity(arrow), precision, matrix
+def _normal(
+    problems: Problem, parameters: Parameters, bound: Array
+) -> tuple[Normal, Float[Array, " lanes"]]:
+    """Normal equations of the bounded problem, offsets eliminated; the cost that is rounding."""
+    images = Images.of(problems)
+    place, observation = Iterate.of(parameters, RIGID), BoundedOffsets.of(bound, images)
+    rounding = Rounding.of(place, observation, images)
+    return accumulate(place, observation, images, None), rounding.vanished
+
+
+def _judgement(
+    problems: Problem, parameters: Parameters, bound: Array, poses: Array, points: Array
+) -> tuple[Array, Array, Array, Array]:
+    normal, vanished = _normal(problems, parameters, bound)
+    matrix = jax.vmap(Parameters.matrix)(parameters)
+    precision = jnp.asarray(jax.vmap(reconstruction_precision)(matrix, poses, points))
+    return normal.cost, gradient_cosine(normal, vanished), precision, matrix
 
 
 def tests_of(problems: Problem, settings: np.ndarray) -> tuple[Array, Array]:

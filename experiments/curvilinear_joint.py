@@ -25,15 +25,12 @@ from common import arguments, machine, results_folder, write_table
 from jaxtyping import Array, Float
 
 from jaxcal import Protocol, calibrate_batch, reconstruction_precision, simulate
+from jaxcal.backend import RIGID, Images, Iterate, Parameters, minimise, target_in_image
 from jaxcal.io.atomic import atomic_path
-from jaxcal.model.parameters import RIGID
-from jaxcal.model.priors import Fixed
-from jaxcal.model.residuals import target_in_image
+from jaxcal.model.observations import HeldOffsets
 from jaxcal.probe import C5_2
 from jaxcal.problem import Problem
 from jaxcal.segmentation.time_of_flight import fit_out_of_plane
-from jaxcal.solvers.conventional import from_scratch
-from jaxcal.solvers.least_squares import minimise
 
 SEED = 20261121
 BOUNDS_MM = (1.0, 3.0, 5.0)
@@ -42,24 +39,44 @@ SUBSET = 0.3
 """Share of the images, those of least |y|, that the paper's way calibrates with first."""
 
 
-def paper_way(problem: Problem) -> Float[Array, "4 4"]:
+def paper_way(problems: Problem) -> Float[Array, "trials 4 4"]:
     """Image by image: |y| from Eq. 6, signs from a fit on the reduced subset, Eq. 7 with both."""
-    channels = problem.channels
-    assert channels is not None
-    measured = jnp.where(channels.heard > 0, channels.distances, jnp.nan)
-    _, full = fit_out_of_plane(measured, channels.elements, robust=False)
-    lateral, axial, square = jnp.moveaxis(full.position, -1, 0)
-    size = jnp.sqrt(jnp.maximum(square, 0.0))
-    # Eq. 5's range for a straight line through the apex: what the residuals take for r_i.
-    points = jnp.stack([lateral, jnp.hypot(axial, size)], axis=1)
-    known = replace(problem, measurements=points, channels=None, covariance=None)
+    known, size = _image_by_image(problems)
+    few = jnp.sort(size, axis=1)[:, max(int(SUBSET * size.shape[1]), 9) - 1]
+    subset = replace(known, mask=jnp.where(size <= few[:, None], known.mask, 0.0))
+    first = calibrate_batch(subset, "conventional")
+    return _with_signs(known, size, first.image_to_probe, first.point)
 
-    few = jnp.sort(size)[max(int(SUBSET * problem.images), 9) - 1]
-    subset = replace(known, mask=jnp.where(size <= few, known.mask, 0.0))
-    first = from_scratch(subset, RIGID).fit.parameters
-    y = target_in_image(first, known)[:, 1]
-    signed = jnp.where(y < 0, -size, size)
-    return minimise(first, Fixed(signed), known, RIGID).parameters.matrix()
+
+@jax.jit
+def _image_by_image(problems: Problem) -> tuple[Problem, Float[Array, "trials n"]]:
+    """The problems with ranges that know of |y|, and |y|, mm."""
+
+    def one(problem: Problem) -> tuple[Problem, Array]:
+        channels = problem.channels
+        assert channels is not None
+        measured = jnp.where(channels.heard > 0, channels.distances, jnp.nan)
+        _, full = fit_out_of_plane(measured, channels.elements, robust=False)
+        lateral, axial, square = jnp.moveaxis(full.position, -1, 0)
+        size = jnp.sqrt(jnp.maximum(square, 0.0))
+        # Eq. 5's range for a straight line through the apex: what the residuals take for r_i.
+        points = jnp.stack([lateral, jnp.hypot(axial, size)], axis=1)
+        return replace(problem, measurements=points, channels=None, covariance=None), size
+
+    return jax.lax.map(one, problems, batch_size=64)
+
+
+@jax.jit
+def _with_signs(
+    known: Problem, size: Float[Array, "trials n"], x: Float[Array, "trials 4 4"], point: Array
+) -> Float[Array, "trials 4 4"]:
+    """Eq. 7 with offsets of the given sizes, whose signs are those that X and the target say."""
+    first = jax.vmap(Parameters.of)(x[:, :3, :3], x[:, :3, 3], point)
+    y = jax.vmap(target_in_image)(first, known)[..., 1]
+    images = Images.of(known)
+    held = HeldOffsets.of(jnp.where(y < 0, -size, size), images)
+    found = minimise(Iterate.of(first, RIGID), held, images).place.parameters()
+    return jax.vmap(Parameters.matrix)(found)
 
 
 def run_cell(cell: int, bound: float, noise: float, trials: int) -> dict[str, np.ndarray]:
@@ -75,7 +92,7 @@ def run_cell(cell: int, bound: float, noise: float, trials: int) -> dict[str, np
     experiments, problems = draw(indices)
     conventional = calibrate_batch(problems, method="conventional")
     joint = calibrate_batch(problems, method="joint", prior="gaussian")
-    paper = _paper_batch(problems)
+    paper = paper_way(problems)
     precision = jax.jit(jax.vmap(reconstruction_precision))
     out = {
         name: np.asarray(precision(x, experiments.test_poses, experiments.test_points))
@@ -94,11 +111,6 @@ def run_cell(cell: int, bound: float, noise: float, trials: int) -> dict[str, np
     assert joint.channel_sigma is not None
     out["channel"] = np.asarray(joint.channel_sigma) / noise
     return out
-
-
-@jax.jit
-def _paper_batch(problems: Problem) -> Float[Array, "trials 4 4"]:
-    return jax.lax.map(paper_way, problems, batch_size=64)
 
 
 def main() -> None:

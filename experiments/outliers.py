@@ -24,14 +24,11 @@ import numpy as np
 from common import arguments, machine, results_folder, write_table
 from jaxtyping import Array
 
-from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision, simulate
+from jaxcal import Protocol, calibrate_batch, reconstruction_precision, simulate
 from jaxcal.cli.cache import enable_compilation_cache
-from jaxcal.compiler import quick_to_compile
 from jaxcal.contamination import OutlierKind, contaminate
 from jaxcal.io.atomic import atomic_path
-from jaxcal.model.parameters import RIGID
 from jaxcal.offsets import OffsetLaw
-from jaxcal.pipeline import agreed_images
 
 SEED = 20261126
 LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "heavy-tailed")
@@ -95,20 +92,15 @@ def draw(indices: Array, elevation_mm, noise_mm, *, law, fraction, kind, images)
     return jax.vmap(one)(indices)
 
 
-@partial(jax.jit, compiler_options=quick_to_compile(jax.default_backend()))
-def agree(problems: Problem) -> Array:
-    """1 for the images that agree with each other, problem by problem."""
-    return jax.lax.map(lambda problem: agreed_images(problem, RIGID), problems)
-
-
 def run_cell(index: int, cell: Cell, trials: int) -> list[object]:
     """A row of the table."""
     experiments, problems, outlier = draw(
         index * 1_000_000 + jnp.arange(trials), cell.elevation_mm, cell.noise_mm, law=cell.law,
         fraction=cell.fraction, kind=cell.kind, images=cell.images,
     )  # fmt: skip
-    # What robust=True does; taken apart, all three solves are one program.
-    agreed = agree(problems)
+    # Which images agree does not depend on the method: the cheapest one to compile finds them, and
+    # the three solves are one program.
+    agreed = calibrate_batch(problems, "conventional", robust=True).mask
     robust = calibrate_batch(replace(problems, mask=agreed))
     oracle = calibrate_batch(replace(problems, mask=problems.mask - outlier))
     plain = calibrate_batch(problems)

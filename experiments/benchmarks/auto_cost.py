@@ -1,11 +1,11 @@
 """Cost of prior ``auto`` over that of the self-tuned Gaussian solve, in a batch.
 
-``calibrate_batch`` with everything that belongs to an answer (uncertainty, status, inspection), one
-core, float64: the Gaussian REML solve and ``auto`` on the same problems without covariances, and
-``auto`` on the same with the covariances that the times of flight give. Rounds are interleaved,
-each with its own order; times are medians over the rounds, the ratio is the median of the rounds'
-ratios. Compilation is timed apart. Uniform offsets to 2 mm, 2 mm of noise on each element's
-distance. Seed 20261126.
+``calibrate_batch`` with all that a solve returns (status and covariance; what is computed when it
+is read is not), one core, float64: the Gaussian REML solve and ``auto`` on the same problems
+without covariances, and ``auto`` on the same with the covariances that the times of flight give.
+Rounds are interleaved, each with its own order; times are medians over the rounds, the ratio is the
+median of the rounds' ratios. Compilation is timed apart. Uniform offsets to 2 mm, 2 mm of noise on
+each element's distance. Seed 20261126.
 """
 
 from __future__ import annotations

@@ -1,11 +1,13 @@
-"""The explicit joint problem, and how the usual solvers solve it: the peers of solver_peers.py.
+"""The joint problem with given SDs, and how the usual solvers solve it: peers of solver_peers.py.
 
-Per image, with q_i = X^-1 B_i^-1 c and p_i(y) = (x_i, y, sqrt(r_i^2 - y^2)), minimise over X, c, y
+It is what ``jaxcal.calibrate_batch(problems, sigma=...)`` minimises. With q_i = X^-1 B_i^-1 c the
+target in image i's frame, and (x_i, r_i) its measured lateral position and range, over X and c
 
-    sum_i |w * (q_i - p_i(y_i))|^2 + (e y_i)^2.
+    sum_i (q_x - x_i)^2 / s_x^2 + (hypot(q_y, q_z) - r_i)^2 / s_r^2 + q_y^2 / s_y^2.
 
-Every peer gets the same problems, the same start and an exact Jacobian, and hands back X, c and y,
-from which objective and gradient cosine are computed alike for all.
+The offsets are q_y: there are 9 unknowns, and nothing to eliminate. Every peer gets the same
+problems, a start, an exact Jacobian, and hands back X and c, from which objective and gradient
+cosine are computed alike for all.
 """
 
 from __future__ import annotations
@@ -27,26 +29,28 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-LARGEST = 0.95
-"""Offsets stay below this fraction of the range, as in jaxcal."""
+UNKNOWNS = 9
+RESIDUALS = 3
+"""Of an image."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Problems with their starts; mm.
+    """Problems with their starts.
 
     Attributes:
-        poses: (b, n, 4, 4) probe -> tracker. points: (b, n, 2) lateral, range. matrix: (b, 4, 4)
-            start of X. point: (b, 3) start of c. weight: (3,) one over the SD of each component of
-            q - p. elevation_weight: one over the SD of the offsets.
+        poses: (b, n, 4, 4) probe -> tracker, mm.
+        points: (b, n, 2) lateral position and range, mm.
+        matrix: (b, 4, 4) start of X, mm.
+        point: (b, 3) start of c, mm.
+        sigma: SDs of lateral position, range and offset, mm.
     """
 
     poses: np.ndarray
     points: np.ndarray
     matrix: np.ndarray
     point: np.ndarray
-    weight: np.ndarray
-    elevation_weight: float
+    sigma: tuple[float, float, float]
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -59,95 +63,87 @@ class Batch:
 
 @dataclass(frozen=True)
 class Solved:
-    """What a solver hands back: X (b, 4, 4), c (b, 3), y (b, n), iterations (b,) and seconds."""
+    """What a solver hands back.
+
+    Attributes:
+        matrix: (b, 4, 4) X, mm.
+        point: (b, 3) c, mm.
+        iterations: (b,).
+        seconds: that the batch took.
+    """
 
     matrix: np.ndarray
     point: np.ndarray
-    offset: np.ndarray
     iterations: np.ndarray
     seconds: float
 
 
-def linearise(
-    batch: Batch, k: int, matrix: np.ndarray, point: np.ndarray, offset: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (n, 4) and Jacobian (n, 4, 10) along v, omega, c and the image's own offset."""
+def residuals(batch: Batch, k: int, matrix: np.ndarray, point: np.ndarray) -> tuple[Any, ...]:
+    """Residuals (n, 3) of a problem in SDs, and q (n, 3)."""
     poses, (lateral, distance) = batch.poses[k], batch.points[k].T
-    turn, shift = matrix[:3, :3], matrix[:3, 3]
     in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], point - poses[:, :3, 3])
-    q = (in_probe - shift) @ turn
-    axial = np.sqrt(np.maximum(distance**2 - offset**2, (1e-6 * distance) ** 2))
-    w, e = batch.weight, batch.elevation_weight
-    residual = np.empty((len(poses), 4))
-    residual[:, :3] = w * (q - np.stack([lateral, offset, axial], axis=1))
-    residual[:, 3] = e * offset
-    jacobian = np.zeros((len(poses), 4, 10))
-    jacobian[:, [0, 1, 2], [0, 1, 2]] = -w
-    jacobian[:, 0, 4], jacobian[:, 0, 5] = -w[0] * q[:, 2], w[0] * q[:, 1]
-    jacobian[:, 1, 3], jacobian[:, 1, 5] = w[1] * q[:, 2], -w[1] * q[:, 0]
-    jacobian[:, 2, 3], jacobian[:, 2, 4] = -w[2] * q[:, 1], w[2] * q[:, 0]
-    jacobian[:, :3, 6:9] = w[:, None] * np.einsum("ji,nkj->nik", turn, poses[:, :3, :3])
-    jacobian[:, 1, 9], jacobian[:, 2, 9], jacobian[:, 3, 9] = -w[1], w[2] * offset / axial, e
-    return residual, jacobian
+    q = (in_probe - matrix[:3, 3]) @ matrix[:3, :3]
+    away = np.stack([q[:, 0] - lateral, np.hypot(q[:, 1], q[:, 2]) - distance, q[:, 1]], axis=1)
+    return away / np.asarray(batch.sigma), q
+
+
+def linearise(
+    batch: Batch, k: int, matrix: np.ndarray, point: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (n, 3) and Jacobian (n, 3, 9) along v, omega and c."""
+    residual, q = residuals(batch, k, matrix, point)
+    moved = np.zeros((len(q), 3, UNKNOWNS))
+    moved[:, [0, 1, 2], [0, 1, 2]] = -1
+    moved[:, 0, 4], moved[:, 0, 5] = -q[:, 2], q[:, 1]
+    moved[:, 1, 3], moved[:, 1, 5] = q[:, 2], -q[:, 0]
+    moved[:, 2, 3], moved[:, 2, 4] = -q[:, 1], q[:, 0]
+    moved[:, :, 6:9] = np.einsum("ji,nkj->nik", matrix[:3, :3], batch.poses[k][:, :3, :3])
+    far = np.hypot(q[:, 1], q[:, 2])[:, None]
+    jacobian = np.stack(
+        [moved[:, 0], (q[:, 1:2] * moved[:, 1] + q[:, 2:] * moved[:, 2]) / far, moved[:, 1]],
+        axis=1,
+    )
+    return residual, jacobian / np.asarray(batch.sigma)[:, None]
 
 
 def judge(batch: Batch, solved: Solved) -> tuple[np.ndarray, np.ndarray]:
     """Objective (b,) and gradient cosine max |g_k| / (|J_k| |r|) (b,) where a solver stopped."""
     cost, cosine = np.empty(len(solved.matrix)), np.empty(len(solved.matrix))
     for k in range(len(cost)):
-        args = solved.matrix[k], solved.point[k], solved.offset[k]
-        residual, jacobian = linearise(batch, k, *args)
+        residual, jacobian = linearise(batch, k, solved.matrix[k], solved.point[k])
         cost[k] = (residual**2).sum()
-        shared = np.einsum("nri,nr->i", jacobian[..., :9], residual)
-        length = np.sqrt((jacobian[..., :9] ** 2).sum(axis=(0, 1)))
-        own = (jacobian[..., 9] * residual).sum(axis=1)
-        own_length = np.sqrt((jacobian[..., 9] ** 2).sum(axis=1))
-        largest = max(np.abs(shared / length).max(), np.abs(own / own_length).max())
-        cosine[k] = largest / np.sqrt(cost[k])
+        gradient = np.einsum("nri,nr->i", jacobian, residual)
+        length = np.sqrt((jacobian**2).sum(axis=(0, 1)))
+        cosine[k] = np.abs(gradient / length).max() / np.sqrt(cost[k])
     return cost, cosine
 
 
 class _Flat:
-    """One problem as a function of x = (v, omega, c, y) about its start, for dense solvers."""
+    """One problem as a function of x = (v, omega, c) about its start."""
 
     def __init__(self, batch: Batch, k: int) -> None:
         self.batch, self.k, self.images = batch, k, batch.points.shape[1]
-        self.size = 9 + self.images
 
-    def place(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """X, c and y at x."""
+    def place(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """X and c at x."""
         start = self.batch.matrix[self.k]
         matrix = start.copy()
         matrix[:3, :3] = start[:3, :3] @ Rotation.from_rotvec(x[3:6]).as_matrix()
         matrix[:3, 3] += start[:3, :3] @ x[:3]
-        return matrix, self.batch.point[self.k] + x[6:9], x[9:]
+        return matrix, self.batch.point[self.k] + x[6:]
 
     def residual(self, x: np.ndarray) -> np.ndarray:
-        """Residuals (4 n,) alone, for solvers that difference them."""
-        batch, k = self.batch, self.k
-        matrix, point, offset = self.place(x)
-        lateral, distance = batch.points[k].T
-        poses = batch.poses[k]
-        in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], point - poses[:, :3, 3])
-        q = (in_probe - matrix[:3, 3]) @ matrix[:3, :3]
-        axial = np.sqrt(np.maximum(distance**2 - offset**2, (1e-6 * distance) ** 2))
-        residual = np.empty((self.images, 4))
-        residual[:, :3] = batch.weight * (q - np.stack([lateral, offset, axial], axis=1))
-        residual[:, 3] = batch.elevation_weight * offset
-        return residual.ravel()
+        """Residuals (3 n,) alone, for solvers that difference them."""
+        return residuals(self.batch, self.k, *self.place(x))[0].ravel()
 
     def both(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (4 n,) and dense Jacobian (4 n, 9 + n)."""
+        """Residuals (3 n,) and Jacobian (3 n, 9)."""
         residual, jacobian = linearise(self.batch, self.k, *self.place(x))
-        dense = np.zeros((self.images, 4, self.size))
-        shared = jacobian[..., :9].copy()
         # v is along the start's axes, and omega's own increments pass the right Jacobian of SO(3).
         back = Rotation.from_rotvec(x[3:6]).as_matrix()
-        shared[..., :3] = shared[..., :3] @ back.T
-        shared[..., 3:6] = shared[..., 3:6] @ _right_jacobian(x[3:6])
-        dense[..., :9] = shared
-        dense[np.arange(self.images), :, 9 + np.arange(self.images)] = jacobian[..., 9]
-        return residual.ravel(), dense.reshape(-1, self.size)
+        jacobian[..., :3] = jacobian[..., :3] @ back.T
+        jacobian[..., 3:6] = jacobian[..., 3:6] @ _right_jacobian(x[3:6])
+        return residual.ravel(), jacobian.reshape(-1, UNKNOWNS)
 
 
 def _right_jacobian(turn: np.ndarray) -> np.ndarray:
@@ -166,17 +162,14 @@ def _one_by_one(batch: Batch, solve: Callable[[_Flat], tuple[np.ndarray, int]]) 
     found = [solve(problem) for problem in problems]
     seconds = time.perf_counter() - begun
     places = [problem.place(x) for problem, (x, _) in zip(problems, found, strict=True)]
-    matrix, point, offset = (np.array(part) for part in zip(*places, strict=True))
-    return Solved(matrix, point, offset, np.array([count for _, count in found]), seconds)
+    matrix, point = (np.array(part) for part in zip(*places, strict=True))
+    return Solved(matrix, point, np.array([count for _, count in found]), seconds)
 
 
 def scipy_solver(
     method: str, tolerance: float = 1e-12, exact: bool = True
 ) -> Callable[[Batch], Solved]:
     """scipy.optimize.least_squares, ``lm`` (MINPACK) or ``trf``.
-
-    Unknowns are not scaled by their columns: that took more evaluations here (10.1 against 8.2 of
-    ``lm`` at 1e-12), and left one problem of 64 where an offset had reached its range.
 
     Args:
         method: scipy's name.
@@ -195,7 +188,7 @@ def scipy_solver(
             return last[key]
 
         found = least_squares(
-            (lambda x: at(x)[0]) if exact else problem.residual, np.zeros(problem.size),
+            (lambda x: at(x)[0]) if exact else problem.residual, np.zeros(UNKNOWNS),
             jac=(lambda x: at(x)[1]) if exact else "2-point",  # pyright: ignore[reportArgumentType]
             method=method, x_scale=1.0, ftol=tolerance, xtol=tolerance, gtol=tolerance,  # pyright: ignore[reportArgumentType]
         )  # fmt: skip
@@ -213,8 +206,8 @@ def pyceres_solver(batch: Batch) -> Solved:
         def __init__(self, problem: _Flat) -> None:
             super().__init__()
             self.problem = problem
-            self.set_num_residuals(4 * problem.images)
-            self.set_parameter_block_sizes([problem.size])
+            self.set_num_residuals(RESIDUALS * problem.images)
+            self.set_parameter_block_sizes([UNKNOWNS])
 
         def Evaluate(self, parameters, residuals, jacobians):
             value, jacobian = self.problem.both(np.asarray(parameters[0]))
@@ -224,7 +217,7 @@ def pyceres_solver(batch: Batch) -> Solved:
             return True
 
     def one(problem: _Flat) -> tuple[np.ndarray, int]:
-        x = np.zeros(problem.size)
+        x = np.zeros(UNKNOWNS)
         whole: Any = pyceres.Problem()
         whole.add_residual_block(Cost(problem), None, [x])
         options: Any = pyceres.SolverOptions()
@@ -243,7 +236,7 @@ def pyceres_solver(batch: Batch) -> Solved:
 
 
 def optimistix_solver(batch: Batch) -> Callable[[Batch], Solved]:
-    """Levenberg-Marquardt of optimistix on all 9 + n unknowns, dense, vmapped and compiled.
+    """Levenberg-Marquardt of optimistix, vmapped and compiled.
 
     Args:
         batch: of the size that will be solved (it is compiled here).
@@ -254,26 +247,24 @@ def optimistix_solver(batch: Batch) -> Callable[[Batch], Solved]:
 
     from jaxcal.geometry import rotation_from_vector
 
-    weight, elevation_weight = jnp.asarray(batch.weight), batch.elevation_weight
+    sigma = jnp.asarray(batch.sigma)
 
     def residual(x, args):
         poses, points, matrix, point = args
         turn = matrix[:3, :3] @ rotation_from_vector(x[3:6])
         shift = matrix[:3, 3] + matrix[:3, :3] @ x[:3]
-        in_probe = jnp.einsum("nji,nj->ni", poses[:, :3, :3], point + x[6:9] - poses[:, :3, 3])
+        in_probe = jnp.einsum("nji,nj->ni", poses[:, :3, :3], point + x[6:] - poses[:, :3, 3])
         q = (in_probe - shift) @ turn
         lateral, distance = points.T
-        offset = x[9:]
-        axial = jnp.sqrt(jnp.maximum(distance**2 - offset**2, (1e-6 * distance) ** 2))
-        error = weight * (q - jnp.stack([lateral, offset, axial], axis=1))
-        return error, elevation_weight * offset
+        far = jnp.hypot(q[:, 1], q[:, 2])
+        return jnp.stack([q[:, 0] - lateral, far - distance, q[:, 1]], axis=1) / sigma
 
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
 
     @jax.jit
     @jax.vmap
     def solve(poses, points, matrix, point):
-        start = jnp.zeros(9 + points.shape[0])
+        start = jnp.zeros(UNKNOWNS)
         args = (poses, points, matrix, point)
         found = optx.least_squares(residual, solver, start, args=args, throw=False, max_steps=256)
         return found.value, found.stats["num_steps"]
@@ -288,8 +279,8 @@ def optimistix_solver(batch: Batch) -> Callable[[Batch], Solved]:
         )
         seconds = time.perf_counter() - begun
         places = [_Flat(batch, k).place(row) for k, row in enumerate(np.array(x))]
-        matrix, point, offset = (np.array(part) for part in zip(*places, strict=True))
-        return Solved(matrix, point, offset, np.asarray(steps), seconds)
+        matrix, point = (np.array(part) for part in zip(*places, strict=True))
+        return Solved(matrix, point, np.asarray(steps), seconds)
 
     return run
 
@@ -319,7 +310,8 @@ def ceres_solver(
 
     Args:
         program: from :func:`build_ceres`.
-        solver: ``schur`` (DENSE_SCHUR) or ``tiny`` (TinySolver, offsets eliminated by hand).
+        solver: ``schur`` (DENSE_SCHUR, the target eliminated), ``normal``
+            (DENSE_NORMAL_CHOLESKY) or ``tiny`` (TinySolver).
         tolerance: function tolerance.
         repeats: solves of the whole batch; the median time counts.
     """
@@ -329,7 +321,7 @@ def ceres_solver(
         affine = batch.poses[:, :, :3].reshape(count, images, 12)
         rows = np.concatenate([affine, batch.points], axis=2).reshape(count, -1)
         start = np.concatenate([batch.matrix[:, :3].reshape(count, 12), batch.point, rows], axis=1)
-        head = np.array([count, images, *batch.weight, batch.elevation_weight], dtype=float)
+        head = np.array([count, images, *batch.sigma], dtype=float)
         with tempfile.TemporaryDirectory() as folder:
             problems, results = Path(folder) / "problems", Path(folder) / "results"
             np.concatenate([head, start.ravel()]).tofile(problems)
@@ -337,11 +329,11 @@ def ceres_solver(
                 [program, problems, results, solver, repr(tolerance), str(repeats)], check=True
             )
             out = np.fromfile(results)
-        each = out[:-repeats].reshape(count, 17 + images)
+        each = out[:-repeats].reshape(count, 17)
         matrix = np.tile(np.eye(4), (count, 1, 1))
         matrix[:, :3] = each[:, :12].reshape(count, 3, 4)
         seconds = float(np.median(out[-repeats:]))
-        return Solved(matrix, each[:, 12:15], each[:, 15:-2], each[:, -1].astype(int), seconds)
+        return Solved(matrix, each[:, 12:15], each[:, -1].astype(int), seconds)
 
     return run
 

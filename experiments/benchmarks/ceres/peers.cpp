@@ -1,21 +1,22 @@
-// The explicit joint problem of jaxcal, solved one by one on one thread by Ceres (DENSE_SCHUR) and
-// by its TinySolver with every offset eliminated by hand.
+// The joint problem of jaxcal with given SDs, solved one by one on one thread by Ceres and by its
+// TinySolver.
 //
-// Per image i, with q_i = X^-1 B_i^-1 c and p_i(y) = (x_i, y, sqrt(r_i^2 - y^2)):
-//     minimise over X, c, y   sum_i |w .* (q_i - p_i(y_i))|^2 + (y_i / s)^2.
+// Per image i, with q_i = X^-1 B_i^-1 c the target in its frame and (x_i, r_i) what was measured:
+//     minimise over X, c   sum_i ((q_x - x_i) / s_x)^2 + ((|(q_y, q_z)| - r_i) / s_r)^2
+//                                + (q_y / s_y)^2.
 // X steps by the right perturbation about its current value, X Exp([v, omega]) with Exp's
 // translation taken as v, as in jaxcal.
 //
 // usage: ceres_peers PROBLEMS RESULTS SOLVER TOLERANCE REPEATS
-// PROBLEMS: binary float64, see read_problems. SOLVER: schur | tiny.
-// RESULTS: per problem X (12, row-major 3x4), c (3), y (n), cost, iterations; then REPEATS seconds.
+// PROBLEMS: binary float64, see read_problems. SOLVER: schur | normal
+// | tiny.
+// RESULTS: per problem X (12, row-major 3x4), c (3), cost, iterations; then REPEATS seconds.
 
 #include <ceres/ceres.h>
 #include <ceres/tiny_solver.h>
 
 #include <Eigen/Core>
 #include <Eigen/Geometry>
-#include <algorithm>
 #include <chrono>
 #include <cmath>
 #include <cstdint>
@@ -30,18 +31,13 @@
 using Mat3 = Eigen::Matrix3d;
 using Vec3 = Eigen::Vector3d;
 
-constexpr double kLargest = 0.95;  // offsets stay below this fraction of the range
-
 struct Image {
   Mat3 rotation;  // B_i
   Vec3 translation;
   double lateral, range;
 };
 
-struct Weights {
-  Vec3 point;        // 1 / SD of the three components of q - p
-  double elevation;  // 1 / SD of the offset
-};
+using Weights = Vec3;  // 1 / SD of lateral position, range and offset
 
 // X as quaternion (x y z w, Eigen's order) and translation.
 struct Problem {
@@ -53,7 +49,6 @@ struct Problem {
 struct Solution {
   Eigen::Matrix<double, 7, 1> pose;
   Vec3 point;
-  std::vector<double> offsets;
   double cost = 0;
   int iterations = 0;
 };
@@ -72,8 +67,14 @@ inline Mat3 skew(const Vec3& a) {
   return out;
 }
 
-inline double axial_of(double range, double offset) {
-  return std::sqrt(std::max(range * range - offset * offset, 1e-12 * range * range));
+// Residuals of an image and their derivatives by q.
+inline Vec3 residual_of(const Image& image, const Weights& weights, const Vec3& q, Mat3* slope) {
+  const double far = std::hypot(q.y(), q.z());
+  if (slope != nullptr) {
+    *slope << weights.x(), 0, 0, 0, weights.y() * q.y() / far, weights.y() * q.z() / far, 0,
+        weights.z(), 0;
+  }
+  return weights.cwiseProduct(Vec3(q.x() - image.lateral, far - image.range, q.y()));
 }
 
 // The pose moves on its manifold. Costs give their Jacobian along the tangent in the first six
@@ -101,38 +102,30 @@ class PoseManifold final : public ceres::Manifold {
   bool MinusJacobian(const double*, double*) const override { return false; }
 };
 
-// Residuals (4) of one image and their derivatives along v, omega, c and its offset.
-class ImageCost final : public ceres::SizedCostFunction<4, 7, 3, 1> {
+// Residuals of one image and their derivatives along v, omega and c.
+class ImageCost final : public ceres::SizedCostFunction<3, 7, 3> {
  public:
   ImageCost(const Image& image, const Weights& weights) : image_(image), weights_(weights) {}
   bool Evaluate(double const* const* parameters, double* residuals,
                 double** jacobians) const override {
     Eigen::Map<const Eigen::Quaterniond> rotation(parameters[0]);
     Eigen::Map<const Vec3> translation(parameters[0] + 4), point(parameters[1]);
-    const double offset = parameters[2][0];
     const Mat3 turn = rotation.toRotationMatrix();
     const Vec3 probe = image_.rotation.transpose() * (point - image_.translation) - translation;
     const Vec3 q = turn.transpose() * probe;
-    const double axial = axial_of(image_.range, offset);
-    Eigen::Map<Eigen::Vector4d> r(residuals);
-    r.head<3>() = weights_.point.cwiseProduct(q - Vec3(image_.lateral, offset, axial));
-    r[3] = weights_.elevation * offset;
+    Mat3 slope;
+    Eigen::Map<Vec3> r(residuals);
+    r = residual_of(image_, weights_, q, jacobians == nullptr ? nullptr : &slope);
     if (jacobians == nullptr) return true;
-    const auto scale = weights_.point.asDiagonal();
     if (jacobians[0] != nullptr) {
-      Eigen::Map<Eigen::Matrix<double, 4, 7, Eigen::RowMajor>> j(jacobians[0]);
-      j.setZero();
-      j.topLeftCorner<3, 3>() = -1.0 * Mat3(scale);
-      j.block<3, 3>(0, 3) = scale * skew(q);
+      Eigen::Map<Eigen::Matrix<double, 3, 7, Eigen::RowMajor>> j(jacobians[0]);
+      j.leftCols<3>() = -slope;
+      j.middleCols<3>(3) = slope * skew(q);
+      j.col(6).setZero();
     }
     if (jacobians[1] != nullptr) {
-      Eigen::Map<Eigen::Matrix<double, 4, 3, Eigen::RowMajor>> j(jacobians[1]);
-      j.topRows<3>() = scale * (turn.transpose() * image_.rotation.transpose());
-      j.row(3).setZero();
-    }
-    if (jacobians[2] != nullptr) {
-      Eigen::Map<Eigen::Vector4d> j(jacobians[2]);
-      j << 0, -weights_.point.y(), weights_.point.z() * offset / axial, weights_.elevation;
+      Eigen::Map<Eigen::Matrix<double, 3, 3, Eigen::RowMajor>> j(jacobians[1]);
+      j = slope * (turn.transpose() * image_.rotation.transpose());
     }
     return true;
   }
@@ -142,26 +135,26 @@ class ImageCost final : public ceres::SizedCostFunction<4, 7, 3, 1> {
   const Weights& weights_;
 };
 
-Solution solve_schur(const Problem& problem, const Weights& weights, double tolerance) {
+Solution solve_ceres(const Problem& problem, const Weights& weights, double tolerance,
+                     ceres::LinearSolverType linear) {
   Solution out;
   out.pose << problem.rotation.coeffs(), problem.translation;
   out.point = problem.point;
-  out.offsets.assign(problem.images.size(), 0.0);
   ceres::Problem ceres_problem;
   ceres_problem.AddParameterBlock(out.pose.data(), 7, new PoseManifold);
   ceres_problem.AddParameterBlock(out.point.data(), 3);
-  auto ordering = std::make_shared<ceres::ParameterBlockOrdering>();
-  for (size_t i = 0; i < problem.images.size(); ++i) {
-    double* offset = &out.offsets[i];
-    ceres_problem.AddResidualBlock(new ImageCost(problem.images[i], weights), nullptr,
-                                   out.pose.data(), out.point.data(), offset);
-    ordering->AddElementToGroup(offset, 0);
+  for (const Image& image : problem.images) {
+    ceres_problem.AddResidualBlock(new ImageCost(image, weights), nullptr, out.pose.data(),
+                                   out.point.data());
   }
-  ordering->AddElementToGroup(out.pose.data(), 1);
-  ordering->AddElementToGroup(out.point.data(), 1);
   ceres::Solver::Options options;
-  options.linear_solver_type = ceres::DENSE_SCHUR;
-  options.linear_solver_ordering.reset(new ceres::ParameterBlockOrdering(*ordering));
+  options.linear_solver_type = linear;
+  if (linear == ceres::DENSE_SCHUR) {
+    auto ordering = std::make_shared<ceres::ParameterBlockOrdering>();
+    ordering->AddElementToGroup(out.point.data(), 0);
+    ordering->AddElementToGroup(out.pose.data(), 1);
+    options.linear_solver_ordering = ordering;
+  }
   options.num_threads = 1;
   options.function_tolerance = tolerance;
   options.gradient_tolerance = 1e-300;
@@ -175,15 +168,21 @@ Solution solve_schur(const Problem& problem, const Weights& weights, double tole
   return out;
 }
 
-// y eliminated by hand: at every (X, c) each offset is taken to its own optimum by Newton steps on
-// its scalar problem, and the Jacobian loses its component along the offset (Kaufman).
-class Eliminated {
+Solution solve_schur(const Problem& problem, const Weights& weights, double tolerance) {
+  return solve_ceres(problem, weights, tolerance, ceres::DENSE_SCHUR);
+}
+
+Solution solve_normal(const Problem& problem, const Weights& weights, double tolerance) {
+  return solve_ceres(problem, weights, tolerance, ceres::DENSE_NORMAL_CHOLESKY);
+}
+
+// All images at once, along (v, omega, c) about the start.
+class Whole {
  public:
   using Scalar = double;
   enum { NUM_RESIDUALS = Eigen::Dynamic, NUM_PARAMETERS = 9 };
-  Eliminated(const Problem& problem, const Weights& weights)
-      : problem_(problem), weights_(weights), offsets_(problem.images.size(), 0.0) {}
-  int NumResiduals() const { return 4 * static_cast<int>(problem_.images.size()); }
+  Whole(const Problem& problem, const Weights& weights) : problem_(problem), weights_(weights) {}
+  int NumResiduals() const { return 3 * static_cast<int>(problem_.images.size()); }
 
   bool operator()(const double* parameters, double* residuals, double* jacobian) const {
     Eigen::Map<const Vec3> shift(parameters), turn(parameters + 3), move(parameters + 6);
@@ -195,44 +194,19 @@ class Eliminated {
     // Along omega at omega: Exp(w + d) = Exp(w) Exp(J d), J the right Jacobian of SO(3).
     const Mat3 right = right_jacobian(turn);
     const Mat3 back = step.transpose();  // -dq/dv = Exp(w)'
-    const Vec3 w = weights_.point;
     const int rows = NumResiduals();
     for (size_t i = 0; i < problem_.images.size(); ++i) {
       const Image& image = problem_.images[i];
       const Vec3 probe = image.rotation.transpose() * (point - image.translation) - translation;
       const Vec3 q = rotation.transpose() * probe;
-      double y = offsets_[i];
-      const double largest = kLargest * image.range;
-      double z = axial_of(image.range, y);
-      for (int k = 0; k < 20; ++k) {
-        const double slope_z = -y / z;
-        const double ey = w.y() * w.y() * (q.y() - y), ez = w.z() * w.z() * (q.z() - z);
-        const double gradient = -ey - ez * slope_z + weights_.elevation * weights_.elevation * y;
-        double curvature = w.y() * w.y() + w.z() * w.z() * slope_z * slope_z +
-                           weights_.elevation * weights_.elevation;
-        const double full = curvature + ez * (image.range * image.range) / (z * z * z);
-        if (full > 0) curvature = full;
-        const double next = std::clamp(y - gradient / curvature, -largest, largest);
-        const double moved = std::abs(next - y);
-        y = next;
-        z = axial_of(image.range, y);
-        if (moved <= 1e-13 * image.range) break;
-      }
-      offsets_[i] = y;
-      const Vec3 e = q - Vec3(image.lateral, y, z);
-      Eigen::Map<Eigen::Vector4d> r(residuals + 4 * i);
-      r << w.cwiseProduct(e), weights_.elevation * y;
+      Mat3 slope;
+      Eigen::Map<Vec3> r(residuals + 3 * i);
+      r = residual_of(image, weights_, q, jacobian == nullptr ? nullptr : &slope);
       if (jacobian == nullptr) continue;
-      Eigen::Matrix<double, 4, 9> j;
-      j.row(3).setZero();
-      j.topLeftCorner<3, 3>() = -(w.asDiagonal() * back);
-      j.block<3, 3>(0, 3) = w.asDiagonal() * (skew(q) * right);
-      j.block<3, 3>(0, 6) = w.asDiagonal() * (rotation.transpose() * image.rotation.transpose());
-      Eigen::Vector4d k(0, -w.y(), w.z() * y / z, weights_.elevation);
-      const Eigen::Matrix<double, 1, 9> along = k.transpose() * j / k.squaredNorm();
-      j -= k * along;
       Eigen::Map<Eigen::Matrix<double, Eigen::Dynamic, 9>> out(jacobian, rows, 9);
-      out.middleRows<4>(4 * i) = j;
+      out.block<3, 3>(3 * i, 0) = -slope * back;
+      out.block<3, 3>(3 * i, 3) = slope * skew(q) * right;
+      out.block<3, 3>(3 * i, 6) = slope * (rotation.transpose() * image.rotation.transpose());
     }
     return true;
   }
@@ -242,7 +216,6 @@ class Eliminated {
     const Eigen::Quaterniond turned = problem_.rotation * quaternion_exp(x.segment<3>(3));
     out->pose << turned.coeffs(), problem_.translation + first * x.head<3>();
     out->point = problem_.point + x.tail<3>();
-    out->offsets = offsets_;
   }
 
  private:
@@ -256,13 +229,12 @@ class Eliminated {
   }
   const Problem& problem_;
   const Weights& weights_;
-  mutable std::vector<double> offsets_;
 };
 
 Solution solve_tiny(const Problem& problem, const Weights& weights, double tolerance) {
   Solution out;
-  Eliminated function(problem, weights);
-  ceres::TinySolver<Eliminated> solver;
+  Whole function(problem, weights);
+  ceres::TinySolver<Whole> solver;
   solver.options.function_tolerance = tolerance;
   solver.options.gradient_tolerance = 1e-300;
   solver.options.parameter_tolerance = 1e-300;
@@ -270,7 +242,7 @@ Solution solve_tiny(const Problem& problem, const Weights& weights, double toler
   solver.options.max_num_iterations = 200;
   Eigen::Matrix<double, 9, 1> x = Eigen::Matrix<double, 9, 1>::Zero();
   const auto& summary = solver.Solve(function, &x);
-  std::vector<double> residuals(4 * problem.images.size());
+  std::vector<double> residuals(3 * problem.images.size());
   function(x.data(), residuals.data(), nullptr);
   function.store(x, &out);
   out.cost = 0;
@@ -289,15 +261,14 @@ std::vector<double> read_doubles(const std::string& path) {
   return values;
 }
 
-// count, n, w (3), 1 / s; then per problem: start X (3x4 row-major), start c, and per image B
+// count, n, s (3); then per problem: start X (3x4 row-major), start c, and per image B
 // (3x4 row-major), lateral, range.
 std::vector<Problem> read_problems(const std::string& path, Weights* weights) {
   const std::vector<double> values = read_doubles(path);
   const auto count = static_cast<size_t>(values.at(0)), images = static_cast<size_t>(values.at(1));
-  if (values.size() != 6 + count * (15 + 14 * images)) throw std::runtime_error("wrong size");
-  weights->point = Vec3(values[2], values[3], values[4]);
-  weights->elevation = values[5];
-  const double* at = values.data() + 6;
+  if (values.size() != 5 + count * (15 + 14 * images)) throw std::runtime_error("wrong size");
+  *weights = Vec3(values[2], values[3], values[4]).cwiseInverse();
+  const double* at = values.data() + 5;
   using Affine = Eigen::Matrix<double, 3, 4, Eigen::RowMajor>;
   std::vector<Problem> problems(count);
   for (Problem& problem : problems) {
@@ -317,12 +288,14 @@ std::vector<Problem> read_problems(const std::string& path, Weights* weights) {
 }
 
 int main(int argc, char** argv) try {
-  if (argc != 6) throw std::runtime_error("PROBLEMS RESULTS schur|tiny TOLERANCE REPEATS");
+  if (argc != 6) throw std::runtime_error("PROBLEMS RESULTS schur|normal|tiny TOLERANCE REPEATS");
   Weights weights;
   const std::vector<Problem> problems = read_problems(argv[1], &weights);
   const std::string solver = argv[3];
-  if (solver != "schur" && solver != "tiny") throw std::runtime_error("no solver " + solver);
-  const auto solve = solver == "schur" ? solve_schur : solve_tiny;
+  if (solver != "schur" && solver != "normal" && solver != "tiny") throw std::runtime_error("no solver " + solver);
+  const auto solve = solver == "schur"    ? solve_schur
+                     : solver == "normal" ? solve_normal
+                                          : solve_tiny;
   const double tolerance = std::atof(argv[4]);
   const int repeats = std::atoi(argv[5]);
   std::vector<Solution> solutions(problems.size());
@@ -346,7 +319,6 @@ int main(int argc, char** argv) try {
     matrix.col(3) = solution.pose.tail<3>();
     put(matrix.data(), 12);
     put(solution.point.data(), 3);
-    put(solution.offsets.data(), solution.offsets.size());
     const double tail[2] = {solution.cost, static_cast<double>(solution.iterations)};
     put(tail, 2);
   }
