@@ -2,11 +2,11 @@
 
 One objective for all (peer_solvers.py): points with given SDs, n = 50 images, float64, offsets to
 2 mm, 2 mm of noise on each element's distance. ``calibrate_batch`` finds its own start, and its
-status and covariance are read; ``jaxcal.backend.minimise`` and the peers start at the same place: X turned
-by 20 degrees about a random axis and moved by 20 mm, the target moved by 20 mm. Ceres also starts
-at the conventional fit, which costs it nothing here; no peer computes a covariance. Beside them
-other public calls, whose objectives are their own: REML, auto, the alternation, bounded offsets,
-pixels of unknown scale, channels (32 elements). Everything runs pinned to one core; each solver
+status and covariance are read; ``jaxcal.backend.minimise`` and the peers start at the same place: X
+turned by 20 degrees about a random axis and moved by 20 mm, the target moved by 20 mm. Ceres also
+starts at the conventional fit, which costs it nothing here; no peer computes a covariance. Beside
+them other public calls, whose objectives are their own: REML, auto, the alternation, bounded
+offsets, pixels of unknown scale, channels (32 elements). Everything runs pinned to one core; each solver
 takes its share of the problems in each round, and ratios are medians over the rounds. The table
 counts the problems whose objective is within 1e-8 (relative) of the lowest that any solver found.
 
