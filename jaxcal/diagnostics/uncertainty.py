@@ -170,8 +170,11 @@ def threshold(eps: float) -> float:
     return max(SINGULAR, 100 * eps)
 
 
-def mm_at_target(lever: Float[AnyArray, "*batch"], blocks: Blocks) -> Float[AnyArray, "*batch p"]:
-    """What makes each unknown's tangent mm at the target (traceable): 1, or the lever arm."""
+def mm_at_target(lever: Float[AnyArray, "*batch"], blocks: Blocks) -> Any:
+    """What makes each unknown's tangent mm at the target, (*batch, p): 1, or the lever arm.
+
+    Of a traced lever arm a traced array.
+    """
     xp, one = array_module(lever), 0 * lever + 1
     turning = ("rotation", "scale", "sound-speed")
     each = [lever if name in turning else one for name in blocks for _ in range(BLOCK_SIZE[name])]
@@ -308,7 +311,7 @@ class Whitened:
             one = np.ones_like(far)
             offset = np.stack([0 * one, seen.errors[..., 2] / far, one], axis=-1)
             offset = tau[:, None, None] * seen.mask[..., None] * offset
-        parts: list[Array] = [seen.errors[..., None], seen.rows]
+        parts: list[Any] = [seen.errors[..., None], seen.rows]
         parts += [] if offset is None else [offset[..., None]]
         parts = [_decorrelated(np.asarray(p / sigma[:, None, :, None]), shape) for p in parts]
         errors, rows = parts[0][..., 0], parts[1]

@@ -183,7 +183,7 @@ def solve(
         point_error=away[1],
         sigma=found.sigma,
         status=found.status_code.astype(jnp.int8),
-        iterations=found.iterations.astype(jnp.int32),
+        iterations=jnp.asarray(found.iterations, jnp.int32),
     )
 
 
