@@ -16,7 +16,7 @@ k_i'k_i and E_i = J_i'k_i, a function of both with derivatives (a, b) has the va
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
