@@ -94,6 +94,18 @@ def quick_to_compile(platform: str) -> Flags | None:
     return known(platform, {"xla_cpu_use_fusion_emitters": False}) if platform == "cpu" else None
 
 
+ONE_PROBLEM: Flags = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+}
+"""Wishes for a program that solves one problem and that a person waits for.
+
+Measured on the joint method with 54 images (jax 0.10.2): 8.5 s of compilation instead of 17.7, 37
+ms of run time instead of 20.
+"""
+
+
 def single_threaded(platform: str) -> Flags:
     """Flags that keep a program on one thread, for processes that share the cores among them."""
     return known(platform, {"xla_cpu_multi_thread_eigen": False}) if platform == "cpu" else {}

@@ -7,7 +7,8 @@ shapes and options, and mapped over batches.
 
 from __future__ import annotations
 
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -16,7 +17,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
-from jaxcal import compiler
+from jaxcal import buckets, compiler, executables
 from jaxcal.calibration import Calibration
 from jaxcal.errors import InputError
 from jaxcal.options import (
@@ -122,6 +123,8 @@ def calibrate(
     problem = with_bound(problem, given)
     alone = compiler.is_whole_program(problem, given)
     platform = _devices(problem)[0].platform if alone else None
+    if platform == "cpu" and executables.is_describable(plan) and not jax.config.jax_disable_jit:
+        return _solve_kept(problem, given, plan).with_problem(problem)
     # A program of its own, which serves every method and prior.
     agreed = _agreement(platform)(seen_by_agreement(problem), plan.blocks) if plan.robust else None
     return _one_problem(platform)(problem, given, plan, agreed).with_problem(problem)
@@ -195,6 +198,32 @@ def calibrate_batch(
     return _solve_batch(problems, given, plan, chunk)
 
 
+def _solve_kept(problem: Problem, given: Given, plan: Plan) -> Calibration:
+    """One problem by programs that are kept, which serve every number of images of a bucket."""
+    padded = buckets.padded(problem)
+    given = replace(given, max_elevation=None)  # the problem has it
+    run = partial(executables.run, flags=compiler.ONE_PROBLEM)
+    label = {
+        "method": plan.method,
+        "prior": plan.reported_prior,
+        "unknowns": ", ".join(plan.blocks),
+        "data": "channels" if plan.channels else "points",
+        "images": padded.images,
+    }
+    agreed = None
+    if plan.robust:
+        search = label | {"method": "robust", "prior": "none"}
+        agreed = run(agreed_images, (seen_by_agreement(padded),), plan.blocks, label=search)
+    result = run(_solve_agreeing, (padded, given, agreed), plan, label=label)
+    return jax.device_put(buckets.cut(result, problem.images), next(iter(_held(problem)), None))
+
+
+def _solve_agreeing(
+    problem: Problem, given: Given, agreed: Array | None, plan: Plan
+) -> Calibration:
+    return solve_one(problem, given, plan, agreed)
+
+
 def _in_asked_precision(problem: Problem, options: Options | None, name: str) -> Problem:
     precision = Options.precision if options is None else options.precision
     if precision == "float64":
@@ -204,6 +233,11 @@ def _in_asked_precision(problem: Problem, options: Options | None, name: str) ->
 
 def _devices(problems: Problem) -> tuple[Any, ...]:
     """The devices that hold a problem's arrays, or all local ones where they may go anywhere."""
+    return _held(problems) or tuple(jax.local_devices())
+
+
+def _held(problems: Problem) -> tuple[Any, ...]:
+    """The devices that hold a problem's arrays; none where they may go anywhere."""
     leaves = [leaf for leaf in jax.tree.leaves(problems) if isinstance(leaf, jax.Array)]
     held = {frozenset(leaf.devices()) for leaf in leaves if leaf.committed}
     if len(held) > 1:
@@ -211,7 +245,7 @@ def _devices(problems: Problem) -> tuple[Any, ...]:
             "the problem's arrays lie on different devices: put all of them on the same ones "
             "(jax.device_put takes a whole problem)"
         )
-    return tuple(sorted(held.pop(), key=lambda d: d.id)) if held else tuple(jax.local_devices())
+    return tuple(sorted(held.pop(), key=lambda d: d.id)) if held else ()
 
 
 def _solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None) -> Calibration:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,8 +43,13 @@ os.environ["XLA_FLAGS"] = (
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The cache of compiled programs is the command line's; here it would outlive the test that runs it.
-os.environ.setdefault("JAXCAL_NO_CACHE", "1")
+# One cache of compiled programs for all workers and for every process that a test starts: each
+# program is compiled once. It is new for each run, so that a run never depends on the last one.
+if "JAXCAL_TEST_CACHE" not in os.environ:
+    os.environ["JAXCAL_TEST_CACHE"] = tempfile.mkdtemp(prefix="jaxcal-tests-")
+    atexit.register(shutil.rmtree, os.environ["JAXCAL_TEST_CACHE"], ignore_errors=True)
+os.environ["XDG_CACHE_HOME"] = os.environ["JAXCAL_TEST_CACHE"]
+os.environ.pop("JAXCAL_NO_CACHE", None)
 
 import gc
 
@@ -50,6 +58,7 @@ import numpy as np
 import pytest
 
 import jaxcal
+from jaxcal import executables
 
 # Many tests look at the insides, which compute in the caller's bits; test_guest.py is about callers
 # who have 32. Not by the environment: processes that the tests start are users'.
@@ -63,6 +72,7 @@ def _programs_of_one_module():
     """Compiled programs take memory, and mappings of it, which are limited: forget them."""
     yield
     jax.clear_caches()
+    executables.forget()
     gc.collect()
 
 

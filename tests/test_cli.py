@@ -1,7 +1,7 @@
 """The command line: exit codes, one line of error, pure JSON, whole files or none.
 
-Commands that compile run in processes of their own and share one cache of compiled programs; what
-must be refused before that runs in this one.
+Commands that compile run in processes of their own; what must be refused before that runs in this
+one.
 """
 
 import json
@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import jaxcal
+from jaxcal import program_cache
 from jaxcal.cli import cache, common, demo
 from jaxcal.cli.main import commands, main
 from jaxcal.recording import Recording, make_images
@@ -65,11 +66,10 @@ def shared(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def jaxcal_process(shared):
+def jaxcal_process():
     """Run the command line in its own process: ``jaxcal_process("demo", "--json")``."""
     environment = {
         **os.environ,
-        "XDG_CACHE_HOME": str(shared / "cache"),
         "COLUMNS": "100",
         "PYTHONWARNINGS": "error::DeprecationWarning",  # they are not shown otherwise
     }
@@ -509,20 +509,12 @@ def test_messages_are_not_markup(capfd):
     assert lines[2].startswith("  word")
 
 
-def test_cache_folder_is_private(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "c"))
-    folder = cache._private_folder()
-    assert folder == tmp_path / "c" / "jaxcal" / "xla"
-    assert folder.stat().st_mode & 0o777 == folder.parent.stat().st_mode & 0o777 == 0o700
-    assert cache._private_folder() == folder
-
-
 @pytest.mark.parametrize("spoil", ["open", "open_parent", "link", "file", "unwritable", "off"])
 def test_cache_that_cannot_be_trusted_is_not_used(spoil, tmp_path, monkeypatch, capfd):
     monkeypatch.delenv("JAXCAL_NO_CACHE")
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    folder = cache._private_folder()
+    folder = program_cache.private_folder("xla")
     if spoil == "open":
         folder.chmod(0o770)
     elif spoil == "open_parent":
@@ -551,12 +543,6 @@ def test_cache_keeps_the_newest(tmp_path, monkeypatch):
         os.utime(tmp_path / name, (0, -age))
     cache._prune(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
-
-
-def test_relative_cache_home_is_ignored(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert cache._private_folder() == tmp_path / ".cache" / "jaxcal" / "xla"
 
 
 def test_numbers_are_positive_and_finite():
@@ -615,3 +601,42 @@ def test_plans_that_cannot_be(capfd, tmp_path):
     ):
         assert match in refused(capfd, "plan", *arguments)
     assert list(tmp_path.iterdir()) == []
+
+
+SLOW_COMPILE = """
+import sys, jax
+from jaxcal.cli.cache import enable_compilation_cache
+if sys.argv[1] == "quiet":
+    enable_compilation_cache()
+jax.devices()
+print("compiling", flush=True)
+jax.jit(lambda: jax.lax.reduce_window(
+    jax.lax.iota("float32", 400_000), 0.0, jax.lax.add, (2_000,), (1,), "VALID"
+).sum())()
+"""
+
+
+def test_alarms_of_the_compiler_do_not_reach_the_terminal():
+    """One that comes after a second; "Very slow compile?" takes two minutes, by the same way."""
+    started = []
+    try:
+        for how in ("quiet", "loud"):  # quiet first, so that its alarm would come first
+            process = subprocess.Popen(
+                [sys.executable, "-c", SLOW_COMPILE, how],
+                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            )  # fmt: skip
+            started.append(process)
+            assert process.stdout.readline() == "compiling\n"
+        quiet, loud = started
+        for line in loud.stderr:
+            if "Constant folding" in line:
+                break
+        else:
+            pytest.fail("the alarm never came: this test tests nothing")
+        assert quiet.poll() is None
+        quiet.kill()
+        assert quiet.stderr.read() == ""
+    finally:
+        for process in started:
+            process.kill()
+            process.communicate()

@@ -1,30 +1,209 @@
-"""Compiled programs kept between runs of the command line, in the user's own cache folder.
+"""``jaxcal cache``: compiled programs kept between runs, in the user's own cache folder.
 
-A calibration takes milliseconds and its compilation seconds, so the second run is much faster. What
-lies in the folder is loaded as machine code: it is used only where nobody else can write to it.
-Importing the library never does this; ``JAXCAL_NO_CACHE=1`` turns it off.
+A calibration takes milliseconds and its compilation seconds, so the second run is much faster.
+:mod:`jaxcal.program_cache` says what is kept, and when it is trusted. ``JAXCAL_NO_CACHE=1`` turns
+it off.
 """
 
 from __future__ import annotations
 
 import os
-import stat
+import time
 import warnings
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from jaxcal import program_cache
+from jaxcal.cli.common import ExitCode, print_json, print_page, progress
+from jaxcal.errors import InputError, OutputError
+
+if TYPE_CHECKING:
+    from jaxcal.problem import Problem
 
 KEPT_PROGRAMS = 256
-"""Newest programs to keep; one is about 0.4 MB."""
+"""Newest programs of JAX's own cache to keep; one is about 0.4 MB."""
+
+WARMED_IMAGES = (16, 32, 64)
+"""Numbers of images that ``warm`` prepares for, unless it is told others."""
+
+
+@click.group()
+def cache() -> None:
+    """Show, prepare or remove the compiled programs that are kept between runs."""
+
+
+@cache.command()
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+def show(as_json: bool) -> int:
+    """List the programs: plan, number of images, size, time to compile, last use."""
+    try:
+        folder, found = program_cache.private_folder(), program_cache.entries()
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"the cache cannot be used: {error}") from error
+    now = time.time()
+    rows = [
+        {
+            **entry.header.get("label", {}),
+            "bytes": entry.size,
+            "compile_s": entry.header.get("seconds"),
+            "used_s_ago": round(max(now - entry.used, 0.0)),
+            "refused": not entry.header,
+        }
+        for entry in found
+    ]
+    total = sum(entry.size for entry in found)
+    if as_json:
+        print_json({"folder": str(folder), "bytes": total, "on": program_cache.is_on(),
+                    "programs": rows})  # fmt: skip
+        return ExitCode.CONVERGED
+    off = [] if program_cache.is_on() else [f"It is off: {program_cache.SWITCH} is set."]
+    said = f"{len(rows)} programs, {total / 2**20:.1f} of {program_cache.LIMIT_BYTES >> 20} MiB"
+    print_page(*([_table(rows)] if rows else []), f"{said}, in {folder}", *off)
+    return ExitCode.CONVERGED
+
+
+@cache.command()
+@click.argument("recording", type=click.Path(), metavar="[REC]", required=False)
+@click.option(
+    "--images",
+    type=click.IntRange(4, 100_000),
+    multiple=True,
+    default=WARMED_IMAGES,
+    show_default=True,
+    metavar="N",
+    help="Number of images, may be repeated; its program serves every number up to the next "
+    "of 8, 12, 16, 24, 32, 48, 64, 96, ...",
+)
+@click.option(
+    "--method",
+    "methods",
+    type=click.Choice(["joint", "alternating", "conventional"]),
+    multiple=True,
+    default=("joint",),
+    show_default=True,
+    help="May be repeated.",
+)
+@click.option(
+    "--estimate",
+    metavar="LIST",
+    help="Further unknowns, as of jaxcal calibrate; with scale the points are pixels.",
+)
+def warm(
+    recording: str | None,
+    images: tuple[int, ...],
+    methods: tuple[Literal["joint", "alternating", "conventional"], ...],
+    estimate: str | None,
+) -> int:
+    """Compile now what later runs of "jaxcal calibrate" need.
+
+    For recordings that hold what REC holds; without it, for points in mm or, with --estimate scale,
+    in pixels.
+    """
+    if not program_cache.is_on():
+        raise InputError(f"the cache is off: {program_cache.SWITCH} is set")
+    try:
+        program_cache.private_folder()
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"the cache cannot be used: {error}") from error
+    from jaxcal.buckets import size
+    from jaxcal.cli.calibrate import unknowns
+    from jaxcal.solve import calibrate
+
+    names = unknowns(estimate)
+    like = _problem(recording, "scale" in names)
+    for method in methods:
+        for count in sorted({size(count) for count in images}):
+            with progress(f"compiling ({method}, {count} images)"):
+                began = time.perf_counter()
+                calibrate(_repeated(like, count), method, estimate=names)
+            taken = time.perf_counter() - began
+            print_page(f"{method}, up to {count} images: {taken:.1f} s")
+    return ExitCode.CONVERGED
+
+
+@cache.command()
+def clear() -> int:
+    """Remove all kept programs."""
+    try:
+        removed = program_cache.clear()
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"the cache cannot be cleared: {error}") from error
+    print_page(f"{removed} programs removed")
+    return ExitCode.CONVERGED
+
+
+def _table(rows: list[dict[str, Any]]) -> Any:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE)
+    for heading in ("method", "prior", "unknowns", "data"):
+        table.add_column(heading)
+    for heading in ("images", "size (MB)", "compiled in (s)", "last used"):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        words = [str(row.get(name, "-")) for name in ("method", "prior", "unknowns", "data")]
+        if row["refused"]:
+            words[0] = "refused"
+        seconds = "-" if row["compile_s"] is None else f"{row['compile_s']:.1f}"
+        table.add_row(*words, str(row.get("images", "-")), f"{row['bytes'] / 1e6:.1f}", seconds,
+                      _ago(row["used_s_ago"]))  # fmt: skip
+    return table
+
+
+def _ago(seconds: float) -> str:
+    for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= length:
+            return f"{seconds / length:.0f} {unit} ago"
+    return f"{seconds:.0f} s ago"
+
+
+def _problem(recording: str | None, pixels: bool) -> Problem:
+    """A problem of the kind to prepare for; what it measured does not matter."""
+    from jaxcal.problem import Problem
+
+    if recording is not None:
+        from jaxcal.io.hdf5 import load
+
+        return Problem.from_recording(load(recording))
+    import numpy as np
+    from scipy.spatial.transform import Rotation
+
+    draws = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, :3, :3] = Rotation.random(8, rng=draws).as_matrix()
+    points = draws.uniform(10.0, 50.0, (8, 2))
+    return Problem.from_arrays(poses, points, kind="pixel" if pixels else "point")
+
+
+def _repeated(problem: Problem, count: int) -> Problem:
+    """As many images as that: the first ones over and over."""
+    from jaxcal import buckets
+
+    return buckets.taken(problem, [k % problem.images for k in range(count)])
 
 
 def enable_compilation_cache() -> None:
-    """Let JAX keep compiled programs on disk; silently without where that cannot be."""
-    if os.environ.get("JAXCAL_NO_CACHE", "0") not in ("", "0"):
+    """Let JAX keep what :mod:`jaxcal.executables` does not; silently without where it cannot be.
+
+    And silence the compiler, whose alarms ("Very slow compile?") ask users of XLA to file bugs. It
+    has no option for that but the level of its log, which is the whole process': so only the
+    command line does it, not the library, and not by an environment that other programs inherit.
+    """
+    if not {"JAX_LOGGING_LEVEL", "TF_CPP_MIN_LOG_LEVEL"} & os.environ.keys():
+        from jaxlib import utils
+
+        with suppress(AttributeError):  # not part of jaxlib's public interface
+            utils.absl_set_min_log_level(3)
+    if not program_cache.is_on():
         return
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     try:
-        folder = _private_folder()
+        folder = program_cache.private_folder("xla")
         _prune(folder)
     except (OSError, RuntimeError):
         return
@@ -34,25 +213,6 @@ def enable_compilation_cache() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     # A damaged entry is compiled anew; that is nothing that a user of the command line can mend.
     warnings.filterwarnings("ignore", message=".*persistent compilation cache.*")
-
-
-def _private_folder() -> Path:
-    """~/.cache/jaxcal/xla, made if need be; OSError where it is not ours alone."""
-    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if not base.is_absolute():  # the XDG specification: relative paths are to be ignored
-        base = Path.home() / ".cache"
-    base.mkdir(parents=True, exist_ok=True)
-    folder = base / "jaxcal" / "xla"
-    for place in (folder.parent, folder):
-        with suppress(FileExistsError):
-            place.mkdir(mode=0o700)
-        found = place.lstat()
-        if not stat.S_ISDIR(found.st_mode):
-            raise NotADirectoryError(place)
-        # Windows keeps its profile folders private by other means.
-        if os.name == "posix" and (found.st_uid != os.geteuid() or found.st_mode & 0o077):
-            raise PermissionError(place)
-    return folder
 
 
 def _prune(folder: Path) -> None:

@@ -253,10 +253,11 @@ def _request(
     chosen: Literal["auto", "gaussian", "uniform", "bounded"] = "auto"
     if prior == "gaussian" or prior == "uniform" or prior == "bounded":
         chosen = prior
-    return _Request(method, chosen, max_elevation, _unknowns(estimate), data, sigma, options)
+    return _Request(method, chosen, max_elevation, unknowns(estimate), data, sigma, options)
 
 
-def _unknowns(estimate: str | None) -> tuple[str, ...]:
+def unknowns(estimate: str | None) -> tuple[str, ...]:
+    """The names in the option --estimate."""
     if estimate is None:
         return ()
     names = tuple(name.strip() for name in estimate.split(","))

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import click
 
 from jaxcal import __version__
+from jaxcal.cli.cache import cache
 from jaxcal.cli.calibrate import calibrate
 from jaxcal.cli.demo import demo
 from jaxcal.cli.import_ import import_
@@ -30,7 +31,7 @@ def commands() -> None:
     """Calibrate a tracked or robotic ultrasound probe from images of one small fixed target."""
 
 
-for _command in (demo, simulate, import_, segment, calibrate, plan, pivot, study):
+for _command in (demo, simulate, import_, segment, calibrate, plan, pivot, study, cache):
     commands.add_command(_command)
 
 

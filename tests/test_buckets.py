@@ -1,0 +1,151 @@
+"""Padding to a bucket changes no answer, and one program serves every number of images in it."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import problem as simulated
+from conftest import select
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxcal
+from jaxcal import buckets, executables, program_cache, solve
+
+METHODS = {
+    "conventional": {"method": "conventional"},
+    "alternating": {"method": "alternating", "max_elevation": 2.0},
+    "auto": {},
+}
+PROBLEMS = [
+    simulated(seed, images=12, elevation_mm=2.0, noise_mm=0.5, test_images=4) for seed in (1, 2)
+]
+
+
+def test_buckets_grow_by_a_half_or_a_third():
+    expected = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)
+    assert tuple(sorted({buckets.size(n) for n in range(1, 513)})) == expected
+    assert all(n <= buckets.size(n) for n in range(1, 2000))
+    assert all(buckets.size(n) <= 1.5 * n for n in range(8, 2000))
+
+
+def test_every_axis_of_images_is_known():
+    """What holds a number for each image is padded and cut; nothing else is."""
+    result = jaxcal.calibrate(PROBLEMS[0], "conventional").numpy()
+    cut = buckets.cut(result, 9)
+    changed = {name: (old, new) for (name, old), (_, new) in
+               zip(shapes(result), shapes(cut), strict=True) if old != new}  # fmt: skip
+    assert changed == {
+        "elevation": ((12,), (9,)),
+        "elevation_sd": ((12,), (9,)),
+        "residual": ((12, 3), (9, 3)),
+        "mask": ((12,), (9,)),
+        "at_bound": ((12,), (9,)),
+        "inspection.outlier": ((12,), (9,)),
+        "inspection.departure": ((12, 3), (9, 3)),
+    }
+    raw = jaxcal.simulate_recording(jaxcal.Protocol(images=9, raw=True), 1)
+    channels = buckets.padded(jaxcal.Problem.from_recording(raw)).channels
+    assert channels is not None
+    assert channels.distances.shape == channels.heard.shape == (12, 128)
+    assert channels.elements.shape == (128, 3)
+
+
+def shapes(tree, prefix=""):
+    for field in fields(tree):
+        value = getattr(tree, field.name)
+        if is_dataclass(value):
+            yield from shapes(value, f"{prefix}{field.name}.")
+        elif hasattr(value, "shape"):
+            yield prefix + field.name, value.shape
+
+
+def with_garbage(problem: jaxcal.Problem, more: int) -> jaxcal.Problem:
+    """Further images, masked, that hold no numbers."""
+    count = problem.images
+    longer = buckets.taken(problem, [*range(count), *[0] * more])
+    mask = np.concatenate([np.asarray(problem.mask), np.zeros(more)])
+    used = (mask > 0) | (np.arange(count + more) < count)
+
+    def spoilt(values):
+        return np.where(used.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
+
+    return replace(
+        jax.tree.map(jnp.asarray, longer),
+        mask=jnp.asarray(mask),
+        poses=jnp.asarray(spoilt(longer.poses)),
+        measurements=jnp.asarray(spoilt(longer.measurements)),
+    )
+
+
+def same(one: jaxcal.Calibration, other: jaxcal.Calibration, images: int) -> None:
+    """Equal to 1e-10 SD, every decision included."""
+    one, other = one.numpy(), buckets.cut(other.numpy(), images)
+    assert one.status == other.status
+    for name in ("mask", "at_bound", "searched_start", "tolerance_met"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    np.testing.assert_array_equal(one.outlier, other.outlier)
+    if one.status == "failed":
+        return
+    moved = np.linalg.solve(np.asarray(one.image_to_probe), np.asarray(other.image_to_probe))
+    turned = np.array([moved[2, 1], moved[0, 2], moved[1, 0]])
+    sd = np.sqrt(np.diagonal(one.covariance))
+    if np.isfinite(sd).all():
+        assert np.abs(np.concatenate([moved[:3, 3], turned]) / sd).max() < 1e-10
+        np.testing.assert_allclose(other.covariance / np.outer(sd, sd),
+                                   one.covariance / np.outer(sd, sd), atol=1e-8)  # fmt: skip
+    np.testing.assert_allclose(other.elevation, one.elevation, atol=1e-9)
+    np.testing.assert_allclose(other.residual, one.residual, atol=1e-9)
+    np.testing.assert_allclose(other.sigma, one.sigma, rtol=1e-8)
+    np.testing.assert_allclose(other.rms, one.rms, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_masked_images_beyond_the_bucket_change_nothing(name):
+    """From 5 to 12 images, some of them masked, in the buckets of 12 and of 16."""
+    smaller = simulated(3, images=8, elevation_mm=2.0, noise_mm=0.5, test_images=4)
+    sources = [
+        *PROBLEMS,
+        jax.tree.map(jnp.asarray, buckets.taken(smaller, [*range(8), 0])),
+    ]  # nine: one comes twice
+
+    @settings(max_examples=12, deadline=None, derandomize=True, database=None)
+    @given(
+        source=st.sampled_from(sources),
+        count=st.integers(9, 12),
+        left_out=st.sets(st.integers(0, 11), max_size=4),
+        more=st.integers(1, 4),
+    )
+    def holds(source, count, left_out, more):
+        count = min(count, source.images)
+        problem = select(source, slice(0, count))
+        mask = jnp.asarray([float(k not in left_out) for k in range(count)])
+        problem = replace(problem, mask=mask)
+        padded = with_garbage(problem, 12 - count + more)
+        assert buckets.size(padded.images) == 16
+        same(jaxcal.calibrate(problem, **METHODS[name]), jaxcal.calibrate(padded, **METHODS[name]),
+             count)  # fmt: skip
+
+    holds()
+
+
+def test_the_answer_is_that_of_the_unpadded_problem():
+    nine = select(PROBLEMS[0], slice(0, 9))
+    plan, given = solve.prepare(nine, solve.Request(method="conventional"))
+    exact = jax.jit(solve.solve_problem, static_argnums=2)(nine, given, plan)
+    found = jaxcal.calibrate(nine, "conventional")
+    assert found.elevation.shape == (9,)
+    same(exact, found, 9)
+
+
+def test_every_number_of_images_in_a_bucket_is_one_program(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    executables.forget()
+    for count in (9, 10, 11, 12):
+        jaxcal.calibrate(select(PROBLEMS[0], slice(0, count)), "conventional")
+    (entry,) = program_cache.entries()
+    assert entry.header["label"]["images"] == 12
