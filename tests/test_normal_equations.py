@@ -1,0 +1,447 @@
+"""One pass over the images against dense automatic differentiation, for every observation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
+
+from jaxcal.model import derivatives, unrolled
+from jaxcal.model.batch import Images, Iterate, targets, total
+from jaxcal.model.observations import (
+    BoundedOffsets,
+    Channels,
+    Further,
+    HeldOffsets,
+    InPlane,
+    LocalUnknown,
+    Medium,
+    OwnCovariances,
+    Points,
+    TrackedPoints,
+    local_unknowns,
+)
+from jaxcal.model.parameters import EXTRA, RIGID, Parameters
+from jaxcal.problem import Channels as Heard
+from jaxcal.problem import Problem
+from jaxcal.solvers.levenberg_marquardt import (
+    Descent,
+    Rounding,
+    gradient_cosine,
+    iterate_once,
+    minimise,
+)
+from jaxcal.solvers.normal_equations import accumulate, component_sums
+
+LANES, IMAGES, ELEMENTS, LEFT_OUT = 3, 11, 5, 4
+SIGMA = jnp.asarray([0.3, 0.4, 1.5])[:, None] * jnp.asarray([1.0, 0.7, 1.3])
+GATE = jnp.asarray([1.0, 0.0, 1.0])
+"""Second derivatives in two lanes, none in the one between."""
+
+
+def turns(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    flat = Rotation.random(int(np.prod(shape)), random_state=rng).as_matrix()
+    return flat.reshape(*shape, 3, 3)
+
+
+@pytest.fixture(scope="module")
+def drawn() -> tuple[Problem, Parameters]:
+    """Problems, one image left out of each with rubbish in it, and unknowns some mm off."""
+    rng = np.random.default_rng(3)
+    rotation, target = turns(rng, (LANES,)), rng.uniform(-50, 50, (LANES, 3))
+    translation = rng.uniform(-30, 30, (LANES, 3))
+    poses = np.tile(np.eye(4), (LANES, IMAGES, 1, 1))
+    poses[..., :3, :3] = turns(rng, (LANES, IMAGES))
+    shape = (LANES, IMAGES)
+    depth = rng.uniform(20, 70, shape)
+    q = np.stack([rng.uniform(-25, 25, shape), 1.5 * rng.normal(size=shape), depth], axis=-1)
+    in_probe = np.einsum("kij,knj->kni", rotation, q) + translation[:, None]
+    away = np.einsum("knij,knj->kni", poses[..., :3, :3], in_probe)
+    poses[..., :3, 3] = target[:, None] - away
+    points = np.stack([q[..., 0], np.hypot(q[..., 1], q[..., 2])], axis=-1)
+    across = np.linspace(-20, 20, ELEMENTS)
+    elements = np.stack([across, 0 * across, -0.01 * across**2], axis=-1)
+    distances = np.linalg.norm(q[:, :, None] - elements, axis=-1)
+    heard = (rng.uniform(size=distances.shape) < 0.8).astype(float)
+    points, distances = (v + 0.3 * rng.normal(size=v.shape) for v in (points, distances))
+    mask = np.ones(shape)
+    mask[:, LEFT_OUT] = 0
+    points[:, LEFT_OUT], poses[1, LEFT_OUT] = [1e30, np.nan], np.nan
+    distances[:, LEFT_OUT] = np.nan
+    problems = Problem(
+        *(jnp.asarray(v) for v in (poses, points, mask)),
+        spacing=jnp.ones((LANES, 2)),
+        face_offset=jnp.full(LANES, 2.0),
+        channels=Heard(
+            jnp.asarray(distances), jnp.asarray(heard), jnp.tile(elements, (LANES, 1, 1))
+        ),
+    )
+    # Range is measured from the face.
+    problems = replace(problems, measurements=problems.measurements.at[..., 1].add(-2.0))
+    small = Rotation.from_rotvec(rng.normal(scale=0.01, size=(LANES, 3))).as_matrix()
+    near = Parameters(
+        jnp.asarray(rotation @ small),
+        jnp.asarray(translation + rng.normal(scale=0.5, size=(LANES, 3))),
+        jnp.asarray(target + rng.normal(scale=0.5, size=(LANES, 3))),
+        jnp.asarray(rng.uniform(0.98, 1.02, (LANES, 2))),
+        jnp.asarray(rng.uniform(0.98, 1.02, LANES)),
+        jnp.asarray(rng.uniform(-0.5, 0.5, LANES)),
+    )
+    return problems, near
+
+
+def shapes() -> jax.Array:
+    rng = np.random.default_rng(8)
+    first, second = rng.uniform(0.5, 2.0, (2, LANES, IMAGES))
+    return jnp.asarray(np.stack([first, rng.uniform(-0.4, 0.4, first.shape), second]))
+
+
+OFFSETS = jnp.asarray(np.random.default_rng(9).normal(size=(LANES, IMAGES)))
+# Images left out have a range of 1 mm; an offset has to fit in there.
+OFFSETS = OFFSETS.at[:, LEFT_OUT].set(0.0)
+TAU = jnp.asarray([0.3, 0.2, 0.5])
+
+CASES = {
+    "points": (lambda images: Points(SIGMA), RIGID + EXTRA),
+    "own covariances": (
+        lambda images: OwnCovariances(SIGMA, shapes(), SIGMA[1] / SIGMA[0]),
+        (*RIGID, "scale"),
+    ),
+    "own covariances, one factor": (
+        lambda images: OwnCovariances(SIGMA[1:], shapes(), jnp.ones(LANES), tied=True),
+        RIGID,
+    ),
+    "tracked points": (lambda images: TrackedPoints(SIGMA, TAU), (*RIGID, "scale")),
+    "tracked points, own covariances": (
+        lambda images: TrackedPoints(SIGMA, TAU, shapes()),
+        RIGID,
+    ),
+    "in plane": (InPlane.of, (*RIGID, "scale")),
+    "held offsets": (lambda images: HeldOffsets.of(OFFSETS, images), (*RIGID, "scale")),
+    "bounded offsets": (
+        lambda images: BoundedOffsets.of(jnp.full((LANES, IMAGES), 1.2), images),
+        RIGID + EXTRA,
+    ),
+    "channels": (lambda images: Channels(SIGMA[1:]), (*RIGID, "sound-speed", "delay")),
+}
+"""Every observation, and the unknowns it is looked at with."""
+
+
+def case(drawn, name: str) -> tuple[Iterate, Any, Images, Medium | None]:
+    make, blocks = CASES[name]
+    problems, near = drawn
+    images = Images.of(problems, channels=name == "channels")
+    medium = None
+    if "delay" in blocks and name != "bounded offsets":
+        medium = Medium(jnp.asarray([[0.01] * LANES, [0.4] * LANES]), blocks)
+    return Iterate.of(near, blocks), make(images), images, medium
+
+
+def whitened(step, local, place: Iterate, observation, images: Images, medium):
+    """All whitened residuals of every lane after a step, (lanes, n, residuals of an image)."""
+    moved = place.moved(list(step))
+    q, _ = targets(moved, images)
+    still = [jnp.zeros((LANES, 1))] * moved.extras.shape[0]
+    further = Further.of(moved, still)
+    if local is None:
+        parts = observation.components(q, further, images)
+    else:
+        parts = observation.components_at(q, local, further, images)
+    found = []
+    for part, sd in zip(parts, observation.sigma, strict=True):
+        present = 1.0 if part.present is None else part.present
+        for error in part.errors:
+            wide = (present * error).reshape(LANES, IMAGES, -1)
+            found.append(images.mask[..., None] * wide / sd[:, None, None])
+    if medium is not None:
+        speed, delay = moved.extra("sound-speed"), moved.extra("delay")
+        known = jnp.stack([jnp.log(speed[0]), delay[0]]) / medium.sd
+        found.append(jnp.zeros((LANES, IMAGES, 2)).at[:, 0].set(known.T))
+    return jnp.concatenate(found, axis=-1)
+
+
+def dense(place: Iterate, observation, images: Images, medium):
+    """Cost, gradient, exact and Gauss-Newton's curvature, squares of the columns."""
+    zero, units = jnp.zeros((place.unknowns, LANES)), jnp.eye(place.unknowns)
+
+    def residuals(step, local=None):
+        return whitened(step, local, place, observation, images, medium)
+
+    def half(step):
+        return 0.5 * jnp.sum(residuals(step) ** 2)
+
+    def everywhere(unit):
+        return jnp.broadcast_to(unit[:, None], zero.shape)
+
+    exact = jax.vmap(lambda unit: jax.jvp(jax.grad(half), (zero,), (everywhere(unit),))[1])(units)
+    local = None
+    if isinstance(observation, LocalUnknown):
+        q, _ = targets(place, images)
+        still = [jnp.zeros((LANES, 1))] * place.extras.shape[0]
+        local, free = observation.local(q, Further.of(place, still), images)
+    jacobian = jax.vmap(
+        lambda unit: jax.jvp(lambda step: residuals(step, local), (zero,), (everywhere(unit),))[1]
+    )(units)
+    newton = jnp.einsum("aknr,bknr->abk", jacobian, jacobian)
+    squares = jnp.einsum("aakk->ak", newton[..., None] * jnp.eye(LANES))
+    if local is not None:
+        _, own = jax.jvp(lambda y: residuals(zero, y), (local,), (jnp.ones_like(local),))
+        meets, bend = jnp.einsum("aknr,knr->akn", jacobian, own), jnp.sum(own**2, axis=-1)
+        give = jnp.where(free * images.mask > 0, 1 / jnp.where(bend > 0, bend, 1.0), 0.0)
+        newton = newton - jnp.einsum("akn,bkn,kn->abk", meets, meets, give)
+    cost = jnp.sum(residuals(zero) ** 2, axis=(1, 2))
+    return cost, jax.grad(half)(zero), exact, newton, squares
+
+
+def assert_close(found, wanted, tolerance: float) -> None:
+    """To the largest entry of each lane."""
+    wanted = np.asarray(wanted)
+    scale = np.abs(wanted).reshape(-1, LANES).max(axis=0)
+    np.testing.assert_allclose(np.asarray(found) / scale, wanted / scale, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize(
+    "name",
+    # The longest to compile by far, and the other one has all of it.
+    [pytest.param(n, marks=[pytest.mark.slow] * (n == "tracked points")) for n in CASES],
+)
+def test_sums_are_the_derivatives_of_the_cost(drawn, name):
+    place, observation, images, medium = case(drawn, name)
+    cost, gradient, exact, newton, squares = jax.jit(dense)(place, observation, images, medium)
+    # Newton's steps to a tracker's error end within rounding of its best value, not at it.
+    tolerance = 1e-9 if "tracked" in name else 1e-12
+    normal = jax.jit(accumulate)(place, observation, images, GATE, medium)
+    assert_close(normal.cost, cost, 1e-13)
+    assert_close(normal.gradient, gradient, tolerance)
+    assert_close(normal.stacked(), jnp.where(GATE > 0, exact, newton), tolerance)
+    assert np.abs(exact - newton).max() > 1e-5 * np.abs(newton).max()
+    if isinstance(observation, LocalUnknown):
+        assert_close(normal.diagonal(), squares, 1e-12)
+
+
+@pytest.mark.parametrize("name", ["points", "own covariances", "channels"])
+def test_components_apart_come_to_the_whole(drawn, name):
+    """The second derivatives of all go into the rest."""
+    place, observation, images, medium = case(drawn, name)
+
+    @jax.jit
+    def both():
+        ones = jnp.ones(LANES)
+        sums = component_sums(place, observation, images, observation.sigma, medium)
+        return sums, *(
+            accumulate(place, observation, images, gate, medium) for gate in (ones, None)
+        )
+
+    sums, exact, newton = both()
+    weighed = sums.weighed(1 / observation.sigma**2)
+    for part in ("cost", "gradient", "curvature"):
+        assert_close(getattr(weighed, part), getattr(newton, part), 1e-13)
+    assert_close(weighed.curvature + sums.rest, exact.curvature, 1e-13)
+    alone = observation.with_sigma(jnp.full_like(observation.sigma, 1e12).at[0].set(1.0))
+    if name == "channels":
+        first = jax.jit(accumulate)(place, alone, images, None)
+        assert_close(sums.squares[0], first.cost, 1e-12)
+        assert_close(sums.gradient[0], first.gradient, 1e-12)
+
+
+@pytest.mark.parametrize("name", ["points", "bounded offsets", "channels"])
+def test_images_left_out_and_padding_count_for_nothing(drawn, name):
+    place, observation, images, medium = case(drawn, name)
+    keep = np.delete(np.arange(IMAGES), LEFT_OUT)
+    problems, _ = drawn
+    channels = replace(
+        problems.channels,
+        distances=problems.channels.distances[:, keep],
+        heard=problems.channels.heard[:, keep],
+    )
+    few = Images.of(
+        replace(
+            problems,
+            poses=problems.poses[:, keep],
+            measurements=problems.measurements[:, keep],
+            mask=problems.mask[:, keep],
+            channels=channels,
+        ),
+        channels=name == "channels",
+    )
+    without = observation
+    if name == "bounded offsets":
+        without = BoundedOffsets.of(observation.bound[:, keep], few)
+    # Padding is whole vectors of 64 bytes; none for times of flight.
+    padded = images.padded()
+    assert padded.mask.shape[1] == (IMAGES if name == "channels" else 16)
+    ways = [
+        (observation, images),
+        (without, few),
+        (observation.padded(), padded),
+    ]
+    sums = jax.jit(accumulate)
+    whole, fewer, more = (sums(place, each, data, None, medium) for each, data in ways)
+    for leaf, other, third in zip(*map(jax.tree.leaves, (whole, fewer, more)), strict=True):
+        assert np.isfinite(leaf).all()
+        np.testing.assert_allclose(leaf, other, rtol=1e-11, atol=1e-11 * np.abs(leaf).max())
+        np.testing.assert_allclose(leaf, third, rtol=1e-11, atol=1e-11 * np.abs(leaf).max())
+
+
+def test_sums_of_planes_have_both_derivatives():
+    planes = [jnp.arange(6.0).reshape(2, 3), 0, jnp.ones((1, 3))]
+
+    def squares(scale):
+        kept = [plane if unrolled.is_zero(plane) else scale * plane for plane in planes]
+        return sum(jnp.sum(value**2) for value in total(kept))
+
+    found = total(planes)
+    np.testing.assert_array_equal(found, [[3, 12], [0, 0], [3, 3]])
+    at = jnp.asarray(2.0)
+    expected = 2 * 2.0 * (3**2 + 12**2 + 2 * 3**2)
+    for slope in (jax.grad(squares)(at), jax.jvp(squares, (at,), (1.0,))[1]):
+        np.testing.assert_allclose(slope, expected, rtol=1e-15)
+    # And again: curvature is asked for at optima.
+    np.testing.assert_allclose(jax.grad(jax.grad(squares))(at), expected / 2, rtol=1e-15)
+
+
+def test_the_gradient_has_forward_and_reverse_derivatives_by_the_data(drawn):
+    place, observation, images, _ = case(drawn, "own covariances")
+    rng = np.random.default_rng(1)
+    weight = jnp.asarray(rng.normal(size=(place.unknowns, LANES)))
+    along = jnp.asarray(rng.normal(size=(LANES, IMAGES)))
+
+    def value(lateral):
+        data = replace(images, lateral=lateral)
+        return jnp.sum(weight * accumulate(place, observation, data, GATE).gradient)
+
+    def reference(lateral):
+        data = replace(images, lateral=lateral)
+
+        def half(step):
+            return 0.5 * jnp.sum(whitened(step, None, place, observation, data, None) ** 2)
+
+        return jnp.sum(weight * jax.grad(half)(jnp.zeros_like(weight)))
+
+    @jax.jit
+    def slopes(lateral):
+        return (
+            jax.jvp(value, (lateral,), (along,))[1],
+            jnp.sum(along * jax.grad(value)(lateral)),
+            jax.jvp(reference, (lateral,), (along,))[1],
+        )
+
+    forward, reverse, wanted = slopes(images.lateral)
+    np.testing.assert_allclose([forward, reverse], [wanted] * 2, rtol=1e-9)
+
+
+def test_derivatives_of_planes_leave_out_what_vanishes():
+    def function(x, y, z):
+        return [x * y + 3.0, jnp.sin(z), 2.0 * x - z, jnp.ones_like(x)]
+
+    x, y, z = (jnp.asarray([[value]]) for value in (2.0, 5.0, 0.3))
+    assert derivatives.depends(function, [x, y, z]) == [{0, 1}, {2}, {0, 2}, set()]
+    values, rows = derivatives.first(function, [x, y, z])
+    np.testing.assert_allclose(np.ravel(values), [13, np.sin(0.3), 3.7, 1])
+    zeros = [[unrolled.is_zero(entry) for entry in row] for row in rows]
+    assert zeros == [[False, False, True], [True, True, False], [False, True, False], [True] * 3]
+    np.testing.assert_allclose(
+        [rows[0][0][0, 0], rows[0][1][0, 0], rows[1][2][0, 0], rows[2][0][0, 0], rows[2][2][0, 0]],
+        [5, 2, np.cos(0.3), 2, -1],
+    )
+    bends = derivatives.second(function, [x, y, z])
+    assert set(bends) == {(0, 0, 1), (1, 2, 2)}
+    np.testing.assert_allclose(bends[0, 0, 1], [[1]])
+    np.testing.assert_allclose(bends[1, 2, 2], [[-np.sin(0.3)]])
+
+
+def test_offsets_are_the_closest_points_of_the_circles(drawn):
+    place, observation, images, _ = case(drawn, "bounded offsets")
+    found = np.asarray(local_unknowns(place, observation, images))
+    q, _ = targets(place, images)
+    still = [jnp.zeros((LANES, 1))] * place.extras.shape[0]
+    distance = np.asarray(Further.of(place, still).points(images)[1])
+    for k, i in [(0, 0), (1, 7), (2, 10), (2, 3)]:
+        best: Any = minimize_scalar(
+            lambda y, k=k, i=i: (
+                (q[1][k, i] - y) ** 2 + (q[2][k, i] - np.sqrt(distance[k, i] ** 2 - y**2)) ** 2
+            ),
+            bounds=(-1.2, 1.2),
+            method="bounded",
+            options={"xatol": 1e-10},
+        )
+        # A minimum is known to the root of the rounding of its value.
+        assert abs(found[k, i] - best.x) < 1e-6
+    assert np.all(found[:, LEFT_OUT] == 0)
+    assert np.any(np.abs(found) == 1.2)
+    assert np.any((np.abs(found) > 0) & (np.abs(found) < 1.2))
+
+
+def test_a_step_turns_by_the_rotation_vector_to_third_order():
+    vector = np.array([0.02, -0.03, 0.01])
+    turn = np.array(unrolled.rotation(list(vector)))
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-15)
+    exact = Rotation.from_rotvec(vector).as_matrix()
+    assert np.abs(turn - exact).max() < np.linalg.norm(vector) ** 3 / 12 * 1.01
+    large = np.array(unrolled.rotation([2.0, -3.0, 5.0]))
+    np.testing.assert_allclose(large @ large.T, np.eye(3), atol=1e-14)
+
+
+@pytest.fixture(scope="module")
+def descent(drawn):
+    """The minimiser of given SDs, compiled once."""
+    place, observation, images, _ = case(drawn, "own covariances, one factor")
+    return place, observation, images, jax.jit(minimise)
+
+
+def test_where_the_last_step_was_not_looked_at_the_gradient_is_gone_too(descent):
+    place, observation, images, run = descent
+    found = run(place, observation, images)
+    rounding = Rounding.of(found.place, observation, images)
+    normal = jax.jit(accumulate)(found.place, observation, images, None)
+    assert np.all(found.settled)
+    assert not np.any(found.active)
+    assert np.all(found.cosine <= 1e-10)
+    assert np.all(gradient_cosine(normal, rounding.vanished) <= 1e-10)
+    # Its cost is that before the last step: higher, by nothing.
+    np.testing.assert_allclose(found.cost, normal.cost, rtol=1e-10)
+
+
+def test_a_lost_lane_leaves_its_neighbours_alone(descent):
+    place, observation, images, run = descent
+    whole = run(place, observation, images)
+    spoilt = replace(images, lateral=images.lateral.at[1, 0].set(jnp.nan))
+    broken = run(place, observation, spoilt)
+    others = [0, 2]
+    assert np.isnan(broken.cost[1])
+    assert not broken.active[1]
+    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(broken), strict=True):
+        assert np.array_equal(np.asarray(a)[..., others], np.asarray(b)[..., others])
+
+
+def test_a_step_that_fails_is_tried_again_with_more_damping(drawn):
+    """Far from the optimum, hardly damped: without rejections there is no way down."""
+    place, observation, images, _ = case(drawn, "bounded offsets")
+    place = Iterate.of(place.parameters(), RIGID)
+    far = (60, -50, 70, 1.5, -1, 1.2, 80, 90, -40)
+    away = place.moved([jnp.full(LANES, float(value)) for value in far])
+    rounding = Rounding.of(away, observation, images)
+    step = jax.jit(
+        partial(
+            iterate_once,
+            equations=lambda g, gate: accumulate(g, observation, images, gate),
+            rounding=rounding,
+            tolerance=1e-10,
+            max_steps=100,
+        )
+    )
+    state, failed = Descent.before(away, jnp.zeros(LANES), 1e-9), 0
+    while np.any(state.active):
+        before, state = state, step(state)
+        taken = ~np.asarray(before.retry)
+        assert np.all(state.cost[taken] <= before.cost[taken] * (1 + 1e-9))
+        failed += int(np.sum(state.retry & state.active))
+    assert failed > 0
+    assert np.all(state.settled)
