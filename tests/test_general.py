@@ -1,0 +1,153 @@
+"""Our Levenberg-Marquardt on other people's problems, and the arrow-shaped one, against scipy."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from scipy.optimize import least_squares
+
+from jaxcal.solvers.general import LevenbergMarquardt, arrow_least_squares
+
+POINTS = 12
+
+
+def banana(unknowns, args):
+    del args
+    return {"valley": 10 * (unknowns[1] - unknowns[0] ** 2), "along": 1 - unknowns[0]}
+
+
+def test_rosenbrock():
+    start = jnp.asarray([-1.2, 1.0])
+    solution = optx.least_squares(banana, LevenbergMarquardt(), start, max_steps=200)
+    assert solution.result == optx.RESULTS.successful
+    np.testing.assert_allclose(solution.value, [1, 1], atol=1e-10)
+
+
+def decay(unknowns, data):
+    time = jnp.linspace(0, 2, data.shape[0])
+    return unknowns["size"] * jnp.exp(-unknowns["rate"] * time) - data
+
+
+def fitted(data, steps: int = 100):
+    start = {"size": jnp.asarray(1.0), "rate": jnp.asarray(0.1)}
+    return optx.least_squares(decay, LevenbergMarquardt(), start, data, max_steps=steps)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    time = np.linspace(0, 2, POINTS)
+    return 3 * np.exp(-1.5 * time) + 0.1 * rng.normal(size=(3, POINTS))
+
+
+def test_a_curve_is_scipys_and_has_both_derivatives(noisy):
+    """In a batch, by one program: the value, and the implicit derivative in both modes."""
+
+    def value(data):
+        found = fitted(data).value
+        return found["size"] + 2 * found["rate"]
+
+    along = np.random.default_rng(1).normal(size=POINTS)
+
+    @jax.jit
+    @jax.vmap
+    def everything(data):
+        forward = jax.jvp(value, (data,), (jnp.asarray(along),))[1]
+        return fitted(data).value, forward, jax.grad(value)(data)
+
+    found, forward, reverse = everything(jnp.asarray(noisy))
+    for k, data in enumerate(noisy):
+        time = np.linspace(0, 2, POINTS)
+
+        def scipys(data, time=time):
+            fit = least_squares(
+                lambda u: u[0] * np.exp(-u[1] * time) - data,
+                [3.0, 1.5],
+                lambda u: np.exp(-u[1] * time)[:, None] * np.stack([1 + 0 * time, -u[0] * time], 1),
+                method="lm",
+                xtol=1e-15,
+                ftol=1e-15,
+            )
+            return fit.x
+
+        np.testing.assert_allclose([found["size"][k], found["rate"][k]], scipys(data), atol=1e-6)
+        step = 1e-4
+        ends = [scipys(data + sign * step * along) @ [1, 2] for sign in (1, -1)]
+        difference = (ends[0] - ends[1]) / (2 * step)
+        np.testing.assert_allclose([forward[k], reverse[k] @ along], [difference] * 2, rtol=1e-4)
+
+
+def test_too_few_steps_are_said():
+    solution = optx.least_squares(
+        banana, LevenbergMarquardt(), jnp.asarray([-1.2, 1.0]), max_steps=2, throw=False
+    )
+    assert solution.result == optx.RESULTS.nonlinear_max_steps_reached
+
+
+def parabola(curve, local, data):
+    """Points that err in both coordinates; the local unknown is where a point is along x."""
+    return jnp.stack([local, curve["low"] + curve["bend"] * local**2], 1) - data
+
+
+@pytest.fixture(scope="module")
+def points() -> np.ndarray:
+    x = np.linspace(0, 1, POINTS)
+    rng = np.random.default_rng(1)
+    return np.stack([x, 2 + 3 * x**2], 1) + 0.05 * rng.normal(size=(3, POINTS, 2))
+
+
+@pytest.fixture(scope="module")
+def arrow():
+    """Shared and local unknowns with their derivatives, of a batch, with a bound on the local."""
+
+    def fit(data, limit):
+        start = {"low": jnp.asarray(1.0), "bend": jnp.asarray(1.0)}
+        solution = arrow_least_squares(parabola, start, 0.5 * data[:, 0], data, limit=limit)
+        curve, local = solution.value
+        return jnp.stack([curve["low"], curve["bend"]]), local
+
+    def both(data, limit, along):
+        def moved(step):
+            return fit(data + step * along, limit)[0]
+
+        shared, local = fit(data, limit)
+        reverse = jax.jacrev(lambda data: fit(data, limit)[0])(data)
+        return shared, local, jax.jvp(moved, (0.0,), (1.0,))[1], reverse
+
+    return jax.jit(jax.vmap(both, in_axes=(0, None, None)))
+
+
+def peer(data: np.ndarray, limit: float) -> np.ndarray:
+    """All unknowns at once, by scipy."""
+
+    def residual(u):
+        local = u[2:]
+        return (np.stack([local, u[0] + u[1] * local**2], 1) - data).ravel()
+
+    first = np.concatenate([[1.0, 1.0], np.clip(0.5 * data[:, 0], -0.9 * limit, 0.9 * limit)])
+    bound = np.concatenate([[np.inf] * 2, np.full(POINTS, limit)])
+    return least_squares(
+        residual, first, bounds=(-bound, bound), xtol=1e-15, ftol=1e-15, gtol=1e-15
+    ).x
+
+
+@pytest.mark.parametrize("limit", [np.inf, 0.8])
+def test_shared_and_local_unknowns_are_those_of_a_dense_solver(arrow, points, limit):
+    along = np.random.default_rng(2).normal(size=(POINTS, 2))
+    most = np.full(POINTS, limit)
+    shared, local, forward, reverse = arrow(points, most, along)
+    for k, data in enumerate(points):
+        dense = peer(data, limit)
+        np.testing.assert_allclose(shared[k], dense[:2], atol=1e-5)
+        np.testing.assert_allclose(local[k], dense[2:], atol=1e-5)
+    assert np.any(np.abs(local) == limit) == np.isfinite(limit)
+    np.testing.assert_allclose(
+        forward, np.einsum("kanm,nm->ka", reverse, along), rtol=1e-8, atol=1e-10
+    )
+    if np.isinf(limit):
+        step = 1e-5
+        ends = [arrow(points + sign * step * along, most, along)[0] for sign in (1, -1)]
+        np.testing.assert_allclose(forward, (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
