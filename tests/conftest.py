@@ -110,8 +110,9 @@ def angle(first: np.ndarray, second: np.ndarray) -> float:
 
 LONGEST = (
     "test_cli", "test_channels", "test_study", "test_solvers", "test_robust", "test_crosswire",
-    "test_resampling", "test_acquire", "test_observability_sets", "test_auto", "test_abreast",
-    "test_live", "test_observability", "test_recorder", "test_pivot", "test_report", "test_fused",
+    "test_resampling", "test_acquire", "test_observability_sets", "test_auto", "test_batches",
+    "test_live", "test_observability", "test_recorder", "test_pivot", "test_report",
+    "test_normal_equations",
 )  # fmt: skip
 """Modules that take longest, which start first: no worker is left alone with one at the end."""
 

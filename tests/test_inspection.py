@@ -21,10 +21,11 @@ from jaxcal.diagnostics.residual_checks import (
     skewness_score,
 )
 from jaxcal.diagnostics.uncertainty import inverses, quadratic
+from jaxcal.model.batch import Images, Iterate
+from jaxcal.model.observations import Points
 from jaxcal.model.parameters import RIGID, Parameters
-from jaxcal.model.priors import Gaussian
 from jaxcal.model.residuals import target_in_image
-from jaxcal.solvers.least_squares import minimise
+from jaxcal.solvers.levenberg_marquardt import minimise
 
 SIGMA = np.array([0.4, 0.3, 1.0])
 
@@ -53,19 +54,21 @@ def scores():
     x = jnp.asarray(recording.truth.image_to_probe)
     truth = Parameters.of(x[:3, :3], x[:3, 3], jnp.asarray(recording.truth.point))
     q = target_in_image(truth, base)
-    belief = Gaussian(jnp.asarray(SIGMA))
     elevational = jnp.einsum("nij,j->ni", base.poses[:, :3, :3], x[:3, 1])
 
-    def one(errors):
+    def drawn(errors):
         errors = errors * SIGMA
         # Moving the probe along its own elevational axis offsets the target by as much.
         offset = errors[:, 2]
         poses = base.poses.at[:, :3, 3].add(-(offset - q[:, 1])[:, None] * elevational)
         points = jnp.stack([q[:, 0], jnp.hypot(offset, q[:, 2])], axis=1) + errors[:, :2]
-        data = replace(base, poses=poses, measurements=points)
-        return minimise(truth, belief, data, RIGID).parameters, data
+        return truth, replace(base, poses=poses, measurements=points)
 
-    fit = jax.jit(jax.vmap(one))
+    @jax.jit
+    def fit(errors):
+        start, data = jax.vmap(drawn)(errors)
+        images, sigma = Images.of(data), jnp.tile(SIGMA[:, None], len(errors))
+        return minimise(Iterate.of(start, RIGID), Points(sigma), images).place.parameters(), data
 
     def run(errors):
         parameters, data = jax.tree.map(np.asarray, fit(errors))

@@ -12,10 +12,11 @@ from conftest import problem
 from test_geometry import random_poses
 
 import jaxcal
+from jaxcal.model.batch import Images, Iterate
+from jaxcal.model.observations import InPlane
 from jaxcal.model.parameters import RIGID, Parameters
-from jaxcal.model.priors import InPlane
 from jaxcal.model.residuals import target_in_image
-from jaxcal.solvers.least_squares import minimise
+from jaxcal.solvers.levenberg_marquardt import minimise
 
 METHODS = [
     {"method": "conventional"},
@@ -103,7 +104,10 @@ def test_a_start_drowned_in_noise_is_searched_for():
     ).truth
     matrix = jnp.asarray(truth.image_to_probe)
     start = Parameters.of(matrix[:3, :3], matrix[:3, 3], jnp.asarray(truth.point))
-    assert float(result.cost) <= float(minimise(start, InPlane(), data, RIGID).cost) * (1 + 1e-9)
+    alone, start = jax.tree.map(lambda leaf: leaf[None], (data, start))
+    images = Images.of(alone)
+    fit = minimise(Iterate.of(start, RIGID), InPlane.of(images), images)
+    assert float(result.cost) <= float(fit.cost[0]) * (1 + 1e-9)
 
 
 def test_a_narrow_cone_is_weak_but_solved():
