@@ -12,6 +12,7 @@ from conftest import angle, experiment, problem, select
 
 import jaxcal
 from jaxcal import Options
+from jaxcal.probe import LinearProbe
 
 
 @dataclass(frozen=True)
@@ -146,20 +147,81 @@ def test_batches_of_any_shape_and_bad_lanes(solver):
     np.testing.assert_allclose(lane.covariance, alone.covariance, rtol=1e-3)
 
 
-def test_derivative_under_jit_matches_finite_differences(solver):
+def of_channels() -> jaxcal.Problem:
+    """A linear probe's times of flight, few elements."""
+    probe = LinearProbe(elements=8, pitch_mm=6.0)
+    protocol = jaxcal.Protocol(images=12, elevation_mm=2.0, noise_mm=0.3, probe=probe, raw=True)
+    return jaxcal.Problem.from_recording(jaxcal.simulate_recording(protocol, 3))
+
+
+SD = {"sigma": (0.3, 0.15, 1.0)}
+DERIVATIVES = {
+    "conventional": {"method": "conventional"},
+    "bounded": {"prior": "bounded"},
+    "gaussian": {"prior": "gaussian"},
+    "tracker": SD | {"tracker_sd": 0.1},
+    "given": SD,
+    "auto": {},
+    "channels": {"sigma": (0.3, 1.0), "data": "channels"},
+}
+LONG = [pytest.param(name, marks=pytest.mark.slow) for name in ("given", "auto", "channels")]
+
+
+@pytest.mark.parametrize("name", [*list(DERIVATIVES)[:4], *LONG])
+def test_derivatives_in_both_modes_are_finite_differences(name):
+    """By poses, measurements and given SDs; forward, and its transpose, by one program."""
+    start = of_channels() if name == "channels" else noisy(12)
+    rng = np.random.default_rng(0)
+    weight = jnp.asarray(rng.normal(size=(4, 4)))
+    given = {
+        k: jnp.asarray(v) for k, v in DERIVATIVES[name].items() if k in ("sigma", "tracker_sd")
+    }
+    others = {k: v for k, v in DERIVATIVES[name].items() if k not in given}
+    measured = start.measurements if start.channels is None else start.channels.distances
+    data = (start.poses[:, :3, 3], measured, given)
+    along = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), data)
+    # A step of given SDs in their own size.
+    along = (*along[:2], jax.tree.map(lambda step, value: 0.1 * value * step, along[2], given))
+
+    def value(data):
+        positions, measured, given = data
+        moved = replace(start, poses=start.poses.at[:, :3, 3].set(positions))
+        if start.channels is None:
+            moved = replace(moved, measurements=measured)
+        else:
+            moved = replace(moved, channels=replace(start.channels, distances=measured))
+        result = jaxcal.calibrate(moved, **others, **given)
+        total = jnp.sum(weight * result.image_to_probe) + jnp.sum(result.point)
+        return total + jnp.sum(result.elevation[::2]), (result.differentiable, result.status_code)
+
+    @jax.jit
+    def everything(data):
+        found, push, facts = jax.linearize(value, data, has_aux=True)
+        (gradient,) = jax.linear_transpose(push, data)(jnp.ones_like(found))
+        return found, push(along), gradient, facts
+
+    _, forward, gradient, (valid, status) = everything(data)
+    assert valid
+    assert status == jaxcal.Status.CONVERGED
+    leaves = zip(jax.tree.leaves(gradient), jax.tree.leaves(along), strict=True)
+    np.testing.assert_allclose(forward, sum(jnp.sum(a * b) for a, b in leaves), rtol=1e-9)
+    step = 1e-5
+    ends = [
+        everything(jax.tree.map(lambda v, d, h=h: v + h * d, data, along))[0] for h in (step, -step)
+    ]
+    np.testing.assert_allclose(forward, (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", SOLVERS[1:4], ids=lambda s: s.name)
+def test_derivative_of_the_other_minimisers_matches_finite_differences(solver):
+    """They end where the implicit derivative is told that they do."""
     start = noisy(12)
     weight = jnp.asarray(np.random.default_rng(0).normal(size=(4, 4)))
-    direction = jax.tree.map(
-        lambda leaf: jnp.asarray(np.random.default_rng(1).normal(size=leaf.shape)),
-        (start.poses[:, :3, 3], start.measurements),
-    )
+    direction = jnp.asarray(np.random.default_rng(1).normal(size=start.measurements.shape))
 
     def value(step):
-        moved = replace(
-            start,
-            poses=start.poses.at[:, :3, 3].add(step * direction[0]),
-            measurements=start.measurements + step * direction[1],
-        )
+        moved = replace(start, measurements=start.measurements + step * direction)
         result = jaxcal.calibrate(moved, **solver.arguments)
         total = jnp.sum(weight * result.image_to_probe) + jnp.sum(result.point)
         return total + jnp.sum(result.elevation[::2]), (result.differentiable, result.status_code)
