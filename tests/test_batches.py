@@ -1,0 +1,111 @@
+"""A problem in a batch has the answer that it has alone, whatever its neighbours are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import problem
+
+import jaxcal
+from jaxcal import compiler
+
+METHODS = {
+    "conventional": {"method": "conventional"},
+    "alternating": {"method": "alternating"},
+    "bounded": {"prior": "bounded"},
+    "given": {"sigma": (0.2, 0.2, 1.0)},
+    "tracker": {"sigma": (0.2, 0.2, 1.0), "tracker_sd": 0.1},
+    "gaussian": {"prior": "gaussian"},
+    "auto": {},
+    "robust": {"prior": "gaussian", "robust": True},
+}
+IMAGES = 23
+
+
+def hard_problems() -> tuple[list[jaxcal.Problem], list[jaxcal.Problem]]:
+    """Ordinary ones; and these with a left-out image, an outlier, parallel poses and NaN."""
+    good = [problem(k, images=IMAGES, elevation_mm=1.5, noise_mm=1.0) for k in range(5)]
+    rest = replace(good[1], mask=good[1].mask.at[3].set(0.0))
+    outlier = replace(good[2], measurements=good[2].measurements.at[4, 0].add(30.0))
+    parallel = replace(good[3], poses=good[3].poses.at[:, :3, :3].set(jnp.eye(3)))
+    lost = replace(good[4], poses=good[4].poses.at[3, 0, 3].set(jnp.nan))
+    return good, [good[0], rest, outlier, parallel, lost]
+
+
+LONG = [pytest.param(name, marks=pytest.mark.slow) for name in METHODS if name != "conventional"]
+
+
+@pytest.mark.parametrize("name", ["conventional", *LONG])
+def test_a_lane_is_its_problem_and_bad_ones_leave_it_alone(name):
+    good, hard = hard_problems()
+    result = jaxcal.calibrate_batch(jaxcal.stack(hard), **METHODS[name])
+    # The same program, the last two lanes sound.
+    sound = jaxcal.calibrate_batch(jaxcal.stack([*hard[:3], *good[3:]]), **METHODS[name])
+    assert result.status.tolist() == [*["converged"] * 3, "unobservable", "failed"]
+    assert sound.status.tolist() == ["converged"] * 5
+    for field in ("covariance", "elevation_sd"):
+        assert np.isnan(np.asarray(getattr(result, field))[3]).all()
+    alone = jaxcal.stack([jaxcal.calibrate(each, **METHODS[name]) for each in hard[:3]])
+    flat = [jax.tree_util.tree_leaves_with_path(each) for each in (result, sound, alone)]
+    for (path, lane), (_, beside), (_, one) in zip(*flat, strict=True):
+        where = jax.tree_util.keystr(path)
+        lane, beside, one = (np.asarray(each)[:3] for each in (lane, beside, one))
+        np.testing.assert_array_equal(lane, beside, err_msg=where)
+        if where in (".iterations", ".variance_rounds", ".cost", ".stationarity"):
+            continue
+        if where in (".weakest", ".prior_direction"):
+            # A direction has no sign.
+            across = np.abs(np.sum(lane * one, axis=-1))
+            np.testing.assert_allclose(across, np.sum(one**2, axis=-1), atol=1e-6)
+            continue
+        if lane.dtype.kind != "f":
+            np.testing.assert_array_equal(lane, one, err_msg=where)
+            continue
+        # The alternation stops before it is stationary, elsewhere by rounding.
+        scale = np.nanmax(np.abs(one), initial=1e-12)
+        np.testing.assert_allclose(lane / scale, one / scale, rtol=0, atol=1e-6, err_msg=where)
+
+
+@pytest.mark.slow
+def test_compiler_flags_change_rounding_only(monkeypatch):
+    problems = jaxcal.stack(
+        [problem(k, images=IMAGES, elevation_mm=1.5, noise_mm=1.0) for k in range(3)]
+    )
+    fast = jaxcal.calibrate_batch(problems, method="conventional")
+    again = jaxcal.calibrate_batch(problems, method="conventional")
+    assert np.array_equal(fast.image_to_probe, again.image_to_probe)
+    from jaxcal import solve
+
+    solve._chunks.cache_clear()
+    monkeypatch.setenv(compiler.SWITCH, "0")
+    assert compiler.fast_to_run("cpu") is None
+    plain = jaxcal.calibrate_batch(problems, method="conventional")
+    solve._chunks.cache_clear()
+    np.testing.assert_allclose(fast.image_to_probe, plain.image_to_probe, rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_batch_has_the_derivatives_of_its_problems():
+    problems = jaxcal.stack(
+        [problem(k, images=12, elevation_mm=1.0, noise_mm=1.0) for k in range(3)]
+    )
+    weight = jnp.asarray(np.random.default_rng(0).normal(size=(4, 4)))
+
+    def value(result):
+        return jnp.sum(weight * result.image_to_probe) + jnp.sum(result.covariance)
+
+    def batch(measurements):
+        moved = replace(problems, measurements=measurements)
+        # Chunks of two: the derivative passes the loop over them.
+        return value(jaxcal.calibrate_batch(moved, "conventional", chunk=2))
+
+    def alone(measurements, one):
+        return value(jaxcal.calibrate(replace(one, measurements=measurements), "conventional"))
+
+    together = jax.jit(jax.grad(batch))(problems.measurements)
+    each = jax.jit(jax.vmap(jax.grad(alone)))(problems.measurements, problems)
+    np.testing.assert_allclose(together, each, rtol=1e-6, atol=1e-9)
