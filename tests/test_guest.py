@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -204,7 +205,7 @@ def blocks_of(page: str) -> list[str]:
 
 
 def test_the_documentations_examples_with_another_solver_and_on_another_problem():
-    first, dogleg, pieces, circle = (blocks_of("api.md")[k] for k in range(4))
+    first, dogleg, pieces, circle, decay, own = blocks_of("api.md")
     names: dict[str, object] = {}
     exec(compile(first, "api.md", "exec"), names)
     assert np.isfinite(names["gradient"].measurements).all()
@@ -222,6 +223,44 @@ def test_the_documentations_examples_with_another_solver_and_on_another_problem(
     exec(compile(circle, "api.md", "exec"), names)
     np.testing.assert_allclose(names["circle"]["centre"], [3, 1], atol=0.02)
     np.testing.assert_allclose(names["circle"]["radius"], 5, atol=0.02)
+    exec(compile(decay, "api.md", "exec"), names)
+    np.testing.assert_allclose([names["decay"][k] for k in ("size", "rate")], [3, 1.5], rtol=1e-9)
+    exec(compile(own, "api.md", "exec"), names)
+    check_the_documentations_own_observation(names)
+
+
+def check_the_documentations_own_observation(names: dict) -> None:
+    """Against scipy on residuals that are written out again; its derivative against its answers."""
+    from scipy.optimize import least_squares
+
+    from jaxcal import backend
+
+    fit, problems = names["fit"], names["problems"]
+    assert np.all(fit.settled)
+    problem = jax.tree.map(lambda leaf: leaf[0], problems)
+    found = jax.tree.map(lambda leaf: leaf[0], fit.place.parameters())
+    depth = np.asarray(problem.measurements)[:, 1]
+    assert float(problem.face_offset) == 0
+
+    def residual(step):
+        errors = backend.measurement_residual(backend.retract(found, step, backend.RIGID), problem)
+        return (errors / jnp.stack([0.3 + 0 * depth, 0.01 * depth, 0.6 + 0 * depth], 1)).ravel()
+
+    peer = least_squares(
+        jax.jit(residual), 0.05 * np.ones(9), jax.jit(jax.jacfwd(residual)), xtol=1e-15, gtol=1e-15
+    )
+    np.testing.assert_allclose(2 * peer.cost, fit.cost[0], rtol=1e-9)
+    np.testing.assert_allclose(peer.x, 0, atol=1e-5)
+    images = names["images"]
+    step = jnp.zeros_like(images.lateral).at[0, 3].set(1e-4)
+
+    @jax.jit
+    def solved(lateral):
+        moved = replace(images, lateral=lateral)
+        return jnp.sum(backend.minimise(fit.place, names["relative"], moved).place.translation)
+
+    difference = (solved(images.lateral + step) - solved(images.lateral - step)) / 2e-4
+    np.testing.assert_allclose(names["by_lateral"][0, 3], difference, rtol=1e-5)
 
 
 def test_our_solver_on_another_problem_equals_a_dense_one_and_differentiates():
