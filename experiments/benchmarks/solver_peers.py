@@ -6,9 +6,9 @@ status and covariance are read; ``jaxcal.backend.minimise`` and the peers start 
 turned by 20 degrees about a random axis and moved by 20 mm, the target moved by 20 mm. Ceres also
 starts at the conventional fit, which costs it nothing here; no peer computes a covariance. Beside
 them other public calls, whose objectives are their own: REML, auto, the alternation, bounded
-offsets, pixels of unknown scale, channels (32 elements). Everything runs pinned to one core; each solver
-takes its share of the problems in each round, and ratios are medians over the rounds. The table
-counts the problems whose objective is within 1e-8 (relative) of the lowest that any solver found.
+offsets, pixels of unknown scale, channels (32 elements). Everything runs pinned to one core; each
+solver takes its share of the problems in each round, and ratios are medians over the rounds. The
+table counts the problems whose objective is within 1e-8 (relative) of the lowest that any found.
 
 Further tables: from how far the optimum is reached; scaling with images, batch and chunk, float32;
 cores; one warm problem. ``--part`` runs one of them alone; the figure is drawn from the tables that
