@@ -6,10 +6,9 @@ the solver is compiled once and every later solve costs milliseconds.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
+from jaxcal.buckets import cut
 from jaxcal.calibration import Calibration
 from jaxcal.errors import InputError
 from jaxcal.geometry import check_poses
@@ -159,7 +158,4 @@ class LiveCalibration:
             InputError: as :meth:`problem`.
         """
         result = calibrate(self.problem(), **self._arguments)
-        taken = slice(0, self._count)
-        names = ("elevation", "elevation_sd", "residual", "mask", "at_bound")
-        cut = {name: getattr(result, name)[taken] for name in names}
-        return replace(result, **cut)
+        return cut(result.numpy(), self._count)
