@@ -219,7 +219,7 @@ def _device(leaves: list[Any]) -> Any:
     for leaf in leaves:
         if isinstance(leaf, jax.Array) and leaf.committed:
             return next(iter(leaf.devices()))
-    default: Any = jax.config.read("jax_default_device")
+    default: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     return default if isinstance(default, jax.Device) else jax.local_devices(backend=default)[0]
 
 
