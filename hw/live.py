@@ -11,7 +11,7 @@ import numpy as np
 from jaxcal.buckets import cut
 from jaxcal.calibration import Calibration
 from jaxcal.errors import InputError
-from jaxcal.geometry import check_poses
+from jaxcal.poses import check_poses
 from jaxcal.probe import Probe
 from jaxcal.problem import Problem
 from jaxcal.recording import MINIMUM_IMAGES, Kind, Recording, make_images

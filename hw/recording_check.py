@@ -112,8 +112,6 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
     Raises:
         FormatError: not such a file; one line that starts with the path.
     """
-    from jaxcal.geometry import check_poses  # needs JAX, which the writer's process does not
-
     check_readable(path)
     try:
         with open_root(path, length=stored_length(path)) as root:

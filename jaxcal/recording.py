@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxcal.errors import InputError
-from jaxcal.geometry import check_poses
+from jaxcal.poses import check_poses
 from jaxcal.probe import Probe
 
 MINIMUM_IMAGES = 4

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import theilslopes
 
 from jaxcal.errors import InputError
-from jaxcal.geometry import check_poses
+from jaxcal.poses import check_poses
 
 MINIMUM_MOTION_MM = 8.0
 """Least motion from which a latency is estimated."""

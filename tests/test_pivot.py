@@ -94,7 +94,7 @@ def test_reading_poses(tmp_path):
         np.testing.assert_allclose(read_poses(tmp_path / "poses.txt"), poses, atol=1e-12)
     quaternions[3, 3:] *= 2
     np.savetxt(tmp_path / "poses.txt", quaternions)
-    with pytest.raises(jaxcal.FormatError, match=r"poses.txt:4: the quaternion's length is 2"):
+    with pytest.raises(jaxcal.FormatError, match=r"poses.txt: quaternion in line 4 has length 2"):
         read_poses(tmp_path / "poses.txt")
 
 

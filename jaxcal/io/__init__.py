@@ -1,1 +1,15 @@
-"""Files in and out: recordings (HDF5 and text), and writing that is complete or did not happen."""
+"""Files in and out. What is read is not trusted; what is written is complete or absent.
+
+=================== ==========================================================================
+recordings          ``hdf5`` (jaxcal's own), ``text`` (``table``, ``columns``, ``lines``)
+tracked sequences   ``sequence`` (the type), ``sequence_files`` (``metaimage``, ``nrrd``,
+                    ``sequence_header``, ``pixel_stream``), ``trackers`` (NDI, Motive),
+                    ``tus_rec``
+points              ``slicer`` (markups)
+transforms          ``itk`` (Slicer), ``plus`` (configurations, fCal), ``ros``, ``tus_rec``
+what all need       ``untrusted`` and ``heap`` (HDF5), ``xml``, ``toml``, ``readable``,
+                    ``frame_names``, ``atomic``
+=================== ==========================================================================
+
+Nothing here imports JAX. Units are mm, px and s; another unit in a file is converted at once.
+"""

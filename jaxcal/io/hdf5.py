@@ -29,7 +29,6 @@ import h5py
 import numpy as np
 
 from jaxcal.errors import FormatError, InputError
-from jaxcal.geometry import check_poses
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.readable import check_readable, quoted
 from jaxcal.io.untrusted import (
@@ -44,6 +43,7 @@ from jaxcal.io.untrusted import (
     open_root,
     text,
 )
+from jaxcal.poses import check_poses
 from jaxcal.probe import CurvilinearProbe, LinearProbe, Probe
 from jaxcal.recording import MINIMUM_IMAGES, Images, Kind, Recording, Truth, make_images, unit_of
 

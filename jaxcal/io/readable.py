@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-from jaxcal.errors import FormatError
+from jaxcal.errors import FormatError, InputError
 
 
 def check_readable(path: str | os.PathLike[str], *, maximum_bytes: int | None = None) -> None:
@@ -55,3 +57,14 @@ def one_line(error: Exception) -> str:
 def quoted(text: str, limit: int = 40) -> str:
     """Text of an untrusted file, short and with control characters escaped, for a message."""
     return ascii(text if len(text) <= limit else f"{text[:limit]}...")
+
+
+@contextmanager
+def naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Put a file's name in front of the messages of errors that do not begin with it."""
+    name = os.fspath(path)
+    try:
+        yield
+    except InputError as error:
+        text = str(error)
+        raise type(error)(text if text.startswith(name) else f"{name}: {text}") from None

@@ -1,29 +1,163 @@
-"""Recordings as text: the cross-wire pair of files, and comma-separated tables.
+"""Poses and points as text: tables with or without a header, and the cross-wire pair of files.
 
-Blank lines and lines that start with ``#`` are skipped; numbers have a decimal point. A file is
-UTF-8 (or ASCII) of at most 64 MiB.
+Blank lines and lines that start with ``#`` are skipped. A file is UTF-8 (or ASCII) of at most
+64 MiB. :mod:`jaxcal.io.columns` has the names that headers may use.
 """
 
 from __future__ import annotations
 
-import io
 import os
-from collections.abc import Iterator
-from pathlib import Path
+from dataclasses import dataclass
+from datetime import datetime
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation
+from jaxtyping import Float, Int
 
 from jaxcal.errors import FormatError, InputError
-from jaxcal.io.readable import check_readable, one_line, quoted
+from jaxcal.io.columns import LENGTHS_MM, Columns, columns_of_header
+from jaxcal.io.readable import naming, quoted
+from jaxcal.io.table import Table, read_table
+from jaxcal.poses import QuaternionOrder, check_poses, rotations_from_quaternions
 from jaxcal.recording import Recording, make_images
 
-MAXIMUM_BYTES = 64 * 2**20
-"""Largest text file that is read."""
+LengthUnit = Literal["mm", "cm", "m"]
 
-_QUATERNION_TOLERANCE = 1e-2
+_TRUE = frozenset(("1", "1.0", "true", "yes", "ok", "valid", "good", "tracked"))
+_FALSE = frozenset((
+    "0", "0.0", "false", "no", "invalid", "missing", "bad", "lost", "out_of_view", "out of view",
+    "out_of_volume", "partially out of volume", "too few markers", "req_timeout", "",
+))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PoseTable:
+    """What a table holds, row by row; None for what it does not have.
+
+    Attributes:
+        name: of the file.
+        lines: (n,) where each row stands.
+        poses: (n, 4, 4), mm, rotations projected to SO(3).
+        points: (n, 2): [u, v] px, or [lateral, range] mm.
+        kind: of the points.
+        time: (n,) s.
+        frame: (n,) number of the image.
+        skipped: rows that were left out as invalid.
+    """
+
+    name: str
+    lines: list[int]
+    poses: Float[np.ndarray, "n 4 4"] | None = None
+    points: Float[np.ndarray, "n 2"] | None = None
+    kind: Literal["pixel", "point"] = "pixel"
+    time: Float[np.ndarray, " n"] | None = None
+    frame: Int[np.ndarray, " n"] | None = None
+    skipped: int = 0
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+
+def read_pose_table(
+    path: str | os.PathLike[str],
+    *,
+    quaternion: QuaternionOrder | None = None,
+    pose_units: LengthUnit | None = None,
+    units: Literal["px", "mm"] | None = None,
+    skip_invalid: bool = False,
+) -> PoseTable:
+    """Read a table of poses, points or both.
+
+    Args:
+        path: with a header, columns in any order and units as it says. Without one, columns are
+            time (s), a pose (12 or 16 numbers row by row, or x y z and a quaternion), u and v.
+        quaternion: where the scalar stands, which is never guessed: needed where columns are not
+            named.
+        pose_units: of translations; mm where neither this nor the header says.
+        units: of u and v, where the header does not say; px by default.
+        skip_invalid: leave out rows that a column ``valid`` or ``status`` marks as invalid, and
+            rows with empty cells, NaN or Inf; otherwise they are errors.
+
+    Raises:
+        FormatError: a file, a header or a row that cannot be read; file and line are named.
+        InputError: poses that are no rigid transforms; the line is named.
+    """
+    table = read_table(path)
+    with naming(path):
+        columns = _columns(table, quaternion)
+        rows, skipped = _used_rows(table, columns, skip_invalid)
+        unit = _agreed(units, columns.point_unit)
+        points, kind = None, "pixel"
+        if columns.point is not None:
+            points = table.numbers(columns.point, rows)
+            if unit != "px":
+                points, kind = points * LENGTHS_MM[unit], "point"
+        frame = None
+        if columns.frame is not None:
+            frame = _whole_numbers(table, columns.frame, rows)
+        return PoseTable(
+            name=table.name,
+            lines=[table.lines[row] for row in rows],
+            poses=_poses(table, columns, rows, pose_units),
+            points=points,
+            kind="pixel" if kind == "pixel" else "point",
+            time=None if columns.time is None else _times(table, columns, rows),
+            frame=frame,
+            skipped=skipped,
+        )
+
+
+def read_csv(
+    path: str | os.PathLike[str],
+    *,
+    spacing_mm: np.ndarray | tuple[float, float] | None = None,
+    units: Literal["px", "mm"] | None = None,
+    quaternion: QuaternionOrder | None = None,
+    pose_units: LengthUnit | None = None,
+    skip_invalid: bool = False,
+) -> Recording:
+    """Read a table with pose and point in each row; see :func:`read_pose_table`.
+
+    Args:
+        path: of the table.
+        spacing_mm: [lateral, axial] mm per px, when known; pixels only.
+        units: of u and v: "px" (lateral and axial pixel, the default) or "mm" (lateral, range).
+        quaternion: where the scalar of a quaternion stands.
+        pose_units: of translations.
+        skip_invalid: leave out rows that are marked as invalid.
+
+    Returns:
+        Images of kind ``pixel`` or ``point`` with their times; rotations are projected to SO(3).
+
+    Raises:
+        FormatError: a file, a header or a row that cannot be read; file and line are named.
+        InputError: units other than these, or images that cannot be used (see
+            :func:`jaxcal.recording.make_images`).
+    """
+    if units not in (None, "px", "mm"):
+        raise InputError(f"units must be px or mm, not {quoted(str(units))}")
+    table = read_pose_table(
+        path, quaternion=quaternion, pose_units=pose_units, units=units, skip_invalid=skip_invalid
+    )
+    return recording_of(table, spacing_mm)
+
+
+def recording_of(
+    table: PoseTable, spacing_mm: np.ndarray | tuple[float, float] | None = None
+) -> Recording:
+    """The recording of a table that has poses and points.
+
+    Raises:
+        InputError: poses or points missing, or images that cannot be used.
+    """
+    if table.poses is None or table.points is None:
+        missing = "poses" if table.poses is None else "points (u and v, or lateral and range)"
+        raise InputError(f"{table.name}: holds no {missing}")
+    images = make_images(
+        table.poses, table.points, table.kind,
+        time=table.time, spacing_mm=spacing_mm, where=table.name,
+    )  # fmt: skip
+    return Recording(images, source=table.name)
 
 
 def read_crosswire(
@@ -49,55 +183,19 @@ def read_crosswire(
             the line are named.
         InputError: poses or pixels that cannot be used (see :func:`jaxcal.recording.make_images`).
     """
-    rows, lines = _table(transforms_path, None, (4,), "3 rotation numbers and a translation")
+    transforms = read_table(transforms_path, header=False, separator="")
+    rows = _fixed(transforms, (4,), "3 rotation numbers and a translation")
     if len(rows) % 3:
         raise FormatError(
-            f"{os.fspath(transforms_path)}:{lines[-1]}: {len(rows)} rows are not whole poses: each "
-            "takes 3 rows"
+            f"{transforms.row(-1)}: {len(rows)} rows are not whole poses: each takes 3 rows"
         )
-    pixels, _ = _table(points_path, None, (2,), "u and v")
-    name = f"{os.fspath(transforms_path)} with {os.fspath(points_path)}"
+    points = read_table(points_path, header=False, separator="")
+    pixels = _fixed(points, (2,), "u and v")
+    name = f"{transforms.name} with {points.name}"
     if len(rows) // 3 != len(pixels):
         raise FormatError(f"{name}: {len(rows) // 3} poses but {len(pixels)} points")
     images = make_images(rows.reshape(-1, 3, 4), pixels, "pixel", spacing_mm=spacing_mm, where=name)
     return Recording(images, source=name)
-
-
-def read_csv(
-    path: str | os.PathLike[str],
-    *,
-    spacing_mm: np.ndarray | tuple[float, float] | None = None,
-    units: Literal["px", "mm"] = "px",
-) -> Recording:
-    """Read a table with a row ``time, pose, u, v`` for each image.
-
-    Args:
-        path: comma-separated columns: time (s); the pose, probe -> tracker, mm, row by row, 12
-            numbers (without the row 0 0 0 1) or 16; u and v. One header line may come first.
-        spacing_mm: [lateral, axial] mm per px, when known; pixels only.
-        units: of u and v: "px" (lateral and axial pixel) or "mm" (lateral and range).
-
-    Returns:
-        Images of kind ``pixel`` or ``point`` with their times; rotations are projected to SO(3).
-
-    Raises:
-        FormatError: a file that cannot be read, a row of another length, something that is not a
-            number; the file and the line are named.
-        InputError: units other than these, or images that cannot be used (see
-            :func:`jaxcal.recording.make_images`).
-    """
-    if units not in ("px", "mm"):
-        raise InputError(f"units must be px or mm, not {quoted(str(units))}")
-    rows, _ = _table(path, ",", (15, 19), "time, 12 or 16 pose numbers, u and v", header=True)
-    images = make_images(
-        rows[:, 1:-2].reshape(len(rows), -1, 4),
-        rows[:, -2:],
-        "pixel" if units == "px" else "point",
-        time=rows[:, 0],
-        spacing_mm=spacing_mm,
-        where=os.fspath(path),
-    )
-    return Recording(images, source=os.fspath(path))
 
 
 def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "n 4 4"]:
@@ -114,91 +212,162 @@ def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "n 4 4"]:
         FormatError: a file that cannot be read, a row of another length, something that is not a
             number, or a quaternion whose length is not 1; the file and the line are named.
     """
-    rows, lines = _table(path, None, (7, 12, 16), "x y z qx qy qz qs, or a matrix row by row")
+    table = read_table(path, header=False, separator="")
+    rows = _fixed(table, (7, 12, 16), "x y z qx qy qz qs, or a matrix row by row", finite=False)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     if rows.shape[1] != 7:
         matrices = rows.reshape(len(rows), -1, 4)
         poses[:, : matrices.shape[1]] = matrices
         return poses
-    length = np.linalg.norm(rows[:, 3:], axis=1)
-    off = np.flatnonzero(~(np.abs(length - 1) < _QUATERNION_TOLERANCE))
-    if len(off):
-        raise FormatError(
-            f"{os.fspath(path)}:{lines[off[0]]}: the quaternion's length is {length[off[0]]:g}, "
-            "not 1"
-        )
-    poses[:, :3, :3] = Rotation.from_quat(rows[:, 3:]).as_matrix()
+    with naming(path):
+        try:
+            poses[:, :3, :3] = rotations_from_quaternions(
+                rows[:, 3:], "xyzw", labels=_labels(table.lines)
+            )
+        except InputError as error:
+            raise FormatError(str(error)) from None
     poses[:, :3, 3] = rows[:, :3]
     return poses
 
 
-def _table(
-    path: str | os.PathLike[str],
-    separator: str | None,
-    widths: tuple[int, ...],
-    columns: str,
-    *,
-    header: bool = False,
-) -> tuple[Float[np.ndarray, "rows columns"], list[int]]:
-    """A file's numbers, every row as long as the first, and the line that each row stands in."""
-    name = os.fspath(path)
-    rows: list[list[float]] = []
-    lines: list[int] = []
-    for line, content in _lines(path):
-        fields = [field.strip() for field in content.split(separator)]
-        values = [_number(field) for field in fields]
-        # A line without any number is a header; one with some is a row with a slip in it.
-        if header and not rows and all(value is None for value in values):
-            header = False
-            continue
-        if len(fields) not in (widths if not rows else (len(rows[0]),)):
-            needed = " or ".join(map(str, widths)) if not rows else f"{len(rows[0])} as before"
-            separated = "by commas" if separator else "by white space"
+def _labels(lines: list[int]) -> list[str]:
+    return [f"in line {line}" for line in lines]
+
+
+def _fixed(
+    table: Table, widths: tuple[int, ...], columns: str, *, finite: bool = True
+) -> Float[np.ndarray, "rows columns"]:
+    """All numbers of a table that has no header."""
+    width = len(table.rows[0])
+    if width not in widths:
+        raise FormatError(
+            f"{table.row(0)}: {width} columns; {' or '.join(map(str, widths))} are needed "
+            f"({columns}, separated by white space)"
+        )
+    if finite:
+        return table.numbers(tuple(range(width)))
+    return np.array([
+        [table.number(row, column) for column in range(width)] for row in range(len(table.rows))
+    ])  # fmt: skip
+
+
+def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
+    if table.header is not None:
+        return columns_of_header(table.header, quaternion)
+    width = len(table.rows[0])
+    if width in (15, 19):
+        matrix = tuple(range(1, width - 2))
+        return Columns(width, matrix=matrix, time=0, point=(width - 2, width - 1))
+    if width != 10:
+        raise FormatError(
+            f"{table.row(0)}: {width} columns without a header; 15 or 19 (time, 12 or 16 "
+            "pose numbers, u and v) or 10 (time, x, y, z, a quaternion, u and v) are needed"
+        )
+    if quaternion is None:
+        raise FormatError(
+            f"{table.row(0)}: 10 columns hold a quaternion: say whether its scalar comes "
+            "first or last (--quaternion wxyz or xyzw)"
+        )
+    order = (5, 6, 7, 4) if quaternion == "wxyz" else (4, 5, 6, 7)
+    return Columns(10, translation=(1, 2, 3), quaternion=order, time=0, point=(8, 9))
+
+
+def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list[int], int]:
+    """Rows to use, and how many are left out as invalid."""
+    needed = [
+        *(columns.matrix or ()), *(columns.translation or ()), *(columns.quaternion or ()),
+        *(columns.point or ()), *(() if columns.time is None else (columns.time,)),
+    ]  # fmt: skip
+    kept: list[int] = []
+    for row, cells in enumerate(table.rows):
+        valid = columns.valid is None or _is_valid(table, row, columns.valid)
+        if valid and not (skip_invalid and any(_missing(cells[k]) for k in needed)):
+            kept.append(row)
+        elif not skip_invalid:
             raise FormatError(
-                f"{name}:{line}: {len(fields)} columns; {needed} are needed ({columns}, separated "
-                f"{separated})"
+                f"{table.row(row)}: the row is marked as invalid "
+                f"({quoted(cells[columns.valid or 0])}): leave such rows out with --skip-invalid"
             )
-        row = [value for value in values if value is not None]
-        if len(row) < len(values):
-            column = values.index(None)
+    if not kept:
+        raise FormatError(f"all {len(table.rows)} rows are marked as invalid")
+    return kept, len(table.rows) - len(kept)
+
+
+def _missing(cell: str) -> bool:
+    return cell.lower().lstrip("+-") in ("", "nan", "inf", "infinity", "na", "n/a", "null", "none")
+
+
+def _is_valid(table: Table, row: int, column: int) -> bool:
+    text = table.rows[row][column].strip().lower()
+    if text in _TRUE or text in _FALSE:
+        return text in _TRUE
+    raise FormatError(
+        f"{table.row(row)}: column {column + 1} is neither OK nor INVALID (nor 1, 0, true, false): "
+        f"{quoted(text)}"
+    )
+
+
+def _poses(
+    table: Table, columns: Columns, rows: list[int], pose_units: LengthUnit | None
+) -> Float[np.ndarray, "n 4 4"] | None:
+    stated = None if pose_units is None else LENGTHS_MM[pose_units]
+    if stated is not None and columns.length_mm not in (None, stated):
+        raise FormatError(f"the header's unit of translations is not {pose_units}")
+    factor = columns.length_mm or stated or 1.0
+    labels = _labels([table.lines[row] for row in rows])
+    if columns.matrix is not None:
+        matrices = table.numbers(columns.matrix, rows).reshape(len(rows), -1, 4)
+        matrices[:, :3, 3] *= factor
+        return check_poses(matrices, labels=labels)
+    if columns.translation is None or columns.quaternion is None:
+        return None
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, 3] = table.numbers(columns.translation, rows) * factor
+    quaternions = table.numbers(columns.quaternion, rows)
+    poses[:, :3, :3] = rotations_from_quaternions(quaternions, "xyzw", labels=labels)
+    return poses
+
+
+def _agreed(asked: str | None, stated: str | None) -> str:
+    if asked is not None and stated not in (None, asked):
+        raise FormatError(f"the header says that points are in {stated}, not {asked}")
+    return stated or asked or "px"
+
+
+def _whole_numbers(table: Table, column: int, rows: list[int]) -> Int[np.ndarray, " n"]:
+    values = table.numbers((column,), rows)[:, 0]
+    bad = np.flatnonzero((values != np.round(values)) | (values < 0) | (values > 1e9))
+    if len(bad):
+        row = rows[int(bad[0])]
+        raise FormatError(
+            f"{table.row(row)}: column {column + 1} is not the number of an image: "
+            f"{quoted(table.rows[row][column])}"
+        )
+    return values.astype(np.int64)
+
+
+def _times(table: Table, columns: Columns, rows: list[int]) -> Float[np.ndarray, " n"]:
+    """Seconds; dates by ISO 8601 count from the first one."""
+    column = columns.time
+    assert column is not None
+    dates = [_date(table.rows[row][column]) for row in rows]
+    if dates[0] is None:
+        return table.numbers((column,), rows)[:, 0] * columns.time_s
+    values = []
+    for row, date in zip(rows, dates, strict=True):
+        if date is None or (date.tzinfo is None) != (dates[0].tzinfo is None):
             raise FormatError(
-                f"{name}:{line}: column {column + 1} is not a number: {quoted(fields[column])}"
+                f"{table.row(row)}: column {column + 1} is not a date like those before: "
+                f"{quoted(table.rows[row][column])}"
             )
-        rows.append(row)
-        lines.append(line)
-    if not rows:
-        raise FormatError(f"{name}: holds no rows of numbers")
-    return np.array(rows, dtype=np.float64), lines
+        values.append((date - dates[0]).total_seconds())
+    return np.array(values)
 
 
-def _lines(path: str | os.PathLike[str]) -> Iterator[tuple[int, str]]:
-    """Numbered lines of a text file, without blank lines and comments."""
-    name = os.fspath(path)
-    check_readable(path, maximum_bytes=MAXIMUM_BYTES)
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise FormatError(f"{name}: cannot be read: {one_line(error)}") from None
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content.count(b"\n", 0, error.start) + 1
-        raise FormatError(f"{name}:{line}: is not text (UTF-8)") from None
-    if "\0" in text:
-        line = text.count("\n", 0, text.index("\0")) + 1
-        raise FormatError(f"{name}:{line}: is not text (UTF-8): it holds a zero byte")
-    del content
-    # Not splitlines: it also breaks at form feeds and the like, and then no editor's numbers match.
-    for number, line in enumerate(io.StringIO(text, newline=None), start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            yield number, line
-
-
-def _number(field: str) -> float | None:
-    # float() takes 1_000, which no program that writes tables means.
-    if "_" in field:
+def _date(text: str) -> datetime | None:
+    if "-" not in text or ":" not in text:
         return None
     try:
-        return float(field)
+        return datetime.fromisoformat(text)
     except ValueError:
         return None

@@ -186,6 +186,47 @@ def check_attributes(node: Node) -> None:
                 raise FormatError(f"{node}: attribute {quoted(name)} is neither text nor a number")
 
 
+def check_rows(node: Node, axes: int, most_bytes: int, kinds: str) -> tuple[int, ...]:
+    """Look at a dataset that will be read row by row, and is too large for :func:`array`.
+
+    Args:
+        node: the dataset.
+        axes: how many it must have.
+        most_bytes: of one row.
+        kinds: numpy's letters of the types that are taken.
+
+    Returns:
+        Its shape.
+
+    Raises:
+        FormatError: anything else, virtual, stored elsewhere, or packed by an unknown filter.
+    """
+    dataset = node.item
+    if not isinstance(dataset, h5py.Dataset):
+        raise FormatError(f"{node} must be a dataset")
+    with _reading(str(node)):
+        layout = dataset.id.get_create_plist()
+        if layout.get_layout() == h5d.VIRTUAL or layout.get_external_count():
+            raise FormatError(f"{node} is stored in another file: recordings must hold their data")
+        shape = dataset.shape or ()
+        if dataset.dtype.kind not in kinds or len(shape) != axes:
+            raise FormatError(f"{node} has type {quoted(str(dataset.dtype))} and shape {shape}")
+        if math.prod(shape[1:]) * dataset.dtype.itemsize > most_bytes:
+            raise FormatError(f"{node} has rows of more than {most_bytes} bytes")
+        if layout.get_layout() == h5d.CHUNKED:
+            _check_chunks(node, dataset, layout)
+        elif math.prod(shape) * dataset.dtype.itemsize > dataset.id.get_storage_size():
+            raise FormatError(f"{node} claims more than the file holds")
+        return shape
+
+
+def row(node: Node, index: int) -> np.ndarray:
+    """One row of a dataset that :func:`check_rows` has looked at; FormatError where damaged."""
+    with _reading(str(node)):
+        assert isinstance(node.item, h5py.Dataset)
+        return np.asarray(node.item[index])
+
+
 def array(node: Node, shape: tuple[int | UpTo, ...], kinds: str = "iuf") -> np.ndarray:
     """The values of a dataset of the agreed shape.
 

@@ -13,7 +13,7 @@ from jaxcal.calibration import Calibration
 from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.errors import InputError
-from jaxcal.geometry import rotation_angle
+from jaxcal.poses import rotation_angle
 from jaxcal.recording import Images, Recording, Truth
 from jaxcal.report.certified import certificate_record
 

@@ -1,0 +1,230 @@
+"""What the columns of a table are, by the names in its header.
+
+Names are compared without case, blanks and underscores. A unit may stand in brackets or behind an
+underscore: ``tx [mm]``, ``time (ms)``, ``u_px``.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from jaxcal.errors import FormatError
+from jaxcal.io.readable import quoted
+from jaxcal.poses import QuaternionOrder
+
+LENGTHS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+TIMES_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+
+_NAMES = {
+    "time": ("time", "t", "timestamp", "timestamps", "stamp", "seconds"),
+    "frame": ("frame", "framenumber", "frameindex", "index", "image", "imagenumber"),
+    "ignored": ("name", "filename", "file", "label", "comment"),
+    "valid": ("valid", "status", "state", "ok", "used"),
+    "u": ("u", "column", "col", "pixelu", "pixelx"),
+    "v": ("v", "row", "pixelv", "pixely"),
+    "lateral": ("lateral",),
+    "range": ("range", "axial", "depth"),
+    "x": ("x", "tx", "px", "posx", "positionx", "translationx"),
+    "y": ("y", "ty", "py", "posy", "positiony", "translationy"),
+    "z": ("z", "tz", "pz", "posz", "positionz", "translationz"),
+    "qx": ("qx", "quaternionx", "rotationx"),
+    "qy": ("qy", "quaterniony", "rotationy"),
+    "qz": ("qz", "quaternionz", "rotationz"),
+    "qw": ("qw", "qs", "quaternionw", "rotationw", "w"),
+}  # fmt: skip
+_ROLE = {name: role for role, names in _NAMES.items() for name in names}
+_UNIT = re.compile(r"^(.*?)(?:\s*[\[(]\s*([^\])]*?)\s*[\])]|[_\s](mm|cm|m|px|pixels?|s|ms|us))?$")
+_CELL = re.compile(r"([a-z]*?)_?([0-4])[_,]?([0-4])")
+_NUMBERED = re.compile(r"([a-z]*?)_?(\d{1,2})")
+_UNITS = {
+    "mm": "mm", "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm",
+    "cm": "cm", "m": "m", "meter": "m", "meters": "m", "metre": "m", "metres": "m",
+    "px": "px", "pixel": "px", "pixels": "px",
+    "s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Where in a row everything is; column numbers from 0.
+
+    Attributes:
+        width: number of columns.
+        matrix: 12 or 16 columns of a pose, row by row; None without.
+        translation: 3 columns beside a quaternion; None without.
+        quaternion: 4 columns, x y z w; None without.
+        point: 2 columns, u v or lateral range; None without.
+        time: s.
+        frame: number of an image.
+        valid: whether a row counts.
+        length_mm: one unit of translations in mm.
+        point_unit: ``px`` or a unit of length; None where the header does not say.
+        time_s: one unit of time in s.
+    """
+
+    width: int
+    matrix: tuple[int, ...] | None = None
+    translation: tuple[int, ...] | None = None
+    quaternion: tuple[int, ...] | None = None
+    point: tuple[int, ...] | None = None
+    time: int | None = None
+    frame: int | None = None
+    valid: int | None = None
+    length_mm: float | None = None
+    point_unit: str | None = None
+    time_s: float = 1.0
+
+
+def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> Columns:
+    """The columns that a header names.
+
+    Args:
+        names: cells of the header.
+        quaternion: order of columns that are only numbered (q1 to q4, q0 to q3).
+
+    Raises:
+        FormatError: a name that is not known, twice, or missing beside others; units that differ.
+    """
+    bases, units = zip(*(_base_and_unit(name) for name in names), strict=True)
+    roles: dict[str, int] = {}
+    rest: list[int] = []
+    numbered = [k for k, base in enumerate(bases) if re.fullmatch(r"q[0-4]", base)]
+    for index, base in enumerate(bases):
+        role = _ROLE.get(base)
+        if base == "q0" and len(numbered) == 1:
+            role = "qw"
+        if role == "ignored":
+            continue
+        if role is None:
+            rest.append(index)
+        elif role in roles:
+            raise FormatError(
+                f"columns {roles[role] + 1} and {index + 1} are both {role}: "
+                f"{quoted(names[roles[role]])} and {quoted(names[index])}"
+            )
+        else:
+            roles[role] = index
+    quaternion_columns = _quaternion(roles, numbered, quaternion)
+    rest = [index for index in rest if index not in (quaternion_columns or ())]
+    translation = _complete(roles, ("x", "y", "z"), "x, y and z")
+    matrix, unknown = _matrix(rest, list(bases), translation)
+    if unknown:
+        raise FormatError(
+            f"the header's column {unknown[0] + 1}, {quoted(names[unknown[0]])}, is not known: "
+            "name the columns time, u, v, x, y, z, qx, qy, qz, qw or m11 to m34, or leave the "
+            "header out"
+        )
+    if matrix is not None and translation is not None and len(matrix) == 16:
+        raise FormatError("the header names both a whole matrix and x, y, z")
+    if (quaternion_columns is None) != (translation is None) and matrix is None:
+        raise FormatError("the header needs x, y, z and a quaternion together")
+    if matrix is not None and quaternion_columns is not None:
+        raise FormatError("the header names both a matrix and a quaternion")
+    point, point_unit = _point(roles, list(units))
+    lengths = translation or (matrix[3:12:4] if matrix else ())
+    time_unit = None if "time" not in roles else units[roles["time"]]
+    if time_unit not in (None, *TIMES_S):
+        raise FormatError(f"time in {quoted(str(time_unit))} is not known: s, ms or us")
+    return Columns(
+        width=len(names), matrix=matrix,
+        translation=None if matrix is not None else translation,
+        quaternion=quaternion_columns, point=point,
+        time=roles.get("time"), frame=roles.get("frame"), valid=roles.get("valid"),
+        length_mm=_length(lengths, names, list(units)),
+        point_unit=point_unit, time_s=TIMES_S[time_unit or "s"],
+    )  # fmt: skip
+
+
+def _base_and_unit(name: str) -> tuple[str, str | None]:
+    found = _UNIT.match(name.strip().lower())
+    assert found is not None
+    unit = found[2] or found[3]
+    if unit is not None:
+        if unit not in _UNITS:
+            raise FormatError(f"the unit of {quoted(name)} is not known")
+        unit = _UNITS[unit]
+    return re.sub(r"[\s_.]+", "", found[1]), unit
+
+
+def _complete(roles: dict[str, int], names: tuple[str, ...], what: str) -> tuple[int, ...] | None:
+    present = [name for name in names if name in roles]
+    if not present:
+        return None
+    if len(present) < len(names):
+        raise FormatError(f"the header has {', '.join(present)} but not all of {what}")
+    return tuple(roles[name] for name in names)
+
+
+def _quaternion(
+    roles: dict[str, int], numbered: list[int], order: QuaternionOrder | None
+) -> tuple[int, ...] | None:
+    if len(numbered) == 4:
+        if order is None:
+            raise FormatError(
+                "the quaternion's columns are only numbered: say whether the scalar comes first or "
+                "last (--quaternion wxyz or xyzw)"
+            )
+        first = numbered[0]
+        return (*numbered[1:], first) if order == "wxyz" else tuple(numbered)
+    return _complete(roles, ("qx", "qy", "qz", "qw"), "qx, qy, qz and qw")
+
+
+def _matrix(
+    rest: list[int], bases: list[str], translation: tuple[int, ...] | None
+) -> tuple[tuple[int, ...] | None, list[int]]:
+    """Columns of a matrix row by row, and those that are of no matrix."""
+    if not rest:
+        return None, []
+    cells = [_CELL.fullmatch(bases[index]) for index in rest]
+    found = [cell for cell in cells if cell is not None]
+    if len(found) == len(rest) and len(rest) in (9, 12, 16):
+        places = [(int(cell[2]), int(cell[3])) for cell in found]
+        first = min(min(place) for place in places)
+        where = {
+            (row - first, column - first): index
+            for (row, column), index in zip(places, rest, strict=True)
+        }
+        if translation is not None and len(rest) == 9:
+            where |= {(row, 3): index for row, index in enumerate(translation)}
+        rows = 4 if len(where) == 16 else 3
+        wanted = [(row, column) for row in range(rows) for column in range(4)]
+        if set(where) == set(wanted):
+            return tuple(where[place] for place in wanted), []
+    numbers = [_NUMBERED.fullmatch(bases[index]) for index in rest]
+    if all(numbers) and len(rest) in (12, 16):
+        values = [int(number[2]) for number in numbers if number is not None]
+        if values in (list(range(len(rest))), list(range(1, len(rest) + 1))):
+            return tuple(rest), []
+    strange = [index for index, cell in zip(rest, cells, strict=True) if cell is None]
+    return None, strange or rest
+
+
+def _point(
+    roles: dict[str, int], units: list[str | None]
+) -> tuple[tuple[int, ...] | None, str | None]:
+    pixels = _complete(roles, ("u", "v"), "u and v")
+    lengths = _complete(roles, ("lateral", "range"), "lateral and range")
+    if pixels is not None and lengths is not None:
+        raise FormatError("the header names both u, v and lateral, range")
+    point = pixels or lengths
+    if point is None:
+        return None, None
+    stated = {units[index] for index in point}
+    if len(stated) > 1:
+        raise FormatError("the two coordinates of a point are in different units")
+    unit = stated.pop()
+    if unit not in (None, "px", *LENGTHS_MM):
+        raise FormatError(f"points in {quoted(str(unit))} are not known")
+    return point, unit or ("mm" if lengths is not None else None)
+
+
+def _length(columns: tuple[int, ...], names: list[str], units: list[str | None]) -> float | None:
+    stated = {units[index] for index in columns}
+    if len(stated) > 1:
+        mixed = ", ".join(quoted(names[index]) for index in columns)
+        raise FormatError(f"translations are in different units: {mixed}")
+    unit = stated.pop() if stated else None
+    if unit not in (None, *LENGTHS_MM):
+        raise FormatError(f"translations in {quoted(str(unit))} are not known: mm, cm or m")
+    return None if unit is None else LENGTHS_MM[unit]

@@ -1,0 +1,67 @@
+"""Names of coordinate frames as PLUS and Slicer write them: ``ProbeToTracker`` and the like."""
+
+from __future__ import annotations
+
+import re
+
+from jaxcal.errors import FormatError
+from jaxcal.io.readable import quoted
+
+FramePair = tuple[str, str]
+"""(from, to): the transform takes coordinates of the first frame to the second."""
+
+_SEPARATOR = re.compile(r"(?<=.)To(?=[A-Z0-9])")
+
+
+def split_name(name: str) -> FramePair | None:
+    """The frames of ``<From>To<To>``, or None where the name has not exactly one "To"."""
+    found = list(_SEPARATOR.finditer(name))
+    if len(found) != 1:
+        return None
+    return capitalised(name[: found[0].start()]), capitalised(name[found[0].end() :])
+
+
+def capitalised(name: str) -> str:
+    """A frame's name with its first letter in upper case, as PLUS compares them."""
+    return name[:1].upper() + name[1:]
+
+
+def check_frame(name: str) -> str:
+    """A frame's name that PLUS and Slicer accept, capitalised.
+
+    Raises:
+        FormatError: anything but letters and digits that begins with a letter, or a name in which
+            "To" stands before a capital letter: ``ProbeToTracker`` could not be split again.
+    """
+    capital = capitalised(name)
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*", name) or _SEPARATOR.search(capital):
+        raise FormatError(
+            f"{quoted(name)} cannot name a coordinate frame: letters and digits are needed, "
+            'without "To" before a capital letter'
+        )
+    return capital
+
+
+def path_between(pairs: list[FramePair], start: str, end: str) -> list[tuple[int, bool]] | None:
+    """The shortest way from one frame to another along transforms and their inverses.
+
+    Args:
+        pairs: the transforms' frames.
+        start: frame to begin at.
+        end: frame to arrive at.
+
+    Returns:
+        (index of the pair, whether it is inverted) for each step; None where there is no way.
+    """
+    reached: dict[str, list[tuple[int, bool]]] = {start: []}
+    pending = [start]
+    while pending:
+        frame = pending.pop(0)
+        if frame == end:
+            return reached[frame]
+        for index, (source, target) in enumerate(pairs):
+            for here, there, inverted in ((source, target, False), (target, source, True)):
+                if here == frame and there not in reached:
+                    reached[there] = [*reached[frame], (index, inverted)]
+                    pending.append(there)
+    return None

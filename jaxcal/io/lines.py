@@ -1,0 +1,47 @@
+"""Lines of text files that somebody else wrote."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from jaxcal.errors import FormatError
+from jaxcal.io.readable import check_readable, one_line
+
+MAXIMUM_BYTES = 64 * 2**20
+"""Largest text file that is read."""
+
+
+def text_lines(
+    path: str | os.PathLike[str], *, comments: bool = False
+) -> Iterator[tuple[int, str]]:
+    """Numbered lines of a UTF-8 (or ASCII) file, without blank ones.
+
+    Args:
+        path: the file.
+        comments: also those that begin with ``#``.
+
+    Raises:
+        FormatError: cannot be read, too large, not text; one line with path and line.
+    """
+    name = os.fspath(path)
+    check_readable(path, maximum_bytes=MAXIMUM_BYTES)
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise FormatError(f"{name}: cannot be read: {one_line(error)}") from None
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise FormatError(f"{name}:{line}: is not text (UTF-8)") from None
+    if "\0" in text:
+        line = text.count("\n", 0, text.index("\0")) + 1
+        raise FormatError(f"{name}:{line}: is not text (UTF-8): it holds a zero byte")
+    del content
+    # Not splitlines: it also breaks at form feeds and the like, and then no editor's numbers match.
+    for number, line in enumerate(io.StringIO(text, newline=None), start=1):
+        if line.strip() and (comments or not line.lstrip().startswith("#")):
+            yield number, line.rstrip("\n")

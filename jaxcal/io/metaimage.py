@@ -1,0 +1,129 @@
+"""MetaImage sequences: ``.igs.mha``, and ``.igs.mhd`` with ``.raw`` or ``.zraw`` beside it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from jaxcal.errors import FormatError
+from jaxcal.io.readable import check_readable, quoted
+from jaxcal.io.sequence import Pixels, TrackedSequence
+from jaxcal.io.sequence_header import (
+    SequenceHeader,
+    check_count,
+    checked_pixels,
+    header_lines,
+    image_type_of,
+    orientation_of,
+    sequence_of,
+    whole_numbers,
+    written_orientation,
+)
+
+_META_TYPES = {
+    "MET_UCHAR": np.dtype("u1"), "MET_CHAR": np.dtype("i1"),
+    "MET_SHORT": np.dtype("i2"), "MET_USHORT": np.dtype("u2"),
+    "MET_FLOAT": np.dtype("f4"), "MET_DOUBLE": np.dtype("f8"),
+}  # fmt: skip
+
+
+def read_metaimage(path: Path, name: str) -> TrackedSequence:
+    """Read a header; its errors do not name the file."""
+    header = SequenceHeader({}, {}, 0)
+    for line, text, end in header_lines(path):
+        key, separator, value = text.partition("=")
+        key, value = key.strip(), value.strip()
+        if not key and not separator:
+            continue
+        if not separator:
+            raise FormatError(f"line {line} is not KEY = VALUE: {quoted(text)}")
+        if header.take_frame_field(key, value, line):
+            continue
+        if header.fields.get(key, value) != value:
+            raise FormatError(f"line {line}: {quoted(key)} stands there twice, and differs")
+        header.fields[key] = value
+        if key == "ElementDataFile":
+            header.end = end
+            break
+    fields = header.fields
+    if "ElementDataFile" not in fields or "DimSize" not in fields:
+        raise FormatError("is not a MetaImage sequence: DimSize or ElementDataFile is missing")
+    columns, rows, count = _metaimage_size(fields)
+    check_count(count, header)
+    kind = fields.get("ElementType", "")
+    pixels = None
+    # Three forms of tracking alone: 0 0 N with either type, and 1 1 N with one dummy pixel a frame.
+    if kind != "MET_OTHER" and columns > 1 and rows > 1:
+        pixels = _metaimage_pixels(path, header, columns, rows, count)
+    return sequence_of(header, count, pixels, "ImageStatus", name)
+
+
+def _metaimage_size(fields: dict[str, str]) -> tuple[int, int, int]:
+    size = whole_numbers(fields["DimSize"], "DimSize")
+    dimensions = whole_numbers(fields.get("NDims", str(len(size))), "NDims")[0]
+    if len(size) != dimensions or dimensions not in (2, 3, 4):
+        raise FormatError(f"DimSize has {len(size)} numbers, NDims is {dimensions}")
+    if dimensions == 4 and size[2] > 1:
+        raise FormatError(f"holds volumes of depth {size[2]}; plane images are read")
+    return size[0], size[1], size[-1] if dimensions > 2 else 1
+
+
+def _metaimage_pixels(
+    path: Path, header: SequenceHeader, columns: int, rows: int, count: int
+) -> Pixels:
+    fields = header.fields
+    if fields.get("ElementType") not in _META_TYPES:
+        raise FormatError(f"ElementType {quoted(fields.get('ElementType', ''))} is not read")
+    if fields.get("BinaryData", "True").lower() != "true":
+        raise FormatError("holds pixels as text; only binary ones are read")
+    big = fields.get("BinaryDataByteOrderMSB", "False").lower() == "true"
+    dtype = _META_TYPES[fields["ElementType"]].newbyteorder(">" if big else "<")
+    packed = fields.get("CompressedData", "False").lower() == "true"
+    data = fields["ElementDataFile"]
+    start, where = (header.end, path) if data == "LOCAL" else (0, _beside(path, data))
+    return checked_pixels(Pixels(
+        where, start, "zlib" if packed else "raw", columns, rows,
+        whole_numbers(fields.get("ElementNumberOfChannels", "1"), "ElementNumberOfChannels")[0],
+        dtype, orientation_of(fields.get("UltrasoundImageOrientation", "")),
+        image_type_of(fields.get("UltrasoundImageType", "")),
+    ), count)  # fmt: skip
+
+
+def _beside(path: Path, data: str) -> Path:
+    """The file of pixels that a header names: in its own folder, and nowhere else."""
+    if not data or data in ("LIST", ".", "..") or re.search(r"[/\\%:\0]", data) or " " in data:
+        raise FormatError(
+            f"ElementDataFile = {quoted(data)}: only LOCAL, or a file beside the header, is read"
+        )
+    file = path.parent / data
+    try:
+        check_readable(file)
+        inside = file.resolve().parent == path.resolve().parent
+    except FormatError as error:
+        raise FormatError(f"its pixels, {error}") from None
+    if not inside:
+        raise FormatError(f"ElementDataFile = {quoted(data)}: is a link to another folder")
+    return file
+
+
+def metaimage_header(
+    stack: np.ndarray, orientation: str, pixels: bool, compressed: bool, size: int
+) -> list[str]:
+    """The lines of a header before the fields of frames."""
+    channels = stack.shape[3] if stack.ndim == 4 else 1
+    head = ["ObjectType = Image", "NDims = 3", "AnatomicalOrientation = RAI", "BinaryData = True",
+            "BinaryDataByteOrderMSB = False", "CenterOfRotation = 0 0 0",
+            f"CompressedData = {compressed}"]  # fmt: skip
+    if compressed:
+        head.append(f"CompressedDataSize = {size}")
+    head += [f"DimSize = {stack.shape[2]} {stack.shape[1]} {stack.shape[0]}",
+             "Kinds = domain domain list", "ElementSpacing = 1 1 1",
+             f"ElementType = {'MET_UCHAR' if stack.dtype == np.uint8 else 'MET_SHORT'}",
+             "Offset = 0 0 0", "TransformMatrix = 1 0 0 0 1 0 0 0 1",
+             f"UltrasoundImageOrientation = {written_orientation(orientation)}",
+             "UltrasoundImageType = BRIGHTNESS"]  # fmt: skip
+    if pixels:
+        head.append(f"ElementNumberOfChannels = {channels}")
+    return head

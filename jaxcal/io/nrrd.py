@@ -1,0 +1,141 @@
+"""NRRD sequences: ``.igs.nrrd`` and ``.seq.nrrd``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxcal.errors import FormatError
+from jaxcal.io.pixel_stream import Packing
+from jaxcal.io.readable import quoted
+from jaxcal.io.sequence import Pixels, TrackedSequence
+from jaxcal.io.sequence_header import (
+    SequenceHeader,
+    check_count,
+    checked_pixels,
+    header_lines,
+    image_type_of,
+    orientation_of,
+    sequence_of,
+    whole_numbers,
+    written_orientation,
+)
+
+_NRRD_TYPES = {
+    "uchar": "u1", "unsigned char": "u1", "uint8": "u1", "uint8_t": "u1",
+    "char": "i1", "signed char": "i1", "int8": "i1", "int8_t": "i1",
+    "short": "i2", "short int": "i2", "signed short": "i2", "int16": "i2", "int16_t": "i2",
+    "ushort": "u2", "unsigned short": "u2", "uint16": "u2", "uint16_t": "u2",
+    "float": "f4", "double": "f8",
+}  # fmt: skip
+
+
+def read_nrrd(path: Path, name: str) -> TrackedSequence:
+    """Read a header; its errors do not name the file."""
+    header = SequenceHeader({}, {}, 0)
+    for line, text, end in header_lines(path):
+        if line == 1:
+            if not text.startswith("NRRD00"):
+                raise FormatError("is not an NRRD file")
+            continue
+        if not text:
+            header.end = end
+            break
+        if text.startswith("#"):
+            continue
+        own, found, value = text.partition(": ")
+        key, pair, other = text.partition(":=")
+        if pair and (not found or len(key) <= len(own)):
+            key, value = key.strip(), other.strip()
+            if header.take_frame_field(key, value, line):
+                continue
+        elif found:
+            key, value = own.strip().lower(), value.strip()
+        else:
+            raise FormatError(f"line {line} is not a field: {quoted(text)}")
+        if header.fields.get(key, value) != value:
+            raise FormatError(f"line {line}: {quoted(key)} stands there twice, and differs")
+        header.fields[key] = value
+    fields = header.fields
+    if not header.end:
+        raise FormatError(
+            "its pixels are in another file (no empty line ends the header): not read"
+        )
+    for key in ("data file", "datafile", "line skip", "lineskip", "byte skip", "byteskip"):
+        if key in fields:
+            raise FormatError(f"has {quoted(key)}: only pixels that follow the header are read")
+    columns, rows, channels, count = _nrrd_size(fields)
+    check_count(count, header)
+    pixels = None
+    if columns > 1 and rows > 1:
+        pixels = _nrrd_pixels(path, header, (columns, rows, channels), count)
+    return sequence_of(header, count, pixels, "Status", name)
+
+
+def _nrrd_size(fields: dict[str, str]) -> tuple[int, int, int, int]:
+    """Columns, rows, channels and frames, from sizes and kinds."""
+    sizes = whole_numbers(fields.get("sizes", ""), "sizes")
+    kinds = fields.get("kinds", "").split()
+    if not kinds:
+        kinds = ["domain", "domain", "list"][: len(sizes)]
+    if len(kinds) != len(sizes) or len(sizes) > 5:
+        raise FormatError(f"has {len(sizes)} sizes, but {len(kinds)} kinds")
+    plane = [size for size, kind in zip(sizes, kinds, strict=True) if kind in ("domain", "space")]
+    listed = [size for size, kind in zip(sizes, kinds, strict=True) if kind in ("list", "time")]
+    others = kinds[0] in ("vector", "RGB-color", "RGBA-color", "3-color", "4-color")
+    regular = kinds[others:] == ["domain"] * len(plane) + kinds[len(kinds) - len(listed) :]
+    # Without a list axis the third one counts the frames.
+    if len(plane) == 3 and not listed:
+        plane, listed = plane[:2], plane[2:]
+    if len(plane) == 3 and plane[2] == 1:
+        plane = plane[:2]
+    if len(plane) != 2 or len(listed) > 1 or not regular:
+        raise FormatError(
+            f"sizes {quoted(fields['sizes'])} of kinds {quoted(fields.get('kinds', ''))} are no "
+            "sequence of plane images"
+        )
+    return plane[0], plane[1], sizes[0] if others else 1, listed[0] if listed else 1
+
+
+def _nrrd_pixels(
+    path: Path, header: SequenceHeader, size: tuple[int, int, int], count: int
+) -> Pixels:
+    fields = header.fields
+    kind = fields.get("type", "").lower()
+    if kind not in _NRRD_TYPES:
+        raise FormatError(f"type {quoted(kind)} is not read")
+    encoding = fields.get("encoding", "raw").lower()
+    packings: dict[str, Packing] = {"raw": "raw", "gz": "gzip", "gzip": "gzip"}
+    if encoding not in packings:
+        raise FormatError(f"encoding {quoted(encoding)} is not read: write raw or gzip")
+    order = ">" if fields.get("endian", "little").lower() == "big" else "<"
+    columns, rows, channels = size
+    return checked_pixels(Pixels(
+        path, header.end, packings[encoding], columns, rows, channels,
+        np.dtype(_NRRD_TYPES[kind]).newbyteorder(order),
+        orientation_of(fields.get("ultrasound image orientation", "")),
+        image_type_of(fields.get("ultrasound image type", "")),
+    ), count)  # fmt: skip
+
+
+def nrrd_header(stack: np.ndarray, orientation: str, pixels: bool, compressed: bool) -> list[str]:
+    """The lines of a header before the fields of frames."""
+    colour = stack.ndim == 4
+    sizes = f"{stack.shape[2]} {stack.shape[1]} {stack.shape[0]}"
+    return [
+        "NRRD0004",
+        "# Complete NRRD file format specification at:",
+        "# http://teem.sourceforge.net/nrrd/format.html",
+        f"type: {'uint8' if stack.dtype == np.uint8 else 'int16'}",
+        f"dimension: {4 if colour else 3}",
+        f"sizes: {'3 ' if colour else ''}{sizes}",
+        f"kinds: {'vector ' if colour else ''}domain domain list",
+        "endian: little",
+        f"encoding: {'gzip' if compressed else 'raw'}",
+        "space dimension: 2",
+        f"space directions: {'none ' if colour else ''}(1,0) (0,1) none",
+        "space origin: (0,0)",
+        f"ultrasound image orientation:={written_orientation(orientation)}",
+        "ultrasound image type:=BRIGHTNESS",
+    ]

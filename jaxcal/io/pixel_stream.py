@@ -1,0 +1,121 @@
+"""Pixels of a file in their order, without what is not asked for; its sizes are not trusted."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from types import TracebackType
+from typing import Literal
+
+from jaxcal.errors import FormatError
+from jaxcal.io.readable import one_line
+
+Packing = Literal["raw", "zlib", "gzip"]
+
+_PORTION = 2**18
+_MOST_INFLATION = 1032
+"""Deflate cannot pack more than this many bytes into one."""
+
+
+class PixelStream:
+    """Read forwards from a place in a file, unpacking on the way; a context manager.
+
+    Memory is one request's, whatever the file claims.
+
+    Args:
+        path: the file.
+        start: byte where the pixels begin.
+        packing: ``raw``, ``zlib`` or ``gzip``.
+        size: bytes that the unpacked pixels have by the file's header.
+
+    Raises:
+        FormatError: fewer bytes than the header says, or packed bytes that cannot be as many.
+    """
+
+    def __init__(self, path: Path, start: int, packing: Packing, size: int) -> None:
+        self._size, self._packing = size, packing
+        try:
+            self._file = path.open("rb")
+            self._file.seek(0, 2)
+            stored = self._file.tell() - start
+            self._file.seek(start)
+        except OSError as error:
+            raise FormatError(f"the pixels cannot be read: {one_line(error)}") from None
+        most = stored if packing == "raw" else stored * _MOST_INFLATION
+        if size > most:
+            self._file.close()
+            packed = "" if packing == "raw" else f", packed ({packing})"
+            raise FormatError(
+                f"claims {size} bytes of pixels, the file holds {max(stored, 0)}{packed}"
+            )
+        self._inflate = None
+        if packing != "raw":
+            self._inflate = zlib.decompressobj(zlib.MAX_WBITS + (16 if packing == "gzip" else 0))
+        self._position = 0
+
+    def __enter__(self) -> PixelStream:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    def read_at(self, offset: int, count: int) -> bytes:
+        """``count`` bytes from ``offset`` on, which must not lie before what was read last.
+
+        Raises:
+            FormatError: damaged, or the file ends before.
+        """
+        try:
+            if self._inflate is None:
+                self._file.seek(offset - self._position, 1)
+                content = self._file.read(count)
+            else:
+                self._skip(offset - self._position)
+                content = self._unpack(count)
+        except (OSError, zlib.error) as error:
+            raise FormatError(f"the pixels are damaged: {one_line(error)}") from None
+        if len(content) != count:
+            raise FormatError(f"the pixels end at byte {offset + len(content)} of {self._size}")
+        self._position = offset + count
+        return content
+
+    def check_end(self) -> None:
+        """See that nothing follows the claimed size in a packed stream.
+
+        Raises:
+            FormatError: the stream inflates beyond its size.
+        """
+        if self._inflate is None or self._position != self._size:
+            return
+        try:
+            more = self._unpack(1)
+        except (OSError, zlib.error) as error:
+            raise FormatError(f"the pixels are damaged: {one_line(error)}") from None
+        if more:
+            raise FormatError(f"the pixels inflate beyond their size, {self._size} bytes")
+        if not self._inflate.eof:
+            raise FormatError("the pixels are damaged: their packed end is missing")
+
+    def _skip(self, count: int) -> None:
+        while count > 0:
+            skipped = len(self._unpack(min(count, _PORTION)))
+            if not skipped:
+                return
+            count -= skipped
+
+    def _unpack(self, count: int) -> bytes:
+        assert self._inflate is not None
+        parts: list[bytes] = []
+        while count > 0 and not self._inflate.eof:
+            packed = self._inflate.unconsumed_tail or self._file.read(_PORTION)
+            part = self._inflate.decompress(packed, count)
+            if not packed and not part:
+                break
+            parts.append(part)
+            count -= len(part)
+        return b"".join(parts)

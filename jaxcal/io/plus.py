@@ -1,0 +1,484 @@
+"""PLUS: device-set configurations, read and patched, and results of fCal.
+
+PLUS's ``Image`` frame is in pixels: origin at the first pixel, x along the rows towards the marked
+side, y along the columns away from the transducer, z = x cross y, which is *minus* jaxcal's
+elevational axis. Its ImageToProbe carries the pixel size in its columns.
+
+Source: PlusLib, vtkPlusConfig and IGSIO's vtkIGSIOTransformRepository.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import os
+from dataclasses import dataclass
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.errors import FormatError, InputError
+from jaxcal.io.atomic import atomic_path
+from jaxcal.io.frame_names import FramePair, capitalised, check_frame, path_between, split_name
+from jaxcal.io.readable import quoted
+from jaxcal.io.xml import Element, parse_xml, read_xml
+
+_ROOT = "PlusConfiguration"
+_COORDINATES = "CoordinateDefinitions"
+
+
+@dataclass(frozen=True)
+class PlusTransform:
+    """One ``<Transform>``.
+
+    Attributes:
+        frames: (from, to), capitalised.
+        matrix: (4, 4), mm, or mm per px where it begins in Image.
+        error_mm: as stated, or None.
+        date: as stated, or None.
+        line: where it stands.
+    """
+
+    frames: FramePair
+    matrix: Float[np.ndarray, "4 4"]
+    error_mm: float | None
+    date: str | None
+    line: int
+
+
+@dataclass(frozen=True)
+class Wire:
+    """A wire of an fCal phantom: its name and its ends in the phantom's frame, mm."""
+
+    name: str
+    front: Float[np.ndarray, 3]
+    back: Float[np.ndarray, 3]
+
+
+@dataclass(frozen=True)
+class PlusConfiguration:
+    """What calibration needs of a device-set configuration.
+
+    Attributes:
+        transforms: of CoordinateDefinitions, in their order.
+        wires: of the phantom, pattern by pattern.
+        landmarks: (3,) positions in the phantom's frame, mm, by name.
+        local_time_offset_s: by device: global = local + offset.
+    """
+
+    transforms: tuple[PlusTransform, ...]
+    wires: tuple[tuple[Wire, ...], ...]
+    landmarks: dict[str, Float[np.ndarray, 3]]
+    local_time_offset_s: dict[str, float]
+
+    def find(self, source: str, target: str) -> PlusTransform | None:
+        """The transform between two frames as it is stated, or None."""
+        wanted = capitalised(source), capitalised(target)
+        return next((found for found in self.transforms if found.frames == wanted), None)
+
+
+@dataclass(frozen=True)
+class ResultFrame:
+    """A frame of an fCal result.
+
+    Attributes:
+        index: its number.
+        status: ``OK``, ``Failed``, ``InvalidPatterns`` or ``HasNotBeenRun``.
+        time: s; None where not stated.
+        transforms: (4, 4), mm, by their frames.
+        status_of: of each transform.
+        points: [u, v] of each segmented wire, px, MF orientation.
+        errors_mm: three-dimensional reprojection errors by wire.
+    """
+
+    index: int
+    status: str
+    time: float | None
+    transforms: dict[FramePair, Float[np.ndarray, "4 4"]]
+    status_of: dict[FramePair, str]
+    points: dict[str, Float[np.ndarray, 2]]
+    errors_mm: dict[str, float]
+
+
+@dataclass(frozen=True)
+class PlusResult:
+    """An fCal result (``ProbeCalibrationResult`` 2.0).
+
+    Attributes:
+        transforms: ``ImageToProbe`` and others, by their frames.
+        calibration_error_mm: mean of the lowest 95 % of the calibration's errors, by PLUS.
+        validation_error_mm: the same of the validation's.
+        calibration: frames that were calibrated with.
+        validation: frames that were not.
+    """
+
+    transforms: tuple[PlusTransform, ...]
+    calibration_error_mm: float | None
+    validation_error_mm: float | None
+    calibration: tuple[ResultFrame, ...]
+    validation: tuple[ResultFrame, ...]
+
+    def find(self, source: str, target: str) -> PlusTransform | None:
+        """The transform between two frames, or None."""
+        wanted = capitalised(source), capitalised(target)
+        return next((found for found in self.transforms if found.frames == wanted), None)
+
+
+def read_configuration(path: str | os.PathLike[str]) -> PlusConfiguration:
+    """Read a device-set configuration; the file is not trusted.
+
+    Raises:
+        FormatError: not such a file, a DTD, a transform that is not 16 finite numbers; one line
+            with path and line.
+    """
+    root, _ = read_xml(path)
+    name = os.fspath(path)
+    try:
+        if root.tag != _ROOT:
+            raise FormatError(f"is not a configuration of PLUS: its root is {quoted(root.tag)}")
+        return PlusConfiguration(
+            tuple(_transform(element) for element in root.all(f"{_COORDINATES}/Transform")),
+            tuple(
+                tuple(_wire(wire) for wire in pattern.all("Wire"))
+                for pattern in root.all("PhantomDefinition/Geometry/Pattern")
+            ),
+            {
+                _attribute(mark, "Name"): _numbers(mark, "Position", 3)
+                for mark in root.all("PhantomDefinition/Geometry/Landmarks/Landmark")
+            },
+            {
+                _attribute(device, "Id"): float(_numbers(device, "LocalTimeOffsetSec", 1)[0])
+                for device in root.all("DataCollection/Device")
+                if "LocalTimeOffsetSec" in device.attributes
+            },
+        )
+    except FormatError as error:
+        raise FormatError(f"{name}: {error}") from None
+
+
+def read_result(path: str | os.PathLike[str]) -> PlusResult:
+    """Read a result of fCal; the file is not trusted.
+
+    Raises:
+        FormatError: not such a file or not as it should be; one line with path and line.
+    """
+    root, _ = read_xml(path)
+    try:
+        if root.tag != "ProbeCalibrationResult":
+            raise FormatError(f"is not a result of fCal: its root is {quoted(root.tag)}")
+        errors = root.first("ErrorReport/ReprojectionError3DStatistics")
+        return PlusResult(
+            tuple(_transform(element) for element in root.all("CalibrationResults/Transform")),
+            _optional_number(errors, "CalibrationMeanMm"),
+            _optional_number(errors, "ValidationMeanMm"),
+            tuple(map(_result_frame, root.all("ErrorReport/CalibrationData/Frame"))),
+            tuple(map(_result_frame, root.all("ErrorReport/ValidationData/Frame"))),
+        )
+    except FormatError as error:
+        raise FormatError(f"{os.fspath(path)}: {error}") from None
+
+
+def _result_frame(frame: Element) -> ResultFrame:
+    tracked = frame.first("TrackedFrame")
+    points: dict[str, Float[np.ndarray, 2]] = {}
+    places = ("SegmentedPoints/Point", "TrackedFrame/Segmentation/SegmentedPoints/Point")
+    for place in places:
+        for point in frame.all(place):
+            key = "WireName" if "WireName" in point.attributes else "ID"
+            points[_attribute(point, key)] = _numbers(point, "Position", 3)[:2]
+    transforms: dict[FramePair, Float[np.ndarray, "4 4"]] = {}
+    status_of: dict[FramePair, str] = {}
+    for custom in [] if tracked is None else tracked.all("CustomFrameField"):
+        name = _attribute(custom, "Name")
+        if name.endswith("Transform") and (pair := split_name(name.removesuffix("Transform"))):
+            transforms[pair] = _numbers(custom, "Value", 16).reshape(4, 4)
+        elif name.endswith("TransformStatus"):
+            pair = split_name(name.removesuffix("TransformStatus"))
+            if pair:
+                status_of[pair] = _attribute(custom, "Value")
+    return ResultFrame(
+        index=int(_numbers(frame, "Index", 1)[0]),
+        status=_attribute(frame, "SegmentationStatus"),
+        time=_optional_number(tracked, "Timestamp"),
+        transforms=transforms,
+        status_of=status_of,
+        points=points,
+        errors_mm={
+            _attribute(error, "WireName"): float(_numbers(error, "ErrorMm", 1)[0])
+            for error in frame.all("ReprojectionError3DList/ReprojectionError3D")
+        },
+    )
+
+
+def _transform(element: Element) -> PlusTransform:
+    matrix = _numbers(element, "Matrix", 16).reshape(4, 4)
+    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
+        raise FormatError(f"line {element.line}: the matrix's last row is not 0 0 0 1")
+    return PlusTransform(
+        _frames(element), matrix, _optional_number(element, "Error"),
+        element.attributes.get("Date"), element.line,
+    )  # fmt: skip
+
+
+def _frames(element: Element) -> FramePair:
+    return capitalised(_attribute(element, "From")), capitalised(_attribute(element, "To"))
+
+
+def _wire(element: Element) -> Wire:
+    return Wire(
+        _attribute(element, "Name"),
+        _numbers(element, "EndPointFront", 3),
+        _numbers(element, "EndPointBack", 3),
+    )
+
+
+def _attribute(element: Element, name: str) -> str:
+    if name not in element.attributes:
+        raise FormatError(f"line {element.line}: <{element.tag}> has no {name}")
+    return element.attributes[name]
+
+
+def _numbers(element: Element, name: str, count: int) -> Float[np.ndarray, " count"]:
+    text = _attribute(element, name)
+    try:
+        numbers = [float(part) for part in text.split()]
+    except ValueError:
+        raise FormatError(
+            f"line {element.line}: {name} of <{element.tag}> is not numbers: {quoted(text)}"
+        ) from None
+    if len(numbers) != count:
+        raise FormatError(
+            f"line {element.line}: {name} of <{element.tag}> has {len(numbers)} numbers, {count} "
+            "are needed"
+        )
+    if not all(map(math.isfinite, numbers)):
+        raise FormatError(f"line {element.line}: {name} of <{element.tag}> holds NaN or Inf")
+    return np.array(numbers)
+
+
+def _optional_number(element: Element | None, name: str) -> float | None:
+    if element is None or name not in element.attributes:
+        return None
+    return float(_numbers(element, name, 1)[0])
+
+
+# What is written.
+
+
+def transform_element(
+    frames: FramePair,
+    matrix: Float[np.ndarray, "4 4"],
+    *,
+    error_mm: float | None = None,
+    date: datetime.datetime | None = None,
+    others: dict[str, str] | None = None,
+    indent: str = "",
+    newline: str = "\n",
+) -> str:
+    """A ``<Transform>`` to paste into CoordinateDefinitions, with every digit.
+
+    Args:
+        frames: (from, to).
+        matrix: finite, last row 0 0 0 1.
+        error_mm: stated where it is positive.
+        date: stated in PLUS's form.
+        others: further attributes.
+        indent: in front of every line but the first.
+        newline: of the file.
+
+    Raises:
+        InputError: a matrix that PLUS would not take, or names that it could not.
+    """
+    matrix = np.asarray(matrix, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError("the matrix must be 4 x 4 and finite")
+    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-12:
+        raise InputError("the matrix's last row must be 0 0 0 1")
+    if np.linalg.det(matrix[:3, :3]) <= 0:
+        raise InputError("the matrix is a reflection: its determinant is not positive")
+    source, target = check_frame(frames[0]), check_frame(frames[1])
+    # Minus zero would be written as -0.0.
+    rows = [" ".join(repr(value + 0.0) for value in row) for row in matrix.tolist()]
+    lines = [f'<Transform From="{source}" To="{target}"', f'  Matrix="{rows[0]}']
+    lines += [f"          {row}" for row in rows[1:]]
+    lines[-1] += '"'
+    stated = dict(others or {})
+    if error_mm is not None and error_mm > 0:
+        stated["Error"] = f"{error_mm:.6g}"
+    if date is not None:
+        stated["Date"] = date.strftime("%Y.%m.%d %X")
+    tail = "".join(f" {key}={quoteattr(value)}" for key, value in stated.items())
+    if tail:
+        lines.append(f" {tail}")
+    lines[-1] += " />"
+    return (newline + indent).join(lines)
+
+
+def patched_configuration(
+    content: bytes,
+    frames: FramePair,
+    matrix: Float[np.ndarray, "4 4"],
+    *,
+    error_mm: float | None = None,
+    date: datetime.datetime | None = None,
+) -> tuple[bytes, list[str]]:
+    """A configuration in which one transform is another; every other byte stays as it is.
+
+    The element between the two frames, in either direction, is replaced (PLUS refuses both at
+    once). Without one the transform is put at the end of CoordinateDefinitions.
+
+    Args:
+        content: of the configuration's file.
+        frames: (from, to).
+        matrix: of the transform.
+        error_mm: stated where it is positive.
+        date: stated in PLUS's form.
+
+    Returns:
+        The new content, and what a person should know.
+
+    Raises:
+        FormatError: not a configuration, or one that PLUS would refuse then: several transforms
+            between the frames, or another path from one to the other.
+        InputError: a matrix or names that cannot be written.
+    """
+    root = parse_xml(content)
+    if root.tag != _ROOT:
+        raise FormatError(f"is not a configuration of PLUS: its root is {quoted(root.tag)}")
+    places = list(root.all(_COORDINATES))
+    if len(places) > 1:
+        raise FormatError(f"line {places[1].line}: a second {_COORDINATES}")
+    wanted = capitalised(frames[0]), capitalised(frames[1])
+    elements = [] if not places else list(places[0].all("Transform"))
+    between = [element for element in elements if set(_frames(element)) == set(wanted)]
+    if len(between) > 1:
+        lines = " and ".join(str(element.line) for element in between)
+        raise FormatError(
+            f"lines {lines}: {len(between)} transforms between {wanted[0]} and {wanted[1]}; PLUS "
+            "takes one: remove the others"
+        )
+    _check_other_paths([element for element in elements if element not in between], wanted)
+    newline = "\r\n" if b"\r\n" in content else "\n"
+    stated = {"error_mm": error_mm, "date": date, "newline": newline}
+    if between:
+        old = between[0]
+        others = {
+            key: value for key, value in old.attributes.items()
+            if key not in ("From", "To", "Matrix", "Error", "Date", "Valid", "Status")
+        }  # fmt: skip
+        indent = _indent(content, old.start)
+        text = transform_element(wanted, matrix, others=others, indent=indent, **stated)
+        new = content[: old.start] + text.encode() + content[old.end :]
+        return new, _stale_scale(elements, wanted, matrix)
+    parent = places[0] if places else root
+    if parent.content_end == parent.end:
+        raise FormatError(f"line {parent.line}: <{parent.tag}/> is empty; write a start and an end")
+    outer = _indent(content, parent.content_end)
+    inner = outer + "  "
+    if places:
+        text = transform_element(wanted, matrix, indent=inner, **stated)
+        text = f"  {text}{newline}{outer}"
+    else:
+        deeper = inner + "  "
+        text = transform_element(wanted, matrix, indent=deeper, **stated)
+        parts = (f"  <{_COORDINATES}>", f"{deeper}{text}", f"{inner}</{_COORDINATES}>", outer)
+        text = newline.join(parts)
+    at = parent.content_end
+    return content[:at] + text.encode() + content[at:], _stale_scale(elements, wanted, matrix)
+
+
+def patch_configuration(
+    path: str | os.PathLike[str],
+    frames: FramePair,
+    matrix: Float[np.ndarray, "4 4"],
+    *,
+    out: str | os.PathLike[str] | None = None,
+    error_mm: float | None = None,
+    date: datetime.datetime | None = None,
+) -> list[str]:
+    """:func:`patched_configuration` of a file, which is replaced in one step, or not at all.
+
+    Args:
+        path: the configuration.
+        frames: (from, to).
+        matrix: of the transform.
+        out: where to write instead of in place.
+        error_mm: stated where it is positive.
+        date: stated in PLUS's form.
+
+    Returns:
+        What a person should know.
+
+    Raises:
+        FormatError: see there; one line that starts with the path.
+        OutputError: the file could not be written; it is as it was.
+    """
+    _, content = read_xml(path)
+    try:
+        new, notes = patched_configuration(content, frames, matrix, error_mm=error_mm, date=date)
+    except FormatError as error:
+        raise FormatError(f"{os.fspath(path)}: {error}") from None
+    with atomic_path(path if out is None else out) as temporary:
+        temporary.write_bytes(new)
+    return notes
+
+
+def _check_other_paths(others: list[Element], wanted: FramePair) -> None:
+    pairs = [_frames(element) for element in others]
+    way = path_between(pairs, *wanted)
+    if way is not None:
+        steps = ", ".join(
+            f"{pairs[index][0]} to {pairs[index][1]} (line {others[index].line})"
+            for index, _ in way
+        )
+        raise FormatError(
+            f"{wanted[0]} and {wanted[1]} are connected already, by {steps}; PLUS refuses a second "
+            "path"
+        )
+
+
+def _indent(content: bytes, position: int) -> str:
+    line = content[content.rfind(b"\n", 0, position) + 1 : position]
+    return "" if line.strip() else line.decode("ascii", "replace")
+
+
+def _stale_scale(
+    elements: list[Element], wanted: FramePair, matrix: Float[np.ndarray, "4 4"]
+) -> list[str]:
+    """PLUS keeps the pixel size once more, between two frames of the transducer."""
+    if wanted[0] != "Image":
+        return []
+    scale = np.linalg.norm(np.asarray(matrix)[:3, :2], axis=0)
+    for element in elements:
+        if _frames(element) == ("TransducerOriginPixel", "TransducerOrigin"):
+            kept = np.linalg.norm(_transform(element).matrix[:3, :2], axis=0)
+            if np.abs(kept / scale - 1).max() > 1e-4:
+                return [
+                    f"line {element.line}: TransducerOriginPixel to TransducerOrigin still has "
+                    f"pixels of {kept[0]:.6g} x {kept[1]:.6g} mm, the new transform "
+                    f"{scale[0]:.6g} x {scale[1]:.6g} mm"
+                ]
+    return []
+
+
+def update_transform_command(
+    frames: FramePair,
+    matrix: Float[np.ndarray, "4 4"],
+    *,
+    error_mm: float | None = None,
+    date: datetime.datetime | None = None,
+) -> str:
+    """PlusServer's command that sets a transform while it runs, as XML.
+
+    Source: PlusLib, vtkPlusUpdateTransformCommand.
+    """
+    source, target = check_frame(frames[0]), check_frame(frames[1])
+    numbers = " ".join(repr(value) for value in np.asarray(matrix, float).ravel().tolist())
+    stated = "" if not error_mm else f' TransformError="{error_mm:.6g}"'
+    if date is not None:
+        stated += f' TransformDate="{date.strftime("%Y.%m.%d %X")}"'
+    return (
+        f'<Command Name="UpdateTransform" TransformName="{source}To{target}" '
+        f'TransformValue="{numbers}" TransformPersistent="TRUE"{stated}/>'
+    )

@@ -1,0 +1,124 @@
+"""Transforms for ROS: tf2's static publisher and easy_handeye's YAML. Metres, scalar last.
+
+A transform here is the pose of a child frame in its parent, which is the matrix that takes the
+child's coordinates to the parent's: of the image in the probe it is the calibration itself. It is
+rigid, so it begins in the image plane in *metres*, not in pixels.
+
+Source: tf2_ros static_transform_publisher; easy_handeye2.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.errors import FormatError, InputError
+from jaxcal.io.lines import text_lines
+from jaxcal.io.readable import quoted
+from jaxcal.poses import check_poses, quaternion_from_rotation, rotations_from_quaternions
+
+_KEYS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_/]*")
+
+
+def _seven(matrix: Float[np.ndarray, "4 4"]) -> dict[str, str]:
+    """x, y, z in metres and the quaternion, with every digit."""
+    pose = check_poses(np.asarray(matrix, float)[None], what="transform")[0]
+    numbers = [*(pose[:3, 3] / 1e3), *quaternion_from_rotation(pose[:3, :3])]
+    return {key: _digits(float(value)) for key, value in zip(_KEYS, numbers, strict=True)}
+
+
+def _digits(value: float) -> str:
+    """All digits, with the decimal point without which YAML 1.1 takes 1e-05 for text."""
+    text = repr(value + 0.0)
+    return text.replace("e", ".0e") if "e" in text and "." not in text else text
+
+
+def _checked_name(name: str) -> str:
+    if not _NAME.fullmatch(name):
+        raise InputError(f"{quoted(name)} cannot name a frame in ROS")
+    return name
+
+
+def static_transform_command(
+    matrix: Float[np.ndarray, "4 4"], parent: str = "probe", child: str = "us_image"
+) -> str:
+    """The command that publishes a transform, in one line.
+
+    Args:
+        matrix: rigid, mm, child -> parent.
+        parent: frame.
+        child: frame.
+
+    Raises:
+        InputError: a matrix that is not rigid, or names that ROS does not take.
+    """
+    stated = " ".join(f"--{key} {value}" for key, value in _seven(matrix).items())
+    return (
+        f"ros2 run tf2_ros static_transform_publisher {stated} "
+        f"--frame-id {_checked_name(parent)} --child-frame-id {_checked_name(child)}"
+    )
+
+
+def ros_yaml(
+    matrix: Float[np.ndarray, "4 4"], parent: str = "probe", child: str = "us_image"
+) -> str:
+    """The YAML of easy_handeye2, with the command of tf2 as a comment above it.
+
+    Args:
+        matrix: rigid, mm, child -> parent.
+        parent: frame; easy_handeye2's ``robot_effector_frame``.
+        child: frame; its ``tracking_base_frame``.
+
+    Raises:
+        InputError: a matrix that is not rigid, or names that ROS does not take.
+    """
+    numbers = "".join(f"  {key}: {value}\n" for key, value in _seven(matrix).items())
+    return (
+        f"# {child} in {parent}: metres, unit quaternion with the scalar last.\n"
+        f"# {static_transform_command(matrix, parent, child)}\n"
+        "parameters:\n"
+        "  eye_on_hand: true\n"
+        f"  robot_effector_frame: {parent}\n"
+        f"  tracking_base_frame: {child}\n"
+        "  freehand_robot_movement: true\n"
+        f"transformation:\n{numbers}"
+    )
+
+
+def read_ros_yaml(path: str | os.PathLike[str]) -> Float[np.ndarray, "4 4"]:
+    """The rigid transform, mm, of a file as :func:`ros_yaml` or easy_handeye writes it.
+
+    Only the seven numbers are looked for; nothing else of YAML is understood.
+
+    Raises:
+        FormatError: one of them missing, twice or not a number, or no unit quaternion.
+    """
+    name = os.fspath(path)
+    found: dict[str, float] = {}
+    for line, content in text_lines(path):
+        match = re.fullmatch(r"\s*(x|y|z|qx|qy|qz|qw):\s*(\S+)\s*", content)
+        if match is None:
+            continue
+        key, text = match.groups()
+        try:
+            value = float(text)
+        except ValueError:
+            raise FormatError(f"{name}:{line}: {key} is not a number: {quoted(text)}") from None
+        if key in found or not np.isfinite(value):
+            raise FormatError(f"{name}:{line}: {key} stands there twice, or is not finite")
+        found[key] = value
+    missing = [key for key in _KEYS if key not in found]
+    if missing:
+        raise FormatError(f"{name}: {', '.join(missing)} missing: not a transform of easy_handeye")
+    matrix = np.eye(4)
+    try:
+        quaternion = np.array([[found[key] for key in _KEYS[3:]]])
+        matrix[:3, :3] = rotations_from_quaternions(quaternion, "xyzw")[0]
+    except InputError as error:
+        raise FormatError(f"{name}: {error}") from None
+    matrix[:3, 3] = [1e3 * found[key] for key in _KEYS[:3]]
+    return matrix

@@ -1,0 +1,208 @@
+"""Tracked sequences: frames, the transforms that were tracked with each, and their statuses.
+
+:mod:`jaxcal.io.sequence_files` reads and writes them. Pixels stay in their file until they
+are asked for, and come frame by frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxcal.errors import FormatError, InputError
+from jaxcal.io.frame_names import FramePair, path_between
+from jaxcal.io.pixel_stream import Packing, PixelStream
+from jaxcal.io.readable import quoted
+from jaxcal.poses import check_poses, inverse_poses
+
+Orientation = Literal["MF", "UF", "MN", "UN"]
+"""Of pixels as they are stored: M or U, the marked or the unmarked side at the end of a row; F or
+N, far from or near to the transducer at the end of a column."""
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Where a sequence's pixels are and how they are stored.
+
+    Attributes:
+        path: the file that holds them.
+        start: their first byte.
+        packing: how they are packed.
+        columns: of a frame, px.
+        rows: of a frame, px.
+        channels: 1, or 3 for colour.
+        dtype: of one number.
+        orientation: of the stored pixels; None where the file does not say.
+        kind: ``BRIGHTNESS`` for B-mode; PLUS's other types are RF data.
+    """
+
+    path: Path
+    start: int
+    packing: Packing
+    columns: int
+    rows: int
+    channels: int
+    dtype: np.dtype
+    orientation: Orientation | None
+    kind: str = "BRIGHTNESS"
+
+    @property
+    def frame_bytes(self) -> int:
+        """Size of one frame, bytes."""
+        return self.columns * self.rows * self.channels * self.dtype.itemsize
+
+
+@dataclass(frozen=True)
+class Hdf5Pixels:
+    """Pixels in a dataset (n, rows, columns) of uint8, MF-oriented.
+
+    Attributes:
+        path: of the HDF5 file.
+        dataset: its name in the root.
+        columns: of a frame, px.
+        rows: of a frame, px.
+    """
+
+    path: Path
+    dataset: str
+    columns: int
+    rows: int
+
+
+@dataclass(frozen=True)
+class TrackedSequence:
+    """A sequence of n frames.
+
+    Attributes:
+        transforms: (n, 4, 4) matrices, mm, by their frames (from, to); NaN where a frame has none.
+        valid: (n,) by the same frames: the status was OK and a matrix was there.
+        time: (n,) s; NaN where not stated.
+        image_valid: (n,) whether a frame's pixels are there and were not marked as invalid.
+        pixels: where they are; None for tracking alone.
+        source: the file.
+    """
+
+    transforms: Mapping[FramePair, Float[np.ndarray, "n 4 4"]]
+    valid: Mapping[FramePair, Bool[np.ndarray, " n"]]
+    time: Float[np.ndarray, " n"]
+    image_valid: Bool[np.ndarray, " n"]
+    pixels: Pixels | Hdf5Pixels | None = None
+    source: str = field(default="memory", compare=False)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def frames(self) -> list[str]:
+        """Names of all coordinate frames, in the order of the transforms."""
+        return list(dict.fromkeys(name for pair in self.transforms for name in pair))
+
+    def poses(
+        self, source: str, target: str
+    ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"]]:
+        """Poses from one frame to another, through whatever transforms lead there.
+
+        Args:
+            source: frame, for instance ``Probe``.
+            target: frame, for instance ``Tracker`` or ``Reference``.
+
+        Returns:
+            (n, 4, 4) rigid poses, mm (the identity where not valid), and where every transform on
+            the way had the status OK.
+
+        Raises:
+            InputError: no way between the frames, or a valid transform that is not rigid.
+        """
+        pairs = list(self.transforms)
+        way = path_between(pairs, source, target)
+        if not way:
+            known = ", ".join(f"{a} to {b}" for a, b in pairs) or "none"
+            raise InputError(
+                f"{self.source}: no transforms lead from {quoted(source)} to {quoted(target)} "
+                f"(there are: {known})"
+            )
+        valid = np.ones(len(self), bool)
+        for index, _ in way:
+            valid &= self.valid[pairs[index]]
+        total = np.tile(np.eye(4), (len(self), 1, 1))
+        for index, inverted in way:
+            name = f"{self.source}: {'To'.join(pairs[index])}Transform of frame"
+            step = check_poses(self.transforms[pairs[index]], valid, what=name)
+            total = (inverse_poses(step) if inverted else step) @ total
+        return total, valid
+
+    def images(
+        self, wanted: Sequence[int] | np.ndarray | None = None, *, orientation: str | None = None
+    ) -> Iterator[np.ndarray]:
+        """Frames one after another, grey, in the orientation MF (PLUS's Image frame).
+
+        Args:
+            wanted: increasing frame numbers; all by default. Others are not kept in memory.
+            orientation: of the stored pixels, where the file does not say.
+
+        Yields:
+            (rows, columns) arrays. Colour becomes grey by ITU-R BT.601's weights.
+
+        Raises:
+            FormatError: no pixels, an unknown orientation, RF data, or a damaged file.
+        """
+        pixels = self.pixels
+        if pixels is None:
+            raise FormatError(f"{self.source}: holds no pixels, only transforms")
+        numbers = range(len(self)) if wanted is None else [int(number) for number in wanted]
+        if isinstance(pixels, Hdf5Pixels):
+            yield from _hdf5_images(pixels, numbers, orientation or "MF", self.source)
+            return
+        stored = pixels.orientation if orientation is None else orientation
+        if pixels.kind != "BRIGHTNESS":
+            raise FormatError(f"{self.source}: holds {quoted(pixels.kind)} data, not B-mode images")
+        if stored not in ("MF", "UF", "MN", "UN"):
+            raise FormatError(
+                f"{self.source}: does not say how its pixels are oriented: name it (MF, UF, MN or "
+                "UN), as UltrasoundImageOrientation would"
+            )
+        size = pixels.frame_bytes
+        try:
+            with PixelStream(pixels.path, pixels.start, pixels.packing, size * len(self)) as stream:
+                for number in numbers:
+                    content = stream.read_at(number * size, size)
+                    yield _oriented(_grey(content, pixels), stored)
+                stream.check_end()
+        except FormatError as error:
+            raise FormatError(f"{self.source}: {error}") from None
+
+
+def _hdf5_images(
+    pixels: Hdf5Pixels, numbers: Sequence[int], orientation: str, source: str
+) -> Iterator[np.ndarray]:
+    # h5py takes a fifth of a second to import, and other sequences do not need it.
+    from jaxcal.io.untrusted import child, open_root, row
+
+    try:
+        with open_root(pixels.path) as root:
+            node = child(root, pixels.dataset)
+            for number in numbers:
+                if node is None:
+                    raise FormatError(f"/{pixels.dataset} is missing")
+                yield _oriented(row(node, number), orientation)
+    except FormatError as error:
+        raise FormatError(f"{source}: {error}") from None
+
+
+def _grey(content: bytes, pixels: Pixels) -> np.ndarray:
+    frame = np.frombuffer(content, pixels.dtype)
+    frame = frame.reshape(pixels.rows, pixels.columns, pixels.channels)
+    if pixels.channels == 1:
+        return frame[:, :, 0]
+    grey = frame[:, :, :3].astype(np.float64) @ [0.299, 0.587, 0.114]
+    return grey.astype(frame.dtype) if frame.dtype.kind == "f" else np.rint(grey).astype(np.uint8)
+
+
+def _oriented(frame: np.ndarray, stored: str) -> np.ndarray:
+    if stored[0] == "U":
+        frame = frame[:, ::-1]
+    return frame[::-1] if stored[1] == "N" else frame

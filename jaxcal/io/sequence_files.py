@@ -1,0 +1,103 @@
+"""Tracked sequences to and from files, as PLUS and Slicer write them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jaxcal.errors import FormatError, InputError
+from jaxcal.io.atomic import atomic_path
+from jaxcal.io.frame_names import FramePair
+from jaxcal.io.metaimage import metaimage_header, read_metaimage
+from jaxcal.io.nrrd import nrrd_header, read_nrrd
+from jaxcal.io.readable import check_readable
+from jaxcal.io.sequence import Orientation, TrackedSequence
+from jaxcal.io.sequence_header import check_written, frame_fields, packed_pixels, stacked
+
+EXTENSIONS = (".mha", ".mhd", ".nrrd", ".nhdr")
+
+
+def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
+    """Read a sequence's header: transforms, statuses and times. Pixels stay in the file.
+
+    Args:
+        path: a ``.mha``, ``.mhd`` or ``.nrrd`` file as PLUS or Slicer writes it.
+
+    Raises:
+        FormatError: not such a file, damaged, absurd sizes, pixels in another folder, a transform
+            that is not 16 finite numbers though its status is OK; one line that starts with the
+            path.
+    """
+    check_readable(path)
+    name = os.fspath(path)
+    try:
+        if name.lower().endswith((".nrrd", ".nhdr")):
+            return read_nrrd(Path(path), name)
+        return read_metaimage(Path(path), name)
+    except FormatError as error:
+        raise FormatError(f"{name}: {error}") from None
+
+
+def write_sequence(
+    path: str | os.PathLike[str],
+    transforms: Mapping[FramePair, np.ndarray],
+    time: np.ndarray,
+    *,
+    valid: Mapping[FramePair, np.ndarray] | None = None,
+    images: Iterable[np.ndarray] | None = None,
+    orientation: Orientation = "MF",
+    compressed: bool = True,
+) -> None:
+    """Write a sequence that PLUS and Slicer read, complete or not at all.
+
+    Args:
+        path: ends in ``.mha``, ``.mhd`` or ``.nrrd``; the pixels of ``.mhd`` go to a ``.raw`` or
+            ``.zraw`` beside it.
+        transforms: (n, 4, 4), mm, by their frames (from, to).
+        time: (n,) s, at least a millisecond apart: Slicer tells frames by rounded milliseconds.
+        valid: (n,) by the same frames; where False the status is INVALID. All by default.
+        images: n arrays (rows, columns), or (rows, columns, 3), uint8 or int16. None: tracking
+            alone, one dummy pixel a frame, as PLUS writes it.
+        orientation: of the pixels.
+        compressed: zlib for MetaImage, gzip for NRRD.
+
+    Raises:
+        InputError: shapes that differ, other types, names or times that cannot be written.
+        OutputError: the file could not be written; it is as it was.
+    """
+    name = os.fspath(path)
+    if not name.lower().endswith((".mha", ".mhd", ".nrrd")):
+        raise InputError(f"{name}: a sequence's name ends in .mha, .mhd or .nrrd")
+    time = np.asarray(time, dtype=np.float64)
+    count = len(time)
+    check_written(transforms, time)
+    stack = stacked(images, count)
+    fields = [
+        frame_fields(index, transforms, valid, time, images is not None) for index in range(count)
+    ]
+    if name.lower().endswith(".nrrd"):
+        head = nrrd_header(stack, orientation, images is not None, compressed)
+        lines = [f"{key}:={value}" for of_frame in fields for key, value in of_frame]
+        lines = [line.replace("_ImageStatus:=", "_Status:=") for line in lines]
+        packed = packed_pixels(stack, "gzip" if compressed else "raw")
+        content = "\n".join([*head, *lines, "", ""]).encode() + packed
+        _put(path, content)
+        return
+    packed = packed_pixels(stack, "zlib" if compressed else "raw")
+    head = metaimage_header(stack, orientation, images is not None, compressed, len(packed))
+    lines = [f"{key} = {value}" for of_frame in fields for key, value in of_frame]
+    if name.lower().endswith(".mha"):
+        _put(path, "\n".join([*head, *lines, "ElementDataFile = LOCAL", ""]).encode() + packed)
+        return
+    data = Path(name).with_suffix(".zraw" if compressed else ".raw")
+    # The pixels first: a header without them would be half a recording.
+    _put(data, packed)
+    _put(path, "\n".join([*head, *lines, f"ElementDataFile = {data.name}", ""]).encode())
+
+
+def _put(path: str | os.PathLike[str], content: bytes) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)

@@ -1,0 +1,261 @@
+"""What the headers of MetaImage and NRRD sequences have in common: fields of frames, and bounds.
+
+Every frame has fields ``Seq_Frame0000_<Name>``: the transforms ``<From>To<To>Transform``, 16
+numbers, row by row, in mm, the status of each, and a time stamp in seconds. Headers are not
+trusted: their length is bounded, and sizes are compared with the file before anything is allocated.
+
+Format: IGSIO, vtkIGSIOMetaImageSequenceIO and vtkIGSIONrrdSequenceIO.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.errors import FormatError, InputError
+from jaxcal.io.frame_names import FramePair, check_frame, split_name
+from jaxcal.io.pixel_stream import Packing, PixelStream
+from jaxcal.io.readable import one_line, quoted
+from jaxcal.io.sequence import Orientation, Pixels, TrackedSequence
+
+MAXIMUM_HEADER = 64 * 2**20
+"""Largest header, bytes: some 60,000 frames."""
+MOST_FRAMES = 100_000
+LARGEST_FRAME = 2**26
+"""Bytes of one frame."""
+
+_LONGEST_LINE = 2**16
+_FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,18})_(.+)", re.DOTALL)
+
+
+@dataclass
+class SequenceHeader:
+    """Lines of a header: its own fields, those of frames, and where the pixels begin."""
+
+    fields: dict[str, str]
+    frames: dict[int, dict[str, tuple[str, int]]]
+    end: int
+
+    def take_frame_field(self, key: str, value: str, line: int) -> bool:
+        """Keep a field of a frame; False where the key is not one."""
+        if not key.startswith("Seq_Frame"):
+            return False
+        found = _FRAME_FIELD.fullmatch(key)
+        if found is None:
+            raise FormatError(f"line {line}: {quoted(key)} does not name a frame and a field")
+        number = int(found[1])
+        if number >= MOST_FRAMES:
+            raise FormatError(f"line {line}: frame {number}; at most {MOST_FRAMES} frames are read")
+        of_frame = self.frames.setdefault(number, {})
+        if found[2] in of_frame:
+            raise FormatError(f"line {line}: {quoted(key)} stands there twice")
+        of_frame[found[2]] = (value, line)
+        return True
+
+
+def header_lines(path: Path) -> Iterator[tuple[int, str, int]]:
+    """(number, text without its end, byte after its end) of a header's lines."""
+    position = 0
+    try:
+        with path.open("rb") as file:
+            for number in range(1, 2**31):
+                line = file.readline(_LONGEST_LINE)
+                if not line:
+                    return
+                position += len(line)
+                if not line.endswith(b"\n") and len(line) >= _LONGEST_LINE:
+                    raise FormatError(f"line {number} is too long: not a sequence file, or damaged")
+                if position > MAXIMUM_HEADER:
+                    raise FormatError(f"its header is longer than {MAXIMUM_HEADER} bytes")
+                yield number, line.decode("utf-8", "replace").rstrip("\r\n"), position
+    except OSError as error:
+        raise FormatError(f"cannot be read: {one_line(error)}") from None
+
+
+def whole_numbers(text: str, what: str) -> list[int]:
+    """Whole numbers that are not negative, separated by blanks."""
+    numbers = text.split()
+    if not numbers or not all(re.fullmatch(r"\d{1,18}", number) for number in numbers):
+        raise FormatError(f"{what} must be whole numbers, not {quoted(text)}")
+    return [int(number) for number in numbers]
+
+
+def checked_pixels(pixels: Pixels, count: int) -> Pixels:
+    """The same, after sizes were compared with bounds and with the file."""
+    if pixels.channels not in (1, 3, 4):
+        raise FormatError(f"{pixels.channels} channels a pixel; 1, 3 or 4 are read")
+    if pixels.frame_bytes > LARGEST_FRAME:
+        raise FormatError(
+            f"a frame of {pixels.columns} x {pixels.rows} pixels is larger than "
+            f"{LARGEST_FRAME} bytes"
+        )
+    # Opening compares the claim with the file.
+    with PixelStream(pixels.path, pixels.start, pixels.packing, pixels.frame_bytes * count):
+        return pixels
+
+
+def check_count(count: int, header: SequenceHeader) -> None:
+    """Refuse absurd numbers of frames, and fields of frames that are not there."""
+    if count > MOST_FRAMES:
+        raise FormatError(f"claims {count} frames; at most {MOST_FRAMES} are read")
+    if count < 1:
+        raise FormatError("holds no frames")
+    beyond = [number for number in header.frames if number >= count]
+    if beyond:
+        raise FormatError(f"has fields of frame {min(beyond)}, but only {count} frames")
+
+
+def orientation_of(text: str) -> Orientation | None:
+    """The first two letters of an orientation; None for XX, ?? and nothing."""
+    start = text.strip().upper()[:2]
+    return cast(Orientation, start) if start in ("MF", "UF", "MN", "UN") else None
+
+
+def image_type_of(text: str) -> str:
+    """``BRIGHTNESS``, or PLUS's name of another type."""
+    # Missing means B-mode; Slicer writes the word twice.
+    text = text.strip()
+    return "BRIGHTNESS" if not text or text == "XX" or text.startswith("BRIGHTNESS") else text
+
+
+def sequence_of(
+    header: SequenceHeader, count: int, pixels: Pixels | None, image_status: str, name: str
+) -> TrackedSequence:
+    """The sequence of a header; ``image_status`` is how the format names that field."""
+    transforms: dict[FramePair, np.ndarray] = {}
+    valid: dict[FramePair, np.ndarray] = {}
+    time = np.full(count, np.nan)
+    image_valid = np.full(count, pixels is not None)
+    for number, fields in header.frames.items():
+        if "Timestamp" in fields:
+            time[number] = _stamp(*fields["Timestamp"])
+        if image_status in fields and fields[image_status][0].upper() != "OK":
+            image_valid[number] = False
+        for field_name, (value, line) in fields.items():
+            pair = _transform_frames(field_name)
+            if pair is None:
+                continue
+            if pair not in transforms:
+                transforms[pair] = np.full((count, 4, 4), np.nan)
+                valid[pair] = np.zeros(count, bool)
+            status, _ = fields.get(f"{field_name}Status", ("OK", 0))
+            if status.upper() == "OK":
+                transforms[pair][number] = _sixteen(value, line)
+                valid[pair][number] = True
+    return TrackedSequence(transforms, valid, time, image_valid, pixels, name)
+
+
+def _transform_frames(field_name: str) -> FramePair | None:
+    if not field_name.endswith("Transform"):
+        return None
+    return split_name(field_name.removesuffix("Transform"))
+
+
+def _stamp(value: str, line: int) -> float:
+    try:
+        found = float(value)
+    except ValueError:
+        raise FormatError(f"line {line}: {quoted(value)} is not a time stamp") from None
+    if not math.isfinite(found):
+        raise FormatError(f"line {line}: the time stamp is {quoted(value)}")
+    return found
+
+
+def _sixteen(value: str, line: int) -> Float[np.ndarray, "4 4"]:
+    parts = value.split()
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        raise FormatError(f"line {line}: {quoted(value)} are not numbers") from None
+    if len(numbers) != 16:
+        raise FormatError(f"line {line}: a transform has 16 numbers, not {len(numbers)}")
+    matrix = np.array(numbers).reshape(4, 4)
+    if not np.isfinite(matrix).all():
+        raise FormatError(f"line {line}: a transform with status OK holds NaN or Inf")
+    return matrix
+
+
+def check_written(transforms: Mapping[FramePair, np.ndarray], time: np.ndarray) -> None:
+    """Refuse shapes, names and times that cannot be written."""
+    if time.ndim != 1 or not 0 < len(time) <= MOST_FRAMES:
+        raise InputError(f"1 to {MOST_FRAMES} time stamps are needed, not shape {time.shape}")
+    if not np.isfinite(time).all():
+        raise InputError(f"time stamp {np.flatnonzero(~np.isfinite(time))[0]} is NaN or Inf")
+    milliseconds = np.round(time * 1e3)
+    order = np.argsort(milliseconds, kind="stable")
+    same = np.flatnonzero(np.diff(milliseconds[order]) == 0)
+    if len(same):
+        first, second = order[same[0]], order[same[0] + 1]
+        raise InputError(
+            f"frames {first} and {second} have the same time stamp to the millisecond; Slicer "
+            "would keep one of them"
+        )
+    for (source, target), matrices in transforms.items():
+        check_frame(source)
+        check_frame(target)
+        if np.shape(matrices) != (len(time), 4, 4):
+            raise InputError(
+                f"{source}To{target} has shape {np.shape(matrices)}, ({len(time)}, 4, 4) is needed"
+            )
+
+
+def stacked(images: Iterable[np.ndarray] | None, count: int) -> np.ndarray:
+    """Images as one array; a dummy pixel a frame where there are none."""
+    if images is None:
+        return np.zeros((count, 1, 1), np.uint8)
+    stack = np.asarray(list(images))
+    if len(stack) != count or stack.ndim not in (3, 4) or (stack.ndim == 4 and stack.shape[3] != 3):
+        raise InputError(f"images have shape {stack.shape}, ({count}, rows, columns) is needed")
+    if stack.dtype not in (np.uint8, np.int16):
+        raise InputError(f"images must be uint8 or int16, not {stack.dtype}")
+    return stack
+
+
+def packed_pixels(stack: np.ndarray, packing: Packing) -> bytes:
+    """The bytes of pixels, packed frame by frame."""
+    content = stack.astype(stack.dtype.newbyteorder("<"), copy=False)
+    if packing == "raw":
+        return content.tobytes()
+    packer = zlib.compressobj(wbits=31 if packing == "gzip" else 15)
+    return b"".join([*(packer.compress(frame.tobytes()) for frame in content), packer.flush()])
+
+
+def frame_fields(
+    index: int,
+    transforms: Mapping[FramePair, np.ndarray],
+    valid: Mapping[FramePair, np.ndarray] | None,
+    time: np.ndarray,
+    pixels: bool,
+) -> list[tuple[str, str]]:
+    """Keys and values of one frame."""
+    start = f"Seq_Frame{index:04d}_"
+    fields: list[tuple[str, str]] = []
+    for pair, matrices in transforms.items():
+        good = valid is None or pair not in valid or bool(valid[pair][index])
+        matrix = np.asarray(matrices[index], dtype=np.float64)
+        if good and not np.isfinite(matrix).all():
+            raise InputError(f"{'To'.join(pair)} of frame {index} holds NaN or Inf")
+        numbers = matrix if np.isfinite(matrix).all() else np.eye(4)
+        key = f"{start}{'To'.join(pair)}Transform"
+        fields.append((key, " ".join(map(repr, numbers.ravel().tolist()))))
+        fields.append((f"{key}Status", "OK" if good else "INVALID"))
+    fields.append((f"{start}Timestamp", repr(float(time[index]))))
+    if pixels:
+        fields.append((f"{start}ImageStatus", "OK"))
+    return fields
+
+
+def written_orientation(orientation: str) -> str:
+    """With the third letter, which follows from the others: images are right-handed."""
+    third = {"MF": "A", "UF": "D", "UN": "A", "MN": "D"}
+    if orientation not in third:
+        raise InputError(f"orientation must be MF, UF, MN or UN, not {quoted(orientation)}")
+    return orientation + third[orientation]

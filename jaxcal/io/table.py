@@ -1,0 +1,145 @@
+"""Tables of numbers: separators, decimal commas and headers as they come, with their lines."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.errors import FormatError
+from jaxcal.io.lines import text_lines
+from jaxcal.io.readable import quoted
+
+_NUMBER = re.compile(
+    r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.I
+)
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+_SEPARATED = {",": "commas", ";": "semicolons", "\t": "tabs", "": "white space"}
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells of a table.
+
+    Attributes:
+        name: of the file.
+        header: names of the columns, or None without a header.
+        rows: cells, as they stand.
+        lines: of each row.
+        separator: between cells; "" for white space.
+    """
+
+    name: str
+    header: list[str] | None
+    rows: list[list[str]]
+    lines: list[int]
+    separator: str
+
+    def row(self, row: int) -> str:
+        """Where a row stands, for a message."""
+        return f"{self.name}:{self.lines[row]}"
+
+    def number(self, row: int, column: int) -> float:
+        """One cell as a number, NaN and Inf included.
+
+        Raises:
+            FormatError: not a number; file, line and column are named.
+        """
+        text = self.rows[row][column]
+        value = parse_number(text, decimal_comma=self.separator != ",")
+        if value is None:
+            raise FormatError(
+                f"{self.row(row)}: column {column + 1}{self._named(column)} is not a number: "
+                f"{quoted(text)}"
+            )
+        return value
+
+    def numbers(
+        self, columns: tuple[int, ...], rows: list[int] | None = None
+    ) -> Float[np.ndarray, "rows columns"]:
+        """Finite numbers of some columns.
+
+        Raises:
+            FormatError: not a number, NaN or Inf; file, line and column are named.
+        """
+        chosen = range(len(self.rows)) if rows is None else rows
+        values = np.empty((len(chosen), len(columns)))
+        for place, row in enumerate(chosen):
+            for position, column in enumerate(columns):
+                value = self.number(row, column)
+                if not math.isfinite(value):
+                    raise FormatError(
+                        f"{self.row(row)}: column {column + 1}{self._named(column)} is "
+                        f"{self.rows[row][column]}"
+                    )
+                values[place, position] = value
+        return values
+
+    def _named(self, column: int) -> str:
+        return "" if self.header is None else f" ({quoted(self.header[column])})"
+
+
+def parse_number(text: str, *, decimal_comma: bool = False) -> float | None:
+    """A number as programs write it, or None; never ``1_000``."""
+    text = text.strip()
+    if decimal_comma and _DECIMAL_COMMA.fullmatch(text):
+        text = text.replace(",", ".")
+    return float(text) if _NUMBER.fullmatch(text) else None
+
+
+def read_table(
+    path: str | os.PathLike[str], *, header: bool = True, separator: str | None = None
+) -> Table:
+    """Read a table; comments (``#``) and blank lines are left out.
+
+    Args:
+        path: cells separated by semicolons, tabs, commas or white space: whichever of these the
+            first line has, in this order. Where it is not commas, a comma may be the decimal sign.
+        header: the first line names the columns if none of its cells is a number.
+        separator: the one that is known to be used; "" for white space.
+
+    Raises:
+        FormatError: cannot be read, no rows, or rows of different lengths; file and line are named.
+    """
+    name = os.fspath(path)
+    names: list[str] | None = None
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    for line, content in text_lines(path):
+        if separator is None:
+            separator = next((mark for mark in (";", "\t", ",") if mark in content.strip()), "")
+        cells = _cells(content, separator)
+        if header and not rows and names is None and _is_header(cells, separator):
+            names = cells
+            continue
+        width = len(names or rows[0]) if names or rows else len(cells)
+        if len(cells) != width:
+            before = "the header has" if names else "the rows before have"
+            raise FormatError(
+                f"{name}:{line}: {len(cells)} columns, {before} {width} (separated by "
+                f"{_SEPARATED[separator]})"
+            )
+        rows.append(cells)
+        lines.append(line)
+    if not rows:
+        raise FormatError(f"{name}: holds no rows of numbers")
+    return Table(name, names, rows, lines, separator or "")
+
+
+def _cells(content: str, separator: str) -> list[str]:
+    if not separator:
+        return content.split()
+    if '"' not in content:
+        return [cell.strip() for cell in content.split(separator)]
+    return [cell.strip() for cell in next(csv.reader([content], delimiter=separator))]
+
+
+def _is_header(cells: list[str], separator: str) -> bool:
+    comma = separator != ","
+    named = [cell for cell in cells if cell]
+    return bool(named) and all(parse_number(cell, decimal_comma=comma) is None for cell in named)

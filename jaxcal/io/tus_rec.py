@@ -1,0 +1,117 @@
+"""TUS-REC challenge data: scans in HDF5, and the calibration as ``calib_matrix.csv``.
+
+The baseline of the challenge counts pixels from 1, so that its matrices' origin lies one pixel
+before ours.
+
+Source: UCL, tus-rec-challenge.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.errors import FormatError, InputError
+from jaxcal.io.lines import text_lines
+from jaxcal.io.readable import check_readable, naming, quoted
+from jaxcal.io.sequence import Hdf5Pixels, TrackedSequence
+from jaxcal.io.sequence_header import LARGEST_FRAME, MOST_FRAMES
+from jaxcal.io.untrusted import UpTo, array, check_rows, child, open_root
+
+FRAMES = "Tool", "Tracker"
+
+_SCALING = "scaling_from_pixel_to_mm"
+_CALIBRATION = "spatial_calibration_from_image_coordinate_system_to_tracking_tool_coordinate_system"
+
+
+def read_scan(path: str | os.PathLike[str]) -> TrackedSequence:
+    """Read a scan; the file is not trusted.
+
+    Args:
+        path: HDF5 with ``tforms`` (n, 4, 4), tool -> camera, mm, and ``frames`` (n, rows, columns),
+            uint8; without time stamps.
+
+    Returns:
+        The transforms from ``Tool`` to ``Tracker``; frames are taken for MF-oriented.
+
+    Raises:
+        FormatError: not such a file; one line that starts with the path.
+    """
+    check_readable(path)
+    with naming(path), open_root(path) as root:
+        transforms = child(root, "tforms")
+        if transforms is None:
+            raise FormatError("is no scan of TUS-REC: /tforms is missing")
+        poses = array(transforms, (UpTo(MOST_FRAMES, "frames"), 4, 4))
+        frames = child(root, "frames")
+        pixels = None
+        if frames is not None:
+            count, rows, columns = check_rows(frames, 3, LARGEST_FRAME, "u")
+            if count != len(poses):
+                raise FormatError(f"/frames has {count} frames, /tforms {len(poses)}")
+            pixels = Hdf5Pixels(Path(path), "frames", columns, rows)
+        count = len(poses)
+        valid = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+        return TrackedSequence(
+            {FRAMES: poses}, {FRAMES: valid}, np.full(count, np.nan),
+            np.full(count, pixels is not None), pixels, os.fspath(path),
+        )  # fmt: skip
+
+
+def calib_matrix(
+    image_to_probe: Float[np.ndarray, "4 4"], scale_mm_per_px: Float[np.ndarray, 2]
+) -> str:
+    """``calib_matrix.csv`` of a calibration from pixels, which are counted from 1 there.
+
+    Args:
+        image_to_probe: rigid, from the Image frame in mm (lateral, axial, and their cross product)
+            to the probe.
+        scale_mm_per_px: [lateral, axial].
+    """
+    scaling = np.diag([*scale_mm_per_px, 1.0, 1.0])
+    rigid = np.array(image_to_probe, dtype=np.float64)
+    rigid[:3, 3] -= rigid[:3, :2] @ np.asarray(scale_mm_per_px)
+    lines = [_SCALING, *_rows(scaling), _CALIBRATION, *_rows(rigid)]
+    return "\n".join(lines) + "\n"
+
+
+def _rows(matrix: np.ndarray) -> list[str]:
+    return [",".join(repr(value + 0.0) for value in row) for row in matrix.tolist()]
+
+
+def read_calib_matrix(
+    path: str | os.PathLike[str],
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, 2]]:
+    """What :func:`calib_matrix` was made from; the file is not trusted.
+
+    Raises:
+        FormatError: not the ten lines of such a file; file and line are named.
+    """
+    with naming(path):
+        found = list(text_lines(path))
+        if len(found) != 10 or found[0][1].strip() != _SCALING:
+            raise FormatError("is no calib_matrix.csv of TUS-REC: ten lines are needed")
+        scaling, rigid = (_four_rows(found[start : start + 4]) for start in (1, 6))
+        if np.abs(scaling - np.diag(np.diag(scaling))).max() > 0 or (np.diag(scaling) <= 0).any():
+            raise FormatError("its scaling is not a diagonal of positive numbers")
+        scale = np.diag(scaling)[:2].copy()
+        rigid[:3, 3] += rigid[:3, :2] @ scale
+        return rigid, scale
+
+
+def _four_rows(lines: list[tuple[int, str]]) -> Float[np.ndarray, "4 4"]:
+    rows = []
+    for line, content in lines:
+        try:
+            row = [float(cell) for cell in content.split(",")]
+        except ValueError:
+            raise FormatError(f"line {line}: not numbers: {quoted(content)}") from None
+        if len(row) != 4 or not np.isfinite(row).all():
+            raise FormatError(f"line {line}: four finite numbers are needed")
+        rows.append(row)
+    if np.abs(np.array(rows[3]) - [0, 0, 0, 1]).max() > 1e-9:
+        raise InputError(f"line {lines[3][0]}: the last row of a matrix is 0 0 0 1")
+    return np.array(rows)
