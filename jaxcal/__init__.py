@@ -21,6 +21,7 @@ _HOME = {
     "ClosedForm": "jaxcal.closed_form",
     "CurvilinearProbe": "jaxcal.probe",
     "FormatError": "jaxcal.errors",
+    "ImageTransform": "jaxcal.transform",
     "Images": "jaxcal.recording",
     "InputError": "jaxcal.errors",
     "LinearProbe": "jaxcal.probe",
@@ -42,6 +43,7 @@ _HOME = {
     "certify": "jaxcal.certificate",
     "cross_validate": "jaxcal.resampling",
     "load": "jaxcal.io.hdf5",
+    "load_calibration": "jaxcal.transform",
     "make_images": "jaxcal.recording",
     "predicted_tre": "jaxcal.diagnostics.intervals",
     "reconstruction_precision": "jaxcal.diagnostics.metrics",
@@ -97,6 +99,8 @@ if TYPE_CHECKING:
     from jaxcal.solve import calibrate as calibrate
     from jaxcal.solve import calibrate_batch as calibrate_batch
     from jaxcal.sound import sound_speed_in_water as sound_speed_in_water
+    from jaxcal.transform import ImageTransform as ImageTransform
+    from jaxcal.transform import load_calibration as load_calibration
 
 
 def __getattr__(name: str) -> object:

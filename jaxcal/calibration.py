@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.errors import CalibrationError
+from jaxcal.errors import CalibrationError, InputError
 from jaxcal.geometry import AnyArray
 from jaxcal.model.parameters import Blocks
 from jaxcal.problem import Problem, is_traced
 from jaxcal.solvers.auto import OffsetLaw
+from jaxcal.transform import AppliedPoints, ImageTransform
 
 if TYPE_CHECKING:
     from jaxcal.diagnostics.residual_checks import Inspection
@@ -362,6 +363,47 @@ class Calibration(eqx.Module):
     def with_problem(self, problem: Problem) -> Calibration:
         """The same with the data that were solved."""
         return replace(self, problem=problem)
+
+    def image_transform(self, face_offset_mm: float = 0.0) -> ImageTransform:
+        """The transform by itself: to apply it to pixels, and to save it for other programs.
+
+        Args:
+            face_offset_mm: range of pixel row 0, mm: the recording's, where it has one.
+
+        Raises:
+            CalibrationError: under a JAX transformation.
+            InputError: of a batch.
+        """
+        answer = self.numpy()
+        if answer.image_to_probe.ndim != 2:
+            raise InputError("a batch holds many transforms: take one of its calibrations")
+        scale = answer.scale_mm_per_px
+        known = np.isfinite(answer.covariance).all()
+        return ImageTransform(
+            np.asarray(answer.image_to_probe),
+            None if scale is None else np.asarray(scale),
+            face_offset_mm,
+            np.asarray(answer.covariance) if known else None,
+            float(answer.rms),
+            bool(self.converged),
+            "the calibration",
+        )
+
+    def plus_matrix(self, face_offset_mm: float = 0.0) -> Float[np.ndarray, "4 4"]:
+        """PLUS's ImageToProbe; see :meth:`jaxcal.ImageTransform.plus_matrix`."""
+        return self.image_transform(face_offset_mm).plus_matrix()
+
+    def apply(
+        self,
+        pixels: np.ndarray,
+        pose: np.ndarray | None = None,
+        *,
+        pixel_sd_px: float | tuple[float, float] = 0.0,
+        face_offset_mm: float = 0.0,
+    ) -> AppliedPoints:
+        """Image points in the probe's or the tracker's frame; see :meth:`ImageTransform.apply`."""
+        transform = self.image_transform(face_offset_mm)
+        return transform.apply(pixels, pose, pixel_sd_px=pixel_sd_px)
 
     def numpy(self) -> Calibration:
         """The same with numpy arrays (concrete values).

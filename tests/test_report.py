@@ -84,7 +84,7 @@ def test_record_holds_what_the_result_holds(record, result, recording):
     assert record["converged"] is True
     assert record["status"] == "converged"
     assert (record["images"], record["images_used"]) == (20, 19)
-    np.testing.assert_array_equal(record["image_to_probe"], result.image_to_probe)
+    np.testing.assert_array_equal(record["image_plane_to_probe"], result.image_to_probe)
     np.testing.assert_array_equal(record["covariance"], result.covariance)
     np.testing.assert_array_equal(record["elevation_mm"], result.elevation)
     assert record["elevation_sd_mm"][LEFT_OUT] is None
@@ -100,7 +100,7 @@ def test_record_holds_what_the_result_holds(record, result, recording):
 
 def test_rms_is_that_of_the_contract(record, recording):
     images, used = recording.calibration, recording.calibration.mask
-    transform = np.array(record["image_to_probe"])
+    transform = np.array(record["image_plane_to_probe"])
     points = np.c_[images.measurements[:, 0], np.zeros(20), images.measurements[:, 1], np.ones(20)]
     cloud = np.einsum("nij,jk,nk->ni", images.poses, transform, points)[used, :3]
     misses = np.linalg.norm(np.array(record["point_mm"]) - cloud, axis=1)
@@ -198,7 +198,7 @@ def test_a_failed_solve_is_null_not_nan(failed, recording):
     assert record["status"] == "failed"
     assert record["converged"] is False
     assert record["covariance"] is None
-    assert record["image_to_probe"][0][0] is None
+    assert record["image_plane_to_probe"][0][0] is None
     assert record["reconstruction_precision_mm"] is None
 
 
@@ -253,7 +253,7 @@ def test_verdict_says_what_rests_on_an_assumption(record):
 
 def test_tables(record, failed, recording):
     text = text_of(calibration_table(record))
-    assert f"{record['image_to_probe'][0][3]:.6f}" in text
+    assert f"{record['image_plane_to_probe'][0][3]:.6f}" in text
     assert "19 used of 20" in text
     lost = calibration_record(failed, recording)
     assert "failed" in text_of(calibration_table(lost))

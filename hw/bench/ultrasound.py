@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hw.clock import REAL, Clock
-from hw.ultrasound.openigtlink import (
+from jaxcal.io.openigtlink import (
     HEADER_SIZE,
     RF_DEVICE,
     Content,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from fastcrc import crc64
 
-from hw.ultrasound.openigtlink import (
+from jaxcal.io.openigtlink import (
     BEGINNING,
     HEADER_SIZE,
     MAXIMUM_BODY,
@@ -54,7 +54,7 @@ class MessageDecoder:
     """Incremental decoder; never waits, and never raises on what it is fed.
 
     It holds at most one message and what came with it: bodies are bounded by
-    :data:`~hw.ultrasound.openigtlink.MAXIMUM_BODY`, and nothing is allocated before it arrives.
+    :data:`~jaxcal.io.openigtlink.MAXIMUM_BODY`, and nothing is allocated before it arrives.
     """
 
     def __init__(self) -> None:

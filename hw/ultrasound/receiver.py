@@ -20,7 +20,7 @@ from hw.clock import REAL, Clock
 from hw.errors import Device, DeviceError, LostError, StaleError
 from hw.shapes import Float
 from hw.ultrasound.framing import MessageDecoder
-from hw.ultrasound.openigtlink import RF_DEVICE, Message, Picture, Pixels, Status, Tracked
+from jaxcal.io.openigtlink import RF_DEVICE, Message, Picture, Pixels, Status, Tracked
 
 DEVICE: Device = "ultrasound"
 PORT = 18944

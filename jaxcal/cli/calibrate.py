@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -27,6 +28,7 @@ Method = Literal["joint", "alternating", "conventional"]
 MOST_FOLDS = 100
 """With more images than this, cross-validation holds out several at a time."""
 
+EXPORTS = ("plus", "slicer", "itk", "ros", "tusrec", "numpy")
 UNKNOWNS = ("scale", "sound-speed", "delay")
 
 
@@ -138,6 +140,14 @@ class _Request:
     metavar="N",
     help="Calibrate N times from images drawn anew, and tell how the answers scatter.",
 )
+@click.option(
+    "--export",
+    "exports",
+    multiple=True,
+    metavar="FORMAT:PATH",
+    help="Also write the transform for another program: plus:CONFIG.xml (put into this "
+    "configuration), slicer:PATH, itk:PATH, ros:PATH, tusrec:PATH or numpy:PATH.",
+)
 @click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def calibrate(
@@ -156,6 +166,7 @@ def calibrate(
     test: str | None,
     cross_validate: bool,
     bootstrap: int | None,
+    exports: tuple[str, ...],
     out: str | None,
     as_json: bool,
 ) -> int:
@@ -165,6 +176,7 @@ def calibrate(
     }  # fmt: skip
     request = _request(method, prior, max_elevation, sigma, estimate, data, solver, alternation)
     request = replace(request, robust=robust)
+    targets = [_export_target(export) for export in exports]
     import_engine()
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.io.hdf5 import load
@@ -190,11 +202,42 @@ def calibrate(
             with progress("drawing the report"):
                 curves = _curves(measured, request, result)
                 write_report(folder, record, result, measured, curves)
+    exported = _export(record, recording, targets)
     if as_json:
         print_json(record)
     else:
         _print(record, out)
+        print_page(*exported)
     return exit_code([record])
+
+
+def _export_target(text: str) -> tuple[str, str]:
+    format, colon, path = text.partition(":")
+    if not colon or not path or format not in EXPORTS:
+        raise InputError(f"--export {text}: FORMAT:PATH is needed, of {', '.join(EXPORTS)}")
+    if format == "plus" and not Path(path).is_file():
+        raise InputError(f"--export {text}: there is no such configuration")
+    return format, path
+
+
+def _export(record: dict[str, Any], recording: str, targets: list[tuple[str, str]]) -> list[str]:
+    """Write the transform for other programs; nothing of a calibration that did not converge."""
+    if not targets:
+        return []
+    from jaxcal.cli.export import patched
+    from jaxcal.transform import transform_from_record
+
+    if not record["converged"]:
+        return ["exported: nothing, since the calibration is not to be used"]
+    transform = transform_from_record(record, source=recording)
+    said: list[str] = []
+    for format, path in targets:
+        if format == "plus":
+            said += patched(transform, path, None, ("Image", "Probe"))
+        else:
+            transform.save(path, format)  # pyright: ignore[reportArgumentType]
+            said.append(f"{path}: written")
+    return said
 
 
 def _segmented(recording: Recording) -> tuple[Recording, list[str]]:

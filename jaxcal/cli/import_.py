@@ -1,19 +1,14 @@
-"""``jaxcal import``: text recordings as HDF5."""
+"""``jaxcal import``: recordings of other programs as HDF5."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Any
 
 import click
 
-from jaxcal.cli.common import POSITIVE, ExitCode, import_engine
+from jaxcal.cli.common import POSITIVE, ExitCode, progress
 from jaxcal.errors import InputError
-
-if TYPE_CHECKING:
-    from jaxcal.recording import Recording
-
-_PLUS = (".mha", ".mhd", ".nrrd", ".nhdr")
 
 
 @click.command("import")
@@ -21,6 +16,7 @@ _PLUS = (".mha", ".mhd", ".nrrd", ".nhdr")
 @click.argument("out", type=click.Path(), metavar="OUT.h5")
 @click.option(
     "--spacing",
+    "spacing_mm",
     type=POSITIVE,
     nargs=2,
     metavar="LATERAL AXIAL",
@@ -29,57 +25,86 @@ _PLUS = (".mha", ".mhd", ".nrrd", ".nhdr")
 @click.option(
     "--units",
     type=click.Choice(["px", "mm"]),
-    help="Unit of u and v in a CSV: px (lateral and axial pixel, the default) or mm (lateral "
+    help="Unit of u and v in a table: px (lateral and axial pixel, the default) or mm (lateral "
     "position and range).",
 )
-def import_(
-    sources: tuple[str, ...],
-    out: str,
-    spacing: tuple[float, float] | None,
-    units: Literal["px", "mm"] | None,
-) -> int:
-    """Turn tables into a recording, OUT.h5.
+@click.option(
+    "--pose-units",
+    type=click.Choice(["mm", "cm", "m"]),
+    help="Unit of translations in a table whose header does not say; mm by default.",
+)
+@click.option(
+    "--quaternion",
+    type=click.Choice(["xyzw", "wxyz"]),
+    help="Whether a quaternion's scalar is the last or the first of its numbers.",
+)
+@click.option(
+    "--skip-invalid",
+    is_flag=True,
+    help="Leave out, and count, rows of tables that are marked as invalid or have gaps.",
+)
+@click.option("--from", "source", metavar="FRAME", help="Tracked frame on the probe, e.g. Probe.")
+@click.option("--to", "target", metavar="FRAME", help="Frame the target rests in, e.g. Reference.")
+@click.option(
+    "--points",
+    type=click.Choice(["labels", "order"]),
+    help="How points of Slicer belong to frames: by the number that ends each label (frames count "
+    "from 0), or one for each frame.",
+)
+@click.option(
+    "--target",
+    "target_kind",
+    type=click.Choice(["echo", "cross"]),
+    default="echo",
+    show_default=True,
+    help="What to look for in frames: one bright spot, or a crossing of wires.",
+)
+@click.option(
+    "--region",
+    type=int,
+    nargs=4,
+    metavar="COLUMN ROW COLUMNS ROWS",
+    help="Part of the frames to look in, px: its first column and row, and its size.",
+)
+@click.option(
+    "--orientation",
+    type=click.Choice(["MF", "UF", "MN", "UN"]),
+    help="Of the frames, where their file does not say.",
+)
+@click.option("--ignore-time", is_flag=True, help="Import without times where they go back.")
+def import_(sources: tuple[str, ...], out: str, **options: Any) -> int:
+    """Turn other programs' files into a recording, OUT.h5.
 
-    SOURCE is one CSV file with a row "time, pose, u, v" for each image (pose: probe -> tracker, mm,
-    12 or 16 numbers row by row), or two text files: POSES (three rows of four numbers for each
-    image) and POINTS (a row "u v" in pixels for each image).
+    SOURCE is one of: a table (CSV) with a pose and a point in each row; a tracked sequence of PLUS
+    or Slicer (.igs.mha, .igs.mhd, .igs.nrrd, .seq.nrrd) whose frames show the target; such a
+    sequence, or an export of NDI ToolBox or Motive, and a file of points (a table with frame or
+    time, u and v, or Slicer's .mrk.json or .fcsv); or POSES (three rows of four numbers for each
+    image) and POINTS (a row "u v" in pixels). docs/formats.md says what each must hold.
     """
-    _check(sources, out)
-    if len(sources) == 2 and units == "mm":
-        raise click.BadParameter("a pair of text files holds pixels", param_hint="--units")
-    if spacing is not None and units == "mm":
-        raise click.BadParameter("points in mm have no pixel size", param_hint="--spacing")
-    import_engine()
+    _check(sources, out, options)
+    from jaxcal.importing import ImportOptions, import_files
     from jaxcal.io.hdf5 import save
 
-    recording = _read(sources, spacing, units or "px")
+    with progress("importing"):
+        recording, notes = import_files(sources, ImportOptions(**options))
     save(recording, out)
     images = recording.calibration
     unscaled = images.kind == "pixel" and images.spacing_mm is None
     hint = "; their size is not known: calibrate with --estimate scale" if unscaled else ""
     click.echo(f"{out}: {len(images)} images, {images.kind}s{hint}")
+    for note in notes:
+        click.echo(f"- {note}")
     return ExitCode.CONVERGED
 
 
-def _read(
-    sources: tuple[str, ...], spacing: tuple[float, float] | None, units: Literal["px", "mm"]
-) -> Recording:
-    from jaxcal.io.text import read_crosswire, read_csv
-
-    first, *rest = sources
-    if rest:
-        return read_crosswire(first, rest[0], spacing_mm=spacing)
-    return read_csv(first, spacing_mm=spacing, units=units)
-
-
-def _check(sources: tuple[str, ...], out: str) -> None:
+def _check(sources: tuple[str, ...], out: str, options: dict[str, Any]) -> None:
     if len(sources) > 2:
         raise click.UsageError(
-            f"{len(sources)} sources; one CSV, or POSES and POINTS, are read (OUT.h5 comes last)"
+            f"{len(sources)} sources; one table or sequence, or two files that belong together, "
+            "are read (OUT.h5 comes last)"
         )
-    sequence = next((source for source in sources if source.lower().endswith(_PLUS)), None)
-    if sequence is not None:
-        raise InputError(f"{sequence}: this version does not read PLUS sequences")
+    if options["spacing_mm"] is not None and options["units"] == "mm":
+        raise click.BadParameter("points in mm have no pixel size", param_hint="--spacing")
     # Whoever forgets OUT.h5 names a source last: it must not be overwritten.
     try:
         with Path(out).open("rb") as existing:
@@ -88,3 +113,12 @@ def _check(sources: tuple[str, ...], out: str) -> None:
         return
     if start and start != b"\x89HDF\r\n\x1a\n":
         raise InputError(f"{out}: exists and is not a recording; name the output file last")
+    if any(_same(source, out) for source in sources):
+        raise InputError(f"{out}: is one of the sources; name the output file last")
+
+
+def _same(first: str, second: str) -> bool:
+    try:
+        return Path(first).samefile(second)
+    except OSError:
+        return False

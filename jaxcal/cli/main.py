@@ -8,14 +8,17 @@ from collections.abc import Sequence
 import click
 
 from jaxcal import __version__
+from jaxcal.cli.apply import apply
 from jaxcal.cli.cache import cache
 from jaxcal.cli.calibrate import calibrate
 from jaxcal.cli.demo import demo
+from jaxcal.cli.export import export
 from jaxcal.cli.import_ import import_
 from jaxcal.cli.pivot import pivot
 from jaxcal.cli.plan import plan
 from jaxcal.cli.run import run
 from jaxcal.cli.segment import segment
+from jaxcal.cli.serve import serve
 from jaxcal.cli.simulate import simulate
 from jaxcal.cli.study import study
 
@@ -31,7 +34,20 @@ def commands() -> None:
     """Calibrate a tracked or robotic ultrasound probe from images of one small fixed target."""
 
 
-for _command in (demo, simulate, import_, segment, calibrate, plan, pivot, study, cache):
+for _command in (
+    demo,
+    simulate,
+    import_,
+    segment,
+    calibrate,
+    export,
+    apply,
+    serve,
+    plan,
+    pivot,
+    study,
+    cache,
+):
     commands.add_command(_command)
 
 

@@ -16,17 +16,21 @@ from jaxcal.errors import InputError
 from jaxcal.poses import rotation_angle
 from jaxcal.recording import Images, Recording, Truth
 from jaxcal.report.certified import certificate_record
+from jaxcal.transform import FORMAT, VERSION, ImageTransform
 
 CONVENTION = {
     "units": "lengths in mm; rotations in rad where no unit is in the name",
     "image_frame": "x lateral along the elements, y elevational (z cross x), z axial away from the "
     "transducer; pixels: lateral = scale u, range = scale v + face offset",
-    "image_to_probe": "4x4, row-major; maps the image frame to the probe's (tracked) frame",
+    "image_plane_to_probe": "4x4, row-major, rigid; maps the image frame, in mm, to the probe's "
+    "(tracked) frame. It is not PLUS's ImageToProbe",
+    "plus_image_to_probe": "4x4, row-major; PLUS's and Slicer's ImageToProbe: maps (u, v, 0, 1) in "
+    "pixels to the probe's frame; null for points in mm",
     "point_mm": "target in the tracker's frame",
     "elevation_mm": "estimated distance of the target from the image's mid-plane, along y; 0 where "
     "an image was left out",
-    "covariance": "of image_to_probe under the right perturbation X Exp([v, omega]): v in mm, then "
-    "omega in rad, along and about the image's axes",
+    "covariance": "of image_plane_to_probe under the right perturbation X Exp([v, omega]): v in "
+    "mm, then omega in rad, along and about the image's axes",
     "objective": "the minimised sum of squares: mm^2, or in SDs with the gaussian prior; with auto "
     "and uniform that of the Gaussian fit before the laws are weighed",
     "certified": "no transform fits Eq. 7 better (one part in 1e9), which is proved: of the answer "
@@ -55,7 +59,15 @@ def calibration_record(
     """
     answer = result.numpy()
     precision, precision_set = _precision(answer, recording, test)
+    scale = answer.scale_mm_per_px
+    transform = ImageTransform(
+        np.asarray(answer.image_to_probe),
+        None if scale is None else np.asarray(scale),
+        recording.calibration.face_offset_mm,
+    )
     record: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
         "method": result.method,
         "prior": result.prior,
         "converged": bool(result.converged),
@@ -64,7 +76,8 @@ def calibration_record(
         "variance_rounds": int(answer.variance_rounds),
         "images": len(answer.mask),
         "images_used": int(result.images_used),
-        "image_to_probe": answer.image_to_probe,
+        "image_plane_to_probe": answer.image_to_probe,
+        "plus_image_to_probe": None if scale is None else transform.plus_matrix(),
         "point_mm": answer.point,
         "elevation_mm": answer.elevation,
         "elevation_sd_mm": answer.elevation_sd,
@@ -79,6 +92,7 @@ def calibration_record(
         "reconstruction_precision_mm": precision,
         "reconstruction_precision_set": precision_set,
         "scale_mm_per_px": answer.scale_mm_per_px,
+        "face_offset_mm": recording.calibration.face_offset_mm,
         "data": result.data,
         "channel_sigma_mm": answer.channel_sigma,
         "sound_speed_m_s": answer.sound_speed_m_s,

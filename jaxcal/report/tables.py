@@ -20,8 +20,8 @@ def calibration_table(record: dict[str, Any]) -> RenderableType:
     Args:
         record: of :func:`jaxcal.report.record.calibration_record`.
     """
-    transform = Table(title="image_to_probe (mm)", box=box.SIMPLE, show_header=False)
-    for row in record["image_to_probe"]:
+    transform = Table(title="image_plane_to_probe (mm)", box=box.SIMPLE, show_header=False)
+    for row in record["image_plane_to_probe"]:
         transform.add_row(*(_number(value, ".6f") for value in row))
     for _ in range(4):
         transform.columns[_].justify = "right"
@@ -94,7 +94,7 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
         facts.append(("global minimum", proved))
     spread = spread_of_transform(record)
     if spread is not None:
-        facts.append(("SD of image_to_probe", f"{spread[0]:.3f} mm, {spread[1]:.3f} deg"))
+        facts.append(("SD of image_plane_to_probe", f"{spread[0]:.3f} mm, {spread[1]:.3f} deg"))
     if record["scale_mm_per_px"] is not None:
         facts.append(("pixel scale (mm/px)", _numbers(record["scale_mm_per_px"], ".6f")))
     if record["sound_speed_m_s"] is not None:

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hw.ultrasound.framing import MessageDecoder
-from hw.ultrasound.openigtlink import (
+from jaxcal.io.openigtlink import (
     HEADER_SIZE,
     MAXIMUM_BODY,
     Message,

@@ -19,7 +19,7 @@ from hw.bench.ultrasound import ImageServer
 from hw.clock import Clock
 from hw.errors import DeviceError, LostError, StaleError
 from hw.ultrasound import Image, UltrasoundStream
-from hw.ultrasound.openigtlink import HEADER_SIZE, Message, Picture, Status, encode
+from jaxcal.io.openigtlink import HEADER_SIZE, Message, Picture, Status, encode
 
 RNG = np.random.default_rng(11)
 PICTURES = [RNG.integers(0, 256, (48, 64), dtype=np.uint8) for _ in range(16)]

@@ -1,0 +1,98 @@
+"""``jaxcal apply``: where pixels are, in the probe's or the tracker's frame, and how certain."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+import click
+
+from jaxcal.cli.common import NOT_NEGATIVE, ExitCode
+from jaxcal.errors import InputError
+
+_COLUMNS = ("x_mm", "y_mm", "z_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm", "cov_xy_mm2", "cov_xz_mm2",
+            "cov_yz_mm2")  # fmt: skip
+
+
+@click.command()
+@click.argument("calibration", type=click.Path(), metavar="CAL")
+@click.argument("source", type=click.Path(), metavar="[SOURCE]", required=False)
+@click.option("--pixel", type=float, nargs=2, multiple=True, metavar="U V", help="A single point.")
+@click.option(
+    "--pixel-sd",
+    type=NOT_NEGATIVE,
+    default=0.0,
+    metavar="PX",
+    help="SD of the points in the image, px (mm without pixels).",
+)
+@click.option(
+    "--quaternion",
+    type=click.Choice(["xyzw", "wxyz"]),
+    help="Whether a quaternion's scalar is the last or the first of its numbers.",
+)
+@click.option("--pose-units", type=click.Choice(["mm", "cm", "m"]), help="Of translations.")
+@click.option("--out", type=click.Path(), metavar="OUT.csv", help="Instead of standard output.")
+def apply(
+    calibration: str,
+    source: str | None,
+    pixel: tuple[tuple[float, float], ...],
+    pixel_sd: float,
+    quaternion,
+    pose_units,
+    out: str | None,
+) -> int:
+    """Take image points through the calibration CAL, as a table with standard deviations.
+
+    SOURCE is a table with columns u and v, and a pose (probe to tracker) if points in the tracker's
+    frame are wanted; or a recording (.h5). Standard deviations and covariances are those of the
+    calibration and of --pixel-sd; neither of the pixel size nor of the pose.
+    """
+    import numpy as np
+
+    from jaxcal.cli.export import check_usable
+    from jaxcal.io.atomic import write_text
+    from jaxcal.transform import load_calibration
+
+    if (source is None) == (not pixel):
+        raise click.UsageError("name SOURCE, or points by --pixel U V")
+    transform = load_calibration(calibration)
+    check_usable(transform)
+    points, poses = np.array(pixel), None
+    if source is not None:
+        points, poses, kind = _read(source, quaternion, pose_units)
+        _check_kind(kind, transform.scale_mm_per_px is not None, source)
+    applied = transform.apply(points, poses, pixel_sd_px=pixel_sd)
+    table = io.StringIO()
+    rows = csv.writer(table, lineterminator="\n")
+    rows.writerow(_COLUMNS)
+    for point, covariance in zip(applied.points, applied.covariance, strict=True):
+        numbers = [*point, *np.sqrt(np.diag(covariance)), *covariance[[0, 0, 1], [1, 2, 2]]]
+        rows.writerow([repr(float(value)) if np.isfinite(value) else "" for value in numbers])
+    if out is None:
+        click.echo(table.getvalue(), nl=False)
+    else:
+        write_text(out, table.getvalue())
+        frame = "probe" if poses is None else "tracker"
+        click.echo(f"{out}: {len(points)} points in the {frame}'s frame")
+    return ExitCode.CONVERGED
+
+
+def _read(source: str, quaternion, pose_units):
+    """Points, poses or None, and the points' kind."""
+    if source.lower().endswith((".h5", ".hdf5")):
+        from jaxcal.io.hdf5 import load
+
+        images = load(source).calibration
+        return images.measurements[images.mask], images.poses[images.mask], images.kind
+    from jaxcal.io.text import read_pose_table
+
+    table = read_pose_table(source, quaternion=quaternion, pose_units=pose_units)
+    if table.points is None:
+        raise InputError(f"{source}: holds no points (columns u and v)")
+    return table.points, table.poses, table.kind
+
+
+def _check_kind(kind: str, pixels: bool, source: str) -> None:
+    if kind != ("pixel" if pixels else "point"):
+        wanted = "pixels" if pixels else "points in mm"
+        raise InputError(f"{source}: holds {kind} data, the calibration takes {wanted}")

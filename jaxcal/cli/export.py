@@ -1,0 +1,122 @@
+"""``jaxcal export``: a calibration for PLUS, Slicer, ITK, ROS, TUS-REC and numpy."""
+
+from __future__ import annotations
+
+import datetime
+from typing import TYPE_CHECKING
+
+import click
+
+from jaxcal.cli.common import POSITIVE, ExitCode
+from jaxcal.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxcal.transform import ImageTransform, SaveFormat
+
+_TEXTS = {
+    "plus": "PLUS's <Transform> to paste into CoordinateDefinitions.",
+    "slicer": "An ITK transform that Slicer loads (OUT.tfm, .txt or .h5).",
+    "itk": "The same, for other programs that use ITK.",
+    "ros": "YAML of easy_handeye and the command of tf2: metres, rigid.",
+    "tusrec": "calib_matrix.csv of the TUS-REC challenge.",
+    "numpy": "PLUS's matrix (OUT.npy), or all that is known (OUT.npz).",
+}
+
+
+def _formats(command):
+    for name, text in reversed(_TEXTS.items()):
+        command = click.option(f"--{name}", "format", flag_value=name, help=text)(command)
+    return command
+
+
+@click.command()
+@click.argument("calibration", type=click.Path(), metavar="CAL")
+@click.argument("out", type=click.Path(), metavar="[OUT]", required=False)
+@_formats
+@click.option(
+    "--plus-config",
+    type=click.Path(),
+    metavar="CONFIG.xml",
+    help="Put the transform into this configuration of PLUS, in place, or into a copy, OUT.",
+)
+@click.option("--image-frame", default="Image", show_default=True, metavar="FRAME")
+@click.option("--probe-frame", default="Probe", show_default=True, metavar="FRAME")
+@click.option(
+    "--pixel-size",
+    type=POSITIVE,
+    nargs=2,
+    metavar="LATERAL AXIAL",
+    help="Of a calibration from points in mm: size of a pixel, mm,",
+)
+@click.option(
+    "--origin",
+    type=float,
+    nargs=2,
+    metavar="U V",
+    help="and the pixel of lateral 0 and range 0 (0 0 by default).",
+)
+def export(
+    calibration: str,
+    out: str | None,
+    format: SaveFormat | None,
+    plus_config: str | None,
+    image_frame: str,
+    probe_frame: str,
+    pixel_size: tuple[float, float] | None,
+    origin: tuple[float, float] | None,
+) -> int:
+    """Write the calibration CAL for another program, to OUT or to standard output.
+
+    CAL is the JSON of "jaxcal calibrate", or another program's calibration (a configuration or fCal
+    result of PLUS, an ITK transform, calib_matrix.csv, a YAML of easy_handeye). PLUS's and Slicer's
+    ImageToProbe takes pixels (u, v, 0, 1) to the probe in mm; ROS gets the rigid transform from the
+    image plane in metres.
+    """
+    if (format is None) == (plus_config is None):
+        names = ", ".join(f"--{name}" for name in _TEXTS)
+        raise click.UsageError(f"name one format: {names} or --plus-config")
+    if origin is not None and pixel_size is None:
+        raise click.BadParameter("needs --pixel-size", param_hint="--origin")
+    from jaxcal.transform import load_calibration
+
+    transform = load_calibration(calibration)
+    check_usable(transform)
+    if pixel_size is not None:
+        transform = transform.with_pixels(pixel_size, origin or (0.0, 0.0))
+    frames = image_frame, probe_frame
+    if plus_config is not None:
+        for line in patched(transform, plus_config, out, frames):
+            click.echo(line)
+    elif out is not None:
+        transform.save(out, format, frames=frames)
+        click.echo(f"{out}: written")
+    elif format is not None:
+        click.echo(transform.text(format, frames=frames), nl=False)
+    return ExitCode.CONVERGED
+
+
+def check_usable(transform: ImageTransform) -> None:
+    """Refuse to hand on a calibration that did not converge.
+
+    Raises:
+        InputError: with what to do.
+    """
+    if transform.converged is False:
+        raise InputError(
+            f"{transform.source}: did not converge or is not determined by its images; its "
+            "transform must not be used"
+        )
+
+
+def patched(
+    transform: ImageTransform, config: str, out: str | None, frames: tuple[str, str]
+) -> list[str]:
+    """Put a transform into a configuration of PLUS; what was done and what should be known."""
+    from jaxcal.io.plus import patch_configuration
+
+    notes = patch_configuration(
+        config, frames, transform.plus_matrix(),
+        out=out, error_mm=transform.error_mm, date=datetime.datetime.now(),
+    )  # fmt: skip
+    written = f"{config if out is None else out}: {frames[0]} to {frames[1]} written"
+    return [written, *(f"- {note}" for note in notes)]

@@ -1,0 +1,38 @@
+"""``jaxcal serve``: a calibration over OpenIGTLink."""
+
+from __future__ import annotations
+
+import click
+
+from jaxcal.cli.common import POSITIVE, ExitCode
+
+
+@click.command()
+@click.argument("calibration", type=click.Path(), metavar="CAL")
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    help="Address to listen at. Any other than the default lets other machines connect.",
+)
+@click.option("--port", type=click.IntRange(0, 65535), default=18945, show_default=True)
+@click.option(
+    "--rate", type=POSITIVE, default=2.0, show_default=True, metavar="HZ", help="Messages a second."
+)
+@click.option("--name", default="ImageToProbe", show_default=True, help="Name of the transform.")
+def serve(calibration: str, host: str, port: int, rate: float, name: str) -> int:
+    """Serve the calibration CAL as an OpenIGTLink TRANSFORM until Ctrl-C.
+
+    In Slicer: OpenIGTLinkIF, a connector as client to this host and port. The matrix is PLUS's
+    ImageToProbe, with the pixel size in it: leave the image's own spacing at 1.
+    """
+    from jaxcal.cli.export import check_usable
+    from jaxcal.serving import TransformServer
+    from jaxcal.transform import load_calibration
+
+    transform = load_calibration(calibration)
+    check_usable(transform)
+    with TransformServer(name, transform.plus_matrix(), host, port) as server:
+        click.echo(f"{name} at {host}:{server.port}, {rate:g} times a second; Ctrl-C ends")
+        server.serve(1 / rate)
+    return ExitCode.CONVERGED

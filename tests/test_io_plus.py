@@ -1,0 +1,285 @@
+"""PLUS's configurations and results: read, patched byte by byte, and refused as PLUS refuses."""
+
+from __future__ import annotations
+
+import datetime
+import re
+
+import numpy as np
+import pytest
+
+from jaxcal.cli.main import main
+from jaxcal.errors import FormatError, InputError
+from jaxcal.io.plus import (
+    patch_configuration,
+    patched_configuration,
+    read_configuration,
+    read_result,
+    transform_element,
+    update_transform_command,
+)
+from jaxcal.io.xml import parse_xml
+
+IMAGE = ("Image", "Probe")
+MATRIX = np.array([
+    [0.0026, 0.1382, -0.0036, 44.265], [0.1472, -0.0021, 0.0139, -31.186],
+    [0.0144, -0.0037, -0.1424, 6.817], [0, 0, 0, 1],
+])  # fmt: skip
+MATRIX[:3, :3] /= 1 + 1e-16
+DATE = datetime.datetime(2026, 11, 21, 21, 0)
+
+OLD = '<Transform From="Image" To="Probe" Matrix="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/>'
+OTHER = '<Transform From="StylusTip" To="Stylus" Matrix="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/>'
+
+
+def configuration(
+    *inside: str, newline: str = "\r\n", head: str = '<?xml version="1.0"?>'
+) -> bytes:
+    lines = [
+        head,
+        "<PlusConfiguration version='2.3'>",
+        "\t<!-- of 2013: a > b, \"quoted\" <Transform From='Image' To='Probe'/> -->",
+        "\t<DataCollection  StartupDelaySec = '1' ><Device Id='V' LocalTimeOffsetSec='-0.084' />",
+        "\t</DataCollection>",
+        "\t<CoordinateDefinitions>",
+        *(f"\t  {line}" for line in inside),
+        "\t</CoordinateDefinitions>",
+        "</PlusConfiguration>",
+        "",
+    ]
+    return newline.join(lines).encode()
+
+
+VARIANTS = {
+    "lf": configuration(OLD, OTHER, newline="\n"),
+    "crlf": configuration(OLD, OTHER),
+    "bom": b"\xef\xbb\xbf" + configuration(OLD, OTHER),
+    "latin": configuration(OLD.replace("/>", " Date='M\xe4rz'/>"), head="<?xml version='1.0' "
+                           "encoding='ISO-8859-1'?>").decode().encode("latin-1"),
+    "single quotes": configuration(OLD.replace('"', "'")),
+    "tabs in the matrix": configuration(OLD.replace("1 0 0 0", "1\t0\t0\t0")),
+    "lines in the matrix": configuration(OLD.replace(" 0 1 0 0 ", "\r\n\t\t0 1 0 0\r\n ")),
+    "end tag": configuration(OLD.replace("/>", "></Transform>")),
+    "comment inside": configuration(OLD.replace("/>", "><!-- a /> b --></Transform >")),
+    "greater than": configuration(OLD.replace("/>", " Date='a > b /> c'/>")),
+    "blanks": configuration(OLD.replace(' From="', '\r\n   From = "')),
+    "lower case": configuration(OLD.replace('"Image"', '"image"')),
+    "inverse": configuration(OLD.replace('"Image" To="Probe"', '"Probe" To="Image"')),
+    "persistent": configuration(OLD.replace("/>", ' Persistent="FALSE" Error="3" />')),
+    "last": configuration(OTHER, OLD),
+    "twice in a line": configuration(OTHER + OLD),
+    "no element": configuration(OTHER),
+    "empty": configuration(),
+    "no definitions": configuration(OLD).replace(b"CoordinateDefinitions", b"Else"),
+    "entities of XML": configuration(OTHER.replace("StylusTip", "A&amp;B"), OLD),
+    "error and date": configuration(OLD.replace("/>", ' Error="0.9" Date="021513_103745"/>')),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_only_the_element_changes(name, tmp_path):
+    old = VARIANTS[name]
+    new, _ = patched_configuration(old, IMAGE, MATRIX, error_mm=0.5, date=DATE)
+    (tmp_path / "c.xml").write_bytes(new)
+    found = read_configuration(tmp_path / "c.xml").find(*IMAGE)
+    assert found is not None
+    np.testing.assert_array_equal(found.matrix, MATRIX)
+    assert found.error_mm == 0.5
+    assert found.date == "2026.11.21 21:00:00"
+    put = found_element(parse_xml(new))
+    replaced = [element for element in transforms(old) if is_between(element)]
+    if replaced:
+        # By expat's own offsets: every byte before and after the element is as it was.
+        assert new[: put.start] == old[: replaced[0].start]
+        assert new[put.end :] == old[replaced[0].end :]
+    else:
+        # What was put in is one piece, and the rest is as it was.
+        before = next(k for k in range(len(new)) if new[k : k + 1] != old[k : k + 1])
+        assert old == new[:before] + new[before + len(new) - len(old) :]
+    if b"\r\n" in old:
+        assert b"\n" not in new.replace(b"\r\n", b"")
+    # Done again, nothing changes.
+    assert patched_configuration(new, IMAGE, MATRIX, error_mm=0.5, date=DATE)[0] == new
+
+
+def transforms(content):
+    return list(parse_xml(content).all("CoordinateDefinitions/Transform"))
+
+
+def is_between(element):
+    names = {element.attributes["From"].capitalize(), element.attributes["To"]}
+    return names == {"Image", "Probe"}
+
+
+def found_element(root):
+    return next(
+        t for t in root.all("CoordinateDefinitions/Transform")
+        if (t.attributes["From"], t.attributes["To"]) == IMAGE
+    )  # fmt: skip
+
+
+def test_other_attributes_are_kept():
+    new, _ = patched_configuration(VARIANTS["persistent"], IMAGE, MATRIX)
+    attributes = found_element(parse_xml(new)).attributes
+    assert attributes["Persistent"] == "FALSE"
+    assert "Error" not in attributes
+
+
+@pytest.mark.parametrize(
+    ("inside", "message"),
+    [
+        ([OLD, OLD], "lines 7 and 8: 2 transforms between Image and Probe"),
+        ([OLD, OLD.replace('"Image" To="Probe"', '"Probe" To="Image"')], "2 transforms between"),
+        (
+            [OTHER.replace("StylusTip", "Image").replace('"Stylus"', '"X"'),
+             OTHER.replace("StylusTip", "Probe").replace('"Stylus"', '"X"')],
+            "Image to X (line 7), Probe to X (line 8); PLUS refuses a second path",
+        ),
+        ([OLD.replace(' From="Image"', "")], "line 7: <Transform> has no From"),
+    ],
+)  # fmt: skip
+def test_what_plus_refuses(inside, message, tmp_path):
+    path = tmp_path / "c.xml"
+    path.write_bytes(configuration(*inside))
+    with pytest.raises(FormatError, match=re.escape(message)) as caught:
+        patch_configuration(path, IMAGE, MATRIX)
+    assert str(caught.value).startswith(str(path))
+    assert path.read_bytes() == configuration(*inside)
+
+
+BOMB = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>'
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (configuration(OLD, head=BOMB), "document types and entities are not read"),
+        (configuration(OLD, head="<!DOCTYPE x SYSTEM 'file:///etc/passwd'>"), "are not read"),
+        (configuration(OLD).decode().encode("utf-16"), "is UTF-16"),
+        (b"<a>" * 100 + b"</a>" * 100, "nested more than"),
+        (b"<PlusConfiguration>", "is not XML"),
+        (b"<Other/>", "its root is 'Other'"),
+        (
+            configuration("<Transform From='A' To='B' Matrix='1 2 3'/>"),
+            "line 7: Matrix of <Transform> has 3 numbers, 16",
+        ),
+        (configuration(OLD.replace("1 0 0 0 0", "nan 0 0 0 0")), "<Transform> holds NaN"),
+        (configuration(OLD.replace("1 0 0 0 0", "1 x 0 0 0")), "is not numbers"),
+        (configuration(OLD.replace('0 0 0 1"', '0 0 1 1"')), "last row is not 0 0 0 1"),
+    ],
+)  # fmt: skip
+def test_configuration_that_lies(content, message, tmp_path):
+    (tmp_path / "c.xml").write_bytes(content)
+    with pytest.raises(FormatError, match=re.escape(message)) as caught:
+        read_configuration(tmp_path / "c.xml")
+    assert str(caught.value).startswith(str(tmp_path / "c.xml"))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (MATRIX @ np.diag([1, 1, -1, 1.0]), "is a reflection"),
+        (np.full((4, 4), np.nan), "4 x 4 and finite"),
+        (MATRIX.T, "last row must be 0 0 0 1"),
+    ],
+)
+def test_matrices_that_plus_would_not_take(matrix, message):
+    with pytest.raises(InputError, match=message):
+        patched_configuration(configuration(OLD), IMAGE, matrix)
+
+
+def test_stale_pixel_size_is_told():
+    scaled = OTHER.replace("StylusTip", "TransducerOriginPixel").replace(
+        '"Stylus"', '"TransducerOrigin"'
+    )
+    _, notes = patched_configuration(configuration(OLD, scaled), IMAGE, MATRIX)
+    assert "still has pixels of 1 x 1 mm" in notes[0]
+
+
+def test_paste_and_command():
+    text = transform_element(IMAGE, MATRIX, error_mm=1.25, date=DATE)
+    numbers = np.array(parse_xml(text.encode()).attributes["Matrix"].split(), float)
+    np.testing.assert_array_equal(numbers.reshape(4, 4), MATRIX)
+    command = parse_xml(update_transform_command(IMAGE, MATRIX, error_mm=0.5).encode())
+    assert command.attributes["TransformName"] == "ImageToProbe"
+    numbers = np.array(command.attributes["TransformValue"].split(), float)
+    np.testing.assert_array_equal(numbers.reshape(4, 4), MATRIX)
+    with pytest.raises(FormatError, match="cannot name a coordinate frame"):
+        transform_element(('Image"><x/>', "Probe"), MATRIX)
+
+
+# Real files.
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "PlusDeviceSet_IPEA_OptimizationMethod.xml",
+        "PlusDeviceSet_fCal_Sim_SpatialCalibration_2.0.xml",
+        "PlusDeviceSet_fCal_Sonix_NDIPolaris_LegoPhantom3_3Nwire.xml",
+    ],
+)
+def test_real_configurations(real_data, name):
+    path = real_data / "plus" / name
+    old = path.read_bytes()
+    known = read_configuration(path)
+    assert len(known.wires) == 3
+    assert all(len(pattern) == 3 for pattern in known.wires)
+    new, _ = patched_configuration(old, IMAGE, MATRIX)
+    found = found_element(parse_xml(new))
+    assert old.startswith(new[: found.start].rstrip())
+    had = [t for t in parse_xml(old).all("CoordinateDefinitions/Transform")
+           if {t.attributes["From"], t.attributes["To"]} == set(IMAGE)]  # fmt: skip
+    if had:
+        assert new[: had[0].start] == old[: had[0].start]
+        assert new[found.end :] == old[had[0].end :]
+
+
+def test_fcal_result_reproduces_its_errors(real_data):
+    """Each error of PLUS's report from wires, points and poses alone: fixes every convention."""
+    folder = real_data / "plus"
+    result = read_result(folder / "IPEA_OptimizationMethod_Calibration.results.xml")
+    known = read_configuration(folder / "PlusDeviceSet_IPEA_OptimizationMethod.xml")
+    image_to_probe = result.find("Image", "Probe").matrix
+    phantom = known.find("Phantom", "Reference").matrix
+    assert len(result.validation) == len(result.calibration) == 200
+    assert sum(frame.status == "OK" for frame in result.validation) == 73
+    assert sum(frame.status == "OK" for frame in result.calibration) == 75
+    errors = []
+    for frame in result.validation:
+        for middle, stated in frame.errors_mm.items():
+            pose = np.linalg.inv(frame.transforms["Reference", "Tracker"])
+            pose = pose @ frame.transforms["Probe", "Tracker"]
+            wires = next(p for p in known.wires if any(w.name in middle for w in p))
+            points = [next(v for k, v in frame.points.items() if k.endswith(w.name)) for w in wires]
+            in_phantom = middle_point(wires, points)
+            there = np.linalg.inv(pose) @ phantom @ [*in_phantom, 1]
+            here = image_to_probe @ [*points[1], 0, 1]
+            found = np.linalg.norm(there - here)
+            assert abs(found - stated) < 2e-3
+            errors.append(found)
+    assert len(errors) == 219
+    kept = np.sort(errors)[: round(0.95 * len(errors))]
+    assert abs(kept.mean() - result.validation_error_mm) < 2e-4
+
+
+def middle_point(wires, points):
+    first, middle, third = ((w.front, w.back) for w in wires)
+    alpha = np.linalg.norm(points[1] - points[0]) / np.linalg.norm(points[2] - points[0])
+    crossing = [intersection(middle, first), intersection(middle, third)]
+    return crossing[0] + alpha * (crossing[1] - crossing[0])
+
+
+def intersection(line, other):
+    a, b = line[1] - line[0], other[1] - other[0]
+    solution = np.linalg.lstsq(np.stack([a, -b], axis=1), other[0] - line[0], rcond=None)[0]
+    return line[0] + solution[0] * a
+
+
+def test_command_line_leaves_a_refused_configuration(tmp_path, capsys):
+    (tmp_path / "c.xml").write_bytes(configuration(OLD, OLD))
+    np.save(tmp_path / "m.npy", np.diag([0.1, 0.2, 0.15, 1]))
+    assert main(["export", str(tmp_path / "m.npy"), "--plus-config", str(tmp_path / "c.xml")]) == 2
+    assert "2 transforms between" in capsys.readouterr().err
+    assert (tmp_path / "c.xml").read_bytes() == configuration(OLD, OLD)

@@ -1,0 +1,431 @@
+"""A calibration in use: applied, saved and loaded in every format, without JAX."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import threading
+
+import h5py
+import numpy as np
+import pytest
+
+from jaxcal.cli.main import main
+from jaxcal.errors import FormatError, InputError
+from jaxcal.io.itk import itk_from_matrix, itk_text, matrix_from_itk, read_itk, write_itk
+from jaxcal.io.ros import read_ros_yaml
+from jaxcal.io.tus_rec import read_scan
+from jaxcal.poses import quaternion_from_rotation, rotations_from_quaternions
+from jaxcal.serving import TransformServer
+from jaxcal.transform import ImageTransform, load_calibration, transform_from_plus_matrix
+
+
+def random_transform(seed: int = 0, scale=(0.148, 0.14), offset: float = 1.5) -> ImageTransform:
+    rng = np.random.default_rng(seed)
+    quaternion = rng.normal(size=4)
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotations_from_quaternions(
+        quaternion[None] / np.linalg.norm(quaternion), "xyzw"
+    )[0]
+    matrix[:3, 3] = rng.uniform(-150, 150, 3)
+    root = rng.normal(size=(6, 6)) * [0.2, 0.2, 0.2, 0.01, 0.01, 0.01]
+    return ImageTransform(
+        matrix, None if scale is None else np.array(scale), offset, root.T @ root, 0.7, True
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_plus_matrix_is_jaxcals_model(seed):
+    """Eq. of the README, pixel by pixel, and PLUS's rule for the third column."""
+    known = random_transform(seed)
+    pixels = np.random.default_rng(seed).uniform(0, 600, (20, 2))
+    s_u, s_v = known.scale_mm_per_px
+    plane = np.stack(
+        [s_u * pixels[:, 0], np.zeros(20), s_v * pixels[:, 1] + 1.5, np.ones(20)], axis=1
+    )
+    expected = (plane @ known.image_plane_to_probe.T)[:, :3]
+    homogeneous = np.column_stack([pixels, np.zeros(20), np.ones(20)])
+    matrix = known.plus_matrix()
+    np.testing.assert_allclose((homogeneous @ matrix.T)[:, :3], expected, atol=1e-11)
+    np.testing.assert_allclose(known.apply(pixels).points, expected, atol=1e-11)
+    assert np.linalg.det(matrix[:3, :3]) > 0
+    third = np.cross(matrix[:3, 0] / s_u, matrix[:3, 1] / s_v) * (s_u + s_v) / 2
+    np.testing.assert_allclose(matrix[:3, 2], third, atol=1e-14)
+    # The elevational axis is minus the third column's direction.
+    assert matrix[:3, 2] @ known.image_plane_to_probe[:3, 1] < 0
+
+
+@pytest.mark.parametrize("extension", ["json", "xml", "tfm", "txt", "h5", "csv", "npy"])
+def test_saved_and_loaded(tmp_path, extension):
+    known = random_transform()
+    path = tmp_path / f"cal.{extension}"
+    known.save(path)
+    if extension == "xml":
+        text = path.read_text()
+        path.write_text(f"<PlusConfiguration><CoordinateDefinitions>{text}</CoordinateDefinitions>"
+                        "</PlusConfiguration>")  # fmt: skip
+    found = load_calibration(path)
+    np.testing.assert_allclose(found.plus_matrix(), known.plus_matrix(), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        found.image_plane_to_probe[:3, :3], known.image_plane_to_probe[:3, :3], atol=1e-13
+    )
+    if extension == "json":
+        np.testing.assert_array_equal(found.covariance, known.covariance)
+        assert (found.face_offset_mm, found.error_mm, found.converged) == (1.5, 0.7, True)
+
+
+def test_ros_is_rigid_and_in_metres(tmp_path):
+    known = random_transform()
+    known.save(tmp_path / "cal.yaml")
+    np.testing.assert_allclose(
+        read_ros_yaml(tmp_path / "cal.yaml"), known.image_plane_to_probe, atol=1e-12
+    )
+    text = (tmp_path / "cal.yaml").read_text()
+    x = float(re.search(r"--x (\S+) ", text)[1])
+    assert x == pytest.approx(known.image_plane_to_probe[0, 3] / 1000)
+    assert "--frame-id probe --child-frame-id image" in text
+    # A number without a point would be text in YAML 1.1.
+    tiny = ImageTransform(np.eye(4) + np.pad([[1e-2]], ((0, 3), (3, 0))))
+    assert "x: 1.0e-05\n" in tiny.text("ros")
+    # No pixels are needed, unlike everywhere else.
+    with pytest.raises(InputError, match="--pixel-size"):
+        tiny.plus_matrix()
+
+
+def test_tus_rec_counts_from_one(tmp_path):
+    known = random_transform()
+    known.save(tmp_path / "calib_matrix.csv")
+    lines = (tmp_path / "calib_matrix.csv").read_text().splitlines()
+    assert len(lines) == 10
+    scaling, rigid = (
+        np.array([[float(cell) for cell in line.split(",")] for line in lines[k : k + 4]])
+        for k in (1, 6)
+    )
+    pixel = np.array([17.0, 230.0])
+    counted = rigid @ scaling @ [*(pixel + 1), 0, 1]
+    np.testing.assert_allclose(counted[:3], known.apply(pixel).points[0], atol=1e-11)
+
+
+def test_tus_rec_scan(tmp_path):
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (5, 8, 9), dtype=np.uint8)
+    transforms = np.tile(np.eye(4), (5, 1, 1))
+    transforms[:, 0, 3] = np.arange(5)
+    with h5py.File(tmp_path / "scan.h5", "w") as file:
+        file["tforms"] = transforms
+        file.create_dataset("frames", data=frames, chunks=(1, 8, 9), compression="gzip")
+    found = read_scan(tmp_path / "scan.h5")
+    np.testing.assert_array_equal(found.poses("Tool", "Tracker")[0], transforms)
+    np.testing.assert_array_equal(np.array(list(found.images([1, 3]))), frames[[1, 3]])
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = 1
+    with pytest.raises(FormatError, match=r"other\.h5: is no scan of TUS-REC"):
+        read_scan(tmp_path / "other.h5")
+
+
+# ITK and Slicer.
+
+
+def slicer_snippet(parameters, fixed):
+    """Slicer's documented way from an ITK transform to its own matrix (script repository)."""
+    lps = np.diag([-1.0, -1.0, 1.0, 1.0])
+    linear, translation = np.reshape(parameters[:9], (3, 3)), np.array(parameters[9:])
+    matrix = np.eye(4)
+    matrix[:3, :3] = linear
+    matrix[:3, 3] = translation + fixed - linear @ fixed
+    return np.linalg.inv(lps @ matrix @ lps)
+
+
+@pytest.mark.parametrize("fixed", [np.zeros(3), np.array([5.0, -3.0, 40.0])])
+def test_slicers_documented_snippet(fixed):
+    matrix = random_transform().plus_matrix()
+    parameters = itk_from_matrix(matrix)
+    # The same transform about another centre.
+    linear = parameters[:9].reshape(3, 3)
+    parameters[9:] += linear @ fixed - fixed
+    np.testing.assert_allclose(slicer_snippet(parameters, fixed), matrix, rtol=0, atol=1e-12)
+    found = matrix_from_itk("AffineTransform_double_3_3", parameters, fixed)
+    np.testing.assert_allclose(found, matrix, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("extension", ["tfm", "txt", "h5"])
+def test_itk_files_by_itk(tmp_path, extension):
+    sitk = pytest.importorskip("SimpleITK")
+    matrix = random_transform().plus_matrix()
+    path = tmp_path / f"t.{extension}"
+    write_itk(path, matrix)
+    read = sitk.ReadTransform(str(path))
+    np.testing.assert_array_equal(read.GetParameters(), itk_from_matrix(matrix))
+    np.testing.assert_array_equal(read.GetFixedParameters(), [0, 0, 0])
+    # And the other way, with a centre, and as rigid transforms.
+    affine = sitk.AffineTransform(3)
+    affine.SetCenter((1.0, 2.0, 3.0))
+    affine.SetMatrix(itk_from_matrix(matrix)[:9].tolist())
+    versor = sitk.VersorRigid3DTransform()
+    versor.SetRotation((1.0, 2.0, -1.0), 0.7)
+    versor.SetTranslation((4.0, 5.0, 6.0))
+    versor.SetCenter((1.0, -2.0, 3.0))
+    euler = sitk.Euler3DTransform((9.0, 8.0, 7.0), 0.3, -0.5, 0.9, (1.0, 2.0, 3.0))
+    for transform in (affine, versor, euler):
+        sitk.WriteTransform(transform, str(path))
+        found = read_itk(path)
+        lps = np.diag([-1.0, -1.0, 1.0])
+        for point in np.random.default_rng(0).normal(size=(5, 3)) * 50:
+            stored = lps @ np.array(transform.TransformPoint((lps @ point).tolist()))
+            np.testing.assert_allclose((found @ [*stored, 1])[:3], point, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (itk_text(np.eye(4)).replace("#Insight", "#Outsight"), "its first line is another"),
+        (itk_text(np.eye(4)).replace(" 1.0 ", " nan "), "holds NaN"),
+        (itk_text(np.eye(4)).replace(" 1.0 ", " ", 1), "with 11 parameters is not read"),
+        (itk_text(np.eye(4)).replace(" 1.0 ", " 0.0 "), "is singular"),
+        (itk_text(np.eye(4)).replace("Affine", "BSpline"), "is not read"),
+        (itk_text(np.eye(4)) + "Transform: X\n", "a second 'Transform'"),
+        ("#Insight Transform File V1.0\n", "holds no transform"),
+    ],
+)
+def test_itk_text_that_lies(tmp_path, text, message):
+    (tmp_path / "t.tfm").write_text(text)
+    with pytest.raises(FormatError, match=message) as caught:
+        read_itk(tmp_path / "t.tfm")
+    assert str(caught.value).startswith(str(tmp_path / "t.tfm"))
+
+
+# Applying.
+
+
+def test_apply_with_pose_and_covariance():
+    """Against a Monte-Carlo simulation of the stated law."""
+    known = random_transform(4)
+    small = ImageTransform(
+        known.image_plane_to_probe, known.scale_mm_per_px, 1.5, known.covariance * 1e-4
+    )
+    pose = random_transform(5).image_plane_to_probe
+    pixel = np.array([300.0, 410.0])
+    applied = small.apply(pixel, pose, pixel_sd_px=(0.1, 0.3))
+    rng = np.random.default_rng(0)
+    draws = rng.multivariate_normal(np.zeros(6), small.covariance, 40_000)
+    moved = pixel + rng.normal(size=(40_000, 2)) * [0.1, 0.3]
+    s_u, s_v = small.scale_mm_per_px
+    plane = np.stack([s_u * moved[:, 0], np.zeros(40_000), s_v * moved[:, 1] + 1.5], axis=1)
+    plane = plane + draws[:, :3] + np.cross(draws[:, 3:], plane)
+    x = pose @ small.image_plane_to_probe
+    points = plane @ x[:3, :3].T + x[:3, 3]
+    np.testing.assert_allclose(points.mean(axis=0), applied.points[0], atol=5e-3)
+    spread = np.cov(points.T)
+    np.testing.assert_allclose(applied.covariance[0], spread, atol=0.03 * np.trace(spread))
+
+
+def test_pixels_for_a_calibration_in_mm():
+    known = random_transform(scale=None, offset=0.0)
+    with_pixels = known.with_pixels((0.2, 0.1), (64.0, -10.0))
+    millimetres = np.array([[3.0, 40.0], [-7.0, 12.0]])
+    pixels = millimetres / [0.2, 0.1] + [64.0, -10.0]
+    expected, found = known.apply(millimetres), with_pixels.apply(pixels)
+    np.testing.assert_allclose(found.points, expected.points, atol=1e-11)
+    np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-11)
+    with pytest.raises(InputError, match="pixels of its own"):
+        with_pixels.with_pixels((1.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("pixels", "pose", "message"),
+    [
+        ([[1.0, 2, 3]], None, "shape"),
+        ([[np.nan, 2]], None, "finite"),
+        ([[1.0, 2]], np.eye(4)[None].repeat(2, 0), "1 pixels but 2 poses"),
+        ([[1.0, 2]], np.diag([1.0, 1, -1, 1]), "is a reflection"),
+    ],
+)
+def test_apply_refuses(pixels, pose, message):
+    with pytest.raises(InputError, match=message):
+        random_transform().apply(np.array(pixels), pose)
+
+
+# What is loaded.
+
+
+def test_older_json(tmp_path):
+    """Before version 1 the field had the name of PLUS's matrix."""
+    known = random_transform(offset=0.0)
+    record = {
+        "method": "joint", "image_to_probe": known.image_plane_to_probe.tolist(),
+        "scale_mm_per_px": known.scale_mm_per_px.tolist(), "jaxcal_version": "0.1.0",
+    }  # fmt: skip
+    (tmp_path / "old.json").write_text(json.dumps(record))
+    found = load_calibration(tmp_path / "old.json")
+    np.testing.assert_allclose(found.plus_matrix(), known.plus_matrix(), atol=1e-12)
+
+
+def good_record():
+    return json.loads(random_transform().text("json"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": "other"}, "its format is 'other'"),
+        ({"version": 2}, "understands version 1: update jaxcal"),
+        ({"version": "x"}, "is version 'x'"),
+        (
+            {"image_plane_to_probe": None},
+            "image_plane_to_probe is missing, or the solve had failed",
+        ),
+        ({"image_plane_to_probe": [1] * 15}, r"must have shape \(4, 4\), it has \(15,\)"),
+        ({"image_plane_to_probe": "x"}, "must be numbers"),
+        ({"image_plane_to_probe": [[None] * 4] * 4}, "the solve had failed"),
+        ({"image_plane_to_probe": np.diag([1, 1, -1, 1]).tolist()}, "is a reflection"),
+        ({"scale_mm_per_px": [0, 1]}, "must be positive"),
+        ({"covariance": [[1]]}, r"must have shape \(6, 6\)"),
+    ],
+)
+def test_json_that_lies(tmp_path, change, message):
+    (tmp_path / "c.json").write_text(json.dumps(good_record() | change))
+    with pytest.raises(InputError, match=message) as caught:
+        load_calibration(tmp_path / "c.json")
+    assert str(caught.value).startswith(str(tmp_path / "c.json"))
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (np.diag([0.1, -0.1, 0.1, 1]), "is a reflection"),
+        (np.diag([0.1, 0, 0.1, 1]), "pixels without a size"),
+        (np.diag([0.1, np.nan, 0.1, 1]), "finite"),
+        (np.diag([0.1, 0.1, 0.1, 2]), "last row"),
+        (np.eye(4) + np.pad([[0.1]], ((0, 3), (1, 2))), "degrees apart: fCal fitted"),
+    ],
+)
+def test_matrices_that_are_no_calibration(matrix, message):
+    with pytest.raises(InputError, match=message):
+        transform_from_plus_matrix(matrix)
+
+
+def test_json_bombs(tmp_path):
+    (tmp_path / "c.json").write_text("[" * 100_000)
+    with pytest.raises(FormatError, match="is not JSON"):
+        load_calibration(tmp_path / "c.json")
+    (tmp_path / "c.npy").write_bytes(b"\x80\x04cos\nsystem\n")
+    with pytest.raises(FormatError, match="is not an array of numbers"):
+        load_calibration(tmp_path / "c.npy")
+
+
+def test_quaternions_there_and_back():
+    quaternions = np.random.default_rng(0).normal(size=(50, 4))
+    quaternions[:4] = np.eye(4)
+    quaternions /= np.linalg.norm(quaternions, axis=1)[:, None]
+    quaternions *= np.where(quaternions[:, 3:] < 0, -1, 1)
+    for quaternion, rotation in zip(
+        quaternions, rotations_from_quaternions(quaternions, "xyzw"), strict=True
+    ):
+        found = quaternion_from_rotation(rotation)
+        assert min(np.abs(found - quaternion).max(), np.abs(found + quaternion).max()) < 1e-14
+    first = rotations_from_quaternions(quaternions[:, [3, 0, 1, 2]], "wxyz")
+    np.testing.assert_allclose(first, rotations_from_quaternions(quaternions, "xyzw"), atol=1e-14)
+
+
+# Command lines.
+
+
+@pytest.fixture
+def saved(tmp_path):
+    random_transform().save(tmp_path / "cal.json")
+    return tmp_path / "cal.json"
+
+
+@pytest.mark.parametrize("name", ["plus", "slicer", "itk", "ros", "tusrec", "numpy"])
+def test_export_to_standard_output(saved, capsys, name):
+    assert main(["export", str(saved), f"--{name}"]) == 0
+    assert capsys.readouterr().out == random_transform().text(name)
+
+
+def test_export_to_files(saved, tmp_path, capsys):
+    for name, out in (("slicer", "a.tfm"), ("itk", "a.h5"), ("numpy", "a.npz"), ("numpy", "a.npy")):
+        assert main(["export", str(saved), f"--{name}", str(tmp_path / out)]) == 0
+    matrix = random_transform().plus_matrix()
+    with np.load(tmp_path / "a.npz") as arrays:
+        np.testing.assert_array_equal(arrays["plus_image_to_probe"], matrix)
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), matrix)
+    np.testing.assert_allclose(
+        load_calibration(tmp_path / "a.h5").plus_matrix(), matrix, atol=1e-12
+    )
+    capsys.readouterr()
+    assert main(["export", str(saved)]) == 2
+    assert "name one format" in capsys.readouterr().err
+
+
+def test_what_did_not_converge_is_not_handed_on(saved, capsys):
+    saved.write_text(json.dumps(good_record() | {"converged": False}))
+    for command in (["export", "--plus"], ["apply", "--pixel", "1", "2"], ["serve"]):
+        assert main([command[0], str(saved), *command[1:]]) == 2
+        assert "must not be used" in capsys.readouterr().err
+
+
+def test_apply_to_a_table(saved, tmp_path, capsys):
+    (tmp_path / "p.csv").write_text("v;u\n12,5;300\n40;7,25\n")
+    assert main(["apply", str(saved), str(tmp_path / "p.csv"), "--pixel-sd", "0.5"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    applied = random_transform().apply(np.array([[300, 12.5], [7.25, 40]]), pixel_sd_px=0.5)
+    rows = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
+    np.testing.assert_allclose(rows[:, :3], applied.points, rtol=1e-15)
+    np.testing.assert_allclose(rows[:, 3] ** 2, applied.covariance[:, 0, 0])
+    (tmp_path / "p.csv").write_text("lateral,range\n1,2\n")
+    assert main(["apply", str(saved), str(tmp_path / "p.csv")]) == 2
+    assert "the calibration takes pixels" in capsys.readouterr().err
+
+
+def test_served_to_another_client():
+    """pyigtl, which is not ours, gets the matrix at once, and again."""
+    pyigtl = pytest.importorskip("pyigtl")
+    matrix = random_transform().plus_matrix()
+    stop = threading.Event()
+    with TransformServer("ImageToProbe", matrix, port=0) as server:
+        thread = threading.Thread(target=server.serve, args=(0.02, stop.is_set))
+        thread.start()
+        client = pyigtl.OpenIGTLinkClient("127.0.0.1", server.port)
+        try:
+            for _ in range(2):
+                message = client.wait_for_message("ImageToProbe", timeout=20)
+                np.testing.assert_allclose(message.matrix, matrix, atol=1e-4)
+        finally:
+            client.stop()
+            stop.set()
+            thread.join()
+
+
+def test_server_refuses():
+    with pytest.raises(InputError, match="1 to 20 bytes"):
+        TransformServer("TransducerOriginPixelsToProbe", np.eye(4), port=0)
+    with (
+        TransformServer("ImageToProbe", np.eye(4), port=0) as server,
+        pytest.raises(InputError, match="cannot listen at"),
+    ):
+        TransformServer("ImageToProbe", np.eye(4), port=server.port, host="256.0.0.1")
+
+
+def test_no_jax(saved, tmp_path):
+    """Loading, applying, converting and reading recordings must not cost JAX's start-up time."""
+    code = (
+        "import sys, numpy as np, jaxcal; from jaxcal.cli.main import main\n"
+        "c = jaxcal.load_calibration(sys.argv[1]); c.apply(np.ones((2, 2)))\n"
+        "assert main(['export', sys.argv[1], '--plus']) == 0\n"
+        "c.save(sys.argv[2] + '/a.h5'); jaxcal.load_calibration(sys.argv[2] + '/a.h5')\n"
+        "open(sys.argv[2] + '/t.csv', 'w').write('u,v,x,y,z,qx,qy,qz,qw\\n' + ''.join(\n"
+        "    f'{k},{2 * k},{k},0,9,0,0,0,1\\n' for k in range(1, 9)))\n"
+        "assert main(['import', sys.argv[2] + '/t.csv', sys.argv[2] + '/r.h5']) == 0\n"
+        "assert len(jaxcal.load(sys.argv[2] + '/r.h5')) == 8\n"
+        "assert main(['apply', sys.argv[1], sys.argv[2] + '/r.h5', '--out', "
+        "sys.argv[2] + '/p.csv']) == 0\n"
+        "import jaxcal.importing, jaxcal.io.plus, jaxcal.io.trackers, jaxcal.serving\n"
+        "loaded = {name.split('.')[0] for name in sys.modules}\n"
+        "assert not loaded & {'jax', 'jaxlib', 'equinox', 'optimistix', 'matplotlib'}, loaded\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, saved, tmp_path], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
