@@ -105,16 +105,15 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
             )
         else:
             roles[role] = index
+    strange = [k for k in rest if not (_CELL.fullmatch(bases[k]) or _NUMBERED.fullmatch(bases[k]))]
+    if strange:
+        raise _unknown(names, strange[0])
     quaternion_columns = _quaternion(roles, numbered, quaternion)
     rest = [index for index in rest if index not in (quaternion_columns or ())]
     translation = _complete(roles, ("x", "y", "z"), "x, y and z")
     matrix, unknown = _matrix(rest, list(bases), translation)
     if unknown:
-        raise FormatError(
-            f"the header's column {unknown[0] + 1}, {quoted(names[unknown[0]])}, is not known: "
-            "name the columns time, u, v, x, y, z, qx, qy, qz, qw or m11 to m34, or leave the "
-            "header out"
-        )
+        raise _unknown(names, unknown[0])
     if matrix is not None and translation is not None and len(matrix) == 16:
         raise FormatError("the header names both a whole matrix and x, y, z")
     if (quaternion_columns is None) != (translation is None) and matrix is None:
@@ -134,6 +133,13 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
         length_mm=_length(lengths, names, list(units)),
         point_unit=point_unit, time_s=TIMES_S[time_unit or "s"],
     )  # fmt: skip
+
+
+def _unknown(names: list[str], column: int) -> FormatError:
+    return FormatError(
+        f"the header's column {column + 1}, {quoted(names[column])}, is not known: name the "
+        "columns time, frame, u, v, x, y, z, qx, qy, qz, qw or m11 to m34, or leave the header out"
+    )
 
 
 def _base_and_unit(name: str) -> tuple[str, str | None]:
@@ -196,8 +202,7 @@ def _matrix(
         values = [int(number[2]) for number in numbers if number is not None]
         if values in (list(range(len(rest))), list(range(1, len(rest) + 1))):
             return tuple(rest), []
-    strange = [index for index, cell in zip(rest, cells, strict=True) if cell is None]
-    return None, strange or rest
+    return None, rest
 
 
 def _point(

@@ -52,6 +52,7 @@ def read_metaimage(path: Path, name: str) -> TrackedSequence:
         raise FormatError("is not a MetaImage sequence: DimSize or ElementDataFile is missing")
     columns, rows, count = _metaimage_size(fields)
     check_count(count, header)
+    _check_data_name(fields["ElementDataFile"])
     kind = fields.get("ElementType", "")
     pixels = None
     # Three forms of tracking alone: 0 0 N with either type, and 1 1 N with one dummy pixel a frame.
@@ -91,12 +92,15 @@ def _metaimage_pixels(
     ), count)  # fmt: skip
 
 
-def _beside(path: Path, data: str) -> Path:
-    """The file of pixels that a header names: in its own folder, and nowhere else."""
+def _check_data_name(data: str) -> None:
     if not data or data in ("LIST", ".", "..") or re.search(r"[/\\%:\0]", data) or " " in data:
         raise FormatError(
             f"ElementDataFile = {quoted(data)}: only LOCAL, or a file beside the header, is read"
         )
+
+
+def _beside(path: Path, data: str) -> Path:
+    """The file of pixels that a header names: in its own folder, and nowhere else."""
     file = path.parent / data
     try:
         check_readable(file)

@@ -1,0 +1,446 @@
+"""From other programs' files to a recording, and the whole way to a configuration of PLUS."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from conftest import REAL_DATA
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+import jaxcal
+from jaxcal.cli.main import main
+from jaxcal.errors import FormatError, InputError
+from jaxcal.importing import ImportOptions, import_files
+from jaxcal.io.columns import columns_of_header
+from jaxcal.io.sequence_files import read_sequence, write_sequence
+from jaxcal.io.slicer import read_markups
+from jaxcal.io.trackers import read_tracker
+
+PROBE, REFERENCE = ("Probe", "Tracker"), ("Reference", "Tracker")
+
+
+def random_poses(count: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
+    poses[:, :3, 3] = rng.uniform(-200, 200, (count, 3))
+    return poses
+
+
+POSES = random_poses(6)
+PIXELS = np.random.default_rng(1).uniform(50, 500, (6, 2))
+QUATERNIONS = Rotation.from_matrix(POSES[:, :3, :3]).as_quat()
+TRANSLATIONS = POSES[:, :3, 3]
+
+
+def table(names, columns, separator=",", comma=False):
+    lines = [] if names is None else [separator.join(names)]
+    for row in np.column_stack(columns).tolist():
+        cells = [repr(value) for value in row]
+        lines.append(separator.join(cell.replace(".", ",") if comma else cell for cell in cells))
+    return lines
+
+
+NAMES = ["u", "v", "x", "y", "z", "qx", "qy", "qz", "qw"]
+COLUMNS = [PIXELS, TRANSLATIONS, QUATERNIONS]
+SCALAR_FIRST = [PIXELS, TRANSLATIONS, QUATERNIONS[:, [3, 0, 1, 2]]]
+MATRIX = [f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        table(NAMES, COLUMNS),
+        table(["v", "u", *NAMES[2:]], [PIXELS[:, ::-1], TRANSLATIONS, QUATERNIONS]),
+        table(NAMES, COLUMNS, ";", comma=True),
+        table(NAMES, COLUMNS, "\t"),
+        table(NAMES, COLUMNS, " "),
+        table(["U [px]", "V [px]", "Tx (mm)", "Ty (mm)", "Tz (mm)", *NAMES[5:]], COLUMNS),
+        table(["u_px", "v_px", "tx_m", "ty_m", "tz_m", *NAMES[5:]],
+              [PIXELS, TRANSLATIONS / 1e3, QUATERNIONS]),
+        table([*NAMES[:5], "q0", "qx", "qy", "qz"], SCALAR_FIRST),
+        table([*NAMES[:5], "w", "qx", "qy", "qz"], SCALAR_FIRST),
+        table([*MATRIX, "u", "v"], [POSES[:, :3].reshape(6, 12), PIXELS]),
+        table(["u", "v", *(f"p{k}" for k in range(16))], [PIXELS, POSES.reshape(6, 16)]),
+        table(["u", "v", *(f"r{i}{j}" for i in range(1, 4) for j in range(1, 4)), "x", "y", "z"],
+              [PIXELS, POSES[:, :3, :3].reshape(6, 9), TRANSLATIONS]),
+        ["# a comment", "", *table([*NAMES, "name"], COLUMNS)[:1],
+         *(f"{line},image.png" for line in table(None, COLUMNS))],
+        table(['"u"', *NAMES[1:]], COLUMNS),
+    ],
+)  # fmt: skip
+def test_headers_are_read(tmp_path, lines):
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    recording, notes = import_files([tmp_path / "t.csv"])
+    images = recording.calibration
+    np.testing.assert_allclose(images.poses, POSES, atol=1e-11)
+    np.testing.assert_allclose(images.measurements, PIXELS, rtol=1e-14)
+    assert (images.kind, notes) == ("pixel", [])
+
+
+def test_times_of_every_kind(tmp_path):
+    for name, stamps, expected in (
+        ("time [ms]", [0.5, 1, 2, 4, 8, 9], np.array([0.5, 1, 2, 4, 8, 9]) / 1e3),
+        ("Timestamp", [f"2026-11-21T21:00:0{k}.5" for k in range(6)], np.arange(6.0)),
+    ):
+        lines = table(NAMES, COLUMNS)
+        lines = [
+            f"{name},{lines[0]}",
+            *(f"{s},{r}" for s, r in zip(stamps, lines[1:], strict=True)),
+        ]
+        (tmp_path / "t.csv").write_text("\n".join(lines))
+        found = import_files([tmp_path / "t.csv"])[0].calibration.time
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_quaternion_order_is_asked_for(tmp_path):
+    numbered = table([*NAMES[:5], "q1", "q2", "q3", "q4"], COLUMNS)
+    bare = table(None, [np.arange(6), TRANSLATIONS, QUATERNIONS, PIXELS])
+    for lines in (numbered, bare):
+        (tmp_path / "t.csv").write_text("\n".join(lines))
+        with pytest.raises(FormatError, match="--quaternion wxyz or xyzw"):
+            import_files([tmp_path / "t.csv"])
+        options = ImportOptions(quaternion="xyzw")
+        found = import_files([tmp_path / "t.csv"], options)[0].calibration
+        np.testing.assert_allclose(found.poses, POSES, atol=1e-11)
+        other = import_files([tmp_path / "t.csv"], ImportOptions(quaternion="wxyz"))[0].calibration
+        expected = Rotation.from_quat(QUATERNIONS[:, [1, 2, 3, 0]]).as_matrix()
+        np.testing.assert_allclose(other.poses[:, :3, :3], expected, atol=1e-12)
+
+
+def test_invalid_rows_are_counted(tmp_path):
+    lines = table([*NAMES, "status"], [*COLUMNS, np.ones(6)])
+    more = [lines[1].replace(",1.0", ",OUT_OF_VIEW"), "nan" + lines[2][lines[2].index(",") :]]
+    (tmp_path / "t.csv").write_text("\n".join([*lines, *more]))
+    with pytest.raises(FormatError, match=r"t\.csv:8: the row is marked as invalid"):
+        import_files([tmp_path / "t.csv"])
+    recording, notes = import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True))
+    assert len(recording) == 6
+    assert notes == [f"{tmp_path / 't.csv'}: 2 invalid rows left out"]
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["u", "v", "foo", *NAMES[3:]], "column 3, 'foo', is not known"),
+        (["u", "u", *NAMES[2:]], "columns 1 and 2 are both u"),
+        (["u", "row", "x", "y", "tz", "qx", "qy", "qz", "qz"], "columns 8 and 9 are both qz"),
+        (["u", "time", *NAMES[2:]], "has u but not all of u and v"),
+        (
+            ["u", "v", "x [mm]", "y [m]", "z [mm]", *NAMES[5:]],
+            "translations are in different units",
+        ),
+        (["u [px]", "v [mm]", *NAMES[2:]], "different units"),
+        (["u", "v", "x [in]", *NAMES[3:]], "unit of 'x [in]' is not known"),
+        (["u", "v", "x", "y", "z", "qx", "qy", "qz", "frame"], "not all of qx, qy, qz and qw"),
+    ],
+)
+def test_headers_that_are_refused(names, message):
+    with pytest.raises(FormatError, match=re.escape(message)):
+        columns_of_header(names, None)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda row: row.replace(",", ",nan,", 1).rsplit(",", 1)[0], ":4: column 2"),
+        (lambda row: row + ",1", ":4: 10 columns, the header has 9"),
+        (lambda row: row.rsplit(",", 1)[0] + ",0.5e9", ": quaternion in line 4 has length"),
+        (lambda row: row.replace(",", ",x", 1), ":4: column 2 ('v') is not a number"),
+    ],
+)  # fmt: skip
+def test_rows_that_are_refused(tmp_path, change, message):
+    rows = table(NAMES, COLUMNS)
+    (tmp_path / "t.csv").write_text("\n".join([*rows[:3], change(rows[3])]))
+    with pytest.raises(InputError, match=re.escape(message)):
+        import_files([tmp_path / "t.csv"])
+
+
+def test_times_that_go_back(tmp_path):
+    lines = table(["time", *NAMES], [[0.0, 1, 2, 2, 3, 1], *COLUMNS])
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    with pytest.raises(
+        InputError, match=r"t\.csv:5: the time stamp is not later than the one before"
+    ):
+        import_files([tmp_path / "t.csv"])
+    recording, notes = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
+    assert recording.calibration.time is None
+    assert "not kept" in notes[0]
+
+
+# Trackers' exports. The lines are those of real files, shortened.
+
+NDI = """\
+Tools,Port 0x01: JJH Probe  s/n:3E4C880C,Frame,Time [sec],Face,State,Q0,Qx,Qy,Qz,Tx,Ty,Tz,Error,Markers,State,Tx,Ty,Tz,Port 0x02: Ref,Frame,Time [sec],Face,State,Q0,Qx,Qy,Qz,Tx,Ty,Tz,Error,Markers,State,Tx,Ty,Tz
+3,Port 0x01: JJH Probe  s/n:3E4C880C,650512279,1778067471.318767388,1,OK,0.5973400,0.4357213,0.5083389,0.4415014,-42.126,-236.320,-1655.290,0.2372032,3,OK,-54.047,1,2,Port 0x02: Ref,1,1778067471.3,1,OK,1,0,0,0,1,2,3,0.1,3,OK,4,5,6
+3,Port 0x01: JJH Probe  s/n:3E4C880C,650537443,1778067890.718813102,1,Too Few Markers,-3.697314E28,-3.697314E28,-3.697314E28,-3.697314E28,-3.697314E28,-3.697314E28,-3.697314E28,-3.697314E28,0,Missing,,,,Port 0x02: Ref,1,1778067890.7,1,Missing,,,,,,,,,0,Missing,,,
+"""  # noqa: E501
+OLD_NDI = """\
+Tools,Port 1,Frame,Face,State,Q0,Qx,Qy,Qz,Tx,Ty,Tz,Error
+1,Port 1,7,0,OK,0.5973400,0.4357213,0.5083389,0.4415014,-42.126,-236.320,-1655.290,0.2
+"""
+MOTIVE = """\
+Format Version,1.23,Take Name,t,Export Frame Rate,120.000000,Rotation Type,Quaternion,Length Units,Meters,Coordinate Space,Global
+
+,Type,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body Marker
+,Name,Probe,Probe,Probe,Probe,Probe,Probe,Probe,Probe,Probe:M1
+,ID,1,1,1,1,1,1,1,1,2
+,,Rotation,Rotation,Rotation,Rotation,Position,Position,Position,Mean Marker Error,Position
+Frame,Time (Seconds),X,Y,Z,W,X,Y,Z,,X
+0,0.000000,0.4357213,0.5083389,0.4415014,0.5973400,-0.042126,-0.236320,-1.655290,0.0002,1
+1,0.008333,,,,,,,,,
+"""  # noqa: E501
+
+
+def test_trackers_exports(tmp_path):
+    expected = Rotation.from_quat([0.4357213, 0.5083389, 0.4415014, 0.5973400]).as_matrix()
+    for text, tool, time in (
+        (NDI, "JJH Probe", 1778067471.318767388),
+        (OLD_NDI, "Port 1", np.nan),
+        (MOTIVE, "Probe", 0.0),
+    ):
+        (tmp_path / "t.csv").write_text(text)
+        found = read_tracker(tmp_path / "t.csv")
+        pose = found.transforms[tool, "Tracker"][0]
+        np.testing.assert_allclose(pose[:3, :3], expected, atol=1e-6)
+        np.testing.assert_allclose(pose[:3, 3], [-42.126, -236.32, -1655.29], atol=1e-9)
+        np.testing.assert_equal(found.time[0], time)
+        np.testing.assert_array_equal(found.valid[tool, "Tracker"], [True, False][: len(found)])
+    (tmp_path / "t.csv").write_text(MOTIVE.replace("Quaternion", "XYZ"))
+    with pytest.raises(FormatError, match="export quaternions from Motive"):
+        read_tracker(tmp_path / "t.csv")
+    (tmp_path / "t.csv").write_text(MOTIVE.replace("Meters", "Furlongs"))
+    with pytest.raises(FormatError, match="Length Units 'furlongs' are not known"):
+        read_tracker(tmp_path / "t.csv")
+    (tmp_path / "t.csv").write_text(NDI.replace("0.5973400", "0.59x"))
+    with pytest.raises(FormatError, match=r"line 2: column 7 is not a number: '0\.59x'"):
+        read_tracker(tmp_path / "t.csv")
+
+
+# Sequences with points from another file.
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    """Six frames of tracking, of which number 2 is lost; Reference moves as well."""
+    references = random_poses(6, 9)
+    transforms = {PROBE: references @ POSES, REFERENCE: references}
+    valid = {PROBE: np.arange(6) != 2}
+    write_sequence(tmp_path / "s.igs.mha", transforms, 10 + np.arange(6) / 10, valid=valid)
+    return tmp_path / "s.igs.mha"
+
+
+KEPT = [0, 1, 3, 4, 5]
+
+
+def markups(system, sign, labels):
+    points = [
+        {"label": label, "position": [sign * u, sign * v, 0.0], "positionStatus": "defined"}
+        for label, (u, v) in zip(labels, PIXELS, strict=True)
+    ]
+    points.append({"label": "x", "position": [0, 0, 0], "positionStatus": "undefined"})
+    document = {"markups": [{"coordinateSystem": system, "controlPoints": points}]}
+    return json.dumps(document)
+
+
+def fcsv(sign):
+    rows = [
+        f"id{k},{sign * u!r},{sign * v!r},0,0,0,0,1,1,1,0,F-{k},,"
+        for k, (u, v) in enumerate(PIXELS.tolist())
+    ]
+    head = "# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n"
+    return head + "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc\n" + "\n".join(rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "points"),
+    [
+        ("p.mrk.json", markups("LPS", 1, [f"F-{k}" for k in range(6)]), "labels"),
+        ("p.mrk.json", markups("RAS", 1, [f"frame {k}" for k in range(6)]), "labels"),
+        ("p.mrk.json", markups("LPS", -1, ["?"] * 6), "order"),
+        ("p.fcsv", fcsv(1), "labels"),
+        ("p.fcsv", fcsv(-1), "order"),
+        ("p.csv", "\n".join(table(["frame", "v", "u"], [np.arange(6), PIXELS[:, ::-1]])), None),
+        ("p.csv", "\n".join(table(["time", "u", "v"], [10.01 + np.arange(6) / 10, PIXELS])), None),
+        ("p.csv", "\n".join(table(["u", "v"], [PIXELS])), None),
+    ],
+)
+def test_points_of_a_sequence(tmp_path, sequence, name, text, points):
+    (tmp_path / name).write_text(text)
+    recording, notes = import_files([sequence, tmp_path / name], ImportOptions(points=points))
+    images = recording.calibration
+    np.testing.assert_allclose(images.poses, POSES[KEPT], atol=1e-11)
+    np.testing.assert_allclose(images.measurements, PIXELS[KEPT], rtol=1e-14)
+    np.testing.assert_allclose(images.time, 10 + np.array(KEPT) / 10)
+    assert "poses from Probe to Reference" in notes[0]
+    assert "1 of 6 frames left out: their tracking was not OK" in notes
+    tracker = ImportOptions(points=points, target="Tracker")
+    found = import_files([sequence, tmp_path / name], tracker)[0].calibration.poses
+    np.testing.assert_allclose(found, (random_poses(6, 9) @ POSES)[KEPT], atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("p.mrk.json", markups("LPS", 1, ["F-0"] * 6), "how points belong to frames"),
+        ("p.mrk.json", "[" * 10**5, "is not JSON"),
+        ("p.mrk.json", "{}", "holds no markups"),
+        ("p.mrk.json", markups("XYZ", 1, ["F"] * 6), "neither LPS nor RAS"),
+        ("p.csv", "frame,u,v\n9,1,1\n", "frame 9 is not in the sequence"),
+        ("p.csv", "frame,u,v\n1,1,1\n1,2,2\n", "frame 1 has more than one point"),
+        ("p.csv", "frame,u,v\n1.5,1,1\n", "p.csv:2: column 1 is not the number of an image"),
+        ("p.csv", "time,u,v\n11.5,1,1\n", "line 2: no frame was taken at 11.5 s"),
+        ("p.csv", "u,v\n1,1\n", "has neither a column frame nor time stamps"),
+        ("p.csv", "frame,x,y,z,qx,qy,qz,qw\n1,1,1,1,0,0,0,1\n", "holds no points"),
+        ("p.csv", "frame,u,v\n0,1,1\n1,1,1\n2,3,4\n", "2 used images are too few"),
+    ],
+)
+def test_points_that_do_not_belong(tmp_path, sequence, name, text, message, capsys):
+    (tmp_path / name).write_text(text)
+    out = tmp_path / "out.h5"
+    assert main(["import", str(sequence), str(tmp_path / name), str(out)]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not out.exists()
+
+
+def test_label_without_a_number(tmp_path, sequence):
+    (tmp_path / "p.fcsv").write_text(fcsv(1).replace("F-3", "tip"))
+    with pytest.raises(
+        InputError, match="point 4: its label 'tip' does not end in a frame's number"
+    ):
+        import_files([sequence, tmp_path / "p.fcsv"], ImportOptions(points="labels"))
+
+
+def test_markups_are_ras(tmp_path):
+    (tmp_path / "p.mrk.json").write_text(markups("LPS", 1, "012345"))
+    found = read_markups(tmp_path / "p.mrk.json")
+    np.testing.assert_allclose(found.positions[:, :2], -PIXELS)
+    assert (found.labels, found.unplaced) == (tuple("012345"), 1)
+
+
+def test_stylus_tip_as_target(tmp_path, capsys):
+    """Pose = probe to stylus; the target is the tip, which rests in the stylus' frame."""
+    references = random_poses(6, 9)
+    transforms = {PROBE: references @ POSES, ("Stylus", "Tracker"): references}
+    write_sequence(tmp_path / "s.igs.mha", transforms, np.arange(6.0))
+    (tmp_path / "p.csv").write_text("\n".join(table(["u", "v"], [PIXELS])))
+    sources = [str(tmp_path / "s.igs.mha"), str(tmp_path / "p.csv"), str(tmp_path / "r.h5")]
+    assert main(["import", *sources, "--to", "Stylus"]) == 0
+    np.testing.assert_allclose(jaxcal.load(sources[2]).calibration.poses, POSES, atol=1e-11)
+    assert main(["import", *sources, "--from", "Needle"]) == 2
+    assert "no transforms lead from 'Needle'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("pattern", "replacement", "message"),
+    [
+        (rb"LOCAL", b"/etc/passwd", "only LOCAL"),
+        (rb"DimSize = 1 1 6", b"DimSize = 1 1 2147483648", "claims 2147483648 frames"),
+        (rb"(Seq_Frame0001_\w+Transform = )\S+ ", rb"\1", "16 numbers, not 15"),
+        (rb"(Seq_Frame0001_\w+Transform = )\S+ ", rb"\1nan ", "holds NaN"),
+        (rb"(Seq_Frame0003_Timestamp = )\S+", rb"\g<1>10.0", "the time stamp is not later"),
+    ],
+)
+def test_hostile_sequences_write_nothing(tmp_path, sequence, pattern, replacement, message, capsys):
+    content = sequence.read_bytes()
+    new, count = re.subn(pattern, replacement, content)
+    assert count
+    sequence.write_bytes(new)
+    (tmp_path / "p.csv").write_text("\n".join(table(["frame", "u", "v"], [np.arange(6), PIXELS])))
+    out = tmp_path / "out.h5"
+    assert main(["import", str(sequence), str(tmp_path / "p.csv"), str(out)]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not out.exists()
+
+
+def test_sources_are_not_overwritten(tmp_path, sequence, capsys):
+    before = sequence.read_bytes()
+    assert main(["import", str(sequence), str(sequence)]) == 2
+    assert "name the output file last" in capsys.readouterr().err
+    assert sequence.read_bytes() == before
+
+
+# The whole way.
+
+COLUMN, ROW, WIDE, HIGH = 164, 480, 492, 130
+
+
+def burnt_sequence(path, count=28):
+    """A sequence whose frames show a simulated point target, and the true matrix of PLUS.
+
+    Where the real N-wire sequence is there, frames and the reference's poses are its own; the
+    probe's poses are simulated, as in the real one it turned by 5 degrees only.
+    """
+    rng = np.random.default_rng(7)
+    real = REAL_DATA / "plus" / "NwirePhantomFreehand.igs.mha"
+    if real.exists():
+        source = read_sequence(real)
+        frames = [frame.copy() for frame in source.images(np.arange(count) * 3)]
+        references = source.poses("Reference", "Tracker")[0][::3][:count]
+    else:
+        frames = list(rng.integers(0, 20, (count, ROW + HIGH, COLUMN + WIDE), dtype=np.uint8))
+        references = random_poses(count, 3)
+    truth = jaxcal.ImageTransform(random_poses(1, 5)[0], np.array([0.21, 0.19]))
+    x, target = truth.image_plane_to_probe, rng.uniform(-80, 80, 3)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    v, u = np.mgrid[: frames[0].shape[0], : frames[0].shape[1]]
+    for index, frame in enumerate(frames):
+        pixel = np.array([COLUMN, ROW]) + 30 + rng.uniform(size=2) * [WIDE - 60, HIGH - 60]
+        plane = [0.21 * pixel[0], rng.normal(0, 0.3), 0.19 * pixel[1]]
+        turn = Rotation.from_rotvec(rng.normal(0, 0.6, 3)).as_matrix()
+        poses[index, :3, :3] = turn
+        poses[index, :3, 3] = target - turn @ (x[:3, :3] @ plane + x[:3, 3])
+        # A Gaussian echo in a display of 60 dB over 255 levels.
+        radius = ((u - pixel[0]) / 5) ** 2 + ((v - pixel[1]) / 3) ** 2
+        level = 250 - 8.686 * radius / 2 * 255 / 60
+        np.maximum(frame, np.clip(level, 0, 250).astype(np.uint8), out=frame)
+    transforms = {PROBE: references @ poses, REFERENCE: references}
+    valid = {PROBE: np.arange(count) != 4}
+    write_sequence(path, transforms, np.arange(count) / 10, valid=valid, images=frames)
+    return truth
+
+
+def test_import_calibrate_export(tmp_path, capsys):
+    """The documented path, and its answer against the truth."""
+    truth = burnt_sequence(tmp_path / "x.igs.mha")
+    config = tmp_path / "config.xml"
+    lines = ["<PlusConfiguration>", " <CoordinateDefinitions>", " </CoordinateDefinitions>"]
+    config.write_bytes("\r\n".join([*lines, "</PlusConfiguration>", ""]).encode())
+    recording = str(tmp_path / "out.h5")
+    region = [str(value) for value in (COLUMN, ROW, WIDE, HIGH)]
+    assert main(["import", str(tmp_path / "x.igs.mha"), recording, "--region", *region]) == 0
+    said = capsys.readouterr().out
+    # Frames in which a real reflection is as bright as the target are left out and counted.
+    assert 24 <= int(re.search(r"out\.h5: (\d+) images, pixels", said)[1]) <= 27
+    assert "1 of 28 frames left out: their tracking was not OK" in said
+    arguments = ["--method", "conventional", "--estimate", "scale", "--json"]
+    exported = ["--export", f"plus:{config}", "--export", f"slicer:{tmp_path / 'x.tfm'}"]
+    assert main(["calibrate", recording, *arguments, *exported]) == 0
+    (tmp_path / "cal.json").write_text(capsys.readouterr().out)
+    found = jaxcal.load_calibration(tmp_path / "cal.json")
+    for other in (config, tmp_path / "x.tfm"):
+        matrix = jaxcal.load_calibration(other).plus_matrix()
+        np.testing.assert_allclose(matrix, found.plus_matrix(), rtol=0, atol=1e-11)
+    record = json.loads((tmp_path / "cal.json").read_text())
+    np.testing.assert_allclose(record["plus_image_to_probe"], found.plus_matrix(), atol=1e-12)
+    # The error of X in its own frame, X Exp(d), against the stated covariance.
+    error = np.linalg.inv(found.image_plane_to_probe) @ truth.image_plane_to_probe
+    turned = Rotation.from_matrix(error[:3, :3]).as_rotvec()
+    deviation = np.concatenate([error[:3, 3], turned])
+    squared = deviation @ np.linalg.solve(found.covariance, deviation)
+    assert squared < stats.chi2.ppf(0.999, 6)
+    assert np.abs(turned).max() < np.radians(3)
+    np.testing.assert_allclose(found.scale_mm_per_px, truth.scale_mm_per_px, rtol=0.02)
+    # Whoever trusts PLUS's matrix finds the target's pixels where they are.
+    pixels = np.array([[COLUMN + WIDE / 2, ROW + HIGH / 2]])
+    applied = found.apply(pixels)
+    sd = np.sqrt(np.trace(applied.covariance[0]))
+    assert np.linalg.norm(applied.points - truth.apply(pixels).points) < 4 * sd < 4
