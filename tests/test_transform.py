@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -398,6 +399,53 @@ def test_served_to_another_client():
             thread.join()
 
 
+@pytest.mark.parametrize("status", ["SUCCESS", "FAIL"])
+def test_set_in_a_running_plus_server(saved, capsys, status):
+    """By another implementation of OpenIGTLink, which streams and replies as PLUS does."""
+    pyigtl = pytest.importorskip("pyigtl")
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    server = pyigtl.OpenIGTLinkServer(port=0, local_server=True)
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+    image = pyigtl.ImageMessage(np.zeros((1, 40, 30), np.uint8), device_name="Image")
+    received = []
+    stop = threading.Event()
+
+    def serve():
+        while not stop.is_set():
+            server.send_message(image)
+            for message in server.get_latest_messages():
+                received.append(message)
+                reply = f'<CommandReply Name="UpdateTransform" Status="{status}" Message="said"/>'
+                name = message.device_name.replace("CMD", "ACK")
+                server.send_message(pyigtl.StringMessage(reply, device_name=name))
+            stop.wait(0.02)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        port = server.server_address[1]
+        code = main(["export", str(saved), "--plus-server", f"127.0.0.1:{port}"])
+    finally:
+        stop.set()
+        thread.join()
+        server.stop()
+    output = capsys.readouterr()
+    assert code == (0 if status == "SUCCESS" else 2)
+    assert ("Image to Probe set; said" in output.out) == (status == "SUCCESS")
+    assert ("refuses the transform: 'said'" in output.err) == (status == "FAIL")
+    numbers = re.search(r'TransformValue="([^"]*)"', received[0].string)[1].split()
+    sent = np.array(numbers, float).reshape(4, 4)
+    np.testing.assert_allclose(sent, random_transform().plus_matrix(), atol=1e-12)
+
+
+def test_no_plus_server(saved, capsys):
+    with TransformServer("ImageToProbe", np.eye(4), port=0) as closed:
+        port = closed.port
+    assert main(["export", str(saved), "--plus-server", f"127.0.0.1:{port}"]) == 2
+    assert "Connection refused" in capsys.readouterr().err
+
+
 def test_server_refuses():
     with pytest.raises(InputError, match="1 to 20 bytes"):
         TransformServer("TransducerOriginPixelsToProbe", np.eye(4), port=0)
@@ -405,7 +453,7 @@ def test_server_refuses():
         TransformServer("ImageToProbe", np.eye(4), port=0) as server,
         pytest.raises(InputError, match="cannot listen at"),
     ):
-        TransformServer("ImageToProbe", np.eye(4), port=server.port, host="256.0.0.1")
+        TransformServer("ImageToProbe", np.eye(4), port=server.port)
 
 
 def test_no_jax(saved, tmp_path):

@@ -39,6 +39,11 @@ def _formats(command):
     metavar="CONFIG.xml",
     help="Put the transform into this configuration of PLUS, in place, or into a copy, OUT.",
 )
+@click.option(
+    "--plus-server",
+    metavar="HOST[:PORT]",
+    help="Set the transform in a PlusServer that is running (port 18944 by default).",
+)
 @click.option("--image-frame", default="Image", show_default=True, metavar="FRAME")
 @click.option("--probe-frame", default="Probe", show_default=True, metavar="FRAME")
 @click.option(
@@ -60,6 +65,7 @@ def export(
     out: str | None,
     format: SaveFormat | None,
     plus_config: str | None,
+    plus_server: str | None,
     image_frame: str,
     probe_frame: str,
     pixel_size: tuple[float, float] | None,
@@ -72,9 +78,11 @@ def export(
     ImageToProbe takes pixels (u, v, 0, 1) to the probe in mm; ROS gets the rigid transform from the
     image plane in metres.
     """
-    if (format is None) == (plus_config is None):
-        names = ", ".join(f"--{name}" for name in _TEXTS)
-        raise click.UsageError(f"name one format: {names} or --plus-config")
+    if sum(chosen is not None for chosen in (format, plus_config, plus_server)) != 1:
+        names = ", ".join(f"--{name}" for name in (*_TEXTS, "plus-config"))
+        raise click.UsageError(f"name one format: {names} or --plus-server")
+    if plus_server is not None and out is not None:
+        raise click.UsageError("--plus-server writes no file: leave OUT out")
     if origin is not None and pixel_size is None:
         raise click.BadParameter("needs --pixel-size", param_hint="--origin")
     from jaxcal.transform import load_calibration
@@ -87,6 +95,8 @@ def export(
     if plus_config is not None:
         for line in patched(transform, plus_config, out, frames):
             click.echo(line)
+    elif plus_server is not None:
+        click.echo(sent(transform, plus_server, frames))
     elif out is not None:
         transform.save(out, format, frames=frames)
         click.echo(f"{out}: written")
@@ -120,3 +130,17 @@ def patched(
     )  # fmt: skip
     written = f"{config if out is None else out}: {frames[0]} to {frames[1]} written"
     return [written, *(f"- {note}" for note in notes)]
+
+
+def sent(transform: ImageTransform, server: str, frames: tuple[str, str]) -> str:
+    """Set a transform in a running PlusServer; what was done."""
+    from jaxcal.plus_server import PORT, update_transform
+
+    host, colon, text = server.rpartition(":") if server.count(":") == 1 else (server, "", "")
+    if colon and not (text.isdigit() and 0 < int(text) < 65536):
+        raise click.BadParameter(f"{server!r} is not HOST or HOST:PORT", param_hint="--plus-server")
+    said = update_transform(
+        frames, transform.plus_matrix(), host, int(text) if colon else PORT,
+        error_mm=transform.error_mm,
+    )  # fmt: skip
+    return f"{server}: {frames[0]} to {frames[1]} set; {said}"
