@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
+from jaxcal.array_types import Bool, Float, Int
 from jaxcal.errors import FormatError, InputError
 from jaxcal.io.frame_names import capitalised
 from jaxcal.io.readable import naming, quoted

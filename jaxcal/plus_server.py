@@ -15,9 +15,9 @@ import struct
 import time
 
 from fastcrc import crc64
-from jaxtyping import Float
 from numpy import ndarray
 
+from jaxcal.array_types import Float
 from jaxcal.errors import FormatError, InputError
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.openigtlink import HEADER_SIZE, Message, encode_header, parse_header

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Num
 
+from jaxcal.array_types import Bool, Float, Num
 from jaxcal.errors import InputError
 from jaxcal.sound import check_sound_speed
 

@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.errors import InputError
 from jaxcal.io.openigtlink import Message, Tracked, encode
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.errors import InputError
 
 # W. Marczak, "Water as a standard in the measurements of speed of sound in liquids",

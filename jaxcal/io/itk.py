@@ -13,8 +13,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 from h5py import h5d, h5t  # pyright: ignore[reportAttributeAccessIssue]
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.errors import FormatError, InputError
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.lines import text_lines

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.errors import FormatError, InputError
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.frame_names import FramePair, capitalised, check_frame, path_between, split_name

@@ -13,8 +13,8 @@ import os
 import re
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.errors import FormatError, InputError
 from jaxcal.io.lines import text_lines
 from jaxcal.io.readable import quoted

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
 
+from jaxcal.array_types import Bool, Float
 from jaxcal.errors import FormatError, InputError
 from jaxcal.io.frame_names import FramePair, path_between
 from jaxcal.io.pixel_stream import Packing, PixelStream

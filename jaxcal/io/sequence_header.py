@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.errors import FormatError, InputError
 from jaxcal.io.frame_names import FramePair, check_frame, split_name
 from jaxcal.io.pixel_stream import Packing, PixelStream

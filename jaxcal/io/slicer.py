@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.errors import FormatError
 from jaxcal.io.lines import text_lines
 from jaxcal.io.readable import check_readable, naming, one_line, quoted

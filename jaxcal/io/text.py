@@ -12,8 +12,8 @@ from datetime import datetime
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
 
+from jaxcal.array_types import Float, Int
 from jaxcal.errors import FormatError, InputError
 from jaxcal.io.columns import LENGTHS_MM, Columns, columns_of_header
 from jaxcal.io.readable import naming, quoted

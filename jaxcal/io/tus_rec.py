@@ -12,8 +12,8 @@ import os
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.errors import FormatError, InputError
 from jaxcal.io.lines import text_lines
 from jaxcal.io.readable import check_readable, naming, quoted
