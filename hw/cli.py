@@ -1,4 +1,4 @@
-"""The entry point ``jaxcal-hw``: acquire, bench, check. Nothing numerical is imported for help."""
+"""The entry point ``jaxcal-hw``. Nothing numerical is imported for help."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -195,6 +196,25 @@ def bench(speed: float | None, controller: str | None, seed: int) -> int:
 
     pose_hz = _POSE_HZ[controller or "cb"]
     serve(Options(speed=1.0 if speed is None else speed, seed=seed, pose_hz=pose_hz))
+    return ExitCode.CONVERGED
+
+
+@commands.command("setup")
+@click.argument("out", type=click.Path(), metavar="[OUT.toml]", required=False)
+def setup_(out: str | None) -> int:
+    """Write a commented description of a bench, to fill in, to OUT.toml or to standard output."""
+    from importlib.resources import files
+
+    from jaxcal.io.atomic import write_text
+
+    text = files("hw").joinpath("example_setup.toml").read_text("utf-8")
+    if out is None:
+        click.echo(text, nl=False)
+        return ExitCode.CONVERGED
+    if Path(out).exists():
+        raise InputError(f"{out}: exists; name another file")
+    write_text(out, text)
+    click.echo(f"{out}: written; fill it in, then jaxcal-hw check --setup {out}")
     return ExitCode.CONVERGED
 
 

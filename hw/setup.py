@@ -1,34 +1,7 @@
 """One bench as a person describes it: where its devices are, what is known of probe and target.
 
-A TOML file, units in the names; a key that is not known is refused:
-
-    [robot]
-    host = "192.168.1.10"
-    frequency_hz = 125              # optional: the controller's own rate otherwise
-    tcp_offset = [0, 0, 0.12, 0, 0, 0]  # m, rad; for controllers that do not tell it, and dry runs
-    model = "UR5"                   # of hw.robot.kinematics.MODELS: what the dry run checks; else
-                                    # the controller is asked, and a dry run leaves it out
-    settle_s = 0.3                  # poses are averaged for so long after a move
-    [active_echo]
-    url = "/dev/ttyUSB0"
-    [ultrasound]                    # optional
-    host = "192.168.1.20"
-    port = 18944
-    [probe]
-    elements = 128
-    pitch_mm = 0.457
-    sound_speed_m_s = 1490
-    housing_mm = [58.5, 25, 60]     # width, thickness, length back from the face; optional, this is
-                                    # the array's width, 25 and 60
-    [scene]                         # as drawn or measured with a ruler
-    image_to_probe = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 60], [0, 0, 0, 1]]
-    point_mm = [350, -250, 80]
-    looking = [0, 0, -1]
-    tip_at_tcp = false              # true where the controller's TCP is the probe's tip itself:
-                                    # else image_to_probe must be at least 5 mm long
-    [limits]                        # of hw.robot.limits; the box bounds the probe with its housing
-    [plan]                          # of hw.poses.Extent
-    [search]                        # of hw.midplane.search.Settings
+A TOML file, units in the names; a key that is not known is refused. ``example_setup.toml`` beside
+this module has every table and key with a comment; ``jaxcal-hw setup`` writes it.
 """
 
 from __future__ import annotations

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
+
 import numpy as np
 import pytest
 
 import jaxcal
-from hw.setup import load_setup
+from hw.cli import main
+from hw.setup import _TABLES, load_setup
 
 GOOD = """
 [robot]
@@ -78,3 +82,25 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, old, new, what):
         load_setup(path)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
+
+
+def test_the_example_is_a_setup(tmp_path, capsys):
+    path = tmp_path / "bench.toml"
+    assert main(["setup", str(path)]) == 0
+    setup = load_setup(path)
+    assert setup.ultrasound is None
+    setup.motion_limits()
+    # The optional lines as well: with all of them switched on it is a setup that has every key.
+    text = re.sub(r"(?m)^# (?=\[|\w+ = )", "", path.read_text())
+    (tmp_path / "full.toml").write_text(text)
+    full = load_setup(tmp_path / "full.toml")
+    assert full.ultrasound == ("192.168.1.20", 18944)
+    full.motion_limits()
+    written = tomllib.loads(text)
+    for table in ("robot", "active_echo", "ultrasound", "probe", "scene"):
+        assert set(written[table]) == set(_TABLES[table]), table
+    capsys.readouterr()
+    assert main(["setup", str(path)]) == 2
+    assert "exists; name another file" in capsys.readouterr().err
+    assert main(["setup"]) == 0
+    assert capsys.readouterr().out == path.read_text()
