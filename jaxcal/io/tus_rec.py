@@ -44,7 +44,9 @@ def read_scan(path: str | os.PathLike[str]) -> TrackedSequence:
     with naming(path), open_root(path) as root:
         transforms = child(root, "tforms")
         if transforms is None:
-            raise FormatError("is no scan of TUS-REC: /tforms is missing")
+            ours = " (jaxcal calibrate takes jaxcal's recordings as they are)"
+            hint = "" if child(root, "calibration") is None else ours
+            raise FormatError(f"is no scan of TUS-REC: /tforms is missing{hint}")
         poses = array(transforms, (UpTo(MOST_FRAMES, "frames"), 4, 4))
         frames = child(root, "frames")
         pixels = None
