@@ -135,6 +135,8 @@ def test_invalid_rows_are_counted(tmp_path):
             "translations are in different units",
         ),
         (["u [px]", "v [mm]", *NAMES[2:]], "different units"),
+        ([*MATRIX, "x", "y", "z"], "both a whole matrix and x, y, z"),
+        ([*MATRIX, "qx", "qy", "qz", "qw"], "both a matrix and a quaternion"),
         (["u", "v", "x [in]", *NAMES[3:]], "unit of 'x [in]' is not known"),
         (["u", "v", "x", "y", "z", "qx", "qy", "qz", "frame"], "not all of qx, qy, qz and qw"),
     ],

@@ -114,7 +114,7 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
     matrix, unknown = _matrix(rest, list(bases), translation)
     if unknown:
         raise _unknown(names, unknown[0])
-    if matrix is not None and translation is not None and len(matrix) == 16:
+    if matrix is not None and translation is not None and len(rest) != 9:
         raise FormatError("the header names both a whole matrix and x, y, z")
     if (quaternion_columns is None) != (translation is None) and matrix is None:
         raise FormatError("the header needs x, y, z and a quaternion together")
