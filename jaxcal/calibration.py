@@ -364,11 +364,8 @@ class Calibration(eqx.Module):
         """The same with the data that were solved."""
         return replace(self, problem=problem)
 
-    def image_transform(self, face_offset_mm: float = 0.0) -> ImageTransform:
+    def image_transform(self) -> ImageTransform:
         """The transform by itself: to apply it to pixels, and to save it for other programs.
-
-        Args:
-            face_offset_mm: range of pixel row 0, mm: the recording's, where it has one.
 
         Raises:
             CalibrationError: under a JAX transformation.
@@ -379,19 +376,20 @@ class Calibration(eqx.Module):
             raise InputError("a batch holds many transforms: take one of its calibrations")
         scale = answer.scale_mm_per_px
         known = np.isfinite(answer.covariance).all()
+        offset = 0.0 if answer.problem is None else float(np.asarray(answer.problem.face_offset))
         return ImageTransform(
             np.asarray(answer.image_to_probe),
             None if scale is None else np.asarray(scale),
-            face_offset_mm,
+            offset,
             np.asarray(answer.covariance) if known else None,
             float(answer.rms),
             bool(self.converged),
             "the calibration",
         )
 
-    def plus_matrix(self, face_offset_mm: float = 0.0) -> Float[np.ndarray, "4 4"]:
+    def plus_matrix(self) -> Float[np.ndarray, "4 4"]:
         """PLUS's ImageToProbe; see :meth:`jaxcal.ImageTransform.plus_matrix`."""
-        return self.image_transform(face_offset_mm).plus_matrix()
+        return self.image_transform().plus_matrix()
 
     def apply(
         self,
@@ -399,11 +397,9 @@ class Calibration(eqx.Module):
         pose: np.ndarray | None = None,
         *,
         pixel_sd_px: float | tuple[float, float] = 0.0,
-        face_offset_mm: float = 0.0,
     ) -> AppliedPoints:
         """Image points in the probe's or the tracker's frame; see :meth:`ImageTransform.apply`."""
-        transform = self.image_transform(face_offset_mm)
-        return transform.apply(pixels, pose, pixel_sd_px=pixel_sd_px)
+        return self.image_transform().apply(pixels, pose, pixel_sd_px=pixel_sd_px)
 
     def numpy(self) -> Calibration:
         """The same with numpy arrays (concrete values).
