@@ -21,6 +21,7 @@ from hw.recording_layout import (
     Column,
 )
 from jaxcal.errors import FormatError, InputError
+from jaxcal.geometry import check_poses
 from jaxcal.io.readable import check_readable
 from jaxcal.io.untrusted import (
     Node,

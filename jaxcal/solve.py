@@ -123,7 +123,8 @@ def calibrate(
     problem = with_bound(problem, given)
     alone = compiler.is_whole_program(problem, given)
     platform = _devices(problem)[0].platform if alone else None
-    if platform == "cpu" and executables.is_describable(plan) and not jax.config.jax_disable_jit:
+    interpreted = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
+    if platform == "cpu" and executables.is_describable(plan) and not interpreted:
         return _solve_kept(problem, given, plan).with_problem(problem)
     # A program of its own, which serves every method and prior.
     agreed = _agreement(platform)(seen_by_agreement(problem), plan.blocks) if plan.robust else None

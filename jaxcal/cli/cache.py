@@ -194,7 +194,7 @@ def enable_compilation_cache() -> None:
     command line does it, not the library, and not by an environment that other programs inherit.
     """
     if not {"JAX_LOGGING_LEVEL", "TF_CPP_MIN_LOG_LEVEL"} & os.environ.keys():
-        from jaxlib import utils
+        from jaxlib import utils  # pyright: ignore[reportAttributeAccessIssue]
 
         with suppress(AttributeError):  # not part of jaxlib's public interface
             utils.absl_set_min_log_level(3)

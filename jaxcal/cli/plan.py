@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from jaxcal.cli.calibrate import _segmented, _unknowns
+from jaxcal.cli.calibrate import _segmented, unknowns
 from jaxcal.cli.common import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -171,7 +171,7 @@ def _from_recording(
 
     measured, _ = _segmented(load(path))
     with progress("calibrating"):
-        result = calibrate(measured, estimate=_unknowns(estimate))
+        result = calibrate(measured, estimate=unknowns(estimate))
     if result.status == "failed":
         raise InputError(f"{path}: the calibration failed: there is nothing to plan from")
     candidates = design.candidates_around(
