@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     """What the used images leave for the noise's SDs (traceable); inf where SDs were given."""
     xp = array_module(calibration)
-    left = xp.sum(calibration.mask > 0, axis=-1) - size(calibration.blocks) / 3
+    left = xp.sum(xp.asarray(calibration.mask) > 0, axis=-1) - size(calibration.blocks) / 3
     if calibration.prior not in TUNED:
         return xp.maximum(left, 1.0)
     return xp.where(calibration.sigma_tuned, xp.maximum(left, 1.0), np.inf)
