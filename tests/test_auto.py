@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ from jaxcal.solvers.auto import (
 )
 from jaxcal.solvers.dense import inverse_abreast, inverse_positive
 from jaxcal.solvers.evidence import MEAN_SD
-from jaxcal.solvers.expectation_propagation import Marginal, Posterior, Sites
+from jaxcal.solvers.expectation_propagation import Marginal, Sites
 from jaxcal.solvers.expectation_propagation import propagate as propagate_abreast
 
 DENSITY = {
@@ -93,7 +94,7 @@ class Linear:
     used: jax.Array
 
 
-def propagate(linear: Linear, families, sd, **sweeps) -> Posterior:
+def propagate(linear: Linear, families, sd, **sweeps) -> SimpleNamespace:
     """As one lane of the solver's six unknowns, of which the others are seen by no image."""
     count = linear.gradient.shape[0]
     more = 6 - count
@@ -115,11 +116,11 @@ def propagate(linear: Linear, families, sd, **sweeps) -> Posterior:
     found = propagate_abreast(
         known, sites, squares[..., None], pull[:, None], families, sd[:, None], **sweeps
     )
-    return Posterior(
-        found.mean[:count, :, 0].T,
-        jnp.moveaxis(found.covariance[:count, :count, :, 0], -1, 0),
-        found.log_evidence[:, 0],
-        found.change[:, 0],
+    return SimpleNamespace(
+        mean=found.mean[:count, :, 0].T,
+        covariance=jnp.moveaxis(found.covariance[:count, :count, :, 0], -1, 0),
+        log_evidence=found.log_evidence[:, 0],
+        change=found.change[:, 0],
     )
 
 

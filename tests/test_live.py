@@ -20,12 +20,12 @@ def test_live_calibration_is_the_batch_one_and_compiles_once(tmp_path, monkeypat
     for k, (pose, point) in enumerate(zip(images.poses, images.measurements, strict=True)):
         result = live.add(pose, point)
         assert (result is None) == (k < 3)
+    # From four images to ten, of twelve at most: one program.
+    assert len(program_cache.entries()) == 1
     whole = jaxcal.calibrate(recording, method="conventional")
     assert result.status == "converged"
     np.testing.assert_allclose(result.image_to_probe, whole.image_to_probe, atol=1e-7)
     assert result.elevation.shape == (10,)
-    # Twelve images at most, and ten: one program.
-    assert len(program_cache.entries()) == 1
     live.leave_out(4)
     assert int(live.solve().images_used) == 9
 

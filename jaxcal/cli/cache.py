@@ -193,7 +193,9 @@ def enable_compilation_cache() -> None:
     has no option for that but the level of its log, which is the whole process': so only the
     command line does it, not the library, and not by an environment that other programs inherit.
     """
-    if not {"JAX_LOGGING_LEVEL", "TF_CPP_MIN_LOG_LEVEL"} & os.environ.keys():
+    # "1" is what importing JAX puts there; anything else is somebody's wish.
+    wished = os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") != "1"
+    if not wished and "JAX_LOGGING_LEVEL" not in os.environ:
         from jaxlib import utils  # pyright: ignore[reportAttributeAccessIssue]
 
         with suppress(AttributeError):  # not part of jaxlib's public interface
