@@ -164,10 +164,11 @@ DERIVATIVES = {
     "auto": {},
     "channels": {"sigma": (0.3, 1.0), "data": "channels"},
 }
-LONG = [pytest.param(name, marks=pytest.mark.slow) for name in ("given", "auto", "channels")]
+LATER = ("tracker", "given", "auto", "channels")
+LONG = [pytest.param(name, marks=pytest.mark.slow) for name in LATER]
 
 
-@pytest.mark.parametrize("name", [*list(DERIVATIVES)[:4], *LONG])
+@pytest.mark.parametrize("name", [*list(DERIVATIVES)[:3], *LONG])
 def test_derivatives_in_both_modes_are_finite_differences(name):
     """By poses, measurements and given SDs; forward, and its transpose, by one program."""
     start = of_channels() if name == "channels" else noisy(12)

@@ -36,7 +36,7 @@ def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     xp = array_module(calibration)
     left = xp.sum(xp.asarray(calibration.mask) > 0, axis=-1) - size(calibration.blocks) / 3
     if calibration.prior not in TUNED:
-        return xp.maximum(left, 1.0)
+        return xp.asarray(xp.maximum(left, 1.0))
     return xp.where(calibration.sigma_tuned, xp.maximum(left, 1.0), np.inf)
 
 
