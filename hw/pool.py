@@ -16,7 +16,7 @@ from hw.scene import Scene
 from hw.shapes import Bool, Float
 from jaxcal.design import Constraints, Model, Noise, Region, Rules, make_candidates, plan
 from jaxcal.design.constraints import Allowed
-from jaxcal.geometry import check_poses
+from jaxcal.poses import check_poses
 
 BENCH_SDS_MM = (0.15, 0.12, 0.35)
 """Lateral, range and elevational SDs of a bench before its images tell: placed by an arm that is

@@ -21,7 +21,6 @@ from hw.recording_layout import (
     Column,
 )
 from jaxcal.errors import FormatError, InputError
-from jaxcal.geometry import check_poses
 from jaxcal.io.readable import check_readable
 from jaxcal.io.untrusted import (
     Node,
@@ -36,6 +35,7 @@ from jaxcal.io.untrusted import (
     open_root,
     text,
 )
+from jaxcal.poses import check_poses
 
 _MOST_MEMBERS = 100
 """Arrays in a group that is written once: ten times what an acquisition writes."""
