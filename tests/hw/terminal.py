@@ -53,7 +53,7 @@ class Terminal:
         """Press keys."""
         os.write(self._terminal, keys.encode())
 
-    def wait_for(self, pattern: str, timeout_s: float = 120.0, flags: int = 0) -> re.Match[str]:
+    def wait_for(self, pattern: str, timeout_s: float = 300.0, flags: int = 0) -> re.Match[str]:
         """Read until the pattern is shown after what was found last; escapes are left out."""
         deadline = time.monotonic() + timeout_s
         while True:
@@ -63,7 +63,7 @@ class Terminal:
                 return found
             assert self._more(deadline), f"{pattern!r} was not shown:\n{self.shown[-3000:]}"
 
-    def finish(self, timeout_s: float = 120.0) -> int:
+    def finish(self, timeout_s: float = 300.0) -> int:
         """Read until the command ends; its exit status."""
         deadline = time.monotonic() + timeout_s
         while self._more(deadline):

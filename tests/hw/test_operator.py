@@ -29,7 +29,7 @@ ASKED = re.compile(
 def answer(person: Terminal, until: str) -> str:
     """Press what the screen says until a line is shown; what was shown meanwhile."""
     began, offset = len(person.shown), None
-    deadline = time.monotonic() + 300
+    deadline = time.monotonic() + 400
     while time.monotonic() < deadline:
         found = person.wait_for(rf"{ASKED.pattern}|{until}", flags=re.DOTALL)
         if found.group("advice") is None:
