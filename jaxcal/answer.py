@@ -34,8 +34,8 @@ from jaxcal.problem import Problem
 from jaxcal.recording import MINIMUM_IMAGES
 from jaxcal.solvers.auto import OffsetLaw
 from jaxcal.solvers.dense import inverse_abreast
+from jaxcal.solvers.methods import nominal_sound_speed
 from jaxcal.solvers.reml import MINIMUM_SELF_TUNING
-from jaxcal.sound import WATER_M_S
 
 LEAST_GAP_MM = 1e-6
 """An offset nearer to its bound than this is about to reach it."""
@@ -167,13 +167,6 @@ def assemble(
         blocks=blocks,
         robust=plan.robust,
     )
-
-
-def nominal_sound_speed(problem: Problem) -> Float[Array, "*batch"]:
-    """By which the problem's times of flight became distances, m/s; water's where unknown."""
-    if problem.sound_speed is None:
-        return jnp.full(problem.batch_shape, WATER_M_S, problem.mask.dtype)
-    return problem.sound_speed
 
 
 class Errors(eqx.Module):

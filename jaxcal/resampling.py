@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from jaxcal.answer import nominal_sound_speed
 from jaxcal.calibration import Calibration
 from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.errors import InputError
@@ -31,6 +30,7 @@ from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import MINIMUM_IMAGES, Recording
 from jaxcal.solve import calibrate, calibrate_batch
 from jaxcal.solvers import dense
+from jaxcal.solvers.methods import nominal_sound_speed
 
 LARGEST_RESAMPLES = 100_000
 

@@ -28,6 +28,9 @@ def test_answers_are_those_recorded(name, call, road):
         assert decision != "status_code"
     for number, values in corpus.differences(recorded, found).items():
         values = np.where(early, np.nan, values)
+        if number == "cost":
+            # Of exact data residuals and floored SDs are rounding, and so is their quotient.
+            values = np.where([kind == "exact" for kind in family.kinds], np.nan, values)
         worst = int(np.nanargmax(values))
         limit = corpus.tolerance(name, call, number)
         assert values[worst] <= limit, f"{number} of problem {worst} ({family.kinds[worst]})"

@@ -139,10 +139,6 @@ class Observation(eqx.Module):
         del sigma
         return self
 
-    def planar_weight(self) -> Float[Array, "3 lanes"] | None:
-        """Weights of q - p(0), 1/mm^2, with which this is nearly the same; None for none."""
-        return None
-
 
 class Points(Observation):
     """Lateral position, range and elevational offset, each with its SD (mm); y_i is q_y itself."""
@@ -152,10 +148,6 @@ class Points(Observation):
     def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
         lateral, distance = errors(q, further, images)
         return [Component([lateral]), Component([distance]), Component([q[1]])]
-
-    def planar_weight(self) -> Float[Array, "3 lanes"]:
-        lateral, axial, across = self.sigma
-        return 1 / jnp.stack([lateral**2, across**2, axial**2])
 
 
 def errors(q: Vector, further: Further, images: Images) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ References: More, "The Levenberg-Marquardt algorithm: implementation and theory"
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -64,14 +64,6 @@ SMALL = 1e-11
 
 IDLE = 4
 """Steps in a row without a gain above rounding before a lane is called settled."""
-
-
-class Place(Protocol):
-    """A value of the unknowns, lanes last; a pytree."""
-
-    def moved(self, step: Vector) -> Any:
-        """The same after a step."""
-        ...
 
 
 Equations = Callable[[Any, Float[Array, " lanes"]], Normal]

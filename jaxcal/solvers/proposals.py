@@ -1,6 +1,6 @@
 """Proposals for a consensus: closed-form solutions of many small subsets of the images at once.
 
-Every proposal is the start's linear system (:mod:`jaxcal.solvers.initial`) on a few images; each
+Every proposal is the start's linear system (:mod:`jaxcal.solvers.start`) on a few images; each
 image's moments are formed once, and a subset's system is the sum of those of its images.
 """
 
@@ -47,7 +47,7 @@ def subset_weights(used: Float[Array, " n"], size: int) -> Float[Array, "k n"]:
 
 
 def linear_proposals(problem: Problem, subsets: Float[Array, "k n"], *, scaled: bool) -> Parameters:
-    """Solve the start's linear system (see :mod:`jaxcal.solvers.initial`) for every subset at once.
+    """Solve the start's linear system (see :mod:`jaxcal.solvers.start`) for every subset at once.
 
     Args:
         problem: one problem.

@@ -574,9 +574,7 @@ LOOSER: tuple[tuple[str, str, str, float], ...] = (
     # Self-tuning stops where no SD changes by 1e-9.
     ("*", "auto uniform gaussian", "X point elevation", 3e-8),
     ("*", "auto uniform gaussian", "covariance", 3e-8),
-    # With exact data residuals and floored SDs are rounding, and so is the cost, their quotient: 24
-    # residuals of 1e-13 mm that are summed in another order differ by some 1e-7 of it.
-    ("*", "auto uniform gaussian", "cost", 1e-6),
+    ("*", "auto uniform gaussian", "cost", 3e-7),
     # An evidence is stationary in nothing: what it is made of differs by 1e-9 and is multiplied by
     # squared residuals in SDs. On images whose offsets rest on their floor it may be anything.
     ("*", "auto uniform", "log_odds", 1e-5),
