@@ -131,7 +131,6 @@ def assemble(
     status = _status(solved, observed, used)
     known = (status != Status.UNOBSERVABLE)[..., None, None]
     covariance = jnp.where(known, covariance, jnp.nan)
-    point = block_slice(blocks, "point")
     channel_sigma = None if not plan.channels or solved.sigma is None else solved.sigma[..., 0]
     tracker_sd = None
     if given.tracker_sd is not None:
@@ -143,8 +142,7 @@ def assemble(
         sigma=_three_sigmas(solved, errors, elevation, problem, plan),
         offset_law=None if averaged is None else averaged.law,
         channel_sigma=channel_sigma,
-        covariance=covariance[..., :6, :6],
-        point_covariance=covariance[..., point, point],
+        unknowns_covariance=covariance,
         scale_mm_per_px=problem.spacing * parameters.scale if problem.pixels else None,
         medium=_medium(parameters, covariance, problem, given, plan),
         rms=jnp.sqrt(in_plane / used),

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.errors import CalibrationError, InputError
 from jaxcal.geometry import AnyArray
+from jaxcal.image_points import IMAGE_BLOCKS, image_rows
 from jaxcal.model.parameters import Blocks
 from jaxcal.problem import Problem, is_traced
 from jaxcal.solvers.auto import OffsetLaw
@@ -120,8 +121,8 @@ class Calibration(eqx.Module):
         offset_law: what the data say of the offsets' law, their mean and the noise; None where no
             laws were weighed.
         channel_sigma: SD of an element's distance, mm; None for solves on points.
-        covariance: of X (v mm, omega rad); NaN where X is not observable.
-        point_covariance: of the target, mm^2.
+        unknowns_covariance: of all unknowns, in the order of ``blocks`` (mm, rad, log units); NaN
+            where X is not observable.
         scale_mm_per_px: [lateral, axial], or None for points in mm.
         medium: sound speed and delay, or None where neither was estimated.
         rms: root mean square of ``residual``'s length over the used images, mm.
@@ -147,8 +148,7 @@ class Calibration(eqx.Module):
     sigma: Float[Array, "*batch 3"]
     offset_law: OffsetLaw | None
     channel_sigma: Float[Array, "*batch"] | None
-    covariance: Float[Array, "*batch 6 6"]
-    point_covariance: Float[Array, "*batch 3 3"]
+    unknowns_covariance: Float[Array, "*batch p p"]
     scale_mm_per_px: Float[Array, "*batch 2"] | None
     medium: Medium | None
     rms: Float[Array, "*batch"]
@@ -174,6 +174,16 @@ class Calibration(eqx.Module):
     def images_used(self) -> Int[Array, "*batch"]:
         """Number of used images (traceable)."""
         return jnp.sum(self.mask > 0, axis=-1)
+
+    @property
+    def covariance(self) -> Float[AnyArray, "*batch 6 6"]:
+        """Of X (v mm, omega rad), whatever the other unknowns; NaN where X is not observable."""
+        return self.unknowns_covariance[..., :6, :6]
+
+    @property
+    def point_covariance(self) -> Float[AnyArray, "*batch 3 3"]:
+        """Of the target in the tracker's frame, mm^2."""
+        return self.unknowns_covariance[..., 6:9, 6:9]
 
     @property
     def information(self) -> Float[AnyArray, "*batch p p"]:
@@ -371,20 +381,26 @@ class Calibration(eqx.Module):
             CalibrationError: under a JAX transformation.
             InputError: of a batch.
         """
+        from jaxcal.diagnostics.intervals import range_of_row_zero
+
         answer = self.numpy()
         if answer.image_to_probe.ndim != 2:
             raise InputError("a batch holds many transforms: take one of its calibrations")
         scale = answer.scale_mm_per_px
-        known = np.isfinite(answer.covariance).all()
-        offset = 0.0 if answer.problem is None else float(np.asarray(answer.problem.face_offset))
+        known = np.isfinite(answer.unknowns_covariance).all()
+        origin, factor = range_of_row_zero(answer)
+        rows = image_rows(answer.blocks)
         return ImageTransform(
-            np.asarray(answer.image_to_probe),
-            None if scale is None else np.asarray(scale),
-            offset,
-            np.asarray(answer.covariance) if known else None,
-            float(answer.rms),
-            bool(self.converged),
-            "the calibration",
+            image_plane_to_probe=np.asarray(answer.image_to_probe),
+            scale_mm_per_px=None if scale is None else np.asarray(scale),
+            face_offset_mm=float(origin),
+            covariance=np.asarray(answer.covariance) if known else None,
+            error_mm=float(answer.rms),
+            converged=bool(self.converged),
+            source="the calibration",
+            range_factor=float(factor),
+            unknowns=tuple(block for block in answer.blocks if block in IMAGE_BLOCKS),
+            image_covariance=answer.unknowns_covariance[rows[:, None], rows] if known else None,
         )
 
     def plus_matrix(self) -> Float[np.ndarray, "4 4"]:

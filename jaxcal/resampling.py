@@ -55,6 +55,10 @@ class CrossValidation(eqx.Module):
         converged: (folds,) whether its solve converged.
         fold_cost: (n,) minimised objective of the calibration that held the image out.
         mask: (n,) 1 for used images.
+        image_moved: (n,) root mean square over ``image_points`` of how far leaving the image (its
+            fold) out moves them, estimated pixel sizes included, mm.
+        image_points: (m, 2) [lateral, axial] of those points, mm: corners and middle of the box
+            that the measured points fill.
     """
 
     residual: Float[Array, "n 3"]
@@ -68,6 +72,8 @@ class CrossValidation(eqx.Module):
     converged: Float[Array, " folds"]
     fold_cost: Float[Array, " n"]
     mask: Float[Array, " n"]
+    image_moved: Float[Array, " n"]
+    image_points: Float[Array, "m 2"]
 
 
 class Bootstrap(eqx.Module):
@@ -78,7 +84,8 @@ class Bootstrap(eqx.Module):
         converged: (k,) 1 where its solve converged; only those count below.
         spread: (6,) SD of X about the full data's, [v, omega], mm and rad; a median-based one, so
             that a few resamples without enough different images do not spoil it.
-        reproducibility: (m,) mean distance of an image point from its mean over the resamples, mm.
+        reproducibility: (m,) mean distance of an image point from its mean over the resamples, mm;
+            estimated pixel sizes count.
         image_points: (m, 2) [lateral, axial] of those points, mm: corners and middle of the box
             that the measured points fill.
     """
@@ -132,6 +139,9 @@ def cross_validate(
         jnp.asarray(result.image_to_probe), held.image_to_probe
     )
     moved = mask[:, None] * moved
+    points = _corners(problem, result)
+    whole = jnp.asarray(result.image_to_probe)
+    image_moved = _apart(_with_scale(held, result), whole, points) * mask
     density = -0.5 * jnp.sum((errors / held.sigma) ** 2 + jnp.log(2 * jnp.pi * held.sigma**2), 1)
     return CrossValidation(
         residual=errors,
@@ -145,6 +155,8 @@ def cross_validate(
         converged=fits.converged.astype(mask.dtype),
         fold_cost=held.cost,
         mask=mask,
+        image_moved=image_moved,
+        image_points=points,
     )
 
 
@@ -195,7 +207,7 @@ def bootstrap(
     moved = jnp.where(converged[:, None] > 0, jnp.abs(moved), jnp.nan)
     points = _corners(problem, result)
     # A resample that did not converge stands at the whole's X: it adds nothing to the scatter.
-    transforms = jnp.where(converged[:, None, None] > 0, fits.image_to_probe, whole)
+    transforms = jnp.where(converged[:, None, None] > 0, _with_scale(fits, result), whole)
     share = jnp.maximum(jnp.mean(converged), 1e-9)
     return Bootstrap(
         image_to_probe=fits.image_to_probe,
@@ -221,6 +233,30 @@ def relative_twist(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> F
         ]
     )
     return jnp.concatenate([shift, turn])
+
+
+def _with_scale(fits: Calibration, result: Calibration) -> Float[Array, "k 4 4"]:
+    """X of many calibrations, stretched by their pixel sizes over those of the whole.
+
+    It takes a point of the image, in mm as the whole has it, to the probe. (A face offset, which
+    only pixels of known size have, is stretched along with the range.)
+    """
+    if fits.scale_mm_per_px is None or result.scale_mm_per_px is None:
+        return jnp.asarray(fits.image_to_probe)
+    ratio = jnp.asarray(fits.scale_mm_per_px) / jnp.asarray(result.scale_mm_per_px)
+    one = jnp.ones_like(ratio[:, 0])
+    stretch = jnp.stack([ratio[:, 0], one, ratio[:, 1], one], axis=1)
+    return jnp.asarray(fits.image_to_probe) * stretch[:, None]
+
+
+def _apart(
+    transforms: Float[Array, "k 4 4"], whole: Float[Array, "4 4"], points: Float[Array, "m 2"]
+) -> Float[Array, " k"]:
+    """Root mean square distance of image points under each transform and under the whole's."""
+    zero, one = jnp.zeros_like(points[:, 0]), jnp.ones_like(points[:, 0])
+    there = jnp.stack([points[:, 0], zero, points[:, 1], one])
+    moved = ((transforms - whole) @ there)[:, :3]
+    return jnp.sqrt(jnp.mean(jnp.sum(moved**2, axis=1), axis=1))
 
 
 def _one_problem(problem: Problem | Recording) -> Problem:

@@ -4,7 +4,9 @@ Two descriptions of the same thing. jaxcal's own is rigid and in mm: X = [a e z 
 plane (lateral, elevational, axial) to the probe, and a pixel is (s_u u, 0, s_v v + f) in it. PLUS's
 ``ImageToProbe`` takes (u, v, 0, 1) in pixels to the probe and carries the pixel size:
 
-    M[:3, 0] = s_u a,  M[:3, 1] = s_v z,  M[:3, 2] = -(s_u + s_v) / 2 e,  M[:3, 3] = t + f z.
+    M[:3, 0] = s_u a,  M[:3, 1] = s_v z,  M[:3, 2] = -(s_u + s_v) / 2 e,  M[:3, 3] = t + f z,
+
+where s_v is the pixel's size at the sound speed that was found, and f the range of row 0 there.
 
 The third column is *minus* the elevational axis: y = z cross x here, and z = x cross y there.
 """
@@ -14,7 +16,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +24,7 @@ import numpy as np
 
 from jaxcal.array_types import Float
 from jaxcal.errors import FormatError, InputError
+from jaxcal.image_points import IMAGE_BLOCKS, UNKNOWNS, point_jacobian, unknown_names
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.readable import check_readable, naming, one_line, quoted
@@ -58,8 +61,11 @@ class ImageTransform:
     Attributes:
         image_plane_to_probe: (4, 4) X, rigid, mm, from (lateral, elevational, axial).
         scale_mm_per_px: [lateral, axial]; None where points were in mm.
-        face_offset_mm: range of pixel row 0, mm.
+        face_offset_mm: range of pixel row 0, or of a measured range of 0, mm.
         covariance: (6, 6) of X's right perturbation X Exp([v, omega]), mm and rad; None if unknown.
+        range_factor: estimated sound speed over the nominal one, by which ranges are larger.
+        unknowns: blocks of estimated unknowns that move an image point, X's first.
+        image_covariance: (q, q) of all of these (mm, rad, log units); None: ``covariance`` alone.
         error_mm: root mean square residual of the calibration, mm; None if unknown.
         converged: whether the calibration can be used; None if unknown.
         source: the file.
@@ -72,6 +78,9 @@ class ImageTransform:
     error_mm: float | None = None
     converged: bool | None = None
     source: str = field(default="memory", compare=False)
+    range_factor: float = 1.0
+    unknowns: tuple[str, ...] = ("translation", "rotation")
+    image_covariance: Float[np.ndarray, "q q"] | None = None
 
     def plus_matrix(self) -> Float[np.ndarray, "4 4"]:
         """PLUS's ImageToProbe: (u, v, 0, 1), px, to the probe, mm.
@@ -79,7 +88,7 @@ class ImageTransform:
         Raises:
             InputError: the calibration was made from points in mm, which have no pixels.
         """
-        s_u, s_v = self._scale()
+        s_u, s_v = self._scale() * [1.0, self.range_factor]
         lateral, elevational, axial, origin = self.image_plane_to_probe[:3].T
         matrix = np.eye(4)
         matrix[:3, 0] = s_u * lateral
@@ -104,16 +113,23 @@ class ImageTransform:
             raise InputError("a pixel's size must be two positive numbers, its origin two numbers")
         moved = self.image_plane_to_probe.copy()
         moved[:3, 3] -= moved[:3, 0] * scale[0] * origin_px[0]
-        covariance = None
-        if self.covariance is not None:
+
+        def shifted(covariance: np.ndarray | None) -> np.ndarray | None:
+            if covariance is None:
+                return None
             # X' = X T with T a shift by d along lateral: the perturbation at the new origin.
-            adjoint = np.eye(6)
-            adjoint[:3, 3:] = -_cross(np.array([-scale[0] * origin_px[0], 0.0, 0.0]))
-            covariance = adjoint @ self.covariance @ adjoint.T
-        return ImageTransform(
-            moved, scale, -float(scale[1] * origin_px[1]), covariance, self.error_mm,
-            self.converged, self.source,
-        )  # fmt: skip
+            adjoint = np.eye(len(covariance))
+            adjoint[:3, 3:6] = -_cross(np.array([-scale[0] * origin_px[0], 0.0, 0.0]))
+            return adjoint @ covariance @ adjoint.T
+
+        return replace(
+            self,
+            image_plane_to_probe=moved,
+            scale_mm_per_px=scale,
+            face_offset_mm=self.face_offset_mm - self.range_factor * float(scale[1] * origin_px[1]),
+            covariance=shifted(self.covariance),
+            image_covariance=shifted(self.image_covariance),
+        )
 
     def apply(
         self,
@@ -130,8 +146,8 @@ class ImageTransform:
             pixel_sd_px: SD of the points themselves, one number or [u, v] (mm without pixels).
 
         Returns:
-            Points and covariances. They hold the calibration's covariance and the points' own; not
-            the uncertainty of the pixel size, nor of the pose.
+            Points and covariances. They hold the calibration's covariance, that of estimated pixel
+            sizes, sound speed and delay included, and the points' own; not the pose's.
 
         Raises:
             InputError: shapes that do not agree, NaN or Inf, or a pose that is not rigid.
@@ -144,6 +160,7 @@ class ImageTransform:
         scale = np.ones(2) if self.scale_mm_per_px is None else self.scale_mm_per_px
         plane = np.zeros((count, 3))
         plane[:, 0] = scale[0] * measured[:, 0]
+        scale = scale * np.array([1.0, self.range_factor])
         plane[:, 2] = scale[1] * measured[:, 1] + self.face_offset_mm
         rotation = self.image_plane_to_probe[:3, :3]
         points = plane @ rotation.T + self.image_plane_to_probe[:3, 3]
@@ -166,15 +183,16 @@ class ImageTransform:
         scale: Float[np.ndarray, 2],
         pixel_sd_px: float | tuple[float, float],
     ) -> Float[np.ndarray, "n 3 3"]:
-        """R (J C J' + S) R' with J = [I, -[p]x], in the probe's frame."""
-        if self.covariance is None:
+        """R (J C J' + S) R' with J of :mod:`jaxcal.image_points`, in the probe's frame."""
+        covariance, blocks = self.image_covariance, self.unknowns
+        if covariance is None:
+            covariance, blocks = self.covariance, ("translation", "rotation")
+        if covariance is None:
             return np.full((len(plane), 3, 3), np.nan)
-        jacobian = np.zeros((len(plane), 3, 6))
-        jacobian[:, :, :3] = np.eye(3)
-        jacobian[:, :, 3:] = [-_cross(point) for point in plane]
+        jacobian = point_jacobian(plane[:, [0, 2]], blocks, self.face_offset_mm, self.range_factor)
         own = np.zeros(3)
         own[[0, 2]] = np.broadcast_to(np.asarray(pixel_sd_px, dtype=np.float64), 2) * scale
-        inner = jacobian @ self.covariance @ jacobian.swapaxes(1, 2) + np.diag(own**2)
+        inner = jacobian @ covariance @ jacobian.swapaxes(1, 2) + np.diag(own**2)
         return rotation @ inner @ rotation.T
 
     def _scale(self) -> Float[np.ndarray, 2]:
@@ -246,7 +264,7 @@ class ImageTransform:
             from jaxcal.io.tus_rec import calib_matrix
 
             matrix = self.plus_matrix()
-            scale = self._scale()
+            scale = self._scale() * [1.0, self.range_factor]
             rigid = matrix.copy()
             rigid[:3, :3] /= [*scale, scale.mean()]
             return calib_matrix(rigid, scale)
@@ -260,10 +278,10 @@ class ImageTransform:
             arrays |= {"plus_image_to_probe": self.plus_matrix(), "scale_mm_per_px": self._scale()}
         if self.covariance is not None:
             arrays["covariance"] = self.covariance
-        return arrays | {"face_offset_mm": self.face_offset_mm}
+        return arrays | {"face_offset_mm": self.face_offset_mm, "range_factor": self.range_factor}
 
     def _record(self) -> dict[str, Any]:
-        scale, covariance = self.scale_mm_per_px, self.covariance
+        scale, covariance, full = self.scale_mm_per_px, self.covariance, self.image_covariance
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -272,7 +290,10 @@ class ImageTransform:
             "plus_image_to_probe": None if scale is None else self.plus_matrix().tolist(),
             "scale_mm_per_px": None if scale is None else scale.tolist(),
             "face_offset_mm": self.face_offset_mm,
+            "range_factor": self.range_factor,
             "covariance": None if covariance is None else covariance.tolist(),
+            "image_unknowns": unknown_names(self.unknowns),
+            "image_covariance": None if full is None else full.tolist(),
             "rms_mm": self.error_mm,
         }
 
@@ -436,13 +457,37 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     if scale is not None and not (scale > 0).all():
         raise FormatError("scale_mm_per_px must be positive")
     offset = _array(record, "face_offset_mm", ())
+    factor = _array(record, "range_factor", ())
+    if factor is not None and not factor > 0:
+        raise FormatError("range_factor must be positive")
     error = _array(record, "rms_mm", ())
     converged = record.get("converged")
+    unknowns = _unknowns(record)
+    size = len(unknown_names(unknowns))
     return ImageTransform(
-        transform, scale, 0.0 if offset is None else float(offset),
-        _array(record, "covariance", (6, 6)), None if error is None else float(error),
-        converged if isinstance(converged, bool) else None, source,
-    )  # fmt: skip
+        transform,
+        scale,
+        0.0 if offset is None else float(offset),
+        _array(record, "covariance", (6, 6)),
+        None if error is None else float(error),
+        converged if isinstance(converged, bool) else None,
+        source,
+        1.0 if factor is None else float(factor),
+        unknowns,
+        _array(record, "image_covariance", (size, size)),
+    )
+
+
+def _unknowns(record: dict[str, Any]) -> tuple[str, ...]:
+    """The blocks whose tangents ``image_unknowns`` names."""
+    names = record.get("image_unknowns")
+    if names is None:
+        return ("translation", "rotation")
+    known = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    blocks = tuple(block for block in IMAGE_BLOCKS if known and UNKNOWNS[block][0] in names)
+    if not known or unknown_names(blocks) != names or blocks[:2] != ("translation", "rotation"):
+        raise FormatError("image_unknowns names other unknowns than those of an image point")
+    return blocks
 
 
 def _array(record: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray | None:

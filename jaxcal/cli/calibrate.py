@@ -11,11 +11,11 @@ import click
 
 from jaxcal.cli.common import (
     POSITIVE,
-    exit_code,
     import_engine,
     print_json,
     print_page,
     progress,
+    verdict_code,
 )
 from jaxcal.errors import InputError
 
@@ -148,6 +148,25 @@ class _Request:
     help="Also write the transform for another program: plus:CONFIG.xml (put into this "
     "configuration), slicer:PATH, itk:PATH, ros:PATH, tusrec:PATH or numpy:PATH.",
 )
+@click.option(
+    "--tre",
+    "tre_points",
+    type=float,
+    nargs=2,
+    multiple=True,
+    metavar="X Y",
+    help="The error to expect at this point of the image (pixels u v, or mm lateral and depth as "
+    "the recording has them), with its interval.",
+)
+@click.option(
+    "--require",
+    type=click.Choice(["good", "fair", "uncertain"]),
+    default="fair",
+    show_default=True,
+    help="Exit with status 5 if the verdict is worse: good is an error up to 0.5 mm at the image, "
+    "fair up to 1.5 mm.",
+)
+@click.option("--report", type=click.Path(), metavar="HTML", help="Write a page for a browser.")
 @click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def calibrate(
@@ -167,6 +186,9 @@ def calibrate(
     cross_validate: bool,
     bootstrap: int | None,
     exports: tuple[str, ...],
+    tre_points: tuple[tuple[float, float], ...],
+    require: str,
+    report: str | None,
     out: str | None,
     as_json: bool,
 ) -> int:
@@ -180,6 +202,7 @@ def calibrate(
     import_engine()
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.io.hdf5 import load
+    from jaxcal.report.accuracy import settle
     from jaxcal.report.next_poses import next_poses_record
     from jaxcal.report.record import calibration_record, check_test_images
     from jaxcal.report.write import prepare_folder, write_report
@@ -192,23 +215,28 @@ def calibrate(
         with progress(f"calibrating ({method})"):
             traced = folder is not None and method == "conventional"
             result = _solve(measured, request, traced=traced)
-            record = calibration_record(result, measured, test_data)
+            record = calibration_record(result, measured, test_data, tre_points)
             record["warnings"] += notes
             record["next_poses"] = next_poses_record(result, measured)
         if cross_validate or bootstrap is not None:
             with progress("calibrating over and over"):
                 record |= _resampled(measured, request, result, cross_validate, bootstrap)
+            settle(record)
         if folder is not None:
             with progress("drawing the report"):
                 curves = _curves(measured, request, result)
                 write_report(folder, record, result, measured, curves)
+    if report is not None:
+        from jaxcal.report.page import write_page
+
+        write_page(report, record, result, measured)
     exported = _export(record, recording, targets)
     if as_json:
         print_json(record)
     else:
         _print(record, out)
         print_page(*exported)
-    return exit_code([record])
+    return verdict_code(record, require)
 
 
 def _export_target(text: str) -> tuple[str, str]:
@@ -359,10 +387,10 @@ def _resampled(
     if cross_validate:
         folds = min(problem.images, MOST_FOLDS)
         held_out = resampling.cross_validate(problem, folds=folds, result=result, **arguments)
-        found["cross_validation"] = cross_validation_record(held_out)
+        found["cross_validation"] = cross_validation_record(held_out, result)
     if draws is not None:
         scatter = resampling.bootstrap(problem, draws, result=result, **arguments)
-        found["bootstrap"] = bootstrap_record(scatter)
+        found["bootstrap"] = bootstrap_record(scatter, result)
     return found
 
 

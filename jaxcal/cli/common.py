@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 class ExitCode(enum.IntEnum):
     """How the process ends; the last two are the shell's names for signals 2 and 13.
 
-    Only an acquisition ends with 4: stopped early, by a device or a person, and to be resumed.
+    Only an acquisition ends with 4: stopped early, by a device or a person, and to be resumed. 5 is
+    a calibration that converged and is less accurate than was required (fair, if not told
+    otherwise).
     """
 
     CONVERGED = 0
@@ -32,6 +34,7 @@ class ExitCode(enum.IntEnum):
     BAD_INPUT = 2
     NOT_CONVERGED = 3
     STOPPED = 4
+    UNCERTAIN = 5
     INTERRUPTED = 130
     BROKEN_PIPE = 141
 
@@ -66,6 +69,18 @@ def exit_code(records: Iterable[dict[str, Any]]) -> ExitCode:
     """0 where every calibration converged, else 3."""
     converged = all(record["converged"] for record in records)
     return ExitCode.CONVERGED if converged else ExitCode.NOT_CONVERGED
+
+
+WORDS = ("good", "fair", "uncertain")
+"""Verdicts, best first."""
+
+
+def verdict_code(record: dict[str, Any], required: str) -> ExitCode:
+    """:func:`exit_code`, and 5 where the verdict is worse than what is required."""
+    code = exit_code([record])
+    if code or WORDS.index(record["verdict"] or "uncertain") <= WORDS.index(required):
+        return code
+    return ExitCode.UNCERTAIN
 
 
 def print_json(record: dict[str, Any]) -> None:

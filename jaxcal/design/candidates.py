@@ -202,7 +202,7 @@ def candidates_around(
         images = poses[used, :3, :3] @ x[:3, :3]
         reference, _ = nearest_rotations(images.mean(axis=0)[None])
         constraints = Constraints(
-            region=_seen_region(recording, targets[used]) if region is None else region,
+            region=seen_region(recording, targets[used]) if region is None else region,
             reference=reference[0],
         )
         seen = constraints.coordinates(poses[used], x, point)
@@ -217,7 +217,7 @@ def candidates_around(
     return Candidates(found, model, constraints, poses, used)
 
 
-def _seen_region(recording: Recording, targets: Float[np.ndarray, "n 3"]) -> Region:
+def seen_region(recording: Recording, targets: Float[np.ndarray, "n 3"]) -> Region:
     """Where the target was, somewhat wider; at least most of the probe's face where it is known."""
     probe = recording.probe
     whole = Region() if probe is None else Region.of_probe(probe)

@@ -1,7 +1,8 @@
 """What a plan is for: the weight matrices W, and what a further pose gains.
 
-TRE. At an image point p the error of X Exp(d) p is J_p d with J_p = [I, -[p]x] (mm), so its mean
-square over an image region is tr(W S), W = mean of J_p'J_p.
+TRE. At an image point p the error of X Exp(d) p is J_p d with J_p = [I, -[p]x] (mm) and, where the
+pixel scales are unknown, two columns more (:mod:`jaxcal.image_points`), so its mean square over an
+image region is tr(W S), W = mean of J_p'J_p.
 
 RP (Eq. 8). The reconstructed points B_i X p_i scatter by J_i d about their mean, J_i = R_i R_X J_p;
 the expected square is tr(W S), W = sum_i (J_i - mean J)'(J_i - mean J) / (n - 1) over the test set.
@@ -46,10 +47,8 @@ def check_criterion(criterion: str) -> None:
 
 def tre_weight(points: Float[np.ndarray, "m 3"], size: int = 9) -> Float[np.ndarray, "p p"]:
     """W of the mean squared TRE over image points [lateral, 0, axial], mm."""
-    moved = _point_jacobian(points)
-    weight = np.zeros((size, size))
-    weight[:6, :6] = np.einsum("mia,mib->ab", moved, moved) / len(points)
-    return weight
+    moved = _point_jacobian(points, size)
+    return np.einsum("mia,mib->ab", moved, moved) / len(points)
 
 
 def rp_weight(
@@ -66,20 +65,22 @@ def rp_weight(
         image_to_probe: X.
         size: number of unknowns.
     """
-    moved = poses[:, :3, :3] @ image_to_probe[:3, :3] @ _point_jacobian(points)
+    moved = poses[:, :3, :3] @ image_to_probe[:3, :3] @ _point_jacobian(points, size)
     moved = moved - moved.mean(axis=0)
-    weight = np.zeros((size, size))
-    weight[:6, :6] = np.einsum("mia,mib->ab", moved, moved) / max(len(points) - 1, 1)
-    return weight
+    return np.einsum("mia,mib->ab", moved, moved) / max(len(points) - 1, 1)
 
 
-def _point_jacobian(points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3 6"]:
-    """[I, -[p]x]."""
+def _point_jacobian(points: Float[np.ndarray, "m 3"], size: int) -> Float[np.ndarray, "m 3 p"]:
+    """[I, -[p]x, 0] and, for eleven unknowns, the columns of the scales' logarithms."""
+    moved = np.zeros((len(points), 3, size))
+    moved[:, :, :3] = np.eye(3)
     x, y, z = points.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
-    eye = np.broadcast_to(np.eye(3), (len(points), 3, 3))
-    return np.concatenate([eye, cross], axis=2)
+    moved[:, 0, 4], moved[:, 0, 5] = z, -y
+    moved[:, 1, 3], moved[:, 1, 5] = -z, x
+    moved[:, 2, 3], moved[:, 2, 4] = y, -x
+    if size > 9:
+        moved[:, 0, 9], moved[:, 2, 10] = x, z
+    return moved
 
 
 def hypotheses(doubt: float) -> Float[np.ndarray, "k 3"]:

@@ -23,7 +23,7 @@ from scipy.optimize import brentq
 
 from jaxcal.design.noise import Noise
 from jaxcal.errors import InputError
-from jaxcal.model.parameters import RIGID
+from jaxcal.model.parameters import RIGID, block_slice
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
@@ -111,11 +111,9 @@ def known_information(
 ) -> Float[np.ndarray, "p p"]:
     """Information of a calibration about all unknowns, its weak directions included.
 
-    The images tell how the target hangs together with X; the calibration's covariance tells what is
-    known of X (offsets' law, their mean, tuned SDs). Both hold with the images' information J whose
-    block of X is changed by C^-1 - (J / J_target), the inverse of the calibration's covariance less
-    the Schur complement: X's marginal covariance is then exactly C. Where C is not known (X is not
-    observable), it is what the images' poses tell, with the beliefs that any plan begins with.
+    It is the inverse of the calibration's covariance of these unknowns. Where that is not known (X
+    is not observable), it is what the images' poses tell, with the beliefs that any plan begins
+    with.
 
     Args:
         result: of one problem.
@@ -126,14 +124,22 @@ def known_information(
     used = np.asarray(answer.mask) > 0
     if len(used) != len(poses):
         raise InputError(f"the calibration is of {len(used)} images, {len(poses)} poses were given")
-    found = model.information(poses[used]) + model.beliefs()
-    covariance = np.asarray(answer.covariance, float)
-    if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0:
-        return found
-    rest = found[6:, 6:]
-    schur = found[:6, :6] - found[:6, 6:] @ np.linalg.solve(rest, found[6:, :6])
-    found[:6, :6] += covariance_of(covariance) - schur
-    return 0.5 * (found + found.T)
+    covariance = _of_model(result, model)
+    if covariance is None:
+        return model.information(poses[used]) + model.beliefs()
+    return covariance_of(covariance)
+
+
+def _of_model(result: Calibration, model: Model) -> Float[np.ndarray, "p p"] | None:
+    """The calibration's covariance of a model's unknowns; None where it is not known."""
+    rows = np.concatenate([np.r_[block_slice(result.blocks, name)] for name in model.blocks])
+    covariance = np.asarray(result.numpy().unknowns_covariance, float)[rows[:, None], rows]
+    if not np.isfinite(covariance).all():
+        return None
+    unit = np.sqrt(np.diagonal(covariance))
+    if not (unit > 0).all() or np.linalg.eigvalsh(covariance / np.outer(unit, unit))[0] <= 0:
+        return None
+    return covariance
 
 
 def effective_elevational(
@@ -154,11 +160,11 @@ def effective_elevational(
         weight: W of what counts.
     """
     answer = result.numpy()
-    covariance = np.asarray(answer.covariance, float)
+    covariance = _of_model(result, model)
     used = np.asarray(answer.mask) > 0
-    if not np.isfinite(covariance).all():
+    if covariance is None:
         return 1.0
-    said = float(np.sum(weight[:6, :6] * covariance))
+    said = float(np.sum(weight * covariance))
     rows = model.jacobian(poses[used])
 
     def excess(log_factor: float) -> float:

@@ -5,29 +5,51 @@ so intervals use Student's t instead of the normal law. Its degrees of freedom a
 kind of residual: of the n used images' three kinds (lateral, range, offset) the unknowns take a
 third each. It is the usual small-sample approximation, and nothing more.
 
-The target registration error (TRE) at an image point p is the distance between where the estimated
-and the true transform put it. To first order X_true p = X Exp(d) p with d ~ N(0, covariance), so
-the error is J d with J = [I, -[p]x], and the root mean square error is sqrt(trace(J C J')).
+The target registration error (TRE) at an image point is the distance between where the estimated
+and the true calibration put it. To first order it is |J d| with d ~ N(0, C), C the covariance of
+all unknowns that move the point and J its derivatives by them (:mod:`jaxcal.image_points`); its
+root mean square is sqrt(trace(J C J')).
 
-References: Fitzpatrick, West and Maurer 1998 (TRE as a root mean square); Student 1908.
+Its distribution: with J C J' = L L', d = L u rho for a uniformly distributed direction u, and rho^2
+is chi squared, or with SDs that were tuned k F(k, nu). So
+
+    P(TRE <= r) = mean over directions of P(rho^2 <= r^2 / |L u|^2),
+
+a mean over a few hundred directions that fill the sphere evenly.
+
+References: Fitzpatrick, West and Maurer 1998 (TRE as a root mean square); Student 1908; Genz and
+Bretz 2009, section 4.1.2 (radial and spherical integration); Roberts 2018 (the sequence);
+Kackar and Harville 1984 (estimated weights).
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy import special
 
 from jaxcal.diagnostics.arrays import array_module, traceable
 from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.errors import InputError
 from jaxcal.geometry import AnyArray
+from jaxcal.image_points import image_rows, point_jacobian
 from jaxcal.model.parameters import size
+from jaxcal.sound import WATER_M_S
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
+
+DIRECTIONS = 1024
+"""Directions over which the distribution of an error is averaged. Quantiles are right to 0.5 %,
+lower ends of errors along a single axis to 5 %."""
+
+_BISECTIONS = 30
+_RADII = 4000
+"""Values of rho^2 between which its distribution is interpolated."""
 
 
 @traceable
@@ -38,6 +60,22 @@ def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     if calibration.prior not in TUNED:
         return xp.asarray(xp.maximum(left, 1.0))
     return xp.where(calibration.sigma_tuned, xp.maximum(left, 1.0), np.inf)
+
+
+@traceable
+def variance_factor(calibration: Calibration) -> Float[AnyArray, "*batch"]:
+    """What a mean square error is larger by than the covariance says (traceable).
+
+    1 for a single pooled variance, which is estimated without bias. SDs that are tuned to the same
+    images are used as weights, too: the answer errs by more than with known weights, and by more
+    than it says (Kackar and Harville 1984). Student's variance makes up for that: see
+    ``experiments/tre_calibration.py``.
+    """
+    xp = array_module(calibration)
+    left = degrees_of_freedom(calibration)
+    if calibration.prior not in TUNED:
+        return xp.ones_like(left)
+    return xp.where(xp.isfinite(left), left / xp.maximum(left - 2, 1.0), 1.0)
 
 
 def transform_intervals(
@@ -56,11 +94,57 @@ def transform_intervals(
     Raises:
         InputError: a level that is no probability between 0 and 1.
     """
-    if not 0 < level < 1:
-        raise InputError(f"level must be between 0 and 1, not {level}")
-    factor = stats.t.ppf(0.5 + 0.5 * level, np.asarray(degrees_of_freedom(calibration)))
+    _check_level(level)
+    left = np.asarray(degrees_of_freedom(calibration), float)
+    factor = np.where(
+        np.isfinite(left),
+        special.stdtrit(np.where(np.isfinite(left), left, 1.0), 0.5 + 0.5 * level),
+        special.ndtri(0.5 + 0.5 * level),
+    )
     variance = np.diagonal(calibration.numpy().covariance, axis1=-2, axis2=-1)
     return factor[..., None] * np.sqrt(variance)
+
+
+@traceable
+def image_jacobian(
+    calibration: Calibration, points: Float[AnyArray, "m 2"]
+) -> Float[AnyArray, "*batch m 3 p"]:
+    """Derivatives of image points by all unknowns of a calibration, image frame (traceable).
+
+    Args:
+        calibration: one or a batch.
+        points: [lateral, axial], mm.
+    """
+    xp = array_module(calibration, points)
+    origin, speed = range_of_row_zero(calibration)
+    shape = (*np.shape(calibration.mask)[:-1], *points.shape)
+    points = xp.broadcast_to(xp.asarray(points), shape)
+    return point_jacobian(points, calibration.blocks, origin, speed, xp)
+
+
+@traceable
+def range_of_row_zero(
+    calibration: Calibration,
+) -> tuple[Float[AnyArray, "*batch"], Float[AnyArray, "*batch"]]:
+    """Range that measurements of 0 stand for, mm, and the factor on the nominal sound speed.
+
+    A calibration without its problem is taken to have no face offset and the nominal sound speed of
+    water.
+    """
+    xp = array_module(calibration)
+    problem = calibration.problem
+    face, before, nominal = 0.0, 0.0, WATER_M_S
+    if problem is not None:
+        face = problem.face_offset
+        nominal = WATER_M_S if problem.sound_speed is None else problem.sound_speed
+        before = 0.0 if problem.delay is None else problem.delay
+    one = xp.ones(np.shape(calibration.mask)[:-1])
+    speed, delay = one, 0.0
+    if calibration.sound_speed_m_s is not None:
+        speed = xp.asarray(calibration.sound_speed_m_s) / xp.asarray(nominal)
+    if calibration.delay_s is not None:
+        delay = (xp.asarray(calibration.delay_s) - before) * 1e3 * xp.asarray(nominal)
+    return xp.asarray(one * speed * (xp.asarray(face) - delay)), xp.asarray(one * speed)
 
 
 @traceable
@@ -68,6 +152,8 @@ def predicted_tre(
     calibration: Calibration, points: Float[AnyArray, "*points 2"]
 ) -> Float[AnyArray, "*shape"]:
     """Root mean square target registration error that the covariance predicts, mm (traceable).
+
+    Estimated pixel sizes, sound speed and delay count with their correlation with X.
 
     Args:
         calibration: one or a batch.
@@ -78,19 +164,160 @@ def predicted_tre(
     """
     xp = array_module(calibration, points)
     points = xp.asarray(points)
-    lateral, axial = points[..., 0].ravel(), points[..., 1].ravel()
-    zero, one = xp.zeros_like(lateral), xp.ones_like(lateral)
-    # I and omega x p with p = (lateral, 0, axial).
-    rows = (
-        (one, zero, zero, zero, axial, zero),
-        (zero, one, zero, -axial, zero, lateral),
-        (zero, zero, one, zero, -lateral, zero),
+    covariance = error_covariance(calibration, points.reshape(-1, 2))
+    found = xp.sqrt(
+        variance_factor(calibration)[..., None] * xp.trace(covariance, axis1=-2, axis2=-1)
     )
-    jacobian = xp.stack([xp.stack(row, axis=-1) for row in rows])
-    left = degrees_of_freedom(calibration)
-    # Student's variance exceeds the normal one's by this factor.
-    factor = xp.where(xp.isfinite(left), left / xp.maximum(left - 2, 1.0), 1.0)
-    covariance = xp.asarray(calibration.covariance)
-    square = xp.einsum("kma,...ab,kmb->...m", jacobian, covariance, jacobian)
-    found = xp.sqrt(factor[..., None] * square)
     return found.reshape(*found.shape[:-1], *points.shape[:-1])
+
+
+@traceable
+def error_covariance(
+    calibration: Calibration, points: Float[AnyArray, "m 2"]
+) -> Float[AnyArray, "*batch m 3 3"]:
+    """J C J' of image points [lateral, axial] (mm), in the image frame, mm^2 (traceable)."""
+    xp = array_module(calibration, points)
+    jacobian = image_jacobian(calibration, points)
+    covariance = xp.asarray(calibration.unknowns_covariance)
+    return xp.einsum("...mia,...ab,...mjb->...mij", jacobian, covariance, jacobian)
+
+
+@dataclass(frozen=True)
+class TargetError:
+    """Target registration error, mm.
+
+    Attributes:
+        rms: root mean square.
+        lower: lower end of the interval.
+        upper: upper end.
+    """
+
+    rms: Float[np.ndarray, "*shape"]
+    lower: Float[np.ndarray, "*shape"]
+    upper: Float[np.ndarray, "*shape"]
+
+    def times(self, factor: float) -> TargetError:
+        """The same, larger by a factor."""
+        return TargetError(factor * self.rms, factor * self.lower, factor * self.upper)
+
+
+def tre_at(
+    calibration: Calibration, points: Float[np.ndarray, "*points 2"], level: float = 0.95
+) -> TargetError:
+    """Target registration error to expect at image points, with equal-tailed intervals.
+
+    Args:
+        calibration: one or a batch, with concrete values.
+        points: [lateral, axial] in the image plane, mm.
+        level: probability that an interval holds the actual error.
+
+    Returns:
+        Arrays of shape (*batch, *points); NaN where X is not observable.
+
+    Raises:
+        InputError: a level that is no probability between 0 and 1.
+    """
+    points = np.asarray(points, float)
+    covariance = error_covariance(calibration.numpy(), points.reshape(-1, 2))
+    left = np.asarray(degrees_of_freedom(calibration), float)[..., None]
+    factor = np.asarray(variance_factor(calibration))[..., None]
+    found = _errors(covariance, np.broadcast_to(left, covariance.shape[:-2]), factor, level)
+    shape = (*covariance.shape[:-3], *points.shape[:-1])
+    return TargetError(*(value.reshape(shape) for value in found))
+
+
+def tre_over(
+    calibration: Calibration, points: Float[np.ndarray, "m 2"], level: float = 0.95
+) -> TargetError:
+    """Root mean square over image points of the error of one calibration, with its interval.
+
+    It is sqrt(mean of |J_p d|^2 over the points p): what a comparison of two calibrations over the
+    image shows, and so its interval is one of a single number.
+
+    Args:
+        calibration: one or a batch, with concrete values.
+        points: [lateral, axial] of points that fill the region, mm.
+        level: probability that the interval holds the actual value.
+    """
+    answer = calibration.numpy()
+    rows = image_rows(answer.blocks)
+    jacobian = image_jacobian(answer, np.asarray(points, float))[..., rows]
+    weight = np.einsum("...mia,...mib->...ab", jacobian, jacobian) / jacobian.shape[-3]
+    covariance = np.asarray(answer.unknowns_covariance, float)[..., rows[:, None], rows]
+    values, vectors = np.linalg.eigh(weight)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    spread = np.swapaxes(root, -1, -2) @ covariance @ root
+    left = np.asarray(degrees_of_freedom(calibration), float)
+    factor = np.asarray(variance_factor(calibration))
+    return TargetError(*_errors(spread, np.broadcast_to(left, spread.shape[:-2]), factor, level))
+
+
+def _errors(
+    covariance: Float[np.ndarray, "*shape k k"],
+    left: Float[np.ndarray, "*shape"],
+    factor: np.ndarray,
+    level: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Root mean square and interval of the length of a vector with Student's distribution."""
+    _check_level(level)
+    finite = np.isfinite(covariance).all(axis=(-1, -2))
+    spread = np.where(finite[..., None, None], covariance, np.eye(covariance.shape[-1]))
+    values = np.maximum(np.linalg.eigvalsh(spread), 0.0)
+    flat, freedom = values.reshape(-1, values.shape[-1]), left.reshape(-1)
+    lower, upper = np.empty(len(flat)), np.empty(len(flat))
+    for each in np.unique(freedom):
+        rows = freedom == each
+        for chance, out in ((0.5 - 0.5 * level, lower), (0.5 + 0.5 * level, upper)):
+            out[rows] = _length_quantile(flat[rows], float(each), chance)
+    rms = np.sqrt(factor * values.sum(axis=-1))
+    found = rms, lower.reshape(left.shape), upper.reshape(left.shape)
+    return tuple(np.where(finite, value, np.nan) for value in found)  # pyright: ignore[reportReturnType]
+
+
+def _length_quantile(
+    variances: Float[np.ndarray, "m k"], freedom: float, chance: float
+) -> Float[np.ndarray, " m"]:
+    """Quantile of the length of vectors with these variances along their axes."""
+    dimensions = variances.shape[1]
+    total = variances.sum(axis=1)
+    total = np.where(total > 0, total, 1.0)
+    # |L u|^2 of every direction, as a share of the trace.
+    along = (variances / total[:, None]) @ (_directions(dimensions) ** 2).T
+    along = np.maximum(along, 1e-300)
+    grid, below = _radial(dimensions, freedom)
+    low = np.full(len(variances), np.log(1e-8))
+    high = np.full(len(variances), np.log(1e8))
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        share = np.interp(middle[:, None] - np.log(along), grid, below).mean(axis=1)
+        low, high = np.where(share < chance, middle, low), np.where(share < chance, high, middle)
+    found = np.exp(0.25 * (low + high))
+    return found * np.sqrt(np.where(variances.sum(axis=1) > 0, total, 0.0))
+
+
+@cache
+def _directions(dimensions: int) -> Float[np.ndarray, "d k"]:
+    """Unit vectors that fill the sphere evenly: normal scores of Roberts's sequence."""
+    # The generalised golden ratio: the positive root of g^(k+1) = g + 1.
+    golden = 1.5
+    for _ in range(60):
+        golden = (1 + golden) ** (1 / (dimensions + 1))
+    steps = golden ** -np.arange(1, dimensions + 1)
+    uniform = (0.5 + np.arange(1, DIRECTIONS + 1)[:, None] * steps) % 1.0
+    normal = special.ndtri(np.clip(uniform, 1e-9, 1 - 1e-9))
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+@cache
+def _radial(dimensions: int, freedom: float) -> tuple[Any, Any]:
+    """Logarithms of rho^2, and the probability that it is below them."""
+    grid = np.linspace(np.log(1e-9), np.log(1e9), _RADII)
+    square = np.exp(grid)
+    if np.isfinite(freedom):
+        return grid, special.fdtr(dimensions, freedom, square / dimensions)
+    return grid, special.chdtr(dimensions, square)
+
+
+def _check_level(level: float) -> None:
+    if not 0 < level < 1:
+        raise InputError(f"level must be between 0 and 1, not {level}")

@@ -304,7 +304,7 @@ class Whitened:
     def of(cls, answer: Calibration, seen: ImageErrors, problem: Problem) -> Whitened:
         """Of calibrations on points with Gaussian errors."""
         sigma, tau = np.asarray(answer.sigma), answer.linearisation.tracker_sd
-        offset, shape = None, _own_covariance(answer, problem)
+        offset, shape = None, own_covariance(answer, problem)
         if tau is not None:
             sigma = np.hypot(sigma, tau[:, None] * [1.0, 1.0, 0.0])
             far = np.hypot(seen.errors[..., 2], seen.q[..., 2])
@@ -332,7 +332,7 @@ class Whitened:
         return quadratic(flat, inverse).reshape(rows.shape[:-1]) + own
 
 
-def _own_covariance(answer: Calibration, problem: Problem) -> Float[Array, "k n 2 2"] | None:
+def own_covariance(answer: Calibration, problem: Problem) -> Float[Array, "k n 2 2"] | None:
     """The shape of the images' own covariances where they whiten the errors, or None."""
     if problem.covariance is None:
         return None

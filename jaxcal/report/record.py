@@ -13,10 +13,12 @@ from jaxcal.calibration import Calibration
 from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.errors import InputError
+from jaxcal.image_points import image_rows, unknown_names
 from jaxcal.poses import rotation_angle
 from jaxcal.recording import Images, Recording, Truth
+from jaxcal.report.accuracy import accuracy_record, settle
 from jaxcal.report.certified import certificate_record
-from jaxcal.transform import FORMAT, VERSION, ImageTransform
+from jaxcal.transform import FORMAT, VERSION
 
 CONVENTION = {
     "units": "lengths in mm; rotations in rad where no unit is in the name",
@@ -31,6 +33,13 @@ CONVENTION = {
     "an image was left out",
     "covariance": "of image_plane_to_probe under the right perturbation X Exp([v, omega]): v in "
     "mm, then omega in rad, along and about the image's axes",
+    "image_covariance": "of image_unknowns: those of covariance, and the logarithms of estimated "
+    "pixel sizes and sound speed, and the delay in mm",
+    "face_offset_mm": "range of pixel row 0, or of a measured range of 0; range_factor: estimated "
+    "sound speed over the nominal one",
+    "tre": "target registration error: distance between the true and the calibrated place of an "
+    "image point; rms_mm over the region and in points with 95 % intervals, stated_* as the "
+    "covariance has them, larger by factor where the data contradict it",
     "objective": "the minimised sum of squares: mm^2, or in SDs with the gaussian prior; with auto "
     "and uniform that of the Gaussian fit before the laws are weighed",
     "certified": "no transform fits Eq. 7 better (one part in 1e9), which is proved: of the answer "
@@ -42,7 +51,10 @@ CONVENTION = {
 
 
 def calibration_record(
-    result: Calibration, recording: Recording, test: Recording | None = None
+    result: Calibration,
+    recording: Recording,
+    test: Recording | None = None,
+    tre_points: tuple[tuple[float, float], ...] = (),
 ) -> dict[str, Any]:
     """Everything about one calibration that goes into ``calibration.json`` and ``--json``.
 
@@ -50,6 +62,7 @@ def calibration_record(
         result: of one problem (not a batch), with concrete values.
         recording: what was calibrated; its truth and test set are used where it has them.
         test: another recording whose calibration images are the test set instead.
+        tre_points: further image points, in the images' unit, whose error is wanted.
 
     Returns:
         A dictionary that ``json.dumps(..., allow_nan=False)`` takes.
@@ -60,11 +73,9 @@ def calibration_record(
     answer = result.numpy()
     precision, precision_set = _precision(answer, recording, test)
     scale = answer.scale_mm_per_px
-    transform = ImageTransform(
-        np.asarray(answer.image_to_probe),
-        None if scale is None else np.asarray(scale),
-        recording.calibration.face_offset_mm,
-    )
+    transform = answer.image_transform()
+    full, rows = answer.unknowns_covariance, image_rows(answer.blocks)
+    known = bool(np.isfinite(full).all())
     record: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
@@ -85,14 +96,18 @@ def calibration_record(
         "sigma_lateral_mm": answer.sigma[0],
         "sigma_range_mm": answer.sigma[1],
         "sigma_elevation_mm": answer.sigma[2],
-        "covariance": answer.covariance if np.isfinite(answer.covariance).all() else None,
+        "covariance": answer.covariance if known else None,
+        "image_unknowns": unknown_names(transform.unknowns),
+        "image_covariance": full[rows[:, None], rows] if known else None,
+        "point_covariance_mm2": answer.point_covariance if known else None,
         "observability": result.observability,
         "rms_mm": answer.rms,
         **certificate_record(answer, recording),
         "reconstruction_precision_mm": precision,
         "reconstruction_precision_set": precision_set,
         "scale_mm_per_px": answer.scale_mm_per_px,
-        "face_offset_mm": recording.calibration.face_offset_mm,
+        "face_offset_mm": transform.face_offset_mm,
+        "range_factor": transform.range_factor,
         "data": result.data,
         "channel_sigma_mm": answer.channel_sigma,
         "sound_speed_m_s": answer.sound_speed_m_s,
@@ -106,12 +121,15 @@ def calibration_record(
         "outliers": messages.outliers(answer),
         "outlier_reasons": messages.outlier_reasons(answer),
         "warnings": result.warnings,
+        **accuracy_record(result, recording, tre_points),
     }
     if recording.truth is not None:
         record["truth_error"] = truth_error(answer, recording.truth)
     record |= {"source": recording.source, "convention": CONVENTION}
     record["jaxcal_version"] = jaxcal.__version__
-    return plain(record)
+    found = plain(record)
+    settle(found)
+    return found
 
 
 def truth_error(result: Calibration, truth: Truth) -> dict[str, float]:

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxcal.calibration import Calibration
+from jaxcal.report.accuracy import stated_at
 from jaxcal.report.record import plain
 from jaxcal.resampling import Bootstrap, CrossValidation
 
@@ -14,8 +16,13 @@ INFLUENTIAL = 1.0
 """An image that moves X by more than this many of its SDs is worth naming."""
 
 
-def cross_validation_record(found: CrossValidation) -> dict[str, Any]:
-    """For ``calibration.json`` and ``--json``."""
+def cross_validation_record(found: CrossValidation, result: Calibration) -> dict[str, Any]:
+    """For ``calibration.json`` and ``--json``.
+
+    Args:
+        found: by holding images out.
+        result: the calibration of all images.
+    """
     influence = np.asarray(found.influence, dtype=float)
     used = np.asarray(found.mask) > 0
     strongest = np.argsort(np.where(used & np.isfinite(influence), -influence, np.inf))[:5]
@@ -26,12 +33,20 @@ def cross_validation_record(found: CrossValidation) -> dict[str, Any]:
         "rms_mm": float(found.rms),
         "log_density": float(np.sum(np.asarray(found.log_density))),
         "influence": np.where(used, influence, np.nan),
+        "image_moved_mm": np.where(used, np.asarray(found.image_moved), np.nan),
+        "image_points_mm": np.asarray(found.image_points),
+        "stated_mm": stated_at(result, np.asarray(found.image_points)),
         "most_influential": [int(image) for image in strongest if used[image]],
     })  # fmt: skip
 
 
-def bootstrap_record(found: Bootstrap) -> dict[str, Any]:
-    """For ``calibration.json`` and ``--json``."""
+def bootstrap_record(found: Bootstrap, result: Calibration) -> dict[str, Any]:
+    """For ``calibration.json`` and ``--json``.
+
+    Args:
+        found: by drawing images anew.
+        result: the calibration of all images.
+    """
     spread = np.asarray(found.spread, dtype=float)
     return plain({
         "resamples": len(np.asarray(found.converged)),
@@ -40,6 +55,7 @@ def bootstrap_record(found: Bootstrap) -> dict[str, Any]:
         "rotation_sd_deg": np.degrees(spread[3:]),
         "image_points_mm": np.asarray(found.image_points),
         "reproducibility_mm": np.asarray(found.reproducibility),
+        "stated_mm": stated_at(result, np.asarray(found.image_points)),
     })  # fmt: skip
 
 

@@ -73,6 +73,7 @@ def comparison_table(
 def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
     prior = "" if record["prior"] == "none" else f", {record['prior']} prior"
     facts = [
+        *_accuracy(record),
         ("method", f"{record['method']}{prior}"),
         ("status", f"{record['status']} after {record['iterations']} iterations"),
         ("images", f"{record['images_used']} used of {record['images']}"),
@@ -83,7 +84,7 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
             f"range {_number(record['sigma_range_mm'], '.3f')}, "
             f"elevational {_number(record['sigma_elevation_mm'], '.3f')}",
         ),
-        ("RMS in the image plane (mm)", _number(record["rms_mm"], ".3f")),
+        ("residual RMS (mm)", _residuals(record)),
         (
             f"reconstruction precision, {record['reconstruction_precision_set']} images (mm)",
             _number(record["reconstruction_precision_mm"], ".3f"),
@@ -126,6 +127,38 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
             )
         )
     return facts
+
+
+def _accuracy(record: dict[str, Any]) -> list[tuple[str, str]]:
+    """The error to expect at the image, over it and at points."""
+    tre = record.get("tre")
+    if tre is None or tre.get("rms_mm") is None:
+        return []
+
+    def shown(error: float | None, interval: list[float | None]) -> str:
+        low, high = (_number(end, ".3f") for end in interval)
+        return f"{_number(error, '.3f')}, 95 % interval {low} to {high}"
+
+    facts = [("error to expect at the image (mm)", shown(tre["rms_mm"], tre["interval_95_mm"]))]
+    for point in tre["points"]:
+        u, v = point["image"]
+        place = f"({u:g}, {v:g})" if point["name"] == "asked for" else f"({u:.0f}, {v:.0f})"
+        named = "" if point["name"] == "asked for" else f"{point['name']} "
+        facts.append(
+            (f"  at {named}{place} {tre['unit']}", shown(point["tre_mm"], point["interval_95_mm"]))
+        )
+    return facts
+
+
+def _residuals(record: dict[str, Any]) -> str:
+    found = record.get("limits")
+    whole = _number(record["rms_mm"], ".3f")
+    if found is None:
+        return whole
+    return (
+        f"{whole}: {_number(found['rms_in_plane_mm'], '.3f')} in the image plane, "
+        f"{_number(found['rms_elevational_mm'], '.3f')} out of it"
+    )
 
 
 def _number(value: float | None, form: str) -> str:

@@ -1,4 +1,8 @@
-"""A calibration in a few plain sentences: how good, how certain, what looks wrong, what to do."""
+"""A calibration in a few plain sentences: how good, how certain, what looks wrong, what to do.
+
+The first sentence has one word and one number, and both are the target registration error to expect
+at the image (:mod:`jaxcal.report.accuracy`).
+"""
 
 from __future__ import annotations
 
@@ -6,20 +10,24 @@ import math
 from typing import Any
 
 from jaxcal.diagnostics import messages
+from jaxcal.report.accuracy import FAIR_MM
 from jaxcal.report.certified import certificate_words
 from jaxcal.report.resampled import resampled_sentences
 
-GOOD = 0.5
-"""Largest SD of X, in mm and in degrees, that is called good,"""
-FAIR = 1.5
-"""and fair."""
 FEW_IMAGES = 20
+_MOST_MOVED_SHARE = 0.3
+"""Images that move the image by more than this share of the stated error are worth naming."""
 
 _AXES = ("lateral (sideways)", "elevational (out-of-plane)", "axial (depth)")
 _MORE_VARIED = (
     "Add images with the probe tilted by 20 to 30 degrees about each of its three axes, and with "
     "the target in all parts of the image, near and far, left and right."
 )
+_KINDS = {
+    "lateral": "sideways errors of the points",
+    "range": "errors of their depth",
+    "elevational": "targets out of the image plane",
+}
 
 
 def verdict(record: dict[str, Any]) -> list[str]:
@@ -31,18 +39,185 @@ def verdict(record: dict[str, Any]) -> list[str]:
     Returns:
         Paragraphs without line breaks; bullet points start with "- ".
     """
-    lines = [_headline(record)]
+    lines = [headline(record)]
     if record["status"] in ("converged", "max_iterations"):
-        lines += [*_certainty(record), _errors(record), *resampled_sentences(record)]
+        lines += [*_contradictions(record), *_where(record), *limits(record), *_believe(record)]
+        lines += [*_certainty(record), *resampled_sentences(record)]
         proved = certificate_words(record)
         if proved is not None:
             lines.append(f"{proved[0].upper()}{proved[1:]}.")
     if record["warnings"]:
         lines += ["Look at this:", *(f"- {text}" for text in record["warnings"])]
-    todo = _advice(record)
+    todo = advice(record)
     if todo:
         lines += ["What to do:", *(f"- {text}" for text in todo)]
     return lines
+
+
+def headline(record: dict[str, Any]) -> str:
+    """Word and number."""
+    status, tre = record["status"], record.get("tre")
+    if status == "failed":
+        return "Failed: there is no calibration."
+    if status == "unobservable":
+        return "Do not use: these images do not determine the calibration."
+    if status == "max_iterations":
+        return "Do not trust: the solver stopped before it had arrived."
+    if tre is None or tre.get("rms_mm") is None:
+        return (
+            f"Uncertain: solved from {record['images_used']} images, which do not tell how far off "
+            "the image is."
+        )
+    low, high = tre["interval_95_mm"]
+    return (
+        f"{record['verdict'].capitalize()}: expect points of the image to be {_mm(tre['rms_mm'])} "
+        f"off, between {_mm(low)} and {_mm(high)} with 95 % probability (target registration "
+        "error, root mean square over the image)."
+    )
+
+
+def _mm(value: float | None) -> str:
+    """Two significant digits, at least hundredths."""
+    if value is None:
+        return "an unknown distance"
+    digits = 2 if value >= 0.0095 else 4
+    return f"{value:.{1 if value >= 10 else digits}f} mm"
+
+
+def _contradictions(record: dict[str, Any]) -> list[str]:
+    tre = record.get("tre")
+    if tre is None or not tre.get("contradictions"):
+        return []
+    return [
+        f"The noise model by itself states {_mm(tre['stated_mm'])}, but "
+        f"{'; '.join(tre['contradictions'])}. That much more is to be expected."
+    ]
+
+
+def _where(record: dict[str, Any]) -> list[str]:
+    """Where in the image, and the points that were asked for."""
+    tre = record.get("tre")
+    if tre is None or tre.get("rms_mm") is None:
+        return []
+    corners = [point for point in tre["points"] if point["name"] != "asked for"]
+    best = min(corners, key=lambda point: point["tre_mm"])
+    worst = max(corners, key=lambda point: point["tre_mm"])
+    lines = [
+        f"Best: {_place(best)}, {_mm(best['tre_mm'])}. Worst: {_place(worst)}, "
+        f"{_mm(worst['tre_mm'])}."
+    ]
+    for point in tre["points"]:
+        if point["name"] == "asked for":
+            low, high = point["interval_95_mm"]
+            u, v = point["image"]
+            lines.append(
+                f"At ({u:g}, {v:g}) {tre['unit']}: {_mm(point['tre_mm'])}, between {_mm(low)} and "
+                f"{_mm(high)} with 95 % probability."
+            )
+    return lines
+
+
+def _place(point: dict[str, Any]) -> str:
+    lateral, axial = point["position_mm"]
+    words = {"middle": "the middle"}.get(point["name"], f"the {point['name']} corner")
+    return f"{words} (lateral {lateral:.0f}, depth {axial:.0f} mm)"
+
+
+def limits(record: dict[str, Any]) -> list[str]:
+    """What limits the accuracy: noise, offsets, poses, single images."""
+    found, tre = record.get("limits"), record.get("tre")
+    if found is None or tre is None:
+        return []
+    lines = []
+    shares = {kind: share for kind, share in found["error_share"].items() if share is not None}
+    if shares:
+        ranked = sorted(shares.items(), key=lambda item: -item[1])
+        named = [f"{_KINDS[kind]} ({100 * share:.0f} %)" for kind, share in ranked if share >= 0.1]
+        lines.append(
+            f"What limits it: {', then '.join(named)} make its mean square error; the weakest "
+            f"direction is {record['observability']['weakest_direction']}."
+        )
+    lines.append(_scatter(record))
+    poses = _poses(record)
+    if poses:
+        lines.append(poses)
+    influence = record.get("influence")
+    if influence is not None:
+        strong = [
+            (image, influence["moved_mm"][image])
+            for image in influence["most"]
+            if (influence["moved_mm"][image] or 0.0) > _MOST_MOVED_SHARE * (tre["stated_mm"] or 0.0)
+        ]
+        if strong:
+            told = ", ".join(f"{image} ({moved:.2f} mm)" for image, moved in strong[:3])
+            lines.append(f"Images that move it most when they are left out: {told}.")
+    return lines
+
+
+def _scatter(record: dict[str, Any]) -> str:
+    """Why the target scatters as it does, which is not how far off the calibration is."""
+    found = record["limits"]
+    precision = record["reconstruction_precision_mm"]
+    shown = "" if precision is None else (
+        f", {_mm(precision)} by Eq. 8 over the {record['reconstruction_precision_set']} images"
+    )  # fmt: skip
+    ranked = sorted(found["scatter_share"].items(), key=lambda item: -(item[1] or 0.0))
+    told = [f"{_KINDS[kind]} {100 * share:.0f} %" for kind, share in ranked if share is not None]
+    return (
+        f"Seen through it, the target stays within {_mm(record['rms_mm'])} of one place{shown}: "
+        f"{', '.join(told)} of the mean square. That is how the images were taken and read, which "
+        "no calibration removes; the calibration's own error is the smaller number above."
+        if (record["tre"]["rms_mm"] or 0.0) < (record["rms_mm"] or 0.0)
+        else f"Seen through it, the target stays within {_mm(record['rms_mm'])} of one place"
+        f"{shown}: {', '.join(told)} of the mean square. The images agree with each other better "
+        "than the calibration is known: what is missing are other poses."
+    )
+
+
+def _poses(record: dict[str, Any]) -> str | None:
+    """Whether other poses would help more than further ones of the same kind."""
+    more = record.get("next_poses")
+    if not more or not more["tre_then_mm"] or not more["tre_now_mm"]:
+        return None
+    gain = (more["tre_now_mm"] / more["tre_then_mm"]) ** 2 - 1
+    alike, count = gain * record["images_used"], len(more["poses"])
+    if alike < 2 * count:
+        return "The poses are well chosen: further images help only by their number."
+    return (
+        f"The poses limit it: {count} well chosen images help as much as {alike:.0f} more of the "
+        "same kind."
+    )
+
+
+def _believe(record: dict[str, Any]) -> list[str]:
+    """Why this answer and not the conventional one, with the comparison."""
+    beside = record.get("comparison")
+    if beside is None:
+        return []
+    larger = (beside["rms_mm"] or 0.0) > beside["conventional_rms_mm"]
+    first = (
+        f"Its residuals are larger than those of the conventional fit ({beside['rms_mm']:.3f} and "
+        f"{beside['conventional_rms_mm']:.3f} mm), as they must be: the conventional fit minimises "
+        "that sum and nothing else."
+        if larger
+        else f"Its residuals are those of the conventional fit ({beside['rms_mm']:.3f} and "
+        f"{beside['conventional_rms_mm']:.3f} mm)."
+    )
+    lines = [first]
+    if beside["conventional_tre_mm"] is not None and beside["tre_mm"] is not None:
+        lines.append(
+            "With errors of the sizes found, equal weights would put the image "
+            f"{_mm(beside['conventional_tre_mm'])} off, these weights {_mm(beside['tre_mm'])}"
+        )
+    gain, sd = beside["log_density_gain"], beside["log_density_gain_sd"]
+    if gain is not None and sd is not None:
+        better = "more" if gain > 0 else "less"
+        lines[-1] += (
+            f"; images left out are predicted {better} closely (log density {gain:+.1f} +- "
+            f"{sd:.1f})"
+        )
+    lines[-1] += f". The two differ by {_mm(beside['apart_mm'])} at the image."
+    return [" ".join(lines)]
 
 
 def spread_of_transform(record: dict[str, Any]) -> tuple[float, float] | None:
@@ -54,27 +229,6 @@ def spread_of_transform(record: dict[str, Any]) -> tuple[float, float] | None:
     if min(variances) < 0:
         return None
     return math.sqrt(sum(variances[:3])), math.degrees(math.sqrt(sum(variances[3:])))
-
-
-def _headline(record: dict[str, Any]) -> str:
-    status = record["status"]
-    if status == "failed":
-        return "Failed: there is no calibration."
-    if status == "unobservable":
-        return "Do not use: these images do not determine the calibration."
-    if status == "max_iterations":
-        return "Do not trust: the solver stopped before it had arrived."
-    spread = spread_of_transform(record)
-    worst = math.inf if spread is None else max(spread)
-    word = "Good" if worst <= GOOD else "Fair" if worst <= FAIR else "Uncertain"
-    precision = record["reconstruction_precision_mm"]
-    if precision is None:
-        return f"{word}: solved from {record['images_used']} images."
-    where = "independent test" if record["reconstruction_precision_set"] == "test" else "same"
-    return (
-        f"{word}: seen through this calibration, the target stays within {precision:.2f} mm "
-        f"(one standard deviation) over the {where} images."
-    )
 
 
 def _certainty(record: dict[str, Any]) -> list[str]:
@@ -99,18 +253,6 @@ def _certainty(record: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _errors(record: dict[str, Any]) -> str:
-    lateral, depth, elevational = (
-        record[f"sigma_{name}_mm"] for name in ("lateral", "range", "elevation")
-    )
-    if None in (lateral, depth, elevational):
-        return "The size of the errors is not known."
-    return (
-        f"Typical errors: {lateral:.2f} mm sideways and {depth:.2f} mm in depth; the target was "
-        f"typically {elevational:.2f} mm out of the image plane."
-    )
-
-
 def _addition(record: dict[str, Any]) -> str:
     """What tells most about the weakest direction first, then what is good for all of them."""
     first = record["observability"].get("advice")
@@ -125,7 +267,8 @@ def _out_of_plane(record: dict[str, Any]) -> bool:
     return elevational > 1.5 * in_plane
 
 
-def _advice(record: dict[str, Any]) -> list[str]:
+def advice(record: dict[str, Any]) -> list[str]:
+    """What to do, as sentences."""
     status, few = record["status"], record["images_used"] < FEW_IMAGES
     advice = []
     if status == "failed":
@@ -141,8 +284,8 @@ def _advice(record: dict[str, Any]) -> list[str]:
             "images; then calibrate again."
         )
     else:
-        spread = spread_of_transform(record)
-        if few or spread is None or max(spread) > FAIR:
+        tre = record.get("tre") or {}
+        if few or (tre.get("rms_mm") or math.inf) > FAIR_MM:
             advice.append(_addition(record))
     if status == "converged" and record["method"] == "conventional" and _out_of_plane(record):
         advice.append(

@@ -1,0 +1,283 @@
+"""Does the stated target registration error tell the actual one?
+
+*Intervals.* 1,000 simulated recordings for each of five laws of the elevational offsets, solved by
+the default method in one batch a law: how often the stated 95 % interval of TRE holds the actual
+one, at twenty image points and over the image. A share of 1,000 recordings is known to +- 1.4 %
+(two SDs); that over twenty points a little better, since neighbouring points err alike.
+
+Offsets of two sizes. Those of the one-sided law average half their bound, which hardly differs from
+a shift of X along the elevational axis: unless they are large no method can tell them apart, and
+the default then takes them for symmetric.
+
+*Unknown scales.* 18 conditions with pixels of unknown size (three methods, three numbers of images,
+the target all over the image or in its middle only), and six on channels with unknown sound speed
+and delay: root mean square of the predicted TRE over that of the actual one, where the target was;
+beside it what was stated before: the covariance of X alone, times Student's factor also for the
+pooled variance of the conventional method.
+
+Seed 20261126; trial k of a condition is fold_in(root, condition * 10^6 + k).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from common import arguments, machine, results_folder, write_table
+from jaxtyping import Array
+
+from jaxcal import Calibration, Problem, Protocol, calibrate_batch, predicted_tre, simulate
+from jaxcal.diagnostics.intervals import tre_at, tre_over
+from jaxcal.image_points import unknown_names
+from jaxcal.io.atomic import atomic_path
+from jaxcal.offsets import OFFSET_LAWS, OffsetLaw
+from jaxcal.probe import L14_5
+
+SEED = 20261126
+POINTS_MM = np.stack(
+    np.meshgrid(np.linspace(-20, 20, 5), np.linspace(20, 80, 4), indexing="ij"), axis=-1
+).reshape(-1, 2)
+MIDDLE_MM = np.stack(
+    np.meshgrid(np.linspace(-8, 8, 5), np.linspace(35, 60, 4), indexing="ij"), axis=-1
+).reshape(-1, 2)
+FIELDS = {
+    "all": (POINTS_MM, 29.25, (10.0, 90.0), 2.0),
+    "middle": (MIDDLE_MM, 12.0, (30.0, 65.0), 0.5),
+}
+"""Where the target is: points to look at, bounds of its place and of its offsets, mm."""
+SIZES_MM = (1.5, 5.0)
+SPACING_MM = np.array([0.15, 0.12])
+LEFT_MM = 32.0
+"""Pixel column 0 is so far to the left of the middle of the array: the image's corner."""
+HELD = (0.93, 0.97)
+"""Share of 95 % intervals that is asked for,"""
+RATIO = (0.95, 1.08)
+"""and predicted over actual TRE."""
+LAW_HEADER = [
+    "elevation_distribution", "images", "elevation_mm", "noise_mm", "trials", "held_at_points",
+    "below", "above", "held_over_image", "tre_actual_mm", "tre_predicted_mm",
+    "predicted_over_actual", "not_converged",
+]  # fmt: skip
+SCALE_HEADER = [
+    "unknowns", "method", "prior", "images", "target", "elevation_mm", "noise_mm", "trials",
+    "tre_actual_mm", "tre_predicted_mm", "predicted_over_actual", "before_over_actual",
+    "held_at_points",
+    "not_converged",
+]  # fmt: skip
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def draw(
+    law: OffsetLaw,
+    images: int,
+    raw: bool,
+    indices: Array,
+    elevation: Array,
+    noise: Array,
+    lateral: float | Array = 29.25,
+    depth: tuple[float | Array, float | Array] = (10.0, 90.0),
+):
+    """Experiments of one condition."""
+    protocol = Protocol(images=images, test_images=2, elevation_distribution=law, raw=raw)
+    protocol = replace(protocol, elevation_mm=elevation, noise_mm=noise)
+    protocol = replace(protocol, lateral_mm=lateral, depth_mm=depth)
+    root = jax.random.key(SEED)
+    return jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol))(indices)
+
+
+def in_pixels(problems: Problem) -> Problem:
+    """The same points as pixels of a size that has to be found."""
+    spacing = jnp.broadcast_to(jnp.asarray(SPACING_MM), problems.spacing.shape)
+    from_corner = problems.measurements + jnp.asarray([LEFT_MM, 0.0])
+    return replace(
+        problems,
+        measurements=from_corner / spacing[:, None],
+        spacing=spacing,
+        pixels=True,
+    )
+
+
+def places(result: Calibration, points: np.ndarray) -> np.ndarray:
+    """The image points in the frame of a calibration, whose origin is pixel (0, 0), mm."""
+    return points + np.array([0.0 if result.scale_mm_per_px is None else LEFT_MM, 0.0])
+
+
+def actual_errors(result: Calibration, truth: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Distance between estimated and true place of the image points, mm (trials, points)."""
+    estimate = np.asarray(result.image_to_probe)
+    one = np.ones(len(estimate))
+    lateral, axial, shift = one, one, 0 * one
+    if result.scale_mm_per_px is not None:
+        lateral, axial = (np.asarray(result.scale_mm_per_px) / SPACING_MM).T
+        truth = truth.copy()
+        truth[:, :3, 3] -= LEFT_MM * truth[:, :3, 0]
+    if result.sound_speed_m_s is not None:
+        nominal = L14_5.sound_speed_m_s
+        axial = np.asarray(result.sound_speed_m_s) / nominal
+        delay = np.zeros_like(one) if result.delay_s is None else np.asarray(result.delay_s)
+        shift = (delay - L14_5.delay_s) * 1e3 * nominal
+
+    def placed(transform: np.ndarray, x: np.ndarray, z: np.ndarray) -> np.ndarray:
+        there = np.stack([x, 0 * x, z, np.ones_like(x)], axis=1)
+        return (transform @ there)[:, :3]
+
+    x = np.broadcast_to(places(result, points)[:, 0], (len(one), len(points)))
+    z = np.broadcast_to(points[:, 1], x.shape)
+    seen = placed(estimate, lateral[:, None] * x, axial[:, None] * (z - shift[:, None]))
+    return np.linalg.norm(seen - placed(truth, x, z), axis=1)
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square of what is finite."""
+    return float(np.sqrt(np.nanmean(np.square(values))))
+
+
+def laws(trials: int, folder: Path) -> list[list[object]]:
+    """Coverage of the intervals, law by law."""
+    rows: list[list[object]] = []
+    for condition, (size, law) in enumerate(itertools.product(SIZES_MM, OFFSET_LAWS)):
+        indices = condition * 1_000_000 + jnp.arange(trials)
+        experiments = draw(law, 40, False, indices, size, 0.5)
+        plain = jax.vmap(lambda experiment: experiment.problem())(experiments)
+        result = calibrate_batch(replace(plain, covariance=experiments.covariance))
+        actual = actual_errors(result, np.asarray(experiments.image_to_probe), POINTS_MM)
+        stated = tre_at(result, POINTS_MM)
+        whole, over = tre_over(result, POINTS_MM), np.sqrt(np.mean(actual**2, axis=1))
+        below, above = np.mean(actual < stated.lower), np.mean(actual > stated.upper)
+        held = np.mean((over >= whole.lower) & (over <= whole.upper))
+        told, happened = rms(stated.rms), rms(actual)
+        held_points = 1 - below - above
+        rows.append([law, 40, size, 0.5, trials, held_points, below, above, held, happened, told,
+                     told / happened, int(np.sum(~np.asarray(result.converged)))])  # fmt: skip
+        print(f"{law}, {size:g} mm: intervals hold {held_points:.3f} at points (below "
+              f"{below:.3f}, above {above:.3f}), {held:.3f} over the image; predicted over actual "
+              f"{told / happened:.3f}", flush=True)  # fmt: skip
+        write_table(folder / "tre_calibration.csv", LAW_HEADER, rows)
+    return rows
+
+
+def scales(trials: int, folder: Path) -> list[list[object]]:
+    """Predicted over actual where pixel sizes, or sound speed and delay, have to be found."""
+    ways = (("conventional", "none"), ("joint", "gaussian"), ("joint", "auto"))
+    conditions = [
+        (("scale",), *way, images, field)
+        for way, images, field in itertools.product(ways, (12, 30, 60), FIELDS)
+    ]
+    conditions += [
+        (unknown, "joint", "gaussian", 20, field)
+        for unknown, field in itertools.product(
+            (("sound-speed",), ("delay",), ("sound-speed", "delay")), FIELDS
+        )
+    ]
+    rows: list[list[object]] = []
+    for condition, (unknown, method, prior, images, field) in enumerate(conditions):
+        channels = unknown != ("scale",)
+        count = min(trials, 200) if channels else trials
+        points, lateral, depth, elevation = FIELDS[field]
+        # The same recordings whatever the method.
+        first = (100 + 2 * images + (field == "all")) * 1_000_000
+        indices = first + jnp.arange(count)
+        experiments = draw("normal", images, channels, indices, elevation, 0.5, lateral, depth)
+        probe = L14_5 if channels else None
+        problems = jax.vmap(lambda experiment, p=probe: experiment.problem(probe=p))(experiments)
+        if not channels:
+            problems = in_pixels(problems)
+        result = calibrate_batch(
+            problems, method, "auto" if prior == "none" else prior, estimate=unknown
+        )
+        actual = actual_errors(result, np.asarray(experiments.image_to_probe), points)
+        stated = tre_at(result, places(result, points))
+        held = np.mean((actual >= stated.lower) & (actual <= stated.upper))
+        told, happened, before = rms(stated.rms), rms(actual), stated_before(result, points)
+        rows.append([" ".join(unknown), method, prior, images, field, elevation, 0.5, count,
+                     happened, told, told / happened, before / happened, held,
+                     int(np.sum(~np.asarray(result.converged)))])  # fmt: skip
+        print(f"{condition} {' '.join(unknown)}, {method} {prior}, n = {images}, {field}: "
+              f"predicted over actual {told / happened:.3f} (before: {before / happened:.3f}), "
+              f"held {held:.3f}", flush=True)  # fmt: skip
+        write_table(folder / "tre_calibration_scale.csv", SCALE_HEADER, rows)
+    return rows
+
+
+def stated_before(result: Calibration, points: np.ndarray) -> float:
+    """Root mean square TRE from X's covariance alone, with Student's factor for every method."""
+    alone = replace(
+        result, blocks=result.blocks[:3],
+        unknowns_covariance=result.unknowns_covariance[:, :9, :9],
+    )  # fmt: skip
+    left = np.asarray(jnp.sum(result.mask > 0, axis=-1)) - len(unknown_names(result.blocks)) / 3
+    factor = left / (left - 2) if result.prior == "none" else 1.0
+    told = np.asarray(predicted_tre(alone, places(result, points)))
+    return rms(np.sqrt(factor)[..., None] * told if result.prior == "none" else told)
+
+
+def main() -> None:
+    quick = arguments(__doc__ or "").quick
+    folder = results_folder(quick)
+    by_law = laws(100 if quick else 1000, folder)
+    by_scale = scales(60 if quick else 400, folder)
+    for line in misses(by_law, by_scale):
+        print(line)
+    print(machine())
+    plot(folder / "tre_calibration.png", by_law, by_scale)
+
+
+def misses(by_law: list[list[object]], by_scale: list[list[object]]) -> list[str]:
+    """What lies outside the limits asked for."""
+    lines = []
+    for row in by_law:
+        for name in ("held_at_points", "held_over_image"):
+            share = float(str(row[LAW_HEADER.index(name)]))
+            if not HELD[0] <= share <= HELD[1]:
+                lines.append(f"misses: {row[0]}: {name} {share:.3f}")
+    for row in by_scale:
+        ratio = float(str(row[SCALE_HEADER.index("predicted_over_actual")]))
+        if not RATIO[0] <= ratio <= RATIO[1]:
+            lines.append(f"misses: {', '.join(map(str, row[:5]))}: ratio {ratio:.3f}")
+    return lines or ["nothing lies outside the limits asked for"]
+
+
+def plot(path: Path, by_law: list[list[object]], by_scale: list[list[object]]) -> None:
+    """Shares held, and predicted over actual with and without the further unknowns."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1, 2.2))
+    spots = np.arange(len(by_law))
+    left.axhspan(*HELD, color="0.9")
+    left.axhline(0.95, color="black", linewidth=0.8)
+    for name, marker, colour, aside in (
+        ("held_at_points", "o", "#0072B2", -0.1), ("held_over_image", "s", "#D55E00", 0.1),
+    ):  # fmt: skip
+        shares = [row[LAW_HEADER.index(name)] for row in by_law]
+        left.plot(spots + aside, shares, marker, color=colour, label=name.replace("_", " "))
+    names = [f"{row[0]}, {row[2]:g} mm" for row in by_law]
+    left.set_xticks(spots, names, rotation=90, fontsize=7)
+    left.set(ylabel="share of 95 % intervals that hold the TRE", ylim=(0.0, 1.02))
+    left.legend(fontsize="small")
+    spots = np.arange(len(by_scale))
+    right.axhspan(*RATIO, color="0.9")
+    right.axhline(1, color="black", linewidth=0.8)
+    for name, label, marker, colour in (
+        ("predicted_over_actual", "all unknowns", "o", "#0072B2"),
+        ("before_over_actual", "before: covariance of X alone", "x", "#D55E00"),
+    ):
+        ratio = [row[SCALE_HEADER.index(name)] for row in by_scale]
+        right.plot(spots, ratio, marker, color=colour, label=label)
+    names = [f"{row[2] if row[2] != 'none' else row[1]}, {row[0]}, {row[3]}, {row[4]}"
+             for row in by_scale]  # fmt: skip
+    right.set_xticks(spots, names, rotation=90, fontsize=7)
+    right.set(ylabel="predicted over actual TRE", yscale="log")
+    right.set_yticks([0.8, 1.0, 1.2, 1.5, 2.0, 3.0], ["0.8", "1", "1.2", "1.5", "2", "3"])
+    right.legend(fontsize="small")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,336 @@
+"""What each image and each kind of error does to an answer, from the normal equations at it.
+
+With R_i the whitened derivatives of image i's errors e_i by the unknowns, S_i = R_i'R_i and
+S = sum S_i (with what is believed besides), all to first order:
+
+*Leaving an image out* moves the unknowns by (S - S_i)^-1 R_i'e_i. If the model holds, that has the
+covariance (S - S_i)^-1 - S^-1, so that both how much an image moves the answer, and whether that is
+more than it should, cost no further solve.
+
+*Kinds of errors.* S is the sum of what lateral position, range and offset tell: S = sum S_k. The
+covariance S^-1 = sum S^-1 S_k S^-1 then tells how much of it comes from each kind.
+
+*What the residuals say.* S^-1 (sum R_i'(I - H_i)^-1/2 e_i e_i'(I - H_i)^-1/2 R_i) S^-1 with the
+leverages H_i = R_i S^-1 R_i' has the expectation S^-1 if the model holds, and does not need it to:
+it is larger where a few images pull, or where errors are large where they matter.
+
+Equal weights (conventional, bounded) are whitened by their pooled SD; what depends on an offset
+that is free within bounds is projected out.
+
+References: Cook 1977 (leaving out); MacKinnon and White 1985 (the residuals' covariance, HC2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns, channel_rows
+from jaxcal.diagnostics.uncertainty import (
+    TUNED,
+    Whitened,
+    inverses,
+    own_covariance,
+    quadratic,
+)
+from jaxcal.errors import CalibrationError
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+    from jaxcal.model.parameters import Blocks
+    from jaxcal.problem import Problem
+
+Array = np.ndarray
+
+KINDS = ("lateral", "range", "elevational")
+"""Kinds of errors."""
+
+_LEAST_LEFT = 1e-6
+"""What is left of an error's variance, where its image is needed to determine the unknowns."""
+
+
+@dataclass(frozen=True)
+class Influence:
+    """What images and kinds of errors do to the unknowns of one calibration.
+
+    Attributes:
+        moved: by how much the unknowns move if the image is left out; 0 where it is not in use.
+        expected: covariance of that, if the model holds.
+        shares: covariance that comes from each of :data:`KINDS`.
+        residual_covariance: of the unknowns, as the residuals tell it.
+        residual_rows: of every error; their squares under a weight add up to what it expects.
+        model_covariance: S^-1, of the same linearisation.
+        log_density: of each image's three errors as predicted from the others (mm); 0 where not in
+            use.
+    """
+
+    moved: Float[Array, "n p"]
+    expected: Float[Array, "n p p"]
+    shares: Float[Array, "3 p p"]
+    residual_covariance: Float[Array, "p p"]
+    residual_rows: Float[Array, "n k p"]
+    model_covariance: Float[Array, "p p"]
+    log_density: Float[Array, " n"]
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Whitened errors of the images in use.
+
+    Attributes:
+        errors: in SDs.
+        rows: their derivatives.
+        kind: index into :data:`KINDS` of each error.
+        log_sd: sum of the logarithms of an image's SDs, mm.
+        used: which images.
+        images: of all images.
+    """
+
+    errors: Float[Array, "m k"]
+    rows: Float[Array, "m k p"]
+    kind: Int[Array, " k"]
+    log_sd: Float[Array, " m"]
+    used: Bool[Array, " n"]
+    images: int
+
+
+def influence_of(calibration: Calibration) -> Influence:
+    """Influence of the images of one calibration, with concrete values.
+
+    Raises:
+        CalibrationError: a batch, or a calibration without the problem that it is of.
+    """
+    import jax
+
+    if calibration.problem is None:
+        raise CalibrationError(
+            "this calibration does not hold its problem: add it with calibration.with_problem"
+        )
+    if np.ndim(calibration.mask) != 1:
+        raise CalibrationError("a batch holds many calibrations: take one of them")
+    alone = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], calibration.numpy())
+    with np.errstate(all="ignore"):
+        found = _whitened(alone, alone.problem)
+        information = np.asarray(alone.linearisation.information)
+        information = information / np.asarray(alone.linearisation.variance)[:, None, None]
+        settled = calibration.offset_law is None or not bool(calibration.offset_law.weighed)
+        return _influence(found, information[0], settled=settled)
+
+
+def _influence(
+    found: _Errors, information: Float[Array, "p p"], *, settled: bool = True
+) -> Influence:
+    rows, errors = found.rows, found.errors
+    components = rows.shape[1]
+    inverse = inverses(information[None], np.finfo(float).eps)[0]
+    if not settled:
+        # An answer averaged over laws is not where these errors' squares are least.
+        gradient = np.einsum("mkp,mk->p", rows, errors)
+        errors = errors - np.einsum("mkp,p->mk", rows, inverse @ gradient)
+    each = np.swapaxes(rows, 1, 2) @ rows
+    pull = np.einsum("mkp,mk->mp", rows, errors)
+    without = inverses(information - each, np.finfo(float).eps)
+    moved = np.einsum("mpq,mq->mp", without, pull)
+    by_kind = np.stack([
+        np.einsum("mkp,mkq->pq", rows[:, found.kind == kind], rows[:, found.kind == kind])
+        for kind in range(len(KINDS))
+    ])  # fmt: skip
+
+    leverage = rows @ inverse @ np.swapaxes(rows, 1, 2)
+    values, vectors = np.linalg.eigh(np.eye(components) - 0.5 * (leverage + leverage.mT))
+    values = np.maximum(values, _LEAST_LEFT)
+    turned = np.einsum("mkl,mk->ml", vectors, errors)
+    unbiased = np.einsum("mkl,ml->mk", vectors, turned / np.sqrt(values))
+    steps = np.einsum("mk,mkp->mp", unbiased, rows) @ inverse
+    # Predicted from the others, an error e has become (I - H)^-1 e, with that covariance.
+    density = -0.5 * np.sum(turned**2 / values, axis=1) + 0.5 * np.sum(np.log(values), axis=1)
+    density = density - 0.5 * components * np.log(2 * np.pi) - found.log_sd
+
+    def everywhere(values: Array) -> Array:
+        whole = np.zeros((found.images, *values.shape[1:]))
+        whole[found.used] = values
+        return whole
+
+    return Influence(
+        moved=everywhere(moved),
+        expected=everywhere(without - inverse),
+        shares=inverse @ by_kind @ inverse,
+        residual_covariance=steps.T @ steps,
+        residual_rows=everywhere(rows @ inverse),
+        model_covariance=inverse,
+        log_density=everywhere(density),
+    )
+
+
+def _whitened(answer: Calibration, problem: Problem | None) -> _Errors:
+    """Of a calibration with one leading axis of length 1."""
+    assert problem is not None
+    blocks, unknowns = answer.blocks, Unknowns.of(answer, problem)
+    seen = ImageErrors.of(unknowns, problem, blocks)
+    used = np.asarray(answer.mask)[0] > 0
+    if answer.data == "channels":
+        return _on_channels(answer, seen, unknowns, problem, used)
+    if answer.prior in TUNED:
+        return _on_points(answer, seen, unknowns, problem, used)
+    sd = float(np.sqrt(answer.linearisation.variance[0]))
+    y = np.asarray(answer.elevation) if answer.prior == "bounded" else np.zeros_like(seen.mask)
+    return _equal_weights(seen, y, sd, blocks, used, answer.prior == "bounded", answer.at_bound[0])
+
+
+def _on_points(
+    answer: Calibration, seen: ImageErrors, unknowns: Unknowns, problem: Problem, used: Array
+) -> _Errors:
+    tau, mean = answer.linearisation.tracker_sd, 0.0
+    if tau is not None:
+        shift = np.where(answer.mask > 0, answer.elevation - seen.q[..., 1], 0.0)
+        seen = ImageErrors.of(unknowns, problem, answer.blocks, shift)
+    if answer.offset_law is not None:
+        mean = float(np.asarray(answer.offset_law.mean)[0])
+    centred = seen.errors - mean * seen.mask[..., None] * [0.0, 0.0, 1.0]
+    whitened = Whitened.of(answer, ImageErrors(
+        seen.q, seen.turned, seen.lateral, seen.distance, centred, seen.rows, seen.mask
+    ), problem)  # fmt: skip
+    errors, rows = whitened.errors[0][used], whitened.rows[0][used]
+    log_sd, shape = np.zeros(len(rows)), own_covariance(answer, problem)
+    if shape is not None:
+        log_sd = 0.5 * np.log(np.linalg.det(shape[0][used]))
+    if whitened.offset is not None:
+        # The image's own unknown has the variance 1 before: errors have I + o o'.
+        own = whitened.offset[0][used]
+        size = np.sum(own**2, axis=1, keepdims=True)
+        log_sd = log_sd + 0.5 * np.log1p(size[:, 0])
+        unit = own / np.sqrt(np.where(size > 0, size, 1.0))
+        shrink = 1 / np.sqrt(1 + size) - 1
+        rows = rows + (shrink * unit)[..., None] * np.einsum("mk,mkp->mp", unit, rows)[:, None]
+        # At the estimate of that unknown an error is (I + o o')^-1 of what it was without.
+        errors = errors + (1 / (1 + shrink) - 1) * unit * np.sum(unit * errors, axis=1)[:, None]
+    sigma = np.asarray(answer.sigma)[0]
+    if tau is not None:
+        sigma = np.hypot(sigma, float(tau[0]) * np.array([1.0, 1.0, 0.0]))
+    log_sd = log_sd + np.sum(np.log(sigma))
+    return _Errors(errors, rows, np.arange(3), log_sd, used, len(used))
+
+
+def _on_channels(
+    answer: Calibration, seen: ImageErrors, unknowns: Unknowns, problem: Problem, used: Array
+) -> _Errors:
+    channels, sigma = problem.channels, np.asarray(answer.sigma)[0]
+    assert channels is not None
+    assert answer.channel_sigma is not None
+    element_sd = float(np.asarray(answer.channel_sigma)[0])
+    rows = channel_rows(seen, unknowns, problem, answer.blocks)[0]
+    elements = np.asarray(channels.elements)[0]
+    rows = rows.reshape(len(used), len(elements), -1)[used] / element_sd
+    far = np.linalg.norm(seen.q[0][used, None] - elements, axis=-1)
+    model = far / unknowns.sound_speed[0] + unknowns.delay[0]
+    heard = np.nan_to_num(np.asarray(channels.heard))[0][used]
+    measured = np.nan_to_num(np.asarray(channels.distances))[0][used]
+    errors = np.where(heard > 0, model - measured, 0.0) / element_sd
+    offset = seen.errors[0][used, 2:] / sigma[2]
+    errors = np.concatenate([errors, offset], axis=1)
+    rows = np.concatenate([rows, seen.rows[0][used, 2:] / sigma[2]], axis=1)
+    # Lateral position and range come from the same elements: they count as the range.
+    kind = np.array([1] * len(elements) + [2])
+    log_sd = heard.sum(axis=1) * np.log(element_sd) + np.log(sigma[2])
+    return _Errors(errors, rows, kind, log_sd, used, len(used))
+
+
+def _equal_weights(
+    seen: ImageErrors,
+    y: Float[Array, "1 n"],
+    sd: float,
+    blocks: Blocks,
+    used: Array,
+    bounded: bool = False,
+    at_bound: Any = None,
+) -> _Errors:
+    residual, axial = seen.from_circle(y)
+    rows = seen.circle_rows(y, axial, blocks)[0][used]
+    errors = residual[0][used]
+    if bounded:
+        slope = (y / axial)[0][used]
+        along = np.stack([0 * slope, -np.ones_like(slope), slope], axis=1)
+        along = along / np.linalg.norm(along, axis=1, keepdims=True)
+        along = np.where(at_bound[used, None] > 0, 0.0, along)
+        rows = rows - along[..., None] * np.einsum("mk,mkp->mp", along, rows)[:, None]
+        errors = errors - along * np.sum(along * errors, axis=1, keepdims=True)
+    log_sd = np.full(int(used.sum()), 3 * np.log(sd))
+    return _Errors(errors / sd, rows / sd, np.array([0, 2, 1]), log_sd, used, len(used))
+
+
+@dataclass(frozen=True)
+class EqualWeights:
+    """The conventional fit of the same images, seen with the noise that was found.
+
+    Attributes:
+        covariance: of its unknowns, if errors have the given SDs.
+        log_density: of every image's three errors as predicted from the others; 0 where not used.
+    """
+
+    covariance: Float[Array, "p p"]
+    log_density: Float[Array, " n"]
+
+
+def conventional_fit(
+    unknowns: Unknowns,
+    problem: Problem,
+    blocks: Blocks,
+    used: Array,
+    sigma: Float[Array, " 3"],
+) -> EqualWeights:
+    """How good equal weights are, if errors have other SDs.
+
+    Its covariance is A^-1 (sum of sigma_k^2 A_k) A^-1 with A the sum of the three kinds' A_k.
+
+    Args:
+        unknowns: of the conventional fit (one leading axis of length 1).
+        problem: the same.
+        blocks: its unknowns.
+        used: images in use.
+        sigma: SDs of lateral position, range and offset, mm.
+    """
+    seen = ImageErrors.of(unknowns, problem, blocks)
+    zero = np.zeros_like(seen.mask)
+    plain = _equal_weights(seen, zero, 1.0, blocks, used)
+    left = max(plain.errors.size - plain.rows.shape[2], 1)
+    sd = float(np.sqrt(np.sum(plain.errors**2) / left))
+    scaled = _equal_weights(seen, zero, sd, blocks, used)
+    rows = scaled.rows.reshape(-1, scaled.rows.shape[2])
+    found = _influence(scaled, rows.T @ rows)
+    weight = (sigma / sd) ** 2
+    return EqualWeights(np.einsum("k,kpq->pq", weight, found.shares), found.log_density)
+
+
+def excess(found: Influence, weight: Float[Array, "p p"]) -> tuple[float, float]:
+    """How much larger the mean square error is than stated, as the residuals tell it.
+
+    Args:
+        found: of a calibration.
+        weight: W, by which the mean square error is tr(W C).
+
+    Returns:
+        tr(W C_residuals) / tr(W S^-1), and its SD if the model holds with Gaussian errors.
+    """
+    stated = float(np.sum(weight * found.model_covariance))
+    if not (np.isfinite(stated) and stated > 0):
+        return 1.0, np.inf
+    rows = found.residual_rows
+    within = rows @ weight @ np.swapaxes(rows, 1, 2)
+    spread = np.sqrt(2 * np.sum(within * within)) / stated
+    return float(np.sum(weight * found.residual_covariance)) / stated, float(spread)
+
+
+def in_image(
+    found: Influence, weight: Float[Array, "p p"]
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """By how much leaving each image out moves the image (root mean square over W's points, mm).
+
+    Returns:
+        What it is, and what it should be if the model holds; both 0 where an image is not in use.
+    """
+    moved = quadratic(found.moved[None], weight[None])[0]
+    expected = np.einsum("npq,pq->n", found.expected, weight)
+    return np.sqrt(np.maximum(moved, 0.0)), np.sqrt(np.maximum(expected, 0.0))

@@ -1,0 +1,373 @@
+"""How accurate a calibration is, what limits it and what contradicts it, as plain values.
+
+The number that everything else is about is the target registration error (TRE) to expect at the
+image: its root mean square over the region that the target filled, with a 95 % interval
+(:mod:`jaxcal.diagnostics.intervals`). The covariance that it comes from believes the noise model.
+Where the data contradict that, more is to be expected, and the larger number is stated:
+
+- the residuals make the error larger than stated by more than three SDs of chance;
+- an image moves the image by more than half the stated error and by more than four times what it
+  should (one step from the normal equations, or by cross-validation where that was asked for);
+- cross-validation or bootstrap scatter by more than 1.3 times the stated error.
+
+The word belongs to that number: good up to 0.5 mm, fair up to 1.5 mm, otherwise uncertain.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.calibration import Calibration
+from jaxcal.closed_form import calibrate_closed_form
+from jaxcal.design.candidates import seen_region
+from jaxcal.design.constraints import Region
+from jaxcal.diagnostics.image_errors import Unknowns
+from jaxcal.diagnostics.influence import (
+    KINDS,
+    Influence,
+    conventional_fit,
+    excess,
+    in_image,
+    influence_of,
+)
+from jaxcal.diagnostics.intervals import (
+    image_jacobian,
+    predicted_tre,
+    tre_at,
+    tre_over,
+)
+from jaxcal.errors import InputError
+from jaxcal.problem import Problem
+from jaxcal.recording import Recording
+
+Word = Literal["good", "fair", "uncertain"]
+
+GOOD_MM = 0.5
+"""Largest error to expect at the image (root mean square) that is called good,"""
+FAIR_MM = 1.5
+"""and fair."""
+
+CHANCE = 3.0
+"""SDs of chance beyond which the residuals contradict the stated error."""
+MOVED_SHARE, MOVED_TIMES = 0.5, 4.0
+"""An image contradicts it that moves the image by more than this share of it, and so many times
+what it should."""
+SCATTER_TIMES = 1.3
+"""Resampled calibrations may scatter by so many times the stated error."""
+
+_ACROSS = 15
+"""Points of the map along each side."""
+_MOST_NAMED = 5
+
+
+def accuracy_record(
+    result: Calibration, recording: Recording, wanted: tuple[tuple[float, float], ...] = ()
+) -> dict[str, Any]:
+    """``tre``, ``limits``, ``influence`` and ``comparison`` of a calibration's record.
+
+    Args:
+        result: of one problem, with concrete values.
+        recording: what was calibrated.
+        wanted: further image points, in the images' own unit (px or mm).
+
+    Returns:
+        Arrays and plain values; all of them None where X is not observable.
+    """
+    nothing = {"tre": None, "limits": None, "influence": None, "comparison": None}
+    answer = result.numpy()
+    if not np.isfinite(answer.unknowns_covariance).all() or not bool(result.converged):
+        return nothing
+    problem = answer.problem
+    if problem is None:
+        answer = answer.with_problem(Problem.from_recording(recording)).numpy()
+    region = region_of(answer, recording)
+    grid = region.grid()[:, [0, 2]]
+    jacobian = image_jacobian(answer, grid)
+    weight = np.einsum("mia,mib->ab", jacobian, jacobian) / len(grid)
+    found = influence_of(answer)
+    tre = _tre(answer, region, wanted)
+    influence = _influence(found, weight, np.asarray(answer.mask) > 0)
+    ratio, chance = excess(found, weight)
+    tre["residuals_over_stated"] = math.sqrt(ratio) if ratio > 0 else None
+    tre["chance"] = chance
+    return {
+        "tre": tre,
+        "limits": _limits(answer, found, weight),
+        "influence": influence,
+        "comparison": _comparison(answer, recording, found, grid),
+    }
+
+
+def region_of(answer: Calibration, recording: Recording) -> Region:
+    """The part of the image that the target filled, and the probe's face where it is known."""
+    used = np.asarray(answer.mask) > 0
+    targets = _targets(answer, recording.calibration.poses)
+    return seen_region(recording, targets[used])
+
+
+def _targets(answer: Calibration, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 3"]:
+    """The target in every image, mm."""
+    x = np.asarray(answer.image_to_probe)
+    away = np.asarray(answer.point) - poses[:, :3, 3]
+    in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], away)
+    return (in_probe - x[:3, 3]) @ x[:3, :3]
+
+
+def _tre(
+    answer: Calibration, region: Region, wanted: tuple[tuple[float, float], ...]
+) -> dict[str, Any]:
+    over = tre_over(answer, region.grid()[:, [0, 2]])
+    names = ("middle", "near left", "near right", "far left", "far right")
+    unit = np.array([[0.0, 0.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
+    places = region.place(unit)[:, [0, 2]]
+    image = _to_image(answer, places)
+    if wanted:
+        given = np.array(wanted, float)
+        if not np.isfinite(given).all():
+            raise InputError("points of --tre must be finite numbers")
+        names += ("asked for",) * len(given)
+        image = np.concatenate([image, given])
+        places = np.concatenate([places, _from_image(answer, given)])
+    at = tre_at(answer, places)
+    side = np.linspace(-1.0, 1.0, _ACROSS)
+    cells = region.place(np.stack(np.meshgrid(side, side), axis=-1))[..., [0, 2]]
+    mapped = tre_at(answer, cells)
+    return {
+        "region": {
+            "lateral_mm": region.lateral_mm,
+            "depth_mm": region.depth_mm,
+            "radius_mm": region.radius_mm,
+        },
+        "unit": _unit(answer),
+        "stated_mm": over.rms,
+        "stated_interval_mm": [over.lower, over.upper],
+        "points": [
+            {
+                "name": name,
+                "image": image[k],
+                "position_mm": places[k],
+                "stated_mm": at.rms[k],
+                "stated_interval_mm": [at.lower[k], at.upper[k]],
+            }
+            for k, name in enumerate(names)
+        ],
+        "map": {
+            "lateral_mm": cells[..., 0],
+            "axial_mm": cells[..., 1],
+            "stated_mm": mapped.rms,
+            "stated_lower_mm": mapped.lower,
+            "stated_upper_mm": mapped.upper,
+        },
+    }
+
+
+def _unit(answer: Calibration) -> str:
+    return "mm" if answer.scale_mm_per_px is None else "px"
+
+
+def _affine(answer: Calibration) -> tuple[np.ndarray, np.ndarray]:
+    """Size of a unit of the image (mm, [lateral, axial]), and where its origin is."""
+    transform = answer.image_transform()
+    scale = np.ones(2) if transform.scale_mm_per_px is None else transform.scale_mm_per_px
+    return scale * [1.0, transform.range_factor], np.array([0.0, transform.face_offset_mm])
+
+
+def _to_image(answer: Calibration, places: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
+    scale, origin = _affine(answer)
+    return (places - origin) / scale
+
+
+def _from_image(answer: Calibration, image: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
+    scale, origin = _affine(answer)
+    return image * scale + origin
+
+
+def _influence(
+    found: Influence, weight: Float[np.ndarray, "p p"], used: np.ndarray
+) -> dict[str, Any]:
+    moved, expected = in_image(found, weight)
+    strongest = [int(k) for k in np.argsort(-moved)[:_MOST_NAMED] if used[k]]
+    return {
+        "moved_mm": np.where(used, moved, np.nan),
+        "expected_mm": np.where(used, expected, np.nan),
+        "most": strongest,
+    }
+
+
+def _limits(
+    answer: Calibration, found: Influence, weight: Float[np.ndarray, "p p"]
+) -> dict[str, Any]:
+    """Shares of the mean square error at the image, and of the scatter of the target."""
+    sigma = np.asarray(answer.sigma, float)
+    residual = np.asarray(answer.residual)[np.asarray(answer.mask) > 0]
+    part = np.einsum("pq,kpq->k", weight, found.shares)
+    if not np.isfinite(part).all() or not part.sum() > 0:
+        part = np.full(len(KINDS), np.nan)
+    elif answer.prior in ("none", "bounded"):
+        # These weigh all alike: what the kinds' own sizes make of that.
+        part = part * sigma**2
+    squares = np.mean(residual**2, axis=0)
+    whole = float(squares.sum())
+    scatter = squares[[0, 2, 1]] / whole if whole > 0 else np.full(3, np.nan)
+    return {
+        "error_share": dict(zip(KINDS, part / part.sum(), strict=True)),
+        "scatter_share": dict(zip(KINDS, scatter, strict=True)),
+        "rms_lateral_mm": math.sqrt(squares[0]),
+        "rms_axial_mm": math.sqrt(squares[2]),
+        "rms_elevational_mm": math.sqrt(squares[1]),
+        "rms_in_plane_mm": math.sqrt(squares[0] + squares[2]),
+    }
+
+
+def _comparison(
+    answer: Calibration, recording: Recording, found: Influence, grid: Float[np.ndarray, "m 2"]
+) -> dict[str, Any] | None:
+    """The conventional fit of the same images beside an answer of another method."""
+    estimate = tuple(name for name in ("scale",) if name in answer.blocks)
+    further = {"sound-speed", "delay"} & set(answer.blocks)
+    images, problem = recording.calibration, answer.problem
+    if answer.method == "conventional" or further or problem is None:
+        return None
+    if images.kind == "time_of_flight" or answer.data == "channels":
+        return None
+    used = np.asarray(answer.mask) > 0
+    try:
+        other = calibrate_closed_form(replace(images, mask=used), estimate=estimate)
+    except InputError:
+        return None
+    x, point = np.asarray(other.image_to_probe), np.asarray(other.point_mm)
+    spacing = np.asarray(problem.spacing, float)
+    scale = np.ones(2)
+    if other.scale_mm_per_px is not None:
+        scale = np.asarray(other.scale_mm_per_px) / spacing
+    alone = _batch_of_one(problem)
+    unknowns = Unknowns(
+        x[None, :3, :3], x[None, :3, 3], point[None], scale[None], np.ones(1), np.zeros(1)
+    )
+    sigma = np.asarray(answer.sigma, float)
+    if not np.isfinite(sigma).all():
+        return None
+    fit = conventional_fit(unknowns, alone, answer.blocks, used, sigma)
+    jacobian = image_jacobian(answer, grid)
+    error = np.einsum("mia,ab,mib->", jacobian, fit.covariance, jacobian) / len(grid)
+    gaussian = np.einsum("mia,ab,mib->", jacobian, found.model_covariance, jacobian) / len(grid)
+    # From the image's pixels to the probe both ways.
+    mine = np.ones(2)
+    if answer.scale_mm_per_px is not None:
+        mine = np.asarray(answer.scale_mm_per_px) / spacing
+    there = np.stack([grid[:, 0], 0 * grid[:, 0], grid[:, 1], np.ones(len(grid))])
+    stretch = np.array([scale[0] / mine[0], 1.0, scale[1] / mine[1], 1.0])
+    moved = ((x @ (stretch[:, None] * there)) - np.asarray(answer.image_to_probe) @ there)[:3]
+    density = found.log_density - fit.log_density
+    count = int(used.sum())
+    return {
+        "conventional_rms_mm": float(other.rms_mm),
+        "rms_mm": float(answer.rms),
+        "apart_mm": math.sqrt(float(np.mean(np.sum(moved**2, axis=0)))),
+        "conventional_tre_mm": math.sqrt(error) if error > 0 else None,
+        "tre_mm": math.sqrt(gaussian) if gaussian > 0 else None,
+        "log_density_gain": float(density.sum()),
+        "log_density_gain_sd": float(np.std(density[used], ddof=1) * math.sqrt(count)),
+        "conventional_image_plane_to_probe": x,
+    }
+
+
+def _batch_of_one(problem: Problem) -> Problem:
+    import jax
+
+    return jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], problem)
+
+
+def settle(record: dict[str, Any]) -> None:
+    """Say what error is to be expected, after whatever was found out about the calibration.
+
+    Adds ``rms_mm``, ``interval_95_mm``, ``factor``, ``contradictions`` to ``record["tre"]``, the
+    same numbers to its points and map, and ``record["verdict"]``: good, fair, uncertain, or None
+    where there is no calibration to be used.
+
+    Args:
+        record: of :func:`jaxcal.report.record.calibration_record`, with cross-validation and
+            bootstrap where they were asked for.
+    """
+    tre = record.get("tre")
+    record["verdict"] = "uncertain" if record["converged"] else None
+    if tre is None or tre["stated_mm"] is None:
+        return
+    told = [*_from_residuals(record), *_from_images(record), *_from_resampling(record)]
+    factor = max([1.0, *(times for times, _ in told)])
+    tre["factor"] = factor
+    tre["contradictions"] = [words for _, words in told]
+    tre["rms_mm"] = factor * tre["stated_mm"]
+    tre["interval_95_mm"] = [factor * end for end in tre["stated_interval_mm"]]
+    for point in tre["points"]:
+        point["tre_mm"] = factor * point["stated_mm"]
+        point["interval_95_mm"] = [factor * end for end in point["stated_interval_mm"]]
+    error = tre["rms_mm"]
+    record["verdict"] = "good" if error <= GOOD_MM else "fair" if error <= FAIR_MM else "uncertain"
+
+
+def _from_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
+    tre = record["tre"]
+    ratio, chance = tre["residuals_over_stated"], tre["chance"]
+    if ratio is None or chance is None or ratio**2 <= 1 + CHANCE * chance:
+        return []
+    return [(ratio, f"the residuals make the error {ratio:.1f} times as large as the covariance")]
+
+
+def _from_images(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """The image that moves the answer most, if by more than it should; cross-validation first."""
+    stated, influence = record["tre"]["stated_mm"], record["influence"]
+    held = record.get("cross_validation")
+    moved, how = influence["moved_mm"], "to first order"
+    if held is not None and held["folds"] == len(moved):
+        moved, how = held["image_moved_mm"], "calibrated anew without it"
+    worst, size = None, 0.0
+    for image, (by, should) in enumerate(zip(moved, influence["expected_mm"], strict=True)):
+        if by is None or should is None or by <= max(MOVED_SHARE * stated, MOVED_TIMES * should):
+            continue
+        if by > size:
+            worst, size = image, by
+    if worst is None:
+        return []
+    words = f"image {worst} alone moves the image by {size:.2f} mm ({how})"
+    return [(math.hypot(1.0, size / stated), words)]
+
+
+def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
+    found: list[tuple[float, str]] = []
+    held, drawn = record.get("cross_validation"), record.get("bootstrap")
+    if held is not None and held["folds"] == held["folds_converged"]:
+        moved = [by for by in held["image_moved_mm"] if by is not None]
+        folds, stated = held["folds"], held["stated_mm"]
+        # The jackknife: every image was held out once, with the others of its fold.
+        each = len(moved) / folds
+        scatter = math.sqrt((folds - 1) / folds * sum(by**2 for by in moved) / each)
+        if stated and scatter > SCATTER_TIMES * stated:
+            found.append((
+                scatter / stated,
+                f"calibrations without some of the images scatter by {scatter:.2f} mm, "
+                f"{scatter / stated:.1f} times what is stated",
+            ))  # fmt: skip
+    if drawn is not None and drawn["stated_mm"]:
+        known = [value for value in drawn["reproducibility_mm"] if value is not None]
+        scatter = math.sqrt(sum(value**2 for value in known) / max(len(known), 1))
+        if scatter > SCATTER_TIMES * drawn["stated_mm"]:
+            times = scatter / drawn["stated_mm"]
+            found.append((
+                times,
+                f"calibrations from images drawn anew scatter by {scatter:.2f} mm, {times:.1f} "
+                "times what is stated",
+            ))  # fmt: skip
+    return found
+
+
+def stated_at(result: Calibration, points: Float[np.ndarray, "m 2"]) -> float | None:
+    """Root mean square over some image points of the error that the covariance states, mm."""
+    found = np.asarray(predicted_tre(result.numpy(), np.asarray(points, float)))
+    value = float(np.sqrt(np.mean(found**2)))
+    return value if math.isfinite(value) else None

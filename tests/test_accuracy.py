@@ -1,0 +1,410 @@
+"""How accurate: TRE with its interval, what each image and error does to it, and the verdict."""
+
+from __future__ import annotations
+
+import copy
+import json
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import experiment
+from rich.console import Console
+
+import jaxcal
+from jaxcal.cli.main import main
+from jaxcal.diagnostics import influence as influences
+from jaxcal.diagnostics.influence import excess, in_image, influence_of
+from jaxcal.diagnostics.intervals import (
+    _length_quantile,
+    error_covariance,
+    image_jacobian,
+    tre_at,
+    tre_over,
+)
+from jaxcal.image_points import point_jacobian
+from jaxcal.recording import Recording, make_images
+from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, settle
+from jaxcal.report.record import calibration_record
+from jaxcal.report.tables import calibration_table
+from jaxcal.report.verdict import headline, limits, verdict
+from jaxcal.resampling import relative_twist
+from jaxcal.transform import ImageTransform, load_calibration
+
+POINTS = np.array([[5.0, 30.0], [55.0, 80.0], [30.0, 50.0]])
+
+
+def in_pixels(recording: Recording) -> Recording:
+    """The same with pixels of unknown size, the corner of the image at (0, 0)."""
+    images = recording.calibration
+    pixels = (images.measurements + np.array([32.0, 0.0])) / [0.15, 0.12]
+    found = make_images(images.poses, pixels, "pixel", mask=images.mask)
+    return replace(recording, calibration=found, test=None, truth=None)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return in_pixels(experiment(3, images=24, elevation_mm=1.0))
+
+
+@pytest.fixture(scope="module")
+def result(recording) -> jaxcal.Calibration:
+    return jaxcal.calibrate(recording, "conventional", estimate=("scale",))
+
+
+@pytest.fixture(scope="module")
+def record(result, recording):
+    return calibration_record(result, recording)
+
+
+@pytest.mark.parametrize(
+    ("variances", "freedom"),
+    [([1.0, 1.0, 1.0], np.inf), ([1.0, 0.2, 0.01], 9.0), ([4.0, 1.0, 0.3, 0.1, 0.05, 0.01], 20.0)],
+)
+def test_quantiles_of_an_error_against_draws(variances, freedom):
+    rng = np.random.default_rng(0)
+    draws = rng.normal(size=(400_000, len(variances))) * np.sqrt(variances)
+    length = np.linalg.norm(draws, axis=1)
+    if np.isfinite(freedom):
+        length = length / np.sqrt(rng.chisquare(freedom, len(length)) / freedom)
+    for chance in (0.025, 0.5, 0.975):
+        found = _length_quantile(np.array([variances]), freedom, chance)[0]
+        assert np.mean(length < found) == pytest.approx(chance, abs=0.002)
+
+
+@pytest.mark.parametrize("pixels", [True, False])
+def test_derivatives_of_an_image_point(pixels):
+    """Against differences of where the calibration puts a pixel."""
+    blocks = ("translation", "rotation", "point", "scale", "sound-speed", "delay")
+    scale, face, k, delay = np.array([0.2, 0.15]), 3.0, 1.02, 0.4
+    measured = np.array([[30.0, 200.0], [150.0, 400.0]])
+    if not pixels:
+        scale, measured = np.ones(2), measured * 0.2
+
+    def placed(step: np.ndarray) -> np.ndarray:
+        x = scale[0] * np.exp(step[9]) * measured[:, 0]
+        axial = scale[1] * np.exp(step[10]) * measured[:, 1] + face - delay - step[12]
+        plane = np.stack([x, 0 * x, k * np.exp(step[11]) * axial], axis=1)
+        w = step[3:6]
+        turn = np.eye(3) + np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+        return plane @ turn.T + step[:3]
+
+    points = placed(np.zeros(13))[:, [0, 2]]
+    found = point_jacobian(points, blocks, k * (face - delay), k)
+    for index, column in enumerate(np.eye(13)):
+        difference = (placed(1e-6 * column) - placed(-1e-6 * column)) / 2e-6
+        np.testing.assert_allclose(found[..., index], difference, atol=1e-7)
+
+
+def test_tre_knows_the_pixel_size(result):
+    """Draws of all unknowns, put through the pixels: X's covariance alone says something else."""
+    rng = np.random.default_rng(1)
+    covariance = np.asarray(result.unknowns_covariance) * 1e-4
+    steps = rng.multivariate_normal(np.zeros(11), covariance, 20_000)
+    stretched = POINTS * np.exp(steps[:, None, 9:])
+    plane = np.stack([stretched[..., 0], 0 * stretched[..., 0], stretched[..., 1]], axis=-1)
+    there = plane + np.cross(steps[:, None, 3:6], plane) + steps[:, None, :3]
+    apart = np.linalg.norm(there - plane[:1] * 0 - np.insert(POINTS, 1, 0.0, axis=1), axis=-1)
+    actual = 1e2 * np.sqrt(np.mean(apart**2, axis=0))
+    np.testing.assert_allclose(jaxcal.predicted_tre(result, POINTS), actual, rtol=0.02)
+    np.testing.assert_allclose(tre_at(result, POINTS).rms, actual, rtol=0.02)
+    over = tre_over(result, POINTS)
+    assert float(over.rms) == pytest.approx(np.sqrt(np.mean(actual**2)), rel=0.02)
+    assert over.lower < over.rms < over.upper
+
+
+def test_apply_knows_the_pixel_size(result, tmp_path):
+    pixels = POINTS / np.asarray(result.scale_mm_per_px)
+    applied = result.apply(pixels)
+    rotation = np.asarray(result.image_to_probe)[:3, :3]
+    expected = rotation @ error_covariance(result.numpy(), POINTS) @ rotation.T
+    np.testing.assert_allclose(applied.covariance, expected, rtol=1e-9)
+    result.image_transform().save(tmp_path / "cal.json")
+    again = load_calibration(tmp_path / "cal.json").apply(pixels)
+    np.testing.assert_array_equal(again.covariance, applied.covariance)
+    np.testing.assert_array_equal(again.points, applied.points)
+    np.testing.assert_allclose(
+        (np.column_stack([pixels, 0 * pixels[:, 0], np.ones(3)]) @ result.plus_matrix().T)[:, :3],
+        applied.points,
+        atol=1e-10,
+    )
+
+
+def test_a_sound_speed_that_was_found_is_applied(tmp_path):
+    """Pixels as the machine scales them lie deeper in faster water."""
+    found = ImageTransform(
+        np.eye(4), np.array([0.2, 0.1]), 3.0, range_factor=1.02,
+        unknowns=("translation", "rotation", "sound-speed"), image_covariance=1e-4 * np.eye(7),
+    )  # fmt: skip
+    assert found.apply(np.array([[10.0, 100.0]])).points[0] == pytest.approx([2.0, 0.0, 13.2])
+    assert found.plus_matrix()[2] == pytest.approx([0.0, 0.102, 0.0, 3.0])
+    assert found.apply(np.array([[10.0, 100.0]])).covariance[0, 2, 2] == pytest.approx(
+        1e-4 * (1 + 2.0**2 + 13.2**2)
+    )
+    found.save(tmp_path / "cal.json")
+    loaded = load_calibration(tmp_path / "cal.json")
+    np.testing.assert_array_equal(loaded.plus_matrix(), found.plus_matrix())
+    record = json.loads((tmp_path / "cal.json").read_text())
+    record["image_unknowns"] = ["nonsense"]
+    (tmp_path / "cal.json").write_text(json.dumps(record))
+    with pytest.raises(jaxcal.FormatError, match="image_unknowns"):
+        load_calibration(tmp_path / "cal.json")
+
+
+def test_leaving_an_image_out_is_foretold(result):
+    found = influence_of(result)
+    problem = result.problem
+    sd = np.sqrt(np.diagonal(result.unknowns_covariance))
+    for image in (2, 11):
+        mask = problem.mask.at[image].set(0.0)
+        without = jaxcal.calibrate(replace(problem, mask=mask), "conventional", estimate=("scale",))
+        twist = relative_twist(
+            jnp.asarray(result.image_to_probe), jnp.asarray(without.image_to_probe)
+        )
+        np.testing.assert_allclose(found.moved[image, :6] / sd[:6], twist / sd[:6], atol=0.03)
+        grown = np.log(np.asarray(without.scale_mm_per_px) / np.asarray(result.scale_mm_per_px))
+        np.testing.assert_allclose(found.moved[image, 9:] / sd[9:], grown / sd[9:], atol=0.03)
+    np.testing.assert_allclose(found.model_covariance, result.unknowns_covariance, rtol=1e-6)
+    np.testing.assert_allclose(found.shares.sum(axis=0), found.model_covariance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("tracker_sd", [None, 0.2])
+def test_whitened_errors_are_those_of_the_solve(tracker_sd):
+    """Their normal matrix is the solve's information, and their gradient vanishes there."""
+    given = {"sigma": (0.2, 0.1, 0.6), "tracker_sd": tracker_sd}
+    result = jaxcal.calibrate(experiment(3, images=24), "joint", "gaussian", **given)
+    alone = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], result.numpy())
+    whitened = influences._whitened(alone, alone.problem)
+    information = np.einsum("mkp,mkq->pq", whitened.rows, whitened.rows)
+    size = np.sqrt(np.diagonal(information))
+    stated = np.asarray(result.information)
+    np.testing.assert_allclose(information / np.outer(size, size), stated / np.outer(size, size),
+                               atol=1e-12)  # fmt: skip
+    gradient = np.einsum("mkp,mk->p", whitened.rows, whitened.errors)
+    np.testing.assert_allclose(gradient / size, 0.0, atol=1e-6)
+
+
+def test_predicting_an_image_from_the_others_is_what_bayes_says():
+    """Log density of an image's errors: of all images less that of the others."""
+    rng = np.random.default_rng(0)
+    rows, errors = rng.normal(size=(9, 3, 4)), rng.normal(size=(9, 3))
+
+    def evidence(rows, errors):
+        # Of errors r = e + R d with a flat belief in d, up to what images share.
+        flat, observed = rows.reshape(-1, 4), errors.reshape(-1)
+        whole = flat.T @ flat
+        step = np.linalg.solve(whole, flat.T @ observed)
+        rest = observed @ observed - step @ whole @ step
+        size = len(observed) * np.log(2 * np.pi)
+        return -0.5 * rest - 0.5 * np.linalg.slogdet(whole)[1] - 0.5 * size
+
+    step = np.linalg.lstsq(rows.reshape(-1, 4), -errors.reshape(-1), rcond=None)[0]
+    seen = influences._Errors(errors + rows @ step, rows, np.arange(3), np.zeros(9),
+                              np.ones(9, bool), 9)  # fmt: skip
+    found = influences._influence(seen, np.einsum("mkp,mkq->pq", rows, rows))
+    for image in range(9):
+        others = np.arange(9) != image
+        expected = evidence(rows, errors) - evidence(rows[others], errors[others])
+        assert found.log_density[image] == pytest.approx(expected, rel=1e-9)
+    np.testing.assert_allclose(found.expected.trace(axis1=1, axis2=2) > 0, True)
+
+
+def test_residuals_that_keep_to_the_model_do_not_contradict_it():
+    rng = np.random.default_rng(4)
+    rows = rng.normal(size=(40, 3, 5))
+    weight = np.diag([1.0, 2.0, 0.5, 0.0, 1.0])
+    ratios, chances, wild = [], [], []
+    for _ in range(200):
+        errors = rng.normal(size=(40, 3))
+        for factor, out in ((1.0, ratios), (3.0, wild)):
+            # Larger errors where they matter, and as much smaller elsewhere.
+            size = np.where(np.arange(40)[:, None] < 8, factor, 1.0)
+            loud = rows * np.where(np.arange(40) < 8, factor, 1.0)[:, None, None]
+            whole = np.einsum("mkp,mkq->pq", loud, loud)
+            step = np.linalg.solve(whole, np.einsum("mkp,mk->p", loud, size * errors))
+            seen = influences._Errors(size * errors - loud @ step, loud, np.arange(3),
+                                      np.zeros(40), np.ones(40, bool), 40)  # fmt: skip
+            ratio, chance = excess(influences._influence(seen, whole), weight)
+            out.append(ratio)
+            if factor == 1.0:
+                chances.append(chance)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.05)
+    assert np.std(ratios) == pytest.approx(np.mean(chances), rel=0.25)
+    assert np.mean(np.array(ratios) > 1 + 3 * np.array(chances)) < 0.03
+    assert np.mean(wild) > 2
+
+
+def test_images_in_the_image(result):
+    found = influence_of(result)
+    jacobian = image_jacobian(result.numpy(), POINTS)
+    weight = np.einsum("mia,mib->ab", jacobian, jacobian) / len(POINTS)
+    moved, should = in_image(found, weight)
+    expected = np.sqrt(np.mean(np.sum((jacobian @ found.moved[5]) ** 2, axis=1)))
+    assert moved[5] == pytest.approx(expected, rel=1e-9)
+    # Of 24 images, as a whole, they move it as much as they should.
+    assert 0.5 < np.sqrt(np.mean(moved**2) / np.mean(should**2)) < 2
+
+
+def test_record_and_table_begin_with_the_error_at_the_image(record, result):
+    tre = record["tre"]
+    low, high = tre["interval_95_mm"]
+    assert low < tre["rms_mm"] < high
+    assert tre["unit"] == "px"
+    assert tre["factor"] == 1.0
+    middle = tre["points"][0]
+    at = tre_at(result, np.array(middle["position_mm"]))
+    assert middle["tre_mm"] == pytest.approx(float(at.rms), rel=1e-12)
+    assert middle["interval_95_mm"] == pytest.approx([float(at.lower), float(at.upper)])
+    np.testing.assert_allclose(
+        np.array(middle["image"]) * record["scale_mm_per_px"], middle["position_mm"]
+    )
+    table = Console(width=120)
+    with table.capture() as captured:
+        table.print(calibration_table(record))
+    text = captured.get()
+    assert f"{tre['rms_mm']:.3f}, 95 % interval {low:.3f} to {high:.3f}" in text
+    assert text.index("error to expect at the image") < text.index("method")
+    assert f"{tre['rms_mm']:.2f} mm" in headline(record)
+    assert sum(record["limits"]["error_share"].values()) == pytest.approx(1)
+
+
+def test_rms_in_the_plane_is_in_the_plane(record, result):
+    residual = np.asarray(result.residual)
+    found = record["limits"]
+    expected = np.sqrt(np.mean(residual[:, 0] ** 2 + residual[:, 2] ** 2))
+    assert found["rms_in_plane_mm"] == pytest.approx(expected)
+    assert np.hypot(expected, found["rms_elevational_mm"]) == pytest.approx(record["rms_mm"])
+    assert sum(found["scatter_share"].values()) == pytest.approx(1)
+
+
+def test_points_that_are_asked_for(result, recording):
+    found = calibration_record(result, recording, tre_points=((10.0, 600.0),))
+    asked = found["tre"]["points"][-1]
+    assert (asked["name"], asked["image"]) == ("asked for", [10.0, 600.0])
+    there = np.array([10.0, 600.0]) * found["scale_mm_per_px"]
+    assert asked["tre_mm"] == pytest.approx(float(tre_at(result, there).rms))
+    assert any("At (10, 600) px" in line for line in verdict(found))
+
+
+def stating(record, error):
+    """A record whose covariance states another error."""
+    changed = copy.deepcopy(record)
+    factor = error / changed["tre"]["stated_mm"]
+    changed["tre"]["stated_mm"] = error
+    changed["tre"]["stated_interval_mm"] = [
+        factor * end for end in changed["tre"]["stated_interval_mm"]
+    ]
+    for name in ("moved_mm", "expected_mm"):
+        changed["influence"][name] = [factor * value for value in changed["influence"][name]]
+    return changed
+
+
+def test_word_and_number_are_of_one_quantity(record):
+    for error, word in ((0.9 * GOOD_MM, "good"), (0.9 * FAIR_MM, "fair"), (2.0, "uncertain")):
+        changed = stating(record, error)
+        # However well or badly the target stays in its place.
+        for precision in (0.001, 30.0):
+            changed["reconstruction_precision_mm"] = changed["rms_mm"] = precision
+            settle(changed)
+            assert changed["verdict"] == word
+            assert verdict(changed)[0].startswith(f"{word.capitalize()}: expect")
+            assert f"{error:.2f} mm" in verdict(changed)[0]
+
+
+def contradicted(kind, record):
+    changed = stating(record, 0.4)
+    count = changed["images"]
+    quiet = [0.05] * count
+    if kind == "residuals":
+        changed["tre"] |= {"residuals_over_stated": 3.0, "chance": 0.3}
+    elif kind == "image":
+        changed["influence"]["moved_mm"][7] = 3.7
+    elif kind == "left out":
+        moved = [*quiet[:-1], 3.7]
+        changed["cross_validation"] = {
+            "folds": count, "folds_converged": count, "image_moved_mm": moved, "stated_mm": 0.4,
+            "precision_mm": 1.3, "most_influential": [], "influence": quiet,
+        }  # fmt: skip
+    else:
+        changed["bootstrap"] = {
+            "reproducibility_mm": [2.3] * 5, "stated_mm": 0.4, "resamples": 200,
+            "rotation_sd_deg": [0.1] * 3,
+        }  # fmt: skip
+    return changed
+
+
+@pytest.mark.parametrize("kind", ["residuals", "image", "left out", "bootstrap"])
+def test_verdict_falls_when_the_covariance_is_contradicted(record, kind):
+    changed = contradicted(kind, record)
+    settle(changed)
+    assert changed["verdict"] in ("fair", "uncertain")
+    tre = changed["tre"]
+    assert tre["rms_mm"] == pytest.approx(tre["factor"] * 0.4)
+    assert tre["interval_95_mm"][1] == pytest.approx(tre["factor"] * tre["stated_interval_mm"][1])
+    assert tre["points"][0]["tre_mm"] == pytest.approx(
+        tre["factor"] * tre["points"][0]["stated_mm"]
+    )
+    lines = verdict(changed)
+    assert f"{tre['rms_mm']:.2f} mm" in lines[0]
+    assert "The noise model by itself states 0.40 mm, but " in lines[1]
+    # Said once, whatever is found out later.
+    again = copy.deepcopy(changed)
+    settle(again)
+    assert again == changed
+
+
+def test_resampling_that_agrees_changes_nothing(record):
+    changed = stating(record, 0.4)
+    count = changed["images"]
+    quiet = [0.4 / np.sqrt(count)] * count
+    changed["cross_validation"] = {
+        "folds": count, "folds_converged": count, "image_moved_mm": quiet, "stated_mm": 0.4,
+    }  # fmt: skip
+    changed["bootstrap"] = {"reproducibility_mm": [0.42] * 5, "stated_mm": 0.4}
+    settle(changed)
+    assert (changed["verdict"], changed["tre"]["factor"]) == ("good", 1.0)
+
+
+def test_limits_in_words(record):
+    changed = stating(record, 0.4)
+    changed["limits"]["error_share"] = {"lateral": 0.05, "range": 0.25, "elevational": 0.7}
+    changed["next_poses"] = {"tre_now_mm": 0.4, "tre_then_mm": 0.3, "poses": [{}, {}, {}]}
+    settle(changed)
+    said = " ".join(limits(changed))
+    assert "targets out of the image plane (70 %), then errors of their depth (25 %)" in said
+    assert "3 well chosen images help as much as 19 more" in said
+
+
+def test_why_larger_residuals_are_believed(record):
+    beside = {
+        "rms_mm": 1.01, "conventional_rms_mm": 0.98, "conventional_tre_mm": 0.44, "tre_mm": 0.41,
+        "log_density_gain": 20.6, "log_density_gain_sd": 5.5, "apart_mm": 0.43,
+    }  # fmt: skip
+    said = " ".join(verdict({**record, "comparison": beside}))
+    assert "larger than those of the conventional fit (1.010 and 0.980 mm)" in said
+    assert "0.44 mm off, these weights 0.41 mm" in said
+    assert "log density +20.6 +- 5.5" in said
+
+
+def test_exit_status_says_less_than_required(tmp_path, capfd):
+    path = tmp_path / "rec.h5"
+    jaxcal.save(jaxcal.simulate_recording(jaxcal.Protocol(images=24, elevation_mm=2.0), 3), path)
+    ask = ["calibrate", str(path), "--method", "conventional", "--json", "--tre", "3", "40"]
+    assert main(ask) == 0
+    record = json.loads(capfd.readouterr().out)
+    assert record["verdict"] in ("good", "fair")
+    assert record["tre"]["points"][-1]["image"] == [3.0, 40.0]
+    assert record["tre"]["unit"] == "mm"
+    noisy = tmp_path / "noisy.h5"
+    protocol = jaxcal.Protocol(images=24, elevation_mm=15.0)
+    jaxcal.save(jaxcal.simulate_recording(protocol, 3), noisy)
+    codes = {
+        require: main(["calibrate", str(noisy), "--method", "conventional", "--json",
+                       "--require", require])
+        for require in ("good", "fair", "uncertain")
+    }  # fmt: skip
+    found = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    assert found[0]["verdict"] == "uncertain"
+    assert codes == {"good": 5, "fair": 5, "uncertain": 0}
