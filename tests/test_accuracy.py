@@ -174,8 +174,11 @@ def test_leaving_an_image_out_is_foretold(result):
 def test_whitened_errors_are_those_of_the_solve(tracker_sd):
     """Their normal matrix is the solve's information, and their gradient vanishes there."""
     given = {"sigma": (0.2, 0.1, 0.6), "tracker_sd": tracker_sd}
-    result = jaxcal.calibrate(experiment(3, images=24), "joint", "gaussian", **given)
-    alone = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], result.numpy())
+    # Without a tracker that errs, with a covariance for each image.
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=24), 3)
+    recording = experiment(3, images=24) if tracker_sd is not None else recording
+    result = jaxcal.calibrate(recording, "joint", "gaussian", **given)
+    alone = jax.tree.map(influences._first, result.numpy())
     whitened = influences._whitened(alone, alone.problem)
     information = np.einsum("mkp,mkq->pq", whitened.rows, whitened.rows)
     size = np.sqrt(np.diagonal(information))

@@ -111,13 +111,19 @@ def influence_of(calibration: Calibration) -> Influence:
         )
     if np.ndim(calibration.mask) != 1:
         raise CalibrationError("a batch holds many calibrations: take one of them")
-    alone = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], calibration.numpy())
+    alone = jax.tree.map(_first, calibration.numpy())
     with np.errstate(all="ignore"):
         found = _whitened(alone, alone.problem)
         information = np.asarray(alone.linearisation.information)
         information = information / np.asarray(alone.linearisation.variance)[:, None, None]
         settled = calibration.offset_law is None or not bool(calibration.offset_law.weighed)
         return _influence(found, information[0], settled=settled)
+
+
+def _first(leaf: Any) -> Array:
+    """As the only one of a batch, in float64."""
+    values = np.asarray(leaf)
+    return (values.astype(float) if values.dtype.kind == "f" else values)[None]
 
 
 def _influence(

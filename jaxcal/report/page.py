@@ -1,0 +1,550 @@
+"""One page for a browser: verdict, error map, matrix in every form, scene, residuals, comparison.
+
+It is one file that asks for nothing: styles, script, figures (SVG) and the whole record are inside,
+and a content security policy forbids the rest. Every word that comes from a recording is escaped.
+Numbers that are also in the JSON carry their path in it (``data-record``).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxcal.calibration import Calibration
+from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.metrics import reconstruct
+from jaxcal.errors import InputError
+from jaxcal.io.atomic import write_text
+from jaxcal.recording import Recording
+from jaxcal.report import svg
+from jaxcal.report.certified import certificate_words
+from jaxcal.report.next_poses import next_poses_sentences
+from jaxcal.report.verdict import advice, verdict
+from jaxcal.transform import SaveFormat, transform_from_record
+
+MOST_POSES = 300
+"""Poses that are drawn in space,"""
+LONGEST_LIST = 3000
+"""and entries of a list that is kept in the page's record."""
+
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
+_KINDS = (
+    ("lateral", "sideways", svg.BLUE),
+    ("range", "depth", svg.GREEN),
+    ("elevational", "out of the plane", svg.ORANGE),
+)
+_FORMS: tuple[tuple[SaveFormat, str, str], ...] = (
+    ("plus", "PLUS", "ImageToProbe, to paste into CoordinateDefinitions of a device set."),
+    ("slicer", "3D Slicer and ITK", "Save as ImageToProbe.tfm and drag it into Slicer."),
+    ("numpy", "numpy", "PLUS's matrix: (u, v, 0, 1) in pixels to the probe in mm."),
+    ("ros", "ROS", "Rigid, metres: easy_handeye's YAML and the command of tf2."),
+    ("tusrec", "TUS-REC", "calib_matrix.csv."),
+    ("json", "jaxcal", "What jaxcal apply, export and serve read."),
+)
+
+
+def write_page(
+    path: str | os.PathLike[str], record: dict[str, Any], result: Calibration, recording: Recording
+) -> None:
+    """Write the page, complete or not at all.
+
+    Args:
+        path: the file to make or replace.
+        record: of :func:`jaxcal.report.record.calibration_record`, settled.
+        result: the calibration.
+        recording: what was calibrated.
+
+    Raises:
+        OutputError: it could not be written; the file is as it was.
+    """
+    write_text(path, page(record, result, recording))
+
+
+def page(record: dict[str, Any], result: Calibration, recording: Recording) -> str:
+    """The page as text."""
+    answer = result.numpy()
+    known = record["status"] in ("converged", "max_iterations")
+    sections = [
+        _head(record),
+        _findings(record),
+        *([_accuracy(record, answer, recording)] if record["tre"] is not None else []),
+        *([_matrix(record)] if known else []),
+        *([_scene(record, answer, recording)] if known else []),
+        *([_residuals(record, answer)] if known else []),
+        *([_limits(record)] if record["limits"] is not None else []),
+        *([_comparison(record)] if known else []),
+        _observability(record),
+        _facts(record),
+    ]
+    name = escape(Path(record["source"]).name)
+    files = resources.files("jaxcal.report")
+    style = (files / "page.css").read_text("utf-8")
+    script = (files / "page.js").read_text("utf-8")
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<link rel="icon" href="data:,">\n'
+        f"<title>Calibration of {name}</title>\n<style>\n{style}</style></head>\n<body>\n"
+        + "\n".join(sections)
+        + f"\n{_embedded('record', _shortened(record))}\n<script>\n{script}</script>\n"
+        "</body></html>\n"
+    )
+
+
+def _embedded(name: str, value: Any) -> str:
+    """JSON inside the page; nothing in it can end the element."""
+    text = json.dumps(value, allow_nan=False).replace("<", "\\u003c")
+    return f'<script type="application/json" id="{name}">{text}</script>'
+
+
+def _shortened(record: dict[str, Any]) -> dict[str, Any]:
+    """The record without the lists of recordings with very many images."""
+
+    def short(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: short(item) for key, item in value.items()}
+        return None if isinstance(value, list) and len(value) > LONGEST_LIST else value
+
+    return short(record)
+
+
+def _number(record: dict[str, Any], path: str, form: str, unit: str = "") -> str:
+    """A number of the record, with where it is."""
+    value: Any = record
+    for key in path.split("."):
+        value = value[int(key)] if isinstance(value, list) else value[key]
+    if value is None:
+        return "not known"
+    tail = f"&nbsp;{escape(unit)}" if unit else ""
+    return f'<span data-record="{path}" data-form="{form}">{value:{form}}</span>{tail}'
+
+
+def _paragraphs(lines: list[str]) -> str:
+    """Sentences, and lists of those that start with "- "."""
+    parts, items = [], []
+    for text in [*lines, ""]:
+        if text.startswith("- "):
+            items.append(f"<li>{escape(text[2:])}</li>")
+            continue
+        if items:
+            parts.append(f"<ul>{''.join(items)}</ul>")
+            items = []
+        if text:
+            parts.append(f"<p>{escape(text)}</p>")
+    return "".join(parts)
+
+
+def _section(title: str, *parts: str) -> str:
+    return f"<section><h2>{escape(title)}</h2>{''.join(parts)}</section>"
+
+
+def _head(record: dict[str, Any]) -> str:
+    lines, tre = verdict(record), record["tre"]
+    word = record["verdict"] or "do not use"
+    kind = escape(record["verdict"] or "uncertain")
+    number = ""
+    if tre is not None and tre.get("rms_mm") is not None:
+        number = (
+            f'<div><span class="big">{_number(record, "tre.rms_mm", ".2f", "mm")}</span>'
+            "<small>error to expect at the image (TRE, root mean square)<br>95 % interval "
+            f"{_number(record, 'tre.interval_95_mm.0', '.2f')} to "
+            f"{_number(record, 'tre.interval_95_mm.1', '.2f', 'mm')}</small></div>"
+        )
+    prior = "" if record["prior"] == "none" else f", prior {record['prior']}"
+    said = [line for line in lines[1:] if not line.startswith("- ")]
+    said = [line for line in said if line not in ("Look at this:", "What to do:")]
+    return (
+        f"<header><h1>Calibration of {escape(Path(record['source']).name)}</h1>"
+        f'<p class="soft">{escape(record["source"])}: {record["images_used"]} images used of '
+        f"{record['images']}; method {escape(record['method'] + prior)}; "
+        f"jaxcal {escape(record['jaxcal_version'])}</p></header>"
+        f'<div class="verdict {kind}"><div class="word">{escape(word)}</div>{number}</div>'
+        f"{_paragraphs([lines[0], *said])}"
+    )
+
+
+def _findings(record: dict[str, Any]) -> str:
+    """What looks wrong and what to do about it, whoever found it."""
+    found = [str(text) for text in [*record.get("findings", ()), *record["warnings"]]]
+    parts = []
+    if found:
+        parts += ["<h3>Look at this</h3>", _paragraphs([f"- {text}" for text in found])]
+    todo = advice(record)
+    if todo:
+        parts += ["<h3>What to do</h3>", _paragraphs([f"- {text}" for text in todo])]
+    more = next_poses_sentences(record)
+    if more:
+        parts += ["<h3>Which images to add</h3>", _paragraphs(more)]
+    return _section("What to look at, and what to do", *parts) if parts else ""
+
+
+def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording) -> str:
+    tre = record["tre"]
+    mapped = {name: np.array(tre["map"][name], float) for name in ("lateral_mm", "axial_mm")}
+    error = tre["factor"] * np.array(tre["map"]["stated_mm"], float)
+    used = np.asarray(answer.mask) > 0
+    seen = _targets(answer, recording)[used][:, [0, 2]]
+    drawn = svg.error_map(
+        mapped["lateral_mm"], mapped["axial_mm"], error, seen,
+        "Target registration error to expect over the image, mm",
+    )  # fmt: skip
+    rows = []
+    for k, point in enumerate(tre["points"]):
+        path = f"tre.points.{k}"
+        rows.append(
+            f"<tr><td>{escape(point['name'])}</td>"
+            f'<td class="n">{_number(record, path + ".image.0", ".1f")}, '
+            f"{_number(record, path + '.image.1', '.1f')}</td>"
+            f'<td class="n">{_number(record, path + ".tre_mm", ".2f")}</td>'
+            f'<td class="n">{_number(record, path + ".interval_95_mm.0", ".2f")} to '
+            f"{_number(record, path + '.interval_95_mm.1', '.2f')}</td></tr>"
+        )
+    table = (
+        f'<div class="wide"><table><tr><th>point</th><th class="n">image ({tre["unit"]})</th>'
+        '<th class="n">TRE (mm)</th><th class="n">95 % interval (mm)</th></tr>'
+        f"{''.join(rows)}</table></div>"
+    )
+    why = "".join(f"<li>{escape(text)}</li>" for text in tre["contradictions"])
+    if why:
+        why = (
+            f"<p>The covariance states {_number(record, 'tre.stated_mm', '.2f', 'mm')}; all "
+            f"numbers here are {_number(record, 'tre.factor', '.2f')} times as large, since</p>"
+            f"<ul>{why}</ul>"
+        )
+    return _section(
+        "How accurate",
+        '<div class="grid"><figure>', drawn,
+        "<figcaption>Distance to expect between the true and the calibrated place of what is seen "
+        "at a point of the image. Dots: where the target was.</figcaption></figure><div>",
+        table, why,
+        '<p class="soft">Half of the intervals\' remaining 5 % lies below, half above. Errors of '
+        "the tracker at the time of use, and of reading a point, come on top.</p></div></div>",
+    )  # fmt: skip
+
+
+def _matrix(record: dict[str, Any]) -> str:
+    transform = transform_from_record(record, source=record["source"])
+    parts = [
+        "<p>PLUS's and Slicer's ImageToProbe takes pixels (u, v, 0, 1) to the probe in mm and "
+        "carries the pixel size; image_plane_to_probe is rigid and takes (lateral, elevational, "
+        "axial) in mm. They are different matrices.</p>"
+    ]
+    for form, title, words in _FORMS:
+        try:
+            text = transform.text(form)
+        except InputError:
+            continue
+        name = f"form-{form}"
+        opened = " open" if len(parts) == 1 else ""
+        parts.append(
+            f"<details{opened}><summary>{escape(title)}</summary><div class='copy'><span "
+            f'class="soft">{escape(words)}</span><button type="button" data-copy="{name}">copy'
+            f'</button></div><pre id="{name}">{escape(text)}</pre></details>'
+        )
+    rows = "".join(
+        "<tr>" + "".join(
+            f'<td class="n">{_number(record, f"image_plane_to_probe.{i}.{j}", ".6f")}</td>'
+            for j in range(4)
+        ) + "</tr>"
+        for i in range(4)
+    )  # fmt: skip
+    parts.append(f'<h3>image_plane_to_probe (mm)</h3><div class="wide"><table>{rows}</table></div>')
+    return _section("The matrix", *parts)
+
+
+def _targets(answer: Calibration, recording: Recording) -> Float[np.ndarray, "n 3"]:
+    """The target in every image, mm."""
+    x, poses = np.asarray(answer.image_to_probe), recording.calibration.poses
+    in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], np.asarray(answer.point) - poses[:, :3, 3])
+    return (in_probe - x[:3, 3]) @ x[:3, :3]
+
+
+def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) -> str:
+    used = np.flatnonzero(np.asarray(answer.mask) > 0)
+    shown = used[:: max(-(-len(used) // MOST_POSES), 1)]
+    x, point = np.asarray(answer.image_to_probe), np.asarray(answer.point)
+    images = recording.calibration.poses[shown] @ x
+    seen = _targets(answer, recording)[shown]
+    # What was measured: the target taken in the plane at its lateral position and range.
+    residual = np.asarray(answer.residual)[shown]
+    measured = seen - residual
+    cloud = reconstruct(x, recording.calibration.poses[shown], measured)
+    wide = max(float(np.ptp(seen[:, 0])) / 2, 10.0)
+    deep = float(seen[:, 2].max())
+    middle = float(0.5 * (seen[:, 0].min() + seen[:, 0].max()))
+    corners = np.array(
+        [[middle - wide, 0, 0], [middle + wide, 0, 0], [middle + wide, 0, deep],
+         [middle - wide, 0, deep], [middle - wide, 0, 0]]
+    )  # fmt: skip
+    frames = images[:, None, :3, :3] @ corners[None, :, :, None]
+    frames = frames[..., 0] + images[:, None, :3, 3]
+    far = np.concatenate([frames.reshape(-1, 3), point[None]])
+    centre = 0.5 * (far.min(axis=0) + far.max(axis=0))
+    lines = [
+        {"points": _rounded(outline), "colour": svg.BLUE, "width": 0.5, "fill": svg.BLUE}
+        for outline in frames
+    ]
+    dots = [
+        {"at": _rounded(frame[:3, 3]), "r": 1.6, "colour": svg.BLUE, "title": f"image {image}"}
+        for frame, image in zip(images, shown.tolist(), strict=True)
+    ]
+    dots.append({"at": _rounded(point), "r": 4, "colour": svg.ORANGE, "title": "target"})
+    whole = {
+        "centre": _rounded(centre),
+        "radius": float(np.linalg.norm(far - centre, axis=1).max()),
+        "lines": lines, "dots": dots, "bar": _bar(np.linalg.norm(np.ptp(far, axis=0))),
+    }  # fmt: skip
+    close = _close_up(answer, cloud, shown)
+    views = (
+        ("scene-all", whole, "Planes of the images (blue) and the target (orange), in the "
+         "tracker's frame. Drag, or use the arrow keys, to turn."),
+        ("scene-target", close, "The target as each image puts it (green; does not fit the rest: "
+         "orange), the estimate (black) with its 95 % ellipsoid."),
+    )  # fmt: skip
+    parts = [
+        f'<figure>{_embedded(name, data)}<svg class="scene" viewBox="0 0 380 300" role="img" '
+        f'tabindex="0" aria-label="{escape(words)}" data-scene="{name}"></svg>'
+        f"<figcaption>{escape(words)}</figcaption></figure>"
+        for name, data, words in views
+    ]
+    place = ", ".join(_number(record, f"point_mm.{k}", ".3f") for k in range(3))
+    return _section(
+        "In space", f'<div class="grid">{"".join(parts)}</div>',
+        f"<p>Target in the tracker's frame: {place}&nbsp;mm.</p>",
+    )  # fmt: skip
+
+
+def _close_up(
+    answer: Calibration, cloud: Float[np.ndarray, "n 3"], shown: np.ndarray
+) -> dict[str, Any]:
+    point, named = np.asarray(answer.point), set(messages.outliers(answer))
+    lines: list[dict[str, Any]] = []
+    covariance = np.asarray(answer.point_covariance, float)
+    reach = 0.0
+    if np.isfinite(covariance).all():
+        values, vectors = np.linalg.eigh(covariance)
+        # 7.81: 95 % point of chi squared with three degrees of freedom.
+        axes = vectors * np.sqrt(7.81 * np.maximum(values, 0.0))
+        reach = float(np.linalg.norm(axes, axis=0).max())
+        round_ = np.linspace(0, 2 * np.pi, 49)
+        for i, j in ((0, 1), (1, 2), (2, 0)):
+            ring = point + np.outer(np.cos(round_), axes[:, i]) + np.outer(
+                np.sin(round_), axes[:, j]
+            )  # fmt: skip
+            lines.append({"points": _rounded(ring), "colour": "var(--text)", "width": 0.8})
+    away = np.linalg.norm(cloud - point, axis=1)
+    # A few that are far off must not make the rest a single dot.
+    radius = max(1.15 * float(np.quantile(away, 0.97)) if len(away) else 1.0, 1.2 * reach, 1e-3)
+    dots = [
+        {"at": _rounded(place), "r": 2.2, "title": f"image {image}, {apart:.2f} mm",
+         "colour": svg.ORANGE if image in named else svg.GREEN}
+        for place, image, apart in zip(cloud, shown.tolist(), away, strict=True)
+        if apart <= 1.2 * radius
+    ]  # fmt: skip
+    dots.append({"at": _rounded(point), "r": 3, "colour": "var(--text)", "title": "target"})
+    return {
+        "centre": _rounded(point), "radius": radius, "lines": lines, "dots": dots,
+        "bar": _bar(2 * radius),
+    }  # fmt: skip
+
+
+def _rounded(values: Any) -> Any:
+    """Numbers with a hundredth of a micrometre, as plain lists."""
+    return np.round(np.asarray(values, float), 5).tolist()
+
+
+def _bar(size: float) -> float:
+    """A round length of about a quarter of a size, mm."""
+    power = 10.0 ** math.floor(math.log10(max(size / 4, 1e-9)))
+    length = max(power * k for k in (1, 2, 5) if power * k <= size / 4 * (1 + 1e-9))
+    return float(f"{length:.3g}")
+
+
+def _residuals(record: dict[str, Any], answer: Calibration) -> str:
+    used = np.flatnonzero(np.asarray(answer.mask) > 0)
+    named = [image for image in messages.outliers(answer) if image in used]
+    residual = np.asarray(answer.residual)[used]
+    images = used.astype(float).tolist()
+    first = svg.series(
+        [
+            (f"{name} (mm)", images, residual[:, axis].tolist(), colour)
+            for name, axis, colour in (
+                ("lateral", 0, svg.BLUE), ("axial", 2, svg.GREEN), ("elevational", 1, svg.ORANGE),
+            )
+        ],
+        named,
+        "Residual of every image: the target less the point that was measured, mm",
+        height=78.0,
+    )  # fmt: skip
+    offset = np.asarray(answer.elevation)[used]
+    second = svg.series(
+        [("offset (mm)", images, offset.tolist(), svg.ORANGE)],
+        named,
+        "Estimated offset of the target from the image plane with one standard deviation, mm",
+        spreads=[np.asarray(answer.elevation_sd)[used].tolist()],
+        height=120.0,
+    )
+    parts = [
+        f"<figure>{first}<figcaption>Residual of every image, one scale for all: the estimated "
+        "target less the measured point taken in the plane. Rings: does not fit the rest."
+        "</figcaption></figure>",
+        f"<figure>{second}<figcaption>How far the target was out of the image plane, with one "
+        "standard deviation (grey).</figcaption></figure>",
+    ]
+    influence = record["influence"]
+    if influence is not None:
+        moved = [influence["moved_mm"][int(k)] or 0.0 for k in used]
+        third = svg.series(
+            [("moves it (mm)", images, moved, svg.BLUE)],
+            influence["most"][:3],
+            "How far leaving out an image would move the calibration, mm at the image",
+            height=120.0,
+        )
+        parts.append(
+            f"<figure>{third}<figcaption>Which images hurt: how far the image would move if one of "
+            "them were left out (to first order). Rings: the three that move it most."
+            "</figcaption></figure>"
+        )
+    held = record.get("cross_validation")
+    words = ""
+    if held is not None and held["precision_mm"] is not None:
+        words = (
+            "<p>On images that were not used for it the precision is "
+            f"{_number(record, 'cross_validation.precision_mm', '.2f', 'mm')}.</p>"
+        )
+    return _section("Image by image", f'<div class="grid">{"".join(parts)}</div>', words)
+
+
+def _limits(record: dict[str, Any]) -> str:
+    found = record["limits"]
+    rows = []
+    for title, name in (
+        ("Mean square error of the calibration at the image", "error_share"),
+        ("Mean square distance of the target from its place", "scatter_share"),
+    ):
+        shares = [(word, found[name][kind], colour) for kind, word, colour in _KINDS]
+        if all(share is not None for _, share, _ in shares):
+            rows.append((title, [(word, float(share), colour) for word, share, colour in shares]))
+    sds = " ".join(
+        f"{word} {_number(record, f'sigma_{name}_mm', '.2f', 'mm')}{mark}"
+        for word, name, mark in (
+            ("sideways", "lateral", ","),
+            ("depth", "range", ","),
+            ("out of the plane", "elevation", "."),
+        )
+    )
+    drawn = svg.stacked(rows, "Where the errors come from, in shares of mean squares")
+    return _section(
+        "Where the errors come from",
+        f"<figure>{drawn}</figure><p>Standard deviations found: {sds} Residual, root mean square: "
+        f"{_number(record, 'rms_mm', '.3f', 'mm')}, of which "
+        f"{_number(record, 'limits.rms_in_plane_mm', '.3f', 'mm')} in the image plane and "
+        f"{_number(record, 'limits.rms_elevational_mm', '.3f', 'mm')} out of it.</p>",
+        '<p class="soft">The upper bar is about the calibration; the lower one about how the '
+        "target was imaged and read, which no calibration removes.</p>",
+    )
+
+
+def _comparison(record: dict[str, Any]) -> str:
+    beside = record["comparison"]
+    if beside is None:
+        return ""
+    rows = (
+        ("residual, root mean square (mm)", "conventional_rms_mm", "rms_mm", ".3f"),
+        ("error at the image by the noise found (mm)", "conventional_tre_mm", "tre_mm", ".3f"),
+    )
+    cells = "".join(
+        f'<tr><td>{escape(name)}</td><td class="n">{_number(record, "comparison." + other, form)}'
+        f'</td><td class="n">{_number(record, "comparison." + own, form)}</td></tr>'
+        for name, other, own, form in rows
+    )
+    return _section(
+        "Beside the conventional fit",
+        '<div class="wide"><table><tr><th></th><th class="n">conventional</th><th class="n">'
+        f"{escape(record['method'])}</th></tr>{cells}</table></div>",
+        "<p>The conventional fit takes every target for in the plane and weighs all errors alike: "
+        "it minimises the first row and nothing else. They differ by "
+        f"{_number(record, 'comparison.apart_mm', '.2f', 'mm')} at the image. Images left out are "
+        "predicted from the others with a log density that is "
+        f"{_number(record, 'comparison.log_density_gain', '+.1f')} ± "
+        f"{_number(record, 'comparison.log_density_gain_sd', '.1f')} higher than by the "
+        "conventional fit.</p>",
+    )
+
+
+def _observability(record: dict[str, Any]) -> str:
+    sight = record["observability"]
+    words = [f"Least known: {sight['weakest_direction']}."]
+    if sight["known_only_from_prior"]:
+        words.append(f"Known only from what is believed of the offsets: "
+                     f"{sight['known_only_from_prior']}.")  # fmt: skip
+    proved = certificate_words(record)
+    if proved is not None:
+        words.append(f"{proved[0].upper()}{proved[1:]}.")
+    parts = [_paragraphs(words)]
+    if record["image_covariance"] is not None:
+        covariance = np.array(record["image_covariance"], float)
+        sd = np.sqrt(np.diagonal(covariance))
+        names = record["image_unknowns"]
+        rows = "".join(
+            f'<tr><td>{k + 1}</td><td>{escape(_plain(name))}</td><td class="n">{value:.3g} {unit}'
+            "</td></tr>"
+            for k, (name, value, unit) in enumerate(
+                (name, *_in_unit(name, float(value))) for name, value in zip(names, sd, strict=True)
+            )
+        )
+        drawn = svg.matrix_map(
+            [_plain(name) for name in names], covariance / np.outer(sd, sd),
+            "Correlations of the unknowns",
+        )  # fmt: skip
+        parts.append(
+            '<div class="grid"><div class="wide"><table><tr><th></th><th>unknown</th>'
+            f'<th class="n">standard deviation</th></tr>{rows}</table></div><figure>{drawn}'
+            "<figcaption>Correlations: orange positive, blue negative.</figcaption></figure></div>"
+        )
+    return _section("What the images determine", *parts)
+
+
+def _plain(name: str) -> str:
+    """An unknown's name for a person."""
+    words = {"v": "shift", "omega": "turn", "log_scale": "pixel size", "log": "", "delay": "delay"}
+    body = name.removesuffix("_mm").removesuffix("_rad")
+    for short, long in words.items():
+        if body == short or body.startswith(short + "_"):
+            return f"{long} {body[len(short) + 1 :]}".strip().replace("_", " ")
+    return body.replace("_", " ")
+
+
+def _in_unit(name: str, sd: float) -> tuple[float, str]:
+    if name.endswith("_rad"):
+        return math.degrees(sd), "deg"
+    return (100 * sd, "%") if name.startswith("log_") else (sd, "mm")
+
+
+def _facts(record: dict[str, Any]) -> str:
+    rows = [
+        ("status", f"{record['status']} after {record['iterations']} iterations"),
+        ("images", f"{record['images_used']} used of {record['images']}"),
+        ("data", record["data"]),
+        ("jaxcal", record["jaxcal_version"]),
+    ]
+    scale = record["scale_mm_per_px"]
+    if scale is not None:
+        rows.append(("pixel size (mm)", f"{scale[0]:.6f} lateral, {scale[1]:.6f} axial"))
+    cells = "".join(
+        f"<tr><td>{escape(name)}</td><td>{escape(str(value))}</td></tr>" for name, value in rows
+    )
+    return _section(
+        "Facts", f'<div class="wide"><table>{cells}</table></div>',
+        '<p class="soft">The whole record of the calibration is inside this page '
+        "(the element with the id record).</p>",
+    )  # fmt: skip

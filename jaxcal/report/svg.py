@@ -1,0 +1,357 @@
+"""Small vector figures as text: axes with units, stems, bars, maps. Nothing else is needed.
+
+Coordinates are those of a figure 380 units wide, which a page shows at any width. Colours are CSS
+variables of the page, so that a figure follows its light or dark scheme; those of data are Okabe
+and Ito's, which the colour-blind can tell apart.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from html import escape
+
+import numpy as np
+from jaxtyping import Float
+
+WIDTH = 380.0
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8a8a8a"
+
+_VIRIDIS = (
+    (68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141), (39, 173, 129),
+    (92, 200, 99), (170, 220, 50), (253, 231, 37),
+)  # fmt: skip
+"""Nine colours of matplotlib's viridis (public domain, CC0), evenly lighter."""
+
+
+def viridis(share: float) -> str:
+    """Colour of a number between 0 and 1."""
+    place = min(max(share, 0.0), 1.0) * (len(_VIRIDIS) - 1)
+    low = min(int(place), len(_VIRIDIS) - 2)
+    mixed = (
+        round(a + (place - low) * (b - a))
+        for a, b in zip(_VIRIDIS[low], _VIRIDIS[low + 1], strict=True)
+    )
+    return "#" + "".join(f"{value:02x}" for value in mixed)
+
+
+def ticks(low: float, high: float, most: int = 6) -> list[float]:
+    """Round numbers between two others, at most so many."""
+    if not high > low:
+        return [low]
+    rough = (high - low) / max(most - 1, 1)
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(power * k for k in (1, 2, 5, 10) if power * k >= rough * (1 - 1e-9))
+    first = math.ceil(low / step - 1e-9)
+    return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def number(value: float) -> str:
+    """A tick's label: no more digits than it needs, a true minus sign."""
+    return f"{value:.6g}".replace("-", "−")
+
+
+def _at(value: float) -> str:
+    return f"{value:.2f}".rstrip("0").rstrip(".")
+
+
+def text(
+    x: float, y: float, words: str, anchor: str = "middle", kind: str = "", turn: float = 0.0
+) -> str:
+    """Words at a place; they are escaped."""
+    turned = f' transform="rotate({_at(turn)} {_at(x)} {_at(y)})"' if turn else ""
+    named = f' class="{kind}"' if kind else ""
+    return (
+        f'<text x="{_at(x)}" y="{_at(y)}" text-anchor="{anchor}"{named}{turned}>'
+        f"{escape(words)}</text>"
+    )
+
+
+def line(
+    x1: float, y1: float, x2: float, y2: float, colour: str = "var(--line)", width: float = 1.0
+) -> str:
+    """A straight line."""
+    return (
+        f'<line x1="{_at(x1)}" y1="{_at(y1)}" x2="{_at(x2)}" y2="{_at(y2)}" stroke="{colour}" '
+        f'stroke-width="{_at(width)}"/>'
+    )
+
+
+def figure(height: float, parts: Iterable[str], label: str) -> str:
+    """An SVG element with a name that is read aloud."""
+    return (
+        f'<svg viewBox="0 0 {_at(WIDTH)} {_at(height)}" role="img" aria-label="{escape(label)}">'
+        f"{''.join(parts)}</svg>"
+    )
+
+
+class Panel:
+    """A rectangle with two linear axes.
+
+    Args:
+        box: left, top, right and bottom, in the figure's units.
+        x: least and greatest value.
+        y: the same; the greatest is on top unless ``down``.
+        down: y grows downwards, as depth does.
+    """
+
+    def __init__(
+        self,
+        box: tuple[float, float, float, float],
+        x: tuple[float, float],
+        y: tuple[float, float],
+        *,
+        down: bool = False,
+    ) -> None:
+        self.box, self.x, self.y, self.down = box, x, y, down
+
+    def place(self, x: float, y: float) -> tuple[float, float]:
+        """Where a point is in the figure."""
+        left, top, right, bottom = self.box
+        across = left + (right - left) * (x - self.x[0]) / (self.x[1] - self.x[0])
+        share = (y - self.y[0]) / (self.y[1] - self.y[0])
+        return across, top + (bottom - top) * (share if self.down else 1 - share)
+
+    def axes(self, x_label: str = "", y_label: str = "", *, most: int = 6) -> list[str]:
+        """Grid, ticks and labels; an empty x label leaves the numbers out, too."""
+        left, top, right, bottom = self.box
+        parts = []
+        for value in ticks(*self.x, most):
+            across = self.place(value, self.y[0])[0]
+            parts.append(line(across, top, across, bottom, "var(--grid)", 0.6))
+            if x_label:
+                parts.append(text(across, bottom + 12, number(value), kind="tick"))
+        for value in ticks(*self.y, max(int((bottom - top) / 24), 3)):
+            down = self.place(self.x[0], value)[1]
+            parts.append(line(left, down, right, down, "var(--grid)", 0.6))
+            parts.append(text(left - 5, down + 3.2, number(value), "end", "tick"))
+        if x_label:
+            parts.append(text(0.5 * (left + right), bottom + 27, x_label, kind="label"))
+        if y_label:
+            middle = 0.5 * (top + bottom)
+            parts.append(text(left - 34, middle, y_label, kind="label", turn=-90))
+        parts.append(
+            f'<rect x="{_at(left)}" y="{_at(top)}" width="{_at(right - left)}" '
+            f'height="{_at(bottom - top)}" fill="none" stroke="var(--line)" stroke-width="0.8"/>'
+        )
+        return parts
+
+    def stems(
+        self,
+        x: Sequence[float],
+        y: Sequence[float],
+        colour: str = BLUE,
+        titles: Sequence[str] | None = None,
+        *,
+        radius: float = 1.9,
+    ) -> list[str]:
+        """Points with a line to zero; one path for all lines, and with titles a dot each."""
+        zero = min(max(0.0, self.y[0]), self.y[1])
+        moves, dots = [], []
+        for k, (a, b) in enumerate(zip(x, y, strict=True)):
+            across, down = self.place(a, b)
+            base = self.place(a, zero)[1]
+            moves.append(f"M{_at(across)} {_at(base)}V{_at(down)}")
+            title = "" if titles is None else f"<title>{escape(titles[k])}</title>"
+            dots.append(
+                f'<circle cx="{_at(across)}" cy="{_at(down)}" r="{radius}" fill="{colour}">'
+                f"{title}</circle>"
+            )
+        return [f'<path d="{"".join(moves)}" stroke="{colour}" stroke-width="0.7"/>', *dots]
+
+    def bars(
+        self, x: Sequence[float], low: Sequence[float], high: Sequence[float], colour: str
+    ) -> str:
+        """Vertical intervals, as one path."""
+        moves = []
+        for a, b, c in zip(x, low, high, strict=True):
+            across, first = self.place(a, b)
+            moves.append(f"M{_at(across)} {_at(first)}V{_at(self.place(a, c)[1])}")
+        return f'<path d="{"".join(moves)}" stroke="{colour}" stroke-width="0.8"/>'
+
+
+def series(
+    panels: Sequence[tuple[str, Sequence[float], Sequence[float], str]],
+    marked: Sequence[int],
+    label: str,
+    *,
+    spreads: Sequence[Sequence[float] | None] | None = None,
+    x_label: str = "image",
+    height: float = 96.0,
+) -> str:
+    """Panels one above the other, with one scale for all: a value of each image.
+
+    Args:
+        panels: name with unit, image numbers, values, colour.
+        marked: images to mark.
+        label: of the figure.
+        spreads: half-lengths of vertical bars in each panel.
+        x_label: of the common axis.
+        height: of one panel.
+    """
+    values = np.array([v for _, _, column, _ in panels for v in column if math.isfinite(v)])
+    for spread in spreads or ():
+        if spread is not None and len(values):
+            wide = float(np.nanmax(np.abs(np.nan_to_num(np.asarray(spread, float)))))
+            values = np.append(values, [values.max() + wide, values.min() - wide])
+    low = min(0.0, float(values.min()) if len(values) else -1.0)
+    high = max(0.0, float(values.max()) if len(values) else 1.0)
+    margin = 0.08 * (high - low) or 1.0
+    scale = (low - margin if low < 0 else 0.0, high + margin)
+    images = np.concatenate([np.asarray(x, float) for _, x, _, _ in panels])
+    first, last = (float(images.min()), float(images.max())) if len(images) else (0.0, 1.0)
+    parts: list[str] = []
+    for k, (name, x, y, colour) in enumerate(panels):
+        top = 8.0 + k * (height + 12.0)
+        panel = Panel((48.0, top, 374.0, top + height), (first - 1, last + 1), scale)
+        parts += panel.axes(x_label if k == len(panels) - 1 else "", name)
+        zero = panel.place(first, 0.0)[1]
+        parts.append(line(48.0, zero, 374.0, zero, "var(--text)", 0.6))
+        titles = None
+        if len(x) <= 300:
+            titles = [f"image {int(a)}: {b:.3f}" for a, b in zip(x, y, strict=True)]
+        if spreads is not None and spreads[k] is not None:
+            half = np.nan_to_num(np.asarray(spreads[k], float))
+            column = np.asarray(y, float)
+            parts.append(panel.bars(list(x), list(column - half), list(column + half), GREY))
+        parts += panel.stems(list(x), list(y), colour, titles)
+        for a, b in zip(x, y, strict=True):
+            if int(a) in marked:
+                across, down = panel.place(a, b)
+                parts.append(
+                    f'<circle cx="{_at(across)}" cy="{_at(down)}" r="5" fill="none" '
+                    f'stroke="{ORANGE}" stroke-width="1.4"/>'
+                )
+    whole = 8.0 + len(panels) * (height + 12.0) + 26.0
+    return figure(whole, parts, label)
+
+
+def error_map(
+    lateral: Float[np.ndarray, "m m"],
+    axial: Float[np.ndarray, "m m"],
+    error: Float[np.ndarray, "m m"],
+    seen: Float[np.ndarray, "n 2"],
+    label: str,
+) -> str:
+    """A map over the image: cells coloured by error, the target's places, a scale bar.
+
+    Args:
+        lateral: mm, of the cells' corners.
+        axial: depth, mm.
+        error: mm there.
+        seen: [lateral, axial] where the target was, mm.
+        label: of the figure.
+    """
+    x = (float(lateral.min()), float(lateral.max()))
+    y = (float(axial.min()), float(axial.max()))
+    pad = 0.03 * max(x[1] - x[0], y[1] - y[0])
+    x, y = (x[0] - pad, x[1] + pad), (y[0] - pad, y[1] + pad)
+    # One unit for both axes; the figure is as high as that makes it.
+    across = min(250.0, 300.0 * (x[1] - x[0]) / (y[1] - y[0]))
+    down = across * (y[1] - y[0]) / (x[1] - x[0])
+    panel = Panel((48.0, 10.0, 48.0 + across, 10.0 + down), x, y, down=True)
+    low, high = float(error.min()), float(error.max())
+    span = high - low or 1.0
+    cells = []
+    for i in range(error.shape[0] - 1):
+        for j in range(error.shape[1] - 1):
+            mean = float(error[i : i + 2, j : j + 2].mean())
+            corners = ((i, j), (i, j + 1), (i + 1, j + 1), (i + 1, j))
+            places = [panel.place(float(lateral[c]), float(axial[c])) for c in corners]
+            outline = " ".join(f"{_at(a)},{_at(b)}" for a, b in places)
+            colour = viridis((mean - low) / span)
+            # The same stroke closes the seams between cells.
+            cells.append(f'<polygon points="{outline}" fill="{colour}" stroke="{colour}" '
+                         f'stroke-width="0.6"><title>{mean:.3f} mm</title></polygon>')  # fmt: skip
+    parts = [*panel.axes("lateral (mm)", "depth (mm)"), *cells]
+    for a, b in seen[:400]:
+        if x[0] <= a <= x[1] and y[0] <= b <= y[1]:
+            place = panel.place(float(a), float(b))
+            parts.append(
+                f'<circle cx="{_at(place[0])}" cy="{_at(place[1])}" r="1.7" fill="#fff" '
+                'stroke="#000" stroke-width="0.6"/>'
+            )
+    parts += _colour_bar(48.0 + across + 22.0, 22.0, min(down - 24.0, 150.0), low, high)
+    bar = 10.0 * across / (x[1] - x[0])
+    left, under = 48.0 + across + 22.0, 10.0 + down - 4.0
+    if down > 210:
+        parts.append(line(left, under, left + bar, under, "var(--text)", 2.0))
+        parts.append(text(left, under - 6, "10 mm", "start", "tick"))
+        dot = under - 30
+        parts.append(f'<circle cx="{_at(left + 2)}" cy="{_at(dot)}" r="1.7" fill="#fff" '
+                     'stroke="var(--text)" stroke-width="0.6"/>')  # fmt: skip
+        parts.append(text(left + 8, dot + 3, "target", "start", "tick"))
+    return figure(10.0 + down + 34.0, parts, label)
+
+
+def _colour_bar(left: float, top: float, height: float, low: float, high: float) -> list[str]:
+    parts = [text(left, top - 8, "mm", "start", "tick")]
+    steps = 40
+    for k in range(steps):
+        y = top + height * (1 - (k + 1) / steps)
+        high_one, colour = _at(height / steps + 0.4), viridis((k + 0.5) / steps)
+        parts.append(
+            f'<rect x="{_at(left)}" y="{_at(y)}" width="12" height="{high_one}" fill="{colour}"/>'
+        )
+    for value in ticks(low, high, 5):
+        y = top + height * (1 - (value - low) / ((high - low) or 1.0))
+        parts.append(line(left + 12, y, left + 15, y, "var(--text)", 0.8))
+        parts.append(text(left + 18, y + 3.2, number(value), "start", "tick"))
+    return parts
+
+
+def stacked(rows: Sequence[tuple[str, Sequence[tuple[str, float, str]]]], label: str) -> str:
+    """Horizontal bars of shares that add up to one, with a legend.
+
+    Args:
+        rows: title of each bar, and name, share and colour of its parts.
+        label: of the figure.
+    """
+    parts: list[str] = []
+    for k, (title, shares) in enumerate(rows):
+        top = 6.0 + 46.0 * k
+        parts.append(text(4.0, top + 9.0, title, "start", "label"))
+        left = 4.0
+        for name, share, colour in shares:
+            wide = 372.0 * share
+            parts.append(
+                f'<rect x="{_at(left)}" y="{_at(top + 14)}" width="{_at(wide)}" height="16" '
+                f'fill="{colour}"><title>{escape(name)}: {100 * share:.0f} %</title></rect>'
+            )
+            if share > 0.09:
+                parts.append(
+                    f'<text x="{_at(left + wide / 2)}" y="{_at(top + 26)}" text-anchor="middle" '
+                    f'class="tick" style="fill:#fff">{100 * share:.0f} %</text>'
+                )
+            left += wide
+    under = 6.0 + 46.0 * len(rows)
+    left = 4.0
+    for name, _, colour in rows[0][1] if rows else ():
+        parts.append(
+            f'<rect x="{_at(left)}" y="{_at(under)}" width="9" height="9" fill="{colour}"/>'
+        )
+        parts.append(text(left + 13, under + 8, name, "start", "tick"))
+        left += 30.0 + 5.4 * len(name)
+    return figure(under + 16.0, parts, label)
+
+
+def matrix_map(names: Sequence[str], values: Float[np.ndarray, "k k"], label: str) -> str:
+    """A correlation matrix: blue below zero, orange above, numbers in the cells."""
+    count, left, top = len(names), 96.0, 6.0
+    size = (WIDTH - left - 8.0) / max(count, 1)
+    parts: list[str] = []
+    for i, name in enumerate(names):
+        parts.append(text(left - 6, top + (i + 0.5) * size + 3, name, "end", "tick"))
+        parts.append(
+            text(left + (i + 0.5) * size, top + count * size + 12, str(i + 1), kind="tick")
+        )
+        for j in range(count):
+            value = float(values[i, j])
+            colour = ORANGE if value > 0 else BLUE
+            parts.append(
+                f'<rect x="{_at(left + j * size)}" y="{_at(top + i * size)}" '
+                f'width="{_at(size - 1)}" height="{_at(size - 1)}" fill="{colour}" '
+                f'fill-opacity="{abs(value):.2f}" stroke="var(--grid)" stroke-width="0.5">'
+                f"<title>{escape(name)}, {escape(names[j])}: {value:.2f}</title></rect>"
+            )
+    return figure(top + count * size + 18.0, parts, label)
