@@ -140,6 +140,7 @@ class Calibration(eqx.Module):
         data: ``points`` or ``channels``: whose residuals were minimised (static).
         blocks: the free unknowns (static).
         robust: images that do not fit the rest were left out (static).
+        notes: what was done to the data before the solve, in words (static; one problem).
     """
 
     image_to_probe: Float[Array, "*batch 4 4"]
@@ -164,6 +165,7 @@ class Calibration(eqx.Module):
     data: str = eqx.field(static=True)
     blocks: Blocks = eqx.field(static=True)
     robust: bool = eqx.field(static=True, default=False)
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def converged(self) -> Bool[Array, "*batch"]:
@@ -345,6 +347,20 @@ class Calibration(eqx.Module):
     def departure(self) -> Float[np.ndarray, "*batch n 3"]:
         """Each image's lateral, range and elevational errors in robust SDs of those in use."""
         return self._summary.inspection.departure
+
+    @cached_property
+    def wrong_frames(self) -> str | None:
+        """What is wrong with the data's frames or units, in words, and what to do (one problem).
+
+        None where nothing seems wrong; see :mod:`jaxcal.frame_checks`. An answer of which something
+        is said here is not to be used, whatever its residuals and standard deviations are.
+        """
+        from jaxcal.frame_checks import wrong_frames
+
+        self._concrete(self.mask)
+        if self.problem is None or self.problem.batch_shape:
+            return None
+        return wrong_frames(replace(self.problem, mask=jnp.asarray(self.mask)), self.blocks)
 
     @property
     def warnings(self) -> list[str]:

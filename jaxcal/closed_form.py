@@ -138,7 +138,7 @@ def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, 6], Certificate]
     """The minimiser (a1, a3) of a reduced objective and its certificate."""
     constraints = reduced.constraints
     both = constraints.free == ("lateral", "axial")
-    found = _scalar_root(reduced) if both else _dual_maximum(reduced)
+    found = scalar_root(reduced) if both else _dual_maximum(reduced)
     first = np.zeros((0, 6))
     if found is not None:
         values, x = found
@@ -165,7 +165,7 @@ def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, 6], Certificate]
     return best, certify_point(reduced, best, gap=max(gap, 0.0))
 
 
-def _scalar_root(
+def scalar_root(
     reduced: ReducedObjective,
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, 6]] | None:
     """Both scales unknown: the root of phi, by Newton's method kept within its bracket."""

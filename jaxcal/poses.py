@@ -150,19 +150,24 @@ def rotations_from_quaternions(
 
 
 def quaternion_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
-    """Unit quaternion x y z w (scalar last, not negative) of a rotation matrix.
+    """Unit quaternion x y z w (scalar last, not negative) of a rotation matrix."""
+    return quaternions_from_rotations(np.asarray(rotation, dtype=np.float64)[None])[0]
+
+
+def quaternions_from_rotations(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
+    """Unit quaternions x y z w (scalar last, not negative) of rotation matrices.
 
     Source: the eigenvector of Bar-Itzhack 2000, which is accurate for every angle.
     """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.asarray(rotation, dtype=np.float64)
-    matrix = np.array([
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(rotations, 0, -1)
+    matrices = np.array([
         [xx - yy - zz, xy + yx, xz + zx, zy - yz],
         [xy + yx, yy - xx - zz, yz + zy, xz - zx],
         [xz + zx, yz + zy, zz - xx - yy, yx - xy],
         [zy - yz, xz - zx, yx - xy, xx + yy + zz],
     ])  # fmt: skip
-    found = np.linalg.eigh(matrix)[1][:, -1]
-    return found if found[3] >= 0 else -found
+    found = np.linalg.eigh(np.moveaxis(matrices, -1, 0))[1][:, :, -1]
+    return np.where(found[:, 3:] >= 0, found, -found)
 
 
 def inverse_poses(poses: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:

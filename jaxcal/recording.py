@@ -304,7 +304,17 @@ def _check_units(images: Images) -> None:
                 f"points reach only {extent:.3g} mm while the poses move by {spread:.3g} mm: "
                 "the points look like metres; give them in mm"
             )
+        if extent < 0.5:
+            raise InputError(
+                f"points reach only {extent:.3g} mm from the image's origin: points and poses look "
+                "like metres; give both in mm"
+            )
     elif images.kind == "pixel":
+        if images.spacing_mm is not None and images.spacing_mm.max() < 1e-3:
+            raise InputError(
+                f"the spacing is only {images.spacing_mm.max():.3g} mm per pixel: it looks like "
+                "metres; give it, and the poses, in mm"
+            )
         spacing = 0.1 if images.spacing_mm is None else float(images.spacing_mm.max())
         extent = float(np.ptp(images.measurements[used], axis=0).max()) * spacing
     else:

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from jaxcal.calibration import Calibration
+from jaxcal.dependence import independent
 from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.errors import InputError
 from jaxcal.model.parameters import Parameters
@@ -117,7 +118,7 @@ def cross_validate(
     Raises:
         InputError: too few images or folds, or options that contradict each other.
     """
-    problem = _one_problem(problem)
+    problem = _one_problem(problem, arguments)
     count = problem.images
     folds = count if folds is None else folds
     if not 2 <= folds <= count:
@@ -182,7 +183,7 @@ def bootstrap(
     Raises:
         InputError: fewer than 2 resamples, or options that contradict each other.
     """
-    problem = _one_problem(problem)
+    problem = _one_problem(problem, arguments)
     if not 2 <= resamples <= LARGEST_RESAMPLES:
         raise InputError(f"resamples must be between 2 and {LARGEST_RESAMPLES}, not {resamples}")
     root = jax.random.key(key) if isinstance(key, int) else key
@@ -259,12 +260,15 @@ def _apart(
     return jnp.sqrt(jnp.mean(jnp.sum(moved**2, axis=1), axis=1))
 
 
-def _one_problem(problem: Problem | Recording) -> Problem:
+def _one_problem(problem: Problem | Recording, arguments: dict[str, Any]) -> Problem:
+    """One problem; where its values can be looked at, every pose counts once."""
     if isinstance(problem, Recording):
         problem = Problem.from_recording(problem)
     if problem.batch_shape:
         raise InputError("resampling takes one problem at a time, not a batch")
-    return problem
+    if any(is_traced(leaf) for leaf in jax.tree.leaves(problem)):
+        return problem
+    return independent(problem, arguments.get("estimate", ()))[0]
 
 
 def _check_left(mask: Array, rest: Array) -> None:

@@ -19,6 +19,8 @@ from jaxtyping import Array, Float
 
 from jaxcal import buckets, compiler, executables
 from jaxcal.calibration import Calibration
+from jaxcal.dependence import independent
+from jaxcal.diagnostics.serial_correlation import widened
 from jaxcal.errors import InputError
 from jaxcal.options import (
     DELAY_SD_S,
@@ -36,7 +38,7 @@ from jaxcal.options import (
 )
 from jaxcal.pipeline import agreed_images, seen_by_agreement, solve_problems
 from jaxcal.precision import in_own_modes, require_float64, with_dtype
-from jaxcal.problem import Problem
+from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import Recording
 
 BATCH_CHUNK = 64
@@ -93,12 +95,16 @@ def calibrate(
             the answer is the one without.
 
     Returns:
-        A :class:`Calibration`; ask its ``status`` and ``warnings`` before using it.
+        A :class:`Calibration`; ask its ``status`` and ``warnings`` before using it. Frames of one
+        pose count once (:mod:`jaxcal.dependence`): the others are masked out in the answer and in
+        its ``problem``. Errors that are alike in successive images widen its covariance
+        (:mod:`jaxcal.diagnostics.serial_correlation`). Both are for one problem with concrete
+        arrays; under jit, vmap or grad, and in batches, images are taken for independent.
 
     Raises:
         InputError: options that contradict each other or the problem; with concrete arrays also
-            NaN, Inf and fewer than 4 used images. Under jit, vmap or grad values cannot be looked
-            at, and such problems come back with status ``failed``.
+            NaN, Inf and fewer than 4 different poses. Under jit, vmap or grad values cannot be
+            looked at, and such problems come back with status ``failed``.
     """
     if isinstance(problem, Recording):
         problem = Problem.from_recording(problem)
@@ -121,14 +127,24 @@ def calibrate(
         return _solve_batch(problem, given, plan, None)
     check_values(problem)
     problem = with_bound(problem, given)
+    if not any(is_traced(leaf) for leaf in jax.tree.leaves((problem, given))):
+        problem, found = independent(problem, estimate)
+        result = _solve_alone(problem, given, plan).with_problem(problem)
+        result = replace(result, notes=() if found.words is None else (found.words,))
+        return widened(result)
+    return _solve_alone(problem, given, plan).with_problem(problem)
+
+
+def _solve_alone(problem: Problem, given: Given, plan: Plan) -> Calibration:
+    """One problem, without it in the result (traceable)."""
     alone = compiler.is_whole_program(problem, given)
     platform = _devices(problem)[0].platform if alone else None
     interpreted = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
     if platform == "cpu" and executables.is_describable(plan) and not interpreted:
-        return _solve_kept(problem, given, plan).with_problem(problem)
+        return _solve_kept(problem, given, plan)
     # A program of its own, which serves every method and prior.
     agreed = _agreement(platform)(seen_by_agreement(problem), plan.blocks) if plan.robust else None
-    return _one_problem(platform)(problem, given, plan, agreed).with_problem(problem)
+    return _one_problem(platform)(problem, given, plan, agreed)
 
 
 @in_own_modes

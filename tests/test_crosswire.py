@@ -37,6 +37,25 @@ def test_self_tuned(recording):
     # Heavy tails, not a bound: Gaussian offsets have 3, uniform ones 1.8.
     assert float(result.inspection.kurtosis[2]) == pytest.approx(4.0, abs=0.1)
     assert not np.asarray(result.outlier).any()
+    names_what_an_eye_sees(result)
+
+
+def names_what_an_eye_sees(result: jaxcal.Calibration) -> None:
+    """Images 11 to 13 stand out in range, and the elevational errors change slowly."""
+    suspects = jaxcal.diagnostics.messages.suspects(result)
+    assert {each["image"] for each in suspects} >= {11, 12, 13}
+    assert all(each["component"] == "range" for each in suspects)
+    assert any("11 to 13 in a row (range errors to one side" in text for text in result.warnings)
+    drifting = [text for text in result.warnings if "elevational offsets" in text]
+    assert any("successive images" in text or "drift in the course" in text for text in drifting)
+    assert result.wrong_frames is None
+    assert result.notes == ()
+
+
+@pytest.mark.slow
+def test_the_robust_answer_names_them_too(recording):
+    robust = jaxcal.calibrate(recording, estimate=("scale",), robust=True)
+    names_what_an_eye_sees(robust)
 
 
 @pytest.mark.slow

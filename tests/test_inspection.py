@@ -90,8 +90,8 @@ def test_few_false_alarms_and_true_ones(scores):
     _, misfit = run(normal)
     limit = messages.MISFIT_SCORE
     alarms = (np.abs(misfit) > limit).any(axis=(1, 2))
-    # 0.7 % expected: more than 6 of 200 in one of a thousand such tests.
-    assert alarms.sum() <= 6
+    # 1.2 % expected: more than 9 of 200 in one of a thousand such tests.
+    assert alarms.sum() <= 9
     # Standard normal scores have a spread of one.
     assert (np.abs(np.asarray(misfit).std(axis=0) - 1) < 0.25).all()
 

@@ -255,7 +255,7 @@ def _export(record: dict[str, Any], recording: str, targets: list[tuple[str, str
     from jaxcal.cli.export import patched
     from jaxcal.transform import transform_from_record
 
-    if not record["converged"]:
+    if not record["converged"] or record["wrong_frames"]:
         return ["exported: nothing, since the calibration is not to be used"]
     transform = transform_from_record(record, source=recording)
     said: list[str] = []
@@ -401,7 +401,7 @@ def _curves(recording: Recording, request: _Request, result: Calibration) -> lis
     if request.method == "conventional":
         return [own_curve(result)]
     return bounded_curves(
-        Problem.from_recording(recording),
+        Problem.from_recording(recording) if result.problem is None else result.problem,
         max_elevation=request.max_elevation,
         estimate=request.estimate,
         alternating=result if request.method == "alternating" else None,

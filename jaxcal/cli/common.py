@@ -66,8 +66,8 @@ NOT_NEGATIVE = Number(zero=True)
 
 
 def exit_code(records: Iterable[dict[str, Any]]) -> ExitCode:
-    """0 where every calibration converged, else 3."""
-    converged = all(record["converged"] for record in records)
+    """0 where every calibration converged, on data in the right frames; else 3."""
+    converged = all(record["converged"] and not record.get("wrong_frames") for record in records)
     return ExitCode.CONVERGED if converged else ExitCode.NOT_CONVERGED
 
 

@@ -5,10 +5,12 @@ All functions take one calibration, with concrete values.
 
 from __future__ import annotations
 
+from statistics import NormalDist
 from typing import TYPE_CHECKING, Protocol, TypedDict, runtime_checkable
 
 import numpy as np
 
+from jaxcal.diagnostics.offset_fit import contradicted
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK, MISFITS
 from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.geometry import AnyArray
@@ -73,14 +75,19 @@ _OBLIQUE = {
 }
 
 COMPONENTS = ("lateral", "range", "elevational")
+SUSPECTED = 0.02
+"""Share of recordings with Gaussian errors in which some image is suspected by chance."""
 STEADY = 1e-3
 WEAK_MM = 1.5
 """A weakest direction with a larger SD (mm at the target) is worth a warning."""
 WORTH = 0.7
 """Kinds of further images are advised that tell at least this much of what the best one does."""
 MISFIT_SCORE = 3.3
-"""A standard normal score beyond this contradicts the noise model; of twelve scores, one in 140
+"""A standard normal score beyond this contradicts the noise model; of nine scores, one in 170
 data sets that follow it has such a one."""
+DRIFT_SCORE = 2.8
+"""The same for correlation in time: of three scores of successive images and three of the trend,
+one in 45 data sets without it has such a one."""
 WEAK_TRANSLATION_MM = 0.3
 WEAK_SHARE = 0.7
 """SDs of sound speed or delay above this share of their prior's tell that the data added little."""
@@ -155,23 +162,47 @@ def offset_law(result: Calibration) -> dict[str, object] | None:
         family: float(value) for family, value in zip(FAMILIES, law.probability, strict=True)
     }
     own = bool(law.own_covariances)
-    words = "The laws of the offsets could not be weighed; they are taken for Gaussian."
+    words, wrong = "The laws of the offsets could not be weighed; they are taken for Gaussian", None
     if weighed:
-        ranked = sorted(probability.items(), key=lambda item: -item[1])
-        told = [f"{_FAMILY[name]} ({100 * p:.0f} %)" for name, p in ranked if p >= 0.1]
-        words = f"The data take the offsets to be {' or '.join(told)}"
+        wrong = _contradicted(result)
+        words = _law_in_words(probability, wrong)
         if law.has_mean:
             words += f", about a mean of {float(law.mean):.2f} +- {float(law.mean_sd):.2f} mm"
         noise = "each image's own covariance" if own else "the same SDs in all images"
-        words += f", and the measurements' errors to have {noise}."
+        words += f". The measurements' errors have {noise}"
+    words += "."
     return {
         "weighed": weighed,
         "probability": probability if weighed else None,
+        "contradicted": wrong,
         "mean_mm": float(law.mean),
         "mean_sd_mm": float(law.mean_sd),
         "own_covariances": own,
         "words": words,
     }
+
+
+def _contradicted(result: Calibration) -> list[str]:
+    """The laws that the estimated offsets do not follow; none are tested with few images."""
+    offsets = np.asarray(result.elevation, dtype=float)[np.asarray(result.mask) > 0]
+    if len(offsets) < FEWEST_TO_CHECK or not np.std(offsets) > 0:
+        return []
+    return [family for family, wrong in contradicted(offsets).items() if wrong]
+
+
+def _law_in_words(probability: dict[str, float], wrong: list[str]) -> str:
+    ranked = sorted(probability.items(), key=lambda item: -item[1])
+    named = [(name, p) for name, p in ranked if p >= 0.1]
+    told = " or ".join(f"{_FAMILY[name]} ({100 * p:.0f} %)" for name, p in named)
+    if not wrong or any(name not in wrong for name, _ in named):
+        return f"Of the laws that were compared, the data prefer offsets that are {told}"
+    fitting = [words for name, words in _FAMILY.items() if name not in wrong]
+    if not fitting:
+        return f"None of the laws that were compared fits the offsets; the least bad is {told}"
+    return (
+        f"The estimate rests on offsets that are {told}, but as they turn out they look "
+        f"{' or '.join(fitting)}"
+    )
 
 
 def poses_to_add(result: Calibration) -> str:
@@ -213,7 +244,7 @@ def misfits(result: Calibration) -> list[str]:
     kurtosis = np.asarray(result.inspection.kurtosis, dtype=float)
     found = []
     for k, name in enumerate(("lateral errors", "range errors", "elevational offsets")):
-        tails, skewness, depth, drift = scores[:, k]
+        tails, skewness, depth, _, _ = scores[:, k]
         if tails > MISFIT_SCORE:
             found.append(
                 f"the {name} have heavier tails than the noise model's (kurtosis "
@@ -223,11 +254,24 @@ def misfits(result: Calibration) -> list[str]:
             found.append(f"the {name} lean to one side")
         if depth > MISFIT_SCORE:
             found.append(f"the {name} grow with depth; the noise model takes them for equal")
-        if drift > MISFIT_SCORE:
-            found.append(
-                f"the {name} of successive images are alike: drift, latency or a slipping mount?"
-            )
+        found += _in_time(name, scores[:, k], int(result.images_used))
     return found
+
+
+def _in_time(name: str, scores: AnyArray, count: int) -> list[str]:
+    """How one kind of error changes in the course of the recording."""
+    drift, trend = (float(scores[MISFITS.index(kind)]) for kind in ("drift", "trend"))
+    parts = []
+    if drift > DRIFT_SCORE:
+        parts.append(
+            f"are alike in successive images (correlation {drift / (count - 1) ** 0.5:.2f})"
+        )
+    if abs(trend) > DRIFT_SCORE:
+        correlation = np.tanh(trend / np.sqrt(count - 3))
+        parts.append(f"drift in the course of the recording (correlation {correlation:.2f})")
+    if not parts:
+        return []
+    return [f"the {name} {' and '.join(parts)}: latency, a slipping mount or a moving target?"]
 
 
 def outliers(result: Calibration) -> list[int]:
@@ -262,6 +306,61 @@ def outlier_reasons(
     return found
 
 
+def suspects(result: Calibration) -> list[OutlierReason]:
+    """Images in use that stand out by less than outliers do, but by more than chance explains.
+
+    Their lateral or range error exceeds what the largest of so many Gaussian errors, in SDs that
+    are medians, does in one of fifty recordings. Offsets are no errors: they may have any law.
+    """
+    count = int(result.images_used)
+    if count < FEWEST_TO_CHECK:
+        return []
+    # The second factor, for medians of few images, is from simulated Gaussian errors.
+    limit = NormalDist().inv_cdf(1 - SUSPECTED / (4 * count)) * (1 + 8 / count)
+    departure = np.asarray(result.departure, dtype=float)
+    departure = np.where(np.asarray(result.mask)[:, None] > 0, departure, 0.0)[:, :2]
+    departure[images_that_stand_out(result)] = 0.0
+    found: list[OutlierReason] = []
+    for image in np.flatnonzero((np.abs(departure) > limit).any(axis=1)):
+        worst = int(np.argmax(np.abs(departure[image])))
+        found.append({
+            "image": int(image), "component": COMPONENTS[worst],
+            "sds": _finite(departure[image, worst]), "left_out": False,
+        })  # fmt: skip
+    return found
+
+
+def suspects_in_words(result: Calibration) -> list[str]:
+    """The suspects, successive ones with errors of one kind and sign together."""
+    runs: list[list[OutlierReason]] = []
+    for each in suspects(result):
+        last = runs[-1][-1] if runs else None
+        alike = last is not None and each["component"] == last["component"]
+        one_side = last is not None and (each["sds"] or 0) * (last["sds"] or 0) > 0
+        if last is not None and alike and one_side and each["image"] == last["image"] + 1:
+            runs[-1].append(each)
+        else:
+            runs.append([each])
+    told = []
+    for run in runs[:10]:
+        sizes = sorted(abs(each["sds"] or 0) for each in run)
+        first, last = run[0]["image"], run[-1]["image"]
+        if first == last:
+            told.append(f"{first} ({run[0]['component']} error, {sizes[0]:.1f} SDs)")
+        else:
+            told.append(
+                f"{first} to {last} in a row ({run[0]['component']} errors to one side, "
+                f"{sizes[0]:.1f} to {sizes[-1]:.1f} SDs)"
+            )
+    if not told:
+        return []
+    listed = ", ".join(told) + (", ..." if len(runs) > 10 else "")
+    return [
+        f"suspicious images, too far off for chance and not far enough to be left out: {listed}; "
+        "look at them"
+    ]
+
+
 def listed_departures(result: HasOutliers, components: tuple[str, ...] = COMPONENTS) -> str:
     """The outliers with component and SDs, the first ten of them, in words."""
     reasons = outlier_reasons(result, components)
@@ -284,6 +383,8 @@ def warnings(result: Calibration) -> list[str]:
     if status == "failed":
         found.append("the solve failed: its result holds no usable numbers")
         return found
+    if result.wrong_frames is not None:
+        found.append(result.wrong_frames)
     if status == "unobservable":
         found.append(f"not observable: these images do not determine {weakest}; {sight['advice']}")
     if status == "max_iterations":
@@ -291,6 +392,7 @@ def warnings(result: Calibration) -> list[str]:
             "not converged: the iteration limit was reached "
             f"(scaled KKT residual {float(result.stationarity):.1e})"
         )
+    found += result.notes
     found += _weak_direction(result)
     if bounded and from_prior:
         held = f"{resting} of {used} images rest on it"
@@ -337,6 +439,8 @@ def warnings(result: Calibration) -> list[str]:
     found += _medium_warnings(result)
     if status == "converged":
         found += [f"noise model: {text}" for text in misfits(result)]
+    if status == "converged":
+        found += suspects_in_words(result)
     named = outliers(result)
     if named and result.robust:
         found.append(

@@ -4,10 +4,10 @@
 deep images count less, as those of an array grow with the range (:mod:`jaxcal.solvers.consensus`).
 
 *Noise model.* If lateral, range and elevational errors are Gaussian, independent and of one size,
-then statistics of the standardised residuals follow known laws, whatever the data. Four are taken
+then statistics of the standardised residuals follow known laws, whatever the data. Five are taken
 for each component and turned into standard normal scores: kurtosis (heavy tails), skewness (one
-side), correlation of the magnitude with the range (errors that grow with depth), and correlation of
-successive images (drift).
+side), correlation of the magnitude with the range (errors that grow with depth), correlation of
+successive images in use (drift), and correlation with the image's number (trend).
 
 *Poses to add.* The weakest direction is a motion of X, the target and the rest that the images
 hardly notice. For a few kinds of further images it is computed by how many SDs they would.
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-MISFITS = ("tails", "skewness", "depth", "drift")
+MISFITS = ("tails", "skewness", "depth", "drift", "trend")
 """Rows of ``misfit``."""
 
 FEWEST_TO_CHECK = 20
@@ -67,7 +67,7 @@ class Inspection:
     outlier: Float[Array, "*batch n"]
     departure: Float[Array, "*batch n 3"]
     kurtosis: Float[Array, "*batch 3"]
-    misfit: Float[Array, "*batch 4 3"]
+    misfit: Float[Array, "*batch 5 3"]
     gain: Float[Array, "*batch 5"]
 
 
@@ -157,7 +157,7 @@ def stands_out(departure: Float[Array, "k n 3"], kept: Float[Array, "k n"]) -> B
 
 def check_noise_model(
     residual: Float[Array, "k n 3"], distance: Float[Array, "k n"], mask: Float[Array, "k n"]
-) -> tuple[Float[Array, "k 3"], Float[Array, "k 4 3"]]:
+) -> tuple[Float[Array, "k 3"], Float[Array, "k 5 3"]]:
     """Kurtosis of standardised residuals, and the scores of :data:`MISFITS`.
 
     Args:
@@ -186,10 +186,16 @@ def check_noise_model(
     joint = np.sum(away * magnitude, axis=1)
     deeper = joint / np.where(lengths > 0, lengths, 1.0) * np.sqrt(count - 1)
 
-    both = used[:, 1:] * used[:, :-1]
-    successive = np.sum(both * centred[:, 1:] * centred[:, :-1], axis=1)
-    drift = successive / np.sqrt(np.maximum(both.sum(axis=1), 1.0))
-    scores = np.stack([tails, skewed, deeper, drift], axis=1)
+    # Images in use follow each other, whatever was left out between them.
+    order = np.argsort(mask <= 0, axis=1, kind="stable")[..., None]
+    row, kept = np.take_along_axis(centred, order, axis=1), np.take_along_axis(used, order, axis=1)
+    successive = np.sum(row[:, 1:] * row[:, :-1], axis=1)
+    drift = successive / np.sqrt(np.maximum(count - 1, 1.0))
+    number = kept * (np.cumsum(kept, axis=1) - 0.5 * (count[:, None] + 1))
+    lengths = np.sqrt(np.sum(number**2, axis=1) * np.sum(row**2, axis=1))
+    correlation = np.sum(number * row, axis=1) / np.where(lengths > 0, lengths, 1.0)
+    trend = np.arctanh(np.clip(correlation, -0.999999, 0.999999)) * np.sqrt(count - 3)
+    scores = np.stack([tails, skewed, deeper, drift, trend], axis=1)
     judged = (count >= FEWEST_TO_CHECK)[:, None] & np.isfinite(scores) & (second > 0)[:, None]
     return kurtosis, np.where(judged, scores, 0.0)
 

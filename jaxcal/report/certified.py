@@ -10,6 +10,7 @@ import numpy as np
 from jaxcal.calibration import Calibration
 from jaxcal.certificate import Certificate, certify
 from jaxcal.closed_form import calibrate_closed_form
+from jaxcal.dependence import independent
 from jaxcal.errors import InputError
 from jaxcal.model.parameters import EXTRA
 from jaxcal.recording import Images, Recording
@@ -32,8 +33,9 @@ def certificate_record(result: Calibration, recording: Recording) -> dict[str, A
     own = result.method == "conventional"
     if images.kind == "time_of_flight" or not (estimate in ((), ("scale",)) or own):
         return nothing
-    images = replace(images, mask=np.asarray(result.mask) > 0)
     try:
+        # What was solved counts every pose once.
+        images = replace(independent(images, estimate)[0], mask=np.asarray(result.mask) > 0)
         if own:
             found = _of_answer(result, images, recording, estimate)
         else:

@@ -45,6 +45,8 @@ CONVENTION = {
     "certified": "no transform fits Eq. 7 better (one part in 1e9), which is proved: of the answer "
     "for the conventional method, of the conventional fit of the same images for the others; "
     "Eq. 7's minimum is at most gap_mm2 lower; null where no proof is tried",
+    "wrong_frames": "what is wrong with the data's frames or units, in words: the calibration is "
+    "not to be used; null where nothing seems wrong",
     "offset_law": "which law the elevational offsets follow and with what probability, their mean, "
     "and which noise model is in use; null where no laws were weighed",
 }
@@ -117,9 +119,11 @@ def calibration_record(
         "objective": answer.cost,
         "scaled_kkt_residual": answer.stationarity,
         "robust": result.robust,
+        "wrong_frames": None if result.status == "failed" else result.wrong_frames,
         "noise_model": messages.noise_model(answer),
         "outliers": messages.outliers(answer),
         "outlier_reasons": messages.outlier_reasons(answer),
+        "suspects": messages.suspects(answer),
         "warnings": result.warnings,
         **accuracy_record(result, recording, tre_points),
     }

@@ -46,8 +46,9 @@ def verdict(record: dict[str, Any]) -> list[str]:
         proved = certificate_words(record)
         if proved is not None:
             lines.append(f"{proved[0].upper()}{proved[1:]}.")
-    if record["warnings"]:
-        lines += ["Look at this:", *(f"- {text}" for text in record["warnings"])]
+    further = [text for text in record["warnings"] if text not in lines[0]]
+    if further:
+        lines += ["Look at this:", *(f"- {text}" for text in further)]
     todo = advice(record)
     if todo:
         lines += ["What to do:", *(f"- {text}" for text in todo)]
@@ -59,6 +60,9 @@ def headline(record: dict[str, Any]) -> str:
     status, tre = record["status"], record.get("tre")
     if status == "failed":
         return "Failed: there is no calibration."
+    if record.get("wrong_frames"):
+        told = record["wrong_frames"]
+        return f"Do not use: {told}" + "." * (not told.endswith("?"))
     if status == "unobservable":
         return "Do not use: these images do not determine the calibration."
     if status == "max_iterations":
@@ -270,7 +274,9 @@ def _out_of_plane(record: dict[str, Any]) -> bool:
 def advice(record: dict[str, Any]) -> list[str]:
     """What to do, as sentences."""
     status, few = record["status"], record["images_used"] < FEW_IMAGES
-    advice = []
+    advice: list[str] = []
+    if record.get("wrong_frames"):
+        return advice
     if status == "failed":
         advice.append(
             "Check that poses and images belong together, that poses are probe -> tracker, and "

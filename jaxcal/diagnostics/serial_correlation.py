@@ -1,0 +1,164 @@
+"""Errors that are alike in successive images, and what they cost in certainty.
+
+A least-squares answer moves by dx = S^-1 sum_i J_i' e_i, with J_i the rows of image i and e_i its
+errors, both in SDs, and S = sum_i J_i' J_i. If errors of one kind k (lateral, range, elevational)
+have correlation rho_k^|i - j| between images i and j, its covariance is
+
+    S^-1 (sum_k sum_ij rho_k^|i - j| J_ik' J_jk) S^-1
+
+instead of S^-1. How much more that is depends on the order of the poses: where they change at
+random, a drift hardly matters; where they change as slowly as the errors, it is all there is.
+
+Each rho_k is the correlation of successive residuals (leverage allowed for), shrunk towards zero by
+1 - (``CHANCE`` / z)^2 with z in its SDs, and zero below ``CHANCE``: of independent errors 2 % of
+all recordings of a kind exceed that. So independent data keep the covariance that they have, and
+the correction grows continuously. It never makes an answer more certain.
+
+References: White 1980; Newey and West 1987 (covariances under dependent errors), here with a
+correlation of one parameter a kind instead of all lags.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcal.array_types import Float
+from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.uncertainty import TUNED, Whitened
+from jaxcal.model.parameters import block_slice
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration
+
+CHANCE = 2.1
+"""SDs that the correlation of successive residuals must exceed to be believed."""
+
+FEWEST_IMAGES = 20
+"""With fewer used images the correlation is not estimated."""
+
+LARGEST = 0.98
+
+
+def widened(result: Calibration) -> Calibration:
+    """The calibration with the covariance that errors alike in successive images leave it.
+
+    Args:
+        result: of one problem, with concrete values.
+
+    Returns:
+        The same object where nothing says that the errors depend on each other. Channels and
+        bounded offsets are left as they are.
+    """
+    if result.data != "points" or result.prior == "bounded" or result.problem is None:
+        return result
+    covariance = np.asarray(result.covariance)
+    if not np.isfinite(covariance).all() or int(result.images_used) < FEWEST_IMAGES:
+        return result
+    errors, rows = _in_sds(result)
+    found = _ratio(errors, rows)
+    if found is None:
+        return result
+    before, after = found
+    point = block_slice(result.blocks, "point")
+    lines = result.linearisation
+    # The information about all unknowns changes in the same proportion.
+    whole = _stretched(np.linalg.inv(np.asarray(lines.information, float)), before, after)
+    dtype = covariance.dtype
+    return replace(
+        result,
+        covariance=_like(
+            result.covariance,
+            _stretched(covariance, before, after, slice(0, len(covariance))).astype(dtype),
+        ),
+        point_covariance=_like(
+            result.point_covariance,
+            _stretched(np.asarray(result.point_covariance), before, after, point).astype(dtype),
+        ),
+        linearisation=replace(
+            lines, information=_like(lines.information, np.linalg.inv(whole).astype(dtype))
+        ),
+    )
+
+
+def _like(before: Any, values: np.ndarray) -> Any:
+    """On the device of what they replace, if that was on one."""
+    return values if isinstance(before, np.ndarray) else jnp.asarray(values)
+
+
+def _in_sds(result: Calibration) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3 p"]]:
+    """Errors of the used images and their derivatives by the unknowns, in SDs."""
+    answer = jax.tree.map(lambda leaf: np.asarray(leaf)[None], result)
+    problem = answer.problem
+    unknowns = Unknowns.of(answer, problem)
+    seen = ImageErrors.of(unknowns, problem, answer.blocks)
+    if answer.prior in TUNED:
+        if answer.linearisation.tracker_sd is not None:
+            shift = np.where(answer.mask > 0, answer.elevation - seen.q[..., 1], 0.0)
+            seen = ImageErrors.of(unknowns, problem, answer.blocks, shift)
+        whitened = Whitened.of(answer, seen, problem)
+        errors, rows = whitened.errors, whitened.rows
+    else:
+        in_plane = np.zeros_like(seen.mask)
+        errors, axial = seen.from_circle(in_plane)
+        rows = seen.circle_rows(in_plane, axial, answer.blocks)
+        sd = np.sqrt(answer.linearisation.variance)[:, None, None]
+        order = [0, 2, 1]
+        errors, rows = (errors / sd)[..., order], (rows / sd[..., None])[:, :, order]
+    used = np.asarray(answer.mask)[0] > 0
+    return errors[0, used], rows[0, used]
+
+
+def _ratio(
+    errors: Float[np.ndarray, "m 3"], rows: Float[np.ndarray, "m 3 p"]
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]] | None:
+    """Covariances of the unknowns without and with the correlation; None where there is none."""
+    count = len(errors)
+    each = np.einsum("mkp,mkq->kpq", rows, rows)
+    before = np.linalg.inv(each.sum(axis=0))
+    leverage = np.einsum("mkp,pq,mkq->mk", rows, before, rows)
+    rho = believed_correlation(errors / np.sqrt(np.maximum(1 - leverage, 0.05)))
+    if not rho.any():
+        return None
+    middle = np.zeros_like(before)
+    for k in range(3):
+        filtered = rows[:, k].copy()
+        for index in range(1, count):
+            filtered[index] += rho[k] * filtered[index - 1]
+        half = filtered.T @ rows[:, k]
+        both = half + half.T - each[k]
+        # Slow errors are taken for the unknowns more than quick ones, and the SD is too small.
+        left = count - np.sum(before * each[k])
+        middle += both * left / max(count - np.sum(before * both), 0.2 * count)
+    lower = np.linalg.cholesky(before)
+    inner = np.linalg.solve(lower, before @ middle @ before)
+    values, vectors = np.linalg.eigh(np.linalg.solve(lower, inner.T))
+    turned = lower @ vectors
+    return before, (turned * np.maximum(values, 1.0)) @ turned.T
+
+
+def believed_correlation(errors: Float[np.ndarray, "m k"]) -> Float[np.ndarray, " k"]:
+    """Correlation of successive images for every kind of error, shrunk by what chance may do."""
+    centred = errors - errors.mean(axis=0)
+    square = np.sum(centred**2, axis=0)
+    successive = np.sum(centred[1:] * centred[:-1], axis=0)
+    rho = successive / np.where(square > 0, square, 1.0)
+    score = np.maximum(rho * np.sqrt(len(errors) - 1), 1e-9)
+    return np.clip(rho * np.maximum(1 - (CHANCE / score) ** 2, 0.0), 0.0, LARGEST)
+
+
+def _stretched(
+    covariance: Float[np.ndarray, "a a"],
+    before: Float[np.ndarray, "p p"],
+    after: Float[np.ndarray, "p p"],
+    block: slice = slice(None),
+) -> Float[np.ndarray, "a a"]:
+    """A covariance of some unknowns, changed in proportion to theirs before and after."""
+    factors = (np.linalg.cholesky(each[block, block]) for each in (after, before))
+    stretch = next(factors) @ np.linalg.inv(next(factors))
+    found = stretch @ covariance @ stretch.T
+    return 0.5 * (found + found.T)

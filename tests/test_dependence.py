@@ -1,0 +1,195 @@
+"""Frames of a held or slowly moving probe count for what they are worth."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcal
+from jaxcal.dependence import (
+    autocorrelation,
+    correlation_time,
+    displacement,
+    independent,
+    same_pose,
+)
+from jaxcal.diagnostics.serial_correlation import CHANCE, believed_correlation
+from jaxcal.problem import Channels
+from jaxcal.recording import make_images
+from jaxcal.report.verdict import GOOD
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """The experiment, whose recordings these are."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(Path(__file__).parents[1] / "experiments")
+        yield import_module("dependent_frames")
+
+
+@pytest.mark.parametrize(("holds", "each"), [(4, 15), (6, 10), (10, 6), (25, 2)])
+def test_a_hold_is_one_image_with_its_mean(frames, holds, each):
+    made = frames.held(holds, each, np.random.default_rng(holds))
+    images = make_images(made.poses, made.points)
+    joined, found = independent(images)
+    np.testing.assert_array_equal(found.group, np.repeat(np.arange(holds), each))
+    assert (found.frames, found.poses, found.images) == (holds * each, holds, holds)
+    assert found.words is not None
+    assert f"{holds * each} frames, {holds} different poses" in found.words
+    middle = np.median if each >= 5 else np.mean
+    expected = middle(made.points.reshape(holds, each, 2), axis=1)
+    np.testing.assert_allclose(joined.measurements[joined.mask], expected)
+    shift = made.poses[:, :3, 3].reshape(holds, each, 3).mean(axis=1)
+    np.testing.assert_allclose(joined.poses[joined.mask, :3, 3], shift)
+    # A second time there is nothing left to do.
+    assert independent(joined)[0] is joined
+
+
+def test_order_and_unused_images_do_not_matter(frames):
+    made = frames.held(8, 6, np.random.default_rng(1))
+    order = np.random.default_rng(2).permutation(48)
+    mask = np.random.default_rng(3).random(48) < 0.7
+    group = same_pose(made.poses[order], mask)
+    assert (group[~mask] == -1).all()
+    truth = np.repeat(np.arange(8), 6)[order]
+    same = truth[:, None] == truth
+    np.testing.assert_array_equal(
+        (group[:, None] == group)[np.ix_(mask, mask)], same[mask][:, mask]
+    )
+
+
+def test_different_poses_are_left_alone(frames):
+    for count in (54, 3000):
+        made = frames.held(count, 1, np.random.default_rng(count))
+        images = make_images(made.poses, made.points)
+        assert independent(images)[0] is images
+
+
+def test_a_chain_of_near_poses_is_no_hold():
+    """A sweep in steps of 0.4 mm over 40 mm: pieces of a millimetre, not one pose."""
+    poses = np.tile(np.eye(4), (101, 1, 1))
+    poses[:, 0, 3] = 0.4 * np.arange(101)
+    group = same_pose(poses, np.ones(101, bool))
+    for number in range(group.max() + 1):
+        members = poses[group == number]
+        assert displacement(members, members[:1]).max() <= 2.0
+    assert 20 <= group.max() + 1 <= 41
+
+
+def test_few_poses_are_refused_with_their_count(frames, tmp_path):
+    made = frames.held(3, 20, np.random.default_rng(5))
+    message = "60 images, but only 3 different poses: at least 4 are needed"
+    data = jaxcal.Problem.from_arrays(made.poses, made.points)
+    for method in ("joint", "conventional"):
+        with pytest.raises(jaxcal.InputError, match=message):
+            jaxcal.calibrate(data, method)
+    with pytest.raises(jaxcal.InputError, match=message):
+        jaxcal.cross_validate(data)
+    path = tmp_path / "held.h5"
+    jaxcal.save(jaxcal.Recording(make_images(made.poses, made.points)), path)
+    command = [sys.executable, "-m", "jaxcal", "calibrate", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stdout == ""
+
+
+def test_channels_and_covariances_are_joined(frames):
+    rng = np.random.default_rng(6)
+    made = frames.held(5, 6, rng)
+    one = rng.uniform(0.1, 0.2, 30)[:, None, None] * np.eye(2)
+    plain = jaxcal.Problem.from_arrays(made.poses, made.points, covariance=one)
+    heard = (rng.random((30, 8)) < 0.8).astype(float)
+    distances = heard * rng.uniform(20, 30, (30, 8))
+    data = replace(
+        plain,
+        channels=Channels(*map(jnp.asarray, (distances, heard, rng.random((8, 3))))),
+    )
+    joined, found = independent(data)
+    assert joined.channels is not None
+    for number, kept in enumerate(np.flatnonzero(found.keep)):
+        rows = slice(6 * number, 6 * number + 6)
+        share = heard[rows].mean(axis=0)
+        np.testing.assert_array_equal(joined.channels.heard[kept], share >= 0.5)
+        total = distances[rows].sum(axis=0) / np.maximum(heard[rows].sum(axis=0), 1)
+        np.testing.assert_allclose(joined.channels.distances[kept], total)
+        np.testing.assert_allclose(joined.covariance[kept], one[rows].mean(axis=0))
+
+
+@pytest.mark.parametrize("alike", [10, 40])
+def test_correlation_time(frames, alike):
+    """Exponential correlation over ``alike`` images: their integrated time is twice that."""
+    rng = np.random.default_rng(alike)
+    times = [
+        correlation_time(autocorrelation(frames.slow(3000, alike / frames.RATE_HZ, rng)))
+        for _ in range(40)
+    ]
+    assert np.median(times) == pytest.approx(2 * alike, rel=0.25)
+
+
+def test_independent_errors_are_not_believed_to_be_correlated():
+    rng = np.random.default_rng(7)
+    found = np.array([believed_correlation(rng.normal(size=(54, 3))) for _ in range(400)])
+    # Beyond CHANCE lie 1.8 % of them.
+    assert (found > 0).mean() < 0.03
+    assert CHANCE == 2.1
+    drifting = np.stack([np.convolve(rng.normal(size=80), np.ones(8), "valid")] * 3, axis=1)
+    assert (believed_correlation(drifting) > 0.6).all()
+
+
+def test_held_probes_are_covered_and_never_good(frames):
+    """Joint calibrations of 60 frames, default prior: the truth is where they say it is."""
+    inside, images = [], 0
+    for trial in range(10):
+        for holds in (4, 6, 10):
+            made = frames.held(holds, 60 // holds, np.random.default_rng([holds, trial]))
+            result = jaxcal.calibrate(jaxcal.Problem.from_arrays(made.poses, made.points))
+            images += int(result.images_used) - holds
+            assert result.notes[0] in result.warnings
+            if result.status != "converged":
+                continue
+            error = frames.error_of(
+                np.asarray(result.image_to_probe)[None], made.image_to_probe[None]
+            )[0]
+            inside.append(np.abs(error) <= jaxcal.transform_intervals(result, 0.95))
+            outside = (np.abs(error) > jaxcal.transform_intervals(result, 0.99)).any()
+            variance = np.diag(np.asarray(result.covariance))
+            spread = max(np.sqrt(variance[:3].sum()), np.degrees(np.sqrt(variance[3:].sum())))
+            assert spread > GOOD or not outside
+    assert images == 0
+    assert len(inside) > 20
+    assert np.mean(inside) > 0.93
+
+
+def test_correlated_errors_widen_the_covariance(frames):
+    """Images a second and a half apart, whose errors are still alike."""
+    made = [frames.swept(120, 2.0, np.random.default_rng([11, trial])) for trial in range(30)]
+    problems = [jaxcal.Problem.from_arrays(one.poses[::30], one.points[::30]) for one in made]
+    truth = np.array([one.image_to_probe for one in made])
+    plain = jaxcal.calibrate_batch(jaxcal.stack(problems), "conventional").numpy()
+    alone = [jaxcal.calibrate(one, "conventional") for one in problems]
+    found = np.array([np.asarray(one.image_to_probe) for one in alone])
+    np.testing.assert_allclose(found, plain.image_to_probe, atol=1e-9)
+    error = frames.error_of(found, truth)
+
+    def spreads(covariances):
+        return np.sqrt(np.diagonal(np.asarray(covariances), axis1=-2, axis2=-1))
+
+    before, after = spreads(plain.covariance), spreads([one.covariance for one in alone])
+    assert (after >= before * (1 - 1e-9)).all()
+    assert np.mean(after / before) > 1.08
+    assert (np.abs(error) <= 2 * after).mean() > (np.abs(error) <= 2 * before).mean() + 0.015
+    for one, wider in zip(alone, after / before, strict=True):
+        sd = np.sqrt(np.diag(np.linalg.inv(np.asarray(one.information))))[:6]
+        np.testing.assert_allclose(
+            sd * np.sqrt(one.linearisation.variance), spreads(one.covariance)
+        )
+        assert np.isfinite(wider).all()

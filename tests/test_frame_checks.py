@@ -1,0 +1,144 @@
+"""Wrong frames and units are named, and right ones are not accused."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxcal
+from jaxcal.cli.common import ExitCode, exit_code
+from jaxcal.frame_checks import wrong_frames
+from jaxcal.io.text import read_crosswire
+from jaxcal.poses import inverse_poses
+from jaxcal.recording import make_images
+from jaxcal.report.record import calibration_record
+from jaxcal.report.verdict import verdict
+
+FILES = 12
+BY_SYMMETRY = {("px, unknown", "u and v swapped")} | {
+    (form, "u mirrored") for form in ("mm", "px, known", "px, unknown")
+}
+"""No fit can see these (:mod:`jaxcal.frame_checks`)."""
+FREE_UNIT = ("px, unknown", "poses in cm")
+"""A pixel of a hundredth of a millimetre is possible."""
+
+
+@pytest.fixture(scope="module")
+def slips():
+    """The experiment, whose recordings and slips these are."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(Path(__file__).parents[1] / "experiments")
+        yield import_module("wrong_frames")
+
+
+@pytest.mark.parametrize("form", ["mm", "px, known", "px, unknown"])
+def test_every_slip_is_named_or_refused_and_no_right_file_is(slips, form):
+    for slip, (make, words) in slips.SLIPS.items():
+        for number in range(FILES):
+            arrays = make(slips.recorded(number, form))
+            try:
+                said = wrong_frames(arrays.images())
+            except jaxcal.InputError as error:
+                said = str(error)
+            if slip == "none" or (form, slip) in BY_SYMMETRY or (form, slip) == FREE_UNIT:
+                assert said is None, (slip, number)
+            else:
+                assert said is not None, (slip, number)
+                assert any(word in said for word in words), said
+                assert "\n" not in said
+
+
+def test_noise_outliers_and_few_images_are_no_slips(slips):
+    """Right data of other kinds: exact, very noisy, with wild images, few, hardly turned."""
+    for number in range(40):
+        rng = np.random.default_rng([77, number])
+        right = slips.recorded(number, "mm")
+        points = right.points.copy()
+        kind = number % 4
+        if kind == 0:
+            points += 3.0 * rng.normal(size=points.shape)
+        elif kind == 1:
+            points[:: rng.integers(5, 9)] += rng.uniform(-30, 30, (1, 2))
+        chosen = slice(0, int(rng.integers(4, 9))) if kind == 2 else slice(None)
+        points[:, 1] = np.maximum(points[:, 1], 1.0)
+        assert wrong_frames(make_images(right.poses[chosen], points[chosen])) is None
+
+
+def test_points_of_other_images_do_not_fit_together(slips):
+    right = slips.recorded(3, "mm")
+    order = np.random.default_rng(4).permutation(len(right.points))
+    said = wrong_frames(make_images(right.poses, right.points[order]))
+    assert said is not None
+    assert "do not fit together" in said
+
+
+def test_a_wrong_spacing_is_told_with_the_right_one(slips):
+    right = slips.recorded(5, "px, known")
+    said = wrong_frames(replace(right, spacing=(0.14, 0.12)).images())
+    assert said is not None
+    told = re.search(r"the pixels are ([0-9.]+) x ([0-9.]+) mm, not 0.14 x 0.12", said)
+    assert told is not None
+    np.testing.assert_allclose([float(told[1]), float(told[2])], slips.SPACING_MM, rtol=0.02)
+    # Who estimates the scale does not believe the spacing.
+    data = jaxcal.Problem.from_recording(jaxcal.Recording(right.images()))
+    wrong = replace(data, spacing=1.4 * data.spacing)
+    assert wrong_frames(wrong) is not None
+    assert wrong_frames(wrong, ("scale",)) is None
+
+
+def test_the_verdict_is_do_not_use_and_the_exit_status_says_so(slips):
+    right = slips.recorded(0, "mm")
+    for poses, named in ((inverse_poses(right.poses), True), (right.poses, False)):
+        recording = jaxcal.Recording(make_images(poses, right.points))
+        result = jaxcal.calibrate(recording, "conventional")
+        assert result.status == "converged"
+        record = calibration_record(result, recording)
+        lines = verdict(record)
+        assert lines[0].startswith("Do not use: it looks as if") is named
+        assert (exit_code([record]) == ExitCode.NOT_CONVERGED) is named
+        assert (result.wrong_frames is not None) is named
+        if named:
+            assert result.wrong_frames in result.warnings
+            assert "invert them" in lines[0]
+            # Said once, and nobody is sent to take further images.
+            assert sum("invert them" in line for line in lines) == 1
+            assert not any("Add images" in line or "tilted" in line for line in lines[-2:])
+
+
+def test_mirrored_points_go_where_they_did(slips):
+    """The symmetry that keeps mirrored pixels from being seen keeps them from doing harm."""
+    right = slips.recorded(1, "px, unknown")
+    places = []
+    for arrays in (right, slips.flipped(right), slips.other_columns(right)):
+        recording = jaxcal.Recording(arrays.images())
+        result = jaxcal.calibrate(recording, "conventional", estimate=("scale",))
+        assert result.wrong_frames is None
+        places.append(result.apply(arrays.points).points)
+    np.testing.assert_allclose(places[1], places[0], atol=1e-6)
+    np.testing.assert_allclose(places[2], places[0], atol=1e-6)
+
+
+def test_the_real_recording_and_its_wrong_twins(real_data):
+    folder = real_data / "crosswire"
+    images = read_crosswire(
+        folder / "crossWirePhantomTransformations.txt", folder / "crossWirePhantom2DPoints.txt"
+    ).calibration
+    assert wrong_frames(images) is None
+    known = replace(images, spacing_mm=np.array([0.1478, 0.1398]))
+    assert wrong_frames(known) is None
+    turned = images.poses.copy()
+    turned[:, :3, :3] = np.swapaxes(turned[:, :3, :3], 1, 2)
+    for wrong, words in (
+        (replace(images, poses=inverse_poses(images.poses)), "invert"),
+        (replace(images, poses=turned), "transpose"),
+        (replace(known, spacing_mm=np.array([1.478, 1.398])), "10 times too large"),
+        (replace(known, poses=inverse_poses(images.poses)), "invert"),
+    ):
+        said = wrong_frames(wrong)
+        assert said is not None
+        assert words in said
