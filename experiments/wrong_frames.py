@@ -140,7 +140,7 @@ SLIPS: dict[str, tuple[Callable[[Arrays], Arrays], tuple[str, ...]]] = {
     "poses in cm": (with_poses(scaled(0.1)), ("cm",)),
     "inverse poses": (with_poses(inverse_poses), ("invert",)),
     "transposed rotations": (with_poses(transposed), ("transpose",)),
-    "quaternions misread": (with_poses(quaternions_misread), ("quaternion",)),
+    "quaternions misread": (with_poses(quaternions_misread), ("first but is read as last",)),
     "one translation mirrored": (with_poses(mirrored), ("wrong sign",)),
     "translations exchanged": (with_poses(exchanged), ("exchanged",)),
     "left-handed poses": (with_poses(left_handed), ("reflection",)),

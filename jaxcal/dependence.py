@@ -190,20 +190,22 @@ def _near(
     empty = np.zeros(0, int)
     if len(places) < 2:
         return empty, empty
-    along = int(np.argmax(np.ptp(places, axis=0)))
+    # Sorted along one coordinate, partners are few places apart; a second one spares most of them.
+    along, across = np.argsort(-np.ptp(places, axis=0))[:2]
     order = np.argsort(places[:, along], kind="stable")
     line, found = places[order], []
+    first, second = line[:, along].copy(), line[:, across].copy()
     for apart in range(1, len(line)):
-        close = line[apart:, along] - line[:-apart, along] < limit
+        close = first[apart:] - first[:-apart] < limit
         if not close.any():
             break
-        at = np.flatnonzero(close)
+        at = np.flatnonzero(close & (np.abs(second[apart:] - second[:-apart]) < limit))
         at = at[(np.abs(line[at + apart] - line[at]) < limit).all(axis=1)]
         found.append(np.stack([order[at], order[at + apart]]))
     if not found:
         return empty, empty
-    first, second = np.concatenate(found, axis=1)
-    return first, second
+    pairs = np.concatenate(found, axis=1)
+    return pairs[0], pairs[1]
 
 
 def _components(

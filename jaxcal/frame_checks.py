@@ -187,8 +187,8 @@ def _slips(
         turned, shifts, points,
     )  # fmt: skip
     for words, order in (
-        ("last but read as first", [1, 2, 3, 0]),
-        ("first but read as last", [3, 0, 1, 2]),
+        ("first but is read as last", [1, 2, 3, 0]),
+        ("last but is read as first", [3, 0, 1, 2]),
     ):
         reordered = _with_quaternions_reordered(rotations, order)
         yield (

@@ -169,27 +169,28 @@ def test_held_probes_are_covered_and_never_good(frames):
     assert np.mean(inside) > 0.93
 
 
-def test_correlated_errors_widen_the_covariance(frames):
+def test_correlated_errors_widen_the_covariance(frames, monkeypatch):
     """Images a second and a half apart, whose errors are still alike."""
-    made = [frames.swept(120, 2.0, np.random.default_rng([11, trial])) for trial in range(30)]
+    made = [frames.swept(120, 2.0, np.random.default_rng([11, trial])) for trial in range(40)]
     problems = [jaxcal.Problem.from_arrays(one.poses[::30], one.points[::30]) for one in made]
-    truth = np.array([one.image_to_probe for one in made])
-    plain = jaxcal.calibrate_batch(jaxcal.stack(problems), "conventional").numpy()
-    alone = [jaxcal.calibrate(one, "conventional") for one in problems]
-    found = np.array([np.asarray(one.image_to_probe) for one in alone])
-    np.testing.assert_allclose(found, plain.image_to_probe, atol=1e-9)
-    error = frames.error_of(found, truth)
+    wide = [jaxcal.calibrate(one, "conventional") for one in problems]
+    monkeypatch.setattr(jaxcal.solve, "widened", lambda result: result)
+    plain = [jaxcal.calibrate(one, "conventional") for one in problems]
+    # Where a recording is taken for a stream, fewer images are left to be correlated.
+    used = [k for k, one in enumerate(wide) if not one.notes]
+    assert len(used) > 30
 
-    def spreads(covariances):
-        return np.sqrt(np.diagonal(np.asarray(covariances), axis1=-2, axis2=-1))
+    def spreads(results):
+        return np.array([np.sqrt(np.diag(np.asarray(results[k].covariance))) for k in used])
 
-    before, after = spreads(plain.covariance), spreads([one.covariance for one in alone])
+    found = np.array([np.asarray(wide[k].image_to_probe) for k in used])
+    np.testing.assert_array_equal(found, [np.asarray(plain[k].image_to_probe) for k in used])
+    error = frames.error_of(found, np.array([made[k].image_to_probe for k in used]))
+    before, after = spreads(plain), spreads(wide)
     assert (after >= before * (1 - 1e-9)).all()
     assert np.mean(after / before) > 1.08
-    assert (np.abs(error) <= 2 * after).mean() > (np.abs(error) <= 2 * before).mean() + 0.015
-    for one, wider in zip(alone, after / before, strict=True):
-        sd = np.sqrt(np.diag(np.linalg.inv(np.asarray(one.information))))[:6]
-        np.testing.assert_allclose(
-            sd * np.sqrt(one.linearisation.variance), spreads(one.covariance)
-        )
-        assert np.isfinite(wider).all()
+    assert (np.abs(error) <= 2 * after).mean() > (np.abs(error) <= 2 * before).mean() + 0.01
+    for k, wider in zip(used, after, strict=True):
+        lines = wide[k].linearisation
+        inverse = np.linalg.inv(np.asarray(lines.information))
+        np.testing.assert_allclose(np.sqrt(np.diag(inverse)[:6] * lines.variance), wider, rtol=1e-6)

@@ -384,7 +384,8 @@ def warnings(result: Calibration) -> list[str]:
         found.append("the solve failed: its result holds no usable numbers")
         return found
     if result.wrong_frames is not None:
-        found.append(result.wrong_frames)
+        # Whatever else there would be to say, it is of an answer that has no meaning.
+        return [result.wrong_frames]
     if status == "unobservable":
         found.append(f"not observable: these images do not determine {weakest}; {sight['advice']}")
     if status == "max_iterations":

@@ -40,7 +40,8 @@ def verdict(record: dict[str, Any]) -> list[str]:
         Paragraphs without line breaks; bullet points start with "- ".
     """
     lines = [headline(record)]
-    if record["status"] in ("converged", "max_iterations"):
+    usable = record["status"] in ("converged", "max_iterations")
+    if usable and not record.get("wrong_frames"):
         lines += [*_contradictions(record), *_where(record), *limits(record), *_believe(record)]
         lines += [*_certainty(record), *resampled_sentences(record)]
         proved = certificate_words(record)

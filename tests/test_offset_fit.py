@@ -1,0 +1,70 @@
+"""What is said of the offsets' law holds for many images as well."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import jaxcal
+from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.offset_fit import CONTRADICTED, contradicted, distribution
+from jaxcal.model.shapes import FAMILIES
+
+DRAWN = {
+    "uniform": stats.uniform(-1, 2),
+    "bell": stats.beta(3, 3, loc=-1, scale=2),
+    "gaussian": stats.norm(),
+    "student": stats.t(4),
+}
+
+
+def test_distributions_are_those_of_scipy():
+    assert set(CONTRADICTED) == set(DRAWN) == set(FAMILIES)
+    u = np.linspace(-4, 4, 81)
+    for family, law in DRAWN.items():
+        np.testing.assert_allclose(distribution(family, u), law.cdf(u * law.std()), atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [30, 300])
+def test_true_laws_are_hardly_ever_contradicted(count):
+    rng = np.random.default_rng(count)
+    for family, law in DRAWN.items():
+        wrong = [contradicted(2 + law.rvs(count, random_state=rng))[family] for _ in range(500)]
+        # Fewer than one in a thousand; 4 of 500 have a chance of one in 6,000.
+        assert sum(wrong) < 4, family
+
+
+def test_many_offsets_tell_the_laws_apart():
+    rng = np.random.default_rng(1)
+    for family, law in DRAWN.items():
+        wrong = contradicted(law.rvs(5000, random_state=rng))
+        assert [name for name, beyond in wrong.items() if not beyond] == [family]
+
+
+def test_words_never_name_a_law_that_the_offsets_contradict():
+    said = messages._law_in_words({"gaussian": 1.0, "uniform": 0.0, "bell": 0.0, "student": 0.0},
+                                  ["gaussian", "bell", "student"])  # fmt: skip
+    assert "look uniform between edges" in said
+    assert said.startswith("The estimate rests on offsets that are Gaussian (100 %), but")
+    none = messages._law_in_words({"gaussian": 1.0, "uniform": 0.0}, list(FAMILIES))
+    assert none.startswith("None of the laws that were compared fits the offsets")
+    fine = messages._law_in_words({"gaussian": 0.2, "uniform": 0.8}, ["student"])
+    assert fine == (
+        "Of the laws that were compared, the data prefer offsets that are uniform between edges "
+        "(80 %) or Gaussian (20 %)"
+    )
+
+
+@pytest.mark.slow
+def test_five_thousand_uniform_offsets_are_not_called_gaussian():
+    protocol = jaxcal.Protocol(images=5000, elevation_mm=1.0, noise_mm=0.2)
+    result = jaxcal.calibrate(jaxcal.simulate_recording(protocol, 0))
+    law = messages.offset_law(result.numpy())
+    assert law is not None
+    words = str(law["words"])
+    assert "uniform between edges" in words
+    assert "gaussian" in law["contradicted"]
+    assert not words.startswith(
+        "Of the laws that were compared, the data prefer offsets that are G"
+    )
