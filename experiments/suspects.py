@@ -5,7 +5,7 @@ heavy-tailed offsets, calibrated with the default prior: the share in which some
 or a kind of error is said to have heavy tails, to lean, to grow with depth, or to be alike in
 successive images or drift. Heavy-tailed offsets have heavy tails: that is no false alarm. Then the
 same with faults: three successive images with the range 5 SDs too long, and offsets that drift by
-1.5 SDs from the first image to the last. Of 400 trials a share is known to +- 1 to 2 %.
+1.5 SDs from the first image to the last. Of 250 trials a share is known to +- 1 to 3 %.
 
 Seed 20261124; trial k of a condition is fold_in(root, condition * 10^6 + k).
 """
@@ -66,7 +66,7 @@ def draw(law: OffsetLaw, images: int, fault: str, indices: Array):
 
 def main() -> None:
     quick = arguments(__doc__ or "").quick
-    trials = 60 if quick else 400
+    trials = 60 if quick else 250
     enable_compilation_cache()
     rows: list[list[object]] = []
     condition = 0

@@ -170,8 +170,7 @@ def outcome(arrays: Arrays, method: str) -> tuple[str, str, np.ndarray | None]:
         assert exit_code([record]) == ExitCode.NOT_CONVERGED
         assert headline.startswith("Do not use")
         return "named", record["wrong_frames"], there
-    word = headline.partition(":")[0]
-    return ("believed" if word in ("Good", "Fair") else "doubted"), headline, there
+    return ("believed" if record["verdict"] in ("good", "fair") else "doubted"), headline, there
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ from jaxcal.dependence import (
 from jaxcal.diagnostics.serial_correlation import CHANCE, believed_correlation
 from jaxcal.problem import Channels
 from jaxcal.recording import make_images
-from jaxcal.report.verdict import GOOD
+from jaxcal.report.accuracy import GOOD_MM
 
 
 @pytest.fixture(scope="module")
@@ -161,9 +161,7 @@ def test_held_probes_are_covered_and_never_good(frames):
             )[0]
             inside.append(np.abs(error) <= jaxcal.transform_intervals(result, 0.95))
             outside = (np.abs(error) > jaxcal.transform_intervals(result, 0.99)).any()
-            variance = np.diag(np.asarray(result.covariance))
-            spread = max(np.sqrt(variance[:3].sum()), np.degrees(np.sqrt(variance[3:].sum())))
-            assert spread > GOOD or not outside
+            assert float(frames.stated_tre(result)) > GOOD_MM or not outside
     assert images == 0
     assert len(inside) > 20
     assert np.mean(inside) > 0.93

@@ -30,7 +30,6 @@ import numpy as np
 from jaxcal.array_types import Float
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.uncertainty import TUNED, Whitened
-from jaxcal.model.parameters import block_slice
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
@@ -56,7 +55,7 @@ def widened(result: Calibration) -> Calibration:
     """
     if result.data != "points" or result.prior == "bounded" or result.problem is None:
         return result
-    covariance = np.asarray(result.covariance)
+    covariance = np.asarray(result.unknowns_covariance)
     if not np.isfinite(covariance).all() or int(result.images_used) < FEWEST_IMAGES:
         return result
     errors, rows = _in_sds(result)
@@ -64,24 +63,15 @@ def widened(result: Calibration) -> Calibration:
     if found is None:
         return result
     before, after = found
-    point = block_slice(result.blocks, "point")
     lines = result.linearisation
     # The information about all unknowns changes in the same proportion.
     whole = _stretched(np.linalg.inv(np.asarray(lines.information, float)), before, after)
-    dtype = covariance.dtype
+    information = np.linalg.inv(whole).astype(covariance.dtype)
+    wider = _stretched(covariance, before, after).astype(covariance.dtype)
     return replace(
         result,
-        covariance=_like(
-            result.covariance,
-            _stretched(covariance, before, after, slice(0, len(covariance))).astype(dtype),
-        ),
-        point_covariance=_like(
-            result.point_covariance,
-            _stretched(np.asarray(result.point_covariance), before, after, point).astype(dtype),
-        ),
-        linearisation=replace(
-            lines, information=_like(lines.information, np.linalg.inv(whole).astype(dtype))
-        ),
+        unknowns_covariance=_like(result.unknowns_covariance, wider),
+        linearisation=replace(lines, information=_like(lines.information, information)),
     )
 
 
@@ -152,13 +142,11 @@ def believed_correlation(errors: Float[np.ndarray, "m k"]) -> Float[np.ndarray, 
 
 
 def _stretched(
-    covariance: Float[np.ndarray, "a a"],
+    covariance: Float[np.ndarray, "p p"],
     before: Float[np.ndarray, "p p"],
     after: Float[np.ndarray, "p p"],
-    block: slice = slice(None),
-) -> Float[np.ndarray, "a a"]:
-    """A covariance of some unknowns, changed in proportion to theirs before and after."""
-    factors = (np.linalg.cholesky(each[block, block]) for each in (after, before))
-    stretch = next(factors) @ np.linalg.inv(next(factors))
+) -> Float[np.ndarray, "p p"]:
+    """A covariance changed in proportion to another one, before and after."""
+    stretch = np.linalg.cholesky(after) @ np.linalg.inv(np.linalg.cholesky(before))
     found = stretch @ covariance @ stretch.T
     return 0.5 * (found + found.T)

@@ -295,7 +295,8 @@ def settle(record: dict[str, Any]) -> None:
             bootstrap where they were asked for.
     """
     tre = record.get("tre")
-    record["verdict"] = "uncertain" if record["converged"] else None
+    usable = record["converged"] and not record.get("wrong_frames")
+    record["verdict"] = "uncertain" if usable else None
     if tre is None or tre["stated_mm"] is None:
         return
     told = [*_from_residuals(record), *_from_images(record), *_from_resampling(record)]
@@ -308,7 +309,8 @@ def settle(record: dict[str, Any]) -> None:
         point["tre_mm"] = factor * point["stated_mm"]
         point["interval_95_mm"] = [factor * end for end in point["stated_interval_mm"]]
     error = tre["rms_mm"]
-    record["verdict"] = "good" if error <= GOOD_MM else "fair" if error <= FAIR_MM else "uncertain"
+    word = "good" if error <= GOOD_MM else "fair" if error <= FAIR_MM else "uncertain"
+    record["verdict"] = None if record.get("wrong_frames") else word
 
 
 def _from_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
