@@ -75,7 +75,9 @@ def variance_factor(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     left = degrees_of_freedom(calibration)
     if calibration.prior not in TUNED:
         return xp.ones_like(left)
-    return xp.where(xp.isfinite(left), left / xp.maximum(left - 2, 1.0), 1.0)
+    # Given SDs leave infinitely many, whose quotient with themselves would be NaN.
+    finite = xp.where(xp.isfinite(left), left, 4.0)
+    return xp.where(xp.isfinite(left), finite / xp.maximum(finite - 2, 1.0), 1.0)
 
 
 def transform_intervals(
