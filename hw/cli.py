@@ -92,15 +92,17 @@ _bench_seed = click.option(
     help="Who follows the injected pattern: you at this terminal, you before a window, or a rule.  "
     "[default: person with --setup, simulated with --bench]",
 )
-@click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Of the plan.  [default: 0]")
+@click.option(
+    "--seed", type=click.IntRange(min=0), metavar="N", help="Seed of the plan.  [default: 0]"
+)
 @click.option("--every-frame", is_flag=True, help="Record every ultrasound frame, not one a pose.")
 @click.option("--resume", is_flag=True, help="Go on with RECORDING, which ended early.")
 @click.option("--move", is_flag=True, help="Move the robot, after a confirmation; else a dry run.")
 @click.option(
     "--unattended",
     metavar="DIGEST",
-    help="Move without asking anybody. It gives up that a person at the robot says, just before it "
-    "moves, that its way is clear. DIGEST names the plan (16 digits or more, as --move shows it); "
+    help="Move without asking anybody: then nobody at the robot says, just before it moves, that "
+    "its way is clear. DIGEST names the plan (16 digits or more, as --move shows it); "
     "any other plan, robot, TCP offset, payload or speed slider is refused.",
 )
 @click.option("--preview", type=click.Path(), metavar="PNG", help="Draw the plan.")
@@ -189,7 +191,13 @@ def acquire(
 @commands.command()
 @_speed
 @_controller
-@click.option("--seed", type=click.IntRange(min=0), default=0, metavar="N", help="Which world.")
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    metavar="N",
+    help="Seed of the simulated world.",
+)
 def bench(speed: float | None, controller: str | None, seed: int) -> int:
     """Serve an emulated bench until Ctrl-C; prints one JSON line with its addresses."""
     from hw.bench.run import Options, serve

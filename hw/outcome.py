@@ -54,7 +54,7 @@ def dry_run(setup: Setup, path: str, request: Request | None, figure: str | None
 def _poses(request: Request, count: int) -> str:
     if request.plan == "sobol":
         return f"{count} poses"
-    return f"at most {request.images} images from a pool of {count} poses, all of them"
+    return f"at most {request.images} images; all {count} poses of the pool were checked"
 
 
 def _dry_limits(setup: Setup) -> Limits:

@@ -14,9 +14,9 @@ for residuals of any shape, :func:`arrow_least_squares` that for problems with s
 one local unknown a row.
 
 Unlike :func:`jaxcal.calibrate`, these functions compute in the caller's modes: switch 64 bits on
-(``jax.enable_x64``) before making a problem's arrays. ``docs/api.md`` has worked examples. Names
-here are public, and provisional until version 1.0: a change is announced by a DeprecationWarning
-for one minor version.
+(``jax.enable_x64``) before making a problem's arrays. ``docs/how-to/own-solver.md`` has worked
+examples. Names here are public, and provisional until version 1.0: a change is announced by a
+DeprecationWarning for one minor version.
 """
 
 from __future__ import annotations

@@ -207,6 +207,9 @@ class Problem(eqx.Module):
 def stack(problems: list[Problem]) -> Problem:
     """Problems of one structure as a batch with one leading axis.
 
+    Args:
+        problems: each of one problem, at least one.
+
     Raises:
         InputError: where they differ in the number of images or in what they hold.
     """

@@ -79,7 +79,15 @@ class Truth:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording: images to calibrate with and, optionally, test images, truth and the probe."""
+    """A recording: images to calibrate with and, optionally, test images, truth and the probe.
+
+    Attributes:
+        calibration: the images to calibrate with.
+        test: the images of an independent test set, or None.
+        truth: what a simulation knows, or None.
+        probe: the transducer, or None.
+        source: the file that it came from, for messages.
+    """
 
     calibration: Images
     test: Images | None = None

@@ -268,7 +268,9 @@ def _one_problem(problem: Problem | Recording, arguments: dict[str, Any]) -> Pro
         raise InputError("resampling takes one problem at a time, not a batch")
     if any(is_traced(leaf) for leaf in jax.tree.leaves(problem)):
         return problem
-    return independent(problem, arguments.get("estimate", ()))[0]
+    alone = independent(problem, arguments.get("estimate", ()))[0]
+    # Where JAX's 64 bits are off a problem holds numpy arrays, which a traced index cannot index.
+    return jax.tree.map(jnp.asarray, alone)
 
 
 def _check_left(mask: Array, rest: Array) -> None:

@@ -336,7 +336,7 @@ def transform_from_plus_matrix(
         raise InputError(f"{source}: the matrix's last row is not 0 0 0 1")
     scale = np.linalg.norm(matrix[:3, :2], axis=0)
     if not (scale > 1e-9).all():
-        raise InputError(f"{source}: the matrix has pixels without a size")
+        raise InputError(f"{source}: a column of the matrix is zero: the pixels have no size")
     if np.linalg.det(matrix[:3, :3]) <= 0:
         raise InputError(f"{source}: the matrix is a reflection, or flat")
     lateral, axial = (matrix[:3, :2] / scale).T

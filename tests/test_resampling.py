@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -40,6 +41,17 @@ def test_holding_out_an_image_is_calibrating_without_it(data):
     # What was not seen fits worse than what was.
     assert float(found.rms) > float(whole.rms)
     assert np.asarray(found.converged).all()
+
+
+@pytest.mark.slow
+def test_a_problem_of_numpy_arrays_where_64_bits_are_off():
+    with jax.enable_x64(False):
+        recording = jaxcal.simulate_recording(jaxcal.Protocol(images=8), seed=2)
+        there = jaxcal.Problem.from_recording(recording)
+        assert isinstance(there.poses, np.ndarray)
+        found = cross_validate(there, folds=2, **CONVENTIONAL)
+    assert found.converged.all()
+    assert 0 < float(found.precision) < 10
 
 
 @pytest.mark.slow

@@ -296,7 +296,7 @@ def test_json_that_lies(tmp_path, change, message):
     ("matrix", "message"),
     [
         (np.diag([0.1, -0.1, 0.1, 1]), "is a reflection"),
-        (np.diag([0.1, 0, 0.1, 1]), "pixels without a size"),
+        (np.diag([0.1, 0, 0.1, 1]), "pixels have no size"),
         (np.diag([0.1, np.nan, 0.1, 1]), "finite"),
         (np.diag([0.1, 0.1, 0.1, 2]), "last row"),
         (np.eye(4) + np.pad([[0.1]], ((0, 3), (1, 2))), "degrees apart: fCal fitted"),

@@ -139,7 +139,8 @@ class Motion:
             raise
         if answer.get("what") != "ready":
             error = _error(answer) or LostError(
-                f"the controller at {self.host} did not let us in within {_START_PATIENCE_S:g} s",
+                f"the controller at {self.host} did not accept the connection within "
+                f"{_START_PATIENCE_S:g} s",
                 device="robot",
             )
             self._kill(error)

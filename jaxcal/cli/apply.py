@@ -30,8 +30,13 @@ _COLUMNS = ("x_mm", "y_mm", "z_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm", "cov_xy_mm2
     type=click.Choice(["xyzw", "wxyz"]),
     help="Whether a quaternion's scalar is the last or the first of its numbers.",
 )
-@click.option("--pose-units", type=click.Choice(["mm", "cm", "m"]), help="Of translations.")
-@click.option("--out", type=click.Path(), metavar="OUT.csv", help="Instead of standard output.")
+@click.option("--pose-units", type=click.Choice(["mm", "cm", "m"]), help="Unit of translations.")
+@click.option(
+    "--out",
+    type=click.Path(),
+    metavar="OUT.csv",
+    help="Write to this file, not to standard output.",
+)
 def apply(
     calibration: str,
     source: str | None,

@@ -54,15 +54,15 @@ class _Request:
     default="joint",
     show_default=True,
     help="joint: transform, target and elevational offsets together; alternating: the paper's; "
-    "conventional: every target taken for in-plane.",
+    "conventional: every target is assumed to lie in the image plane.",
 )
 @click.option(
     "--prior",
     type=click.Choice(["auto", "gaussian", "uniform", "bounded"]),
     default="auto",
     show_default=True,
-    help="What the joint method takes the offsets for; auto: whatever law the data "
-    "speak for, SDs tuned to the data.",
+    help="Distribution of the offsets in the joint method; auto: an average over several, "
+    "weighed by the data.",
 )
 @click.option(
     "--max-elevation",

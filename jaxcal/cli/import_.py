@@ -69,9 +69,11 @@ from jaxcal.errors import InputError
 @click.option(
     "--orientation",
     type=click.Choice(["MF", "UF", "MN", "UN"]),
-    help="Of the frames, where their file does not say.",
+    help="Orientation of the frames, if their file does not say it.",
 )
-@click.option("--ignore-time", is_flag=True, help="Import without times where they go back.")
+@click.option(
+    "--ignore-time", is_flag=True, help="If times repeat or go back, import without them."
+)
 def import_(sources: tuple[str, ...], out: str, **options: Any) -> int:
     """Turn other programs' files into a recording, OUT.h5.
 
@@ -79,7 +81,7 @@ def import_(sources: tuple[str, ...], out: str, **options: Any) -> int:
     or Slicer (.igs.mha, .igs.mhd, .igs.nrrd, .seq.nrrd) whose frames show the target; such a
     sequence, or an export of NDI ToolBox or Motive, and a file of points (a table with frame or
     time, u and v, or Slicer's .mrk.json or .fcsv); or POSES (three rows of four numbers for each
-    image) and POINTS (a row "u v" in pixels). docs/formats.md says what each must hold.
+    image) and POINTS (a row "u v" in pixels). docs/reference/formats.md says what each must hold.
     """
     _check(sources, out, options)
     from jaxcal.importing import ImportOptions, import_files

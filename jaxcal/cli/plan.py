@@ -38,7 +38,7 @@ _COUNTED = (0.5, 0.3, 0.2, 0.1)
     type=click.Choice(["tre", "rp", "d"]),
     default="tre",
     show_default=True,
-    help="What shall be small: target registration error, reconstruction precision, or the volume "
+    help="What to make small: target registration error, reconstruction precision, or the volume "
     "of the confidence ellipsoid.",
 )
 @click.option(
@@ -65,7 +65,7 @@ _COUNTED = (0.5, 0.3, 0.2, 0.1)
 @click.option("--estimate", metavar="LIST", help="With REC: further unknowns (scale), as for "
               "calibrate.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
-              help="Of the candidate poses.")  # fmt: skip
+              help="Seed of the candidate poses.")  # fmt: skip
 @click.option("--figure", type=click.Path(), metavar="PNG", help="Draw the plan.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def plan(

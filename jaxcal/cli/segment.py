@@ -48,10 +48,16 @@ if TYPE_CHECKING:
 )
 @click.option("--interpolate", is_flag=True, help="Between elements (shortest).")
 @click.option(
-    "--sound-speed", type=POSITIVE, metavar="M/S", help="Instead of the recording's, m/s."
+    "--sound-speed",
+    type=POSITIVE,
+    metavar="M/S",
+    help="Sound speed, m/s, instead of the recording's.",
 )
 @click.option(
-    "--temperature", type=float, metavar="CELSIUS", help="Of the water that sets the sound speed."
+    "--temperature",
+    type=float,
+    metavar="CELSIUS",
+    help="Temperature of the water, which sets the sound speed.",
 )
 @click.option(
     "--out",

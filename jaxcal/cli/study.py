@@ -30,7 +30,7 @@ def study() -> None:
     "--workers",
     type=click.IntRange(1, 4096),
     metavar="N",
-    help="So many processes on this machine, each on cores of its own.",
+    help="Number of processes on this machine, each on cores of its own.",
 )
 @click.option(
     "--dask",

@@ -195,7 +195,7 @@ def known_before(
         return Known(prior + candidates.model.beliefs())
     if candidates.taken is None:
         raise InputError(
-            "a calibration tells how the target hangs together with X only along with its images: "
+            "the poses of the calibration's images are needed: "
             "make the candidates with candidates_around(recording, result), or give the images' "
             "poses as their 'taken'"
         )

@@ -141,7 +141,11 @@ class Observation(eqx.Module):
 
 
 class Points(Observation):
-    """Lateral position, range and elevational offset, each with its SD (mm); y_i is q_y itself."""
+    """Lateral position, range and elevational offset, each with its SD; y_i is q_y itself.
+
+    Attributes:
+        sigma: SDs of lateral position, range and offset, mm.
+    """
 
     sigma: Float[Array, "3 lanes"]
 

@@ -29,13 +29,23 @@ def _one_lane(
 
 
 def measured_points(parameters: Parameters, problem: Problem) -> Float[Array, "n 2"]:
-    """Lateral position and range of every image, mm."""
+    """Lateral position and range of every image, mm.
+
+    Args:
+        parameters: X, target and further unknowns.
+        problem: the data.
+    """
     images, further, _ = _one_lane(parameters, problem)
     return jnp.stack([plane[0] for plane in further.points(images)], axis=1)
 
 
 def target_in_image(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:
-    """q_i = X^-1 B_i^-1 c: lateral, elevational, axial, mm; (0, 0, 1) where left out."""
+    """q_i = X^-1 B_i^-1 c: lateral, elevational, axial, mm; (0, 0, 1) where left out.
+
+    Args:
+        parameters: X, target and further unknowns.
+        problem: the data.
+    """
     q = jnp.stack([plane[0] for plane in _one_lane(parameters, problem)[2]], axis=1)
     unused = jnp.asarray([0.0, 0.0, 1.0], q.dtype)
     return jnp.where(problem.mask[:, None] > 0, q, unused)
@@ -44,13 +54,24 @@ def target_in_image(parameters: Parameters, problem: Problem) -> Float[Array, "n
 def circle_residual(
     parameters: Parameters, elevation: Float[Array, " n"], problem: Problem
 ) -> Float[Array, "n 3"]:
-    """q_i - p_i(y_i), mm, at given offsets y_i; its norm is |c - B_i X p_i| of Eq. 7."""
+    """q_i - p_i(y_i), mm, at given offsets y_i; its norm is |c - B_i X p_i| of Eq. 7.
+
+    Args:
+        parameters: X, target and further unknowns.
+        elevation: the offsets y_i, mm.
+        problem: the data.
+    """
     images, further, q = _one_lane(parameters, problem)
     return _rows(on_circle(q, elevation[None], further, images), problem)
 
 
 def measurement_residual(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:
-    """Lateral error, range error and elevational offset of every image, mm."""
+    """Lateral error, range error and elevational offset of every image, mm.
+
+    Args:
+        parameters: X, target and further unknowns.
+        problem: the data.
+    """
     images, further, q = _one_lane(parameters, problem)
     unit = Points(jnp.ones((3, 1), problem.mask.dtype))
     found = unit.components(q, further, images)
@@ -58,7 +79,12 @@ def measurement_residual(parameters: Parameters, problem: Problem) -> Float[Arra
 
 
 def channel_residual(parameters: Parameters, problem: Problem) -> Float[Array, "n elements"]:
-    """Distance error of every element that heard the target, mm at the nominal sound speed."""
+    """Distance error of every element that heard the target, mm at the nominal sound speed.
+
+    Args:
+        parameters: X, target and further unknowns.
+        problem: the data, with channels.
+    """
     images, further, q = _one_lane(parameters, problem, channels=True)
     unit = Channels(jnp.ones((2, 1), problem.mask.dtype))
     distances = unit.components(q, further, images)[0]

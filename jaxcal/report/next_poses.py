@@ -79,5 +79,7 @@ def next_poses_sentences(record: dict[str, Any]) -> list[str]:
         *(f"- {pose['words']}" for pose in found["poses"]),
     ]
     if found["images_to_half"] is not None:
-        lines.append(f"Half the error would take {found['images_to_half']} chosen images more.")
+        lines.append(
+            f"Halving the error takes {found['images_to_half']} more images, chosen like these."
+        )
     return lines

@@ -67,7 +67,7 @@ def headline(record: dict[str, Any]) -> str:
     if status == "unobservable":
         return "Do not use: these images do not determine the calibration."
     if status == "max_iterations":
-        return "Do not trust: the solver stopped before it had arrived."
+        return "Do not trust: the solver stopped before it converged."
     if tre is None or tre.get("rms_mm") is None:
         return (
             f"Uncertain: solved from {record['images_used']} images, which do not tell how far off "

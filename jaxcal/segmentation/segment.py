@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -206,7 +206,7 @@ def segment(
 
 
 def segment_recording(
-    recording: Recording, probe: Probe | None = None, **options
+    recording: Recording, probe: Probe | None = None, **options: Any
 ) -> tuple[Recording, Segmentation]:
     """Segment a recording's calibration images, and its test images where they are raw.
 

@@ -3,8 +3,9 @@
 XLA hands ``jnp.linalg`` to LAPACK on the CPU, one small call a lane. Up to jaxlib 0.11.0 it spreads
 the lanes of a batch over its thread pool while a thread of that same pool waits for them; two such
 calls that do not depend on each other can then wait for each other for ever: with two cores that
-stopped whole studies (docs/upstream/xla-cpu-lapack-deadlock.md). These loops of array operations
-cannot; they also vectorise over the batch and run unchanged on a GPU, where LAPACK is not.
+stopped whole studies (docs/developers/upstream/xla-cpu-lapack-deadlock.md). These loops of array
+operations cannot; they also vectorise over the batch and run unchanged on a GPU, where LAPACK is
+not.
 
 References: Golub and Van Loan, Matrix Computations, 4th ed., 3.4, 5.2, 8.6; Brent and Luk 1985.
 """

@@ -78,6 +78,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         tolerance: gradient cosine to stop at: the largest between the residuals and a column of
             their Jacobian.
         damping: first lambda, relative to the diagonal.
+        rtol: without effect, as are
+        atol: and
+        norm: optimistix asks every solver for them.
     """
 
     tolerance: float = 1e-10

@@ -1,0 +1,255 @@
+"""The pages of the documentation, and the running of what stands on them.
+
+Every fenced block in the language ``python`` or ``sh`` is run, page by page, in a folder of its own
+that is empty at first. A page's Python blocks share their names. A comment before a block says
+otherwise:
+
+- ``<!-- not run: REASON -->``: the block needs what a build does not have (a robot, a network).
+- ``<!-- file: NAME -->``: the block, of whatever language, is written to this file.
+- ``<!-- setup: NAME -->``: the script of this name in ``docs/data`` is run first; it makes files
+  that a reader has.
+- ``<!-- output -->``: the block is what the block before it printed; a build rewrites it.
+
+A file ``NAME.svg`` or ``NAME.png`` that a page's code saves, and that the page shows from
+``figures/``, becomes that figure. Commands of ``sh`` blocks run in this process, so that one
+compilation serves all pages.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import runpy
+import shlex
+import shutil
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parents[1]
+ROOT = DOCS.parent
+FIGURES = DOCS / "figures"
+DATA = DOCS / "data"
+
+LANGUAGES = ("python", "sh")
+_FENCE = re.compile(
+    r"(?:^<!-- (?P<mark>not run|file|setup|output)(?:: (?P<what>[^\n]*?))? -->\n+)?"
+    r"^```(?P<language>[\w-]*)\n(?P<code>.*?)^```$",
+    re.MULTILINE | re.DOTALL,
+)
+
+
+class PageError(Exception):
+    """A block of a page did not run; the message says which and why."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page.
+
+    Attributes:
+        language: of the fence; empty for none.
+        code: without the fence.
+        mark: ``not run``, ``file``, ``setup``, ``output`` or None.
+        what: what the mark says after its colon.
+        line: where the code begins, counted from 1.
+        span: of ``code`` in the page's text.
+    """
+
+    language: str
+    code: str
+    mark: str | None
+    what: str | None
+    line: int
+    span: tuple[int, int]
+
+
+@dataclass
+class Run:
+    """What came of running a page.
+
+    Attributes:
+        names: of its Python blocks.
+        printed: by blocks whose output the page shows, with the span that it belongs to.
+        figures: files that the page shows and its code has saved.
+        seconds: wall time.
+    """
+
+    names: dict[str, object] = field(default_factory=dict)
+    printed: list[tuple[tuple[int, int], str]] = field(default_factory=list)
+    figures: list[Path] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+def pages() -> list[Path]:
+    """README and every page of the site, in order of their paths."""
+    own = (page for page in DOCS.rglob("*.md") if "upstream" not in page.parts)
+    return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(own)]
+
+
+def name_of(page: Path) -> str:
+    """The page's path in the repository, with slashes."""
+    return page.relative_to(ROOT).as_posix()
+
+
+def blocks(text: str) -> list[Block]:
+    """All fenced blocks of a page."""
+    found = []
+    for match in _FENCE.finditer(text):
+        line = text.count("\n", 0, match.start("code")) + 1
+        found.append(
+            Block(
+                match["language"], match["code"], match["mark"], match["what"], line,
+                match.span("code"),
+            )
+        )  # fmt: skip
+    return found
+
+
+def runs(text: str) -> bool:
+    """Whether anything on this page is run."""
+    return any(
+        block.language in LANGUAGES and block.mark in (None, "setup") for block in blocks(text)
+    )
+
+
+def run_page(page: Path, folder: Path) -> Run:
+    """Run a page in a folder.
+
+    Args:
+        page: the Markdown file.
+        folder: where; it should be empty.
+
+    Raises:
+        PageError: a block failed.
+    """
+    text = page.read_text(encoding="utf-8")
+    done = Run(names={"__name__": "__page__"})
+    said, began = "", time.perf_counter()
+    with _inside(folder):
+        for block in blocks(text):
+            where = f"{name_of(page)}:{block.line}"
+            if block.mark == "setup":
+                runpy.run_path(str(DATA / str(block.what)), run_name="__main__")
+            if block.mark == "output":
+                done.printed.append((block.span, said))
+            elif block.mark == "file":
+                assert block.what is not None, where
+                Path(block.what).write_text(block.code, encoding="utf-8")
+            elif block.mark in (None, "setup") and block.language == "python":
+                said = _run_python(block, done.names, where)
+            elif block.mark in (None, "setup") and block.language == "sh":
+                said = _run_commands(block, where)
+    for shown in re.findall(r"\]\((?:\.\./)*(?:docs/)?figures/([\w-]+\.(?:svg|png))", text):
+        if (folder / shown).is_file():
+            done.figures.append(folder / shown)
+    done.seconds = time.perf_counter() - began
+    return done
+
+
+def rewrite(page: Path, done: Run) -> None:
+    """Put what a run printed and drew into the page and beside it."""
+    text = page.read_text(encoding="utf-8")
+    for (start, end), printed in sorted(done.printed, reverse=True):
+        lines = [line.rstrip() for line in printed.splitlines()]
+        text = text[:start] + "\n".join(lines).rstrip() + "\n" + text[end:]
+    page.write_text(text, encoding="utf-8")
+    FIGURES.mkdir(exist_ok=True)
+    for figure in done.figures:
+        shutil.copyfile(figure, FIGURES / figure.name)
+
+
+@contextlib.contextmanager
+def _inside(folder: Path) -> Iterator[None]:
+    import jax
+
+    before, columns = Path.cwd(), os.environ.get("COLUMNS")
+    bits = jax.config.jax_enable_x64
+    # A page may change what a reader's process may change; the next page begins as that one did.
+    jax.config.update("jax_enable_x64", False)
+    os.chdir(folder)
+    os.environ["COLUMNS"] = "100"
+    for data in sorted(DATA.glob("*.txt")) + sorted(DATA.glob("*.csv")):
+        shutil.copyfile(data, folder / data.name)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_x64", bits)
+        os.chdir(before)
+        if columns is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = columns
+
+
+def _run_python(block: Block, names: dict[str, object], where: str) -> str:
+    printed = io.StringIO()
+    code = "\n" * (block.line - 1) + block.code
+    try:
+        with contextlib.redirect_stdout(printed), warnings.catch_warnings():
+            warnings.simplefilter("error")
+            exec(compile(code, where, "exec"), names)
+    except Exception as error:
+        raise PageError(f"{where}: {type(error).__name__}: {error}") from error
+    finally:
+        if "matplotlib.pyplot" in sys.modules:
+            sys.modules["matplotlib.pyplot"].close("all")
+    return printed.getvalue()
+
+
+def _run_commands(block: Block, where: str) -> str:
+    from hw.cli import main as bench
+    from jaxcal.cli.main import main as engine
+
+    printed = io.StringIO()
+    for line in block.code.replace("\\\n", " ").splitlines():
+        program, *arguments = shlex.split(line, comments=True) or [""]
+        if not program:
+            continue
+        into = None
+        if ">" in arguments:
+            into = arguments[arguments.index(">") + 1]
+            arguments = arguments[: arguments.index(">")]
+        main = {"jaxcal": engine, "jaxcal-hw": bench}.get(program)
+        if main is None:
+            raise PageError(f"{where}: {program!r} is no command of ours: say why it is not run")
+        out, trouble = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(trouble):
+            status = main(arguments)
+        if status:
+            raise PageError(f"{where}: {line}: exit {int(status)}: {trouble.getvalue()}")
+        if into is None:
+            printed.write(out.getvalue())
+        else:
+            Path(into).write_text(out.getvalue(), encoding="utf-8")
+    return printed.getvalue()
+
+
+def run_all(chosen: list[Path], write: bool) -> Iterator[tuple[Path, Run | PageError]]:
+    """Run pages one after the other, each in a folder of its own.
+
+    Args:
+        chosen: the pages; those on which nothing is run are passed over.
+        write: whether to put outputs and figures into the pages.
+
+    Yields:
+        A page, and what came of it or why it failed.
+    """
+    for page in chosen:
+        if not runs(page.read_text(encoding="utf-8")):
+            continue
+        with tempfile.TemporaryDirectory(prefix="jaxcal-docs-") as folder:
+            try:
+                done = run_page(page, Path(folder))
+            except PageError as error:
+                yield page, error
+                continue
+            if write:
+                rewrite(page, done)
+        yield page, done
