@@ -30,6 +30,7 @@ import jaxcal
 from jaxcal.calibration import Calibration
 from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.dependence import independent
+from jaxcal.recording import make_images
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM
 
 SEED = 20261122
@@ -213,7 +214,7 @@ def main() -> None:
         truth: list[np.ndarray] = []
         for one in sets:
             try:
-                images, found = independent(jaxcal.recording.make_images(one.poses, one.points))
+                images, found = independent(make_images(one.poses, one.points))
             except jaxcal.InputError:
                 continue
             counted.append((images.poses[found.keep], images.measurements[found.keep]))

@@ -128,8 +128,8 @@ def calibrate(
     check_values(problem)
     problem = with_bound(problem, given)
     if not any(is_traced(leaf) for leaf in jax.tree.leaves((problem, given))):
-        problem, found = independent(problem, estimate)
-        result = _solve_alone(problem, given, plan).with_problem(problem)
+        joined, found = independent(problem, estimate)
+        result = _solve_alone(joined, given, plan).with_problem(joined)
         result = replace(result, notes=() if found.words is None else (found.words,))
         return widened(result)
     return _solve_alone(problem, given, plan).with_problem(problem)
