@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import os
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -19,9 +20,11 @@ from jaxcal.image_points import IMAGE_BLOCKS, image_rows
 from jaxcal.model.parameters import Blocks
 from jaxcal.problem import Problem, is_traced
 from jaxcal.solvers.auto import OffsetLaw
-from jaxcal.transform import AppliedPoints, ImageTransform
+from jaxcal.transform import AppliedPoints, ImageTransform, SaveFormat
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from jaxcal.diagnostics.residual_checks import Inspection
     from jaxcal.diagnostics.summary import Summary
 
@@ -432,6 +435,98 @@ class Calibration(eqx.Module):
     ) -> AppliedPoints:
         """Image points in the probe's or the tracker's frame; see :meth:`ImageTransform.apply`."""
         return self.image_transform().apply(pixels, pose, pixel_sd_px=pixel_sd_px)
+
+    def record(self, tre_points: tuple[tuple[float, float], ...] = ()) -> dict[str, Any]:
+        """What ``jaxcal calibrate --json`` prints, as plain values.
+
+        Args:
+            tre_points: further image points, in the images' unit, whose error is wanted.
+        """
+        from jaxcal.report.summary import record_of
+
+        return record_of(self, tre_points)
+
+    def verdict(self) -> list[str]:
+        """How accurate, what limits it and what to do, in sentences."""
+        from jaxcal.report.verdict import verdict
+
+        return verdict(self.record())
+
+    def save(self, path: str | os.PathLike[str], format: SaveFormat | None = None) -> None:
+        """Write the calibration, complete or not at all; :func:`jaxcal.load_calibration` reads it.
+
+        Args:
+            path: the file to make or replace.
+            format: as for :meth:`jaxcal.ImageTransform.save`; by default what the extension says.
+                ``json`` holds everything that is known of the calibration.
+
+        Raises:
+            InputError: a format that the extension does not tell, pixels that are not known, or a
+                batch.
+            OutputError: it could not be written; the file is as it was.
+        """
+        if format == "json" or (format is None and os.fspath(path).lower().endswith(".json")):
+            from jaxcal.report.write import write_json
+
+            write_json(path, self.record())
+        else:
+            self.image_transform().save(path, format)
+
+    def report(self, path: str | os.PathLike[str]) -> None:
+        """Write one page for a browser, as ``jaxcal calibrate --report`` does."""
+        from jaxcal.report.page import write_page
+        from jaxcal.report.summary import recording_of
+
+        write_page(path, self.record(), self, recording_of(self))
+
+    def plot_tre(self) -> Figure:
+        """Map of the error to expect over the image (matplotlib)."""
+        from jaxcal.report import plots
+
+        return plots.plot_tre(self)
+
+    def plot_residuals(self) -> Figure:
+        """Residual of every image (matplotlib)."""
+        from jaxcal.report import plots
+
+        return plots.plot_residuals(self)
+
+    def plot_offsets(self, truth: np.ndarray | None = None) -> Figure:
+        """Estimated elevational offsets (matplotlib), beside true ones (mm) where given."""
+        from jaxcal.report import plots
+
+        return plots.plot_offsets(self, truth)
+
+    def plot_influence(self) -> Figure:
+        """How far leaving out each image moves the calibration (matplotlib)."""
+        from jaxcal.report import plots
+
+        return plots.plot_influence(self)
+
+    def plot_limits(self) -> Figure:
+        """Where the errors come from (matplotlib)."""
+        from jaxcal.report import plots
+
+        return plots.plot_limits(self)
+
+    def __str__(self) -> str:
+        """Table and verdict; of a batch how many converged; traced: the names of the arrays."""
+        if self.problem is None or any(is_traced(leaf) for leaf in jax.tree.leaves(self)):
+            return repr(self)
+        from jaxcal.report import summary
+
+        if np.ndim(self.mask) != 1:
+            return summary.batch_text(self)
+        return summary.text_of(self)
+
+    def _repr_html_(self) -> str | None:
+        """For notebooks; None (so that the text is shown) where there is nothing to draw."""
+        traced = any(is_traced(leaf) for leaf in jax.tree.leaves(self))
+        if self.problem is None or traced or np.ndim(self.mask) != 1:
+            return None
+        from jaxcal.report.summary import html_of
+
+        return html_of(self)
 
     def numpy(self) -> Calibration:
         """The same with numpy arrays (concrete values).

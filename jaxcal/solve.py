@@ -7,6 +7,7 @@ shapes and options, and mapped over batches.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -22,6 +23,7 @@ from jaxcal.calibration import Calibration
 from jaxcal.dependence import independent
 from jaxcal.diagnostics.serial_correlation import widened
 from jaxcal.errors import InputError
+from jaxcal.inputs import as_batch, as_problem, unknown_names
 from jaxcal.options import (
     DELAY_SD_S,
     SOUND_SPEED_SD_M_S,
@@ -57,7 +59,7 @@ def calibrate(
     max_elevation: float | np.ndarray | Array | None = None,
     sigma: tuple[float, ...] | np.ndarray | Array | None = None,
     tracker_sd: float | Array | None = None,
-    estimate: tuple[str, ...] = (),
+    estimate: str | tuple[str, ...] = (),
     data: Data = "auto",
     sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S,
     delay_sd: float | Array = DELAY_SD_S,
@@ -82,7 +84,8 @@ def calibrate(
         sigma: given SDs of lateral position, range and elevational offset, mm; on channels, of an
             element's distance and the elevational offset.
         tracker_sd: isotropic SD of the tracked position, mm, beside given ``sigma``.
-        estimate: further unknowns: ``scale`` (the pixels' size), ``sound-speed``, ``delay``.
+        estimate: further unknowns: ``scale`` (the pixels' size), ``sound-speed``, ``delay``; one
+            name, or several.
         data: ``channels``: the joint method's residuals are those of every element's time of flight
             (the recording must hold them); ``points``: those of the segmented points; ``auto``:
             channels where they say more, on curvilinear probes and for sound speed or delay.
@@ -106,8 +109,7 @@ def calibrate(
             NaN, Inf and fewer than 4 different poses. Under jit, vmap or grad values cannot be
             looked at, and such problems come back with status ``failed``.
     """
-    if isinstance(problem, Recording):
-        problem = Problem.from_recording(problem)
+    problem, estimate = as_problem(problem, "jaxcal.calibrate"), unknown_names(estimate)
     problem = _in_asked_precision(problem, options, "jaxcal.calibrate")
     request = Request(
         method,
@@ -149,14 +151,14 @@ def _solve_alone(problem: Problem, given: Given, plan: Plan) -> Calibration:
 
 @in_own_modes
 def calibrate_batch(
-    problems: Problem,
+    problems: Problem | Sequence[Problem | Recording],
     method: Method = "joint",
     prior: PriorName = "auto",
     *,
     max_elevation: float | np.ndarray | Array | None = None,
     sigma: tuple[float, ...] | np.ndarray | Array | None = None,
     tracker_sd: float | Array | None = None,
-    estimate: tuple[str, ...] = (),
+    estimate: str | tuple[str, ...] = (),
     data: Data = "auto",
     sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S,
     delay_sd: float | Array = DELAY_SD_S,
@@ -173,7 +175,8 @@ def calibrate_batch(
     first use that it is n, one a core. Results do not depend on it.
 
     Args:
-        problems: leading axes of any shape; see :func:`jaxcal.stack`.
+        problems: leading axes of any shape; see :func:`jaxcal.stack`. A list of problems or
+            recordings with as many images each is stacked.
         method: as for :func:`calibrate`, and so are the following.
         prior: see there.
         max_elevation: see there.
@@ -193,6 +196,8 @@ def calibrate_batch(
     Raises:
         InputError: contradicting options, or problems without a leading axis.
     """
+    problems = as_batch(problems, "jaxcal.calibrate_batch")
+    estimate = unknown_names(estimate)
     if not problems.batch_shape:
         raise InputError("calibrate_batch needs problems with a leading axis; use calibrate")
     if chunk is not None and chunk < 1:

@@ -17,7 +17,8 @@ from jaxcal.errors import InputError, OutputError
 from jaxcal.options import Options
 from jaxcal.recording import Recording, make_images
 from jaxcal.report.convergence import KEPT, Curve, bounded_curves
-from jaxcal.report.figures import convergence_figure, offset_figure, residual_figure
+from jaxcal.report.figures import convergence_figure
+from jaxcal.report.plots import plot_offsets, plot_residuals
 from jaxcal.report.record import calibration_record, check_test_images, plain, truth_error
 from jaxcal.report.tables import calibration_table, comparison_table
 from jaxcal.report.verdict import verdict
@@ -258,16 +259,16 @@ def test_tables(record, failed, recording):
 
 
 def test_figures_have_units_and_data(result, recording):
-    residuals = residual_figure(result)
+    residuals = plot_residuals(result)
     assert [panel.get_ylabel() for panel in residuals.axes] == [
-        "lateral (mm)", "elevational (mm)", "axial (mm)",
+        "lateral (mm)", "axial (mm)", "elevational (mm)",
     ]  # fmt: skip
-    drawn = residuals.axes[0].lines[-1].get_xydata()
+    drawn = residuals.axes[0].lines[1].get_xydata()
     used = np.flatnonzero(recording.calibration.mask)
     np.testing.assert_array_equal(drawn[:, 0], used)
     np.testing.assert_array_equal(drawn[:, 1], result.residual[used, 0])
 
-    offsets = offset_figure(result, recording).axes[0]
+    offsets = plot_offsets(result, recording.truth.elevation).axes[0]
     assert "(mm)" in offsets.get_ylabel()
     labels = offsets.get_legend_handles_labels()[1]
     assert set(labels) == {"true", "estimated, with one SD", "at its bound"}
@@ -314,6 +315,8 @@ def test_report_files(tmp_path, record, result, recording):
     assert float(rows[3]["elevation_mm"]) == result.elevation[3]
     assert rows[LEFT_OUT]["used"] == "0"
     assert rows[LEFT_OUT]["lateral_mm"] == rows[LEFT_OUT]["elevation_mm"] == ""
+    assert {"verdict.txt", "accuracy.svg", "convergence.png"} <= {path.name for path in files}
+    assert (tmp_path / "verdict.txt").read_text().startswith(verdict(record)[0])
     for path in tmp_path.glob("*.png"):
         content = path.read_bytes()
         assert content.startswith(b"\x89PNG")
@@ -322,7 +325,7 @@ def test_report_files(tmp_path, record, result, recording):
 
 def test_report_of_a_failed_solve(tmp_path, failed, recording):
     lost = calibration_record(failed, recording)
-    assert len(write_report(tmp_path, lost, failed, recording, [])) == 5
+    assert len(write_report(tmp_path, lost, failed, recording, [])) == 3 + 2 * 2
     assert "nan" not in (tmp_path / "residuals.csv").read_text().lower()
 
 

@@ -205,12 +205,14 @@ def calibrate(
     from jaxcal.report.accuracy import settle
     from jaxcal.report.next_poses import next_poses_record
     from jaxcal.report.record import calibration_record, check_test_images
-    from jaxcal.report.write import prepare_folder, write_report
+    from jaxcal.report.write import check_writable, prepare_folder, write_report
 
     measured, notes = _segmented(load(recording))
     test_data = None if test is None else _segmented(load(test))[0]
     check_test_images(measured, test_data)
     enable_compilation_cache()
+    if report is not None:
+        check_writable(report)
     with nullcontext() if out is None else prepare_folder(out) as folder:
         with progress(f"calibrating ({method})"):
             traced = folder is not None and method == "conventional"
@@ -400,6 +402,8 @@ def _curves(recording: Recording, request: _Request, result: Calibration) -> lis
 
     if request.method == "conventional":
         return [own_curve(result)]
+    if request.method == "joint" and request.prior != "bounded":
+        return []
     return bounded_curves(
         Problem.from_recording(recording) if result.problem is None else result.problem,
         max_elevation=request.max_elevation,

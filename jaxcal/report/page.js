@@ -31,7 +31,7 @@ function scene(svg) {
     const x = Math.cos(turn) * p[0] + Math.sin(turn) * p[1];
     const y = -Math.sin(turn) * p[0] + Math.cos(turn) * p[1];
     const up = Math.cos(tilt) * p[2] - Math.sin(tilt) * y;
-    const scale = 0.42 * Math.min(width, height) / data.radius;
+    const scale = 0.48 * Math.min(width, height) / data.radius;
     return [width / 2 + scale * x, height / 2 - scale * up];
   }
 
@@ -49,7 +49,7 @@ function scene(svg) {
       const path = line.points.map(project).map((p) => p.map((v) => v.toFixed(1)).join(" "));
       add("path", {
         d: "M" + path.join("L"), fill: line.fill ?? "none", stroke: line.colour,
-        "stroke-width": line.width ?? 0.8, "fill-opacity": 0.12,
+        "stroke-width": line.width ?? 0.8, "fill-opacity": 0.03, "stroke-opacity": line.fill ? 0.45 : 1,
       });
     }
     for (const dot of data.dots) {
@@ -63,7 +63,7 @@ function scene(svg) {
     }
     // The axes' directions in a corner, and a bar of a round length.
     const origin = project(data.centre);
-    const size = 0.42 * Math.min(width, height) / data.radius;
+    const size = 0.48 * Math.min(width, height) / data.radius;
     for (const [k, name] of ["x", "y", "z"].entries()) {
       const end = data.centre.map((value, j) => value + (j === k ? 1 : 0));
       const [a, b] = project(end).map((value, j) => (value - origin[j]) / size * 22);

@@ -27,11 +27,20 @@ from jaxcal.recording import Recording
 from jaxcal.report import svg
 from jaxcal.report.certified import certificate_words
 from jaxcal.report.next_poses import next_poses_sentences
-from jaxcal.report.verdict import advice, verdict
+from jaxcal.report.resampled import resampled_sentences
+from jaxcal.report.verdict import (
+    advice,
+    believe,
+    certainty,
+    contradictions,
+    headline,
+    limits,
+    where,
+)
 from jaxcal.transform import SaveFormat, transform_from_record
 
-MOST_POSES = 300
-"""Poses that are drawn in space,"""
+MOST_POSES, MOST_PLANES = 300, 60
+"""Poses that are drawn in space, and planes of images;"""
 LONGEST_LIST = 3000
 """and entries of a list that is kept in the page's record."""
 
@@ -71,15 +80,16 @@ def write_page(
 def page(record: dict[str, Any], result: Calibration, recording: Recording) -> str:
     """The page as text."""
     answer = result.numpy()
-    known = record["status"] in ("converged", "max_iterations")
+    # Of wrong frames there is nothing to be copied or believed.
+    known = _usable(record)
     sections = [
         _head(record),
         _findings(record),
-        *([_accuracy(record, answer, recording)] if record["tre"] is not None else []),
+        *([_accuracy(record, answer, recording)] if known and record["tre"] is not None else []),
         *([_matrix(record)] if known else []),
         *([_scene(record, answer, recording)] if known else []),
         *([_residuals(record, answer)] if known else []),
-        *([_limits(record)] if record["limits"] is not None else []),
+        *([_limits(record)] if known and record["limits"] is not None else []),
         *([_comparison(record)] if known else []),
         _observability(record),
         _facts(record),
@@ -98,6 +108,10 @@ def page(record: dict[str, Any], result: Calibration, recording: Recording) -> s
         + f"\n{_embedded('record', _shortened(record))}\n<script>\n{script}</script>\n"
         "</body></html>\n"
     )
+
+
+def _usable(record: dict[str, Any]) -> bool:
+    return record["status"] in ("converged", "max_iterations") and not record.get("wrong_frames")
 
 
 def _embedded(name: str, value: Any) -> str:
@@ -148,11 +162,11 @@ def _section(title: str, *parts: str) -> str:
 
 
 def _head(record: dict[str, Any]) -> str:
-    lines, tre = verdict(record), record["tre"]
+    tre = record["tre"]
     word = record["verdict"] or "do not use"
     kind = escape(record["verdict"] or "uncertain")
     number = ""
-    if tre is not None and tre.get("rms_mm") is not None:
+    if _usable(record) and tre is not None and tre.get("rms_mm") is not None:
         number = (
             f'<div><span class="big">{_number(record, "tre.rms_mm", ".2f", "mm")}</span>'
             "<small>error to expect at the image (TRE, root mean square)<br>95 % interval "
@@ -160,15 +174,16 @@ def _head(record: dict[str, Any]) -> str:
             f"{_number(record, 'tre.interval_95_mm.1', '.2f', 'mm')}</small></div>"
         )
     prior = "" if record["prior"] == "none" else f", prior {record['prior']}"
-    said = [line for line in lines[1:] if not line.startswith("- ")]
-    said = [line for line in said if line not in ("Look at this:", "What to do:")]
+    said = [headline(record)]
+    if _usable(record):
+        said += [*contradictions(record), *where(record), *limits(record)]
     return (
         f"<header><h1>Calibration of {escape(Path(record['source']).name)}</h1>"
         f'<p class="soft">{escape(record["source"])}: {record["images_used"]} images used of '
         f"{record['images']}; method {escape(record['method'] + prior)}; "
         f"jaxcal {escape(record['jaxcal_version'])}</p></header>"
         f'<div class="verdict {kind}"><div class="word">{escape(word)}</div>{number}</div>'
-        f"{_paragraphs([lines[0], *said])}"
+        f"{_paragraphs(said)}"
     )
 
 
@@ -291,7 +306,7 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     centre = 0.5 * (far.min(axis=0) + far.max(axis=0))
     lines = [
         {"points": _rounded(outline), "colour": svg.BLUE, "width": 0.5, "fill": svg.BLUE}
-        for outline in frames
+        for outline in frames[:: max(-(-len(frames) // MOST_PLANES), 1)]
     ]
     dots = [
         {"at": _rounded(frame[:3, 3]), "r": 1.6, "colour": svg.BLUE, "title": f"image {image}"}
@@ -308,7 +323,7 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
         ("scene-all", whole, "Planes of the images (blue) and the target (orange), in the "
          "tracker's frame. Drag, or use the arrow keys, to turn."),
         ("scene-target", close, "The target as each image puts it (green; does not fit the rest: "
-         "orange), the estimate (black) with its 95 % ellipsoid."),
+         "orange), and the estimate with its 95 % ellipsoid (lines)."),
     )  # fmt: skip
     parts = [
         f'<figure>{_embedded(name, data)}<svg class="scene" viewBox="0 0 380 300" role="img" '
@@ -409,19 +424,14 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
             "How far leaving out an image would move the calibration, mm at the image",
             height=120.0,
         )
-        parts.append(
+        parts[1] += (
             f"<figure>{third}<figcaption>Which images hurt: how far the image would move if one of "
             "them were left out (to first order). Rings: the three that move it most."
             "</figcaption></figure>"
         )
-    held = record.get("cross_validation")
-    words = ""
-    if held is not None and held["precision_mm"] is not None:
-        words = (
-            "<p>On images that were not used for it the precision is "
-            f"{_number(record, 'cross_validation.precision_mm', '.2f', 'mm')}.</p>"
-        )
-    return _section("Image by image", f'<div class="grid">{"".join(parts)}</div>', words)
+    words = _paragraphs(resampled_sentences(record))
+    columns = "".join(f"<div>{part}</div>" for part in parts)
+    return _section("Image by image", f'<div class="grid">{columns}</div>', words)
 
 
 def _limits(record: dict[str, Any]) -> str:
@@ -462,6 +472,11 @@ def _comparison(record: dict[str, Any]) -> str:
         ("residual, root mean square (mm)", "conventional_rms_mm", "rms_mm", ".3f"),
         ("error at the image by the noise found (mm)", "conventional_tre_mm", "tre_mm", ".3f"),
     )
+    gain = (
+        "<tr><td>images left out, log density</td><td class='n'>0</td><td class='n'>"
+        f"{_number(record, 'comparison.log_density_gain', '+.1f')} ± "
+        f"{_number(record, 'comparison.log_density_gain_sd', '.1f')}</td></tr>"
+    )
     cells = "".join(
         f'<tr><td>{escape(name)}</td><td class="n">{_number(record, "comparison." + other, form)}'
         f'</td><td class="n">{_number(record, "comparison." + own, form)}</td></tr>'
@@ -470,28 +485,21 @@ def _comparison(record: dict[str, Any]) -> str:
     return _section(
         "Beside the conventional fit",
         '<div class="wide"><table><tr><th></th><th class="n">conventional</th><th class="n">'
-        f"{escape(record['method'])}</th></tr>{cells}</table></div>",
-        "<p>The conventional fit takes every target for in the plane and weighs all errors alike: "
-        "it minimises the first row and nothing else. They differ by "
-        f"{_number(record, 'comparison.apart_mm', '.2f', 'mm')} at the image. Images left out are "
-        "predicted from the others with a log density that is "
-        f"{_number(record, 'comparison.log_density_gain', '+.1f')} ± "
-        f"{_number(record, 'comparison.log_density_gain_sd', '.1f')} higher than by the "
-        "conventional fit.</p>",
+        f"{escape(record['method'])}</th></tr>{cells}{gain}</table></div>",
+        _paragraphs(believe(record)),
     )
 
 
 def _observability(record: dict[str, Any]) -> str:
     sight = record["observability"]
     words = [f"Least known: {sight['weakest_direction']}."]
-    if sight["known_only_from_prior"]:
-        words.append(f"Known only from what is believed of the offsets: "
-                     f"{sight['known_only_from_prior']}.")  # fmt: skip
+    if _usable(record):
+        words += certainty(record)
     proved = certificate_words(record)
     if proved is not None:
         words.append(f"{proved[0].upper()}{proved[1:]}.")
     parts = [_paragraphs(words)]
-    if record["image_covariance"] is not None:
+    if _usable(record) and record["image_covariance"] is not None:
         covariance = np.array(record["image_covariance"], float)
         sd = np.sqrt(np.diagonal(covariance))
         names = record["image_unknowns"]

@@ -10,9 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from html import escape
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+
+Number = float | int | np.floating
 
 WIDTH = 380.0
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8a8a8a"
@@ -24,7 +27,7 @@ _VIRIDIS = (
 """Nine colours of matplotlib's viridis (public domain, CC0), evenly lighter."""
 
 
-def viridis(share: float) -> str:
+def viridis(share: Number) -> str:
     """Colour of a number between 0 and 1."""
     place = min(max(share, 0.0), 1.0) * (len(_VIRIDIS) - 1)
     low = min(int(place), len(_VIRIDIS) - 2)
@@ -35,7 +38,7 @@ def viridis(share: float) -> str:
     return "#" + "".join(f"{value:02x}" for value in mixed)
 
 
-def ticks(low: float, high: float, most: int = 6) -> list[float]:
+def ticks(low: Number, high: Number, most: int = 6) -> list[Any]:
     """Round numbers between two others, at most so many."""
     if not high > low:
         return [low]
@@ -46,17 +49,17 @@ def ticks(low: float, high: float, most: int = 6) -> list[float]:
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
-def number(value: float) -> str:
+def number(value: Number) -> str:
     """A tick's label: no more digits than it needs, a true minus sign."""
     return f"{value:.6g}".replace("-", "−")
 
 
-def _at(value: float) -> str:
+def _at(value: Number) -> str:
     return f"{value:.2f}".rstrip("0").rstrip(".")
 
 
 def text(
-    x: float, y: float, words: str, anchor: str = "middle", kind: str = "", turn: float = 0.0
+    x: Number, y: Number, words: str, anchor: str = "middle", kind: str = "", turn: Number = 0.0
 ) -> str:
     """Words at a place; they are escaped."""
     turned = f' transform="rotate({_at(turn)} {_at(x)} {_at(y)})"' if turn else ""
@@ -68,7 +71,7 @@ def text(
 
 
 def line(
-    x1: float, y1: float, x2: float, y2: float, colour: str = "var(--line)", width: float = 1.0
+    x1: Number, y1: Number, x2: Number, y2: Number, colour: str = "var(--line)", width: Number = 1.0
 ) -> str:
     """A straight line."""
     return (
@@ -77,7 +80,7 @@ def line(
     )
 
 
-def figure(height: float, parts: Iterable[str], label: str) -> str:
+def figure(height: Number, parts: Iterable[str], label: str) -> str:
     """An SVG element with a name that is read aloud."""
     return (
         f'<svg viewBox="0 0 {_at(WIDTH)} {_at(height)}" role="img" aria-label="{escape(label)}">'
@@ -97,15 +100,15 @@ class Panel:
 
     def __init__(
         self,
-        box: tuple[float, float, float, float],
-        x: tuple[float, float],
-        y: tuple[float, float],
+        box: tuple[Number, Number, Number, Number],
+        x: tuple[Number, Number],
+        y: tuple[Number, Number],
         *,
         down: bool = False,
     ) -> None:
         self.box, self.x, self.y, self.down = box, x, y, down
 
-    def place(self, x: float, y: float) -> tuple[float, float]:
+    def place(self, x: Number, y: Number) -> tuple[Any, Any]:
         """Where a point is in the figure."""
         left, top, right, bottom = self.box
         across = left + (right - left) * (x - self.x[0]) / (self.x[1] - self.x[0])
@@ -121,7 +124,7 @@ class Panel:
             parts.append(line(across, top, across, bottom, "var(--grid)", 0.6))
             if x_label:
                 parts.append(text(across, bottom + 12, number(value), kind="tick"))
-        for value in ticks(*self.y, max(int((bottom - top) / 24), 3)):
+        for value in ticks(*self.y, max(int((bottom - top) / 19), 3)):
             down = self.place(self.x[0], value)[1]
             parts.append(line(left, down, right, down, "var(--grid)", 0.6))
             parts.append(text(left - 5, down + 3.2, number(value), "end", "tick"))
@@ -138,12 +141,12 @@ class Panel:
 
     def stems(
         self,
-        x: Sequence[float],
-        y: Sequence[float],
+        x: Sequence[Any],
+        y: Sequence[Any],
         colour: str = BLUE,
         titles: Sequence[str] | None = None,
         *,
-        radius: float = 1.9,
+        radius: Number = 1.9,
     ) -> list[str]:
         """Points with a line to zero; one path for all lines, and with titles a dot each."""
         zero = min(max(0.0, self.y[0]), self.y[1])
@@ -159,9 +162,7 @@ class Panel:
             )
         return [f'<path d="{"".join(moves)}" stroke="{colour}" stroke-width="0.7"/>', *dots]
 
-    def bars(
-        self, x: Sequence[float], low: Sequence[float], high: Sequence[float], colour: str
-    ) -> str:
+    def bars(self, x: Sequence[Any], low: Sequence[Any], high: Sequence[Any], colour: str) -> str:
         """Vertical intervals, as one path."""
         moves = []
         for a, b, c in zip(x, low, high, strict=True):
@@ -171,13 +172,13 @@ class Panel:
 
 
 def series(
-    panels: Sequence[tuple[str, Sequence[float], Sequence[float], str]],
-    marked: Sequence[int],
+    panels: Sequence[tuple[str, Sequence[Any], Sequence[Any], str]],
+    marked: Sequence[Any],
     label: str,
     *,
-    spreads: Sequence[Sequence[float] | None] | None = None,
+    spreads: Sequence[Sequence[Any] | None] | None = None,
     x_label: str = "image",
-    height: float = 96.0,
+    height: Number = 96.0,
 ) -> str:
     """Panels one above the other, with one scale for all: a value of each image.
 
@@ -284,7 +285,7 @@ def error_map(
     return figure(10.0 + down + 34.0, parts, label)
 
 
-def _colour_bar(left: float, top: float, height: float, low: float, high: float) -> list[str]:
+def _colour_bar(left: Number, top: Number, height: Number, low: Number, high: Number) -> list[str]:
     parts = [text(left, top - 8, "mm", "start", "tick")]
     steps = 40
     for k in range(steps):
@@ -300,7 +301,7 @@ def _colour_bar(left: float, top: float, height: float, low: float, high: float)
     return parts
 
 
-def stacked(rows: Sequence[tuple[str, Sequence[tuple[str, float, str]]]], label: str) -> str:
+def stacked(rows: Sequence[tuple[str, Sequence[tuple[str, Any, str]]]], label: str) -> str:
     """Horizontal bars of shares that add up to one, with a legend.
 
     Args:

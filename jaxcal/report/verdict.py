@@ -42,8 +42,8 @@ def verdict(record: dict[str, Any]) -> list[str]:
     lines = [headline(record)]
     usable = record["status"] in ("converged", "max_iterations")
     if usable and not record.get("wrong_frames"):
-        lines += [*_contradictions(record), *_where(record), *limits(record), *_believe(record)]
-        lines += [*_certainty(record), *resampled_sentences(record)]
+        lines += [*contradictions(record), *where(record), *limits(record), *believe(record)]
+        lines += [*certainty(record), *resampled_sentences(record)]
         proved = certificate_words(record)
         if proved is not None:
             lines.append(f"{proved[0].upper()}{proved[1:]}.")
@@ -89,7 +89,8 @@ def _mm(value: float | None) -> str:
     return f"{value:.{1 if value >= 10 else digits}f} mm"
 
 
-def _contradictions(record: dict[str, Any]) -> list[str]:
+def contradictions(record: dict[str, Any]) -> list[str]:
+    """What makes the error larger than the covariance states."""
     tre = record.get("tre")
     if tre is None or not tre.get("contradictions"):
         return []
@@ -99,7 +100,7 @@ def _contradictions(record: dict[str, Any]) -> list[str]:
     ]
 
 
-def _where(record: dict[str, Any]) -> list[str]:
+def where(record: dict[str, Any]) -> list[str]:
     """Where in the image, and the points that were asked for."""
     tre = record.get("tre")
     if tre is None or tre.get("rms_mm") is None:
@@ -194,7 +195,7 @@ def _poses(record: dict[str, Any]) -> str | None:
     )
 
 
-def _believe(record: dict[str, Any]) -> list[str]:
+def believe(record: dict[str, Any]) -> list[str]:
     """Why this answer and not the conventional one, with the comparison."""
     beside = record.get("comparison")
     if beside is None:
@@ -236,7 +237,8 @@ def spread_of_transform(record: dict[str, Any]) -> tuple[float, float] | None:
     return math.sqrt(sum(variances[:3])), math.degrees(math.sqrt(sum(variances[3:])))
 
 
-def _certainty(record: dict[str, Any]) -> list[str]:
+def certainty(record: dict[str, Any]) -> list[str]:
+    """How certain the transform is, and what that rests on."""
     spread = spread_of_transform(record)
     if spread is None:
         return ["How certain the transform is cannot be said from these images."]

@@ -20,6 +20,7 @@ from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.readable import one_line
 from jaxcal.recording import Recording
 from jaxcal.report.convergence import Curve
+from jaxcal.report.verdict import verdict
 
 COLUMNS = (
     "image",
@@ -73,6 +74,20 @@ def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """See that a file can be made or replaced, before any work is done for it.
+
+    Raises:
+        OutputError: it cannot.
+    """
+    with suppress(_Unwritten), atomic_path(path):
+        raise _Unwritten
+
+
+class _Unwritten(Exception):
+    """Nothing is to be written."""
+
+
 def write_report(
     folder: Path,
     record: dict[str, Any],
@@ -87,31 +102,46 @@ def write_report(
         record: of :func:`jaxcal.report.record.calibration_record`.
         result: the calibration.
         recording: what was calibrated.
-        curves: for convergence.png.
+        curves: of the method's objective, for convergence.png; none: no such figure.
 
     Returns:
-        The files: calibration.json, residuals.csv, residuals.png, offsets.png, convergence.png.
+        The files: calibration.json, verdict.txt, residuals.csv, and each figure as .png and .svg:
+        accuracy, influence and limits (not of an answer that is not determined), residuals,
+        offsets, convergence.
 
     Raises:
         OutputError: a file could not be written; it is as it was.
     """
     # Matplotlib takes half a second to import: only when there is something to draw.
-    from jaxcal.report.figures import convergence_figure, offset_figure, residual_figure
+    from jaxcal.report import plots
+    from jaxcal.report.figures import convergence_figure
 
+    truth = None if recording.truth is None else recording.truth.elevation
     figures = {
-        "residuals.png": residual_figure(result),
-        "offsets.png": offset_figure(result, recording),
-        "convergence.png": convergence_figure(curves),
+        "residuals": plots.plot_residuals(result),
+        "offsets": plots.plot_offsets(result, truth),
     }
+    if record.get("tre") is not None:
+        figures |= {
+            "accuracy": plots.plot_tre(result),
+            "influence": plots.plot_influence(result),
+            "limits": plots.plot_limits(result),
+        }
+    if curves:
+        figures["convergence"] = convergence_figure(curves)
     write_json(folder / "calibration.json", record)
+    write_text(folder / "verdict.txt", "\n".join(verdict(record)) + "\n")
     write_text(folder / "residuals.csv", _residual_table(result))
+    names = ["calibration.json", "verdict.txt", "residuals.csv"]
     for name, figure in figures.items():
-        with atomic_path(folder / name) as temporary:
-            figure.savefig(temporary, format="png")
-    return [folder / name for name in ("calibration.json", "residuals.csv", *figures)]
+        for kind in ("png", "svg"):
+            with atomic_path(folder / f"{name}.{kind}") as temporary:
+                figure.savefig(temporary, format=kind)
+            names.append(f"{name}.{kind}")
+    return [folder / name for name in names]
 
 
-def write_json(path: Path, record: dict[str, Any]) -> None:
+def write_json(path: str | os.PathLike[str], record: dict[str, Any]) -> None:
     """Write a record as a JSON file, complete or not at all.
 
     Raises:

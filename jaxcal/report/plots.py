@@ -1,0 +1,222 @@
+"""Figures for a publication, of a calibration in memory: one style, units, colours for everybody.
+
+Each function returns a matplotlib Figure that belongs to no window: ``figure.savefig("a.pdf")``; a
+notebook shows it. Sizes are those of a journal's column (88 mm) or page (180 mm).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from jaxcal.calibration import Calibration
+from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.influence import KINDS, in_image, influence_of
+from jaxcal.diagnostics.intervals import image_jacobian, tre_at
+from jaxcal.errors import InputError
+from jaxcal.report.accuracy import region_of
+from jaxcal.report.summary import recording_of
+
+COLUMN_MM, PAGE_MM = 88.0, 180.0
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+"""Okabe and Ito's, which the colour-blind can tell apart; one a kind of error."""
+COLOURS = {"lateral": BLUE, "range": GREEN, "axial": GREEN, "elevational": ORANGE}
+
+
+def canvas(width_mm: float, height_mm: float) -> Figure:
+    """A figure of a size on paper, without pyplot."""
+    figure = Figure(figsize=(width_mm / 25.4, height_mm / 25.4), dpi=200, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def styled(axes: Axes) -> Axes:
+    """Small type, thin lines, no box."""
+    axes.tick_params(labelsize=7, width=0.6, length=2.5)
+    for side, spine in axes.spines.items():
+        spine.set_linewidth(0.6)
+        spine.set_visible(side in ("left", "bottom"))
+    axes.xaxis.label.set_size(8)
+    axes.yaxis.label.set_size(8)
+    axes.title.set_size(8)
+    return axes
+
+
+def plot_tre(calibration: Calibration, points: int = 61) -> Figure:
+    """Map over the image of the target registration error that the covariance states, mm.
+
+    Args:
+        calibration: of one problem, with concrete values.
+        points: along each side of the map.
+
+    Raises:
+        InputError: X is not observable.
+    """
+    answer, recording = _one(calibration)
+    if not np.isfinite(answer.unknowns_covariance).all():
+        raise InputError("these images do not determine the calibration: there is no error to map")
+    region = region_of(answer, recording)
+    side = np.linspace(-1.0, 1.0, points)
+    cells = region.place(np.stack(np.meshgrid(side, side), axis=-1))[..., [0, 2]]
+    error = tre_at(answer, cells).rms
+    figure = canvas(COLUMN_MM, COLUMN_MM)
+    axes = styled(figure.subplots())
+    drawn = axes.pcolormesh(
+        cells[..., 0], cells[..., 1], error, cmap="viridis", shading="gouraud", rasterized=True
+    )
+    lines = axes.contour(
+        cells[..., 0], cells[..., 1], error, colors="white", linewidths=0.5, levels=5
+    )
+    axes.clabel(lines, fontsize=6, fmt="%.2f")
+    seen = _targets(answer, recording.calibration.poses)[np.asarray(answer.mask) > 0]
+    axes.plot(seen[:, 0], seen[:, 2], "o", ms=1.8, mfc="white", mec="black", mew=0.4)
+    axes.set_aspect("equal")
+    axes.invert_yaxis()
+    axes.set(xlabel="lateral (mm)", ylabel="depth (mm)")
+    bar = figure.colorbar(drawn, ax=axes, shrink=0.8)
+    bar.set_label("target registration error (mm)", size=8)
+    bar.ax.tick_params(labelsize=7, width=0.6)
+    bar.outline.set_linewidth(0.6)  # pyright: ignore[reportCallIssue]
+    _scale_bar(axes, 10.0)
+    return figure
+
+
+def plot_residuals(calibration: Calibration) -> Figure:
+    """Residual of every image from the plane, mm: lateral, axial, elevational, on one scale."""
+    answer, _ = _one(calibration)
+    used = np.flatnonzero(np.asarray(answer.mask) > 0)
+    named = np.intersect1d(messages.outliers(answer), used)
+    residual = np.asarray(answer.residual)
+    figure = canvas(PAGE_MM, 110.0)
+    panels = figure.subplots(3, 1, sharex=True, sharey=True)
+    for panel, (name, axis) in zip(
+        panels, (("lateral", 0), ("axial", 2), ("elevational", 1)), strict=True
+    ):
+        styled(panel)
+        panel.axhline(0.0, color=GREY, linewidth=0.5)
+        panel.vlines(used, 0.0, residual[used, axis], color=COLOURS[name], linewidth=0.7)
+        panel.plot(used, residual[used, axis], "o", color=COLOURS[name], ms=2.2)
+        if len(named):
+            panel.plot(
+                named, residual[named, axis], "o", ms=6, mfc="none", mec="black", mew=0.7,
+                label="does not fit the rest",
+            )  # fmt: skip
+        panel.set_ylabel(f"{name} (mm)")
+    if len(named):
+        panels[0].legend(fontsize=7, frameon=False, loc="best")
+    panels[-1].set_xlabel("image")
+    return figure
+
+
+def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None = None) -> Figure:
+    """Estimated distance of the target from the image plane with one SD, mm.
+
+    Args:
+        calibration: of one problem.
+        truth: true offsets, mm, where they are known.
+    """
+    answer, _ = _one(calibration)
+    used = np.flatnonzero(np.asarray(answer.mask) > 0)
+    figure = canvas(PAGE_MM, 60.0)
+    panel, side = figure.subplots(1, 2, sharey=True, width_ratios=(5, 1))
+    styled(panel).axhline(0.0, color=GREY, linewidth=0.5)
+    spread = np.nan_to_num(np.asarray(answer.elevation_sd)[used], nan=0.0)
+    offset = np.asarray(answer.elevation)[used]
+    panel.errorbar(
+        used, offset, yerr=spread, fmt="o", color=ORANGE, ecolor=GREY, ms=2.2, linewidth=0.7,
+        label="estimated, with one SD",
+    )  # fmt: skip
+    resting = used[np.asarray(answer.at_bound)[used] > 0]
+    if len(resting):
+        panel.plot(resting, np.asarray(answer.elevation)[resting], "s", ms=5, mfc="none",
+                   mec=GREEN, mew=0.8, label="at its bound")  # fmt: skip
+    if truth is not None:
+        panel.plot(used, np.asarray(truth)[used], "x", color="black", ms=3, mew=0.7, label="true")
+    panel.legend(fontsize=7, frameon=False, loc="best")
+    panel.set(xlabel="image", ylabel="elevational offset (mm)")
+    styled(side).hist(offset, bins="fd", orientation="horizontal", color=ORANGE, alpha=0.8)
+    side.set_xlabel("images")
+    return figure
+
+
+def plot_influence(calibration: Calibration) -> Figure:
+    """How far leaving out each image moves the image, mm, and how far it should."""
+    answer, recording = _one(calibration)
+    if not np.isfinite(answer.unknowns_covariance).all():
+        raise InputError("these images do not determine the calibration: nothing can be left out")
+    weight = _weight(answer, recording)
+    moved, expected = in_image(influence_of(answer), weight)
+    used = np.flatnonzero(np.asarray(answer.mask) > 0)
+    figure = canvas(PAGE_MM, 60.0)
+    panel = styled(figure.subplots())
+    panel.vlines(used, 0.0, moved[used], color=BLUE, linewidth=0.8)
+    panel.plot(used, moved[used], "o", color=BLUE, ms=2.4, label="by leaving it out")
+    panel.plot(used, expected[used], "_", color="black", ms=4, mew=0.8,
+               label="if the noise model holds (SD)")  # fmt: skip
+    for image in used[np.argsort(-moved[used])[:3]]:
+        panel.annotate(str(image), (image, moved[image]), (0, 3), textcoords="offset points",
+                       ha="center", fontsize=7)  # fmt: skip
+    panel.set(xlabel="image", ylabel="moves the image by (mm)", ylim=(0.0, None))
+    panel.margins(y=0.12)
+    panel.legend(fontsize=7, frameon=False, loc="best")
+    return figure
+
+
+def plot_limits(calibration: Calibration) -> Figure:
+    """Where the errors come from: shares of mean squares, of the calibration and of the scatter."""
+    answer, recording = _one(calibration)
+    weight = _weight(answer, recording)
+    part = np.einsum("pq,kpq->k", weight, influence_of(answer).shares)
+    residual = np.asarray(answer.residual)[np.asarray(answer.mask) > 0]
+    squares = np.mean(residual**2, axis=0)[[0, 2, 1]]
+    figure = canvas(PAGE_MM, 38.0)
+    panel = styled(figure.subplots())
+    rows = ("distance of the target\nfrom its place", "error of the calibration\nat the image")
+    for row, values in enumerate((squares / squares.sum(), part / part.sum())):
+        left = 0.0
+        for kind, share in zip(KINDS, values, strict=True):
+            panel.barh(row, share, left=left, color=COLOURS[kind], height=0.6,
+                       label=kind if row else None)  # fmt: skip
+            if share > 0.05:
+                panel.text(left + share / 2, row, f"{100 * share:.0f} %", ha="center",
+                           va="center", color="white", fontsize=7)  # fmt: skip
+            left += share
+    panel.set_yticks([0, 1], rows)
+    panel.set(xlim=(0, 1), xlabel="share of the mean square")
+    panel.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def _weight(answer: Calibration, recording: Any) -> Float[np.ndarray, "p p"]:
+    grid = region_of(answer, recording).grid()[:, [0, 2]]
+    jacobian = image_jacobian(answer, grid)
+    return np.einsum("mia,mib->ab", jacobian, jacobian) / len(grid)
+
+
+def _one(calibration: Calibration) -> tuple[Calibration, Any]:
+    return calibration.numpy(), recording_of(calibration)
+
+
+def _targets(answer: Calibration, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 3"]:
+    x = np.asarray(answer.image_to_probe)
+    away = np.asarray(answer.point) - poses[:, :3, 3]
+    in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], away)
+    return (in_probe - x[:3, 3]) @ x[:3, :3]
+
+
+def _scale_bar(axes: Axes, length: float) -> None:
+    """A bar of a length (mm), in the lower right corner."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    x = right - 0.05 * (right - left)
+    y = bottom + 0.04 * (top - bottom)
+    axes.plot([x - length, x], [y, y], color="white", linewidth=2.0, solid_capstyle="butt",
+              zorder=6)  # fmt: skip
+    # Above the contours' labels, and readable on whatever lies below.
+    axes.text(x - length / 2, y + 0.025 * (top - bottom), f"{length:g} mm", color="white",
+              ha="center", va="bottom", fontsize=7, zorder=6,
+              bbox={"facecolor": "black", "alpha": 0.55, "linewidth": 0, "pad": 1.5})  # fmt: skip

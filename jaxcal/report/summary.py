@@ -1,0 +1,138 @@
+"""A calibration in Python: as a table with its verdict, for a notebook, and as a file.
+
+What the command line says of a recording's calibration is said here of one in memory, from the
+problem that it holds.
+"""
+
+from __future__ import annotations
+
+import io
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from jaxcal.calibration import Calibration
+from jaxcal.errors import CalibrationError
+from jaxcal.recording import Images, Recording
+from jaxcal.report.record import calibration_record
+
+
+def recording_of(calibration: Calibration) -> Recording:
+    """The data that a calibration is of, as a recording.
+
+    Raises:
+        CalibrationError: a calibration without its problem, or a batch.
+    """
+    answer = calibration.numpy()
+    problem = answer.problem
+    if problem is None:
+        raise CalibrationError(
+            "this calibration does not hold its problem: add it with calibration.with_problem"
+        )
+    if np.ndim(answer.mask) != 1:
+        raise CalibrationError("a batch holds many calibrations: take one of them, batch[0]")
+    mask = np.asarray(problem.mask) > 0
+    used = mask[:, None]
+    spacing = None
+    if problem.pixels:
+        spacing = np.asarray(problem.spacing, float) if problem.spacing_known else None
+    images = Images(
+        poses=np.where(used[..., None], np.asarray(problem.poses, float), np.eye(4)),
+        measurements=np.where(used, np.asarray(problem.measurements, float), 1.0),
+        kind="pixel" if problem.pixels else "point",
+        mask=mask,
+        spacing_mm=spacing,
+        face_offset_mm=float(np.asarray(problem.face_offset)),
+    )
+    return Recording(images, source="memory")
+
+
+def record_of(
+    calibration: Calibration, tre_points: tuple[tuple[float, float], ...] = ()
+) -> dict[str, Any]:
+    """What ``jaxcal calibrate --json`` prints, of a calibration in memory.
+
+    Args:
+        calibration: of one problem, with concrete values.
+        tre_points: further image points, in the images' unit, whose error is wanted.
+    """
+    return calibration_record(calibration, recording_of(calibration), tre_points=tre_points)
+
+
+def text_of(calibration: Calibration, width: int = 100) -> str:
+    """Table and verdict, as a terminal shows them."""
+    import textwrap
+
+    from rich.console import Console
+
+    from jaxcal.report.tables import calibration_table
+    from jaxcal.report.verdict import verdict
+
+    record = record_of(calibration)
+    console = Console(
+        file=io.StringIO(),
+        width=width,
+        markup=False,
+        highlight=False,
+        emoji=False,
+        color_system=None,
+    )
+    with console.capture() as captured:
+        console.print(calibration_table(record))
+    lines = [
+        textwrap.fill(line, width, subsequent_indent="  " if line.startswith("- ") else "")
+        for line in verdict(record)
+    ]
+    table = "\n".join(line.rstrip() for line in captured.get().splitlines())
+    return table + "\n" + "\n".join(lines)
+
+
+def batch_text(calibration: Calibration) -> str:
+    """How many of a batch converged, and where to look on."""
+    status = np.asarray(calibration.status)
+    names, counts = np.unique(status, return_counts=True)
+    told = ", ".join(f"{count} {name}" for name, count in zip(names, counts, strict=True))
+    shape = " x ".join(map(str, status.shape))
+    return f"Calibration of a batch of {shape}: {told or 'empty'}; batch[0] is the first of them"
+
+
+def html_of(calibration: Calibration) -> str:
+    """Verdict, error map and numbers, for a notebook: no script, and styles of its own."""
+    from jaxcal.report import svg
+    from jaxcal.report.verdict import verdict
+
+    record = record_of(calibration)
+    lines = verdict(record)
+    drawn, tre = "", record["tre"]
+    if tre is not None and tre.get("factor") is not None:
+        answer, mapped = calibration.numpy(), tre["map"]
+        images = recording_of(calibration).calibration
+        x = np.asarray(answer.image_to_probe)
+        used = np.asarray(answer.mask) > 0
+        in_probe = np.einsum(
+            "nji,nj->ni",
+            images.poses[used, :3, :3],
+            np.asarray(answer.point) - images.poses[used, :3, 3],
+        )
+        seen = ((in_probe - x[:3, 3]) @ x[:3, :3])[:, [0, 2]]
+        drawn = svg.error_map(
+            np.array(mapped["lateral_mm"]), np.array(mapped["axial_mm"]),
+            tre["factor"] * np.array(mapped["stated_mm"]), seen,
+            "Target registration error to expect over the image, mm",
+        )  # fmt: skip
+    matrix = "".join(
+        "<tr>" + "".join(f"<td style='text-align:right'>{_cell(v)}</td>" for v in row) + "</tr>"
+        for row in record["image_plane_to_probe"]
+    )
+    items = "".join(f"<p>{escape(line)}</p>" for line in lines)
+    return (
+        "<style>.jaxcal{--text:currentColor;--line:#888;--grid:#8884;max-width:46em}"
+        ".jaxcal svg{max-width:26em;width:100%}.jaxcal svg text{fill:currentColor;font-size:10px}"
+        f"</style><div class='jaxcal'>{drawn}{items}<table><caption>image_plane_to_probe (mm)"
+        f"</caption>{matrix}</table></div>"
+    )
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.6f}"

@@ -1,0 +1,213 @@
+"""The report page: numbers of the JSON, nothing from outside, nothing over anything else."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import time
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import experiment
+
+import jaxcal
+from jaxcal.report import svg
+from jaxcal.report.page import page, write_page
+from jaxcal.report.record import calibration_record
+from jaxcal.transform import load_calibration
+
+sys.path.insert(0, str(Path(__file__).parent / "hw"))
+from browser import browsing
+
+HOSTILE = '</script><script>alert(1)</script><img src=x onerror=alert(1)>"&\u2028.h5'
+
+CHECK = """
+const found = [];
+const over = (a, b) => a.left < b.right - 0.7 && b.left < a.right - 0.7
+  && a.top < b.bottom - 0.7 && b.top < a.bottom - 0.7;
+for (const svg of document.querySelectorAll("svg")) {
+  const outer = svg.getBoundingClientRect();
+  const texts = [...svg.querySelectorAll("text")]
+    .map((e) => [e.textContent, e.getBoundingClientRect()]);
+  for (const [k, [words, box]] of texts.entries()) {
+    if (box.left < outer.left - 1 || box.right > outer.right + 1 || box.top < outer.top - 1
+        || box.bottom > outer.bottom + 1) found.push(["outside", svg.ariaLabel, words]);
+    for (const [other, second] of texts.slice(k + 1))
+      if (over(box, second)) found.push([svg.ariaLabel, words, other]);
+  }
+}
+const blocks = [...document.querySelectorAll("h1,h2,h3,p,li,figure,table,details,.verdict>div")]
+  .filter((e) => e.offsetParent !== null);
+for (const [k, first] of blocks.entries()) for (const second of blocks.slice(k + 1))
+  if (!first.contains(second)
+      && over(first.getBoundingClientRect(), second.getBoundingClientRect()))
+    found.push(["block", first.textContent.slice(0, 30), second.textContent.slice(0, 30)]);
+return {found, wide: document.documentElement.scrollWidth,
+  drawn: [...document.querySelectorAll("svg.scene")].map((e) => e.childElementCount),
+  back: getComputedStyle(document.body).backgroundColor};
+"""
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return replace(experiment(3, images=24, elevation_mm=1.0), source=f"/tmp/{HOSTILE}")
+
+
+@pytest.fixture(scope="module")
+def result(recording):
+    return jaxcal.calibrate(recording, "conventional")
+
+
+@pytest.fixture(scope="module")
+def record(result, recording):
+    found = calibration_record(result, recording)
+    found["warnings"] = [*found["warnings"], f"left out {HOSTILE}"]
+    return found
+
+
+@pytest.fixture(scope="module")
+def text(record, result, recording):
+    return page(record, result, recording)
+
+
+class Tags(HTMLParser):
+    """Every element, its attributes, and the text inside those with an id or a place."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags, self.told, self.inside, self.open = [], {}, {}, []
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        self.tags.append((tag, given))
+        self.open.append((tag, given))
+
+    def handle_endtag(self, tag):
+        while self.open and self.open.pop()[0] != tag:
+            pass
+
+    def handle_data(self, data):
+        for tag, given in self.open:
+            if tag == "span" and "data-record" in given:
+                self.told.setdefault((given["data-record"], given["data-form"]), []).append(data)
+            if "id" in given:
+                self.inside[given["id"]] = self.inside.get(given["id"], "") + data
+
+
+@pytest.fixture(scope="module")
+def tags(text):
+    parser = Tags()
+    parser.feed(text)
+    return parser
+
+
+def test_numbers_are_those_of_the_record(tags, record):
+    assert len(tags.told) > 40
+    for (path, form), shown in tags.told.items():
+        value = record
+        for key in path.split("."):
+            value = value[int(key)] if isinstance(value, list) else value[key]
+        assert set(shown) == {format(value, form)}, path
+    assert {"tre.rms_mm", "tre.interval_95_mm.1", "rms_mm"} <= {path for path, _ in tags.told}
+    assert json.loads(tags.inside["record"]) == record
+
+
+def test_matrix_to_copy_is_the_one_that_is_exported(tags, result, tmp_path):
+    (tmp_path / "cal.json").write_text(tags.inside["form-json"])
+    loaded = load_calibration(tmp_path / "cal.json")
+    np.testing.assert_array_equal(loaded.image_plane_to_probe, result.image_to_probe)
+    assert tags.inside["form-ros"] == loaded.text("ros")
+    # Points in mm have no pixels, and so no ImageToProbe.
+    assert "form-plus" not in tags.inside
+
+
+def test_nothing_from_outside_and_nothing_from_names(text, tags):
+    assert len(text.encode()) < 2e6
+    for tag, given in tags.tags:
+        assert tag not in ("img", "iframe", "object", "embed", "form", "base")
+        assert not any(name.startswith("on") for name in given)
+        for name in ("src", "href", "data"):
+            assert given.get(name, "data:,") == "data:,"
+    assert [tag for tag, _ in tags.tags].count("script") == 4  # ours, the record, two scenes
+    assert "@import" not in text
+    assert not re.search(r"url\(|https?://(?!www\.w3\.org/2000/svg)", text)
+
+
+def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path, record, result, recording):
+    path = tmp_path / "cal.html"
+    write_page(path, record, result, recording)
+    assert path.read_text().startswith("<!DOCTYPE html>")
+    with pytest.raises(jaxcal.OutputError):
+        write_page(tmp_path / "no" / "cal.html", record, result, recording)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["cal.html"]
+
+
+def test_a_failed_solve_has_a_page_too(record, result, recording):
+    lost = {
+        **record, "status": "unobservable", "converged": False, "verdict": None, "tre": None,
+        "limits": None, "influence": None, "comparison": None, "covariance": None,
+        "image_covariance": None,
+    }  # fmt: skip
+    text = page(lost, result, recording)
+    assert "Do not use" in text
+    assert "How accurate" not in text
+
+
+def test_wrong_frames_leave_nothing_to_copy(record, result, recording):
+    told = "the poses are inverted: tracker to probe"
+    text = page({**record, "wrong_frames": told, "verdict": None}, result, recording)
+    assert f"Do not use: {told}." in text
+    assert "data-copy" not in text
+    assert "How accurate" not in text
+
+
+def test_many_images_stay_small(result, recording):
+    rng = np.random.default_rng(0)
+    drawn = svg.series([("offset (mm)", list(range(5000)), list(rng.normal(size=5000)), svg.BLUE)],
+                       [], "many")  # fmt: skip
+    assert len(drawn) < 6e5
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.2, 0.58), (-3.1, 2.2), (0.0, 1e-4), (-71.0, 88.0)])
+def test_ticks_are_round_and_inside(low, high):
+    found = svg.ticks(low, high, 5)
+    assert 2 <= len(found) <= 6
+    assert low - 1e-9 <= found[0] <= found[-1] <= high + 1e-9
+    step = found[1] - found[0]
+    assert round(step / 10 ** np.floor(np.log10(step) + 1e-9)) in (1, 2, 5)
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (1280, "dark"), (390, "dark")])
+def test_in_a_browser_without_a_network(tmp_path, text, width, scheme):
+    (tmp_path / "cal.html").write_text(text)
+    with browsing(tmp_path / "profile") as browser:
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", {
+            "width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False,
+        })  # fmt: skip
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+        browser.execute_cdp_cmd("Log.enable", {})
+        browser.get((tmp_path / "cal.html").as_uri())
+        for _ in range(100):
+            time.sleep(0.1)
+            if browser.execute_script("return document.readyState") == "complete":
+                break
+        seen = browser.execute_script(CHECK)
+        entries = [json.loads(entry["message"])["message"] for entry in
+                   browser.get_log("performance")]  # fmt: skip
+    assert seen["found"] == []
+    assert seen["wide"] <= width
+    assert min(seen["drawn"]) > 20
+    assert (seen["back"] == "rgb(255, 255, 255)") == (scheme == "light")
+    own = (tmp_path / "cal.html").as_uri()
+    asked = {entry["params"]["request"]["url"] for entry in entries
+             if entry["method"] == "Network.requestWillBeSent"
+             and entry["params"]["documentURL"] == own}  # fmt: skip
+    assert asked - {"data:,"} == {own}
+    wrong = [entry for entry in entries
+             if entry["method"] in ("Log.entryAdded", "Runtime.exceptionThrown")]  # fmt: skip
+    assert wrong == []

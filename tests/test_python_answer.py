@@ -1,0 +1,166 @@
+"""The answer in Python: printed, saved, applied, drawn; what is no problem is refused in a line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import experiment
+
+import jaxcal
+from jaxcal.inputs import as_problem
+from jaxcal.report import plots
+from jaxcal.report.record import calibration_record
+from jaxcal.transform import load_calibration
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return experiment(3, images=24, elevation_mm=1.0)
+
+
+@pytest.fixture(scope="module")
+def result(recording):
+    return jaxcal.calibrate(recording, "conventional")
+
+
+def test_print_shows_numbers_and_verdict(result):
+    text = str(result)
+    for value in np.asarray(result.image_to_probe)[:3].ravel():
+        assert f"{value:.6f}" in text
+    assert f"{result.record()['tre']['rms_mm']:.2f} mm off" in text
+    assert max(map(len, text.splitlines())) <= 100
+    assert result.verdict()[0].split(":")[0].lower() == result.record()["verdict"]
+
+
+def test_record_in_memory_is_the_command_lines(result, recording):
+    mine = result.record()
+    theirs = calibration_record(result, replace(recording, test=None, truth=None, probe=None))
+    for name in set(theirs) - {"source"}:
+        assert mine[name] == theirs[name], name
+
+
+def test_notebooks_get_a_drawing_and_no_script(result):
+    html = result._repr_html_()
+    assert "<svg" in html
+    assert f"{np.asarray(result.image_to_probe)[0, 3]:.6f}" in html
+    assert "<script" not in html
+
+
+def test_batches_and_traces_print_without_a_verdict(recording):
+    problem = jaxcal.Problem.from_recording(recording)
+    batch = jaxcal.calibrate_batch([problem, recording], "conventional")
+    assert str(batch) == "Calibration of a batch of 2: 2 converged; batch[0] is the first of them"
+    assert batch._repr_html_() is None
+    one = jaxcal.calibrate(problem, "conventional")
+    np.testing.assert_allclose(batch.image_to_probe[1], one.image_to_probe, atol=1e-9)
+    seen = []
+    jax.jit(lambda p: seen.append(str(jaxcal.calibrate(p, "conventional"))))(problem)
+    assert seen[0].startswith("Calibration(")
+
+
+def test_saved_and_loaded(result, tmp_path):
+    result.save(tmp_path / "cal.json")
+    loaded = load_calibration(tmp_path / "cal.json")
+    np.testing.assert_array_equal(loaded.image_plane_to_probe, result.image_to_probe)
+    assert loaded.converged is True
+    pose = np.eye(4)
+    pose[:3, 3] = 10, 20, 30
+    points = np.array([[1.0, 40.0], [-8.0, 70.0]])
+    mine, theirs = result.apply(points, pose), loaded.apply(points, pose)
+    np.testing.assert_array_equal(mine.points, theirs.points)
+    np.testing.assert_array_equal(mine.covariance, theirs.covariance)
+    x = np.asarray(result.image_to_probe)
+    plane = np.insert(points, 1, 0.0, axis=1)
+    np.testing.assert_allclose(mine.points, plane @ x[:3, :3].T + x[:3, 3] + pose[:3, 3])
+    trace = np.trace(mine.covariance, axis1=1, axis2=2)
+    np.testing.assert_allclose(np.sqrt(trace), jaxcal.predicted_tre(result, points), rtol=1e-9)
+    with pytest.raises(jaxcal.InputError, match="points in mm"):
+        result.plus_matrix()
+    with pytest.raises(jaxcal.InputError, match="no format"):
+        result.save(tmp_path / "cal.nonsense")
+    transform = result.image_transform()
+    assert (transform.unknowns, transform.range_factor) == (("translation", "rotation"), 1.0)
+    np.testing.assert_array_equal(transform.covariance, transform.image_covariance)
+
+
+def test_figures_have_units_and_the_datas_numbers(result):
+    tre = result.plot_tre()
+    assert tre.axes[0].get_xlabel() == "lateral (mm)"
+    assert tre.axes[0].get_ylabel() == "depth (mm)"
+    assert "(mm)" in tre.axes[1].get_ylabel()
+    assert any(text.get_text() == "10 mm" for text in tre.axes[0].texts)
+    moved = result.plot_influence().axes[0].lines[0].get_ydata()
+    np.testing.assert_allclose(moved, result.record()["influence"]["moved_mm"], rtol=1e-9)
+    widths = [bar.get_width() for bar in result.plot_limits().axes[0].patches]
+    assert sum(widths) == pytest.approx(2)
+    for panel in result.plot_residuals().axes:
+        assert panel.get_ylabel().endswith("(mm)")
+    offsets = result.plot_offsets(np.zeros(24)).axes[0]
+    assert "true" in offsets.get_legend_handles_labels()[1]
+    lost = replace(result, unknowns_covariance=jnp.full((9, 9), jnp.nan))
+    with pytest.raises(jaxcal.InputError, match="do not determine"):
+        plots.plot_tre(lost)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("rec.h5", r"not a path: jaxcal\.calibrate\(jaxcal\.load\('rec\.h5'\)\)"),
+        ({"poses": 1}, "not a dictionary: jaxcal.Problem.from_arrays"),
+        ([1, 2], "not list"),
+        (np.eye(4), "not ndarray"),
+        (None, "not NoneType"),
+    ],
+)
+def test_what_is_no_problem_is_refused_in_a_line(given, message):
+    with pytest.raises(jaxcal.InputError, match=message) as caught:
+        as_problem(given, "jaxcal.calibrate")
+    assert "\n" not in str(caught.value)
+
+
+def test_lists_and_single_names(recording):
+    problem = jaxcal.Problem.from_recording(recording)
+    with pytest.raises(jaxcal.InputError, match=r"not 2: jaxcal\.calibrate_batch takes a list"):
+        as_problem([problem, problem], "jaxcal.calibrate")
+    with pytest.raises(jaxcal.InputError, match="the list is empty"):
+        jaxcal.calibrate_batch([])
+    # A single name is one name, and not its letters.
+    with pytest.raises(jaxcal.InputError, match="in mm already"):
+        jaxcal.calibrate(problem, estimate="scale")
+    with pytest.raises(jaxcal.InputError, match="cannot estimate 'sped'"):
+        jaxcal.calibrate(problem, estimate="delay, sped")
+
+
+def test_calls_as_users_make_them():
+    """Without the type checks of these tests."""
+    code = """
+import jaxcal
+for call, given in ((jaxcal.calibrate, "rec.h5"), (jaxcal.calibrate, {}),
+                    (jaxcal.calibrate_batch, "rec.h5"), (jaxcal.calibrate_batch, [1])):
+    try:
+        call(given)
+    except jaxcal.InputError as error:
+        print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+    lines = done.stdout.splitlines()
+    assert len(lines) == 4
+    assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
+    assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
+
+
+def test_drawing_is_not_imported_before_it_is_asked_for():
+    code = (
+        "import sys, jaxcal, jaxcal.solve, jaxcal.calibration, jaxcal.report.record; "
+        "heavy = {'matplotlib', 'jaxcal.report.plots', 'jaxcal.report.page'} & set(sys.modules); "
+        "sys.exit(str(heavy) if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
