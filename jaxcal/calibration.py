@@ -419,7 +419,9 @@ class Calibration(eqx.Module):
             source="the calibration",
             range_factor=float(factor),
             unknowns=tuple(block for block in answer.blocks if block in IMAGE_BLOCKS),
-            image_covariance=answer.unknowns_covariance[rows[:, None], rows] if known else None,
+            image_covariance=(
+                np.asarray(answer.unknowns_covariance)[rows[:, None], rows] if known else None
+            ),
         )
 
     def plus_matrix(self) -> Float[np.ndarray, "4 4"]:

@@ -161,7 +161,7 @@ def test_wrong_frames_leave_nothing_to_copy(record, result, recording):
     told = "the poses are inverted: tracker to probe"
     text = page({**record, "wrong_frames": told, "verdict": None}, result, recording)
     assert f"Do not use: {told}." in text
-    assert "data-copy" not in text
+    assert 'id="form-' not in text
     assert "How accurate" not in text
 
 

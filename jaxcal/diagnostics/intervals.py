@@ -220,7 +220,7 @@ def tre_at(
         InputError: a level that is no probability between 0 and 1.
     """
     points = np.asarray(points, float)
-    covariance = error_covariance(calibration.numpy(), points.reshape(-1, 2))
+    covariance = np.asarray(error_covariance(calibration.numpy(), points.reshape(-1, 2)))
     left = np.asarray(degrees_of_freedom(calibration), float)[..., None]
     factor = np.asarray(variance_factor(calibration))[..., None]
     found = _errors(covariance, np.broadcast_to(left, covariance.shape[:-2]), factor, level)
@@ -268,7 +268,7 @@ def _errors(
     flat, freedom = values.reshape(-1, values.shape[-1]), left.reshape(-1)
     lower, upper = np.empty(len(flat)), np.empty(len(flat))
     for each in np.unique(freedom):
-        rows = freedom == each
+        rows = np.asarray(freedom == each)
         for chance, out in ((0.5 - 0.5 * level, lower), (0.5 + 0.5 * level, upper)):
             out[rows] = _length_quantile(flat[rows], float(each), chance)
     rms = np.sqrt(factor * values.sum(axis=-1))

@@ -292,7 +292,7 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     # What was measured: the target taken in the plane at its lateral position and range.
     residual = np.asarray(answer.residual)[shown]
     measured = seen - residual
-    cloud = reconstruct(x, recording.calibration.poses[shown], measured)
+    cloud = np.asarray(reconstruct(x, recording.calibration.poses[shown], measured))
     wide = max(float(np.ptp(seen[:, 0])) / 2, 10.0)
     deep = float(seen[:, 2].max())
     middle = float(0.5 * (seen[:, 0].min() + seen[:, 0].max()))
@@ -316,7 +316,7 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     whole = {
         "centre": _rounded(centre),
         "radius": float(np.linalg.norm(far - centre, axis=1).max()),
-        "lines": lines, "dots": dots, "bar": _bar(np.linalg.norm(np.ptp(far, axis=0))),
+        "lines": lines, "dots": dots, "bar": _bar(float(np.linalg.norm(np.ptp(far, axis=0)))),
     }  # fmt: skip
     close = _close_up(answer, cloud, shown)
     views = (

@@ -41,9 +41,8 @@ def styled(axes: Axes) -> Axes:
     for side, spine in axes.spines.items():
         spine.set_linewidth(0.6)
         spine.set_visible(side in ("left", "bottom"))
-    axes.xaxis.label.set_size(8)
-    axes.yaxis.label.set_size(8)
-    axes.title.set_size(8)
+    for words in (axes.xaxis.label, axes.yaxis.label, axes.title):
+        words.set_fontsize(8)
     return axes
 
 
@@ -89,9 +88,10 @@ def plot_tre(calibration: Calibration, points: int = 61) -> Figure:
 def plot_residuals(calibration: Calibration) -> Figure:
     """Residual of every image from the plane, mm: lateral, axial, elevational, on one scale."""
     answer, _ = _one(calibration)
-    used = np.flatnonzero(np.asarray(answer.mask) > 0)
-    named = np.intersect1d(messages.outliers(answer), used)
     residual = np.asarray(answer.residual)
+    # A solve that failed has no residuals to draw.
+    used = np.flatnonzero((np.asarray(answer.mask) > 0) & np.isfinite(residual).all(axis=1))
+    named = np.intersect1d(messages.outliers(answer), used)
     figure = canvas(PAGE_MM, 110.0)
     panels = figure.subplots(3, 1, sharex=True, sharey=True)
     for panel, (name, axis) in zip(
@@ -121,7 +121,8 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
         truth: true offsets, mm, where they are known.
     """
     answer, _ = _one(calibration)
-    used = np.flatnonzero(np.asarray(answer.mask) > 0)
+    known = np.isfinite(np.asarray(answer.elevation))
+    used = np.flatnonzero((np.asarray(answer.mask) > 0) & known)
     figure = canvas(PAGE_MM, 60.0)
     panel, side = figure.subplots(1, 2, sharey=True, width_ratios=(5, 1))
     styled(panel).axhline(0.0, color=GREY, linewidth=0.5)
