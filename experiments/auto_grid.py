@@ -194,8 +194,8 @@ def run_cell(cell: Cell, indices: Array, *, with_hindsight: bool = True) -> dict
         )
     row |= {
         "auto_loses": float(np.mean(rp["auto"] > rp["conventional"])),
-        "has_mean": float(np.mean(np.asarray(law.has_mean))),
-        "own_covariances": float(np.mean(np.asarray(law.own_covariances))),
+        "mean_probability": float(np.mean(np.asarray(law.mean_probability))),
+        "own_probability": float(np.mean(np.asarray(law.own_probability))),
         "not_converged": int(sum(np.sum(~np.asarray(r.converged)) for r in results.values())),
     }
     if not with_hindsight:

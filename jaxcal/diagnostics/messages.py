@@ -161,14 +161,15 @@ def offset_law(result: Calibration) -> dict[str, object] | None:
     probability = {
         family: float(value) for family, value in zip(FAMILIES, law.probability, strict=True)
     }
-    own = bool(law.own_covariances)
+    own = float(law.own_probability)
+    mean_probability = float(law.mean_probability)
     words, wrong = "The laws of the offsets could not be weighed; they are taken for Gaussian", None
     if weighed:
         wrong = _contradicted(result)
         words = _law_in_words(probability, wrong)
-        if law.has_mean:
+        if mean_probability > 0.5:
             words += f", about a mean of {float(law.mean):.2f} +- {float(law.mean_sd):.2f} mm"
-        noise = "each image's own covariance" if own else "the same SDs in all images"
+        noise = "each image's own covariance" if own > 0.5 else "the same SDs in all images"
         words += f". The measurements' errors have {noise}"
     words += "."
     return {
@@ -177,7 +178,8 @@ def offset_law(result: Calibration) -> dict[str, object] | None:
         "contradicted": wrong,
         "mean_mm": float(law.mean),
         "mean_sd_mm": float(law.mean_sd),
-        "own_covariances": own,
+        "mean_probability": mean_probability,
+        "own_covariances_probability": own,
         "words": words,
     }
 
@@ -431,7 +433,7 @@ def warnings(result: Calibration) -> list[str]:
         if sd > WEAK_TRANSLATION_MM:
             law = result.offset_law
             on = "a mean of the offsets that the data hardly show"
-            if law is None or not law.has_mean:
+            if law is None or not law.mean_probability > 0.5:
                 on = "offsets that average zero"
             found.append(
                 "translation along the elevational axis is weakly seen "

@@ -342,7 +342,7 @@ def own_covariance(answer: Calibration, problem: Problem) -> Float[Array, "k n 2
     mean = variances.sum(axis=1) / kept.sum(axis=1)
     shaped = (mean > 0).all(axis=1)
     if answer.offset_law is not None:
-        shaped = shaped & np.asarray(answer.offset_law.own_covariances)
+        shaped = shaped & (np.asarray(answer.offset_law.own_probability) > 0.5)
     scale = 1 / np.sqrt(np.where(mean > 0, mean, 1.0))
     shape = covariance * (scale[:, :, None] * scale[:, None])[:, None]
     return np.where(shaped[:, None, None, None], shape, np.eye(2))

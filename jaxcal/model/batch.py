@@ -214,6 +214,21 @@ class Iterate(eqx.Module):
             self.blocks,
         )
 
+    def step_to(self, other: Iterate) -> Float[Array, "p lanes"]:
+        """The step that :meth:`moved` takes to get from here to another iterate."""
+        back = jnp.swapaxes(self.rotation, 0, 1)
+        turn = jnp.sum(back[:, :, None] * other.rotation[None], axis=1)
+        axis = jnp.stack(
+            [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+        )
+        along = jnp.sum(back * (other.translation - self.translation), axis=1)
+        parts = [along, 2 * axis / (1 + turn[0, 0] + turn[1, 1] + turn[2, 2])]
+        parts.append(other.point - self.point)
+        names = _extra_names(self.blocks)
+        for here, there, name in zip(self.extras, other.extras, names, strict=True):
+            parts.append((there - here if name == "delay" else jnp.log(there / here))[None])
+        return jnp.concatenate(parts)
+
 
 def _extra_names(blocks: Blocks) -> list[str]:
     """The block of every further unknown, in order."""

@@ -1,25 +1,27 @@
-"""The estimator behind ``--method joint``: nothing to choose, and it says what it chose.
+"""The estimator behind ``--method joint``: nothing to choose, and it says what it found.
 
 What the plain self-tuned fit (:mod:`jaxcal.solvers.reml`) takes for granted is asked of the
 data here: that the offsets are Gaussian, that their mean is zero, and that errors are alike in all
 images. All of it matters because lateral position and range leave rotation about the lateral axis
 open, and only the offsets' law closes it: the edges of bounded offsets tell X twice as well as
-their SD does, heavy tails must not pull it, and a mean that is denied bends it.
+their SD does, heavy tails must not pull it, and a mean that is denied bends it. Nothing is switched
+on or off: every alternative has a weight that moves continuously with the data, and what they
+disagree about is in the covariance.
 
 1. *REML* tunes the SDs of lateral position, range and offset, with Gaussian offsets of mean zero.
-2. *Evidence* (:mod:`jaxcal.solvers.evidence`). The same with a mean b ~ N(0, (2 sigma_y)^2) and,
-   where the images came with covariances of their own, with those, up to one factor. A mean is
-   believed where it makes the data nine times as probable, with Gaussian offsets and, as their
-   beliefs about b tell, under the laws of step 3 together; of own covariances and common SDs, the
-   more probable are.
+2. *Noise models* (:mod:`jaxcal.solvers.evidence`). The same with a belief about the offsets' mean
+   (:mod:`jaxcal.solvers.offset_mean`); and where the images came with covariances of their own,
+   once more with those, up to one factor.
 3. *Laws* (:mod:`jaxcal.model.shapes`). Linearised there, everything is Gaussian but the offsets'
    law. Expectation propagation gives X under each law of :data:`SHAPES` and how probable the data
    are under it: uniform, a bell with edges, Gaussian, Student's t4; the uniform one with five SDs
    about REML's, which knows the edges to a few per cent only, and it is they that matter. Where an
-   image came with a bound on its offset, its law is cut there.
-4. *Median*. X, target and mean are the geometric median of the laws' answers, weighted by their
-   probability; the covariance is the laws' average, with their spread about that answer added.
-   A law under which the propagation does not settle (its edges exclude some image) has weight zero.
+   image came with a bound on its offset, its law is cut there. Under each law the belief about the
+   mean is formed anew, since edges say of it what a Gaussian does not see.
+4. *Median*. X, target and mean are the geometric median of the answers under all laws and noise
+   models, weighted by their probability; the covariance is their average, with their spread about
+   that answer added. A law under which the propagation does not settle (its edges exclude some
+   image) loses its weight.
 
 Each step is a fixed number of array operations, so gradients go through (REML's by the implicit
 function theorem). With fewer than eight used images, with given SDs, or where no law settles, the
@@ -45,17 +47,10 @@ from jaxcal.model.batch import Images, Iterate, barrier, choose, targets
 from jaxcal.model.observations import Medium, Observation, OwnCovariances, Points, unit_shape
 from jaxcal.model.parameters import retract
 from jaxcal.model.shapes import FAMILIES, Family, Shape
-from jaxcal.solvers.evidence import (
-    MEAN_SD,
-    V_Y,
-    Evidence,
-    judged,
-    mean_precision,
-    pass_over,
-    row_of,
-    tune,
-)
+from jaxcal.solvers.evidence import V_Y, NoiseModel, row_of, tune
 from jaxcal.solvers.expectation_propagation import SEEN, Sites, marginal, propagate, seen
+from jaxcal.solvers.normal_equations import stacked
+from jaxcal.solvers.offset_mean import MEAN_SD, believed, gained
 from jaxcal.solvers.reml import MINIMUM_SELF_TUNING
 
 UNIFORM: tuple[Shape, ...] = tuple(
@@ -75,17 +70,14 @@ With equal shares the answer is farthest from the Bayes limit where offsets are 
 one of the uniform laws is paid for where they are triangular, and by few images.
 """
 
-LOG_ODDS_OF_MEAN = float(np.log(9.0))
-"""How much more probable the data must be with a mean: it is one more thing to be wrong about."""
-
 LARGEST_CHANGE = 0.4
-"""A law counts where the last sweep moved no unknown by more than this many SDs.
+"""A law counts as long as the last sweep moved no unknown by more than about this many SDs.
 
 Its evidence is stationary in the sites, and so nearly right before its mean is; the laws that do
 not settle at all are the ones to leave out."""
 
 MEDIAN_STEPS = 12
-"""Weiszfeld's steps to the laws' median."""
+"""Weiszfeld's steps to the median."""
 
 
 class OffsetLaw(eqx.Module):
@@ -93,24 +85,22 @@ class OffsetLaw(eqx.Module):
 
     Attributes:
         probability: of each family of :data:`jaxcal.model.shapes.FAMILIES`.
-        mean: of the offsets, mm; 0 where none is believed.
-        mean_sd: its standard deviation, mm; 0 likewise.
-        has_mean: the data ask for a mean.
-        own_covariances: the images' own covariances describe the errors better than common SDs.
-        log_odds_mean: ln of how much more probable the data are with a mean than without: with
-            Gaussian offsets, or where those ask for one and the laws together less, under these.
-        log_odds_own: ln of how much more probable they are with own covariances; 0 where there are
-            none.
+        mean: of the offsets, mm, its expectation.
+        mean_sd: its standard deviation, mm.
+        mean_probability: that there is a mean other than zero.
+        trust: share of the data's word on the mean that counts: below 1 where the residuals have
+            heavy tails, or are alike in successive images.
+        own_probability: that the images' own covariances describe the errors better than common
+            SDs do; 0 where there are none.
         weighed: the laws were weighed; otherwise the plain Gaussian answer stands.
     """
 
     probability: Float[Array, "*batch families"]
     mean: Float[Array, "*batch"]
     mean_sd: Float[Array, "*batch"]
-    has_mean: Bool[Array, "*batch"]
-    own_covariances: Bool[Array, "*batch"]
-    log_odds_mean: Float[Array, "*batch"]
-    log_odds_own: Float[Array, "*batch"]
+    mean_probability: Float[Array, "*batch"]
+    trust: Float[Array, "*batch"]
+    own_probability: Float[Array, "*batch"]
     weighed: Bool[Array, "*batch"]
 
 
@@ -119,11 +109,11 @@ class Averaged(eqx.Module):
 
     Attributes:
         place: the unknowns.
-        sigma: tuned SDs of the noise model in use, mm.
+        sigma: tuned SDs of the more probable noise model, mm.
         covariance: of the unknowns' tangent.
         elevation_sd: of every image's offset, mm; NaN for images left out.
         law: what was found out, with a leading axis.
-        own_covariances: where the images' own covariances are in use.
+        own_covariances: where the images' own covariances are the more probable ones.
     """
 
     place: Iterate
@@ -144,7 +134,7 @@ def average_over_laws(
     bound: Float[Array, "lanes n"] | None,
     medium: Medium | None,
 ) -> Averaged:
-    """Weigh offset means, noise models and laws of the offsets, and average the answers.
+    """Weigh noise models, offset means and laws of the offsets, and average the answers.
 
     Args:
         place: the self-tuned Gaussian solutions.
@@ -155,69 +145,72 @@ def average_over_laws(
         bound: on the offsets, mm, which cuts the laws; or None.
         medium: what is known of sound speed and delay besides.
     """
-    used = images.used
-    models = candidates(place, observation, images, variances, medium)
-    pairs = jnp.stack([model.log_evidence for model in models])
-    pairs = jnp.where(jnp.isfinite(pairs), pairs, -jnp.inf).reshape(-1, 2, len(used))
-    wanted = pairs - jnp.asarray([0.0, LOG_ODDS_OF_MEAN])[:, None]
-    chosen = jnp.argmax(wanted.reshape(len(models), -1), axis=0)
-    model = models[0]
-    for k, other in enumerate(models[1:], start=1):
-        model = choose(chosen == k, other, model)
-    asked, which = chosen % 2 == 1, chosen // 2
-    best = barrier(answered(barrier(model), asked, images, bound, shapes))
-    pair = jnp.where(which > 0, pairs[-1], pairs[0])
-    gaussian = pair[1] - pair[0]
-    # fmin: where no law settles, the Gaussian's odds stand.
-    log_odds = jnp.where(asked, jnp.fmin(gaussian, best.log_odds), gaussian)
-    step, unknowns = best.step, place.unknowns
+    used, unknowns = images.used, place.unknowns
+    common = tune(place, observation, images, medium)
+    model = Linearised.of(common, common.sigma)
+    answers = answers_under(model, images, bound, shapes)
+    own = jnp.zeros_like(used)
+    if variances is not None and isinstance(observation, Points):
+        other, more_probable = with_own_covariances(common, observation, images, variances, medium)
+        own = jax.nn.sigmoid(more_probable)
+        beside = answers_under(other, images, bound, shapes)
+        answers = Answers.joined(
+            answers.shared(1 - own),
+            beside.seen_from(model.place.step_to(other.place), other.mean - model.mean).shared(own),
+        )
+        sigma = choose(own > 0.5, other.sigma, model.sigma)
+    else:
+        sigma = model.sigma
+    step, covariance = median(answers, model.offsets_metric())
+    step, covariance = barrier((step, covariance))
 
-    enough = (used >= MINIMUM_SELF_TUNING) & best.settled
-    enough = enough & jnp.all(jnp.isfinite(step), axis=0)
+    q, turned = targets(model.place, images)
+    direction = Sites.of(q, turned, images.mask, model.mean, None).direction
+    across = [[covariance[i, j][:, None] for j in SEEN] for i in SEEN]
+    variance = unrolled.dot(direction, unrolled.apply(across, direction))
+
+    enough = (used >= MINIMUM_SELF_TUNING) & answers.settled & jnp.all(jnp.isfinite(step), axis=0)
     # From the linearisation the answer may be a hundredth of a radian away: turn by Exp, and not
     # by the solvers' rotation, which is another one in the eighth digit.
     moved = jax.vmap(lambda here, by: retract(here, by, place.blocks))(
         model.place.parameters(), step[:unknowns].T
     )
     member = jnp.asarray([[shape.family == name for shape in shapes] for name in FAMILIES])
-    has_mean = enough & asked & jnp.logical_not(best.denied)
-    own, log_odds_own = jnp.zeros_like(enough), jnp.zeros_like(log_odds)
-    if variances is not None:
-        own = enough & (which > 0)
-        log_odds_own = jnp.max(pairs[1], axis=0) - jnp.max(pairs[0], axis=0)
-    mean_sd = jnp.sqrt(jnp.maximum(best.covariance[-1, -1], 0.0))
+    weight = answers.weight.reshape(-1, len(shapes), len(used)).sum(axis=0)
+
+    def where_weighed(value: Array) -> Array:
+        return jnp.where(enough, value, 0.0)
+
     law = OffsetLaw(
-        probability=(member @ best.weight).T,
-        mean=jnp.where(has_mean, model.mean + step[-1], 0.0),
-        mean_sd=jnp.where(has_mean, mean_sd, 0.0),
-        has_mean=has_mean,
-        own_covariances=own,
-        log_odds_mean=log_odds,
-        log_odds_own=log_odds_own,
+        probability=(member @ weight).T,
+        mean=where_weighed(model.mean + step[-1]),
+        mean_sd=where_weighed(jnp.sqrt(jnp.maximum(covariance[-1, -1], 0.0))),
+        mean_probability=where_weighed(jnp.sum(answers.weight * answers.mean_probability, axis=0)),
+        trust=model.trust,
+        own_probability=where_weighed(own),
         weighed=enough,
     )
     place, sigma = choose(
-        enough, (Iterate.of(moved, place.blocks), model.sigma), (place, observation.sigma)
+        enough, (Iterate.of(moved, place.blocks), sigma), (place, observation.sigma)
     )
     return Averaged(
         place,
         sigma,
-        best.covariance[:unknowns, :unknowns],
-        jnp.sqrt(jnp.where(images.mask > 0, best.variance.T, jnp.nan)),
+        covariance[:unknowns, :unknowns],
+        jnp.sqrt(jnp.where(images.mask > 0, variance, jnp.nan)),
         law,
-        which > 0,
+        enough & (own > 0.5),
     )
 
 
-class Candidate(eqx.Module):
-    """A noise model, with or without a mean, tuned and linearised; lanes last.
+class Linearised(eqx.Module):
+    """A noise model, linearised where it was tuned; lanes last.
 
     Attributes:
         place: X, c and the further unknowns.
         mean: b, mm.
-        with_mean: 1 where there may be one.
+        trust: share of what the data say of b that counts.
         sigma: SDs of the components of the common noise model, mm.
-        log_evidence: ln Z, up to a constant that all share.
         information: of the unknowns in the measurements, upper triangle.
         gradient: of half the measurements' cost.
         squares: sum of h_i h_i', upper triangle.
@@ -226,16 +219,15 @@ class Candidate(eqx.Module):
 
     place: Iterate
     mean: Float[Array, " lanes"]
-    with_mean: Float[Array, " lanes"]
+    trust: Float[Array, " lanes"]
     sigma: Float[Array, "components lanes"]
-    log_evidence: Float[Array, " lanes"]
     information: Float[Array, "triangle lanes"]
     gradient: Float[Array, "p lanes"]
     squares: Float[Array, "triangle lanes"]
     pull: Float[Array, "p lanes"]
 
     @classmethod
-    def of(cls, tuned: Evidence, sigma: Array, log_evidence: Array) -> Candidate:
+    def of(cls, tuned: NoiseModel, sigma: Array) -> Linearised:
         """From a tuned noise model."""
         sums = tuned.sums
         # The offsets are left to their law.
@@ -246,161 +238,129 @@ class Candidate(eqx.Module):
         return cls(
             tuned.place,
             tuned.mean,
-            tuned.with_mean,
+            tuned.trust,
             sigma,
-            log_evidence,
             measured.curvature,
             measured.gradient,
             sums.matrix[-1],
             sums.gradient[-1] + tuned.mean * along,
         )
 
+    def offsets_metric(self) -> Float[Array, "q q lanes"]:
+        """Sum of h_i h_i' with b, which moves the offsets as v_y does."""
+        matrix = stacked(self.squares)
+        matrix = jnp.concatenate([matrix, matrix[V_Y][None]])
+        return jnp.concatenate([matrix, matrix[:, V_Y][:, None]], axis=1)
 
-class Answer(eqx.Module):
-    """What the laws say together about a noise model's unknowns; lanes last.
+
+class Answers(eqx.Module):
+    """What every law says of the unknowns and of b, about one place; lanes last.
 
     Attributes:
-        step: of all unknowns and b, to the laws' median.
-        covariance: about it.
-        weight: the laws' probabilities.
+        mean: of all unknowns and b.
+        covariance: of these.
+        weight: probability.
+        mean_probability: that there is a mean, under each.
         settled: at least one of them counts.
-        variance: of the images' offsets, mm^2.
-        log_odds: ln of how much more probable they make the data with a mean.
-        denied: a mean was asked for, and all laws together do not believe in it.
     """
 
-    step: Float[Array, "q lanes"]
-    covariance: Float[Array, "q q lanes"]
+    mean: Float[Array, "q k lanes"]
+    covariance: Float[Array, "q q k lanes"]
     weight: Float[Array, "k lanes"]
+    mean_probability: Float[Array, "k lanes"]
     settled: Bool[Array, " lanes"]
-    variance: Float[Array, "n lanes"]
-    log_odds: Float[Array, " lanes"]
-    denied: Bool[Array, " lanes"]
+
+    def shared(self, share: Float[Array, " lanes"]) -> Answers:
+        """With a share of their weight."""
+        return eqx.tree_at(lambda each: each.weight, self, share * self.weight)
+
+    def seen_from(self, step: Float[Array, "p lanes"], mean: Float[Array, " lanes"]) -> Answers:
+        """About another place, from which this one is a small step away."""
+        step = jnp.concatenate([step, mean[None]])
+        return eqx.tree_at(lambda each: each.mean, self, self.mean + step[:, None])
+
+    @classmethod
+    def joined(cls, first: Answers, second: Answers) -> Answers:
+        """Of two noise models."""
+
+        def both(name: str) -> Array:
+            return jnp.concatenate([getattr(first, name), getattr(second, name)], axis=-2)
+
+        return cls(
+            both("mean"),
+            both("covariance"),
+            both("weight"),
+            both("mean_probability"),
+            first.settled & second.settled,
+        )
 
 
-def answered(
-    model: Candidate,
-    asked: Bool[Array, " lanes"],
+def answers_under(
+    model: Linearised,
     images: Images,
     bound: Float[Array, "lanes n"] | None,
     shapes: tuple[Shape, ...],
-) -> Answer:
-    """Weigh the laws on a linearised problem.
-
-    A law with edges says of the mean b what a Gaussian does not see, so where the Gaussian asks for
-    one, all laws together have to agree. That needs no second propagation: the evidence with b over
-    that without is the density of b at zero before the data over that after (Savage and Dickey),
-    and where the laws deny the mean, their beliefs are conditioned on b = 0.
-
-    Reference: Dickey 1971.
-    """
+) -> Answers:
+    """The answers under the laws on a linearised problem."""
     q, turned = targets(model.place, images)
     sites = barrier(Sites.of(q, turned, images.mask, model.mean, bound))
-    precision = mean_precision(model.sigma[-1], model.with_mean)
-    known = marginal(model.information, model.gradient, precision, model.mean, model.with_mean)
+    sd = model.sigma[-1]
+    known = marginal(model.information, model.gradient, (MEAN_SD * sd) ** -2.0, model.mean)
     stretch = jnp.asarray([shape.stretch for shape in shapes], images.mask.dtype)
     prior = jnp.asarray([shape.prior for shape in shapes], images.mask.dtype)
     families: list[Family] = [shape.family for shape in shapes]
-    sd = model.sigma[-1]
     squares, pull = barrier(seen(model.squares, model.pull))
     found = propagate(known, sites, squares, pull, families, stretch[:, None] * sd)
-    weight, good = weights(found.log_evidence, found.change, prior)
-    means = jnp.where(good, found.mean, 0.0)
-    within = jnp.where(good, found.covariance, jnp.eye(len(SEEN))[:, :, None, None])
-    means, within, weight = barrier((means, within, weight))
 
-    expected, variance, along = barrier(known.of_mean(means, within))
-    gain, away = without_mean(expected + model.mean, variance, sd)
-    log_odds = barrier(odds_of_mean(found.log_evidence, gain, good, prior))
-    denied = asked & jnp.logical_not(log_odds > LOG_ODDS_OF_MEAN)
-    fewer, _ = weights(found.log_evidence - gain, found.change, prior)
-    conditioned = within - along[:, None] * along[None] / variance
-    means, within, weight = barrier(
-        choose(denied, (means - along * away, conditioned, fewer), (means, within, weight))
+    mean, covariance = barrier(known.lift()(found.mean, found.covariance))
+    variance = covariance[-1, -1]
+    belief = believed(model.mean + mean[-1], variance, sd, model.trust)
+    weight, good = weights(found.log_evidence + gained(belief), found.change, prior)
+    # The other unknowns follow b.
+    along = covariance[:, -1] / variance
+    mean = mean + along * (belief.mean - model.mean - mean[-1])
+    covariance = covariance + along[:, None] * along * (belief.variance - variance)
+    size = len(mean)
+    return Answers(
+        jnp.where(good, mean, 0.0),
+        jnp.where(good, covariance, jnp.eye(size)[:, :, None, None]),
+        weight,
+        jnp.where(good, belief.probability, 0.0),
+        jnp.any(good, axis=0),
     )
-    known = choose(denied, known.held(-model.mean), known)
-
-    spread = jnp.sum(squares[:, :, None] * within, axis=(0, 1))
-    share = median(means, barrier(spread), weight, squares)
-    mean = jnp.sum(barrier(share) * means, axis=1)
-    off = means - mean[:, None]
-    covariance = jnp.sum(weight * (within + off[:, None] * off[None]), axis=2)
-    step, covariance = barrier(known.lifted(*barrier((mean, covariance))))
-    across = [[covariance[i, j][:, None] for j in SEEN] for i in SEEN]
-    offset = unrolled.dot(sites.direction, unrolled.apply(across, sites.direction))
-    return Answer(step, covariance, weight, jnp.any(good, axis=0), offset.T, log_odds, denied)
 
 
-def candidates(
-    place: Iterate,
-    observation: Observation,
+def with_own_covariances(
+    common: NoiseModel,
+    observation: Points,
     images: Images,
-    variances: Float[Array, "3 lanes n"] | None,
+    variances: Float[Array, "3 lanes n"],
     medium: Medium | None,
-) -> list[Candidate]:
-    """Common SDs and, where there are some, own covariances; each without and with a mean."""
-    used, sigma, count = images.used, observation.sigma, observation.count(images)
-    zero, one = jnp.zeros_like(used), jnp.ones_like(used)
-    sums_at = pass_over(observation, images, medium)
-    # Common SDs without a mean are REML's own model, which has been tuned already.
-    plain = judged(sums_at, place, sigma, zero, zero, count)
-    shifted = tune(sums_at, place, sigma, one, count)
-    found = [Candidate.of(each, each.sigma, each.log_evidence) for each in (plain, shifted)]
-    if variances is None or not isinstance(observation, Points):
-        return found
+) -> tuple[Linearised, Float[Array, " lanes"]]:
+    """The noise model of the images' own covariances, and by how much more probable it is (ln)."""
+    used, sigma = images.used, common.sigma
     shape, mean = unit_shape(variances, images)
     ratio = jnp.sqrt(mean / jnp.mean(mean, axis=0))
     by = jnp.stack([ratio[0] * ratio[0], ratio[0] * ratio[1], ratio[1] * ratio[1]])
     shape = jnp.where(
         images.mask > 0, shape * by[..., None], jnp.asarray([1.0, 0, 1])[:, None, None]
     )
-    start = jnp.sqrt(0.5 * jnp.sum((sigma[:2] / ratio) ** 2, axis=0))
-    # Both at once, as so many lanes more.
-    twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf], axis=-1), place)
-    wide = images.repeated(2)
-    scale = jnp.stack([jnp.tile(start, 2), jnp.tile(sigma[2], 2)])
-    tied = OwnCovariances(scale, jnp.tile(shape, (1, 2, 1)), jnp.ones_like(scale[0]), tied=True)
-    medium = None if medium is None else medium.repeated(2)
-    tuned = tune(
-        pass_over(tied, wide, medium),
-        twice,
-        scale,
-        jnp.concatenate([zero, one]),
-        tied.count(wide),
-    )
+    scale = jnp.sqrt(0.5 * jnp.sum((sigma[:2] / ratio) ** 2, axis=0))
+    tied = OwnCovariances(jnp.stack([scale, sigma[2]]), shape, jnp.ones_like(scale), tied=True)
+    tuned = tune(common.place, tied, images, medium)
     determinant = shape[0] * shape[2] - shape[1] ** 2
     # One more SD that is tuned costs half the log of the number of images.
     penalty = 0.5 * jnp.sum(images.mask * jnp.log(determinant), axis=1) - 0.5 * jnp.log(used)
-    for half in (slice(None, len(used)), slice(len(used), None)):
-        each = jax.tree.map(lambda leaf, half=half: leaf[..., half], tuned)
-        three = jnp.concatenate([ratio * each.sigma[0], each.sigma[1:]])
-        found.append(Candidate.of(each, three, each.log_evidence - penalty))
-    return found
-
-
-def without_mean(off: Array, variance: Array, sd: Array) -> tuple[Array, Array]:
-    """What a belief about the offsets' mean b says of b = 0.
-
-    Args:
-        off: expectation of b, mm.
-        variance: of b, mm^2.
-        sd: the offsets' SD, mm.
-
-    Returns:
-        Log of the evidence with b over that without, and by how many covariances with b (1/mm) the
-        other unknowns give way where b is held at zero.
-    """
-    pull = off / variance
-    return 0.5 * (jnp.log(variance) - 2 * jnp.log(MEAN_SD * sd) + off * pull), pull
+    more = tuned.log_evidence(tied.count(images)) - penalty
+    more = more - common.log_evidence(observation.count(images))
+    more = jnp.where(jnp.isfinite(more), more, -jnp.inf)
+    return Linearised.of(tuned, jnp.concatenate([ratio * tuned.sigma[0], tuned.sigma[1:]])), more
 
 
 def median(
-    means: Float[Array, "p k ..."],
-    spread: Float[Array, "k ..."],
-    weight: Float[Array, "k ..."],
-    squares: Float[Array, "p p ..."],
-) -> Float[Array, "k ..."]:
-    """Shares of the laws' answers in their geometric median.
+    answers: Answers, metric: Float[Array, "q q lanes"]
+) -> tuple[Float[Array, "q lanes"], Float[Array, "q q lanes"]]:
+    """The answers' geometric median, and the covariance about it.
 
     Mean RP is the average of a distance, not of its square, and so the answer is where the expected
     distance is least: between laws that disagree that is nearer to the more probable one than their
@@ -409,48 +369,28 @@ def median(
     x = m for one unknown, and far away.
 
     Args:
-        means: the laws' answers m.
-        spread: tr(C H) of each.
-        weight: the laws' probabilities.
-        squares: H = sum of h_i h_i', the metric.
+        answers: whose.
+        metric: H = sum of h_i h_i'.
 
     Reference: Weiszfeld 1937.
     """
-    within = (2 / np.pi) * spread
+    means, weight, metric = answers.mean, answers.weight, metric[:, :, None]
+    within = (2 / np.pi) * jnp.sum(metric * answers.covariance, axis=(0, 1))
+    within = barrier(within)
     tiny = jnp.finfo(weight.dtype).tiny
 
     def once(_: Array, share: Array) -> Array:
         off = means - jnp.sum(share * means, axis=1, keepdims=True)
-        # H (p, p) times off (p, k), summed against off.
-        length = jnp.sum(off * jnp.sum(squares[:, :, None] * off, axis=1), axis=0)
+        # H (q, q) times off (q, k), summed against off.
+        length = jnp.sum(off * jnp.sum(metric * off, axis=1), axis=0)
         pull = weight / jnp.sqrt(jnp.maximum(jnp.maximum(length, 0.0) + within, tiny))
         whole = jnp.sum(pull, axis=0)
         return pull / jnp.where(whole > 0, whole, 1.0)
 
-    return jax.lax.fori_loop(0, MEDIAN_STEPS, once, weight)
-
-
-def odds_of_mean(
-    log_evidence: Float[Array, "k ..."],
-    gain: Float[Array, "k ..."],
-    good: Bool[Array, "k ..."],
-    prior: Float[Array, " k"],
-) -> Array:
-    """Log of how much more probable all laws together make the data with a mean than without.
-
-    Args:
-        log_evidence: with one.
-        gain: how much less each law's is without.
-        good: laws that count; NaN where none does.
-        prior: their probabilities.
-    """
-    prior = prior.reshape(-1, *(1,) * (log_evidence.ndim - 1))
-
-    def together(score: Array) -> Array:
-        score = jnp.where(good, jax.lax.stop_gradient(score), -jnp.inf)
-        return jax.nn.logsumexp(score, axis=0, b=prior)
-
-    return together(log_evidence) - together(log_evidence - gain)
+    share = barrier(jax.lax.fori_loop(0, MEDIAN_STEPS, once, weight))
+    place = jnp.sum(share * means, axis=1)
+    off = means - place[:, None]
+    return place, jnp.sum(weight * (answers.covariance + off[:, None] * off), axis=2)
 
 
 def weights(
@@ -458,10 +398,15 @@ def weights(
     change: Float[Array, "k ..."],
     prior: Float[Array, " k"],
 ) -> tuple[Array, Array]:
-    """The laws' probabilities, and which of them count at all."""
-    good = jnp.isfinite(log_evidence) & (change < LARGEST_CHANGE)
+    """The laws' probabilities, and which of them are numbers at all.
+
+    A law that is still on the move loses weight, the faster the more.
+    """
+    good = jnp.isfinite(log_evidence) & jnp.isfinite(change)
     prior = prior.reshape(-1, *(1,) * (log_evidence.ndim - 1))
-    score = jnp.where(good, jnp.where(good, log_evidence, 0.0) + jnp.log(prior), -jnp.inf)
+    moving = (jnp.where(good, change, 0.0) / LARGEST_CHANGE) ** 4
+    score = jnp.where(good, log_evidence, 0.0) + jnp.log(prior) - moving
+    score = jnp.where(good, score, -jnp.inf)
     # Where no law is good the weights must still be numbers: a lane's NaN poisons its gradient.
     score = jnp.where(jnp.any(good, axis=0), score, 0.0)
     return jax.nn.softmax(score, axis=0) * good, good

@@ -1,17 +1,18 @@
-"""How probable the data are under Gaussian errors, with their SDs and the offsets' mean tuned.
+"""Gaussian noise models with a mean of the offsets, tuned, and how probable they make the data.
 
-Two questions are put to the data before any law of the offsets is: do the covariances that came
-with the measurements describe their errors better than common SDs do, and do the offsets have a
-mean other than zero? Own covariances fix the ratios of all measurements' SDs, so one factor is
-tuned for them, and one SD for the offsets; common SDs are tuned separately. Each combination is
-tuned by a few rounds of Gauss-Newton with Helmert's updates (:mod:`jaxcal.solvers.reml`) from the
-self-tuned fit, and judged by its Laplace evidence
+What a noise model takes for granted is asked of the data before any law of the offsets is: whether
+the offsets have a mean other than zero (:mod:`jaxcal.solvers.offset_mean`), and whether the
+covariances that came with the measurements describe their errors better than common SDs do. Own
+covariances fix the ratios of all measurements' SDs, so one factor is tuned for them, and one SD for
+the offsets; common SDs are tuned separately. Each is tuned by a few rounds of Gauss-Newton with
+Helmert's updates (:mod:`jaxcal.solvers.reml`) from the self-tuned fit, the mean at what is believed
+of it in every one, and judged by its Laplace evidence
 
     ln Z = -1/2 sum r' W r - 1/2 sum (q_y - b)^2 / s_y^2 + 1/2 sum ln |W| - n ln s_y
            + 1/2 ln tau - 1/2 tau b^2 - 1/2 ln |H|,
 
 W_i the information of image i's measurements, H the curvature with respect to all unknowns, and
-b ~ N(0, 1/tau) with 1/tau = (2 s_y)^2 where there is a mean.
+b ~ N(0, 1/tau) with 1/tau = (2 s_y)^2.
 
 Everything happens on the sums that one pass over the images leaves for each component
 (:func:`jaxcal.solvers.normal_equations.component_sums`). A mean b needs no further sum: it moves
@@ -21,8 +22,6 @@ q_iy - b as v_y does, so its row of N_y is that of v_y, and
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -34,6 +33,7 @@ from jaxcal.model.batch import Images, Iterate, barrier
 from jaxcal.model.observations import Medium, Observation
 from jaxcal.solvers import dense
 from jaxcal.solvers.normal_equations import ComponentSums, component_sums, pairs
+from jaxcal.solvers.offset_mean import MEAN_SD, believed, gained, influences, trust_in
 from jaxcal.solvers.reml import helmert, least_sigma
 
 ROUNDS = 2
@@ -42,17 +42,11 @@ ROUNDS = 2
 UPDATES = 2
 """Updates of the SDs on each of them."""
 
-MEAN_SD = 2.0
-"""SD of the offsets' mean before the data are seen, in SDs of the offsets."""
-
 V_Y = 1
 """The unknown that moves every q_iy by -1."""
 
-Pass = Callable[[Iterate], ComponentSums]
-"""One pass over the images; the offsets are the last component."""
 
-
-class Evidence(eqx.Module):
+class NoiseModel(eqx.Module):
     """A Gaussian noise model tuned to the data; lanes last.
 
     Attributes:
@@ -60,28 +54,28 @@ class Evidence(eqx.Module):
         mean: b, mm.
         sigma: SD of each component, mm.
         sums: of the images there.
-        with_mean: 1 where the offsets may have a mean.
-        log_evidence: ln Z, up to a constant and the covariances' determinants.
+        trust: what share of what the data say of b counts.
     """
 
     place: Iterate
     mean: Float[Array, " lanes"]
     sigma: Float[Array, "k lanes"]
     sums: ComponentSums
-    with_mean: Float[Array, " lanes"]
-    log_evidence: Float[Array, " lanes"]
+    trust: Float[Array, " lanes"]
+
+    def log_evidence(self, count: Float[Array, "k lanes"]) -> Float[Array, " lanes"]:
+        """Ln Z, up to a constant and the covariances' determinants.
+
+        Args:
+            count: residuals of each component.
+        """
+        system = System.of(self.sums, self.mean)
+        inverse, step, evidence = system.solved(self.sigma, self.mean)
+        with_mean = believed(self.mean + step[-1], inverse[-1, -1], self.sigma[-1], self.trust)
+        return evidence + gained(with_mean) - jnp.sum(count * jnp.log(self.sigma), axis=0)
 
 
-def pass_over(observation: Observation, images: Images, medium: Medium | None) -> Pass:
-    """The pass for an observation."""
-
-    def sums(place: Iterate) -> ComponentSums:
-        return component_sums(place, observation, images, None, medium)
-
-    return sums
-
-
-class _System(eqx.Module):
+class System(eqx.Module):
     """Every component's normal equations about a mean b, which is the last unknown.
 
     Attributes:
@@ -97,20 +91,20 @@ class _System(eqx.Module):
     squares: Float[Array, "k lanes"]
 
     @classmethod
-    def of(cls, sums: ComponentSums, mean: Array, with_mean: Array) -> _System:
+    def of(cls, sums: ComponentSums, mean: Array) -> System:
         """From what a pass left."""
         only = np.eye(len(sums.squares))[-1][:, None]
         along = row_of(sums.matrix[-1], V_Y)
         squares = mean * (2 * sums.gradient[-1, V_Y] + mean * along[V_Y])
         gradient = sums.gradient + only[:, None] * mean * along
-        last = only * with_mean * gradient[:, V_Y]
-        border = with_mean * jnp.concatenate([along, along[V_Y, None]])
+        last = only * gradient[:, V_Y]
+        border = jnp.concatenate([along, along[V_Y, None]])
         gradient = jnp.concatenate([gradient, last[:, None]], axis=1)
         return barrier(cls(sums, border, gradient, sums.squares + only * squares))
 
-    def solved(self, sigma: Array, precision: Array, mean: Array) -> tuple[Array, ...]:
-        """Inverse and step with given SDs and belief about b, and ln Z but for the SDs."""
-        weight = 1 / sigma**2
+    def solved(self, sigma: Array, mean: Array) -> tuple[Array, Array, Array]:
+        """Inverse and step with given SDs where there is a mean, and ln Z but for the SDs."""
+        weight, precision = 1 / sigma**2, (MEAN_SD * sigma[-1]) ** -2.0
         normal = self.sums.weighed(weight)
         unknowns = normal.gradient.shape[0]
         last = (np.arange(unknowns + 1) == unknowns)[:, None]
@@ -147,41 +141,49 @@ def row_of(flat: Float[Array, "triangle lanes"], k: int) -> Float[Array, "p lane
     return jnp.stack([flat[places.index((min(k, j), max(k, j)))] for j in range(size)])
 
 
-def mean_precision(offset_sd: Array, with_mean: Array) -> Array:
-    """1 / (2 s_y)^2; without a mean, its unknown is held at zero by a precision of one."""
-    return jnp.where(with_mean > 0, (MEAN_SD * offset_sd) ** -2.0, 1.0)
-
-
 def tune(
-    sums_at: Pass,
     place: Iterate,
-    sigma: Float[Array, "k lanes"],
-    with_mean: Float[Array, " lanes"],
-    count: Float[Array, "k lanes"],
+    observation: Observation,
+    images: Images,
+    medium: Medium | None,
     rounds: int = ROUNDS,
-) -> Evidence:
+) -> NoiseModel:
     """Tune the SDs, the unknowns and the mean from a nearby solution.
 
     Args:
-        sums_at: the pass over the images.
         place: to start from.
-        sigma: SDs to start from, mm.
-        with_mean: 1 where the offsets may have a mean.
-        count: residuals of each component.
+        observation: with the SDs to start from, mm.
+        images: the data.
+        medium: what is known of sound speed and delay besides.
         rounds: passes before the last.
     """
-    # One floor for all models: one that followed each model's own offset SD would count a gain in
+    count, start = observation.count(images), observation.sigma
+    # One floor for all rounds: one that followed each model's own offset SD would count a gain in
     # that SD three times in the evidence, where data are exact.
-    floor = least_sigma(sigma)
+    floor = least_sigma(start)
+
+    def sums_at(place: Iterate) -> ComponentSums:
+        return barrier(component_sums(place, observation, images, None, medium))
 
     def one_round(_: Array, state: tuple) -> tuple:
-        place, mean, sigma = state
-        system = _System.of(barrier(sums_at(place)), mean, with_mean)
+        place, mean, sigma, _ = state
+        system = System.of(sums_at(place), mean)
+        inverse, step, _ = barrier(system.solved(sigma, mean))
+        moved = influences(
+            place, observation, images, 1 / sigma**2, mean, along=inverse[:, -1], step=step
+        )
+        trust = trust_in(inverse[-1, -1], moved)
 
         def update(_: Array, state: tuple) -> tuple:
             sigma, _ = state
-            precision = mean_precision(sigma[-1], with_mean)
-            inverse, step, _ = barrier(system.solved(sigma, precision, mean))
+            inverse, step, _ = barrier(system.solved(sigma, mean))
+            variance = inverse[-1, -1]
+            belief = believed(mean + step[-1], variance, sigma[-1], trust)
+            # The others follow b.
+            along = inverse[:, -1] / variance
+            step = step + along * (belief.mean - mean - step[-1])
+            inverse = inverse + along[:, None] * along * (belief.variance - variance)
+            inverse, step = barrier((inverse, step))
             bent = system.traces(step[:, None] * step)
             left = system.squares + 2 * jnp.sum(system.gradient * step, axis=1) + bent
             updated = helmert(left, system.traces(inverse), count, sigma)
@@ -189,24 +191,9 @@ def tune(
 
         none = jnp.zeros((place.unknowns + 1, mean.shape[0]), mean.dtype)
         sigma, step = jax.lax.fori_loop(0, UPDATES, update, (sigma, none))
-        return barrier((place.moved(list(step[:-1])), mean + step[-1], sigma))
+        return barrier((place.moved(list(step[:-1])), mean + step[-1], sigma, trust))
 
-    state = (place, jnp.zeros_like(with_mean), sigma)
-    place, mean, sigma = jax.lax.fori_loop(0, rounds, one_round, state)
-    return judged(sums_at, place, sigma, mean, with_mean, count)
-
-
-def judged(
-    sums_at: Pass,
-    place: Iterate,
-    sigma: Float[Array, "k lanes"],
-    mean: Float[Array, " lanes"],
-    with_mean: Float[Array, " lanes"],
-    count: Float[Array, "k lanes"],
-) -> Evidence:
-    """A noise model with its Laplace evidence, but for the covariances' determinants."""
-    sums = barrier(sums_at(place))
-    system = _System.of(sums, mean, with_mean)
-    _, _, evidence = system.solved(sigma, mean_precision(sigma[-1], with_mean), mean)
-    evidence = evidence - jnp.sum(count * jnp.log(sigma), axis=0)
-    return Evidence(place, mean, sigma, sums, with_mean, evidence)
+    zero = jnp.zeros_like(start[0])
+    state = (place, zero, start, zero + 1)
+    place, mean, sigma, trust = jax.lax.fori_loop(0, rounds, one_round, state)
+    return NoiseModel(place, mean, sigma, sums_at(place), trust)

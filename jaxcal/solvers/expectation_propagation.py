@@ -25,10 +25,10 @@ the target,
 so the sites never see v_x, v_z, w_y nor the further unknowns, and see v_y and the mean b only
 together. All these are eliminated once, exactly, from what the measurements say (:func:`marginal`);
 the sweeps run on z = (s, w_x, w_z, d), 21 + 6 sums over the images and a 6x6 inverse each; and what
-comes out, after the laws' median, is carried back to all unknowns (:meth:`Marginal.lifted`).
+comes out under each law is carried back to all unknowns (:class:`Lift`).
 
-The laws of one family share a program, and each begins with the sites of the one before. The
-Gaussian law needs no sweep: its sites are the sums that the evidence step left.
+All laws share a program, in which only the moments' quadratures differ, and the laws of one family
+begin each with the sites of the one before.
 
 Reference: Minka 2001; Rasmussen and Williams 2006, section 3.6.
 """
@@ -36,6 +36,7 @@ Reference: Minka 2001; Rasmussen and Williams 2006, section 3.6.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -50,11 +51,8 @@ from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.solvers import dense
 from jaxcal.solvers.normal_equations import pairs, stacked
 
-AHEAD = 3
-"""Sweeps under a family's first law before the following."""
-
 SWEEPS = 3
-"""Sweeps under each law, from the sites of the one before it."""
+"""Sweeps under each law, from the sites of the one before; a family's first gets twice as many."""
 
 DAMPING = 0.8
 
@@ -116,7 +114,6 @@ class Marginal(eqx.Module):
         shift: the others (:func:`hidden`) at z = 0.
         slope: rows B of others = shift + B z.
         spread: their covariance for given z.
-        with_mean: 1 where there is a mean.
     """
 
     information: Float[Array, "6 6 lanes"]
@@ -124,45 +121,45 @@ class Marginal(eqx.Module):
     shift: Float[Array, "h lanes"]
     slope: Float[Array, "h 6 lanes"]
     spread: Float[Array, "h h lanes"]
-    with_mean: Float[Array, " lanes"]
 
-    def lifted(
-        self, mean: Float[Array, "6 lanes"], covariance: Float[Array, "6 6 lanes"]
-    ) -> tuple[Float[Array, "q lanes"], Float[Array, "q q lanes"]]:
-        """Mean and covariance of all unknowns, b last, from those of z."""
-        others = self.shift + dense.product_abreast(self.slope, mean)
-        across = dense.product_abreast(self.slope, covariance)
-        own = self.spread + dense.product_abreast(across, jnp.swapaxes(self.slope, 0, 1))
-        upper = jnp.concatenate([own, across], axis=1)
-        lower = jnp.concatenate([jnp.swapaxes(across, 0, 1), covariance], axis=1)
-        whole, matrix = jnp.concatenate([others, mean]), jnp.concatenate([upper, lower])
-        size = len(whole)
-        order = [*hidden(size - 1), *SEEN]
-        back = [order.index(k) for k in range(size)]
-        whole = jnp.stack([whole[k] for k in back])
-        matrix = jnp.stack([jnp.stack([matrix[i, j] for j in back]) for i in back])
+    def lift(self) -> Lift:
+        """How all unknowns, b last, follow from z."""
+        seen = jnp.broadcast_to(jnp.eye(len(SEEN))[..., None], (len(SEEN), *self.gradient.shape))
+        shift = jnp.concatenate([self.shift, jnp.zeros_like(self.gradient)])
+        slope = jnp.concatenate([self.slope, seen])
+        spread = jnp.pad(self.spread, [(0, len(SEEN)), (0, len(SEEN)), (0, 0)])
+        order = [*hidden(len(shift) - 1), *SEEN]
+        back = np.argsort(order)
+        whole = jnp.concatenate([shift[:, None], slope, spread], axis=1)[back]
         # From s back to v_y = s - b.
-        shear = jnp.where(np.arange(size)[:, None] == ELEVATION, self.with_mean, 0.0)
-        whole = whole - shear * whole[-1]
-        matrix = matrix - shear[:, None] * matrix[-1]
-        return whole, matrix - shear[None] * matrix[:, -1, None]
+        whole = whole - (np.arange(len(back)) == ELEVATION)[:, None, None] * whole[-1]
+        spread = whole[:, 1 + len(SEEN) :][:, back]
+        sheared = (np.arange(len(back)) == ELEVATION)[None, :, None]
+        spread = spread - sheared * spread[:, -1, None]
+        return barrier(Lift(whole[:, 0], whole[:, 1 : 1 + len(SEEN)], spread))
 
-    def of_mean(
+
+class Lift(eqx.Module):
+    """All unknowns from z: x = shift + slope z, and a spread for given z; lanes last.
+
+    Attributes:
+        shift: x at z = 0.
+        slope: by z.
+        spread: covariance of x for given z.
+    """
+
+    shift: Float[Array, "q lanes"]
+    slope: Float[Array, "q 6 lanes"]
+    spread: Float[Array, "q q lanes"]
+
+    def __call__(
         self, mean: Float[Array, "6 k lanes"], covariance: Float[Array, "6 6 k lanes"]
-    ) -> tuple[Float[Array, "k lanes"], Float[Array, "k lanes"], Float[Array, "6 k lanes"]]:
-        """Expectation and variance of b, and its covariances with z, from beliefs about z."""
-        slope = self.slope[-1, :, None]
-        along = jnp.sum(covariance * slope, axis=1)
-        expected = self.shift[-1] + jnp.sum(slope * mean, axis=0)
-        return expected, self.spread[-1, -1] + jnp.sum(slope * along, axis=0), along
-
-    def held(self, mean: Float[Array, " lanes"]) -> Marginal:
-        """The same where b is known."""
-        share = self.spread[:, -1] / self.spread[-1, -1]
-        shift = self.shift + share * (mean - self.shift[-1])
-        slope = self.slope - share[:, None] * self.slope[-1]
-        spread = self.spread - share[:, None] * self.spread[-1]
-        return Marginal(self.information, self.gradient, shift, slope, spread, self.with_mean)
+    ) -> tuple[Float[Array, "q k lanes"], Float[Array, "q q k lanes"]]:
+        """Mean and covariance of all unknowns from those of z."""
+        slope = self.slope[:, :, None]
+        found = self.shift[:, None] + jnp.sum(slope * mean, axis=1)
+        across = barrier(jnp.sum(slope[:, :, None] * covariance, axis=1))
+        return found, self.spread[:, :, None] + jnp.sum(across[:, None] * slope, axis=2)
 
 
 def marginal(
@@ -170,7 +167,6 @@ def marginal(
     gradient: Float[Array, "p lanes"],
     precision: Float[Array, " lanes"],
     mean: Float[Array, " lanes"],
-    with_mean: Float[Array, " lanes"],
 ) -> Marginal:
     """Eliminate what the sites do not see.
 
@@ -179,16 +175,15 @@ def marginal(
         gradient: of half the measurements' cost.
         precision: of b before the data are seen.
         mean: b here, mm.
-        with_mean: 1 where there is a mean; without one its deviation is held at zero.
     """
     unknowns = gradient.shape[0]
     full = unrolled.symmetric(unrolled.rows_of(information))
     # b moves q_iy against s - v_y: in (s, b), b takes v_y's information along.
     for i in range(unknowns):
-        full[i].append(-with_mean * full[i][ELEVATION])
+        full[i].append(-full[i][ELEVATION])
     full.append([full[j][unknowns] for j in range(unknowns)])
-    full[unknowns].append(with_mean * full[ELEVATION][ELEVATION] + precision)
-    force = jnp.concatenate([-gradient, (with_mean * gradient[ELEVATION] - precision * mean)[None]])
+    full[unknowns].append(full[ELEVATION][ELEVATION] + precision)
+    force = jnp.concatenate([-gradient, (gradient[ELEVATION] - precision * mean)[None]])
     others, seen = hidden(unknowns), [*SEEN]
 
     def block(rows: list[int], columns: list[int]) -> Array:
@@ -206,7 +201,6 @@ def marginal(
             dense.product_abreast(spread, pull),
             slope,
             spread,
-            with_mean,
         )
     )
 
@@ -234,10 +228,11 @@ def propagate(
     pull: Float[Array, "6 lanes"],
     families: Sequence[Family],
     sd: Float[Array, "k lanes"],
-    ahead: int = AHEAD,
     sweeps: int = SWEEPS,
 ) -> Posterior:
-    """Belief and evidence under every law.
+    """Belief and evidence under every law, one law after the other.
+
+    Side by side they would not stay in the second-level cache.
 
     Args:
         known: what the measurements say.
@@ -246,23 +241,36 @@ def propagate(
         pull: sum of h_i o_i.
         families: of the laws.
         sd: their SDs, mm; of a family with edges, the widest first.
-        ahead: sweeps under a family's first law before those that each law gets.
-        sweeps: how many under each law.
+        sweeps: how many under each law; the first of a family gets twice as many, since the others
+            begin with the sites of the one before.
     """
-    parts, order = [], []
-    for family in dict.fromkeys(families):
-        at = [k for k, name in enumerate(families) if name == family]
-        found = _in_turn(
-            family, jnp.stack([sd[k] for k in at]), sites, known, (squares, pull), ahead, sweeps
-        )
-        parts.append([jnp.moveaxis(each, 0, -2) for each in found])
-        order += at
-    back = [order.index(k) for k in range(len(order))]
-    mean, covariance, evidence, change = (
-        jnp.concatenate([part[k] for part in parts], axis=-2)[..., jnp.asarray(back), :]
-        for k in range(4)
-    )
-    return Posterior(mean, covariance, evidence, change)
+    names = list(dict.fromkeys(families))
+    turns: list[tuple[int, int, bool]] = []
+    last = []
+    for which, name in enumerate(names):
+        at = [k for k, family in enumerate(families) if family == name]
+        # A Gaussian law's first sites are right, but where it is cut.
+        ahead = [] if name == "gaussian" and sites.lower is None else [(which, at[0], True)]
+        turns += ahead
+        for k in at:
+            turns.append((which, k, k == at[0] and not ahead))
+            last.append((k, len(turns) - 1))
+    family, law, fresh = (jnp.asarray(column) for column in zip(*turns, strict=True))
+    under = _Laws(names, sites, known, squares, pull)
+
+    def one(state: tuple, turn: tuple) -> tuple[tuple, _Found]:
+        family, sd, fresh = turn
+        begun = under.gaussian(sd)
+        state = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, state)
+        return under.swept(family, sd, state, sweeps)
+
+    # The first turn is fresh.
+    shape = jax.eval_shape(under.gaussian, sd[0])
+    start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
+    _, found = jax.lax.scan(one, start, (family, sd[law], fresh))
+    order = jnp.asarray([turn for _, turn in sorted(last)])
+    found = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[order], 0, -2), found)
+    return Posterior(found.mean, found.covariance, found.log_evidence, found.change)
 
 
 class _Belief(eqx.Module):
@@ -271,6 +279,21 @@ class _Belief(eqx.Module):
     information: Float[Array, "6 6 lanes"]
     rhs: Float[Array, "6 lanes"]
     log_determinant: Float[Array, " lanes"]
+
+
+class _State(eqx.Module):
+    """The sites (tau, nu) of every image, and the belief that they make."""
+
+    tau: Float[Array, "lanes n"]
+    nu: Float[Array, "lanes n"]
+    belief: _Belief
+
+
+class _Found(eqx.Module):
+    mean: Float[Array, "6 lanes"]
+    covariance: Float[Array, "6 6 lanes"]
+    log_evidence: Float[Array, " lanes"]
+    change: Float[Array, " lanes"]
 
 
 def seen(
@@ -290,27 +313,46 @@ def _solved(information: Float[Array, "6 6 lanes"], rhs: Float[Array, "6 lanes"]
     return barrier(_Belief(covariance, mean, information, rhs, log_determinant))
 
 
-def _in_turn(
-    family: Family,
-    sd: Float[Array, "k lanes"],
-    sites: Sites,
-    known: Marginal,
-    sums: tuple[Float[Array, "6 6 lanes"], Float[Array, "6 lanes"]],
-    ahead: int,
-    sweeps: int,
-) -> tuple[Array, Array, Array, Array]:
-    """Mean, covariance, log evidence and last change under laws of one family, one by one."""
-    h, offset, used = sites.direction, sites.offset, sites.used
-    information, gradient = known.information, known.gradient
+class _Laws(eqx.Module):
+    """The problem, and what one law's sweeps do to the sites."""
 
-    def begun(sd: Array) -> tuple[Array, Array, _Belief]:
+    families: Sequence[Family] = eqx.field(static=True)
+    sites: Sites
+    known: Marginal
+    squares: Float[Array, "6 6 lanes"]
+    pull: Float[Array, "6 lanes"]
+
+    def gaussian(self, sd: Float[Array, " lanes"]) -> _State:
         """The sites of the Gaussian law."""
-        squares, pull = sums
-        tau = used / (sd * sd)[:, None]
-        belief = _solved(information + squares / sd**2, gradient - pull / sd**2)
-        return tau, jnp.zeros_like(tau), belief
+        tau = self.sites.used / (sd * sd)[:, None]
+        belief = _solved(
+            self.known.information + self.squares / sd**2, self.known.gradient - self.pull / sd**2
+        )
+        return _State(tau, jnp.zeros_like(tau), belief)
 
-    def cavity(tau: Array, nu: Array, belief: _Belief) -> tuple[Array, Array]:
+    def swept(
+        self, family: Array, sd: Float[Array, " lanes"], state: _State, sweeps: int
+    ) -> tuple[_State, _Found]:
+        """So many sweeps under a law; the evidence is that before the last one."""
+
+        def sweep(_: Array, carry: tuple) -> tuple:
+            before, _ = carry
+            after, evidence, crowded = self.sweep(family, sd, before)
+            step = after.belief.mean - before.belief.mean
+            length = jnp.sum(step * dense.product_abreast(after.belief.information, step), axis=0)
+            change = jnp.where(crowded, jnp.inf, jnp.sqrt(jnp.maximum(length, 0.0)))
+            return after, (evidence, change)
+
+        none = jnp.zeros_like(sd)
+        state, (evidence, change) = jax.lax.fori_loop(0, sweeps, sweep, (state, (none, none)))
+        return state, _Found(state.belief.mean, state.belief.covariance, evidence, change)
+
+    def sweep(
+        self, family: Array, sd: Float[Array, " lanes"], state: _State
+    ) -> tuple[_State, Array, Array]:
+        """All sites once; the log evidence before, and where a site left nothing for the others."""
+        h, offset, used = self.sites.direction, self.sites.offset, self.sites.used
+        tau, nu, belief = state.tau, state.nu, state.belief
         entry = belief.covariance[..., None]
         doubled = [
             unrolled.add(*((1 if i == j else 2) * entry[i, j] * h[j] for j in range(i, 6)))
@@ -320,72 +362,37 @@ def _in_turn(
         at = offset + unrolled.dot(h, [row[:, None] for row in belief.mean])
         shrink = 1 / jnp.maximum(1 - tau * variance, LEAST_ROOM)
         centre = shrink * (at - variance * nu)
-        return centre, jnp.where(used > 0, variance * shrink, 1.0)
+        without = jnp.where(used > 0, variance * shrink, 1.0)
+        centre, without = barrier((centre, without))
+        ways = [
+            partial(tilted, name, lower=self.sites.lower, upper=self.sites.upper)
+            for name in self.families
+        ]
+        found = jax.lax.switch(family, ways, sd, centre, without)
 
-    def moments(sd: Array, tau: Array, nu: Array, belief: _Belief) -> tuple[Moments, Array, Array]:
-        centre, without = cavity(tau, nu, belief)
-        found = tilted(family, sd, centre, without, sites.lower, sites.upper)
-        return found, centre, without
-
-    def refresh(
-        tau: Array, nu: Array, before: _Belief, found: Moments, centre: Array, without: Array
-    ) -> tuple[Array, Array, _Belief]:
-        new_tau, new_nu = refreshed(found, centre, without)
-        tau = tau + DAMPING * used * (new_tau - tau)
-        nu = nu + DAMPING * used * (new_nu - nu)
-        tau, nu = barrier((tau, nu))
-        weighted = [tau * row for row in h]
-        force = nu - tau * offset
-        planes = [weighted[i] * h[j] for i, j in TRIANGLE]
-        sums = total([*planes, *(force * row for row in h)])
-        return (
-            tau,
-            nu,
-            _solved(information + stacked(jnp.stack(sums[:21])), gradient + jnp.stack(sums[21:])),
-        )
-
-    def swept(times: int, sd: Array, state: tuple) -> tuple:
-        def sweep(_: Array, state: tuple) -> tuple:
-            tau, nu, belief = state
-            return refresh(tau, nu, belief, *moments(sd, tau, nu, belief))
-
-        return jax.lax.fori_loop(0, times, sweep, state)
-
-    def judged(sd: Array, state: tuple) -> tuple[Array, Array, tuple[Moments, Array, Array]]:
-        """Log evidence, whether a site leaves nothing for the others, and what was found."""
-        tau, nu, belief = state
-        found, centre, without = moments(sd, tau, nu, belief)
         # The evidence is stationary in the sites, so it is as good before the last sweep as after.
         joined = 1 + tau * without
         site = found.log_mass + 0.5 * jnp.log(joined)
         site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
         site = site + nu * offset - 0.5 * tau * offset**2
-        gained = jnp.sum(belief.rhs * belief.mean, axis=0)
         crowded = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)
-        site, crowded = total([used * site, crowded])
+
+        new_tau, new_nu = refreshed(found, centre, without)
+        tau = tau + DAMPING * used * (new_tau - tau)
+        nu = nu + DAMPING * used * (new_nu - nu)
+        tau, nu, site, crowded = barrier((tau, nu, used * site, crowded))
+        weighted = [tau * row for row in h]
+        force = nu - tau * offset
+        planes = [weighted[i] * h[j] for i, j in TRIANGLE]
+        *sums, site, crowded = total([*planes, *(force * row for row in h), site, crowded])
+        gained = jnp.sum(belief.rhs * belief.mean, axis=0)
         evidence = site + 0.5 * gained - 0.5 * belief.log_determinant
-        return evidence, crowded > 0, (found, centre, without)
-
-    def law(state: tuple, sd: Array) -> tuple[tuple, tuple[Array, Array, Array, Array]]:
-        tau, nu, before = state = swept(sweeps - 1, sd, state)
-        evidence, crowded, found = judged(sd, state)
-        after = refresh(tau, nu, before, *found)
-        belief = after[-1]
-        step = belief.mean - before.mean
-        length = jnp.sum(step * dense.product_abreast(belief.information, step), axis=0)
-        change = jnp.where(crowded, jnp.inf, jnp.sqrt(jnp.maximum(length, 0.0)))
-        return after, (belief.mean, belief.covariance, evidence, change)
-
-    def exact(sd: Array) -> tuple[Array, Array, Array, Array]:
-        state = begun(sd)
-        evidence, crowded, _ = judged(sd, state)
-        belief = state[-1]
-        return belief.mean, belief.covariance, evidence, jnp.where(crowded, jnp.inf, 0.0)
-
-    # One after the other: side by side they would not stay in the second-level cache.
-    if family == "gaussian" and sites.lower is None:
-        return jax.lax.map(exact, sd)
-    return jax.lax.scan(law, swept(ahead, sd[0], begun(sd[0])), sd)[1]
+        size = len(TRIANGLE)
+        after = _solved(
+            self.known.information + stacked(jnp.stack(sums[:size])),
+            self.known.gradient + jnp.stack(sums[size:]),
+        )
+        return _State(tau, nu, after), evidence, crowded > 0
 
 
 def refreshed(found: Moments, centre: Array, without: Array) -> tuple[Array, Array]:

@@ -32,12 +32,13 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.model import unrolled
 from jaxcal.model.batch import Images, Iterate, barrier, choose
 from jaxcal.model.observations import Medium, Observation
-from jaxcal.model.unrolled import Matrix, Vector, symmetric
+from jaxcal.solvers import dense
 from jaxcal.solvers.levenberg_marquardt import (
     IDLE,
     LARGEST_DAMPING,
@@ -54,6 +55,7 @@ from jaxcal.solvers.normal_equations import (
     Normal,
     component_sums,
     pairs,
+    stacked,
 )
 
 MINIMUM_SELF_TUNING = 8
@@ -176,71 +178,58 @@ class SelfTuned(eqx.Module):
         )
 
 
-class _Model(eqx.Module):
-    """The sums as rows of lanes."""
+def damped_step(
+    normal: Normal, rest: Float[Array, "triangle lanes"], damping: Array, exact: Array
+) -> Float[Array, "p lanes"]:
+    """The step with given weights; NaN where the matrix is indefinite.
 
-    squares: Vector
-    gradient: list[Vector]
-    matrix: list[Vector]
-    rest: Vector
-
-    @classmethod
-    def of(cls, sums: ComponentSums) -> _Model:
-        """Unpack."""
-        return cls(
-            unrolled.rows_of(sums.squares),
-            [unrolled.rows_of(row) for row in sums.gradient],
-            [unrolled.rows_of(row) for row in sums.matrix],
-            unrolled.rows_of(sums.rest),
-        )
-
-    def step(self, normal: Normal, damping: Array, exact: Array) -> tuple[Vector, Matrix]:
-        """The step and Gauss-Newton's matrix with given weights; NaN where indefinite."""
-        flat = once(unrolled.rows_of(normal.curvature))
-        gradient = once(unrolled.rows_of(normal.gradient))
-        full = symmetric([h + exact * c for h, c in zip(flat, self.rest, strict=True)])
-        plain = symmetric(flat)
-        for k in range(len(full)):
-            full[k][k] = full[k][k] + damping * jnp.where(plain[k][k] > 0, plain[k][k], 1.0)
-        flat = once(unrolled.upper(full))
-        return once(unrolled.solve(symmetric(flat), [-g for g in gradient])), plain
-
-    def updated(
-        self,
-        sigma: Float[Array, "k lanes"],
-        move: Vector,
-        plain: Matrix,
-        count: Float[Array, "k lanes"],
-    ) -> Float[Array, "k lanes"]:
-        """Helmert's update after a step."""
-        unknowns, eps = len(move), jnp.finfo(count.dtype).eps
-        places = pairs(unknowns)
-        scale = once(
-            [jax.lax.rsqrt(jnp.where(plain[k][k] > 0, plain[k][k], 1.0)) for k in range(unknowns)]
-        )
-
-        def scaled(flat: Vector) -> Matrix:
-            return symmetric(
-                [v * scale[i] * scale[j] for (i, j), v in zip(places, flat, strict=True)]
-            )
-
-        unit = symmetric(once(unrolled.upper(scaled(unrolled.upper(plain)))))
-        for k in range(unknowns):
-            unit[k][k] = unit[k][k] + 16 * eps
-        leverage = unrolled.traces(unit, [scaled(matrix) for matrix in self.matrix])
-        left = []
-        for k, matrix in enumerate(self.matrix):
-            bent = [
-                (1 if i == j else 2) * entry * move[i] * move[j]
-                for (i, j), entry in zip(places, matrix, strict=True)
-            ]
-            left.append(self.squares[k] + 2 * unrolled.dot(self.gradient[k], move) + sum(bent))
-        return with_floor(helmert(jnp.stack(left), jnp.stack(leverage), count, sigma))
+    Args:
+        normal: Gauss-Newton's equations.
+        rest: of the exact curvature.
+        damping: Marquardt's lambda.
+        exact: 1 where the rest counts.
+    """
+    diagonal = normal.diagonal()
+    held = damping * jnp.where(diagonal > 0, diagonal, 1.0)
+    matrix = stacked(normal.curvature + exact * rest)
+    places = jnp.eye(len(diagonal))[..., None]
+    matrix, gradient = barrier((matrix + places * held, normal.gradient))
+    return -dense.product_abreast(dense.inverse_abreast(matrix)[0], gradient)
 
 
-def once(entries: Vector) -> Vector:
-    """The same entries, computed here and once."""
-    return unrolled.rows_of(barrier(jnp.stack(entries)))
+def updated(
+    sums: ComponentSums,
+    normal: Normal,
+    sigma: Float[Array, "k lanes"],
+    move: Float[Array, "p lanes"],
+    count: Float[Array, "k lanes"],
+) -> Float[Array, "k lanes"]:
+    """Helmert's update after a step.
+
+    Args:
+        sums: of the images, by component.
+        normal: Gauss-Newton's equations with these SDs.
+        sigma: mm.
+        move: the step.
+        count: residuals of each component.
+    """
+    diagonal = normal.diagonal()
+    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+    unit = stacked(normal.curvature) * scale[:, None] * scale
+    eps = jnp.finfo(count.dtype).eps
+    unit = barrier(unit + 16 * eps * jnp.eye(len(diagonal))[..., None])
+    inverse = dense.inverse_abreast(unit)[0] * scale[:, None] * scale
+    places = pairs(len(diagonal))
+    twice = np.array([1.0 if i == j else 2.0 for i, j in places])[:, None]
+
+    def flat(matrix: Float[Array, "p p lanes"]) -> Float[Array, "triangle lanes"]:
+        rows, columns = (np.array(each) for each in zip(*places, strict=True))
+        return barrier(twice * matrix[rows, columns])
+
+    leverage = jnp.sum(flat(inverse) * sums.matrix, axis=1)
+    bent = jnp.sum(flat(move[:, None] * move) * sums.matrix, axis=1)
+    left = sums.squares + 2 * jnp.sum(sums.gradient * move, axis=1) + bent
+    return with_floor(helmert(left, leverage, count, sigma))
 
 
 def self_tuned(
@@ -280,13 +269,13 @@ def self_tuned(
         sums: ComponentSums, sigma: Array, damping: Array, exact: Array
     ) -> tuple[Array, Array, Array]:
         """The step that belongs to SDs, the SDs after it, and where the matrix was indefinite."""
-        model = _Model.of(sums)
-        move, plain = model.step(sums.weighed(1 / sigma**2), damping, exact)
-        lost = jnp.logical_not(jnp.isfinite(sum(move)))
-        move = [jnp.where(lost, 0.0, value) for value in move]
-        after = barrier(model.updated(sigma, move, plain, count))
+        normal = sums.weighed(1 / sigma**2)
+        move = damped_step(normal, sums.rest, damping, exact)
+        lost = jnp.logical_not(jnp.all(jnp.isfinite(move), axis=0))
+        move = jnp.where(lost, 0.0, move)
+        after = barrier(updated(sums, normal, sigma, move, count))
         after = jnp.where(enough & jnp.isfinite(after), after, jnp.where(enough, sigma, held))
-        return jnp.stack(move), after, lost
+        return move, after, lost
 
     def propose(sums: ComponentSums, sigma: Array, damping: Array, exact: Array) -> tuple:
         """What the sums of a place say of the next: a few updates of the SDs and their step."""
@@ -393,8 +382,8 @@ def update_at(
     """
     observed = observation.with_sigma(sigma)
     sums = component_sums(place, observed, images, None, medium)
-    normal, model = sums.weighed(1 / sigma**2), _Model.of(sums)
-    still: Vector = [jnp.zeros_like(sigma[0])] * place.unknowns
-    updated = model.updated(sigma, still, normal.matrix(), observation.count(images))
+    normal = sums.weighed(1 / sigma**2)
+    still = jnp.zeros_like(normal.gradient)
+    after = updated(sums, normal, sigma, still, observation.count(images))
     enough = images.used >= MINIMUM_SELF_TUNING
-    return normal, jnp.where(enough, updated, observation.sigma)
+    return normal, jnp.where(enough, after, observation.sigma)

@@ -1,0 +1,159 @@
+"""Do the offsets have a mean other than zero, and how far may the data be believed about it?
+
+A mean b of the offsets and X's elevational translation move the images' planes alike. What tells
+them apart are second-order effects in the measured ranges, which other errors of the model imitate.
+So the belief about b is a mixture,
+
+    b = 0 with probability 9/10,      b ~ N(0, (2 s_y)^2) with probability 1/10,
+
+and not one of the two: every answer moves continuously with the data, and where they leave it open
+whether there is a mean, the covariance knows. With the data's likelihood of b proportional to
+exp(eta b - lambda b^2 / 2), all other unknowns eliminated, and v = (2 s_y)^2,
+
+    ln odds = ln(1/9) + 1/2 v eta^2 / (1 + v lambda) - 1/2 ln(1 + v lambda),
+    p = odds / (1 + odds),   m = v eta / (1 + v lambda),   w = v / (1 + v lambda),
+    E b = p m,               var b = p w + p (1 - p) m^2.
+
+*Trust.* lambda is right where the errors are as the model says: Gaussian, alike, independent. The
+data show whether they are: image i moves b by d_i = (row b of H^-1) times its gradient, and the sum
+of d_i^2 is b's variance whatever the errors' law (the sandwich); with the products of neighbours in
+time added, also where these are alike (Newey and West). Where that is more than the variance under
+the model, by a factor, eta and lambda are divided by it.
+
+References: Mitchell and Beauchamp 1988 (spike and slab); White 1980; Newey and West 1987.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxcal.model import unrolled
+from jaxcal.model.batch import RIGID_UNKNOWNS, Images, Iterate, targets
+from jaxcal.model.observations import Further, Observation
+from jaxcal.model.unrolled import Vector
+
+MEAN_SD = 2.0
+"""SD of the offsets' mean before the data are seen, in SDs of the offsets, where there is one."""
+
+PROBABILITY = 0.1
+"""That there is one: it is one more thing to be wrong about."""
+
+LAGS = 5
+"""How many images after it, in the order in which they come, an image's error may still be felt."""
+
+
+class MeanBelief(eqx.Module):
+    """What is believed of the offsets' mean b.
+
+    Attributes:
+        mean: expectation, mm.
+        variance: mm^2.
+        log_odds: ln of how much more probable the data are with a mean than without.
+    """
+
+    mean: Float[Array, "*lanes"]
+    variance: Float[Array, "*lanes"]
+    log_odds: Float[Array, "*lanes"]
+
+    @property
+    def probability(self) -> Float[Array, "*lanes"]:
+        """That there is one."""
+        return jax.nn.sigmoid(self.log_odds + np.log(PROBABILITY / (1 - PROBABILITY)))
+
+
+def believed(mean: Array, variance: Array, offset_sd: Array, trust: Array) -> MeanBelief:
+    """The belief about b from the Gaussian one that takes for granted that there is a mean.
+
+    Args:
+        mean: b where there is a mean, mm.
+        variance: of b there, mm^2.
+        offset_sd: of the offsets, mm.
+        trust: the share of what the data say that counts (:func:`trust_in`).
+    """
+    prior = (MEAN_SD * offset_sd) ** 2
+    precision = trust * jnp.maximum(1 / variance - 1 / prior, 0.0)
+    pull = trust * mean / variance
+    known = 1 + prior * precision
+    within = prior / known
+    log_odds = 0.5 * (within * pull**2 - jnp.log(known))
+    belief = MeanBelief(within * pull, within, log_odds)
+    p = belief.probability
+    spread = p * (within + (1 - p) * belief.mean**2)
+    return MeanBelief(p * belief.mean, spread, log_odds)
+
+
+def gained(belief: MeanBelief) -> Array:
+    """Ln of the evidence over that which takes for granted that there is a mean."""
+    return jnp.logaddexp(np.log(PROBABILITY), np.log(1 - PROBABILITY) - belief.log_odds)
+
+
+def influences(
+    place: Iterate,
+    observation: Observation,
+    images: Images,
+    weight: Float[Array, "k lanes"],
+    mean: Float[Array, " lanes"],
+    *,
+    along: Float[Array, "q lanes"],
+    step: Float[Array, "q lanes"],
+) -> Float[Array, "lanes n"]:
+    """By how much each image moves an unknown, to first order, in the unknown's unit.
+
+    Args:
+        place: X, c and the further unknowns.
+        observation: whose residuals; the offsets are the last.
+        images: the data.
+        weight: 1/s_k^2.
+        mean: of the offsets, mm.
+        along: the unknown's row of the inverse of the normal matrix, b last.
+        step: to the minimum, b last.
+    """
+    q, turned = targets(place, images)
+
+    def moved(by: Float[Array, "q lanes"]) -> Vector:
+        rows = [row[:, None] for row in by]
+        turn = unrolled.apply(unrolled.cross(q), rows[3:6])
+        shift = unrolled.apply(turned, rows[6:RIGID_UNKNOWNS])
+        rigid = [unrolled.add(-v, w, d) for v, w, d in zip(rows[:3], turn, shift, strict=True)]
+        return [*rigid, *rows[RIGID_UNKNOWNS:-1]]
+
+    def residuals(*at: Array) -> list[Vector]:
+        beside = Further.of(place, list(at[len(q) :]))
+        return [each.errors for each in observation.components(list(at[: len(q)]), beside, images)]
+
+    still = jnp.zeros_like(mean)[:, None]
+    here = [*q, *([still] * (place.unknowns - RIGID_UNKNOWNS))]
+    values, to_minimum = jax.jvp(residuals, tuple(here), tuple(moved(step)))
+    _, slopes = jax.jvp(residuals, tuple(here), tuple(moved(along)))
+    values[-1] = [values[-1][0] - mean[:, None]]
+    to_minimum[-1] = [to_minimum[-1][0] - step[-1][:, None]]
+    slopes[-1] = [slopes[-1][0] - along[-1][:, None]]
+    parts = observation.components(q, Further.of(place, here[len(q) :]), images)
+    total = jnp.zeros_like(images.mask)
+    for k, part in enumerate(parts):
+        for value, change, slope in zip(values[k], to_minimum[k], slopes[k], strict=True):
+            felt = (value + change) * slope
+            if part.present is not None:
+                felt = felt * part.present
+            total = total + weight[k][:, None] * (felt if felt.ndim < 3 else jnp.sum(felt, axis=2))
+    return images.mask * total
+
+
+def trust_in(
+    variance: Float[Array, " lanes"], moved: Float[Array, "lanes n"]
+) -> Float[Array, " lanes"]:
+    """The variance of b under the model over that which the images show, at most one.
+
+    Args:
+        variance: under the model, mm^2.
+        moved: by how much each image moves b, mm, in the order in which they were taken.
+    """
+    shown = jnp.sum(moved**2, axis=1)
+    for lag in range(1, LAGS + 1):
+        together = jnp.sum(moved[:, lag:] * moved[:, :-lag], axis=1)
+        shown = shown + 2 * (1 - lag / (LAGS + 1)) * together
+    return variance / jnp.maximum(variance, shown)
