@@ -69,10 +69,10 @@ def test_differences_are_in_standard_deviations():
     assert found["X"][row] == pytest.approx(1e-5, rel=1e-6)
     assert np.nanmax(np.delete(found["X"], row)) == 0
     assert np.nanmax(found["point"]) == 0
-    moved["has_mean"][row] ^= True
+    moved["weighed"][row] ^= True
     moved["status_code"][3] = 1
     assert {name: rows.tolist() for name, rows in corpus.flips(recorded, moved).items()} == {
-        "has_mean": [row],
+        "weighed": [row],
         "status_code": [3],
     }
     assert corpus.tolerance("points12", "auto", "X") < 1e-5

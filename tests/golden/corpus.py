@@ -279,11 +279,12 @@ DECISIONS = (
     "differentiable",
     "outlier",
     "at_bound",
-    "has_mean",
-    "own_covariances",
     "weighed",
 )
 """Fields that are equal or not."""
+
+PROBABILITIES = ("probability", "mean_probability", "trust", "own_probability")
+"""Of the offsets' law; compared as they are."""
 
 
 def numbers(result: jaxcal.Calibration) -> Arrays:
@@ -331,10 +332,9 @@ def numbers(result: jaxcal.Calibration) -> Arrays:
             found[name] = get(name)
     law = result.offset_law
     if law is not None:
-        for name in ("probability", "mean", "mean_sd", "log_odds_mean", "log_odds_own"):
+        for name in ("mean", "mean_sd", *PROBABILITIES):
             found[name] = np.asarray(getattr(law, name))
-        for name in ("has_mean", "own_covariances", "weighed"):
-            found[name] = np.asarray(getattr(law, name)).astype(bool)
+        found["weighed"] = np.asarray(law.weighed).astype(bool)
     return found
 
 
@@ -400,9 +400,8 @@ def differences(recorded: Arrays, found: Arrays) -> Arrays:
     In units of the recorded SDs: ``X`` (the largest of the six of X Exp(d)), ``point``,
     ``elevation``, ``sigma`` (of which the SD is taken to be sigma / sqrt(2 n)), ``scale``,
     ``sound_speed``, ``delay``, ``mean``. ``covariance`` and ``point_covariance``: the largest
-    |difference| over the product of the two SDs. ``probability``: absolute. ``cost``, ``rms``,
-    ``condition``, ``log_odds``: relative (the last to at least 1). NaN for problems that have no
-    answer in either (:func:`converged`) or one without a covariance, which nothing but a bound
+    |difference| over the product of the two SDs. Probabilities: absolute. ``cost``, ``rms``,
+    ``condition``: relative. NaN for problems that have no answer in either (:func:`converged`) or one without a covariance, which nothing but a bound
     confines, or where distributions were not weighed; infinite where only one has a covariance.
     """
     # Infinities and NaN of what has no answer go out at the end.
@@ -467,20 +466,12 @@ def _differences(recorded: Arrays, found: Arrays) -> Arrays:
         relative = np.abs(apart("channel_sigma")) / recorded["channel_sigma"]
         result["channel_sigma"] = relative * np.sqrt(2 * images)
     if "probability" in recorded:
-        result["probability"] = largest(apart("probability"))
-        has = recorded["has_mean"] & found["has_mean"]
-        mean_sd = np.where(has, np.maximum(recorded["mean_sd"], LEAST_MM), 1.0)
-        result["mean"] = np.where(has, np.abs(apart("mean")) / mean_sd, 0.0)
-        result["mean_sd"] = np.where(has, np.abs(apart("mean_sd")) / mean_sd, 0.0)
-        odds = np.maximum(np.abs(recorded["log_odds_mean"]), 1.0)
-        result["log_odds"] = np.maximum(
-            np.abs(apart("log_odds_mean")) / odds,
-            np.abs(apart("log_odds_own")) / np.maximum(np.abs(recorded["log_odds_own"]), 1.0),
-        )
-    if "probability" in recorded:
         weighed = recorded["weighed"] & found["weighed"]
-        for name in ("probability", "mean", "mean_sd", "log_odds"):
-            result[name] = np.where(weighed, result[name], np.nan)
+        mean_sd = np.where(weighed, np.maximum(recorded["mean_sd"], LEAST_MM), 1.0)
+        for name in ("mean", "mean_sd"):
+            result[name] = np.where(weighed, np.abs(apart(name)) / mean_sd, np.nan)
+        for name in PROBABILITIES:
+            result[name] = np.where(weighed, largest(apart(name)), np.nan)
     answered = converged(recorded, found)
     same_kind = np.isfinite(found["covariance"]).all(axis=1) == known
     for name in result:

@@ -2,6 +2,7 @@
 
     python tests/golden/make.py                      # answers of all families, inputs as stored
     python tests/golden/make.py --family points12    # of one
+    python tests/golden/make.py --call auto --call uniform   # these calls of all families
     python tests/golden/make.py --inputs             # draw the inputs anew, too
 
 Each file says which commit and versions it was written by. When one may do that: README.md.
@@ -92,6 +93,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--inputs", action="store_true", help="draw the problems anew")
     parser.add_argument("--family", action="append", help="only this one (or gradients)")
+    parser.add_argument("--call", action="append", help="only this call's answers")
     parser.add_argument("--again", action="store_true", help="gradients: also those recorded")
     chosen = parser.parse_args()
     wanted = chosen.family or [*corpus.CALLS, "gradients"]
@@ -100,15 +102,20 @@ def main() -> None:
             continue
         if not chosen.inputs:
             family, _ = corpus.load(family.name)
-        answers = {}
+        answers, about = {}, written()
+        if chosen.call and not chosen.inputs:
+            answers = corpus.load(family.name)[1]
+            about = family.written | {f"{name} by": about["commit"] for name in chosen.call}
         for call in corpus.CALLS[family.name]:
+            if chosen.call and call.name not in chosen.call:
+                continue
             for road in call.roads:
                 began = time.perf_counter()
                 answers[call.name, road] = corpus.compute(family, call, road)
                 jax.clear_caches()
                 seconds = time.perf_counter() - began
                 print(f"{family.name} {call.name} {road}: {seconds:.0f} s", flush=True)
-        corpus.save(replace(family, written=written()), answers)
+        corpus.save(replace(family, written=about), answers)
     if "gradients" in wanted:
         record_gradients(chosen.again)
 

@@ -1,8 +1,8 @@
 """The model average behind priors ``auto`` and ``uniform``, from its mathematics.
 
-Evidence of a Gaussian model of the errors, with or without a mean b ~ N(0, (2 s_y)^2) of the
-offsets; the offsets' distributions by expectation propagation (EP) on the problem linearised
-there, each image's moments by quadrature; the geometric median of their answers.
+Gaussian models of the errors, with a mean b of the offsets that is zero or b ~ N(0, (2 s_y)^2); the
+offsets' distributions by expectation propagation (EP) on the problem linearised there, each image's
+moments by quadrature; the geometric median of all their answers.
 
 Documented constants of the method (its module heads) stand in :class:`Recipe`: how often SDs are
 updated, how many sweeps EP makes, which distributions there are and with what probability. With
@@ -57,7 +57,8 @@ class Recipe:
     damping: float = 0.8
     largest_change: float = 0.4
     median_steps: int = 12
-    log_odds: float = float(np.log(9.0))
+    probability_of_mean: float = 0.1
+    lags: int = 5
 
 
 # --- Quadrature --------------------------------------------------------------------------------
@@ -173,7 +174,44 @@ QUADRATURES: dict[str, Callable[..., Moments]] = {
 }
 
 
-# --- Evidence of the Gaussian models -----------------------------------------------------------
+# --- The mean of the offsets -------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MeanBelief:
+    """Of b = 0 and b ~ N(0, (2 s_y)^2) together."""
+
+    mean: float
+    variance: float
+    probability: float
+    log_gain: float
+
+
+def mixture(b: float, variance: float, sd: float, trust: float, recipe: Recipe) -> MeanBelief:
+    """From the belief N(b, variance) under the second alone, by its likelihood to some power.
+
+    Args:
+        b: mm.
+        variance: mm^2.
+        sd: of the offsets, mm.
+        trust: the power.
+        recipe: with the probability of a mean.
+    """
+    prior = (2 * sd) ** 2
+    # Likelihood of b: N(b; at, spread), flattened.
+    spread = 1 / (1 / variance - 1 / prior)
+    at, spread = b / variance * spread, spread / trust
+    # Evidences relative to the flattened likelihood's height at its maximum.
+    log_without = -0.5 * at**2 / spread
+    log_with = 0.5 * np.log(spread / (spread + prior)) - 0.5 * at**2 / (spread + prior)
+    share = recipe.probability_of_mean
+    both = np.logaddexp(np.log(share) + log_with, np.log1p(-share) + log_without)
+    p = np.exp(np.log(share) + log_with - both)
+    centre, within = at * prior / (prior + spread), prior * spread / (prior + spread)
+    return MeanBelief(p * centre, p * (within + centre**2) - (p * centre) ** 2, p, both - log_with)
+
+
+# --- Gaussian models ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -182,16 +220,16 @@ class Model:
 
     Attributes:
         residuals: from unknowns to unwhitened residuals by component, the offsets q_y last.
+        image: of each residual, by component, in the order in which they were taken.
         correlated: (n, 2, 2) shape of lateral and range, or None.
         sigma: SDs to start from, mm.
-        mean: the offsets may have one.
         tied: the measurements' SDs keep their ratio.
     """
 
     residuals: Callable[[Unknowns], list[np.ndarray]]
+    image: list[np.ndarray]
     correlated: np.ndarray | None
     sigma: np.ndarray
-    mean: bool
     tied: bool
 
     def whitened(self, parts: list[np.ndarray], sigma: np.ndarray) -> list[np.ndarray]:
@@ -210,6 +248,7 @@ class Linear:
 
     unknowns: Unknowns
     b: float
+    trust: float
     sigma: np.ndarray
     log_evidence: float
     information: np.ndarray
@@ -239,7 +278,7 @@ def tune(
             for k, part in enumerate(values)
         ]
         values[-1] = values[-1] - b
-        along[-1][:, -1] = -1.0 if model.mean else 0.0
+        along[-1][:, -1] = -1.0
         return values, along
 
     def prior_rows(u: Unknowns) -> tuple[np.ndarray, np.ndarray]:
@@ -248,29 +287,44 @@ def tune(
         rows = jacobian(lambda step: medium(u.moved(step, blocks)), count)
         return medium(u), np.hstack([rows, np.zeros((len(rows), 1))])
 
-    def precision(sigma: np.ndarray) -> float:
-        return (2 * sigma[-1]) ** -2.0 if model.mean else 1.0
-
     def normal(u, b, sigma, here):
+        """Residuals, Jacobian, inverse of the normal matrix, and step, where there is a mean."""
         parts = model.whitened(here[0], sigma), model.whitened(here[1], sigma)
         extra, extra_along = prior_rows(u)
         residual = np.concatenate([*parts[0], extra])
         along = np.concatenate([*parts[1], extra_along])
         matrix = along.T @ along
-        matrix[-1, -1] += precision(sigma)
+        matrix[-1, -1] += (2 * sigma[-1]) ** -2.0
         gradient = along.T @ residual
-        gradient[-1] += precision(sigma) * b
+        gradient[-1] += (2 * sigma[-1]) ** -2.0 * b
         return residual, along, matrix, gradient
 
-    u, b, sigma = start, 0.0, model.sigma.copy()
+    def trust_in(u, b, sigma, here) -> float:
+        residual, along, matrix, gradient = normal(u, b, sigma, here)
+        inverse = np.linalg.inv(matrix)
+        felt = (residual - along @ inverse @ gradient) * (along @ inverse[-1])
+        image = np.concatenate(model.image)
+        moved = np.bincount(image, felt[: len(image)])
+        shown = moved @ moved
+        for lag in range(1, recipe.lags + 1):
+            shown += 2 * (1 - lag / (recipe.lags + 1)) * (moved[lag:] @ moved[:-lag])
+        return float(min(1.0, inverse[-1, -1] / shown))
+
+    u, b, sigma, trust = start, 0.0, model.sigma.copy(), 1.0
     for _ in range(500 if recipe.exactly else recipe.rounds):
         here, before = system(u, b), sigma
+        trust = trust_in(u, b, sigma, here)
         step = np.zeros(count + 1)
         for _ in range(1 if recipe.exactly else recipe.updates):
             residual, along, matrix, gradient = normal(u, b, sigma, here)
-            step = -np.linalg.solve(matrix, gradient)
+            inverse = np.linalg.inv(matrix)
+            step = -inverse @ gradient
+            belief = mixture(b + step[-1], inverse[-1, -1], sigma[-1], trust, recipe)
+            follow = inverse[:, -1] / inverse[-1, -1]
+            step = step + follow * (belief.mean - b - step[-1])
+            inverse = inverse + np.outer(follow, follow) * (belief.variance - inverse[-1, -1])
             residual = residual + along @ step
-            leverage = np.einsum("ra,ab,rb->r", along, np.linalg.inv(matrix), along)
+            leverage = np.einsum("ra,ab,rb->r", along, inverse, along)
             squares, freedom, at = [], [], 0
             for part in here[0]:
                 rows = slice(at, at + len(part))
@@ -286,16 +340,19 @@ def tune(
             break
     here = system(u, b)
     residual, along, matrix, gradient = normal(u, b, sigma, here)
-    cost = residual @ residual + precision(sigma) * b**2
-    cost -= gradient @ np.linalg.solve(matrix, gradient)
-    evidence = 0.5 * (np.log(precision(sigma)) - cost - np.linalg.slogdet(matrix)[1])
+    inverse = np.linalg.inv(matrix)
+    precision = (2 * sigma[-1]) ** -2.0
+    cost = residual @ residual + precision * b**2 - gradient @ inverse @ gradient
+    evidence = 0.5 * (np.log(precision) - cost - np.linalg.slogdet(matrix)[1])
     evidence -= sum(len(part) * np.log(s) for part, s in zip(here[0], sigma, strict=True))
     if model.correlated is not None:
         evidence -= 0.5 * np.log(np.linalg.det(model.correlated)).sum()
+    at = b - (inverse @ gradient)[-1]
+    evidence += mixture(at, inverse[-1, -1], sigma[-1], trust, recipe).log_gain
     offset, direction = here[0][-1], here[1][-1]
     rest = matrix - direction.T @ direction / sigma[-1] ** 2
     rest_gradient = gradient - direction.T @ offset / sigma[-1] ** 2
-    return Linear(u, b, sigma, evidence, rest, -rest_gradient, direction, offset)
+    return Linear(u, b, trust, sigma, evidence, rest, -rest_gradient, direction, offset)
 
 
 # --- Expectation propagation -------------------------------------------------------------------
@@ -384,12 +441,11 @@ class Average:
         covariance: of their tangent.
         sigma: SDs in use.
         probability: of each family, by name.
-        mean: of the offsets, mm; 0 where none is believed.
+        mean: of the offsets, mm.
         mean_sd: mm.
-        has_mean: whether.
-        own_covariances: the images' own are used.
-        log_odds_mean: ln.
-        log_odds_own: ln.
+        mean_probability: that there is one.
+        trust: in what the data say of it.
+        own_probability: of the images' own covariances.
         changes: of the last sweep of EP under each distribution, in SDs.
     """
 
@@ -399,31 +455,30 @@ class Average:
     probability: dict[str, float]
     mean: float
     mean_sd: float
-    has_mean: bool
-    own_covariances: bool
-    log_odds_mean: float
-    log_odds_own: float
+    mean_probability: float
+    trust: float
+    own_probability: float
     changes: np.ndarray
 
 
 def models(data: Data, sigma: np.ndarray, on_channels: bool) -> list[Model]:
-    """Without and with a mean; and the same with the images' own covariances, if they have any."""
+    """Common SDs; and the images' own covariances, if they have any, begun with the same SDs."""
+    order = np.arange(len(data)) if data.order is None else data.order
     if on_channels:
         heard = np.asarray(data.heard) > 0
+        image = [np.broadcast_to(order[:, None], heard.shape)[heard], order]
 
         def residuals(u: Unknowns) -> list[np.ndarray]:
             return [channels(data, u)[heard], target(data, u)[:, 1]]
-    else:
 
-        def residuals(u: Unknowns) -> list[np.ndarray]:
-            return list(errors(data, u).T)
+        return [Model(residuals, image, None, sigma, False)]
 
-    found = [Model(residuals, None, sigma, mean, False) for mean in (False, True)]
-    if data.covariance is not None and not on_channels:
-        mean = np.einsum("nkk->nk", data.covariance).mean(axis=0)
-        factor = np.mean(sigma[:2] ** 2 / mean)
-        own = np.sqrt(np.append(factor * mean, sigma[2] ** 2))
-        found += [Model(residuals, data.shape(), own, mean, True) for mean in (False, True)]
+    def errors_of(u: Unknowns) -> list[np.ndarray]:
+        return list(errors(data, u).T)
+
+    found = [Model(errors_of, [order] * 3, None, sigma, False)]
+    if data.covariance is not None:
+        found.append(Model(errors_of, [order] * 3, data.shape(), sigma, True))
     return found
 
 
@@ -452,49 +507,49 @@ def _average(
     on_channels: bool,
     medium: Callable[[Unknowns], np.ndarray] | None,
 ) -> Average:
-    weighed = models(data, sigma, on_channels)
-    tuned = [tune(model, start, blocks, recipe, medium) for model in weighed]
-    # One more SD that is tuned costs half the logarithm of the number of images.
-    scores = np.array(
-        [
-            linear.log_evidence + 0.5 * model.tied * np.log(len(data))
-            for linear, model in zip(tuned, weighed, strict=True)
-        ]
-    )
-    chosen = int(np.argmax(scores - recipe.log_odds * np.array([m.mean for m in weighed])))
-    pair = scores[chosen - chosen % 2 :][:2]
-    gaussian_odds = float(pair[1] - pair[0])
-    linear, asked = tuned[chosen], weighed[chosen].mean
-    sd = float(linear.sigma[-1])
-    beliefs = propagate(linear, sd, recipe, data.bound)
+    common, *others = models(data, sigma, on_channels)
+    tuned = [tune(common, start, blocks, recipe, medium)]
+    own = 0.0
+    for other in others:
+        # From where the common SDs were tuned, with one factor for both measurements.
+        assert data.covariance is not None
+        mean = np.einsum("nkk->nk", data.covariance).mean(axis=0)
+        factor = np.mean(tuned[0].sigma[:2] ** 2 / mean)
+        first = np.sqrt(np.append(factor * mean, tuned[0].sigma[2] ** 2))
+        begun = replace(other, sigma=first)
+        tuned.append(tune(begun, tuned[0].unknowns, blocks, recipe, medium))
+        # One more SD that is tuned costs half the logarithm of the number of images.
+        more = tuned[1].log_evidence + 0.5 * np.log(len(data)) - tuned[0].log_evidence
+        own = float(1 / (1 + np.exp(-more)))
 
     prior = np.array([each.prior for each in recipe.distributions])
-    evidence = np.array([belief.log_evidence for belief in beliefs])
-    changes = np.array([belief.change for belief in beliefs])
-    good = np.isfinite(evidence) & (changes < recipe.largest_change)
-    means = np.stack([belief.mean for belief in beliefs])
-    within = np.stack([belief.covariance for belief in beliefs])
-    # Those that do not count weigh nothing, whatever they hold.
-    evidence = np.where(good, evidence, -np.inf)
-    means, within = (
-        np.where(good[:, None], means, 0.0),
-        np.where(good[:, None, None], within, np.eye(means.shape[1])),
-    )
-    # Savage and Dickey: evidence with b over that without is N(0; 0, (2 s)^2) over the density of
-    # b = 0 afterwards.
-    b, variance = means[:, -1] + linear.b, within[:, -1, -1]
-    gain = 0.5 * (np.log(variance) - 2 * np.log(2 * sd) + b**2 / variance)
-    log_prior = np.where(good, np.log(prior), -np.inf)
-    odds = float(logsumexp(evidence + log_prior) - logsumexp(evidence - gain + log_prior))
-    denied = asked and not odds > recipe.log_odds
-    if denied:
-        evidence = evidence - gain
-        along = within[:, :, -1]
-        means = means - along * (b / variance)[:, None]
-        within = within - np.einsum("kp,kq->kpq", along, along) / variance[:, None, None]
-    weight = np.exp(evidence + log_prior - logsumexp(evidence + log_prior))
+    means, within, weight, with_mean, changes = [], [], [], [], []
+    for linear, share in zip(tuned, [1 - own, own], strict=False):
+        sd = float(linear.sigma[-1])
+        beliefs = propagate(linear, sd, recipe, data.bound)
+        away = np.append(_apart(tuned[0].unknowns, linear.unknowns, blocks), linear.b - tuned[0].b)
+        score = np.full(len(prior), -np.inf)
+        for k, belief in enumerate(beliefs):
+            changes.append(belief.change)
+            if not (np.isfinite(belief.log_evidence) and np.isfinite(belief.change)):
+                means.append(np.zeros(len(away)))
+                within.append(np.eye(len(away)))
+                with_mean.append(0.0)
+                continue
+            b, variance = linear.b + belief.mean[-1], belief.covariance[-1, -1]
+            found = mixture(b, variance, sd, linear.trust, recipe)
+            follow = belief.covariance[:, -1] / variance
+            means.append(away + belief.mean + follow * (found.mean - b))
+            within.append(
+                belief.covariance + np.outer(follow, follow) * (found.variance - variance)
+            )
+            with_mean.append(found.probability)
+            settled = (belief.change / recipe.largest_change) ** 4
+            score[k] = belief.log_evidence + found.log_gain + np.log(prior[k]) - settled
+        weight.append(share * np.exp(score - logsumexp(score)))
+    means, within, weight = np.stack(means), np.stack(within), np.concatenate(weight)
 
-    metric = linear.direction.T @ linear.direction
+    metric = tuned[0].direction.T @ tuned[0].direction
     spread = (2 / np.pi) * np.einsum("pq,kpq->k", metric, within)
     share = weight
     for _ in range(2000 if recipe.exactly else recipe.median_steps):
@@ -504,29 +559,39 @@ def _average(
     answer = share @ means
     off = means - answer
     total = np.einsum("k,kpq->pq", weight, within) + np.einsum("k,kp,kq->pq", weight, off, off)
-    families = dict.fromkeys(each.family for each in recipe.distributions)
-    has_mean = asked and not denied
-    own_odds = float(scores[2:].max() - scores[:2].max()) if len(scores) > 2 else 0.0
+    families = [each.family for each in recipe.distributions] * len(tuned)
     return Average(
-        unknowns=linear.unknowns.moved(answer[:-1], blocks),
+        unknowns=tuned[0].unknowns.moved(answer[:-1], blocks),
         covariance=total[:-1, :-1],
-        sigma=linear.sigma,
+        sigma=tuned[int(own > 0.5)].sigma,
         probability={
             name: float(
-                sum(
-                    w for w, d in zip(weight, recipe.distributions, strict=True) if d.family == name
-                )
+                sum(w for w, family in zip(weight, families, strict=True) if family == name)
             )
-            for name in families
+            for name in dict.fromkeys(families)
         },
-        mean=float(linear.b + answer[-1]) if has_mean else 0.0,
-        mean_sd=float(np.sqrt(total[-1, -1])) if has_mean else 0.0,
-        has_mean=has_mean,
-        own_covariances=chosen >= 2,
-        log_odds_mean=min(gaussian_odds, odds) if asked else gaussian_odds,
-        log_odds_own=own_odds,
-        changes=changes,
+        mean=float(tuned[0].b + answer[-1]),
+        mean_sd=float(np.sqrt(total[-1, -1])),
+        mean_probability=float(weight @ np.array(with_mean)),
+        trust=tuned[0].trust,
+        own_probability=own,
+        changes=np.array(changes),
     )
+
+
+def _apart(first: Unknowns, second: Unknowns, blocks: tuple[str, ...]) -> np.ndarray:
+    """The small step from one to the other, the rotation by Cayley's vector."""
+    turn = first.rotation.T @ second.rotation
+    skew = turn - turn.T
+    parts = {
+        "translation": first.rotation.T @ (second.translation - first.translation),
+        "rotation": 2 * np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) / (1 + np.trace(turn)),
+        "point": second.point - first.point,
+        "scale": np.log(second.scale / first.scale),
+        "sound-speed": np.log(np.atleast_1d(second.speed / first.speed)),
+        "delay": np.atleast_1d(second.delay - first.delay),
+    }
+    return np.concatenate([parts[name] for name in blocks])
 
 
 def uniform_only(recipe: Recipe) -> Recipe:
