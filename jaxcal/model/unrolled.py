@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array
 
 Entry = Any
@@ -109,22 +108,6 @@ def solve(matrix: Matrix, vector: Vector) -> Vector:
     """Solve a symmetric positive definite system by Cholesky's factor."""
     factor, inverse = cholesky(matrix)
     return backward(factor, inverse, forward(factor, inverse, vector))
-
-
-def traces(matrix: Matrix, directions: list[Matrix]) -> Vector:
-    """tr(S^-1 N) of every direction N, S symmetric positive definite: the slope of ln det S.
-
-    By differentiating the factorisation: a few numbers come out, where the inverse would be 45.
-    """
-
-    def log_determinant(flat: Vector) -> Array:
-        _, inverse = cholesky(symmetric(flat))
-        logarithms = [jnp.log(entry) for entry in inverse]
-        return -2 * sum(logarithms[1:], logarithms[0])
-
-    flat = upper(matrix)
-    slopes = [jax.jvp(log_determinant, (flat,), (upper(each),))[1] for each in directions]
-    return slopes
 
 
 def symmetric(flat: Vector) -> Matrix:

@@ -244,7 +244,7 @@ def propagate(
         sweeps: how many under each law; the first of a family gets twice as many, since the others
             begin with the sites of the one before.
     """
-    names = list(dict.fromkeys(families))
+    names = tuple(dict.fromkeys(families))
     turns: list[tuple[int, int, bool]] = []
     last = []
     for which, name in enumerate(names):
@@ -258,7 +258,7 @@ def propagate(
     family, law, fresh = (jnp.asarray(column) for column in zip(*turns, strict=True))
     under = _Laws(names, sites, known, squares, pull)
 
-    def one(state: tuple, turn: tuple) -> tuple[tuple, _Found]:
+    def one(state: _State, turn: tuple) -> tuple[_State, _Found]:
         family, sd, fresh = turn
         begun = under.gaussian(sd)
         state = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, state)

@@ -401,8 +401,9 @@ def differences(recorded: Arrays, found: Arrays) -> Arrays:
     ``elevation``, ``sigma`` (of which the SD is taken to be sigma / sqrt(2 n)), ``scale``,
     ``sound_speed``, ``delay``, ``mean``. ``covariance`` and ``point_covariance``: the largest
     |difference| over the product of the two SDs. Probabilities: absolute. ``cost``, ``rms``,
-    ``condition``: relative. NaN for problems that have no answer in either (:func:`converged`) or one without a covariance, which nothing but a bound
-    confines, or where distributions were not weighed; infinite where only one has a covariance.
+    ``condition``: relative. NaN for problems that have no answer in either (:func:`converged`) or
+    one without a covariance, which nothing but a bound confines, or where distributions were not
+    weighed; infinite where only one has a covariance.
     """
     # Infinities and NaN of what has no answer go out at the end.
     with np.errstate(invalid="ignore"):
