@@ -33,7 +33,7 @@ from jaxcal.options import Given, Plan
 from jaxcal.problem import Problem
 from jaxcal.recording import MINIMUM_IMAGES
 from jaxcal.solvers.auto import OffsetLaw
-from jaxcal.solvers.dense import inverse_abreast
+from jaxcal.solvers.dense import inverse_lanes_last
 from jaxcal.solvers.methods import nominal_sound_speed
 from jaxcal.solvers.reml import MINIMUM_SELF_TUNING
 
@@ -315,7 +315,7 @@ def covariance_and_observability(
         unweighted - floor[..., None, None] * eye,
     ]
     lanes_last = jnp.moveaxis(jnp.stack(matrices).reshape(-1, count, count), 0, -1)
-    inverse, log_determinant = inverse_abreast(lanes_last)
+    inverse, log_determinant = inverse_lanes_last(lanes_last)
     inverse = jnp.moveaxis(inverse.reshape(count, count, 3, -1)[:, :, 0], -1, 0)
     inverse = inverse.reshape(*batch, count, count)
     # The logarithm of a pivot that is not positive is not finite.

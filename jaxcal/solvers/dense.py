@@ -258,7 +258,7 @@ def inverse_positive(matrix: Float[Array, "p p"]) -> tuple[Float[Array, "p p"], 
     return inverse * scale[:, None] * scale[None, :], log_determinant - 2 * jnp.sum(jnp.log(scale))
 
 
-def inverse_abreast(
+def inverse_lanes_last(
     matrix: Float[Array, "p p lanes"],
 ) -> tuple[Float[Array, "p p lanes"], Float[Array, " lanes"]]:
     """:func:`inverse_positive` of many matrices, lanes last.
@@ -288,7 +288,7 @@ def inverse_abreast(
     return work * scale[:, None] * scale, log_determinant
 
 
-def product_abreast(
+def product_lanes_last(
     first: Float[Array, "p q lanes"], second: Float[Array, "q *r lanes"]
 ) -> Float[Array, "p *r lanes"]:
     """Products of many matrices (or of matrices and vectors), lanes last."""

@@ -118,8 +118,8 @@ class System(eqx.Module):
             cost = cost + away
         flat, border, gradient = barrier((normal.curvature, border, gradient))
         rows = [jnp.concatenate([row_of(flat, k), border[k, None]]) for k in range(unknowns)]
-        inverse, log_determinant = dense.inverse_abreast(jnp.stack([*rows, border]))
-        step = -dense.product_abreast(inverse, gradient)
+        inverse, log_determinant = dense.inverse_lanes_last(jnp.stack([*rows, border]))
+        step = -dense.product_lanes_last(inverse, gradient)
         # At the minimum, which is a small step away.
         cost = cost + jnp.sum(gradient * step, axis=0)
         return inverse, step, 0.5 * (jnp.log(precision) - cost - log_determinant)

@@ -190,15 +190,15 @@ def marginal(
         return jnp.stack([jnp.stack([full[i][j] for j in columns]) for i in rows])
 
     own, mixed, left = barrier((block(others, others), block(others, seen), block(seen, seen)))
-    spread, _ = dense.inverse_abreast(own)
-    slope = barrier(-dense.product_abreast(spread, mixed))
+    spread, _ = dense.inverse_lanes_last(own)
+    slope = barrier(-dense.product_lanes_last(spread, mixed))
     pull = jnp.stack([force[k] for k in others])
     return barrier(
         Marginal(
-            left + dense.product_abreast(jnp.swapaxes(mixed, 0, 1), slope),
+            left + dense.product_lanes_last(jnp.swapaxes(mixed, 0, 1), slope),
             jnp.stack([force[k] for k in seen])
-            + dense.product_abreast(jnp.swapaxes(slope, 0, 1), pull),
-            dense.product_abreast(spread, pull),
+            + dense.product_lanes_last(jnp.swapaxes(slope, 0, 1), pull),
+            dense.product_lanes_last(spread, pull),
             slope,
             spread,
         )
@@ -308,8 +308,8 @@ def seen(
 def _solved(information: Float[Array, "6 6 lanes"], rhs: Float[Array, "6 lanes"]) -> _Belief:
     """The Gaussian of an information matrix and a right-hand side."""
     information, rhs = barrier((information, rhs))
-    covariance, log_determinant = barrier(dense.inverse_abreast(information))
-    mean = dense.product_abreast(covariance, rhs)
+    covariance, log_determinant = barrier(dense.inverse_lanes_last(information))
+    mean = dense.product_lanes_last(covariance, rhs)
     return barrier(_Belief(covariance, mean, information, rhs, log_determinant))
 
 
@@ -339,7 +339,9 @@ class _Laws(eqx.Module):
             before, _ = carry
             after, evidence, crowded = self.sweep(family, sd, before)
             step = after.belief.mean - before.belief.mean
-            length = jnp.sum(step * dense.product_abreast(after.belief.information, step), axis=0)
+            length = jnp.sum(
+                step * dense.product_lanes_last(after.belief.information, step), axis=0
+            )
             change = jnp.where(crowded, jnp.inf, jnp.sqrt(jnp.maximum(length, 0.0)))
             return after, (evidence, change)
 

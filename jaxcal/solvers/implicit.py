@@ -57,8 +57,8 @@ def _optimum_jvp(primals: tuple, tangents: tuple) -> tuple:
     _, moved = jax.jvp(gradient, primals[1:], tangents[1:])
     exact = jnp.ones_like(images.mask[:, 0])
     matrix = accumulate(place, observation, images, exact, medium).stacked()
-    inverse, _ = dense.inverse_abreast(matrix)
-    return optimum(*primals), -dense.product_abreast(inverse, moved)
+    inverse, _ = dense.inverse_lanes_last(matrix)
+    return optimum(*primals), -dense.product_lanes_last(inverse, moved)
 
 
 @jax.custom_jvp
@@ -108,7 +108,7 @@ def _self_tuned_jvp(primals: tuple, tangents: tuple) -> tuple:
     # Gradients of X come in 1/sigma^2, conditions of the SDs in units of one: balance the rows.
     scale = 1 / jnp.max(jnp.abs(matrix), axis=1)
     inverse = jax.vmap(dense.inverse, in_axes=-1, out_axes=-1)(scale[:, None] * matrix)
-    step = -dense.product_abreast(inverse, scale * moved)
+    step = -dense.product_lanes_last(inverse, scale * moved)
     return self_tuned_optimum(*primals), (step[:count], sigma * step[count:])
 
 

@@ -194,7 +194,7 @@ def damped_step(
     matrix = stacked(normal.curvature + exact * rest)
     places = jnp.eye(len(diagonal))[..., None]
     matrix, gradient = barrier((matrix + places * held, normal.gradient))
-    return -dense.product_abreast(dense.inverse_abreast(matrix)[0], gradient)
+    return -dense.product_lanes_last(dense.inverse_lanes_last(matrix)[0], gradient)
 
 
 def updated(
@@ -218,7 +218,7 @@ def updated(
     unit = stacked(normal.curvature) * scale[:, None] * scale
     eps = jnp.finfo(count.dtype).eps
     unit = barrier(unit + 16 * eps * jnp.eye(len(diagonal))[..., None])
-    inverse = dense.inverse_abreast(unit)[0] * scale[:, None] * scale
+    inverse = dense.inverse_lanes_last(unit)[0] * scale[:, None] * scale
     places = pairs(len(diagonal))
     twice = np.array([1.0 if i == j else 2.0 for i, j in places])[:, None]
 
