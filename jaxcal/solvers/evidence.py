@@ -169,10 +169,10 @@ def tune(
         place, mean, sigma, _ = state
         system = System.of(sums_at(place), mean)
         inverse, step, _ = barrier(system.solved(sigma, mean))
-        moved = influences(
+        moved, share = influences(
             place, observation, images, 1 / sigma**2, mean, along=inverse[:, -1], step=step
         )
-        trust = trust_in(inverse[-1, -1], moved)
+        trust = trust_in(inverse[-1, -1], moved, share)
 
         def update(_: Array, state: tuple) -> tuple:
             sigma, _ = state

@@ -17,10 +17,18 @@ exp(eta b - lambda b^2 / 2), all other unknowns eliminated, and v = (2 s_y)^2,
 *Trust.* lambda is right where the errors are as the model says: Gaussian, alike, independent. The
 data show whether they are: image i moves b by d_i = (row b of H^-1) times its gradient, and the sum
 of d_i^2 is b's variance whatever the errors' law (the sandwich); with the products of neighbours in
-time added, also where these are alike (Newey and West). Where that is more than the variance under
-the model, by a factor, eta and lambda are divided by it.
+time added, also where these are alike (Newey and West). An image that tells much of b pulls b
+towards itself and so hides its error: d_i is divided by the share of what is known of b that is
+left without that image and its neighbours, as in a jackknife of blocks. Where the sum is more than
+the variance under the model, by a factor, eta and lambda are divided by it.
 
-References: Mitchell and Beauchamp 1988 (spike and slab); White 1980; Newey and West 1987.
+On the cross-wire recording the evidence asks for a mean of 3.2 +- 1.2 mm, odds 7 : 1; its images
+show an SD of 1.9 mm, and little is left of it. On clean simulated data the trust costs power where
+images are few: at n = 20 and a mean of three SDs, RP is 0.55 of conventional's instead of 0.43
+(experiments/README.md).
+
+References: Mitchell and Beauchamp 1988 (spike and slab); White 1980; Newey and West 1987;
+Kuensch 1989 (jackknife of blocks).
 """
 
 from __future__ import annotations
@@ -33,7 +41,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.model import unrolled
 from jaxcal.model.batch import RIGID_UNKNOWNS, Images, Iterate, targets
-from jaxcal.model.observations import Further, Observation
+from jaxcal.model.observations import Component, Further, Observation
 from jaxcal.model.unrolled import Vector
 
 MEAN_SD = 2.0
@@ -44,6 +52,12 @@ PROBABILITY = 0.1
 
 LAGS = 5
 """How many images after it, in the order in which they come, an image's error may still be felt."""
+
+FELT = tuple(1 - lag / (LAGS + 1) for lag in range(1, LAGS + 1))
+"""Bartlett's weights of these."""
+
+LEAST_LEFT = 0.05
+"""Least share of what is known of b that is taken to be left without an image and those near it."""
 
 
 class MeanBelief(eqx.Module):
@@ -100,8 +114,8 @@ def influences(
     *,
     along: Float[Array, "q lanes"],
     step: Float[Array, "q lanes"],
-) -> Float[Array, "lanes n"]:
-    """By how much each image moves an unknown, to first order, in the unknown's unit.
+) -> tuple[Float[Array, "lanes n"], Float[Array, "lanes n"]]:
+    """By how much each image moves b, to first order, mm, and its share of what is known of b.
 
     Args:
         place: X, c and the further unknowns.
@@ -109,7 +123,7 @@ def influences(
         images: the data.
         weight: 1/s_k^2.
         mean: of the offsets, mm.
-        along: the unknown's row of the inverse of the normal matrix, b last.
+        along: b's row of the inverse of the normal matrix, b last.
         step: to the minimum, b last.
     """
     q, turned = targets(place, images)
@@ -133,27 +147,42 @@ def influences(
     to_minimum[-1] = [to_minimum[-1][0] - step[-1][:, None]]
     slopes[-1] = [slopes[-1][0] - along[-1][:, None]]
     parts = observation.components(q, Further.of(place, here[len(q) :]), images)
-    total = jnp.zeros_like(images.mask)
+    total = share = jnp.zeros_like(images.mask)
+
+    def over_elements(plane: Array, part: Component) -> Array:
+        plane = plane if part.present is None else plane * part.present
+        return plane if plane.ndim < 3 else jnp.sum(plane, axis=2)
+
     for k, part in enumerate(parts):
+        heavy = weight[k][:, None]
         for value, change, slope in zip(values[k], to_minimum[k], slopes[k], strict=True):
-            felt = (value + change) * slope
-            if part.present is not None:
-                felt = felt * part.present
-            total = total + weight[k][:, None] * (felt if felt.ndim < 3 else jnp.sum(felt, axis=2))
-    return images.mask * total
+            total = total + heavy * over_elements((value + change) * slope, part)
+            share = share + heavy * over_elements(slope * slope, part)
+    return images.mask * total, images.mask * share / along[-1][:, None]
 
 
 def trust_in(
-    variance: Float[Array, " lanes"], moved: Float[Array, "lanes n"]
+    variance: Float[Array, " lanes"],
+    moved: Float[Array, "lanes n"],
+    share: Float[Array, "lanes n"],
 ) -> Float[Array, " lanes"]:
     """The variance of b under the model over that which the images show, at most one.
 
     Args:
         variance: under the model, mm^2.
         moved: by how much each image moves b, mm, in the order in which they were taken.
+        share: of each image in what is known of b.
     """
+
+    def shifted(plane: Array, lag: int) -> Array:
+        return jnp.pad(plane[:, lag:], [(0, 0), (0, min(lag, plane.shape[1]))])
+
+    near = share
+    for lag, weight in enumerate(FELT, start=1):
+        before = jnp.flip(shifted(jnp.flip(share, axis=1), lag), axis=1)
+        near = near + weight * (shifted(share, lag) + before)
+    moved = moved / jnp.maximum(1 - near, LEAST_LEFT)
     shown = jnp.sum(moved**2, axis=1)
-    for lag in range(1, LAGS + 1):
-        together = jnp.sum(moved[:, lag:] * moved[:, :-lag], axis=1)
-        shown = shown + 2 * (1 - lag / (LAGS + 1)) * together
+    for lag, weight in enumerate(FELT, start=1):
+        shown = shown + 2 * weight * jnp.sum(moved * shifted(moved, lag), axis=1)
     return variance / jnp.maximum(variance, shown)

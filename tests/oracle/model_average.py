@@ -305,9 +305,14 @@ def tune(
         felt = (residual - along @ inverse @ gradient) * (along @ inverse[-1])
         image = np.concatenate(model.image)
         moved = np.bincount(image, felt[: len(image)])
+        known = np.bincount(image, (along @ inverse[-1])[: len(image)] ** 2) / inverse[-1, -1]
+        # Bartlett's window about every image.
+        apart = np.abs(np.subtract.outer(np.arange(len(moved)), np.arange(len(moved))))
+        window = np.clip(1 - apart / (recipe.lags + 1), 0, None)
+        moved = moved / np.maximum(1 - window @ known, 0.05)
         shown = moved @ moved
         for lag in range(1, recipe.lags + 1):
-            shown += 2 * (1 - lag / (recipe.lags + 1)) * (moved[lag:] @ moved[:-lag])
+            shown += 2 * window[0, lag] * (moved[lag:] @ moved[:-lag]) if lag < len(moved) else 0
         return float(min(1.0, inverse[-1, -1] / shown))
 
     u, b, sigma, trust = start, 0.0, model.sigma.copy(), 1.0
