@@ -261,7 +261,8 @@ class Answers(eqx.Module):
         covariance: of these.
         weight: probability.
         mean_probability: that there is a mean, under each.
-        settled: at least one of them counts.
+        settled: the propagation settles under one of them, as it always does under the Gaussian
+            law, unless that is cut.
     """
 
     mean: Float[Array, "q k lanes"]
@@ -326,7 +327,7 @@ def answers_under(
         jnp.where(good, covariance, jnp.eye(size)[:, :, None, None]),
         weight,
         jnp.where(good, belief.probability, 0.0),
-        jnp.any(good, axis=0),
+        jnp.any(good & (found.change < LARGEST_CHANGE), axis=0),
     )
 
 
