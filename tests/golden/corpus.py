@@ -347,7 +347,8 @@ def compute(family: Family, call: Call, road: str, rows: np.ndarray | None = Non
             return numbers(jaxcal.calibrate_batch(problems, **keywords))
         each: list[Arrays | None] = []
         for place, row in enumerate(rows):
-            if not family.usable()[row]:
+            # Images of a single pose are refused, one problem at a time.
+            if not family.usable()[row] or family.kinds[row] == "one pose":
                 each.append(None)
                 continue
             problem = jax.tree.map(lambda leaf, place=place: leaf[place], problems)
