@@ -27,15 +27,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.calibration import Calibration, Convergence, Linearisation, Medium, Status
 from jaxcal.diagnostics.uncertainty import AT_BOUND, LARGEST_SD, mm_at_target, threshold
-from jaxcal.model.observations import LARGEST_ELEVATION
+from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.parameters import Parameters, block_slice, size
+from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
 from jaxcal.options import Given, Plan
 from jaxcal.problem import Problem
 from jaxcal.recording import MINIMUM_IMAGES
-from jaxcal.solvers.auto import OffsetLaw
 from jaxcal.solvers.dense import inverse_lanes_last
 from jaxcal.solvers.methods import nominal_sound_speed
-from jaxcal.solvers.reml import MINIMUM_SELF_TUNING
 
 LEAST_GAP_MM = 1e-6
 """An offset nearer to its bound than this is about to reach it."""

@@ -1,26 +1,52 @@
 """jaxtyping's array annotations, without its import where nobody checks annotations.
 
 Importing jaxtyping takes 0.07 s of CPU (it imports ``unittest.mock`` and with it asyncio), a third
-of what reading a file, or starting a small process that talks to a device, takes. Annotations are
-strings that nothing evaluates at run time but a checker, and whoever checks has imported jaxtyping
-before.
+of what reading a file, or starting a small process that talks to a device, takes; its ``Array``
+imports JAX. Annotations are strings that nothing evaluates at run time but a checker, and whoever
+checks has imported jaxtyping before.
 """
 
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["Bool", "Float", "Int", "Int16", "Num", "UInt8", "UInt16"]
+__all__ = [
+    "AnyArray",
+    "Array",
+    "Bool",
+    "Float",
+    "HeldArray",
+    "Int",
+    "Int16",
+    "Num",
+    "UInt8",
+    "UInt16",
+]
 
 if TYPE_CHECKING or "jaxtyping" in sys.modules:
     from jaxtyping import Bool, Float, Int, Int16, Num, UInt8, UInt16
 else:
 
-    class Array:
+    class Annotation:
         """Stands for an annotation: evaluated, it is the array's type."""
 
         def __class_getitem__(cls, item: tuple[type, str]) -> type:
             return item[0]
 
-    Bool = Float = Int = Int16 = Num = UInt8 = UInt16 = Array
+    Bool = Float = Int = Int16 = Num = UInt8 = UInt16 = Annotation
+
+if TYPE_CHECKING or ("jaxtyping" in sys.modules and "jax" in sys.modules):
+    import numpy as np
+    from jaxtyping import Array
+
+    AnyArray = Array | np.ndarray
+    """JAX's or numpy's: public functions of arrays take both."""
+else:
+    Array = AnyArray = Any
+
+if TYPE_CHECKING:
+    HeldArray = Array
+else:
+    HeldArray = AnyArray
+    """What a tree of arrays holds: JAX's in the solvers' eyes, numpy's too at run time."""

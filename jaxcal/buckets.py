@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from jaxcal.executables import assembled
 from jaxcal.problem import Problem
+from jaxcal.trees import assembled
 
 T = TypeVar("T")
 
@@ -38,16 +38,17 @@ def padded(problem: Problem) -> Problem:
     """The problem with masked images up to its bucket's size, in numpy arrays where it grows.
 
     Args:
-        problem: without leading axes.
+        problem: one, or a batch.
     """
     more = size(problem.images) - problem.images
     if not more:
         return problem
     rows = [*range(problem.images), *[problem.images - 1] * more]  # a masked pose must be one, too
-    mask = np.concatenate([np.asarray(problem.mask), np.zeros(more, problem.mask.dtype)])
+    mask = np.asarray(problem.mask)
+    mask = np.concatenate([mask, np.zeros((*mask.shape[:-1], more), mask.dtype)], axis=-1)
     longer = taken(problem, rows)
-    return assembled(Problem, {field.name: getattr(longer, field.name) for field in fields(longer)}
-                     | {"mask": mask})  # fmt: skip
+    parts = {field.name: getattr(longer, field.name) for field in fields(longer)}
+    return assembled(Problem, parts | {"mask": mask})
 
 
 def taken(problem: Problem, rows: list[int]) -> Problem:

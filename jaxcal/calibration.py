@@ -8,19 +8,17 @@ from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
 
+from jaxcal.array_types import AnyArray, Bool, Float, Int
+from jaxcal.diagnostics.arrays import array_module, is_traced
 from jaxcal.errors import CalibrationError, InputError
-from jaxcal.geometry import AnyArray
 from jaxcal.image_points import IMAGE_BLOCKS, image_rows
-from jaxcal.model.parameters import Blocks
-from jaxcal.problem import Problem, is_traced
-from jaxcal.solvers.auto import OffsetLaw
+from jaxcal.model.blocks import Blocks
+from jaxcal.model.distributions import OffsetLaw
+from jaxcal.problem import Problem
 from jaxcal.transform import AppliedPoints, ImageTransform, SaveFormat
+from jaxcal.trees import array_tree, map_arrays, static
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,7 +36,8 @@ class Status(enum.IntEnum):
     FAILED = 3
 
 
-class Convergence(eqx.Module):
+@array_tree
+class Convergence:
     """How the method ended.
 
     Attributes:
@@ -55,19 +54,20 @@ class Convergence(eqx.Module):
             was asked for.
     """
 
-    cost: Float[Array, "*batch"]
-    stationarity: Float[Array, "*batch"]
-    tolerance_met: Bool[Array, "*batch"]
-    iterations: Int[Array, "*batch"]
-    variance_rounds: Int[Array, "*batch"]
-    searched_start: Bool[Array, "*batch"]
-    sigma_floored: Bool[Array, "*batch 3"]
-    rotation_change: Float[Array, "*batch"]
-    translation_change: Float[Array, "*batch"]
-    trace: Float[Array, "*batch trace"] | None
+    cost: Float[AnyArray, "*batch"]
+    stationarity: Float[AnyArray, "*batch"]
+    tolerance_met: Bool[AnyArray, "*batch"]
+    iterations: Int[AnyArray, "*batch"]
+    variance_rounds: Int[AnyArray, "*batch"]
+    searched_start: Bool[AnyArray, "*batch"]
+    sigma_floored: Bool[AnyArray, "*batch 3"]
+    rotation_change: Float[AnyArray, "*batch"]
+    translation_change: Float[AnyArray, "*batch"]
+    trace: Float[AnyArray, "*batch trace"] | None
 
 
-class Medium(eqx.Module):
+@array_tree
+class Medium:
     """Sound speed and delay, each None where it was not estimated.
 
     Attributes:
@@ -79,15 +79,16 @@ class Medium(eqx.Module):
         delay_prior_s: SD that was believed before, s; None without such a belief.
     """
 
-    sound_speed_m_s: Float[Array, "*batch"] | None = None
-    sound_speed_sd_m_s: Float[Array, "*batch"] | None = None
-    sound_speed_prior_m_s: Float[Array, "*batch"] | None = None
-    delay_s: Float[Array, "*batch"] | None = None
-    delay_sd_s: Float[Array, "*batch"] | None = None
-    delay_prior_s: Float[Array, "*batch"] | None = None
+    sound_speed_m_s: Float[AnyArray, "*batch"] | None = None
+    sound_speed_sd_m_s: Float[AnyArray, "*batch"] | None = None
+    sound_speed_prior_m_s: Float[AnyArray, "*batch"] | None = None
+    delay_s: Float[AnyArray, "*batch"] | None = None
+    delay_sd_s: Float[AnyArray, "*batch"] | None = None
+    delay_prior_s: Float[AnyArray, "*batch"] | None = None
 
 
-class Linearisation(eqx.Module):
+@array_tree
+class Linearisation:
     """The normal matrices at the answer; tangents are in the order of ``Calibration.blocks``.
 
     Attributes:
@@ -98,14 +99,15 @@ class Linearisation(eqx.Module):
         average_elevation_sd: SDs of the offsets under the average over distributions, mm, or None.
     """
 
-    information: Float[Array, "*batch p p"]
-    design: Float[Array, "*batch p p"]
-    variance: Float[Array, "*batch"]
-    tracker_sd: Float[Array, "*batch"] | None
-    average_elevation_sd: Float[Array, "*batch n"] | None
+    information: Float[AnyArray, "*batch p p"]
+    design: Float[AnyArray, "*batch p p"]
+    variance: Float[AnyArray, "*batch"]
+    tracker_sd: Float[AnyArray, "*batch"] | None
+    average_elevation_sd: Float[AnyArray, "*batch n"] | None
 
 
-class Calibration(eqx.Module):
+@array_tree
+class Calibration:
     """A calibration of one problem, or of a batch (then every array has the batch axes in front).
 
     Units are mm and rad; X's perturbations are right ones, X Exp([v, omega]), so they are along and
@@ -146,39 +148,41 @@ class Calibration(eqx.Module):
         notes: what was done to the data before the solve, in words (static; one problem).
     """
 
-    image_to_probe: Float[Array, "*batch 4 4"]
-    point: Float[Array, "*batch 3"]
-    elevation: Float[Array, "*batch n"]
-    sigma: Float[Array, "*batch 3"]
+    image_to_probe: Float[AnyArray, "*batch 4 4"]
+    point: Float[AnyArray, "*batch 3"]
+    elevation: Float[AnyArray, "*batch n"]
+    sigma: Float[AnyArray, "*batch 3"]
     offset_law: OffsetLaw | None
-    channel_sigma: Float[Array, "*batch"] | None
-    unknowns_covariance: Float[Array, "*batch p p"]
-    scale_mm_per_px: Float[Array, "*batch 2"] | None
+    channel_sigma: Float[AnyArray, "*batch"] | None
+    unknowns_covariance: Float[AnyArray, "*batch p p"]
+    scale_mm_per_px: Float[AnyArray, "*batch 2"] | None
     medium: Medium | None
-    rms: Float[Array, "*batch"]
-    mask: Float[Array, "*batch n"]
-    status_code: Int[Array, "*batch"]
-    differentiable: Bool[Array, "*batch"]
-    sigma_tuned: Bool[Array, "*batch"]
+    rms: Float[AnyArray, "*batch"]
+    mask: Float[AnyArray, "*batch n"]
+    status_code: Int[AnyArray, "*batch"]
+    differentiable: Bool[AnyArray, "*batch"]
+    sigma_tuned: Bool[AnyArray, "*batch"]
     convergence: Convergence
     linearisation: Linearisation
     problem: Problem | None
-    method: str = eqx.field(static=True)
-    prior: str = eqx.field(static=True)
-    data: str = eqx.field(static=True)
-    blocks: Blocks = eqx.field(static=True)
-    robust: bool = eqx.field(static=True, default=False)
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    method: str = static()
+    prior: str = static()
+    data: str = static()
+    blocks: Blocks = static()
+    robust: bool = static(default=False)
+    notes: tuple[str, ...] = static(default=())
 
     @property
-    def converged(self) -> Bool[Array, "*batch"]:
+    def converged(self) -> Bool[AnyArray, "*batch"]:
         """Whether the answer is a converged and observable one (traceable)."""
-        return jnp.asarray(self.status_code == Status.CONVERGED)
+        converged = self.status_code == Status.CONVERGED
+        return array_module(converged).asarray(converged)
 
     @property
-    def images_used(self) -> Int[Array, "*batch"]:
+    def images_used(self) -> Int[AnyArray, "*batch"]:
         """Number of used images (traceable)."""
-        return jnp.sum(self.mask > 0, axis=-1)
+        xp = array_module(self.mask)
+        return xp.asarray(xp.sum(self.mask > 0, axis=-1))
 
     @property
     def covariance(self) -> Float[AnyArray, "*batch 6 6"]:
@@ -291,7 +295,7 @@ class Calibration(eqx.Module):
         """Everything that is computed when it is read."""
         from jaxcal.diagnostics.summary import summarise
 
-        if any(is_traced(leaf) for leaf in jax.tree.leaves(self)):
+        if is_traced(self):
             raise CalibrationError(
                 "diagnostics are computed on the host and are not there under jit, vmap or grad: "
                 "read them outside; status_code, converged and covariance are there"
@@ -363,7 +367,7 @@ class Calibration(eqx.Module):
         self._concrete(self.mask)
         if self.problem is None or self.problem.batch_shape:
             return None
-        return wrong_frames(replace(self.problem, mask=jnp.asarray(self.mask)), self.blocks)
+        return wrong_frames(replace(self.problem, mask=self.mask), self.blocks)
 
     @property
     def warnings(self) -> list[str]:
@@ -387,7 +391,12 @@ class Calibration(eqx.Module):
         """
         # As numpy indexes: it raises where jax would clip.
         np.empty(self.mask.shape[:-1])[index]
-        return jax.tree.map(lambda leaf: leaf[index], self)
+
+        def taken(leaf: AnyArray) -> AnyArray:
+            # A number of a numpy array is none any more.
+            return np.asarray(leaf[index]) if isinstance(leaf, np.ndarray) else leaf[index]
+
+        return map_arrays(taken, self)
 
     def with_problem(self, problem: Problem) -> Calibration:
         """The same with the data that were solved."""
@@ -513,7 +522,7 @@ class Calibration(eqx.Module):
 
     def __str__(self) -> str:
         """Table and verdict; of a batch how many converged; traced: the names of the arrays."""
-        if self.problem is None or any(is_traced(leaf) for leaf in jax.tree.leaves(self)):
+        if self.problem is None or is_traced(self):
             return repr(self)
         from jaxcal.report import summary
 
@@ -523,7 +532,7 @@ class Calibration(eqx.Module):
 
     def _repr_html_(self) -> str | None:
         """For notebooks; None (so that the text is shown) where there is nothing to draw."""
-        traced = any(is_traced(leaf) for leaf in jax.tree.leaves(self))
+        traced = is_traced(self)
         if self.problem is None or traced or np.ndim(self.mask) != 1:
             return None
         from jaxcal.report.summary import html_of
@@ -536,7 +545,7 @@ class Calibration(eqx.Module):
         Raises:
             CalibrationError: under a JAX transformation.
         """
-        found = jax.tree.map(self._concrete, self)
+        found = map_arrays(self._concrete, self)
         if "_summary" in vars(self):
             vars(found)["_summary"] = self._summary
         return found

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.errors import InputError
 from jaxcal.reduced_objective import ReducedObjective, image_data, reduce
 from jaxcal.rotation_relaxation import lower_bound

@@ -28,15 +28,15 @@ Software 2, 1993 (the equality); Briales and Gonzalez-Jimenez, CVPR 2017.
 from __future__ import annotations
 
 import itertools
-import sys
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.certificate import Certificate, certify_point, tolerance
+from jaxcal.diagnostics.arrays import is_traced
 from jaxcal.reduced_objective import (
     Constraints,
     ImageData,
@@ -116,7 +116,7 @@ def calibrate_closed_form(
     Raises:
         InputError: other names in ``estimate``, data that cannot be used, fewer than 4 images.
     """
-    if np.ndim(getattr(problem, "mask", ())) > 1 or _is_traced(problem):
+    if np.ndim(getattr(problem, "mask", ())) > 1 or is_traced(problem):
         from jaxcal.closed_form_batch import solve_batch
 
         return solve_batch(problem, tuple(estimate))  # pyright: ignore[reportArgumentType]
@@ -124,14 +124,6 @@ def calibrate_closed_form(
     reduced = reduce(data, constraints)
     x, certificate = solve(reduced)
     return _assemble(x, certificate, reduced, data)
-
-
-def _is_traced(problem: object) -> bool:
-    """Whether JAX is looking at a problem's values; does not import JAX to find out."""
-    jax = sys.modules.get("jax")
-    names = ("poses", "measurements", "mask", "spacing", "face_offset")
-    values = [getattr(problem, name, None) for name in names]
-    return jax is not None and any(isinstance(value, jax.core.Tracer) for value in values)
 
 
 def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, 6], Certificate]:

@@ -15,14 +15,14 @@ import logging
 import os
 from collections.abc import Callable
 from functools import cache
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import jax
-import jax.core
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.precision import inside_transformation
+
+if TYPE_CHECKING:
+    from jax.typing import ArrayLike
 
 T = TypeVar("T")
 
@@ -30,6 +30,13 @@ SWITCH = "JAXCAL_FAST_MATH"
 """Environment variable; 0 leaves batches the compiler's default flags."""
 
 Flags = dict[str, Any]
+
+FAST_MATH: Flags = {
+    "xla_cpu_enable_fast_math": True,
+    "xla_cpu_fast_math_honor_nans": True,
+    "xla_cpu_fast_math_honor_infs": True,
+}
+"""The compiler must know all of these, or gets none."""
 
 _log = logging.getLogger(__name__)
 
@@ -47,11 +54,17 @@ def known(platform: str, flags: Flags) -> Flags:
     items = tuple(flags.items())
     if _are_known(platform, items):
         return dict(flags)
-    return {name: value for name, value in items if _are_known(platform, ((name, value),))}
+    found = {name: value for name, value in items if _are_known(platform, ((name, value),))}
+    # Without NaN and Inf, a bad lane would become a wrong answer: all three or none.
+    if not FAST_MATH.keys() <= found.keys():
+        found = {name: value for name, value in found.items() if FAST_MATH.get(name) != value}
+    return found
 
 
 @cache
 def _are_known(platform: str, flags: tuple[tuple[str, Any], ...]) -> bool:
+    import jax
+
     # Tried on the smallest program; XLA refuses all flags of a call where it refuses one.
     try:
         with jax.default_device(jax.local_devices(backend=platform)[0]):
@@ -63,26 +76,22 @@ def _are_known(platform: str, flags: tuple[tuple[str, Any], ...]) -> bool:
     return True
 
 
-def fast_to_run(platform: str) -> Flags | None:
-    """Flags for the fused programs, or None.
+def batch_wishes() -> Flags:
+    """Wishes for a program that solves batches on a CPU.
 
     Sums over images vectorise only where their order is free, and that is what fast math allows;
     NaN and Inf keep their meaning. Reruns are bitwise equal, and answers within 1e-12 mm of those
     with default flags.
     """
-    if platform != "cpu" or os.environ.get(SWITCH, "1") == "0":
-        return None
-    fast = known(
-        platform,
-        {
-            "xla_cpu_enable_fast_math": True,
-            "xla_cpu_fast_math_honor_nans": True,
-            "xla_cpu_fast_math_honor_infs": True,
-        },
-    )
-    # Without NaN and Inf, a bad lane would become a wrong answer: all three or none.
-    fast = fast if len(fast) == 3 else {}
-    return fast | known(platform, {"xla_cpu_prefer_vector_width": 512})
+    if os.environ.get(SWITCH, "1") == "0":
+        return {}
+    return FAST_MATH | {"xla_cpu_prefer_vector_width": 512}
+
+
+def fast_to_run(platform: str) -> Flags | None:
+    """Those of :func:`batch_wishes` that the compiler knows, or None where it has none."""
+    wishes = batch_wishes()
+    return known(platform, wishes) if platform == "cpu" and wishes else None
 
 
 def quick_to_compile(platform: str) -> Flags | None:
@@ -111,7 +120,7 @@ def single_threaded(platform: str) -> Flags:
     return known(platform, {"xla_cpu_multi_thread_eigen": False}) if platform == "cpu" else {}
 
 
-def computed_once(make: Callable[[], T], witness: jax.typing.ArrayLike) -> T:
+def computed_once(make: Callable[[], T], witness: ArrayLike) -> T:
     """What a function makes, as arrays that whoever reads them does not compute again.
 
     On a CPU, XLA puts a loop that several others read into each of them, unless it holds what is
@@ -128,6 +137,10 @@ def computed_once(make: Callable[[], T], witness: jax.typing.ArrayLike) -> T:
     Returns:
         The same arrays as ``make()``, which have to be floating or complex.
     """
+    import jax
+    import jax.core
+    import jax.numpy as jnp
+
     taken = jnp.asarray(witness) >= 0
     if not isinstance(taken, jax.core.Tracer):
         return make()

@@ -39,6 +39,7 @@ import numpy as np
 from jaxlib import xla_client
 
 from jaxcal import compiler, program_cache
+from jaxcal.trees import assembled
 
 LOADED = 32
 """Programs kept in this process; the least recently used gives way."""
@@ -89,7 +90,7 @@ _lock = Lock()
 
 
 def run(
-    function: Callable[..., Any],
+    function: str | Callable[..., Any],
     arguments: tuple[Any, ...],
     plan: Any,
     *,
@@ -99,7 +100,8 @@ def run(
     """``function(*arguments, plan)``, compiled, by the kept program where there is one.
 
     Args:
-        function: a pure function of a module, called only where no program is kept.
+        function: a pure function of a module, or ``module:name``, which is imported and called
+            only where no program is kept.
         arguments: trees of concrete arrays: modules and dataclasses of jaxcal, tuples, None.
         plan: everything static about it.
         flags: wished for; those unknown to the compiler are left out.
@@ -115,7 +117,7 @@ def run(
     described = describe(arguments, leaves)
     device = _device(leaves)
     key = json.dumps({
-        "function": f"{function.__module__}:{function.__qualname__}",
+        "function": _name_of(function),
         "plan": describe(plan, []),
         "arguments": described,
         "leaves": [[leaf.dtype.name, list(leaf.shape)] for leaf in leaves],
@@ -132,11 +134,24 @@ def run(
             program = _load(key, device)
         if program is None:
             program = _compile(
-                lambda flat: function(*rebuild(described, flat), plan),
+                lambda flat: _found(function)(*rebuild(described, flat), plan),
                 leaves, device, flags, key, label,
             )  # fmt: skip
         _remember(key, program)
     return program(leaves)
+
+
+def _name_of(function: str | Callable[..., Any]) -> str:
+    if isinstance(function, str):
+        return function
+    return f"{function.__module__}:{function.__qualname__}"
+
+
+def _found(function: str | Callable[..., Any]) -> Callable[..., Any]:
+    if not isinstance(function, str):
+        return function
+    module, name = function.split(":")
+    return getattr(importlib.import_module(module), name)
 
 
 def forget() -> None:
@@ -183,6 +198,7 @@ def _compile(
     key: str,
     label: dict[str, Any],
 ) -> _Program:
+    _log.info("compiling, once; later runs are done in a second or two")
     began = time.perf_counter()
     results: list[Description] = []
 
@@ -272,20 +288,12 @@ def rebuild(description: Description, leaves: list[Any]) -> Any:
         module, name = description["class"].split(":")
         if module.split(".")[0] != "jaxcal":
             raise NotDescribableError(f"{module} is not part of jaxcal")
-        found = importlib.import_module(module)
+        found: Any = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
         parts = description["fields"].items()
         return assembled(found, {field: rebuild(part, leaves) for field, part in parts})
     return description
-
-
-def assembled(kind: Any, values: dict[str, Any]) -> Any:
-    """An object of a dataclass as it was, without its constructor: here arrays may be numpy's."""
-    made = object.__new__(kind)
-    for name, value in values.items():
-        object.__setattr__(made, name, value)
-    return made
 
 
 @cache

@@ -6,22 +6,23 @@ numbers that came with the request are a :class:`Given`, which is traced.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float
 
+from jaxcal.array_types import AnyArray, Array, Float
+from jaxcal.diagnostics.arrays import array_module, is_traced
 from jaxcal.errors import InputError
-from jaxcal.model.parameters import EXTRA, MEDIUM, RIGID, Blocks
-from jaxcal.model.shapes import Shape
-from jaxcal.problem import Problem, is_traced
+from jaxcal.model.blocks import EXTRA, MEDIUM, RIGID, Blocks
+from jaxcal.model.distributions import SHAPES, UNIFORM, Shape
+from jaxcal.problem import Problem
 from jaxcal.recording import MINIMUM_IMAGES
-from jaxcal.solvers.auto import SHAPES, UNIFORM
+from jaxcal.trees import array_tree
+
+if TYPE_CHECKING:
+    import optimistix as optx
 
 Method = Literal["joint", "alternating", "conventional"]
 PriorName = Literal["auto", "gaussian", "uniform", "bounded"]
@@ -74,7 +75,7 @@ class Options:
     precision: Literal["float64", "float32"] = "float64"
 
     def __post_init__(self) -> None:
-        if isinstance(self.solver, optx.AbstractLeastSquaresSolver):
+        if _is_optimistix(self.solver):
             _check_static(self.solver)
         elif self.solver not in ("lm", "gauss-newton", "gradient"):
             raise InputError(
@@ -95,6 +96,12 @@ class Options:
         ):
             if getattr(self, name) < least:
                 raise InputError(f"{name} must be at least {least}, not {getattr(self, name)}")
+
+
+def _is_optimistix(solver: Any) -> TypeGuard[optx.AbstractLeastSquaresSolver]:
+    """Whether this is a least-squares solver of optimistix, which takes long to import."""
+    found = sys.modules.get("optimistix")
+    return found is not None and isinstance(solver, found.AbstractLeastSquaresSolver)
 
 
 def _check_static(solver: optx.AbstractLeastSquaresSolver) -> None:
@@ -128,7 +135,7 @@ class Plan:
     def other_solver(self) -> optx.AbstractLeastSquaresSolver | None:
         """The caller's solver, where one was handed over."""
         solver = self.options.solver
-        return solver if isinstance(solver, optx.AbstractLeastSquaresSolver) else None
+        return solver if _is_optimistix(solver) else None
 
     @property
     def one_by_one(self) -> bool:
@@ -142,7 +149,8 @@ class Plan:
         return names[0] if names else self.prior
 
 
-class Given(eqx.Module):
+@array_tree
+class Given:
     """Numbers given by the caller beside the problem.
 
     Attributes:
@@ -152,10 +160,10 @@ class Given(eqx.Module):
         medium_sd: SDs of the sound speed (m/s) and the delay (s).
     """
 
-    sigma: Float[Array, " components"] | None
-    tracker_sd: Float[Array, ""] | None
-    max_elevation: Float[Array, "*images"] | None
-    medium_sd: Float[Array, 2] | None
+    sigma: Float[AnyArray, " components"] | None
+    tracker_sd: Float[AnyArray, ""] | None
+    max_elevation: Float[AnyArray, "*images"] | None
+    medium_sd: Float[AnyArray, 2] | None
 
 
 @dataclass(frozen=True)
@@ -197,15 +205,15 @@ def prepare(problem: Problem, request: Request) -> tuple[Plan, Given]:
 
     dtype = problem.mask.dtype
 
-    def array(value: object) -> Array | None:
-        return None if value is None else jnp.asarray(value, dtype)
+    def array(value: Any) -> AnyArray | None:
+        # Of numbers a numpy array: JAX would compile their conversion.
+        return None if value is None else array_module(value).asarray(value, dtype)
 
     blocks = RIGID + tuple(name for name in EXTRA if name in request.estimate)
     medium = None
     if kind == "gaussian" and any(name in blocks for name in MEDIUM):
-        medium = jnp.stack(
-            [jnp.asarray(request.sound_speed_sd, dtype), jnp.asarray(request.delay_sd, dtype)]
-        )
+        believed = (request.sound_speed_sd, request.delay_sd)
+        medium = array_module(believed).stack([array(sd) for sd in believed])
     given = Given(
         array(request.sigma), array(request.tracker_sd), array(request.max_elevation), medium
     )
@@ -251,7 +259,7 @@ def _check_combination(request: Request, kind: str) -> None:
             "uniform (without given sigma) and bounded"
         )
     options = request.options
-    other = options is not None and isinstance(options.solver, optx.AbstractLeastSquaresSolver)
+    other = options is not None and _is_optimistix(options.solver)
     if other and kind == "bounded":
         raise InputError(
             "another solver would not keep the offsets within their bounds: it goes with the "
@@ -313,7 +321,7 @@ def check_values(problem: Problem) -> None:
     Raises:
         InputError: with the row named.
     """
-    if any(is_traced(leaf) for leaf in jax.tree.leaves(problem)):
+    if is_traced(problem):
         return
     used = np.asarray(problem.mask) > 0
     if used.sum() < MINIMUM_IMAGES:
@@ -331,5 +339,5 @@ def with_bound(problem: Problem, given: Given) -> Problem:
     """The problem with the caller's bound on the offsets, where there is one."""
     if given.max_elevation is None:
         return problem
-    bound = jnp.broadcast_to(given.max_elevation, problem.mask.shape)
+    bound = array_module(given.max_elevation).broadcast_to(given.max_elevation, problem.mask.shape)
     return replace(problem, max_elevation=bound)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from jaxcal.answer import Solved, assemble
 from jaxcal.calibration import Calibration, Convergence
 from jaxcal.model.batch import Images
+from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.observations import (
     BoundedOffsets,
     Channels,
@@ -29,11 +30,10 @@ from jaxcal.options import Given, Plan
 from jaxcal.precision import in_standard_promotion
 from jaxcal.problem import Problem
 from jaxcal.solvers import methods
-from jaxcal.solvers.auto import OffsetLaw
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.solvers.methods import Solution
 from jaxcal.solvers.normal_equations import accumulate
-from jaxcal.solvers.start import ConventionalStart
+from jaxcal.solvers.start import ConventionalStart, GivenStart
 
 
 def solve_problems(
@@ -41,7 +41,7 @@ def solve_problems(
     given: Given,
     plan: Plan,
     agreed: Float[Array, "lanes n"] | None = None,
-    begun: ConventionalStart | None = None,
+    begun: ConventionalStart | GivenStart | None = None,
 ) -> Calibration:
     """Solve a batch of problems (one leading axis).
 
@@ -58,7 +58,7 @@ def solve_problems(
     if plan.robust:
         if agreed is None:
             # Which images are left out is piecewise constant in the data: no derivative passes.
-            seen = jax.lax.stop_gradient(seen_by_agreement(problems))
+            seen = jax.lax.stop_gradient(problems.points_only())
             agreed = jax.vmap(_one_at_a_time(plan.blocks))(seen)
         problems = replace(problems, mask=agreed)
     if plan.one_by_one:
@@ -85,13 +85,6 @@ def agreed_images(problem: Problem, blocks: Blocks) -> Float[Array, " n"]:
     return find_consensus(jax.lax.stop_gradient(problem), rigid_model(blocks)).keep
 
 
-def seen_by_agreement(problem: Problem) -> Problem:
-    """What the agreement of images is about: their points and poses."""
-    return replace(
-        problem, channels=None, covariance=None, max_elevation=None, sound_speed=None, delay=None
-    )
-
-
 class Averaged(eqx.Module):
     """The average over the offsets' laws, problems first.
 
@@ -107,7 +100,7 @@ class Averaged(eqx.Module):
 
 
 def _solved(
-    problems: Problem, given: Given, plan: Plan, begun: ConventionalStart | None = None
+    problems: Problem, given: Given, plan: Plan, begun: ConventionalStart | GivenStart | None = None
 ) -> tuple[Solved, Averaged | None]:
     """The method's solution with its normal matrices, problems first."""
     found = methods.solve(problems, given, plan, begun)

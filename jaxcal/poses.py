@@ -149,6 +149,18 @@ def rotations_from_quaternions(
     ], axis=-1).reshape(-1, 3, 3)  # fmt: skip
 
 
+def rotations_from_vectors(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Rotation matrices of axes times angles (rad), by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
+    cross = cross.reshape(*vectors.shape, 3)
+    # sin(t) / t and (1 - cos(t)) / t^2 by numpy's sinc, which is right at zero.
+    first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.eye(3) + first * cross + second * cross @ cross
+
+
 def quaternion_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
     """Unit quaternion x y z w (scalar last, not negative) of a rotation matrix."""
     return quaternions_from_rotations(np.asarray(rotation, dtype=np.float64)[None])[0]

@@ -12,21 +12,22 @@ values enters the modes that it needs and leaves them when it returns (:func:`in
 Inside a jit, vmap or grad of the caller, the number of bits is the caller's: arrays have lost
 theirs before any function sees them. A calibration there needs 64 bits, or a word that 32 will do
 (:func:`require_float64`); promotion is standard all the same.
+
+What needs no JAX does not import it: where nobody has, there are no modes to enter.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
-import jax
-import jax.core
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.errors import InputError
+from jaxcal.trees import map_arrays
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -39,14 +40,24 @@ NO_64_BITS = (
 
 
 def is_float64_on() -> bool:
-    """Whether JAX makes 64-bit arrays here and now."""
+    """Whether JAX makes 64-bit arrays here and now; so does numpy where JAX is not imported."""
+    if "jax" not in sys.modules:
+        return True
+    import jax.numpy as jnp
+
     return jnp.result_type(float) == np.float64
 
 
 def inside_transformation(*arguments: object) -> bool:
     """Whether a jit, vmap or grad of somebody else looks at the code that runs now."""
+    if "jax" not in sys.modules:
+        return False
+    import jax
+    import jax.core
+
     # Under jit even a constant is a tracer; under vmap and grad only what depends on an argument.
-    leaves = jax.tree.leaves((arguments, jnp.zeros(())))
+    # device_put, since jax.numpy.zeros would be compiled.
+    leaves = jax.tree.leaves((arguments, jax.device_put(np.float32(0))))
     return any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
 
 
@@ -57,6 +68,8 @@ def own_modes(*, bits_too: bool = True) -> Iterator[None]:
     Args:
         bits_too: switch 64 bits on; not inside a transformation that began without.
     """
+    import jax
+
     with ExitStack() as stack:
         if bits_too:
             stack.enter_context(jax.enable_x64(True))
@@ -79,6 +92,10 @@ def in_own_modes(function: Callable[P, T]) -> Callable[P, T]:
         if inside_transformation(args, kwargs):
             with own_modes(bits_too=False):
                 return function(*args, **kwargs)
+        if "jax" not in sys.modules:
+            return function(*args, **kwargs)
+        import jax
+
         keep = is_float64_on()
         with own_modes():
             result = function(*args, **kwargs)
@@ -117,6 +134,13 @@ def require_float64(name: str) -> None:
 
 def with_dtype(tree: T, dtype: Any) -> T:
     """A pytree whose floating arrays, traced or not, have this dtype."""
+    if "jax" not in sys.modules:
+        floating = np.floating
+        return map_arrays(
+            lambda a: a.astype(dtype, copy=False) if np.issubdtype(a.dtype, floating) else a, tree
+        )
+    import jax
+    import jax.numpy as jnp
 
     def cast(leaf: Any) -> Any:
         floating = jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.dtype != dtype
@@ -126,6 +150,9 @@ def with_dtype(tree: T, dtype: Any) -> T:
 
 
 def _without_jax(leaf: Any) -> Any:
+    import jax
+    import jax.numpy as jnp
+
     # A key has no numpy form.
     is_key = isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
     return np.asarray(leaf) if isinstance(leaf, jax.Array) and not is_key else leaf

@@ -7,24 +7,27 @@ is the same class with leading axes on every array.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
-import jax
-import jax.core
-import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
-from jaxtyping import Array, Float
 
+from jaxcal.array_types import AnyArray, Float, HeldArray
+from jaxcal.diagnostics.arrays import array_module
+from jaxcal.diagnostics.arrays import is_traced as is_traced
 from jaxcal.errors import InputError
 from jaxcal.precision import in_own_modes
 from jaxcal.probe import CurvilinearProbe
 from jaxcal.recording import Images, Kind, Recording, make_images
-from jaxcal.segmentation.segment import segment
+from jaxcal.trees import array_tree, static
+
+if TYPE_CHECKING:
+    from jax.typing import DTypeLike
 
 
-class Channels(eqx.Module):
+@array_tree
+class Channels:
     """What every element heard, for the solves on the times of flight themselves.
 
     Attributes:
@@ -33,13 +36,16 @@ class Channels(eqx.Module):
         elements: positions in the image frame [lateral, elevational, axial], mm.
     """
 
-    distances: Float[Array, "*batch n elements"]
-    heard: Float[Array, "*batch n elements"]
-    elements: Float[Array, "*batch elements 3"]
+    distances: Float[HeldArray, "*batch n elements"]
+    heard: Float[HeldArray, "*batch n elements"]
+    elements: Float[HeldArray, "*batch elements 3"]
 
 
-class Problem(eqx.Module):
+@array_tree
+class Problem:
     """Tracked measurements of one target in n images; ``*batch`` may be empty.
+
+    Arrays are JAX's where JAX is imported, and otherwise numpy's, which JAX takes as well.
 
     Attributes:
         poses: probe -> tracker, mm.
@@ -60,19 +66,19 @@ class Problem(eqx.Module):
             position, range and elevational offset apart without bias.
     """
 
-    poses: Float[Array, "*batch n 4 4"]
-    measurements: Float[Array, "*batch n 2"]
-    mask: Float[Array, "*batch n"]
-    spacing: Float[Array, "*batch 2"]
-    face_offset: Float[Array, "*batch"]
-    covariance: Float[Array, "*batch n 2 2"] | None = None
-    max_elevation: Float[Array, "*batch n"] | None = None
-    sound_speed: Float[Array, "*batch"] | None = None
-    delay: Float[Array, "*batch"] | None = None
+    poses: Float[HeldArray, "*batch n 4 4"]
+    measurements: Float[HeldArray, "*batch n 2"]
+    mask: Float[HeldArray, "*batch n"]
+    spacing: Float[HeldArray, "*batch 2"]
+    face_offset: Float[HeldArray, "*batch"]
+    covariance: Float[HeldArray, "*batch n 2 2"] | None = None
+    max_elevation: Float[HeldArray, "*batch n"] | None = None
+    sound_speed: Float[HeldArray, "*batch"] | None = None
+    delay: Float[HeldArray, "*batch"] | None = None
     channels: Channels | None = None
-    pixels: bool = eqx.field(static=True, default=False)
-    spacing_known: bool = eqx.field(static=True, default=True)
-    curved: bool = eqx.field(static=True, default=False)
+    pixels: bool = static(default=False)
+    spacing_known: bool = static(default=True)
+    curved: bool = static(default=False)
 
     @property
     def images(self) -> int:
@@ -84,7 +90,7 @@ class Problem(eqx.Module):
         """Leading axes; () for one problem."""
         return self.mask.shape[:-1]
 
-    def cleared(self, used: Float[Array, "*batch n"]) -> Problem:
+    def cleared(self, used: Float[AnyArray, "*batch n"]) -> Problem:
         """With harmless values where an image is not used: NaN times a mask of 0 is NaN, not 0.
 
         The mask stays as it is, and so do all shapes.
@@ -92,10 +98,11 @@ class Problem(eqx.Module):
         Args:
             used: 0 for images whose values are not to be read.
         """
+        xp = array_module(self, used)
 
-        def keep(values: Array, instead: np.ndarray | float) -> Array:
+        def keep(values: Any, instead: np.ndarray | float) -> Any:
             shape = used.shape + (1,) * (values.ndim - used.ndim)
-            return jnp.where(used.reshape(shape) > 0, values, jnp.asarray(instead, values.dtype))
+            return xp.where(used.reshape(shape) > 0, values, xp.asarray(instead, values.dtype))
 
         channels = self.channels
         if channels is not None:
@@ -109,6 +116,17 @@ class Problem(eqx.Module):
             covariance=None if self.covariance is None else keep(self.covariance, np.eye(2)),
             max_elevation=None if self.max_elevation is None else keep(self.max_elevation, 1.0),
             channels=channels,
+        )
+
+    def points_only(self) -> Problem:
+        """Without what says more than points and poses."""
+        return replace(
+            self,
+            channels=None,
+            covariance=None,
+            max_elevation=None,
+            sound_speed=None,
+            delay=None,
         )
 
     @classmethod
@@ -129,12 +147,17 @@ class Problem(eqx.Module):
         images = recording.calibration if isinstance(recording, Recording) else recording
         dtype = np.float64 if dtype is None else dtype
 
-        def array(values: np.ndarray | float) -> Array:
-            return jnp.asarray(values, dtype=dtype)
+        # Not jax.numpy.asarray of a number, which JAX would compile.
+        put: Any = sys.modules["jax"].device_put if "jax" in sys.modules else lambda array: array
+
+        def array(values: np.ndarray | float) -> Any:
+            return put(np.asarray(values, dtype=dtype))
 
         channels = None
         raw = images.measurements if images.kind == "time_of_flight" else images.time_of_flight
         if raw is not None and (probe is not None or images.kind == "time_of_flight"):
+            from jaxcal.segmentation.segment import segment
+
             segmented = segment(recording)
             if images.kind == "time_of_flight":
                 images = segmented.images
@@ -213,6 +236,9 @@ def stack(problems: list[Problem]) -> Problem:
     Raises:
         InputError: where they differ in the number of images or in what they hold.
     """
+    import jax
+    import jax.numpy as jnp
+
     first = jax.tree.structure(problems[0])
     for index, problem in enumerate(problems):
         if jax.tree.structure(problem) != first or problem.images != problems[0].images:
@@ -221,8 +247,3 @@ def stack(problems: list[Problem]) -> Problem:
                 "pad it with images that are masked out"
             )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)
-
-
-def is_traced(value: object) -> bool:
-    """Whether a value is unknown because jit, vmap or grad is looking at the code."""
-    return isinstance(value, jax.core.Tracer)

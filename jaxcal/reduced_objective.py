@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float
 
+from jaxcal.array_types import Bool, Float
 from jaxcal.errors import InputError
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.reduced_objective import ReducedObjective
 
 FALL = 0.15

@@ -1,25 +1,22 @@
 """The front door: one problem or a batch, by any method, to a :class:`Calibration`.
 
-What was asked for is checked in :mod:`jaxcal.options`; :mod:`jaxcal.pipeline` is the road that
-every problem takes, one pure function of arrays; here it is compiled, once for each combination of
-shapes and options, and mapped over batches.
+What was asked for is checked in :mod:`jaxcal.options`. Conventional calibration of one problem has
+a closed form, which needs numpy only (:mod:`jaxcal.conventional`). Everything else, and everything
+inside somebody's jit, vmap or grad, is solved by the engine: :mod:`jaxcal.pipeline` is the way that
+every problem takes there, one pure function of arrays, which :mod:`jaxcal.programs` compiles.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache, partial
-from typing import Any
+from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float
 
-from jaxcal import buckets, compiler, executables
 from jaxcal.calibration import Calibration
+from jaxcal.conventional import closed_form_answer
 from jaxcal.dependence import independent
 from jaxcal.diagnostics.serial_correlation import widened
 from jaxcal.errors import InputError
@@ -38,16 +35,12 @@ from jaxcal.options import (
     prepare,
     with_bound,
 )
-from jaxcal.pipeline import agreed_images, seen_by_agreement, solve_problems
-from jaxcal.precision import in_own_modes, require_float64, with_dtype
+from jaxcal.precision import in_own_modes, inside_transformation, require_float64, with_dtype
 from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import Recording
 
-BATCH_CHUNK = 64
-"""Problems solved side by side: enough to fill the vector units, few enough to stay in cache."""
-
-CHANNELS_CHUNK = 8
-"""The same for solves on channels, whose problems are a hundred times larger."""
+if TYPE_CHECKING:
+    from jax import Array
 
 
 @in_own_modes
@@ -126,27 +119,33 @@ def calibrate(
     )
     plan, given = prepare(problem, request)
     if problem.batch_shape:
-        return _solve_batch(problem, given, plan, None)
+        from jaxcal.engine import solve_batch
+
+        return solve_batch(problem, given, plan, None)
     check_values(problem)
     problem = with_bound(problem, given)
-    if not any(is_traced(leaf) for leaf in jax.tree.leaves((problem, given))):
-        joined, found = independent(problem, estimate)
-        result = _solve_alone(joined, given, plan).with_problem(joined)
-        result = replace(result, notes=() if found.words is None else (found.words,))
-        return widened(result)
-    return _solve_alone(problem, given, plan).with_problem(problem)
+    if is_traced(problem, given):
+        return _solve_alone(problem, given, plan).with_problem(problem)
+    joined, found = independent(problem, estimate)
+    result = _solve_alone(joined, given, plan).with_problem(joined)
+    result = replace(result, notes=() if found.words is None else (found.words,))
+    return widened(result)
 
 
 def _solve_alone(problem: Problem, given: Given, plan: Plan) -> Calibration:
-    """One problem, without it in the result (traceable)."""
-    alone = compiler.is_whole_program(problem, given)
-    platform = _devices(problem)[0].platform if alone else None
-    interpreted = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
-    if platform == "cpu" and executables.is_describable(plan) and not interpreted:
-        return _solve_kept(problem, given, plan)
-    # A program of its own, which serves every method and prior.
-    agreed = _agreement(platform)(seen_by_agreement(problem), plan.blocks) if plan.robust else None
-    return _one_problem(platform)(problem, given, plan, agreed)
+    """One problem, without it in the result (traceable): in closed form, or by the engine."""
+    found = None
+    if not inside_transformation(problem, given):
+        found = closed_form_answer(problem, plan)
+    if found is None:
+        from jaxcal.engine import solve_problem
+
+        return solve_problem(problem, given, plan)
+    if "jax" in sys.modules:
+        from jaxcal.engine import as_jax_holds
+
+        return as_jax_holds(found, problem)
+    return found
 
 
 @in_own_modes
@@ -217,33 +216,9 @@ def calibrate_batch(
         robust,
     )
     plan, given = prepare(problems, request)
-    return _solve_batch(problems, given, plan, chunk)
+    from jaxcal.engine import solve_batch
 
-
-def _solve_kept(problem: Problem, given: Given, plan: Plan) -> Calibration:
-    """One problem by programs that are kept, which serve every number of images of a bucket."""
-    padded = buckets.padded(problem)
-    given = replace(given, max_elevation=None)  # the problem has it
-    run = partial(executables.run, flags=compiler.ONE_PROBLEM)
-    label = {
-        "method": plan.method,
-        "prior": plan.reported_prior,
-        "unknowns": ", ".join(plan.blocks),
-        "data": "channels" if plan.channels else "points",
-        "images": padded.images,
-    }
-    agreed = None
-    if plan.robust:
-        search = label | {"method": "robust", "prior": "none"}
-        agreed = run(agreed_images, (seen_by_agreement(padded),), plan.blocks, label=search)
-    result = run(_solve_agreeing, (padded, given, agreed), plan, label=label)
-    return jax.device_put(buckets.cut(result, problem.images), next(iter(_held(problem)), None))
-
-
-def _solve_agreeing(
-    problem: Problem, given: Given, agreed: Array | None, plan: Plan
-) -> Calibration:
-    return solve_one(problem, given, plan, agreed)
+    return solve_batch(problems, given, plan, chunk)
 
 
 def _in_asked_precision(problem: Problem, options: Options | None, name: str) -> Problem:
@@ -251,102 +226,3 @@ def _in_asked_precision(problem: Problem, options: Options | None, name: str) ->
     if precision == "float64":
         require_float64(name)
     return with_dtype(problem, np.dtype(precision))
-
-
-def _devices(problems: Problem) -> tuple[Any, ...]:
-    """The devices that hold a problem's arrays, or all local ones where they may go anywhere."""
-    return _held(problems) or tuple(jax.local_devices())
-
-
-def _held(problems: Problem) -> tuple[Any, ...]:
-    """The devices that hold a problem's arrays; none where they may go anywhere."""
-    leaves = [leaf for leaf in jax.tree.leaves(problems) if isinstance(leaf, jax.Array)]
-    held = {frozenset(leaf.devices()) for leaf in leaves if leaf.committed}
-    if len(held) > 1:
-        raise InputError(
-            "the problem's arrays lie on different devices: put all of them on the same ones "
-            "(jax.device_put takes a whole problem)"
-        )
-    return tuple(sorted(held.pop(), key=lambda d: d.id)) if held else ()
-
-
-def _solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None) -> Calibration:
-    shape = problems.batch_shape
-    problems = with_bound(problems, given)
-    flat = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
-    largest = chunk or (CHANNELS_CHUNK if plan.channels else BATCH_CHUNK)
-    count = flat.mask.shape[0]
-    # Chunks of one size, the last one filled up: a remainder would be compiled as a second program.
-    pieces = max(-(-count // largest), 1)
-    program, devices = _chunks_program(flat, given, plan)
-    if pieces >= len(devices):
-        pieces = -(-pieces // len(devices)) * len(devices)
-    else:
-        program, devices = _chunks_program(flat, given, plan, spread=False)
-    lanes = max(-(-count // pieces), 1)
-    if count and pieces * lanes != count:
-        rows = jnp.arange(pieces * lanes) % count
-        flat = jax.tree.map(lambda leaf: leaf[rows], flat)
-    result = program(flat, given, plan, lanes)
-    result = jax.tree.map(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
-    return result.with_problem(problems)
-
-
-def solve_one(
-    problem: Problem, given: Given, plan: Plan, agreed: Float[Array, " n"] | None
-) -> Calibration:
-    """One problem is a batch of one (traceable)."""
-    alone = jax.tree.map(lambda leaf: leaf[None], (problem, agreed))
-    result = solve_problems(alone[0], given, plan, alone[1])
-    return jax.tree.map(lambda leaf: leaf[0], result)
-
-
-@cache
-def _one_problem(platform: str | None):
-    """The compiled solve of one problem; with a platform, as a program of its own."""
-    flags = None if platform is None else compiler.quick_to_compile(platform)
-    return jax.jit(solve_one, static_argnums=2, compiler_options=flags)
-
-
-@cache
-def _agreement(platform: str | None):
-    """The compiled consensus of one problem's images, likewise."""
-    flags = None if platform is None else compiler.quick_to_compile(platform)
-    return jax.jit(agreed_images, static_argnums=1, compiler_options=flags)
-
-
-def solve_chunks(problems: Problem, given: Given, plan: Plan, chunk: int) -> Calibration:
-    """Solve a batch whose size is a multiple of the chunk's (traceable)."""
-    count = problems.mask.shape[0]
-    if count == chunk:
-        return solve_problems(problems, given, plan)
-    chunks = jax.tree.map(lambda leaf: leaf.reshape((-1, chunk, *leaf.shape[1:])), problems)
-    result = jax.lax.map(lambda part: solve_problems(part, given, plan), chunks)
-    return jax.tree.map(lambda leaf: leaf.reshape((count, *leaf.shape[2:])), result)
-
-
-@cache
-def _chunks(devices: tuple[Any, ...], alone: bool):
-    """The compiled solve of chunks, which several devices share; alone: a program of its own."""
-    options = compiler.fast_to_run(devices[0].platform) if alone else None
-    if len(devices) == 1:
-        return jax.jit(solve_chunks, static_argnums=(2, 3), compiler_options=options)
-    mesh, cut = Mesh(np.asarray(devices), ("problems",)), PartitionSpec("problems")
-
-    def spread(problems: Problem, given: Given, plan: Plan, chunk: int) -> Calibration:
-        def share(problems: Problem, given: Given) -> Calibration:
-            return solve_chunks(problems, given, plan, chunk)
-
-        specs = (cut, PartitionSpec())
-        mapped = jax.shard_map(share, mesh=mesh, in_specs=specs, out_specs=cut, check_vma=False)
-        return mapped(problems, given)
-
-    return jax.jit(spread, static_argnums=(2, 3), compiler_options=options)
-
-
-def _chunks_program(problems: Problem, given: Given, plan: Plan, *, spread: bool = True):
-    """The compiled form, and the devices that it runs on."""
-    alone = compiler.is_whole_program(problems, given)
-    devices = _devices(problems) if alone else tuple(jax.local_devices())
-    devices = devices if alone and spread else devices[:1]
-    return _chunks(devices, alone), devices

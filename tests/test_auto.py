@@ -17,8 +17,9 @@ import jaxcal
 from jaxcal import InputError
 from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.intervals import degrees_of_freedom
-from jaxcal.model.shapes import FAMILIES, tilted
-from jaxcal.solvers.auto import UNIFORM, Answers, median, weights
+from jaxcal.model.distributions import FAMILIES, UNIFORM
+from jaxcal.model.shapes import tilted
+from jaxcal.solvers.auto import Answers, median, weights
 from jaxcal.solvers.dense import inverse_lanes_last, inverse_positive
 from jaxcal.solvers.expectation_propagation import Marginal, Sites
 from jaxcal.solvers.expectation_propagation import propagate as propagate_lanes_last

@@ -56,7 +56,8 @@ def test_a_lane_is_its_problem_and_bad_ones_leave_it_alone(name):
         where = jax.tree_util.keystr(path)
         lane, beside, one = (np.asarray(each)[:3] for each in (lane, beside, one))
         np.testing.assert_array_equal(lane, beside, err_msg=where)
-        if where in (".iterations", ".variance_rounds", ".cost", ".stationarity"):
+        # One conventional problem has a closed form, without iterations.
+        if where.rsplit(".")[-1] in ("iterations", "variance_rounds", "cost", "stationarity"):
             continue
         if where in (".weakest", ".prior_direction"):
             # A direction has no sign.
@@ -79,13 +80,13 @@ def test_compiler_flags_change_rounding_only(monkeypatch):
     fast = jaxcal.calibrate_batch(problems, method="conventional")
     again = jaxcal.calibrate_batch(problems, method="conventional")
     assert np.array_equal(fast.image_to_probe, again.image_to_probe)
-    from jaxcal import solve
+    from jaxcal import programs
 
-    solve._chunks.cache_clear()
+    programs.chunks.cache_clear()
     monkeypatch.setenv(compiler.SWITCH, "0")
     assert compiler.fast_to_run("cpu") is None
     plain = jaxcal.calibrate_batch(problems, method="conventional")
-    solve._chunks.cache_clear()
+    programs.chunks.cache_clear()
     np.testing.assert_allclose(fast.image_to_probe, plain.image_to_probe, rtol=0, atol=1e-12)
 
 

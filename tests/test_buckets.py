@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxcal
-from jaxcal import buckets, executables, program_cache, solve
+from jaxcal import buckets, executables, program_cache, programs
 from jaxcal.options import Request, prepare
 
 METHODS = {
@@ -136,7 +136,8 @@ def test_masked_images_beyond_the_bucket_change_nothing(name):
 def test_the_answer_is_that_of_the_unpadded_problem():
     nine = select(PROBLEMS[0], slice(0, 9))
     plan, given = prepare(nine, Request(method="conventional"))
-    exact = jax.jit(solve.solve_one, static_argnums=2)(nine, given, plan, None).with_problem(nine)
+    solved = jax.jit(programs.solve_one, static_argnums=4)(nine, given, None, None, plan)
+    exact = solved.with_problem(nine)
     found = jaxcal.calibrate(nine, "conventional")
     assert found.elevation.shape == (9,)
     same(exact, found, 9)
@@ -146,6 +147,6 @@ def test_every_number_of_images_in_a_bucket_is_one_program(tmp_path, monkeypatch
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     executables.forget()
     for count in (9, 10, 11, 12):
-        jaxcal.calibrate(select(PROBLEMS[0], slice(0, count)), "conventional")
+        jaxcal.calibrate(select(PROBLEMS[0], slice(0, count)), "alternating")
     (entry,) = program_cache.entries()
     assert entry.header["label"]["images"] == 12

@@ -11,11 +11,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from scipy.stats import qmc
 
 import jaxcal
 from jaxcal import design
 from jaxcal.design import Constraints, Model, Noise, Region
-from jaxcal.design.candidates import sobol_poses
+from jaxcal.design.candidates import sobol_poses, sobol_sequence
 from jaxcal.design.criteria import check_criterion, gains, rp_weight, tre_weight
 from jaxcal.design.greedy import Rules, are_alike
 from jaxcal.design.information import covariance_of, known_information
@@ -400,3 +401,8 @@ def test_the_figure_is_a_figure(tmp_path):
     plan = design.plan(some(200), 10)
     design.plan_figure(plan, 0.3).savefig(tmp_path / "plan.png")
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_sobols_sequence_is_scipys():
+    expected = qmc.Sobol(5, scramble=False).random_base2(9)
+    np.testing.assert_array_equal(sobol_sequence(512), expected)

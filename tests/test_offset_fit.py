@@ -9,7 +9,7 @@ from scipy import stats
 import jaxcal
 from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.offset_fit import CONTRADICTED, contradicted, distribution
-from jaxcal.model.shapes import FAMILIES
+from jaxcal.model.distributions import FAMILIES
 
 DRAWN = {
     "uniform": stats.uniform(-1, 2),

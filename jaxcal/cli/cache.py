@@ -19,6 +19,7 @@ import click
 from jaxcal import program_cache
 from jaxcal.cli.common import ExitCode, print_json, print_page, progress
 from jaxcal.errors import InputError, OutputError
+from jaxcal.when_jax import when_jax_is_imported
 
 if TYPE_CHECKING:
     from jaxcal.problem import Problem
@@ -189,10 +190,16 @@ def _repeated(problem: Problem, count: int) -> Problem:
 def enable_compilation_cache() -> None:
     """Let JAX keep what :mod:`jaxcal.executables` does not; silently without where it cannot be.
 
+    Done when JAX is imported, which not every calibration needs.
+
     And silence the compiler, whose alarms ("Very slow compile?") ask users of XLA to file bugs. It
     has no option for that but the level of its log, which is the whole process': so only the
     command line does it, not the library, and not by an environment that other programs inherit.
     """
+    when_jax_is_imported(_enable_compilation_cache)
+
+
+def _enable_compilation_cache() -> None:
     # "1" is what importing JAX puts there; anything else is somebody's wish.
     wished = os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") != "1"
     if not wished and "JAX_LOGGING_LEVEL" not in os.environ:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -205,18 +207,20 @@ def calibrate(
     from jaxcal.report.accuracy import settle
     from jaxcal.report.next_poses import next_poses_record
     from jaxcal.report.record import calibration_record, check_test_images
-    from jaxcal.report.write import check_writable, prepare_folder, write_report
 
     measured, notes = _segmented(load(recording))
     test_data = None if test is None else _segmented(load(test))[0]
     check_test_images(measured, test_data)
     enable_compilation_cache()
     if report is not None:
+        from jaxcal.report.write import check_writable
+
         check_writable(report)
-    with nullcontext() if out is None else prepare_folder(out) as folder:
-        with progress(f"calibrating ({method})"):
+    with nullcontext() if out is None else _prepared(out) as folder:
+        with progress(f"calibrating ({method})") as show:
             traced = folder is not None and method == "conventional"
-            result = _solve(measured, request, traced=traced)
+            with _first_answer(measured, request, show):
+                result = _solve(measured, request, traced=traced)
             record = calibration_record(result, measured, test_data, tre_points)
             record["warnings"] += notes
             record["next_poses"] = next_poses_record(result, measured)
@@ -226,6 +230,8 @@ def calibrate(
             settle(record)
         if folder is not None:
             with progress("drawing the report"):
+                from jaxcal.report.write import write_report
+
                 curves = _curves(measured, request, result)
                 write_report(folder, record, result, measured, curves)
     if report is not None:
@@ -239,6 +245,12 @@ def calibrate(
         _print(record, out)
         print_page(*exported)
     return verdict_code(record, require)
+
+
+def _prepared(out: str) -> AbstractContextManager[Path]:
+    from jaxcal.report.write import prepare_folder
+
+    return prepare_folder(out)
 
 
 def _export_target(text: str) -> tuple[str, str]:
@@ -272,8 +284,6 @@ def _export(record: dict[str, Any], recording: str, targets: list[tuple[str, str
 
 def _segmented(recording: Recording) -> tuple[Recording, list[str]]:
     """A recording with points in the place of times of flight, and what there is to say of them."""
-    from jaxcal.segmentation.segment import segment_recording
-
     test = recording.test
     raw = recording.calibration.kind == "time_of_flight"
     if not raw and (test is None or test.kind != "time_of_flight"):
@@ -283,6 +293,8 @@ def _segmented(recording: Recording) -> tuple[Recording, list[str]]:
             f"{recording.source}: the test images hold times of flight beside other calibration "
             "images: segment them first"
         )
+    from jaxcal.segmentation.segment import segment_recording
+
     segmented, found = segment_recording(recording)
     return segmented, list(found.warnings)
 
@@ -341,16 +353,49 @@ def unknowns(estimate: str | None) -> tuple[str, ...]:
 
 
 def _solve(recording: Recording, request: _Request, *, traced: bool) -> Calibration:
-    import jax
-
     from jaxcal.options import Options
-    from jaxcal.report.convergence import KEPT
     from jaxcal.solve import calibrate as solve
 
-    options = Options(**request.options, trace=KEPT if traced else 0)
+    kept = 0
+    if traced:
+        from jaxcal.report.convergence import KEPT
+
+        kept = KEPT
+    options = Options(**request.options, trace=kept)
     arguments: dict[str, Any] = {**_arguments(request), "options": options}
-    result = solve(recording, **arguments)
-    return jax.block_until_ready(result)
+    return solve(recording, **arguments)
+
+
+@contextmanager
+def _first_answer(
+    recording: Recording, request: _Request, show: Callable[[str], None]
+) -> Iterator[None]:
+    """Show the conventional fit while another method's program is loaded or compiled."""
+    from jaxcal.report.certified import first_answer_words
+
+    words = None
+    if request.method != "conventional" and not request.robust:
+        words = first_answer_words(recording.calibration, request.estimate)
+    if words is None:
+        yield
+        return
+    doing = f"Calibrating ({request.method})"
+    show(f"{words} {doing} ...")
+
+    class Compiling(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            show(f"{words} {doing}: {record.getMessage()} ...")
+
+    # What executables says of compiling, and nothing else of it.
+    log, handler = logging.getLogger("jaxcal.executables"), Compiling(logging.INFO)
+    level = log.level
+    log.addHandler(handler)
+    log.setLevel(min(level or logging.INFO, logging.INFO))
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+        log.removeHandler(handler)
 
 
 def _arguments(request: _Request) -> dict[str, Any]:

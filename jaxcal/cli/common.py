@@ -11,7 +11,7 @@ import signal
 import sys
 import textwrap
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -107,15 +107,20 @@ def print_page(*parts: RenderableType) -> None:
 
 
 @contextmanager
-def progress(message: str) -> Iterator[None]:
-    """Show what is being done on standard error, if somebody is watching."""
+def progress(message: str) -> Iterator[Callable[[str], None]]:
+    """Show what is being done on standard error, if somebody is watching.
+
+    Yields:
+        A function that shows something else instead.
+    """
     if sys.stderr is None or not sys.stderr.isatty():
-        yield
+        yield lambda message: None
         return
     from rich.console import Console
+    from rich.text import Text
 
-    with Console(stderr=True, markup=False, highlight=False).status(message):
-        yield
+    with Console(stderr=True, markup=False, highlight=False).status(Text(message)) as status:
+        yield lambda message: status.update(Text(message))
 
 
 def import_engine() -> None:

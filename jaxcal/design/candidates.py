@@ -11,13 +11,13 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.design.constraints import Constraints, Region
 from jaxcal.design.information import Model
 from jaxcal.design.noise import Noise
 from jaxcal.errors import InputError
-from jaxcal.geometry import check_poses, nearest_rotations
+from jaxcal.poses import check_poses, nearest_rotations
 from jaxcal.probe import Probe
 
 if TYPE_CHECKING:
@@ -27,6 +27,15 @@ if TYPE_CHECKING:
 COUNT = 5000
 """Candidates of a plan; twice as many change the predicted error by less than 1 %."""
 MOST_CANDIDATES = 200_000
+SOBOL: tuple[tuple[int, tuple[int, ...]], ...] = (
+    (0, (1,) * 30), (0, (1,)), (1, (1, 3)), (1, (1, 3, 1)), (2, (1, 1, 1)),
+)  # fmt: skip
+"""Primitive polynomials (their inner coefficients) and first direction numbers of each axis.
+
+Source: Joe and Kuo, SIAM J. Sci. Comput. 30, 2008 (new-joe-kuo-6); the first axis is van der
+Corput's.
+"""
+SOBOL_BITS = 30
 _TRIES_PER_POSE = 50
 _LEAST_CONE_DEG, _LEAST_TURN_DEG = 30.0, 60.0
 _WIDER = 0.15
@@ -74,13 +83,32 @@ class Candidates:
 
 def sobol_numbers(count: int, constraints: Constraints, seed: int) -> Float[np.ndarray, "n 5"]:
     """The first ``count`` points of the sequence (rounded up to a power of two)."""
-    from scipy.stats import qmc
-
-    sequence = qmc.Sobol(5, scramble=False)
-    draws = sequence.random_base2(int(np.ceil(np.log2(max(count, 2)))))
+    draws = sobol_sequence(1 << int(np.ceil(np.log2(max(count, 2)))))
     # Sobol points are balanced in powers of two; turned round in the unit cube, they stay even.
     fraction = (draws + np.random.default_rng(seed).random(5)) % 1.0
     return numbers_of(fraction, constraints)
+
+
+def sobol_sequence(count: int) -> Float[np.ndarray, "n 5"]:
+    """The first points of Sobol's sequence in the unit cube, as ``scipy.stats.qmc`` has them.
+
+    Importing that takes longer than planning. In Gray code, after Antonov and Saleev 1979.
+    """
+    order = np.arange(count, dtype=np.int64)
+    gray = order ^ (order >> 1)
+    found = np.zeros((count, len(SOBOL)), np.int64)
+    for axis, (polynomial, initial) in enumerate(SOBOL):
+        numbers = list(initial)
+        for k in range(len(numbers), SOBOL_BITS):
+            degree = len(initial)
+            value = numbers[k - degree] ^ (numbers[k - degree] << degree)
+            for i in range(1, degree):
+                if polynomial >> (degree - 1 - i) & 1:
+                    value ^= numbers[k - i] << i
+            numbers.append(value)
+        for k, number in enumerate(numbers):
+            found[:, axis] ^= (gray >> k & 1) * (number << (SOBOL_BITS - 1 - k))
+    return found / 2.0**SOBOL_BITS
 
 
 def numbers_of(

@@ -19,10 +19,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
+from jaxcal.array_types import Bool, Float
 from jaxcal.errors import InputError
+from jaxcal.poses import rotations_from_vectors
 from jaxcal.probe import CurvilinearProbe, Probe
 
 _INSIDE = 1e-9
@@ -172,9 +172,7 @@ class Constraints:
         """Poses probe -> tracker (mm) of their five numbers."""
         tilt, turn = np.zeros((len(numbers), 3)), np.zeros((len(numbers), 3))
         tilt[:, :2], turn[:, 2] = numbers[:, 2:4], numbers[:, 4]
-        image = (
-            self.reference @ (Rotation.from_rotvec(tilt) * Rotation.from_rotvec(turn)).as_matrix()
-        )
+        image = self.reference @ rotations_from_vectors(tilt) @ rotations_from_vectors(turn)
         found = np.tile(np.eye(4), (len(numbers), 1, 1))
         found[:, :3, :3] = image @ image_to_probe[:3, :3].T
         place = self.region.place(numbers[:, :2]) @ image_to_probe[:3, :3].T + image_to_probe[:3, 3]
@@ -198,6 +196,6 @@ class Constraints:
         ratio = np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 1.0)
         tilt = np.zeros((len(poses), 3))
         tilt[:, 0], tilt[:, 1] = -ratio * axial[:, 1], ratio * axial[:, 0]
-        rest = Rotation.from_rotvec(tilt).inv().as_matrix() @ relative
+        rest = rotations_from_vectors(-tilt) @ relative
         turn = np.arctan2(rest[:, 1, 0], rest[:, 0, 0])
         return np.column_stack([self.region.unit(target), tilt[:, :2], turn])

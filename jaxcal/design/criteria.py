@@ -23,13 +23,11 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
+from jaxcal.array_types import AnyArray, Array, Float
 from jaxcal.design.information import Model
 from jaxcal.errors import InputError
-from jaxcal.geometry import AnyArray
 
 Criterion = Literal["tre", "rp", "d"]
 _PIECE = 800
@@ -109,6 +107,8 @@ def gain(
         weight: W.
         model: X, target and SDs.
     """
+    import jax.numpy as jnp
+
     rows = model.jacobian(jnp.asarray(pose))
     spread = rows @ jnp.asarray(covariance)
     around = jnp.eye(3) + spread @ rows.T

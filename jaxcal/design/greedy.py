@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
 
+from jaxcal.array_types import Bool, Float
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import gains
 from jaxcal.design.information import covariance_of

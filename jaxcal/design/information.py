@@ -18,12 +18,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
-from scipy.optimize import brentq
 
+from jaxcal.array_types import Float
 from jaxcal.design.noise import Noise
 from jaxcal.errors import InputError
-from jaxcal.model.parameters import RIGID, block_slice
+from jaxcal.model.blocks import RIGID, block_slice
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
@@ -33,6 +32,8 @@ BELIEVED_SD = (50.0, 0.5, 50.0, 0.3)
 target (mm) and of a pixel scale's logarithm. Weak: five images know more."""
 
 _EFFICIENCY = (0.2, 5.0)
+_HALVINGS = 22
+"""Of the logarithm of that interval, which is then known to 1e-6."""
 
 
 @dataclass(frozen=True)
@@ -178,5 +179,7 @@ def effective_elevational(
         return (
             1.0 if not said > 0 else float(_EFFICIENCY[0] if excess(low) >= 0 else _EFFICIENCY[1])
         )
-    root: Any = brentq(excess, low, high, xtol=1e-6)
-    return float(np.exp(root))
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if excess(middle) < 0 else (low, middle)
+    return float(np.exp(0.5 * (low + high)))

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float
 
+from jaxcal.array_types import Bool, Float
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import (
     Criterion,
@@ -25,7 +25,6 @@ from jaxcal.design.information import (
     known_information,
 )
 from jaxcal.design.noise import Noise
-from jaxcal.design.polish import polish as polished
 from jaxcal.diagnostics.messages import direction_in_words
 from jaxcal.errors import InputError
 from jaxcal.recording import MINIMUM_IMAGES
@@ -143,6 +142,8 @@ def plan(
         chosen = exchange(search, chosen)
     poses = candidates.poses[chosen.rows]
     if polish:
+        from jaxcal.design.polish import polish as polished
+
         poses, _ = polished(search, candidates, chosen)
     return _finished(candidates, known, criterion, rules, chosen, poses)
 

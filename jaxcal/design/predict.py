@@ -12,8 +12,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import rp_weight, tre_weight
 from jaxcal.design.information import covariance_of

@@ -9,8 +9,8 @@ the lateral position is smallest (u = 0 in pixels), low is deep.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.design.constraints import Constraints
 
 _LEAST_TILT_DEG, _LEAST_TURN_DEG = 3.0, 5.0

@@ -17,14 +17,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
-from jaxcal.model.parameters import block_slice, size
+from jaxcal.array_types import Float
+from jaxcal.model.blocks import block_slice, size
 from jaxcal.sound import WATER_M_S
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
-    from jaxcal.model.parameters import Blocks
+    from jaxcal.model.blocks import Blocks
     from jaxcal.problem import Problem
 
 Array = np.ndarray

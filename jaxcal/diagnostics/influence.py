@@ -26,8 +26,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
+from jaxcal.array_types import Bool, Float, Int
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns, channel_rows
 from jaxcal.diagnostics.uncertainty import (
     TUNED,
@@ -37,10 +37,11 @@ from jaxcal.diagnostics.uncertainty import (
     quadratic,
 )
 from jaxcal.errors import CalibrationError
+from jaxcal.trees import map_arrays
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
-    from jaxcal.model.parameters import Blocks
+    from jaxcal.model.blocks import Blocks
     from jaxcal.problem import Problem
 
 Array = np.ndarray
@@ -103,15 +104,13 @@ def influence_of(calibration: Calibration) -> Influence:
     Raises:
         CalibrationError: a batch, or a calibration without the problem that it is of.
     """
-    import jax
-
     if calibration.problem is None:
         raise CalibrationError(
             "this calibration does not hold its problem: add it with calibration.with_problem"
         )
     if np.ndim(calibration.mask) != 1:
         raise CalibrationError("a batch holds many calibrations: take one of them")
-    alone = jax.tree.map(_first, calibration.numpy())
+    alone = map_arrays(_first, calibration.numpy())
     with np.errstate(all="ignore"):
         found = _whitened(alone, alone.problem)
         information = np.asarray(alone.linearisation.information)

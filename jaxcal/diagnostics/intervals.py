@@ -29,15 +29,14 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 from scipy import special
 
+from jaxcal.array_types import AnyArray, Float
 from jaxcal.diagnostics.arrays import array_module, traceable
 from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.errors import InputError
-from jaxcal.geometry import AnyArray
 from jaxcal.image_points import image_rows, point_jacobian
-from jaxcal.model.parameters import size
+from jaxcal.model.blocks import size
 from jaxcal.sound import WATER_M_S
 
 if TYPE_CHECKING:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from jaxtyping import Float
-
+from jaxcal.array_types import AnyArray, Float
 from jaxcal.diagnostics.arrays import array_module, traceable
-from jaxcal.geometry import AnyArray
 
 
 @traceable

@@ -22,16 +22,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float
 
+from jaxcal.array_types import Bool, Float
 from jaxcal.diagnostics.uncertainty import TUNED, Uncertainty, Whitened, inverses, quadratic
-from jaxcal.model.parameters import block_slice
-from jaxcal.solvers.consensus import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
+from jaxcal.model.blocks import block_slice
+from jaxcal.model.outliers import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
     from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
-    from jaxcal.model.parameters import Blocks
+    from jaxcal.model.blocks import Blocks
     from jaxcal.problem import Problem
 
 Array = np.ndarray

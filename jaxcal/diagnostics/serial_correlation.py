@@ -23,13 +23,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.array_types import Float
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.uncertainty import TUNED, Whitened
+from jaxcal.trees import map_arrays
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
@@ -77,12 +76,16 @@ def widened(result: Calibration) -> Calibration:
 
 def _like(before: Any, values: np.ndarray) -> Any:
     """On the device of what they replace, if that was on one."""
-    return values if isinstance(before, np.ndarray) else jnp.asarray(values)
+    if isinstance(before, np.ndarray):
+        return values
+    import jax.numpy as jnp
+
+    return jnp.asarray(values)
 
 
 def _in_sds(result: Calibration) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3 p"]]:
     """Errors of the used images and their derivatives by the unknowns, in SDs."""
-    answer = jax.tree.map(lambda leaf: np.asarray(leaf)[None], result)
+    answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
     problem = answer.problem
     unknowns = Unknowns.of(answer, problem)
     seen = ImageErrors.of(unknowns, problem, answer.blocks)

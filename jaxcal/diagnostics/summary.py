@@ -6,12 +6,13 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.residual_checks import Inspection, inspect
 from jaxcal.diagnostics.uncertainty import assess
 from jaxcal.errors import CalibrationError
+from jaxcal.trees import map_arrays
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
@@ -57,8 +58,6 @@ def summarise(calibration: Calibration) -> Summary:
     Raises:
         CalibrationError: a calibration without the problem that it is of.
     """
-    import jax
-
     if calibration.problem is None:
         raise CalibrationError(
             "this calibration does not hold its problem, without which there are no diagnostics: "
@@ -73,12 +72,12 @@ def summarise(calibration: Calibration) -> Summary:
         values = values.astype(float) if values.dtype.kind == "f" else values
         return values.reshape(-1, *values.shape[axes:])
 
-    whole = jax.tree.map(flat, calibration)
+    whole = map_arrays(flat, calibration)
     pieces = []
     with np.errstate(all="ignore"):
         for start in range(0, max(len(whole.mask), 1), CHUNK):
             rows = slice(start, start + CHUNK)
-            pieces.append(_piece(jax.tree.map(lambda leaf, rows=rows: leaf[rows], whole), eps))
+            pieces.append(_piece(map_arrays(lambda leaf, rows=rows: leaf[rows], whole), eps))
     found = {
         name: np.concatenate([piece[name] for piece in pieces]).reshape(batch + each.shape[1:])
         for name, each in pieces[0].items()

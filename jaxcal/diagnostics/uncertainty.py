@@ -19,18 +19,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float
 
+from jaxcal.array_types import AnyArray, Bool, Float
 from jaxcal.diagnostics.arrays import array_module
-from jaxcal.geometry import AnyArray
-from jaxcal.model.observations import LARGEST_ELEVATION
-from jaxcal.model.parameters import BLOCK_SIZE, block_slice
+from jaxcal.model.blocks import BLOCK_SIZE, block_slice
+from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.options import DEFAULT_MAX_ELEVATION_MM
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
     from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
-    from jaxcal.model.parameters import Blocks
+    from jaxcal.model.blocks import Blocks
     from jaxcal.problem import Problem
 
 Array = np.ndarray

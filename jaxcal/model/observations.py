@@ -35,10 +35,8 @@ from jaxtyping import Array, Float
 
 from jaxcal.model.batch import RIGID_UNKNOWNS, Images, Iterate, targets, whole
 from jaxcal.model.parameters import EXTRA, Blocks, block_slice
+from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unrolled import Vector, add
-
-LARGEST_ELEVATION = 0.95
-"""Offsets are kept below this fraction of the range: at 1 the circle's tangent turns axial."""
 
 TRACKER_STEPS = 4
 """Newton steps to a tracker's elevational error: the range bends so little that two suffice."""

@@ -3,7 +3,7 @@
 X steps on its manifold by the right perturbation X Exp([v, omega]), so v (mm) and omega (rad) are
 along and about the image's own axes (lateral, elevational, axial). Pixel scales and sound speed
 step in their logarithm, which keeps them positive. A solver is told which blocks are free; the rest
-stay fixed. A further unknown (latency) is one field, one size and one line here.
+stay fixed. :mod:`jaxcal.model.blocks` holds their names and sizes, which can be had here too.
 """
 
 from __future__ import annotations
@@ -13,19 +13,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.geometry import matrix_from_rotation, rotation_from_vector
-
-Blocks = tuple[str, ...]
-
-BLOCK_SIZE = {"translation": 3, "rotation": 3, "point": 3, "scale": 2, "sound-speed": 1, "delay": 1}
-
-EXTRA = ("scale", "sound-speed", "delay")
-"""Blocks that a caller may ask for beside X and the target."""
-
-MEDIUM = ("sound-speed", "delay")
-"""Blocks between a time of flight and a distance."""
-
-RIGID: Blocks = ("translation", "rotation", "point")
-"""The unknowns of Eq. 7: X and the target."""
+from jaxcal.model.blocks import BLOCK_SIZE as BLOCK_SIZE
+from jaxcal.model.blocks import EXTRA as EXTRA
+from jaxcal.model.blocks import MEDIUM as MEDIUM
+from jaxcal.model.blocks import RIGID as RIGID
+from jaxcal.model.blocks import Blocks as Blocks
+from jaxcal.model.blocks import block_slice as block_slice
+from jaxcal.model.blocks import size as size
 
 
 class Parameters(eqx.Module):
@@ -64,21 +58,6 @@ class Parameters(eqx.Module):
     def matrix(self) -> Float[Array, "4 4"]:
         """X as a 4x4 matrix, mm."""
         return matrix_from_rotation(self.rotation, self.translation)
-
-
-def size(blocks: Blocks) -> int:
-    """Number of scalar unknowns in the given blocks."""
-    return sum(BLOCK_SIZE[name] for name in blocks)
-
-
-def block_slice(blocks: Blocks, name: str) -> slice:
-    """Where a block lies in the tangent vector of the given blocks."""
-    start = 0
-    for block in blocks:
-        if block == name:
-            return slice(start, start + BLOCK_SIZE[name])
-        start += BLOCK_SIZE[block]
-    raise KeyError(name)
 
 
 def retract(parameters: Parameters, tangent: Float[Array, " p"], blocks: Blocks) -> Parameters:

@@ -21,9 +21,7 @@ Reference for the corrections: Hildebrand, Introduction to Numerical Analysis, 5
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
-from typing import Literal, get_args
 
 import equinox as eqx
 import jax
@@ -31,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxcal.model.distributions import Family
 from jaxcal.precision import in_standard_promotion
 
 NODES = 8
@@ -42,28 +41,8 @@ REACH = 4.5
 END_WEIGHTS = np.array([475.0, 1902.0, 1104.0, 1586.0, 1413.0]) / 1440.0
 """Gregory's weights of the first and the last nodes; those between have weight one."""
 
-Family = Literal["uniform", "bell", "gaussian", "student"]
-
-FAMILIES: tuple[Family, ...] = get_args(Family)
-
 EDGE: dict[Family, float] = {"uniform": 3**0.5, "bell": 7**0.5, "gaussian": 1e3, "student": 1e3}
 """Where each family's density of unit SD ends; the last two have no end that matters."""
-
-
-@dataclass(frozen=True)
-class Shape:
-    """One candidate for the law of the offsets.
-
-    Attributes:
-        family: which density.
-        stretch: its SD in units of the SD that the Gaussian fit found.
-        prior: probability before the data are seen.
-    """
-
-    family: Family
-    stretch: float
-    prior: float
-
 
 CURVATURE: dict[Family, float] = {"uniform": 0.0, "bell": -1 / 7, "student": 0.5}
 """-+ 1/a^2 at unit SD."""

@@ -20,8 +20,8 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.calibration import Calibration
 from jaxcal.closed_form import calibrate_closed_form
 from jaxcal.design.candidates import seen_region
@@ -44,6 +44,7 @@ from jaxcal.diagnostics.intervals import (
 from jaxcal.errors import InputError
 from jaxcal.problem import Problem
 from jaxcal.recording import Recording
+from jaxcal.trees import map_arrays
 
 Word = Literal["good", "fair", "uncertain"]
 
@@ -278,9 +279,7 @@ def _comparison(
 
 
 def _batch_of_one(problem: Problem) -> Problem:
-    import jax
-
-    return jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], problem)
+    return map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
 
 
 def settle(record: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from jaxcal.certificate import Certificate, certify
 from jaxcal.closed_form import calibrate_closed_form
 from jaxcal.dependence import independent
 from jaxcal.errors import InputError
-from jaxcal.model.parameters import EXTRA
+from jaxcal.model.blocks import EXTRA
 from jaxcal.recording import Images, Recording
 
 
@@ -58,6 +58,31 @@ def _of_answer(
         scale_mm_per_px=None if scale is None else np.asarray(scale, dtype=float),
         sound_speed_factor=factor,
         estimate=estimate,
+    )
+
+
+def first_answer_words(images: Images, estimate: tuple[str, ...]) -> str | None:
+    """The conventional fit in a sentence, to be shown while another method is at work.
+
+    Args:
+        images: to be calibrated.
+        estimate: further unknowns; without a closed form for them nothing is said.
+    """
+    if images.kind == "time_of_flight":
+        return None
+    try:
+        found = calibrate_closed_form(images, estimate=estimate)
+    except InputError:
+        return None
+    x, y, z = found.image_to_probe[:3, 3]
+    name = "Conventional fit, certified:" if found.certified else "Conventional fit:"
+    scale = ""
+    if "scale" in estimate and found.scale_mm_per_px is not None:
+        lateral, axial = found.scale_mm_per_px
+        scale = f", pixels of {lateral:.4f} x {axial:.4f} mm"
+    return (
+        f"{name} image origin at {x:.2f}, {y:.2f}, {z:.2f} mm on the probe{scale}, "
+        f"RMS {found.rms_mm:.3f} mm."
     )
 
 

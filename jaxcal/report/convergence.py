@@ -10,13 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.calibration import Calibration
 from jaxcal.options import Options
 from jaxcal.problem import Problem
 from jaxcal.solve import calibrate
-from jaxcal.solvers.alternating import WARM_UP_ROUNDS
 
 KEPT = 200
 """Iterations that are drawn."""
@@ -60,6 +59,8 @@ def bounded_curves(
     Returns:
         Curves of the sum of squares, mm^2.
     """
+    from jaxcal.solvers.alternating import WARM_UP_ROUNDS
+
     joint = calibrate(
         problem, "joint", "bounded", max_elevation=max_elevation, estimate=estimate,
         options=Options(trace=KEPT),

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxcal.array_types import Float
 from jaxcal.calibration import Calibration
 from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.metrics import reconstruct

@@ -9,11 +9,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from jaxcal.array_types import Float
 from jaxcal.calibration import Calibration
 from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.influence import KINDS, in_image, influence_of

@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 import jaxcal
+from jaxcal.array_types import Float
 from jaxcal.calibration import Calibration
 from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.metrics import reconstruction_precision

@@ -13,7 +13,8 @@ from html import escape
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+
+from jaxcal.array_types import Float
 
 Number = float | int | np.floating
 

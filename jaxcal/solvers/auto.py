@@ -13,8 +13,8 @@ disagree about is in the covariance.
    (:mod:`jaxcal.solvers.offset_mean`); and where the images came with covariances of their own,
    once more with those, up to one factor.
 3. *Laws* (:mod:`jaxcal.model.shapes`). Linearised there, everything is Gaussian but the offsets'
-   law. Expectation propagation gives X under each law of :data:`SHAPES` and how probable the data
-   are under it: uniform, a bell with edges, Gaussian, Student's t4; the uniform one with five SDs
+   law. Expectation propagation gives X under each law of ``SHAPES`` and how probable the data are
+   under it: uniform, a bell with edges, Gaussian, Student's t4; the uniform one with five SDs
    about REML's, which knows the edges to a few per cent only, and it is they that matter. Where an
    image came with a bound on its offset, its law is cut there. Under each law the belief about the
    mean is formed anew, since edges say of it what a Gaussian does not see.
@@ -44,31 +44,14 @@ from jaxtyping import Array, Bool, Float
 
 from jaxcal.model import unrolled
 from jaxcal.model.batch import Images, Iterate, barrier, choose, targets
+from jaxcal.model.distributions import FAMILIES, Family, OffsetLaw, Shape
 from jaxcal.model.observations import Medium, Observation, OwnCovariances, Points, unit_shape
 from jaxcal.model.parameters import retract
-from jaxcal.model.shapes import FAMILIES, Family, Shape
+from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.solvers.evidence import V_Y, NoiseModel, row_of, tune
 from jaxcal.solvers.expectation_propagation import SEEN, Sites, marginal, propagate, seen
 from jaxcal.solvers.normal_equations import stacked
 from jaxcal.solvers.offset_mean import MEAN_SD, believed, gained
-from jaxcal.solvers.reml import MINIMUM_SELF_TUNING
-
-UNIFORM: tuple[Shape, ...] = tuple(
-    Shape("uniform", float(np.exp(0.14 - 0.055 * k)), 0.08) for k in range(5)
-)
-"""Flat between edges that are a little uncertain, in even steps of ln SD, widest first."""
-
-SHAPES: tuple[Shape, ...] = (
-    *UNIFORM,
-    Shape("bell", 1.05, 1 / 5),
-    Shape("gaussian", 1.0, 1 / 5),
-    Shape("student", 1.10, 1 / 5),
-)
-"""The laws that are weighed: a fifth for each family, two for the uniform one.
-
-With equal shares the answer is farthest from the Bayes limit where offsets are uniform; a larger
-one of the uniform laws is paid for where they are triangular, and by few images.
-"""
 
 LARGEST_CHANGE = 0.4
 """A law counts as long as the last sweep moved no unknown by more than about this many SDs.
@@ -78,30 +61,6 @@ not settle at all are the ones to leave out."""
 
 MEDIAN_STEPS = 12
 """Weiszfeld's steps to the median."""
-
-
-class OffsetLaw(eqx.Module):
-    """What was found out about the offsets and the noise.
-
-    Attributes:
-        probability: of each family of :data:`jaxcal.model.shapes.FAMILIES`.
-        mean: of the offsets, mm, its expectation.
-        mean_sd: its standard deviation, mm.
-        mean_probability: that there is a mean other than zero.
-        trust: share of the data's word on the mean that counts: below 1 where the residuals have
-            heavy tails, or are alike in successive images.
-        own_probability: that the images' own covariances describe the errors better than common
-            SDs do; 0 where there are none.
-        weighed: the laws were weighed; otherwise the plain Gaussian answer stands.
-    """
-
-    probability: Float[Array, "*batch families"]
-    mean: Float[Array, "*batch"]
-    mean_sd: Float[Array, "*batch"]
-    mean_probability: Float[Array, "*batch"]
-    trust: Float[Array, "*batch"]
-    own_probability: Float[Array, "*batch"]
-    weighed: Bool[Array, "*batch"]
 
 
 class Averaged(eqx.Module):

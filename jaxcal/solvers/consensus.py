@@ -39,6 +39,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxcal.model.outliers import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.parameters import Blocks, Parameters, retract, size
 from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.problem import Problem
@@ -49,20 +50,11 @@ SUBSET_STEPS = 2
 CONCENTRATION = 0.6
 CONCENTRATION_STEPS = 5
 REJECTION_STEPS = 6
-CUT = 6.0
-"""SDs beyond which an image stands out. Heavy tails (Student's t4) put 0.3 % of images there."""
-FEW_IMAGES = 30
-"""With fewer images in use, n, the limit is wider by sqrt(30 / n): 9.5 SDs for a dozen."""
 WRONG = 0.01
 """How probable it is, to begin with, that an image is wrong."""
 ANYTHING_MM = 60.0
 """Width of the range in which its errors may lie then. Larger ones are found all the same; a wider
 range lets a third of the images that slipped together pass for noise."""
-FEWEST_IMAGES = 8
-"""With fewer used images nothing is left out: they cannot outvote one another."""
-MAD = 1.4826
-"""SD of a normal law over the median of its magnitude."""
-RELATIVE_FLOOR = 0.02
 HALVINGS = 24
 """Of the bracket about a median: a ten-millionth of the largest value."""
 

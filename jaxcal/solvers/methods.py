@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.model.batch import Images, Iterate
+from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.observations import (
     BoundedOffsets,
     Channels,
@@ -34,12 +35,12 @@ from jaxcal.options import DEFAULT_MAX_ELEVATION_MM, Given, Plan
 from jaxcal.problem import Problem
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import alternate, bounded
-from jaxcal.solvers.auto import OffsetLaw, average_over_laws
+from jaxcal.solvers.auto import average_over_laws
 from jaxcal.solvers.gradient_descent import pairwise_gradient
 from jaxcal.solvers.levenberg_marquardt import minimise
 from jaxcal.solvers.other import minimise_with, self_tuned_with
 from jaxcal.solvers.reml import floored, self_tuned
-from jaxcal.solvers.start import ConventionalStart, conventional
+from jaxcal.solvers.start import ConventionalStart, GivenStart, conventional
 from jaxcal.sound import WATER_M_S
 
 HELD_SIGMA = (0.5, 0.5, 1.0)
@@ -92,7 +93,7 @@ class Solution(eqx.Module):
 
 
 def solve(
-    problems: Problem, given: Given, plan: Plan, begun: ConventionalStart | None = None
+    problems: Problem, given: Given, plan: Plan, begun: ConventionalStart | GivenStart | None = None
 ) -> Solution:
     """Solve a batch (one leading axis) whose images left out hold harmless values.
 
@@ -168,7 +169,9 @@ def nominal_sound_speed(problem: Problem) -> Float[Array, "*batch"]:
     return problem.sound_speed
 
 
-def run(begun: ConventionalStart, problems: Problem, given: Given, plan: Plan) -> Solution:
+def run(
+    begun: ConventionalStart | GivenStart, problems: Problem, given: Given, plan: Plan
+) -> Solution:
     """The plan's method from conventional fits."""
     options, other = plan.options, plan.other_solver
     images = Images.of(problems, channels=plan.channels)
@@ -195,8 +198,9 @@ def run(begun: ConventionalStart, problems: Problem, given: Given, plan: Plan) -
         }
         return Solution(**(common | others))
 
-    start = begun.fit.place
+    start = begun.place
     if plan.method == "conventional":
+        assert isinstance(begun, ConventionalStart)
         fit = begun.fit
         if options.solver == "gradient":
             fit = pairwise_gradient(begun.start, images, options)

@@ -38,6 +38,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxcal.model import unrolled
 from jaxcal.model.batch import Images, Iterate, barrier, choose
 from jaxcal.model.observations import Medium, Observation
+from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.solvers import dense
 from jaxcal.solvers.levenberg_marquardt import (
     IDLE,
@@ -57,9 +58,6 @@ from jaxcal.solvers.normal_equations import (
     pairs,
     stacked,
 )
-
-MINIMUM_SELF_TUNING = 8
-"""With fewer used images the residuals cannot tell three SDs apart from nine unknowns."""
 
 RELATIVE_FLOOR = 1e-3
 ABSOLUTE_FLOOR_MM = 1e-6

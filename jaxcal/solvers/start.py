@@ -31,10 +31,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from jaxcal.conventional import Start
 from jaxcal.model import unrolled
 from jaxcal.model.batch import Images, Iterate, barrier, choose, total
 from jaxcal.model.observations import InPlane
-from jaxcal.model.parameters import Blocks
+from jaxcal.model.parameters import Blocks, Parameters
 from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.solvers.levenberg_marquardt import Descent, minimise
 
@@ -54,6 +55,32 @@ class ConventionalStart(eqx.Module):
     fit: Descent
     start: Iterate
     searched: Bool[Array, " lanes"]
+
+    @property
+    def place(self) -> Iterate:
+        """Where methods begin that begin at the conventional fit."""
+        return self.fit.place
+
+
+class GivenStart(eqx.Module):
+    """The same where the conventional fits were found before.
+
+    Attributes:
+        place: the conventional fits.
+        searched: whether they had to be searched for.
+    """
+
+    place: Iterate
+    searched: Bool[Array, " lanes"]
+
+    @classmethod
+    def of(cls, start: Start, blocks: Blocks) -> GivenStart:
+        """Of starts with a leading axis."""
+        nominal = jnp.zeros_like(start.sound_speed)
+        parameters = Parameters(
+            start.rotation, start.translation, start.point, start.scale, start.sound_speed, nominal
+        )
+        return cls(Iterate.of(parameters, blocks), start.searched)
 
 
 class ImageSums(eqx.Module):

@@ -1,0 +1,9 @@
+"""Numbers on which solvers, answers and diagnostics have to agree. Needs no JAX."""
+
+from __future__ import annotations
+
+LARGEST_ELEVATION = 0.95
+"""Offsets are kept below this fraction of the range: at 1 the circle's tangent turns axial."""
+
+MINIMUM_SELF_TUNING = 8
+"""With fewer used images the residuals cannot tell three SDs apart from nine unknowns."""

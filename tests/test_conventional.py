@@ -1,0 +1,251 @@
+"""One conventional calibration in numpy: the engine's answer, without JAX."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pose_sets
+import pytest
+from conftest import experiment, problem
+
+import jaxcal
+from jaxcal import Options
+from jaxcal.conventional import closed_form_answer
+from jaxcal.options import Request, prepare
+
+METHOD = "conventional"
+SCALE = ("scale",)
+
+
+def leaves(tree, prefix=""):
+    for field in fields(tree):
+        value = getattr(tree, field.name)
+        if is_dataclass(value):
+            yield from leaves(value, f"{prefix}{field.name}.")
+        elif value is not None and not isinstance(value, str | tuple | bool):
+            yield prefix + field.name, np.asarray(value)
+
+
+def in_pixels(problem: jaxcal.Problem) -> jaxcal.Problem:
+    """The same points in pixels of 0.2 x 0.17 mm, with a nominal spacing that is a little off."""
+    pixels = problem.measurements / jnp.array([0.2, 0.17])
+    return replace(problem, measurements=pixels, spacing=jnp.array([0.21, 0.16]), pixels=True)
+
+
+def problems(pixels: bool) -> list[jaxcal.Problem]:
+    """Ordinary, few used, noisy, nearly exact, an offset of the face.
+
+    Of 18 images: from 20 on the front door looks for errors that are alike in successive ones.
+    """
+    drawn = [
+        problem(k, images=18, elevation_mm=elevation, noise_mm=noise)
+        for k, (elevation, noise) in enumerate([(1.0, 0.5), (2.0, 1.0), (5.0, 3.0), (0.0, 1e-4)])
+    ]
+    drawn = [in_pixels(each) for each in drawn] if pixels else drawn
+    left_out = drawn[0].mask.at[jnp.arange(7, 18)].set(0.0)
+    face = replace(drawn[1], face_offset=jnp.asarray(10.0))
+    return [*drawn, replace(drawn[0], mask=left_out), face]
+
+
+@pytest.mark.parametrize("estimate", [(), SCALE], ids=["points", "scale"])
+def test_every_number_is_the_engines(estimate):
+    """The engine solves the same problems as a batch; covariances agree to 1e-8."""
+    each = problems(bool(estimate))
+    engine = jaxcal.calibrate_batch(jaxcal.stack(each), METHOD, estimate=estimate)
+    for k, one in enumerate(each):
+        found, expected = jaxcal.calibrate(one, METHOD, estimate=estimate), engine[k]
+        plan, _ = prepare(one, Request(method=METHOD, estimate=estimate))
+        assert closed_form_answer(one, plan) is not None, "the closed form was not the answer"
+        assert found.status == expected.status == "converged"
+        sd = np.sqrt(np.diagonal(expected.covariance))
+        moved = np.linalg.solve(expected.image_to_probe, found.image_to_probe)
+        turned = np.array([moved[2, 1], moved[0, 2], moved[1, 0]])
+        # Levenberg-Marquardt stops at its tolerance, the closed form does not.
+        assert np.abs(np.concatenate([moved[:3, 3], turned]) / sd).max() < 1e-6
+        both = np.outer(sd, sd)
+        np.testing.assert_allclose(found.covariance / both, expected.covariance / both, atol=1e-8)
+        wanted = dict(leaves(expected))
+        for name, value in leaves(found):
+            assert value.shape == wanted[name].shape, name
+            assert value.dtype == wanted[name].dtype, name
+            if name.rsplit(".")[-1] in ("iterations", "stationarity"):
+                continue
+            # Of nearly exact data an offset is rounding: then of 0.01 mm.
+            least = 0.01 if name == "elevation" else 1e-12
+            size = max(least, np.abs(wanted[name]).max(initial=0.0))
+            np.testing.assert_allclose(value, wanted[name], rtol=0, atol=1e-8 * size, err_msg=name)
+        assert int(found.iterations) == 0
+        assert float(found.stationarity) < 1e-6
+
+
+def test_sound_speed_is_the_engines():
+    recording = jaxcal.simulate_recording(
+        jaxcal.Protocol(images=12, raw=True, elevation_mm=1.0, noise_mm=0.5), 3
+    )
+    one = jaxcal.Problem.from_recording(recording)
+    found = jaxcal.calibrate(one, METHOD, estimate=("sound-speed",), data="points")
+    batch = jaxcal.stack([one])
+    expected = jaxcal.calibrate_batch(batch, METHOD, estimate=("sound-speed",), data="points")[0]
+    assert int(found.iterations) == 0 < int(expected.iterations)
+    for name in ("sound_speed_m_s", "sound_speed_sd_m_s", "covariance", "image_to_probe"):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(expected, name), rtol=1e-7, atol=1e-9, err_msg=name
+        )
+    assert found.sound_speed_prior_m_s is None
+
+
+def iterations(one: jaxcal.Problem, **others) -> int:
+    return int(jaxcal.calibrate(one, METHOD, **others).iterations)
+
+
+def test_where_the_engine_stays():
+    """Another solver, a robust search, 32 bits, a delay, and whatever JAX looks at."""
+    one = problem(1, images=12, elevation_mm=1.0, noise_mm=0.5)
+    assert iterations(one) == 0
+    assert iterations(one, options=Options(solver="gauss-newton")) > 0
+    assert iterations(one, options=Options(precision="float32")) > 0
+    # Under jit the closed form could not be numpy's.
+    assert int(jax.jit(lambda p: jaxcal.calibrate(p, METHOD))(one).iterations) > 0
+
+
+@pytest.mark.parametrize("kind", ["parallel", "one-axis", "line-in-plane"])
+def test_what_is_not_determined_is_left_to_the_engine(kind):
+    # Noise bends a line, and then one answer is the best.
+    noise = 0.0 if kind == "line-in-plane" else 0.1
+    drawn = pose_sets.make(kind, seed=3, elevation=0.0, noise=noise)
+    one = jaxcal.Problem.from_arrays(drawn.poses, drawn.points, mask=drawn.mask)
+    plan, _ = prepare(one, Request(method=METHOD))
+    assert closed_form_answer(one, plan) is None
+
+
+def test_a_weakly_known_direction_is_said():
+    """Poses that hardly differ: the SD along the weakest direction exceeds half the lever arm."""
+    one = problem(2, images=12, elevation_mm=1.0, noise_mm=1.0)
+    vectors = np.random.default_rng(0).normal(size=(12, 3)) * 1e-4
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    for pose, vector in zip(poses, vectors, strict=True):
+        cross = np.cross(np.eye(3), vector)
+        pose[:3, :3] = np.linalg.qr(np.eye(3) + cross)[0] * [-1, -1, -1]
+        pose[:3, :3] *= np.sign(np.diag(pose[:3, :3]))
+    poses[:, :3, 3] = np.random.default_rng(1).normal(size=(12, 3)) * 30
+    weak = replace(one, poses=jnp.asarray(poses))
+    engine = jaxcal.calibrate_batch(jaxcal.stack([weak]), METHOD)
+    assert jaxcal.calibrate(weak, METHOD).status == engine.status[0] == "unobservable"
+
+
+def test_the_trace_is_one_value():
+    found = jaxcal.calibrate(problem(1, images=12), METHOD, options=Options(trace=3))
+    np.testing.assert_array_equal(np.isnan(found.trace), [False, True, True])
+    assert float(found.trace[0]) == float(found.cost)
+
+
+# Without JAX
+
+ALONE = """
+import importlib.util, json, sys
+import numpy as np
+import jaxcal
+recording = jaxcal.load(sys.argv[1])
+problem = jaxcal.Problem.from_recording(recording)
+found = jaxcal.calibrate(problem, method="conventional")
+said = [found.status, float(found.rms), found.warnings, found.observability["condition"]]
+read = [found.residual, found.outlier, found.elevation_sd, found.weakest, found.inspection.misfit]
+assert all(isinstance(each, np.ndarray) for each in read)
+assert isinstance(problem.poses, np.ndarray) and bool(found.converged)
+assert found.image_transform().apply(np.ones((1, 2))).points.shape == (1, 3)
+heavy = {"jax", "jaxlib", "equinox", "optimistix", "jaxtyping", "scipy.stats", "matplotlib"}
+assert not heavy & set(sys.modules), heavy & set(sys.modules)
+
+# Whoever asks whether JAX is there does not import it, and what is asked twice is found twice.
+assert importlib.util.find_spec("jax") is not None and "jax" not in sys.modules
+import jax
+assert len(jax.tree.leaves(problem)) == 7, len(jax.tree.leaves(problem))
+doubled = jax.tree.map(lambda leaf: 2 * leaf, found)
+assert np.allclose(doubled.point, 2 * found.point) and doubled.method == "conventional"
+assert jax.tree.structure(doubled) == jax.tree.structure(found)
+path, _ = jax.tree_util.tree_leaves_with_path(problem)[0]
+assert jax.tree_util.keystr(path) == ".poses", path
+assert type(jax.jit(lambda p: p)(problem)) is jaxcal.Problem
+assert not any(type(finder).__module__.startswith("jaxcal") for finder in sys.meta_path)
+print(json.dumps(said))
+"""
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    path = tmp_path / "recording.h5"
+    jaxcal.save(experiment(5, images=20, elevation_mm=1.0, noise_mm=0.5), path)
+    return path
+
+
+def python(*arguments: str | Path) -> str:
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout
+
+
+def test_a_process_without_jax(saved):
+    status, rms, warnings, condition = json.loads(python("-c", ALONE, saved))
+    expected = jaxcal.calibrate(jaxcal.load(saved), METHOD)
+    assert status == "converged"
+    assert rms == pytest.approx(float(expected.rms), rel=1e-12)
+    assert warnings == expected.warnings
+    assert condition == pytest.approx(expected.observability["condition"], rel=1e-9)
+
+
+COMMAND = """
+import sys
+from jaxcal.cli.main import main
+code = main(["calibrate", sys.argv[1], "--method", "conventional", *sys.argv[2:]])
+heavy = {"jax", "jaxlib", "equinox", "optimistix", "jaxtyping", "scipy.stats", "matplotlib"}
+assert not heavy & set(sys.modules), heavy & set(sys.modules)
+sys.exit(code)
+"""
+
+
+def test_the_command_without_jax(saved):
+    said = python("-c", COMMAND, saved)
+    assert "conventional fit certified" in " ".join(said.split())
+    record = json.loads(python("-c", COMMAND, saved, "--json"))
+    assert record["certified"] is True
+    assert record["next_poses"] is not None
+
+
+# First something, then everything
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no pseudo-terminals here")
+def test_a_person_sees_the_conventional_fit_before_anything_is_compiled(saved, monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parent / "hw")
+    from terminal import Terminal
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(saved.parent / "empty"))
+    expected = jaxcal.calibrate(jaxcal.load(saved), METHOD)
+    origin = ", ".join(f"{value:.2f}" for value in expected.image_to_probe[:3, 3])
+    arguments = ["-m", "jaxcal", "calibrate", str(saved), "--method", "alternating"]
+    with Terminal(arguments, saved.parent) as terminal:
+        found = terminal.wait_for(rf"Conventional fit, certified:.*{re.escape(origin)}")
+        assert f"RMS {float(expected.rms):.3f} mm" in terminal.wait_for(r"RMS \S+ mm")[0]
+        terminal.wait_for(r"compiling, once", flags=re.DOTALL)
+        assert "status" not in terminal.shown[: found.end()]
+        assert terminal.finish() == 0
+        # The compiler's own alarms do not reach the terminal, and the answer comes at the end.
+        assert "slow_operation_alarm" not in terminal.shown
+        assert "converged after" in terminal.shown
+
+
+def test_json_is_one_object_and_nothing_else(saved):
+    said = python("-m", "jaxcal", "calibrate", saved, "--method", "alternating", "--json")
+    assert json.loads(said)["status"] == "converged"
+    assert "Conventional" not in said
