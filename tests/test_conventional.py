@@ -233,7 +233,16 @@ def test_a_person_sees_the_conventional_fit_before_anything_is_compiled(saved, m
     monkeypatch.setenv("XDG_CACHE_HOME", str(saved.parent / "empty"))
     expected = jaxcal.calibrate(jaxcal.load(saved), METHOD)
     origin = ", ".join(f"{value:.2f}" for value in expected.image_to_probe[:3, 3])
-    arguments = ["-m", "jaxcal", "calibrate", str(saved), "--method", "alternating"]
+    arguments = [
+        "-m",
+        "jaxcal",
+        "calibrate",
+        str(saved),
+        "--method",
+        "alternating",
+        "--require",
+        "uncertain",
+    ]
     with Terminal(arguments, saved.parent) as terminal:
         found = terminal.wait_for(rf"Conventional fit, certified:.*{re.escape(origin)}")
         assert f"RMS {float(expected.rms):.3f} mm" in terminal.wait_for(r"RMS \S+ mm")[0]
@@ -246,6 +255,16 @@ def test_a_person_sees_the_conventional_fit_before_anything_is_compiled(saved, m
 
 
 def test_json_is_one_object_and_nothing_else(saved):
-    said = python("-m", "jaxcal", "calibrate", saved, "--method", "alternating", "--json")
+    said = python(
+        "-m",
+        "jaxcal",
+        "calibrate",
+        saved,
+        "--method",
+        "alternating",
+        "--require",
+        "uncertain",
+        "--json",
+    )
     assert json.loads(said)["status"] == "converged"
     assert "Conventional" not in said
