@@ -25,6 +25,7 @@ from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.diagnostics import messages
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.text import read_crosswire, read_poses
+from jaxcal.options import Method
 from jaxcal.resampling import CrossValidation
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "crosswire"
@@ -113,8 +114,9 @@ def steadiness(folder: Path) -> tuple[list[list[object]], list[str]]:
     )
     rows: list[list[object]] = []
     said, precision = [], {}
-    for name, method in (("joint", "joint"), ("conventional", "conventional")):
-        result = jaxcal.calibrate_batch(problems, method, estimate=("scale",))
+    methods: tuple[Method, ...] = ("joint", "conventional")
+    for name in methods:
+        result = jaxcal.calibrate_batch(problems, name, estimate=("scale",))
         x, covariance = np.asarray(result.image_to_probe), np.asarray(result.covariance[0])
         turn = x[0, :3, :3].T @ x[:, :3, :3]
         skew = 0.5 * (turn - np.swapaxes(turn, 1, 2))

@@ -36,6 +36,7 @@ from jaxcal.diagnostics.intervals import tre_at, tre_over
 from jaxcal.image_points import unknown_names
 from jaxcal.io.atomic import atomic_path
 from jaxcal.offsets import OFFSET_LAWS, OffsetLaw
+from jaxcal.options import Method, PriorName
 from jaxcal.probe import L14_5
 
 SEED = 20261126
@@ -163,8 +164,12 @@ def laws(trials: int, folder: Path) -> list[list[object]]:
 
 def scales(trials: int, folder: Path) -> list[list[object]]:
     """Predicted over actual where pixel sizes, or sound speed and delay, have to be found."""
-    ways = (("conventional", "none"), ("joint", "gaussian"), ("joint", "auto"))
-    conditions = [
+    ways: tuple[tuple[Method, PriorName], ...] = (
+        ("conventional", "auto"),
+        ("joint", "gaussian"),
+        ("joint", "auto"),
+    )
+    conditions: list[tuple[tuple[str, ...], Method, PriorName, int, str]] = [
         (("scale",), *way, images, field)
         for way, images, field in itertools.product(ways, (12, 30, 60), FIELDS)
     ]
@@ -187,9 +192,7 @@ def scales(trials: int, folder: Path) -> list[list[object]]:
         problems = jax.vmap(lambda experiment, p=probe: experiment.problem(probe=p))(experiments)
         if not channels:
             problems = in_pixels(problems)
-        result = calibrate_batch(
-            problems, method, "auto" if prior == "none" else prior, estimate=unknown
-        )
+        result = calibrate_batch(problems, method, prior, estimate=unknown)
         actual = actual_errors(result, np.asarray(experiments.image_to_probe), points)
         stated = tre_at(result, places(result, points))
         held = np.mean((actual >= stated.lower) & (actual <= stated.upper))

@@ -261,7 +261,7 @@ def _errors(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Root mean square and interval of the length of a vector with Student's distribution."""
     _check_level(level)
-    finite = np.isfinite(covariance).all(axis=(-1, -2))
+    finite = np.asarray(np.isfinite(covariance).all(axis=(-1, -2)))
     spread = np.where(finite[..., None, None], covariance, np.eye(covariance.shape[-1]))
     values = np.maximum(np.linalg.eigvalsh(spread), 0.0)
     flat, freedom = values.reshape(-1, values.shape[-1]), left.reshape(-1)
