@@ -169,16 +169,12 @@ def scales(trials: int, folder: Path) -> list[list[object]]:
         ("joint", "gaussian"),
         ("joint", "auto"),
     )
-    conditions: list[tuple[tuple[str, ...], Method, PriorName, int, str]] = [
-        (("scale",), *way, images, field)
-        for way, images, field in itertools.product(ways, (12, 30, 60), FIELDS)
-    ]
-    conditions += [
-        (unknown, "joint", "gaussian", 20, field)
-        for unknown, field in itertools.product(
-            (("sound-speed",), ("delay",), ("sound-speed", "delay")), FIELDS
-        )
-    ]
+    conditions: list[tuple[tuple[str, ...], Method, PriorName, int, str]] = []
+    for (method, prior), images, field in itertools.product(ways, (12, 30, 60), FIELDS):
+        conditions.append((("scale",), method, prior, images, field))
+    media = (("sound-speed",), ("delay",), ("sound-speed", "delay"))
+    for medium, field in itertools.product(media, FIELDS):
+        conditions.append((medium, "joint", "gaussian", 20, field))
     rows: list[list[object]] = []
     for condition, (unknown, method, prior, images, field) in enumerate(conditions):
         channels = unknown != ("scale",)
