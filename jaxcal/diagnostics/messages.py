@@ -311,8 +311,9 @@ def outlier_reasons(
 def suspects(result: Calibration) -> list[OutlierReason]:
     """Images in use that stand out by less than outliers do, but by more than chance explains.
 
-    Their lateral or range error exceeds what the largest of so many Gaussian errors, in SDs that
-    are medians, does in one of fifty recordings. Offsets are no errors: they may have any law.
+    Their range error exceeds what the largest of so many Gaussian errors, in SDs that are medians,
+    does in one of a hundred recordings. Lateral errors grow with the depth and offsets may have any
+    law: large ones are no sign.
     """
     count = int(result.images_used)
     if count < FEWEST_TO_CHECK:
@@ -320,14 +321,14 @@ def suspects(result: Calibration) -> list[OutlierReason]:
     # The second factor, for medians of few images, is from simulated Gaussian errors.
     limit = NormalDist().inv_cdf(1 - SUSPECTED / (4 * count)) * (1 + 8 / count)
     departure = np.asarray(result.departure, dtype=float)
-    departure = np.where(np.asarray(result.mask)[:, None] > 0, departure, 0.0)[:, :2]
+    departure = np.where(np.asarray(result.mask)[:, None] > 0, departure, 0.0)
+    departure[:, [0, 2]] = 0.0
     departure[images_that_stand_out(result)] = 0.0
     found: list[OutlierReason] = []
     for image in np.flatnonzero((np.abs(departure) > limit).any(axis=1)):
-        worst = int(np.argmax(np.abs(departure[image])))
         found.append({
-            "image": int(image), "component": COMPONENTS[worst],
-            "sds": _finite(departure[image, worst]), "left_out": False,
+            "image": int(image), "component": COMPONENTS[1],
+            "sds": _finite(departure[image, 1]), "left_out": False,
         })  # fmt: skip
     return found
 
