@@ -38,6 +38,7 @@ from jaxcal.options import (
 from jaxcal.precision import in_own_modes, inside_transformation, require_float64, with_dtype
 from jaxcal.problem import Problem, is_traced
 from jaxcal.recording import Recording
+from jaxcal.reduced_objective import FEWEST_IMAGES
 
 if TYPE_CHECKING:
     from jax import Array
@@ -127,6 +128,12 @@ def calibrate(
     if is_traced(problem, given):
         return _solve_alone(problem, given, plan).with_problem(problem)
     joined, found = independent(problem, estimate)
+    left = int(np.count_nonzero(np.asarray(joined.mask) > 0))
+    if left < FEWEST_IMAGES:
+        raise InputError(
+            f"{found.words or 'too few images'}: {left} images are left, and at least "
+            f"{FEWEST_IMAGES} are needed"
+        )
     result = _solve_alone(joined, given, plan).with_problem(joined)
     result = replace(result, notes=() if found.words is None else (found.words,))
     return widened(result)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxcal
+from jaxcal.diagnostics import messages
 from jaxcal.io.text import read_crosswire
 
 
@@ -42,7 +43,7 @@ def test_self_tuned(recording):
 
 def names_what_an_eye_sees(result: jaxcal.Calibration) -> None:
     """Images 11 to 13 stand out in range, and the elevational errors change slowly."""
-    suspects = jaxcal.diagnostics.messages.suspects(result)
+    suspects = messages.suspects(result)
     assert {each["image"] for each in suspects} >= {11, 12, 13}
     assert all(each["component"] == "range" for each in suspects)
     assert any("11 to 13 in a row (range errors to one side" in text for text in result.warnings)

@@ -171,11 +171,21 @@ def test_correlated_errors_widen_the_covariance(frames, monkeypatch):
     """Images a second and a half apart, whose errors are still alike."""
     made = [frames.swept(120, 2.0, np.random.default_rng([11, trial])) for trial in range(40)]
     problems = [jaxcal.Problem.from_arrays(one.poses[::30], one.points[::30]) for one in made]
-    wide = [jaxcal.calibrate(one, "conventional") for one in problems]
+
+    def calibrated(one):
+        try:
+            return jaxcal.calibrate(one, "conventional")
+        except jaxcal.InputError as refusal:
+            # Of a stream too few images are left.
+            if "images are left" not in str(refusal):
+                raise
+            return None
+
+    wide = [calibrated(one) for one in problems]
     monkeypatch.setattr(jaxcal.solve, "widened", lambda result: result)
-    plain = [jaxcal.calibrate(one, "conventional") for one in problems]
+    plain = [calibrated(one) for one in problems]
     # Where a recording is taken for a stream, fewer images are left to be correlated.
-    used = [k for k, one in enumerate(wide) if not one.notes]
+    used = [k for k, one in enumerate(wide) if one is not None and not one.notes]
     assert len(used) > 30
 
     def spreads(results):

@@ -10,11 +10,13 @@ import jaxcal
 from hw import LiveCalibration
 from jaxcal import program_cache
 
+SIGMA_MM = (0.1, 0.1, 0.5)
+
 
 def test_live_calibration_is_the_batch_one_and_compiles_once(tmp_path, monkeypatch):
     recording = experiment(0, images=10, noise_mm=0.1, elevation_mm=0.5)
     images = recording.calibration
-    live = LiveCalibration(capacity=12, method="conventional")
+    live = LiveCalibration(capacity=12, sigma=SIGMA_MM)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     result = None
     for k, (pose, point) in enumerate(zip(images.poses, images.measurements, strict=True)):
@@ -22,7 +24,7 @@ def test_live_calibration_is_the_batch_one_and_compiles_once(tmp_path, monkeypat
         assert (result is None) == (k < 3)
     # From four images to ten, of twelve at most: one program.
     assert len(program_cache.entries()) == 1
-    whole = jaxcal.calibrate(recording, method="conventional")
+    whole = jaxcal.calibrate(recording, sigma=SIGMA_MM)
     assert result.status == "converged"
     np.testing.assert_allclose(result.image_to_probe, whole.image_to_probe, atol=1e-7)
     assert result.elevation.shape == (10,)

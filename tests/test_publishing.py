@@ -9,7 +9,8 @@ from pathlib import Path
 import jaxcal
 
 ROOT = Path(__file__).parents[1]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+PROJECT = SETTINGS["project"]
 
 
 def test_one_version():
@@ -19,7 +20,11 @@ def test_one_version():
 
 
 def test_links_of_the_readme_work_outside_the_repository():
-    targets = re.findall(r"\]\(([^)]+)\)", (ROOT / PROJECT["readme"]).read_text("utf-8"))
+    shown = (ROOT / "README.md").read_text("utf-8")
+    hook = SETTINGS["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]
+    for each in hook["substitutions"]:
+        shown = re.sub(each["pattern"], each["replacement"], shown)
+    targets = re.findall(r"\]\(([^)]+)\)", shown)
     assert targets
     home = PROJECT["urls"]["Homepage"] + "/blob/main/"
     for target in targets:

@@ -14,6 +14,7 @@ from conftest import problem, select
 
 import jaxcal
 from jaxcal.cli.main import main
+from jaxcal.diagnostics import metrics
 from jaxcal.resampling import bootstrap, cross_validate, relative_twist
 
 CONVENTIONAL: dict[str, Any] = {"method": "conventional"}
@@ -30,9 +31,7 @@ def test_holding_out_an_image_is_calibrating_without_it(data):
     found = cross_validate(data, result=whole, **CONVENTIONAL)
     without = jaxcal.calibrate(replace(data, mask=data.mask.at[7].set(0.0)), **CONVENTIONAL)
     np.testing.assert_allclose(found.image_to_probe[7], without.image_to_probe, atol=1e-9)
-    there = jaxcal.diagnostics.metrics.reconstruct(
-        without.image_to_probe, data.poses[7:8], data.measurements[7:8]
-    )
+    there = metrics.reconstruct(without.image_to_probe, data.poses[7:8], data.measurements[7:8])
     np.testing.assert_allclose(found.cloud[7], there[0] - without.point, atol=1e-9)
     twist = relative_twist(whole.image_to_probe, without.image_to_probe)
     np.testing.assert_allclose(found.moved[7], twist, atol=1e-9)
