@@ -86,8 +86,8 @@ def draw(count: int) -> tuple[Problem, np.ndarray, np.ndarray]:
 
 def parameters_of(answer: Calibration) -> Parameters:
     """X and the targets of calibrations."""
-    x = answer.image_to_probe
-    return jax.vmap(Parameters.of)(x[:, :3, :3], x[:, :3, 3], answer.point)
+    x = jnp.asarray(answer.image_to_probe)
+    return jax.vmap(Parameters.of)(x[:, :3, :3], x[:, :3, 3], jnp.asarray(answer.point))
 
 
 def conventional_starts(problems: Problem) -> Parameters:

@@ -152,8 +152,8 @@ def cross_validate(
         log_density=mask * density,
         moved=moved,
         influence=_in_sds(moved, jnp.asarray(result.covariance)),
-        image_to_probe=fits.image_to_probe,
-        converged=fits.converged.astype(mask.dtype),
+        image_to_probe=jnp.asarray(fits.image_to_probe),
+        converged=jnp.asarray(fits.converged, mask.dtype),
         fold_cost=held.cost,
         mask=mask,
         image_moved=image_moved,
@@ -202,16 +202,17 @@ def bootstrap(
     # As many images as were used: the places of unused ones stay empty.
     options: dict[str, Any] = {**arguments, "robust": False}
     fits = calibrate_batch(_drawn(problem, rows, mask), **options)
-    converged = fits.converged.astype(mask.dtype)
+    converged = jnp.asarray(fits.converged, mask.dtype)
     whole = jnp.asarray(result.image_to_probe)
-    moved = jax.vmap(relative_twist, (None, 0))(whole, fits.image_to_probe)
+    drawn = jnp.asarray(fits.image_to_probe)
+    moved = jax.vmap(relative_twist, (None, 0))(whole, drawn)
     moved = jnp.where(converged[:, None] > 0, jnp.abs(moved), jnp.nan)
     points = _corners(problem, result)
     # A resample that did not converge stands at the whole's X: it adds nothing to the scatter.
     transforms = jnp.where(converged[:, None, None] > 0, _with_scale(fits, result), whole)
     share = jnp.maximum(jnp.mean(converged), 1e-9)
     return Bootstrap(
-        image_to_probe=fits.image_to_probe,
+        image_to_probe=drawn,
         converged=converged,
         spread=1.4826 * jnp.nanmedian(moved, axis=0),
         reproducibility=jnp.asarray(calibration_reproducibility(transforms, points)) / share,
@@ -315,11 +316,11 @@ def _drawn(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Problem:
 
 
 def _parameters(result: Calibration, problem: Problem) -> Parameters:
-    matrix = result.image_to_probe
+    matrix = jnp.asarray(result.image_to_probe)
     scale = None
     if result.scale_mm_per_px is not None:
-        scale = result.scale_mm_per_px / problem.spacing
-    found = Parameters.of(matrix[:3, :3], matrix[:3, 3], result.point, scale)
+        scale = jnp.asarray(result.scale_mm_per_px / problem.spacing)
+    found = Parameters.of(matrix[:3, :3], matrix[:3, 3], jnp.asarray(result.point), scale)
     nominal = nominal_sound_speed(problem)
     if result.sound_speed_m_s is not None:
         found = replace(found, sound_speed=result.sound_speed_m_s / nominal)

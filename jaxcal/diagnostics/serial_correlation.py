@@ -87,6 +87,7 @@ def _in_sds(result: Calibration) -> tuple[Float[np.ndarray, "m 3"], Float[np.nda
     """Errors of the used images and their derivatives by the unknowns, in SDs."""
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
     problem = answer.problem
+    assert problem is not None
     unknowns = Unknowns.of(answer, problem)
     seen = ImageErrors.of(unknowns, problem, answer.blocks)
     if answer.prior in TUNED:

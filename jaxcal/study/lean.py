@@ -167,10 +167,11 @@ def solve(
     plan, given = prepare(problems, Request(*kind, max_elevation=bound, options=options))
     # What is not used of the calibration is not computed.
     found = solve_problems(with_bound(problems, given), given, plan, begun=begun)
+    matrix = jnp.asarray(found.image_to_probe)
     place = Iterate(
-        jnp.moveaxis(found.image_to_probe[:, :3, :3], 0, -1),
-        found.image_to_probe[:, :3, 3].T,
-        found.point.T,
+        jnp.moveaxis(matrix[:, :3, :3], 0, -1),
+        matrix[:, :3, 3].T,
+        jnp.asarray(found.point).T,
         truth.extras,
         truth.blocks,
     )
@@ -181,8 +182,8 @@ def solve(
         rotation_error=chord_angle(place.rotation - truth.rotation),
         translation_error=away[0],
         point_error=away[1],
-        sigma=found.sigma,
-        status=found.status_code.astype(jnp.int8),
+        sigma=jnp.asarray(found.sigma),
+        status=jnp.asarray(found.status_code, jnp.int8),
         iterations=jnp.asarray(found.iterations, jnp.int32),
     )
 
