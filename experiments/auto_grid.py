@@ -30,13 +30,13 @@ from jaxtyping import Array
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision
 from jaxcal.backend import RIGID, BoundedOffsets, Images, Iterate, Parameters
+from jaxcal.calibration.options import Options
 from jaxcal.cli.cache import enable_compilation_cache
-from jaxcal.compiler import fast_to_run
 from jaxcal.io.atomic import atomic_path
-from jaxcal.offsets import OFFSET_LAWS, OffsetLaw, nominal_bound
-from jaxcal.options import Options
-from jaxcal.simulation import Experiment, simulate
+from jaxcal.runtime.compiler import fast_to_run
 from jaxcal.solvers.alternating import alternate
+from jaxcal.study.offsets import OFFSET_LAWS, OffsetLaw, nominal_bound
+from jaxcal.study.simulation import Experiment, simulate
 
 SEED = 20261124
 TRIALS, AGAIN = 200, 4000

@@ -38,7 +38,7 @@ from jaxtyping import Array
 
 from jaxcal import Protocol, calibrate_batch, reconstruction_precision, simulate
 from jaxcal.io.atomic import atomic_path
-from jaxcal.offsets import OffsetLaw
+from jaxcal.study.offsets import OffsetLaw
 
 SEED = 20261126
 LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "heavy-tailed", "triangular")

@@ -23,7 +23,7 @@ from common import arguments, machine, results_folder, write_table
 from jaxtyping import Array
 
 from jaxcal.backend import RIGID, Parameters, measurement_residual, retract
-from jaxcal.offsets import DEGREES_OF_FREEDOM, OffsetLaw, standard_deviation
+from jaxcal.study.offsets import DEGREES_OF_FREEDOM, OffsetLaw, standard_deviation
 
 SEED = 20261127
 CONDITIONS: tuple[tuple[OffsetLaw, int], ...] = (

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from jaxcal.offsets import DEGREES_OF_FREEDOM, OffsetLaw, standard_deviation
+from jaxcal.study.offsets import DEGREES_OF_FREEDOM, OffsetLaw, standard_deviation
 
 UNKNOWNS = 9
 ADAPTING, DRAWS, ROUNDS = 768, 1024, 20

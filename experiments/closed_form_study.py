@@ -25,9 +25,9 @@ from common import arguments, machine, results_folder, write_table
 from jaxtyping import Array, Float
 
 import jaxcal
-from jaxcal.closed_form import solve
 from jaxcal.io.atomic import atomic_path
-from jaxcal.reduced_objective import CONSTRAINTS, ImageData, reduce
+from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS, ImageData, reduce
+from jaxcal.solvers.closed_form.single import solve
 
 SEED = 20261121
 PROBLEMS = 100_000

@@ -27,7 +27,6 @@ from jaxcal.backend import (
     retract,
 )
 from jaxcal.model.observations import on_circle
-from jaxcal.simulation import Protocol, simulate
 from jaxcal.solvers.alternating import bounded
 from jaxcal.solvers.levenberg_marquardt import (
     EXACT_BELOW,
@@ -37,6 +36,7 @@ from jaxcal.solvers.levenberg_marquardt import (
     gradient_cosine,
     iterate_once,
 )
+from jaxcal.study.simulation import Protocol, simulate
 
 SEED = 20261122
 CHUNK = same.CHUNK

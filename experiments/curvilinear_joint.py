@@ -26,11 +26,11 @@ from jaxtyping import Array, Float
 
 from jaxcal import Protocol, calibrate_batch, reconstruction_precision, simulate
 from jaxcal.backend import RIGID, Images, Iterate, Parameters, minimise, target_in_image
+from jaxcal.data.probe import C5_2
+from jaxcal.data.problem import Problem
+from jaxcal.data.segmentation.time_of_flight import fit_out_of_plane
 from jaxcal.io.atomic import atomic_path
 from jaxcal.model.observations import HeldOffsets
-from jaxcal.probe import C5_2
-from jaxcal.problem import Problem
-from jaxcal.segmentation.time_of_flight import fit_out_of_plane
 
 SEED = 20261121
 BOUNDS_MM = (1.0, 3.0, 5.0)

@@ -1,8 +1,8 @@
 """Gross outliers: the robust solve against an oracle that knows which images are spoilt.
 
-A tenth and three tenths of the images are spoilt by 20 to 100 mm (``jaxcal.contamination``: wrong
-echo, wrong click, wrong pose, slipped mount), for three laws of the offsets and five cells of the
-paper's grid at n = 50; each kind by itself, and 12, 20 and 200 images, in the middle cell. Mean
+A tenth and three tenths of the images are spoilt by 20 to 100 mm (``jaxcal.study.contamination``:
+wrong echo, wrong click, wrong pose, slipped mount), for three laws of the offsets and five cells of
+the paper's grid at n = 50; each kind by itself, and 12, 20 and 200 images, in the middle cell. Mean
 reconstruction precision of the robust solve (prior auto, points alone), of the same solve with the
 spoilt images masked, and of the solve that does nothing about them; the share of the spoilt images
 that are named, and of clean ones that are (false alarms); in how many trials a spoilt image stayed.
@@ -26,9 +26,9 @@ from jaxtyping import Array
 
 from jaxcal import Protocol, calibrate_batch, reconstruction_precision, simulate
 from jaxcal.cli.cache import enable_compilation_cache
-from jaxcal.contamination import OutlierKind, contaminate
 from jaxcal.io.atomic import atomic_path
-from jaxcal.offsets import OffsetLaw
+from jaxcal.study.contamination import OutlierKind, contaminate
+from jaxcal.study.offsets import OffsetLaw
 
 SEED = 20261126
 LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "heavy-tailed")

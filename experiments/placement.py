@@ -39,15 +39,8 @@ from hw.midplane.search import PlacementError, Settings, first_seen
 from hw.midplane.threshold_climb import threshold_climb
 from hw.poses import plan_poses
 from hw.rigid import rigid
-from jaxcal import (
-    Problem,
-    Recording,
-    calibrate_batch,
-    make_images,
-    reconstruction_precision,
-    stack,
-)
-from jaxcal.geometry import rotation_angle
+from jaxcal import Problem, Recording, calibrate_batch, make_images, reconstruction_precision, stack
+from jaxcal.data.geometry import rotation_angle
 from jaxcal.io.atomic import atomic_path
 
 IMAGES = 60

@@ -29,13 +29,13 @@ from jaxcal.backend import (
     circle_residual,
     retract,
 )
-from jaxcal.compiler import fast_to_run
+from jaxcal.data.geometry import rotation_angle
 from jaxcal.diagnostics.uncertainty import mm_at_target, spectrum, threshold
-from jaxcal.geometry import rotation_angle
 from jaxcal.io.atomic import atomic_path
 from jaxcal.model.observations import local_unknowns
-from jaxcal.simulation import Protocol, simulate
+from jaxcal.runtime.compiler import fast_to_run
 from jaxcal.solvers.alternating import Alternation, alternate
+from jaxcal.study.simulation import Protocol, simulate
 
 SEED = 20261120
 IMAGES = 50

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from common import arguments, machine, results_folder, write_table
 
+from jaxcal.data.probe import C5_2, L14_5, Probe
+from jaxcal.data.recording import make_images
+from jaxcal.data.segmentation.segment import Segmentation, segment
 from jaxcal.io.atomic import atomic_path
-from jaxcal.probe import C5_2, L14_5, Probe
-from jaxcal.recording import make_images
-from jaxcal.segmentation.segment import Segmentation, segment
 
 SEED = 20261121
 NOISES = (0.05, 0.5, 2.0)

@@ -65,9 +65,9 @@ from common import arguments, machine, results_folder, write_table
 from jaxtyping import Float
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision, simulate
+from jaxcal.data.segmentation.image import localise
+from jaxcal.data.segmentation.time_of_flight import fit_distances
 from jaxcal.io.atomic import atomic_path
-from jaxcal.segmentation.image import localise
-from jaxcal.segmentation.time_of_flight import fit_distances
 
 SEED = 20261122
 IMAGES = 60

@@ -21,10 +21,10 @@ from common import arguments, machine, results_folder, write_table
 from jaxtyping import Array
 
 from jaxcal import Protocol, calibrate, calibrate_batch, reconstruction_precision, simulate
+from jaxcal.data.probe import C5_2, L14_5
+from jaxcal.data.problem import Problem
+from jaxcal.data.segmentation.time_of_flight import fit_in_plane
 from jaxcal.io.atomic import atomic_path
-from jaxcal.probe import C5_2, L14_5
-from jaxcal.problem import Problem
-from jaxcal.segmentation.time_of_flight import fit_in_plane
 
 SEED = 20261122
 PROBES = {"linear": L14_5, "curvilinear": C5_2}

@@ -32,12 +32,12 @@ from common import arguments, machine, results_folder, write_table
 from jaxtyping import Array
 
 from jaxcal import Calibration, Problem, Protocol, calibrate_batch, predicted_tre, simulate
+from jaxcal.calibration.options import Method, PriorName
+from jaxcal.data.probe import L14_5
+from jaxcal.diagnostics.image_points import unknown_names
 from jaxcal.diagnostics.intervals import tre_at, tre_over
-from jaxcal.image_points import unknown_names
 from jaxcal.io.atomic import atomic_path
-from jaxcal.offsets import OFFSET_LAWS, OffsetLaw
-from jaxcal.options import Method, PriorName
-from jaxcal.probe import L14_5
+from jaxcal.study.offsets import OFFSET_LAWS, OffsetLaw
 
 SEED = 20261126
 POINTS_MM = np.stack(

@@ -2,9 +2,9 @@
 
 Forty recordings of 20 to 32 images, in mm, in pixels of known spacing and in pixels of unknown
 size, are calibrated as they are and after each of the slips below. ``named``: the calibration says
-what is wrong (:mod:`jaxcal.frame_checks`), its verdict is "Do not use" and its exit status 3;
-``refused``: one line before anything is solved. ``rightly``: what is said names this slip (of
-slips that have the same effect, either). ``good or fair`` counts verdicts that somebody would
+what is wrong (:mod:`jaxcal.diagnostics.frame_checks`), its verdict is "Do not use" and its exit
+status 3; ``refused``: one line before anything is solved. ``rightly``: what is said names this slip
+(of slips that have the same effect, either). ``good or fair`` counts verdicts that somebody would
 believe.
 
 Mirrored pixels, and swapped ones of unknown size, are no error that these data could show, nor one
@@ -28,8 +28,8 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.cli.common import ExitCode, exit_code
-from jaxcal.poses import inverse_poses
-from jaxcal.recording import Images, make_images
+from jaxcal.data.poses import inverse_poses
+from jaxcal.data.recording import Images, make_images
 from jaxcal.report.record import calibration_record
 from jaxcal.report.verdict import verdict
 

@@ -44,8 +44,8 @@ from hw.session import Session, Watch, median_times
 from hw.setup import Setup, controller_arm
 from hw.stage import ProbeStage
 from hw.view.feed import Audience, Nobody, watched
+from jaxcal import CalibrationError, InputError
 from jaxcal.cli.common import ExitCode
-from jaxcal.errors import CalibrationError, InputError
 
 MOST_IMAGES = 1000
 _MOST_GIVEN_UP = 3

@@ -8,8 +8,8 @@ from hw.live import LiveCalibration
 from hw.midplane.bracket import Placement
 from hw.recording_check import Progress
 from hw.setup import Setup
-from jaxcal.calibration import Calibration
-from jaxcal.errors import InputError
+from jaxcal import InputError
+from jaxcal.calibration.result import Calibration
 
 
 class Estimator:

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING
 import click
 
 from hw.choices import OPERATORS, PLACEMENTS, PLANS
-from jaxcal import __version__
+from jaxcal import InputError, __version__
 from jaxcal.cli.common import POSITIVE, ExitCode, exit_code
 from jaxcal.cli.run import run
-from jaxcal.errors import InputError
 
 if TYPE_CHECKING:
     from hw.acquire import Confirm, Outcome, Request

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxcal.buckets import cut
-from jaxcal.calibration import Calibration
-from jaxcal.errors import InputError
-from jaxcal.poses import check_poses
-from jaxcal.probe import Probe
-from jaxcal.problem import Problem
-from jaxcal.recording import MINIMUM_IMAGES, Kind, Recording, make_images
-from jaxcal.segmentation.segment import MINIMUM_LINES, check_times_of_flight
-from jaxcal.solve import calibrate
+from jaxcal import InputError
+from jaxcal.calibration.calibrate import calibrate
+from jaxcal.calibration.result import Calibration
+from jaxcal.data.poses import check_poses
+from jaxcal.data.probe import Probe
+from jaxcal.data.problem import Problem
+from jaxcal.data.recording import MINIMUM_IMAGES, Kind, Recording, make_images
+from jaxcal.data.segmentation.segment import MINIMUM_LINES, check_times_of_flight
+from jaxcal.runtime.buckets import cut
 
 
 class LiveCalibration:

@@ -14,7 +14,7 @@ from hw.poses import preview
 from hw.robot.limits import Limits
 from hw.robot.safety import MotionPlan, check_plan, plan_lines
 from hw.setup import Setup
-from jaxcal.errors import InputError
+from jaxcal import InputError
 
 
 def dry_run(setup: Setup, path: str, request: Request | None, figure: str | None) -> list[str]:
@@ -74,13 +74,13 @@ def calibrate_and_print(path: str, outcome: Outcome, speed: float) -> dict[str, 
     Returns:
         The calibration's record (:func:`jaxcal.report.record.calibration_record`).
     """
+    from jaxcal.calibration.calibrate import calibrate
     from jaxcal.cli.common import print_page
+    from jaxcal.data.segmentation.segment import segment_recording
     from jaxcal.io.hdf5 import load
     from jaxcal.report.record import calibration_record
     from jaxcal.report.tables import calibration_table
     from jaxcal.report.verdict import verdict
-    from jaxcal.segmentation.segment import segment_recording
-    from jaxcal.solve import calibrate
 
     recording, _ = segment_recording(load(path))
     record = calibration_record(calibrate(recording), recording)

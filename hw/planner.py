@@ -16,11 +16,11 @@ from hw.pool import BENCH_RULES, BENCH_SDS_MM, constraints_of
 from hw.rigid import turn_deg
 from hw.setup import Setup
 from hw.shapes import Float
-from jaxcal.calibration import Calibration
+from jaxcal import InputError
+from jaxcal.calibration.result import Calibration
 from jaxcal.design import Candidates, Model, Noise, images_to, next_poses
 from jaxcal.design.greedy import Cover, space_features
 from jaxcal.design.planning import Known
-from jaxcal.errors import InputError
 
 FEWEST_TO_TRUST = 8
 """Images from which on a calibration's own covariance says what is known."""

@@ -14,9 +14,9 @@ from hw.robot.kinematics import dexterity_mm, flange_of, inverse, model_named
 from hw.robot.limits import Limits
 from hw.scene import Scene
 from hw.shapes import Bool, Float
+from jaxcal.data.poses import check_poses
 from jaxcal.design import Constraints, Model, Noise, Region, Rules, make_candidates, plan
 from jaxcal.design.constraints import Allowed
-from jaxcal.poses import check_poses
 
 BENCH_SDS_MM = (0.15, 0.12, 0.35)
 """Lateral, range and elevational SDs of a bench before its images tell: placed by an arm that is

@@ -24,9 +24,9 @@ import numpy as np
 from hw.rigid import looking_rotation
 from hw.scene import Scene
 from hw.shapes import Float
-from jaxcal.errors import InputError
+from jaxcal import InputError
+from jaxcal.data.poses import check_poses
 from jaxcal.io.atomic import atomic_path
-from jaxcal.poses import check_poses
 
 MOST_POSES = 10_000
 # A turn of one degree takes the arm about as long as this many mm.

@@ -28,8 +28,8 @@ from hw.recording_check import check_resumable
 from hw.recording_file import utc_now
 from hw.recording_layout import Header
 from hw.robot.pose import ur_to_pose
-from jaxcal.errors import CalibrationError, FormatError, OutputError
-from jaxcal.isolated import python_command
+from jaxcal import CalibrationError, FormatError, OutputError
+from jaxcal.runtime.isolated import python_command
 
 if TYPE_CHECKING:
     from hw.active_echo.device import EchoFrame

@@ -21,7 +21,7 @@ import numpy as np
 
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import Header
-from jaxcal.errors import CalibrationError
+from jaxcal import CalibrationError
 from jaxcal.io.readable import one_line
 
 FLUSH_S = 1.0

@@ -20,7 +20,8 @@ from hw.recording_layout import (
     VERSION,
     Column,
 )
-from jaxcal.errors import FormatError, InputError
+from jaxcal import FormatError, InputError
+from jaxcal.data.poses import check_poses
 from jaxcal.io.readable import check_readable
 from jaxcal.io.untrusted import (
     Node,
@@ -35,7 +36,6 @@ from jaxcal.io.untrusted import (
     open_root,
     text,
 )
-from jaxcal.poses import check_poses
 
 _MOST_MEMBERS = 100
 """Arrays in a group that is written once: ten times what an acquisition writes."""

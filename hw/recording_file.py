@@ -38,8 +38,7 @@ from hw.recording_layout import (
     Column,
     Header,
 )
-from jaxcal import __version__
-from jaxcal.errors import FormatError, OutputError
+from jaxcal import FormatError, OutputError, __version__
 from jaxcal.io.atomic import write_text
 from jaxcal.io.readable import one_line
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from hw.recording_check import Progress
 from hw.setup import Setup
-from jaxcal.errors import InputError
+from jaxcal import InputError
 from jaxcal.io.readable import quoted
 
 _SAME = 1e-9

@@ -25,8 +25,8 @@ from hw.recorder import Recorder
 from hw.robot.stream import PoseSample, PoseStream
 from hw.setup import Setup
 from hw.ultrasound.receiver import Image, UltrasoundStream
-from jaxcal.errors import CalibrationError
-from jaxcal.timing import fit_clock
+from jaxcal import CalibrationError
+from jaxcal.data.timing import fit_clock
 
 _PERIOD_WALL_S = 0.005
 # Rows are written in batches: a write costs a millisecond, however many rows it has.

@@ -20,10 +20,10 @@ from hw.poses import Extent
 from hw.robot.kinematics import model_named
 from hw.robot.limits import FURTHEST_TIP_MM, Limits, hull_of, numbers
 from hw.scene import Scene
-from jaxcal.errors import InputError
+from jaxcal import InputError
+from jaxcal.data.probe import LinearProbe
 from jaxcal.io.readable import quoted
 from jaxcal.io.toml import load_toml
-from jaxcal.probe import LinearProbe
 
 _LARGEST_BYTES = 2**18
 _LEAST_TIP_MM = 5.0

@@ -14,93 +14,105 @@ from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
 
+
+class CalibrationError(Exception):
+    """Base of every error that jaxcal raises on purpose; its text is meant for a person."""
+
+
+class InputError(CalibrationError, ValueError):
+    """The data handed in cannot be used: shapes, units, non-rotations, too few images."""
+
+
+class FormatError(InputError):
+    """A file is not what it should be: another format, truncated, a newer version, unsafe."""
+
+
+class OutputError(CalibrationError, OSError):
+    """A result could not be written; nothing was left half-written."""
+
+
+class MissingExtraError(CalibrationError, ImportError):
+    """An optional dependency is absent; the message names the extra that installs it."""
+
+
+_ERRORS = ("CalibrationError", "FormatError", "InputError", "MissingExtraError", "OutputError")
 _HOME = {
-    "Calibration": "jaxcal.calibration",
-    "CalibrationError": "jaxcal.errors",
-    "Certificate": "jaxcal.certificate",
-    "ClosedForm": "jaxcal.closed_form",
-    "CurvilinearProbe": "jaxcal.probe",
-    "FormatError": "jaxcal.errors",
-    "ImageTransform": "jaxcal.transform",
-    "Images": "jaxcal.recording",
-    "InputError": "jaxcal.errors",
-    "LinearProbe": "jaxcal.probe",
-    "MissingExtraError": "jaxcal.errors",
-    "OutputError": "jaxcal.errors",
-    "Problem": "jaxcal.problem",
-    "Protocol": "jaxcal.simulation",
-    "Recording": "jaxcal.recording",
-    "Segmentation": "jaxcal.segmentation.segment",
-    "Status": "jaxcal.calibration",
-    "Options": "jaxcal.options",
-    "Pivot": "jaxcal.pivot",
-    "bootstrap": "jaxcal.resampling",
-    "calibrate": "jaxcal.solve",
-    "calibrate_batch": "jaxcal.solve",
-    "calibrate_closed_form": "jaxcal.closed_form",
-    "calibrate_pivot": "jaxcal.pivot",
+    "Calibration": "jaxcal.calibration.result",
+    "Certificate": "jaxcal.solvers.closed_form.certificate",
+    "ClosedForm": "jaxcal.solvers.closed_form.single",
+    "CurvilinearProbe": "jaxcal.data.probe",
+    "ImageTransform": "jaxcal.calibration.transform",
+    "Images": "jaxcal.data.recording",
+    "LinearProbe": "jaxcal.data.probe",
+    "Problem": "jaxcal.data.problem",
+    "Protocol": "jaxcal.study.simulation",
+    "Recording": "jaxcal.data.recording",
+    "Segmentation": "jaxcal.data.segmentation.segment",
+    "Status": "jaxcal.calibration.result",
+    "Options": "jaxcal.calibration.options",
+    "Pivot": "jaxcal.calibration.pivot",
+    "bootstrap": "jaxcal.calibration.resampling",
+    "calibrate": "jaxcal.calibration.calibrate",
+    "calibrate_batch": "jaxcal.calibration.calibrate",
+    "calibrate_closed_form": "jaxcal.solvers.closed_form.single",
+    "calibrate_pivot": "jaxcal.calibration.pivot",
     "calibration_reproducibility": "jaxcal.diagnostics.metrics",
-    "certify": "jaxcal.certificate",
-    "cross_validate": "jaxcal.resampling",
+    "certify": "jaxcal.solvers.closed_form.certificate",
+    "cross_validate": "jaxcal.calibration.resampling",
     "load": "jaxcal.io.hdf5",
-    "load_calibration": "jaxcal.transform",
-    "make_images": "jaxcal.recording",
+    "load_calibration": "jaxcal.calibration.transform",
+    "make_images": "jaxcal.data.recording",
     "predicted_tre": "jaxcal.diagnostics.intervals",
     "reconstruction_precision": "jaxcal.diagnostics.metrics",
     "save": "jaxcal.io.hdf5",
-    "segment": "jaxcal.segmentation.segment",
-    "segment_recording": "jaxcal.segmentation.segment",
-    "simulate": "jaxcal.simulation",
-    "simulate_recording": "jaxcal.simulation",
-    "sound_speed_in_water": "jaxcal.sound",
-    "stack": "jaxcal.problem",
+    "segment": "jaxcal.data.segmentation.segment",
+    "segment_recording": "jaxcal.data.segmentation.segment",
+    "simulate": "jaxcal.study.simulation",
+    "simulate_recording": "jaxcal.study.simulation",
+    "sound_speed_in_water": "jaxcal.data.sound",
+    "stack": "jaxcal.data.problem",
     "transform_intervals": "jaxcal.diagnostics.intervals",
 }
 
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration as Calibration
-    from jaxcal.calibration import Status as Status
-    from jaxcal.certificate import Certificate as Certificate
-    from jaxcal.certificate import certify as certify
-    from jaxcal.closed_form import ClosedForm as ClosedForm
-    from jaxcal.closed_form import calibrate_closed_form as calibrate_closed_form
+    from jaxcal.calibration.calibrate import calibrate as calibrate
+    from jaxcal.calibration.calibrate import calibrate_batch as calibrate_batch
+    from jaxcal.calibration.options import Options as Options
+    from jaxcal.calibration.pivot import Pivot as Pivot
+    from jaxcal.calibration.pivot import calibrate_pivot as calibrate_pivot
+    from jaxcal.calibration.resampling import bootstrap as bootstrap
+    from jaxcal.calibration.resampling import cross_validate as cross_validate
+    from jaxcal.calibration.result import Calibration as Calibration
+    from jaxcal.calibration.result import Status as Status
+    from jaxcal.calibration.transform import ImageTransform as ImageTransform
+    from jaxcal.calibration.transform import load_calibration as load_calibration
+    from jaxcal.data.probe import CurvilinearProbe as CurvilinearProbe
+    from jaxcal.data.probe import LinearProbe as LinearProbe
+    from jaxcal.data.problem import Problem as Problem
+    from jaxcal.data.problem import stack as stack
+    from jaxcal.data.recording import Images as Images
+    from jaxcal.data.recording import Recording as Recording
+    from jaxcal.data.recording import make_images as make_images
+    from jaxcal.data.segmentation.segment import Segmentation as Segmentation
+    from jaxcal.data.segmentation.segment import segment as segment
+    from jaxcal.data.segmentation.segment import segment_recording as segment_recording
+    from jaxcal.data.sound import sound_speed_in_water as sound_speed_in_water
     from jaxcal.diagnostics.intervals import predicted_tre as predicted_tre
     from jaxcal.diagnostics.intervals import transform_intervals as transform_intervals
     from jaxcal.diagnostics.metrics import (
         calibration_reproducibility as calibration_reproducibility,
     )
     from jaxcal.diagnostics.metrics import reconstruction_precision as reconstruction_precision
-    from jaxcal.errors import CalibrationError as CalibrationError
-    from jaxcal.errors import FormatError as FormatError
-    from jaxcal.errors import InputError as InputError
-    from jaxcal.errors import MissingExtraError as MissingExtraError
-    from jaxcal.errors import OutputError as OutputError
     from jaxcal.io.hdf5 import load as load
     from jaxcal.io.hdf5 import save as save
-    from jaxcal.options import Options as Options
-    from jaxcal.pivot import Pivot as Pivot
-    from jaxcal.pivot import calibrate_pivot as calibrate_pivot
-    from jaxcal.probe import CurvilinearProbe as CurvilinearProbe
-    from jaxcal.probe import LinearProbe as LinearProbe
-    from jaxcal.problem import Problem as Problem
-    from jaxcal.problem import stack as stack
-    from jaxcal.recording import Images as Images
-    from jaxcal.recording import Recording as Recording
-    from jaxcal.recording import make_images as make_images
-    from jaxcal.resampling import bootstrap as bootstrap
-    from jaxcal.resampling import cross_validate as cross_validate
-    from jaxcal.segmentation.segment import Segmentation as Segmentation
-    from jaxcal.segmentation.segment import segment as segment
-    from jaxcal.segmentation.segment import segment_recording as segment_recording
-    from jaxcal.simulation import Protocol as Protocol
-    from jaxcal.simulation import simulate as simulate
-    from jaxcal.simulation import simulate_recording as simulate_recording
-    from jaxcal.solve import calibrate as calibrate
-    from jaxcal.solve import calibrate_batch as calibrate_batch
-    from jaxcal.sound import sound_speed_in_water as sound_speed_in_water
-    from jaxcal.transform import ImageTransform as ImageTransform
-    from jaxcal.transform import load_calibration as load_calibration
+    from jaxcal.solvers.closed_form.certificate import Certificate as Certificate
+    from jaxcal.solvers.closed_form.certificate import certify as certify
+    from jaxcal.solvers.closed_form.single import ClosedForm as ClosedForm
+    from jaxcal.solvers.closed_form.single import calibrate_closed_form as calibrate_closed_form
+    from jaxcal.study.simulation import Protocol as Protocol
+    from jaxcal.study.simulation import simulate as simulate
+    from jaxcal.study.simulation import simulate_recording as simulate_recording
 
 
 def __getattr__(name: str) -> object:
@@ -112,4 +124,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return [*_HOME, "__version__"]
+    return [*_ERRORS, *_HOME, "__version__"]

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import jax
 
+from jaxcal.data.problem import Problem
 from jaxcal.model.batch import Images, Iterate
 from jaxcal.model.observations import (
     BoundedOffsets,
@@ -44,7 +45,6 @@ from jaxcal.model.residuals import (
     measurement_residual,
     target_in_image,
 )
-from jaxcal.problem import Problem
 from jaxcal.solvers.general import LevenbergMarquardt, arrow_least_squares
 from jaxcal.solvers.implicit import optimum as implicit_tangent
 from jaxcal.solvers.levenberg_marquardt import minimise

@@ -58,7 +58,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal import executables
+from jaxcal.runtime import executables
 
 # Many tests look at the insides, which compute in the caller's bits; test_guest.py is about callers
 # who have 32. Not by the environment: processes that the tests start are users'.
@@ -105,7 +105,7 @@ def select(problem: jaxcal.Problem, rows: object) -> jaxcal.Problem:
 
 
 def angle(first: np.ndarray, second: np.ndarray) -> float:
-    return jaxcal.geometry.rotation_angle(np.asarray(first), np.asarray(second))
+    return jaxcal.data.geometry.rotation_angle(np.asarray(first), np.asarray(second))
 
 
 LONGEST = (

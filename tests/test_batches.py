@@ -11,7 +11,7 @@ import pytest
 from conftest import problem
 
 import jaxcal
-from jaxcal import compiler
+from jaxcal.runtime import compiler
 
 METHODS = {
     "conventional": {"method": "conventional"},
@@ -80,7 +80,7 @@ def test_compiler_flags_change_rounding_only(monkeypatch):
     fast = jaxcal.calibrate_batch(problems, method="conventional")
     again = jaxcal.calibrate_batch(problems, method="conventional")
     assert np.array_equal(fast.image_to_probe, again.image_to_probe)
-    from jaxcal import programs
+    from jaxcal.runtime import programs
 
     programs.chunks.cache_clear()
     monkeypatch.setenv(compiler.SWITCH, "0")

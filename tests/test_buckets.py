@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxcal
-from jaxcal import buckets, executables, program_cache, programs
-from jaxcal.options import Request, prepare
+from jaxcal.calibration.options import Request, prepare
+from jaxcal.runtime import buckets, executables, program_cache, programs
 
 METHODS = {
     "conventional": {"method": "conventional"},

@@ -12,11 +12,10 @@ import pytest
 from conftest import angle
 
 import jaxcal
-from jaxcal import Protocol
+from jaxcal import InputError, Protocol
 from jaxcal.cli.main import main
-from jaxcal.errors import InputError
+from jaxcal.data.probe import CurvilinearProbe, LinearProbe
 from jaxcal.io.hdf5 import save
-from jaxcal.probe import CurvilinearProbe, LinearProbe
 
 CURVED = CurvilinearProbe(elements=32, pitch_mm=2.0, radius_mm=60.0)
 STRAIGHT = LinearProbe(elements=32, pitch_mm=1.8)

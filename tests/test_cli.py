@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal import program_cache
 from jaxcal.cli import cache, common, demo
 from jaxcal.cli.main import commands, main
-from jaxcal.recording import Recording, make_images
-from jaxcal.simulation import Protocol
+from jaxcal.data.recording import Recording, make_images
+from jaxcal.runtime import program_cache
+from jaxcal.study.simulation import Protocol
 
 FIGURES = ("residuals", "offsets", "accuracy", "influence", "limits")
 REPORT = {
@@ -417,7 +417,7 @@ def test_a_name_cannot_break_the_one_line(capfd):
 
 def test_simulate_into_no_folder(capfd, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "jaxcal.simulation.simulate_recording", lambda *_, **__: jaxcal.load(tmp_path)
+        "jaxcal.study.simulation.simulate_recording", lambda *_, **__: jaxcal.load(tmp_path)
     )
     assert "is a directory" in refused(capfd, "simulate", tmp_path / "no" / "x.h5")
 

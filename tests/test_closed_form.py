@@ -19,11 +19,11 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal.closed_form import solve
 from jaxcal.io.text import read_crosswire
-from jaxcal.reduced_objective import image_data, reduce
 from jaxcal.report.certified import certificate_record, certificate_words
-from jaxcal.rotation_relaxation import lower_bound
+from jaxcal.solvers.closed_form.reduced_objective import image_data, reduce
+from jaxcal.solvers.closed_form.rotation_relaxation import lower_bound
+from jaxcal.solvers.closed_form.single import solve
 
 SCALE = ("scale",)
 ESTIMATES = ((), SCALE, ("common-scale",))

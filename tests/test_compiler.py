@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxcal import compiler
+from jaxcal.runtime import compiler
 
 
 def test_an_unknown_flag_is_left_out_and_the_others_stay():

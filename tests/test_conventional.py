@@ -18,8 +18,8 @@ from conftest import experiment, problem
 
 import jaxcal
 from jaxcal import Options
-from jaxcal.conventional import closed_form_answer
-from jaxcal.options import Request, prepare
+from jaxcal.calibration.conventional import closed_form_answer
+from jaxcal.calibration.options import Request, prepare
 
 METHOD = "conventional"
 SCALE = ("scale",)

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.dependence import (
+from jaxcal.data.problem import Channels
+from jaxcal.data.recording import make_images
+from jaxcal.diagnostics.dependence import (
     autocorrelation,
     correlation_time,
     displacement,
@@ -21,8 +23,6 @@ from jaxcal.dependence import (
     same_pose,
 )
 from jaxcal.diagnostics.serial_correlation import CHANCE, believed_correlation
-from jaxcal.problem import Channels
-from jaxcal.recording import make_images
 from jaxcal.report.accuracy import GOOD_MM
 
 
@@ -182,7 +182,7 @@ def test_correlated_errors_widen_the_covariance(frames, monkeypatch):
             return None
 
     wide = [calibrated(one) for one in problems]
-    monkeypatch.setattr(jaxcal.solve, "widened", lambda result: result)
+    monkeypatch.setattr(jaxcal.calibration.calibrate, "widened", lambda result: result)
     plain = [calibrated(one) for one in problems]
     # Where a recording is taken for a stream, fewer images are left to be correlated.
     used = [k for k, one in enumerate(wide) if one is not None and not one.notes]

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 import jaxcal
-from jaxcal import design
+from jaxcal import InputError, design
+from jaxcal.data.recording import Recording, make_images
 from jaxcal.design import Constraints, Model, Noise, Region
 from jaxcal.design.candidates import sobol_poses, sobol_sequence
 from jaxcal.design.criteria import check_criterion, gains, rp_weight, tre_weight
@@ -23,8 +24,6 @@ from jaxcal.design.information import covariance_of, known_information
 from jaxcal.design.noise import _basis, _gamma_slopes
 from jaxcal.design.planning import Known, weight_of
 from jaxcal.design.predict import curve
-from jaxcal.errors import InputError
-from jaxcal.recording import Recording, make_images
 
 MOUNT = np.eye(4)
 MOUNT[:3, :3] = Rotation.from_rotvec([0.4, -0.8, 1.1]).as_matrix()
@@ -92,8 +91,8 @@ def test_gain_is_that_of_brute_force_and_its_gradient_that_of_differences():
     pose = jnp.asarray(candidates.poses[20])
 
     def along(tangent):
-        turn = jaxcal.geometry.rotation_from_vector(tangent[3:])
-        moved = jaxcal.geometry.matrix_from_rotation(
+        turn = jaxcal.data.geometry.rotation_from_vector(tangent[3:])
+        moved = jaxcal.data.geometry.matrix_from_rotation(
             pose[:3, :3] @ turn, pose[:3, 3] + pose[:3, :3] @ tangent[:3]
         )
         return design.gain(moved, covariance, weight, model)

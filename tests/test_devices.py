@@ -14,7 +14,7 @@ import sys
 import jax
 import numpy as np
 import jaxcal
-from jaxcal.simulation import Protocol, simulate
+from jaxcal.study.simulation import Protocol, simulate
 
 root, protocol = jax.random.key(1), Protocol(images=12, noise_mm=0.5)
 draw = jax.jit(jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol).problem()))

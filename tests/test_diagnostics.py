@@ -13,10 +13,10 @@ from oracle import model
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from jaxcal.data.problem import Channels, Problem
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns, channel_rows
 from jaxcal.diagnostics.residual_checks import medians
 from jaxcal.diagnostics.uncertainty import inverses, nearest_unknown
-from jaxcal.problem import Channels, Problem
 
 ALL = ("translation", "rotation", "point", "scale", "sound-speed", "delay")
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxcal import draws
-from jaxcal.segmentation.deviations import fit_deviations, halves
-from jaxcal.segmentation.time_of_flight import fit_distances
+from jaxcal.data.segmentation.deviations import fit_deviations, halves
+from jaxcal.data.segmentation.time_of_flight import fit_distances
+from jaxcal.study import draws
 
 KEY = jax.random.key(20261121)
 

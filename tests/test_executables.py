@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxcal import executables, program_cache
+from jaxcal.runtime import executables, program_cache
 
 X = np.arange(6.0).reshape(2, 3)
 FACTOR = 3.0
@@ -34,7 +34,8 @@ traced = []
 CHILD = """
 import json, os, resource, sys, time
 import numpy as np
-from jaxcal import executables, precision
+from jaxcal.runtime import executables
+from jaxcal.runtime import precision
 traced = []
 def function(x, more, plan):
     traced.append(1)
@@ -340,7 +341,7 @@ def test_an_entry_that_cannot_be_trusted_is_compiled_anew(spoil, caplog, capfd):
     with caplog.at_level(logging.DEBUG, "jaxcal"):
         check(run())
     assert traced == [FACTOR]
-    said = [record for record in caplog.records if record.name == "jaxcal.program_cache"]
+    said = [record for record in caplog.records if record.name == "jaxcal.runtime.program_cache"]
     assert [record.levelname for record in said] == ["DEBUG"]
     assert capfd.readouterr() == ("", "")
     # It was replaced by a good one.
@@ -411,7 +412,7 @@ def test_a_full_disk_gives_an_answer_without_a_cache():
 
 WRITER = """
 import os, sys
-from jaxcal import program_cache
+from jaxcal.runtime import program_cache
 program_cache.write("key", {}, os.urandom(int(sys.argv[1])))
 """
 

@@ -12,10 +12,10 @@ import pytest
 
 import jaxcal
 from jaxcal.cli.common import ExitCode, exit_code
-from jaxcal.frame_checks import wrong_frames
+from jaxcal.data.poses import inverse_poses
+from jaxcal.data.recording import make_images
+from jaxcal.diagnostics.frame_checks import wrong_frames
 from jaxcal.io.text import read_crosswire
-from jaxcal.poses import inverse_poses
-from jaxcal.recording import make_images
 from jaxcal.report.record import calibration_record
 from jaxcal.report.verdict import verdict
 
@@ -23,7 +23,7 @@ FILES = 12
 BY_SYMMETRY = {("px, unknown", "u and v swapped")} | {
     (form, "u mirrored") for form in ("mm", "px, known", "px, unknown")
 }
-"""No fit can see these (:mod:`jaxcal.frame_checks`)."""
+"""No fit can see these (:mod:`jaxcal.diagnostics.frame_checks`)."""
 FREE_UNIT = ("px, unknown", "poses in cm")
 """A pixel of a hundredth of a millimetre is possible."""
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxcal import InputError
-from jaxcal.geometry import (
+from jaxcal.data.geometry import (
     check_poses,
     nearest_rotations,
     rotation_angle,

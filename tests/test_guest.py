@@ -18,7 +18,7 @@ from conftest import experiment, problem
 
 import jaxcal
 from jaxcal import Options
-from jaxcal.deprecation import deprecated
+from jaxcal.runtime.deprecation import deprecated
 
 DOCS = Path(__file__).parents[1] / "docs"
 

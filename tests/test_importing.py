@@ -12,10 +12,10 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
-from jaxcal.errors import FormatError, InputError
-from jaxcal.importing import ImportOptions, import_files
 from jaxcal.io.columns import columns_of_header
+from jaxcal.io.importing import ImportOptions, import_files
 from jaxcal.io.sequence_files import read_sequence, write_sequence
 from jaxcal.io.slicer import read_markups
 from jaxcal.io.trackers import read_tracker

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxcal.errors import OutputError
+from jaxcal import OutputError
 from jaxcal.io.atomic import atomic_path, write_text
 
 ROOT = Path(__file__).parents[1]

@@ -18,11 +18,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxcal.errors import FormatError, InputError, OutputError
+from jaxcal import FormatError, InputError, OutputError
+from jaxcal.data.probe import LinearProbe
+from jaxcal.data.recording import Images, Recording, Truth, make_images
 from jaxcal.io import hdf5, untrusted
 from jaxcal.io.hdf5 import load, save
-from jaxcal.probe import LinearProbe
-from jaxcal.recording import Images, Recording, Truth, make_images
 
 ROOT = Path(__file__).parents[1]
 COUNT = 6
@@ -326,8 +326,7 @@ def test_file_that_is_being_written(path):
             check=False,
         )
     assert process.stderr.splitlines()[-1] == (
-        f"jaxcal.errors.FormatError: {path}: is being written: close it in the program that "
-        "writes it"
+        f"jaxcal.FormatError: {path}: is being written: close it in the program that writes it"
     )
 
 

@@ -8,8 +8,8 @@ import re
 import numpy as np
 import pytest
 
+from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
-from jaxcal.errors import FormatError, InputError
 from jaxcal.io.plus import (
     patch_configuration,
     patched_configuration,

@@ -10,10 +10,10 @@ import zlib
 import numpy as np
 import pytest
 
-from jaxcal.errors import FormatError, InputError
+from jaxcal import FormatError, InputError
+from jaxcal.data.poses import rotations_from_quaternions
 from jaxcal.io.frame_names import check_frame, path_between, split_name
 from jaxcal.io.sequence_files import read_sequence, write_sequence
-from jaxcal.poses import rotations_from_quaternions
 
 PROBE, REFERENCE = ("Probe", "Tracker"), ("Reference", "Tracker")
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxcal.errors import FormatError, InputError
+from jaxcal import FormatError, InputError
 from jaxcal.io import lines as text_files
 from jaxcal.io.text import read_crosswire, read_csv
 

@@ -8,7 +8,7 @@ from conftest import experiment
 
 import jaxcal
 from hw import LiveCalibration
-from jaxcal import program_cache
+from jaxcal.runtime import program_cache
 
 SIGMA_MM = (0.1, 0.1, 0.5)
 

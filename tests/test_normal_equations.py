@@ -13,6 +13,8 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from jaxcal.data.problem import Channels as Heard
+from jaxcal.data.problem import Problem
 from jaxcal.model import derivatives, unrolled
 from jaxcal.model.batch import Images, Iterate, targets, total
 from jaxcal.model.observations import (
@@ -29,8 +31,6 @@ from jaxcal.model.observations import (
     local_unknowns,
 )
 from jaxcal.model.parameters import EXTRA, RIGID, Parameters
-from jaxcal.problem import Channels as Heard
-from jaxcal.problem import Problem
 from jaxcal.solvers.levenberg_marquardt import (
     Descent,
     Rounding,

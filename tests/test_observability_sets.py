@@ -12,7 +12,7 @@ from pose_sets import DEGENERATE, WEAK, PoseSet, make
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal.options import Method
+from jaxcal.calibration.options import Method
 
 KNOWN = 0.25
 """Relative SD of the weakest direction (to the lever arm) below which a set must be solved; the

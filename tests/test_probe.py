@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from jaxcal.errors import InputError
-from jaxcal.probe import C5_2, L14_5, CurvilinearProbe, LinearProbe
-from jaxcal.sound import sound_speed_in_water
+from jaxcal import InputError
+from jaxcal.data.probe import C5_2, L14_5, CurvilinearProbe, LinearProbe
+from jaxcal.data.sound import sound_speed_in_water
 
 PROBES = (L14_5, C5_2, LinearProbe(2, 1.0), CurvilinearProbe(17, 1.5, 40.0, 1540.0, 1e-6))
 

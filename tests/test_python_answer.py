@@ -13,10 +13,10 @@ import pytest
 from conftest import experiment
 
 import jaxcal
-from jaxcal.inputs import as_problem
+from jaxcal.calibration.inputs import as_problem
+from jaxcal.calibration.transform import load_calibration
 from jaxcal.report import plots
 from jaxcal.report.record import calibration_record
-from jaxcal.transform import load_calibration
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +158,7 @@ for call, given in ((jaxcal.calibrate, "rec.h5"), (jaxcal.calibrate, {}),
 
 def test_drawing_is_not_imported_before_it_is_asked_for():
     code = (
-        "import sys, jaxcal, jaxcal.solve, jaxcal.calibration, jaxcal.report.record; "
+        "import sys, jaxcal.calibration.calibrate, jaxcal.report.record; "
         "heavy = {'matplotlib', 'jaxcal.report.plots', 'jaxcal.report.page'} & set(sys.modules); "
         "sys.exit(str(heavy) if heavy else 0)"
     )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.errors import InputError
+from jaxcal import InputError
 
 
 def arrays() -> dict:

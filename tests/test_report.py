@@ -12,10 +12,10 @@ import pytest
 from rich.console import Console
 
 import jaxcal
-from jaxcal.calibration import Status
-from jaxcal.errors import InputError, OutputError
-from jaxcal.options import Options
-from jaxcal.recording import Recording, make_images
+from jaxcal import InputError, OutputError
+from jaxcal.calibration.options import Options
+from jaxcal.calibration.result import Status
+from jaxcal.data.recording import Recording, make_images
 from jaxcal.report.convergence import KEPT, Curve, bounded_curves
 from jaxcal.report.figures import convergence_figure
 from jaxcal.report.plots import plot_offsets, plot_residuals
@@ -23,7 +23,7 @@ from jaxcal.report.record import calibration_record, check_test_images, plain, t
 from jaxcal.report.tables import calibration_table, comparison_table
 from jaxcal.report.verdict import verdict
 from jaxcal.report.write import COLUMNS, prepare_folder, write_report
-from jaxcal.simulation import Protocol, simulate_recording
+from jaxcal.study.simulation import Protocol, simulate_recording
 
 LEFT_OUT = 5
 CURVES = [Curve("joint", np.array([3.0, 1.0, np.nan])), Curve("alternating", np.array([3.0, 2.0]))]

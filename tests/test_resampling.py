@@ -13,9 +13,9 @@ import pytest
 from conftest import problem, select
 
 import jaxcal
+from jaxcal.calibration.resampling import bootstrap, cross_validate, relative_twist
 from jaxcal.cli.main import main
 from jaxcal.diagnostics import metrics
-from jaxcal.resampling import bootstrap, cross_validate, relative_twist
 
 CONVENTIONAL: dict[str, Any] = {"method": "conventional"}
 

@@ -13,19 +13,19 @@ import pytest
 from scipy.optimize import least_squares
 
 import jaxcal
+from jaxcal import InputError
 from jaxcal.cli.main import main
-from jaxcal.diagnostics.metrics import reconstruct
-from jaxcal.errors import InputError
-from jaxcal.probe import C5_2, L14_5, LinearProbe
-from jaxcal.recording import Recording, make_images
-from jaxcal.segmentation.segment import OutOfPlane, compiled_fit, segment, segment_recording
-from jaxcal.segmentation.time_of_flight import (
+from jaxcal.data.probe import C5_2, L14_5, LinearProbe
+from jaxcal.data.recording import Recording, make_images
+from jaxcal.data.segmentation.segment import OutOfPlane, compiled_fit, segment, segment_recording
+from jaxcal.data.segmentation.time_of_flight import (
     fit_distances,
     fit_in_plane,
     fit_out_of_plane,
     shortest,
 )
-from jaxcal.simulation import Protocol, simulate_recording, times_of_flight
+from jaxcal.diagnostics.metrics import reconstruct
+from jaxcal.study.simulation import Protocol, simulate_recording, times_of_flight
 
 FRAMES = 2000
 SEED = 20261121

@@ -10,8 +10,8 @@ import pytest
 from scipy import ndimage
 
 import jaxcal
-from jaxcal.segmentation.image import images_from_frames, localise
-from jaxcal.segmentation.spot import half_maximum, local_maxima
+from jaxcal.data.segmentation.image import images_from_frames, localise
+from jaxcal.data.segmentation.spot import half_maximum, local_maxima
 
 POINT_SPREAD = (3.0, 1.2)
 """SD of the envelope along u and v, px."""

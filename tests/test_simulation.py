@@ -10,7 +10,7 @@ from conftest import experiment
 
 from jaxcal import InputError, Protocol, simulate
 from jaxcal.diagnostics.metrics import reconstruct
-from jaxcal.simulation import draw
+from jaxcal.study.simulation import draw
 
 
 def test_truth_reconstructs_the_target():

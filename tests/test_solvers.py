@@ -12,7 +12,7 @@ from conftest import angle, experiment, problem, select
 
 import jaxcal
 from jaxcal import Options
-from jaxcal.probe import LinearProbe
+from jaxcal.data.probe import LinearProbe
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,11 @@ import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
 from jaxcal.diagnostics.metrics import reconstruction_precision
-from jaxcal.offsets import OFFSET_LAWS, nominal_bound, standard_deviation, standard_offsets
-from jaxcal.simulation import simulate
 from jaxcal.study import load_spec, open_results, run_study
+from jaxcal.study.offsets import OFFSET_LAWS, nominal_bound, standard_deviation, standard_offsets
 from jaxcal.study.pipeline import Block, _options, bound_mm, compute_chunk, protocol, trial_keys
 from jaxcal.study.show import as_csv, as_record, mean_interval, summarise
+from jaxcal.study.simulation import simulate
 from jaxcal.study.spec import AXES, parse_spec, spec_from_canonical
 from jaxcal.study.store import Store
 
@@ -242,7 +242,7 @@ def test_a_trial_is_that_of_the_public_functions(finished):
     stored = data.sel(at)
     assert float(stored.rp) == pytest.approx(float(rp), rel=1e-6)
     found, true = np.asarray(result.image_to_probe), np.asarray(experiment.image_to_probe)
-    turned = jaxcal.geometry.rotation_angle(found, true)
+    turned = jaxcal.data.geometry.rotation_angle(found, true)
     assert float(stored.rotation_error) == pytest.approx(turned, rel=1e-5)
     moved = (found - true)[:3, 3]
     assert float(stored.translation_error) == pytest.approx(np.linalg.norm(moved), rel=1e-5)

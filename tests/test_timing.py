@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
-from jaxcal.errors import InputError
-from jaxcal.timing import (
+from jaxcal import InputError
+from jaxcal.data.timing import (
     can_interpolate,
     estimate_latency,
     fit_clock,

@@ -13,14 +13,18 @@ import h5py
 import numpy as np
 import pytest
 
+from jaxcal import FormatError, InputError
+from jaxcal.calibration.transform import (
+    ImageTransform,
+    load_calibration,
+    transform_from_plus_matrix,
+)
 from jaxcal.cli.main import main
-from jaxcal.errors import FormatError, InputError
+from jaxcal.data.poses import quaternion_from_rotation, rotations_from_quaternions
 from jaxcal.io.itk import itk_from_matrix, itk_text, matrix_from_itk, read_itk, write_itk
 from jaxcal.io.ros import read_ros_yaml
+from jaxcal.io.serving import TransformServer
 from jaxcal.io.tus_rec import read_scan
-from jaxcal.poses import quaternion_from_rotation, rotations_from_quaternions
-from jaxcal.serving import TransformServer
-from jaxcal.transform import ImageTransform, load_calibration, transform_from_plus_matrix
 
 
 def random_transform(seed: int = 0, scale=(0.148, 0.14), offset: float = 1.5) -> ImageTransform:
@@ -469,7 +473,7 @@ def test_no_jax(saved, tmp_path):
         "assert len(jaxcal.load(sys.argv[2] + '/r.h5')) == 8\n"
         "assert main(['apply', sys.argv[1], sys.argv[2] + '/r.h5', '--out', "
         "sys.argv[2] + '/p.csv']) == 0\n"
-        "import jaxcal.importing, jaxcal.io.plus, jaxcal.io.trackers, jaxcal.serving\n"
+        "import jaxcal.io.importing, jaxcal.io.plus, jaxcal.io.trackers, jaxcal.io.serving\n"
         "loaded = {name.split('.')[0] for name in sys.modules}\n"
         "assert not loaded & {'jax', 'jaxlib', 'equinox', 'optimistix', 'matplotlib'}, loaded\n"
     )

@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from common import arguments, machine, results_folder, write_table  # noqa: E402
 
 from jaxcal import Problem, calibrate_batch  # noqa: E402
-from jaxcal.simulation import Protocol, simulate  # noqa: E402
+from jaxcal.study.simulation import Protocol, simulate  # noqa: E402
 
 SEED = 20261126
 SIZES = ((50, 512), (12, 512))

@@ -3,8 +3,8 @@
 One process is the bench (an RTDE controller at 125 or 500 Hz, 640 x 480 images and active-echo
 frames at 30/s each), this one has the real clients and reads them every 20 ms, as a recorder
 would. Missing is counted from the devices' own counters and time stamps between the first and the
-last that came. Late is the time of arrival above the devices' clocks (jaxcal.timing.fit_clock),
-so above the promptest message. Seed 20261121.
+last that came. Late is the time of arrival above the devices' clocks
+(jaxcal.data.timing.fit_clock), so above the promptest message. Seed 20261121.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from hw.active_echo import ActiveEcho
 from hw.clock import Clock
 from hw.robot.stream import PoseStream
 from hw.ultrasound import UltrasoundStream
-from jaxcal.timing import fit_clock
+from jaxcal.data.timing import fit_clock
 
 SEED = 20261121
 CONTROLLERS = {125: (3, 15, 8, 106339), 500: (5, 11, 0, 108249)}

@@ -245,7 +245,7 @@ def optimistix_solver(batch: Batch) -> Callable[[Batch], Solved]:
     import jax.numpy as jnp
     import optimistix as optx
 
-    from jaxcal.geometry import rotation_from_vector
+    from jaxcal.data.geometry import rotation_from_vector
 
     sigma = jnp.asarray(batch.sigma)
 

@@ -23,8 +23,8 @@ from scipy.optimize import least_squares
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from common import arguments, machine, results_folder, write_table
 
-from jaxcal.probe import C5_2, L14_5
-from jaxcal.segmentation.segment import compiled_fit
+from jaxcal.data.probe import C5_2, L14_5
+from jaxcal.data.segmentation.segment import compiled_fit
 
 SEED, FRAMES, NOISE = 20261121, 50, 0.5
 

@@ -51,8 +51,8 @@ from peer_solvers import Batch, Solved  # noqa: E402
 
 import jaxcal  # noqa: E402
 from jaxcal.backend import RIGID, Images, Iterate, Parameters, Points, minimise  # noqa: E402
-from jaxcal.compiler import fast_to_run  # noqa: E402
 from jaxcal.io.atomic import atomic_path  # noqa: E402
+from jaxcal.runtime.compiler import fast_to_run  # noqa: E402
 
 SEED = 20261125
 SIGMA_MM = public_calls.SIGMA

@@ -90,7 +90,7 @@ def _random_rotations(generator: np.random.Generator, count: int, largest: float
 def draw(
     generator: np.random.Generator, elevation_mm: float, noise_mm: float, images: int = 50
 ) -> Drawn:
-    """One experiment of the default protocol (:class:`jaxcal.simulation.Protocol`)."""
+    """One experiment of the default protocol (:class:`jaxcal.study.simulation.Protocol`)."""
     half, middle = np.array([29.25, 40.0]), np.array([0.0, 50.0])
     truth = np.eye(4)
     truth[:3, :3] = _random_rotations(generator, 1, np.pi)[0]

@@ -89,8 +89,8 @@ def draws_of(spec: Spec, chunk: int, trials: int) -> list[study_peer.Drawn]:
     """The first trials of a chunk as the study draws them, with the distances."""
     import jax.numpy as jnp
 
-    from jaxcal.simulation import simulate
     from jaxcal.study.pipeline import protocol
+    from jaxcal.study.simulation import simulate
 
     part = spec.chunk(chunk)
     given = replace(protocol(spec.condition(part.condition), spec.probe), raw=True)
@@ -132,8 +132,8 @@ def stage_times(canonical: str, repeats: int) -> dict[str, float]:
     import jax.numpy as jnp
 
     import jaxcal
-    from jaxcal.simulation import draw, draw_noise
     from jaxcal.study import lean, pipeline
+    from jaxcal.study.simulation import draw, draw_noise
     from jaxcal.study.spec import spec_from_canonical
 
     spec = spec_from_canonical(canonical)

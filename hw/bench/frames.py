@@ -18,7 +18,7 @@ import numpy as np
 
 from hw.bench.world import World
 from hw.shapes import Float, UInt8
-from jaxcal.errors import InputError
+from jaxcal import InputError
 
 ROWS, COLUMNS = 480, 640
 DEPTH_MM = 90.0

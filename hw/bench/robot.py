@@ -23,7 +23,7 @@ from hw.bench.arm import Arm, Motion
 from hw.bench.rtde import RtdeServer
 from hw.clock import REAL, Clock
 from hw.robot._process import ANSWERS, be_prompt
-from jaxcal.isolated import python_command
+from jaxcal.runtime.isolated import python_command
 
 START = (0.4, -0.1, 0.3, 0.0, 3.0, 0.2)
 """Where the arm starts by default: m and rotation vector (rad)."""

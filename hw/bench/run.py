@@ -24,9 +24,9 @@ from hw.bench.control import ControlClient
 from hw.clock import Clock
 from hw.scene import Scene
 from hw.shapes import Float
-from jaxcal.errors import InputError
-from jaxcal.isolated import python_command
-from jaxcal.probe import LinearProbe
+from jaxcal import InputError
+from jaxcal.data.probe import LinearProbe
+from jaxcal.runtime.isolated import python_command
 
 __all__ = ["Bench", "Options", "main", "serve", "start_bench"]
 

@@ -28,8 +28,8 @@ import numpy as np
 from hw.rigid import looking_rotation, rigid, rotation_matrix
 from hw.scene import Scene
 from hw.shapes import Bool, Float
-from jaxcal.errors import InputError
-from jaxcal.probe import L14_5, LinearProbe
+from jaxcal import InputError
+from jaxcal.data.probe import L14_5, LinearProbe
 
 FULL_SCALE = 4095
 """Largest amplitude that the electronics' 12-bit converter tells, counts."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.shapes import Float
-from jaxcal.errors import InputError
+from jaxcal import InputError
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import numpy as np
 
 from hw.midplane.pattern_injection import LONGEST, Decision, View, middle_of, sides_seen
 from hw.midplane.terminal_image import COLUMNS, ROWS, Screen, picture
-from jaxcal.errors import InputError
+from jaxcal import InputError
 
 _LEAST_STEP_MM, _LARGEST_STEP_MM = 0.02, 1.0
 _REFRESH_S = 0.25

@@ -23,7 +23,7 @@ from hw.errors import DeviceError
 from hw.midplane.bracket import Placement
 from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
 from hw.shapes import UInt8
-from jaxcal.errors import InputError
+from jaxcal import InputError
 
 LONGEST = 31
 """Lines that the longest bar covers; also the number of lengths an operator can tell apart."""

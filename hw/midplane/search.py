@@ -21,7 +21,7 @@ import numpy as np
 from hw.errors import Device, DeviceError
 from hw.midplane.bracket import Placement, widened
 from hw.shapes import Bool, Float
-from jaxcal.errors import InputError
+from jaxcal import InputError
 
 _TOP_LINES = 8
 _ANSWERING_LINES = 4

@@ -7,11 +7,11 @@ import os
 import subprocess
 import sys
 
-from jaxcal.isolated import python_command
+from jaxcal.runtime.isolated import python_command
 
 
 def spawn(module: str, *arguments: str, stdin: bool = False) -> subprocess.Popen[bytes]:
-    """Start a module in an isolated interpreter (:mod:`jaxcal.isolated`); its output is a pipe.
+    """Start a module in an isolated interpreter (:mod:`jaxcal.runtime.isolated`), output piped.
 
     A fresh interpreter rather than a fork: a fork of a process with threads (JAX has many) may
     deadlock. It leads its own process group, so that Ctrl-C reaches only the parent, which then

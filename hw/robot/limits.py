@@ -22,7 +22,7 @@ import numpy as np
 from hw.errors import RefusedError
 from hw.robot.kinematics import model_named
 from hw.shapes import Float
-from jaxcal.errors import FormatError
+from jaxcal import FormatError
 from jaxcal.io.toml import load_toml
 
 _VECTORS = {

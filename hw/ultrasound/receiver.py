@@ -29,7 +29,7 @@ PORT = 18944
 _CONNECT_TIMEOUT_S = 5.0
 _POLL_S = 0.05
 _CHUNK = 1 << 18
-# As jaxcal.geometry takes it; that module would bring JAX into a process that only receives.
+# As jaxcal.data.geometry takes it; that module would bring JAX into a process that only receives.
 _ROTATION_TOLERANCE = 1e-2
 _QUEUE_BYTES = 256 << 20
 _FRAMES = re.compile(r"(?P<source>.+)To(?P<target>[A-Z].*)")

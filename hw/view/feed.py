@@ -27,9 +27,9 @@ from hw.midplane.bracket import Placement
 from hw.robot.safety import MotionPlan
 from hw.session import Session
 from hw.setup import Setup
-from jaxcal.calibration import Calibration
-from jaxcal.errors import InputError
-from jaxcal.isolated import python_command
+from jaxcal import InputError
+from jaxcal.calibration.result import Calibration
+from jaxcal.runtime.isolated import python_command
 
 RATE_HZ = 10.0
 _START_WALL_S = 30.0

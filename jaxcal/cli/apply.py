@@ -7,8 +7,8 @@ import io
 
 import click
 
+from jaxcal import InputError
 from jaxcal.cli.common import NOT_NEGATIVE, ExitCode
-from jaxcal.errors import InputError
 
 _COLUMNS = ("x_mm", "y_mm", "z_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm", "cov_xy_mm2", "cov_xz_mm2",
             "cov_yz_mm2")  # fmt: skip
@@ -54,9 +54,9 @@ def apply(
     """
     import numpy as np
 
+    from jaxcal.calibration.transform import load_calibration
     from jaxcal.cli.export import check_usable
     from jaxcal.io.atomic import write_text
-    from jaxcal.transform import load_calibration
 
     if (source is None) == (not pixel):
         raise click.UsageError("name SOURCE, or points by --pixel U V")

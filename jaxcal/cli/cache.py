@@ -1,8 +1,8 @@
 """``jaxcal cache``: compiled programs kept between runs, in the user's own cache folder.
 
 A calibration takes milliseconds and its compilation seconds, so the second run is much faster.
-:mod:`jaxcal.program_cache` says what is kept, and when it is trusted. ``JAXCAL_NO_CACHE=1`` turns
-it off.
+:mod:`jaxcal.runtime.program_cache` says what is kept, and when it is trusted. ``JAXCAL_NO_CACHE=1``
+turns it off.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from jaxcal import program_cache
+from jaxcal import InputError, OutputError
 from jaxcal.cli.common import ExitCode, print_json, print_page, progress
-from jaxcal.errors import InputError, OutputError
-from jaxcal.when_jax import when_jax_is_imported
+from jaxcal.runtime import program_cache
+from jaxcal.runtime.when_jax import when_jax_is_imported
 
 if TYPE_CHECKING:
-    from jaxcal.problem import Problem
+    from jaxcal.data.problem import Problem
 
 KEPT_PROGRAMS = 256
 """Newest programs of JAX's own cache to keep; one is about 0.4 MB."""
@@ -109,9 +109,9 @@ def warm(
         program_cache.private_folder()
     except (OSError, RuntimeError) as error:
         raise OutputError(f"the cache cannot be used: {error}") from error
-    from jaxcal.buckets import size
+    from jaxcal.calibration.calibrate import calibrate
     from jaxcal.cli.calibrate import unknowns
-    from jaxcal.solve import calibrate
+    from jaxcal.runtime.buckets import size
 
     names = unknowns(estimate)
     like = _problem(recording, "scale" in names)
@@ -164,7 +164,7 @@ def _ago(seconds: float) -> str:
 
 def _problem(recording: str | None, pixels: bool) -> Problem:
     """A problem of the kind to prepare for; what it measured does not matter."""
-    from jaxcal.problem import Problem
+    from jaxcal.data.problem import Problem
 
     if recording is not None:
         from jaxcal.io.hdf5 import load
@@ -182,13 +182,13 @@ def _problem(recording: str | None, pixels: bool) -> Problem:
 
 def _repeated(problem: Problem, count: int) -> Problem:
     """As many images as that: the first ones over and over."""
-    from jaxcal import buckets
+    from jaxcal.runtime import buckets
 
     return buckets.taken(problem, [k % problem.images for k in range(count)])
 
 
 def enable_compilation_cache() -> None:
-    """Let JAX keep what :mod:`jaxcal.executables` does not; silently without where it cannot be.
+    """Let JAX keep what :mod:`jaxcal.runtime.executables` does not; without a word if it cannot.
 
     Done when JAX is imported, which not every calibration needs.
 

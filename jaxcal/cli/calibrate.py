@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from jaxcal import InputError
 from jaxcal.cli.common import (
     POSITIVE,
     import_engine,
@@ -19,11 +20,10 @@ from jaxcal.cli.common import (
     progress,
     verdict_code,
 )
-from jaxcal.errors import InputError
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
-    from jaxcal.recording import Recording
+    from jaxcal.calibration.result import Calibration
+    from jaxcal.data.recording import Recording
     from jaxcal.report.convergence import Curve
 
 Method = Literal["joint", "alternating", "conventional"]
@@ -266,8 +266,8 @@ def _export(record: dict[str, Any], recording: str, targets: list[tuple[str, str
     """Write the transform for other programs; nothing of a calibration that did not converge."""
     if not targets:
         return []
+    from jaxcal.calibration.transform import transform_from_record
     from jaxcal.cli.export import patched
-    from jaxcal.transform import transform_from_record
 
     if not record["converged"] or record["wrong_frames"]:
         return ["exported: nothing, since the calibration is not to be used"]
@@ -293,7 +293,7 @@ def _segmented(recording: Recording) -> tuple[Recording, list[str]]:
             f"{recording.source}: the test images hold times of flight beside other calibration "
             "images: segment them first"
         )
-    from jaxcal.segmentation.segment import segment_recording
+    from jaxcal.data.segmentation.segment import segment_recording
 
     segmented, found = segment_recording(recording)
     return segmented, list(found.warnings)
@@ -353,8 +353,8 @@ def unknowns(estimate: str | None) -> tuple[str, ...]:
 
 
 def _solve(recording: Recording, request: _Request, *, traced: bool) -> Calibration:
-    from jaxcal.options import Options
-    from jaxcal.solve import calibrate as solve
+    from jaxcal.calibration.calibrate import calibrate as solve
+    from jaxcal.calibration.options import Options
 
     kept = 0
     if traced:
@@ -387,7 +387,7 @@ def _first_answer(
             show(f"{words} {doing}: {record.getMessage()} ...")
 
     # What executables says of compiling, and nothing else of it.
-    log, handler = logging.getLogger("jaxcal.executables"), Compiling(logging.INFO)
+    log, handler = logging.getLogger("jaxcal.runtime.executables"), Compiling(logging.INFO)
     level = log.level
     log.addHandler(handler)
     log.setLevel(min(level or logging.INFO, logging.INFO))
@@ -400,7 +400,7 @@ def _first_answer(
 
 def _arguments(request: _Request) -> dict[str, Any]:
     """The request as the arguments of :func:`jaxcal.calibrate`."""
-    from jaxcal.options import Options
+    from jaxcal.calibration.options import Options
 
     return {
         "method": request.method,
@@ -422,8 +422,8 @@ def _resampled(
     draws: int | None,
 ) -> dict[str, Any]:
     """What cross-validation and bootstrap add to the record."""
-    from jaxcal import resampling
-    from jaxcal.problem import Problem
+    from jaxcal.calibration.result import resampling
+    from jaxcal.data.problem import Problem
     from jaxcal.report.resampled import bootstrap_record, cross_validation_record
 
     found: dict[str, Any] = {}
@@ -442,7 +442,7 @@ def _resampled(
 
 
 def _curves(recording: Recording, request: _Request, result: Calibration) -> list[Curve]:
-    from jaxcal.problem import Problem
+    from jaxcal.data.problem import Problem
     from jaxcal.report.convergence import bounded_curves, own_curve
 
     if request.method == "conventional":

@@ -135,7 +135,7 @@ def import_engine() -> None:
         os._exit(ExitCode.INTERRUPTED)
 
     def load() -> None:
-        importlib.import_module("jaxcal.solve")
+        importlib.import_module("jaxcal.calibration.calibrate")
         importlib.import_module("jaxcal.io.hdf5")
 
     # Python handles signals in its main thread only, and there only if nobody took them over.

@@ -13,8 +13,8 @@ from jaxcal.cli.common import exit_code, import_engine, print_json, print_page, 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from jaxcal.calibration import Calibration
-    from jaxcal.recording import Recording
+    from jaxcal.calibration.result import Calibration
+    from jaxcal.data.recording import Recording
 
 Method = Literal["joint", "alternating", "conventional"]
 _METHODS: tuple[Method, ...] = ("conventional", "alternating", "joint")
@@ -43,7 +43,7 @@ def demo(out: str | None, seed: int, as_json: bool) -> int:
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.report.record import calibration_record
     from jaxcal.report.write import prepare_folder
-    from jaxcal.simulation import Protocol, simulate_recording
+    from jaxcal.study.simulation import Protocol, simulate_recording
 
     with nullcontext() if out is None else prepare_folder(out) as folder:
         enable_compilation_cache()
@@ -69,8 +69,8 @@ def _solve(recording: Recording, method: Method) -> tuple[Calibration, float]:
     """A calibration, and the milliseconds that it takes once it is compiled."""
     import jax
 
-    from jaxcal.problem import Problem
-    from jaxcal.solve import calibrate
+    from jaxcal.calibration.calibrate import calibrate
+    from jaxcal.data.problem import Problem
 
     problem = Problem.from_recording(recording)
     result = jax.block_until_ready(calibrate(problem, method))
@@ -89,8 +89,8 @@ def _write(
     recording: Recording,
 ) -> None:
     """The report of the joint calibration, all three records, and the recording itself."""
+    from jaxcal.data.problem import Problem
     from jaxcal.io.hdf5 import save
-    from jaxcal.problem import Problem
     from jaxcal.report.convergence import bounded_curves
     from jaxcal.report.write import write_json, write_report
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import click
 
+from jaxcal import InputError
 from jaxcal.cli.common import POSITIVE, ExitCode
-from jaxcal.errors import InputError
 
 if TYPE_CHECKING:
-    from jaxcal.transform import ImageTransform, SaveFormat
+    from jaxcal.calibration.transform import ImageTransform, SaveFormat
 
 _TEXTS = {
     "plus": "PLUS's <Transform> to paste into CoordinateDefinitions.",
@@ -85,7 +85,7 @@ def export(
         raise click.UsageError("--plus-server writes no file: leave OUT out")
     if origin is not None and pixel_size is None:
         raise click.BadParameter("needs --pixel-size", param_hint="--origin")
-    from jaxcal.transform import load_calibration
+    from jaxcal.calibration.transform import load_calibration
 
     transform = load_calibration(calibration)
     check_usable(transform)
@@ -134,7 +134,7 @@ def patched(
 
 def sent(transform: ImageTransform, server: str, frames: tuple[str, str]) -> str:
     """Set a transform in a running PlusServer; what was done."""
-    from jaxcal.plus_server import PORT, update_transform
+    from jaxcal.io.plus_server import PORT, update_transform
 
     host, colon, text = server.rpartition(":") if server.count(":") == 1 else (server, "", "")
     if colon and not (text.isdigit() and 0 < int(text) < 65536):

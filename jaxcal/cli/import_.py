@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
+from jaxcal import InputError
 from jaxcal.cli.common import POSITIVE, ExitCode, progress
-from jaxcal.errors import InputError
 
 
 @click.command("import")
@@ -84,8 +84,8 @@ def import_(sources: tuple[str, ...], out: str, **options: Any) -> int:
     image) and POINTS (a row "u v" in pixels). docs/reference/formats.md says what each must hold.
     """
     _check(sources, out, options)
-    from jaxcal.importing import ImportOptions, import_files
     from jaxcal.io.hdf5 import save
+    from jaxcal.io.importing import ImportOptions, import_files
 
     with progress("importing"):
         recording, notes = import_files(sources, ImportOptions(**options))

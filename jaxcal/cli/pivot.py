@@ -9,7 +9,7 @@ import click
 from jaxcal.cli.common import exit_code, import_engine, print_json, print_page, progress
 
 if TYPE_CHECKING:
-    from jaxcal.pivot import Pivot
+    from jaxcal.calibration.pivot import Pivot
 
 
 @click.command()
@@ -23,9 +23,9 @@ def pivot(poses: str, no_robust: bool, as_json: bool) -> int:
     matrix row by row (12 or 16 numbers). Poses that do not fit the rest are left out and named.
     """
     import_engine()
+    from jaxcal.calibration.pivot import calibrate_pivot
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.io.text import read_poses
-    from jaxcal.pivot import calibrate_pivot
 
     measured = read_poses(poses)
     enable_compilation_cache()
@@ -41,8 +41,8 @@ def pivot(poses: str, no_robust: bool, as_json: bool) -> int:
 def _record(result: Pivot) -> dict[str, Any]:
     import numpy as np
 
+    from jaxcal.calibration.pivot import AXES
     from jaxcal.diagnostics import messages
-    from jaxcal.pivot import AXES
     from jaxcal.report.record import plain
 
     mask, covariance = np.asarray(result.mask), np.asarray(result.covariance)

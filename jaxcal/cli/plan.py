@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from jaxcal import InputError
 from jaxcal.cli.calibrate import _segmented, unknowns
 from jaxcal.cli.common import (
     NOT_NEGATIVE,
@@ -17,7 +18,6 @@ from jaxcal.cli.common import (
     print_page,
     progress,
 )
-from jaxcal.errors import InputError
 
 if TYPE_CHECKING:
     from jaxcal.design import Candidates, Plan
@@ -127,8 +127,8 @@ def plan(
 
 
 def _region(probe: str, depth: tuple[float, float] | None, lateral: float | None) -> Region:
+    from jaxcal.data.probe import PRESETS
     from jaxcal.design import Region
-    from jaxcal.probe import PRESETS
 
     across = None if lateral is None else (-lateral, lateral)
     return Region.of_probe(PRESETS[probe], depth or (15.0, 82.0), across)
@@ -143,7 +143,7 @@ def _from_nothing(
     seed: int,
 ) -> Candidates:
     from jaxcal import design
-    from jaxcal.probe import PRESETS
+    from jaxcal.data.probe import PRESETS
 
     transducer = PRESETS[probe]
     region = design.Region.of_probe(transducer) if region is None else region
@@ -166,8 +166,8 @@ def _from_recording(
     seed: int,
 ) -> tuple[Any, Candidates]:
     from jaxcal import design
+    from jaxcal.calibration.calibrate import calibrate
     from jaxcal.io.hdf5 import load
-    from jaxcal.solve import calibrate
 
     measured, _ = _segmented(load(path))
     with progress("calibrating"):

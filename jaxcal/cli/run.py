@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import click
 
+from jaxcal import CalibrationError
 from jaxcal.cli.common import ExitCode
-from jaxcal.errors import CalibrationError
 
 
 def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None) -> int:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from jaxcal import InputError
 from jaxcal.cli.common import (
     POSITIVE,
     ExitCode,
@@ -16,12 +17,11 @@ from jaxcal.cli.common import (
     print_page,
     progress,
 )
-from jaxcal.errors import InputError
 
 if TYPE_CHECKING:
-    from jaxcal.probe import Probe
-    from jaxcal.recording import Recording
-    from jaxcal.segmentation.segment import Segmentation
+    from jaxcal.data.probe import Probe
+    from jaxcal.data.recording import Recording
+    from jaxcal.data.segmentation.segment import Segmentation
 
 
 @click.command()
@@ -92,8 +92,8 @@ def segment(
         raise InputError("--sound-speed and --temperature exclude each other")
     import_engine()
     from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.data.segmentation.segment import segment_recording
     from jaxcal.io.hdf5 import load, save
-    from jaxcal.segmentation.segment import segment_recording
 
     data = load(recording)
     probe = _probe(data, sound_speed, temperature)
@@ -116,7 +116,7 @@ def segment(
 
 
 def _probe(data: Recording, sound_speed: float | None, temperature: float | None) -> Probe | None:
-    from jaxcal.sound import sound_speed_in_water
+    from jaxcal.data.sound import sound_speed_in_water
 
     if temperature is not None:
         sound_speed = float(sound_speed_in_water(temperature))

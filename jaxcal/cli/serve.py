@@ -26,9 +26,9 @@ def serve(calibration: str, host: str, port: int, rate: float, name: str) -> int
     In Slicer: OpenIGTLinkIF, a connector as client to this host and port. The matrix is PLUS's
     ImageToProbe, with the pixel size in it: leave the image's own spacing at 1.
     """
+    from jaxcal.calibration.transform import load_calibration
     from jaxcal.cli.export import check_usable
-    from jaxcal.serving import TransformServer
-    from jaxcal.transform import load_calibration
+    from jaxcal.io.serving import TransformServer
 
     transform = load_calibration(calibration)
     check_usable(transform)

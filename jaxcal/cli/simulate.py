@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import click
 
+from jaxcal import InputError
 from jaxcal.cli.common import NOT_NEGATIVE, POSITIVE, ExitCode, import_engine, progress
-from jaxcal.errors import InputError
 
 
 @click.command()
@@ -77,9 +77,9 @@ def simulate(
         raise InputError("--clock-mhz rounds times of flight: it needs --raw")
     import_engine()
     from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.data.probe import PRESETS
     from jaxcal.io.hdf5 import save
-    from jaxcal.probe import PRESETS
-    from jaxcal.simulation import Protocol, simulate_recording
+    from jaxcal.study.simulation import Protocol, simulate_recording
 
     protocol = Protocol(
         images=images,

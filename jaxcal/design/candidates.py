@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.array_types import Float
+from jaxcal import InputError
+from jaxcal.data.poses import check_poses, nearest_rotations
+from jaxcal.data.probe import Probe
 from jaxcal.design.constraints import Constraints, Region
 from jaxcal.design.information import Model
 from jaxcal.design.noise import Noise
-from jaxcal.errors import InputError
-from jaxcal.poses import check_poses, nearest_rotations
-from jaxcal.probe import Probe
+from jaxcal.runtime.array_types import Float
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
-    from jaxcal.recording import Recording
+    from jaxcal.calibration.result import Calibration
+    from jaxcal.data.recording import Recording
 
 COUNT = 5000
 """Candidates of a plan; twice as many change the predicted error by less than 1 %."""

@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.array_types import Bool, Float
-from jaxcal.errors import InputError
-from jaxcal.poses import rotations_from_vectors
-from jaxcal.probe import CurvilinearProbe, Probe
+from jaxcal import InputError
+from jaxcal.data.poses import rotations_from_vectors
+from jaxcal.data.probe import CurvilinearProbe, Probe
+from jaxcal.runtime.array_types import Bool, Float
 
 _INSIDE = 1e-9
 """Rounding that is not outside."""

@@ -1,8 +1,8 @@
 """What a plan is for: the weight matrices W, and what a further pose gains.
 
 TRE. At an image point p the error of X Exp(d) p is J_p d with J_p = [I, -[p]x] (mm) and, where the
-pixel scales are unknown, two columns more (:mod:`jaxcal.image_points`), so its mean square over an
-image region is tr(W S), W = mean of J_p'J_p.
+pixel scales are unknown, two columns more (:mod:`jaxcal.diagnostics.image_points`), so its mean
+square over an image region is tr(W S), W = mean of J_p'J_p.
 
 RP (Eq. 8). The reconstructed points B_i X p_i scatter by J_i d about their mean, J_i = R_i R_X J_p;
 the expected square is tr(W S), W = sum_i (J_i - mean J)'(J_i - mean J) / (n - 1) over the test set.
@@ -25,9 +25,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from jaxcal.array_types import AnyArray, Array, Float
+from jaxcal import InputError
 from jaxcal.design.information import Model
-from jaxcal.errors import InputError
+from jaxcal.runtime.array_types import AnyArray, Array, Float
 
 Criterion = Literal["tre", "rp", "d"]
 _PIECE = 800

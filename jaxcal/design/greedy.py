@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxcal.array_types import Bool, Float
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import gains
 from jaxcal.design.information import covariance_of
+from jaxcal.runtime.array_types import Bool, Float
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.array_types import Float
+from jaxcal import InputError
 from jaxcal.design.noise import Noise
-from jaxcal.errors import InputError
 from jaxcal.model.blocks import RIGID, block_slice
+from jaxcal.runtime.array_types import Float
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
 
 BELIEVED_SD = (50.0, 0.5, 50.0, 0.3)
 """What is believed before any image (ours): SDs of X's translation (mm) and rotation (rad), of the

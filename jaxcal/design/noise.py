@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.array_types import Float
-from jaxcal.errors import InputError
-from jaxcal.probe import Probe
+from jaxcal import InputError
+from jaxcal.data.probe import Probe
+from jaxcal.runtime.array_types import Float
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
 
 FEWEST_TO_LEARN = 20
 """Images from which on SDs are learned as functions of the place."""

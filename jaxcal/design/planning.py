@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.array_types import Bool, Float
+from jaxcal import InputError
+from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import (
     Criterion,
@@ -26,11 +27,10 @@ from jaxcal.design.information import (
 )
 from jaxcal.design.noise import Noise
 from jaxcal.diagnostics.messages import direction_in_words
-from jaxcal.errors import InputError
-from jaxcal.recording import MINIMUM_IMAGES
+from jaxcal.runtime.array_types import Bool, Float
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
 
 MOST_POSES = 2000
 _SINGULAR = 1e-10
@@ -207,7 +207,7 @@ def known_before(
 
 def with_effective_noise(prior: object, candidates: Candidates) -> Candidates:
     """Candidates whose elevational SD is what the calibration got out of its images."""
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
 
     if not isinstance(prior, Calibration) or candidates.taken is None:
         return candidates

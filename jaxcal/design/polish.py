@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxcal.data.geometry import matrix_from_rotation, rotation_from_vector
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.constraints import Region
 from jaxcal.design.greedy import Chosen, Search, are_alike
 from jaxcal.design.information import Model, covariance_of
 from jaxcal.design.noise import Noise
-from jaxcal.geometry import matrix_from_rotation, rotation_from_vector
-from jaxcal.precision import in_own_modes
+from jaxcal.runtime.precision import in_own_modes
 
 _STEPS = 8
 _HALVINGS = 5

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.array_types import Float
+from jaxcal import InputError
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import rp_weight, tre_weight
 from jaxcal.design.information import covariance_of
-from jaxcal.errors import InputError
+from jaxcal.runtime.array_types import Float
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
     from jaxcal.design.planning import Known, Plan
 
 MOST_IMAGES = 1000

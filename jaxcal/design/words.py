@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxcal.array_types import Float
 from jaxcal.design.constraints import Constraints
+from jaxcal.runtime.array_types import Float
 
 _LEAST_TILT_DEG, _LEAST_TURN_DEG = 3.0, 5.0
 _DIAGONAL = float(np.tan(np.radians(67.5)))

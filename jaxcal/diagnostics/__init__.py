@@ -8,5 +8,6 @@
     intervals        confidence intervals and target registration error
     metrics          reconstruction precision, reproducibility, residual RMS
 
-A solve itself leaves X, target, offsets, SDs, covariance and status (:mod:`jaxcal.answer`).
+A solve itself leaves X, target, offsets, SDs, covariance and status
+(:mod:`jaxcal.calibration.answer`).
 """

@@ -34,7 +34,7 @@ def traceable(function: Callable[P, T]) -> Callable[P, T]:
     def in_standard_modes(*args: P.args, **kwargs: P.kwargs) -> T:
         if not is_traced(args, kwargs):
             return function(*args, **kwargs)
-        from jaxcal.precision import own_modes
+        from jaxcal.runtime.precision import own_modes
 
         with own_modes(bits_too=False):
             return function(*args, **kwargs)

@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.array_types import Float
+from jaxcal.data.sound import WATER_M_S
 from jaxcal.model.blocks import block_slice, size
-from jaxcal.sound import WATER_M_S
+from jaxcal.runtime.array_types import Float
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
+    from jaxcal.data.problem import Problem
     from jaxcal.model.blocks import Blocks
-    from jaxcal.problem import Problem
 
 Array = np.ndarray
 

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.array_types import Bool, Float, Int
+from jaxcal import CalibrationError
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns, channel_rows
 from jaxcal.diagnostics.uncertainty import (
     TUNED,
@@ -36,13 +36,13 @@ from jaxcal.diagnostics.uncertainty import (
     own_covariance,
     quadratic,
 )
-from jaxcal.errors import CalibrationError
-from jaxcal.trees import map_arrays
+from jaxcal.runtime.array_types import Bool, Float, Int
+from jaxcal.runtime.trees import map_arrays
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
+    from jaxcal.data.problem import Problem
     from jaxcal.model.blocks import Blocks
-    from jaxcal.problem import Problem
 
 Array = np.ndarray
 

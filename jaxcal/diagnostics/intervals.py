@@ -7,8 +7,8 @@ third each. It is the usual small-sample approximation, and nothing more.
 
 The target registration error (TRE) at an image point is the distance between where the estimated
 and the true calibration put it. To first order it is |J d| with d ~ N(0, C), C the covariance of
-all unknowns that move the point and J its derivatives by them (:mod:`jaxcal.image_points`); its
-root mean square is sqrt(trace(J C J')).
+all unknowns that move the point and J its derivatives by them
+(:mod:`jaxcal.diagnostics.image_points`); its root mean square is sqrt(trace(J C J')).
 
 Its distribution: with J C J' = L L', d = L u rho for a uniformly distributed direction u, and rho^2
 is chi squared, or with SDs that were tuned k F(k, nu). So
@@ -31,16 +31,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import special
 
-from jaxcal.array_types import AnyArray, Float
+from jaxcal import InputError
+from jaxcal.data.sound import WATER_M_S
 from jaxcal.diagnostics.arrays import array_module, traceable
+from jaxcal.diagnostics.image_points import image_rows, point_jacobian
 from jaxcal.diagnostics.uncertainty import TUNED
-from jaxcal.errors import InputError
-from jaxcal.image_points import image_rows, point_jacobian
 from jaxcal.model.blocks import size
-from jaxcal.sound import WATER_M_S
+from jaxcal.runtime.array_types import AnyArray, Float
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
 
 DIRECTIONS = 1024
 """Directions over which the distribution of an error is averaged. Quantiles are right to 0.5 %,

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Protocol, TypedDict, runtime_checkable
 
 import numpy as np
 
-from jaxcal.array_types import AnyArray
 from jaxcal.diagnostics.offset_fit import contradicted
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK, MISFITS
 from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.model.blocks import BLOCK_SIZE
 from jaxcal.model.distributions import FAMILIES
+from jaxcal.runtime.array_types import AnyArray
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
 
 
 class OutlierReason(TypedDict):

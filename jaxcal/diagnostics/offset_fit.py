@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 
-from jaxcal.array_types import Float
+from jaxcal.runtime.array_types import Float
 
 CONTRADICTED: dict[str, float] = {"uniform": 1.25, "bell": 1.25, "gaussian": 1.25, "student": 1.9}
 """For each family of :data:`jaxcal.model.shapes.FAMILIES`."""

@@ -23,16 +23,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.array_types import Bool, Float
 from jaxcal.diagnostics.uncertainty import TUNED, Uncertainty, Whitened, inverses, quadratic
 from jaxcal.model.blocks import block_slice
 from jaxcal.model.outliers import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
+from jaxcal.runtime.array_types import Bool, Float
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
+    from jaxcal.data.problem import Problem
     from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
     from jaxcal.model.blocks import Blocks
-    from jaxcal.problem import Problem
 
 Array = np.ndarray
 

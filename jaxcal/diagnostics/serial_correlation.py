@@ -25,13 +25,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.array_types import Float
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.uncertainty import TUNED, Whitened
-from jaxcal.trees import map_arrays
+from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.trees import map_arrays
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
 
 CHANCE = 2.1
 """SDs that the correlation of successive residuals must exceed to be believed."""

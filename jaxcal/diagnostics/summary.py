@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.array_types import Float
+from jaxcal import CalibrationError
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.residual_checks import Inspection, inspect
 from jaxcal.diagnostics.uncertainty import assess
-from jaxcal.errors import CalibrationError
-from jaxcal.trees import map_arrays
+from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.trees import map_arrays
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
 
 Array = np.ndarray
 

@@ -1,10 +1,10 @@
 """How certain an answer is, and which directions the data do not see.
 
-The information S of the shared unknowns (:class:`jaxcal.calibration.Linearisation`) tells how well
-each direction is known: eigenvectors with small eigenvalues are directions that the images barely
-determine. To compare mm with rad and log units, rotations, scales and sound speed are multiplied by
-the lever arm, the root mean square distance of the measured points from the image origin: all are
-then mm at the target.
+The information S of the shared unknowns (:class:`jaxcal.calibration.result.Linearisation`) tells
+how well each direction is known: eigenvectors with small eigenvalues are directions that the images
+barely determine. To compare mm with rad and log units, rotations, scales and sound speed are
+multiplied by the lever arm, the root mean square distance of the measured points from the image
+origin: all are then mm at the target.
 
 An offset that is an unknown of its own (bounded, or beside a tracker that errs) was eliminated from
 S. With k_i the derivative of image i's residuals by it, J_i that by the shared unknowns, D_i =
@@ -20,17 +20,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.array_types import AnyArray, Bool, Float
+from jaxcal.calibration.options import DEFAULT_MAX_ELEVATION_MM
 from jaxcal.diagnostics.arrays import array_module
 from jaxcal.model.blocks import BLOCK_SIZE, block_slice
 from jaxcal.model.thresholds import LARGEST_ELEVATION
-from jaxcal.options import DEFAULT_MAX_ELEVATION_MM
+from jaxcal.runtime.array_types import AnyArray, Bool, Float
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.result import Calibration
+    from jaxcal.data.problem import Problem
     from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
     from jaxcal.model.blocks import Blocks
-    from jaxcal.problem import Problem
 
 Array = np.ndarray
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from jaxcal.errors import CalibrationError, OutputError
+from jaxcal import CalibrationError, OutputError
 
 
 @contextmanager

@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from jaxcal.errors import FormatError
+from jaxcal import FormatError
+from jaxcal.data.poses import QuaternionOrder
 from jaxcal.io.readable import quoted
-from jaxcal.poses import QuaternionOrder
 
 LENGTHS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 TIMES_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6}

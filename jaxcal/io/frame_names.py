@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from jaxcal.errors import FormatError
+from jaxcal import FormatError
 from jaxcal.io.readable import quoted
 
 FramePair = tuple[str, str]

@@ -28,7 +28,18 @@ from typing import TYPE_CHECKING
 import h5py
 import numpy as np
 
-from jaxcal.errors import FormatError, InputError
+from jaxcal import FormatError, InputError
+from jaxcal.data.poses import check_poses
+from jaxcal.data.probe import CurvilinearProbe, LinearProbe, Probe
+from jaxcal.data.recording import (
+    MINIMUM_IMAGES,
+    Images,
+    Kind,
+    Recording,
+    Truth,
+    make_images,
+    unit_of,
+)
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.readable import check_readable, quoted
 from jaxcal.io.untrusted import (
@@ -43,12 +54,9 @@ from jaxcal.io.untrusted import (
     open_root,
     text,
 )
-from jaxcal.poses import check_poses
-from jaxcal.probe import CurvilinearProbe, LinearProbe, Probe
-from jaxcal.recording import MINIMUM_IMAGES, Images, Kind, Recording, Truth, make_images, unit_of
 
 if TYPE_CHECKING:
-    from jaxcal.segmentation.segment import Segmentation
+    from jaxcal.data.segmentation.segment import Segmentation
 
 FORMAT = "jaxcal-recording"
 VERSION = 1
@@ -99,7 +107,7 @@ def save(
 
     Raises:
         InputError: the recording is one that ``load`` would refuse (its arrays were not checked by
-            :func:`jaxcal.recording.make_images`, or are too large).
+            :func:`jaxcal.data.recording.make_images`, or are too large).
         OutputError: the file could not be written; it is as it was.
     """
     # Built in memory: HDF5 takes a full disk badly, an ordinary write reports it.

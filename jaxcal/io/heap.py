@@ -21,7 +21,7 @@ import os
 import struct
 from typing import Any
 
-from jaxcal.errors import FormatError
+from jaxcal import FormatError
 
 _LARGEST_HEAP = 2**26
 _MOST_BYTES = 2**28

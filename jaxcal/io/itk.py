@@ -14,12 +14,12 @@ import h5py
 import numpy as np
 from h5py import h5d, h5t  # pyright: ignore[reportAttributeAccessIssue]
 
-from jaxcal.array_types import Float
-from jaxcal.errors import FormatError, InputError
+from jaxcal import FormatError, InputError
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.lines import text_lines
 from jaxcal.io.readable import check_readable, naming, one_line, quoted
 from jaxcal.io.untrusted import Node, array, child, group, open_root
+from jaxcal.runtime.array_types import Float
 
 _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 _KIND = "AffineTransform_double_3_3"

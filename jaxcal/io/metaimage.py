@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxcal.errors import FormatError
+from jaxcal import FormatError
 from jaxcal.io.readable import check_readable, quoted
 from jaxcal.io.sequence import Pixels, TrackedSequence
 from jaxcal.io.sequence_header import (

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxcal.errors import FormatError
+from jaxcal import FormatError
 from jaxcal.io.pixel_stream import Packing
 from jaxcal.io.readable import quoted
 from jaxcal.io.sequence import Pixels, TrackedSequence

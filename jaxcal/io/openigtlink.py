@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from fastcrc import crc64
 
-from jaxcal.array_types import Float, Int16, UInt8
+from jaxcal.runtime.array_types import Float, Int16, UInt8
 
 HEADER_SIZE = 58
 RF_DEVICE = "RF"

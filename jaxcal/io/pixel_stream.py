@@ -7,7 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal
 
-from jaxcal.errors import FormatError
+from jaxcal import FormatError
 from jaxcal.io.readable import one_line
 
 Packing = Literal["raw", "zlib", "gzip"]

@@ -17,12 +17,12 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from jaxcal.array_types import Float
-from jaxcal.errors import FormatError, InputError
+from jaxcal import FormatError, InputError
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.frame_names import FramePair, capitalised, check_frame, path_between, split_name
 from jaxcal.io.readable import quoted
 from jaxcal.io.xml import Element, parse_xml, read_xml
+from jaxcal.runtime.array_types import Float
 
 _ROOT = "PlusConfiguration"
 _COORDINATES = "CoordinateDefinitions"

@@ -7,7 +7,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from jaxcal.errors import FormatError, InputError
+from jaxcal import FormatError, InputError
 
 
 def check_readable(path: str | os.PathLike[str], *, maximum_bytes: int | None = None) -> None:

@@ -13,12 +13,12 @@ from typing import Literal
 
 import numpy as np
 
-from jaxcal.array_types import Bool, Float
-from jaxcal.errors import FormatError, InputError
+from jaxcal import FormatError, InputError
+from jaxcal.data.poses import check_poses, inverse_poses
 from jaxcal.io.frame_names import FramePair, path_between
 from jaxcal.io.pixel_stream import Packing, PixelStream
 from jaxcal.io.readable import quoted
-from jaxcal.poses import check_poses, inverse_poses
+from jaxcal.runtime.array_types import Bool, Float
 
 Orientation = Literal["MF", "UF", "MN", "UN"]
 """Of pixels as they are stored: M or U, the marked or the unmarked side at the end of a row; F or

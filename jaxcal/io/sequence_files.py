@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxcal.errors import FormatError, InputError
+from jaxcal import FormatError, InputError
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.metaimage import metaimage_header, read_metaimage

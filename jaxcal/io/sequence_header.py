@@ -19,12 +19,12 @@ from typing import cast
 
 import numpy as np
 
-from jaxcal.array_types import Float
-from jaxcal.errors import FormatError, InputError
+from jaxcal import FormatError, InputError
 from jaxcal.io.frame_names import FramePair, check_frame, split_name
 from jaxcal.io.pixel_stream import Packing, PixelStream
 from jaxcal.io.readable import one_line, quoted
 from jaxcal.io.sequence import Orientation, Pixels, TrackedSequence
+from jaxcal.runtime.array_types import Float
 
 MAXIMUM_HEADER = 64 * 2**20
 """Largest header, bytes: some 60,000 frames."""

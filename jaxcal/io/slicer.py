@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.array_types import Float
-from jaxcal.errors import FormatError
+from jaxcal import FormatError
 from jaxcal.io.lines import text_lines
 from jaxcal.io.readable import check_readable, naming, one_line, quoted
+from jaxcal.runtime.array_types import Float
 
 MAXIMUM_BYTES = 16 * 2**20
 MOST_POINTS = 100_000

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxcal.array_types import Float
-from jaxcal.errors import FormatError
+from jaxcal import FormatError
 from jaxcal.io.lines import text_lines
 from jaxcal.io.readable import quoted
+from jaxcal.runtime.array_types import Float
 
 _NUMBER = re.compile(
     r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.I

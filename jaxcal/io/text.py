@@ -13,13 +13,13 @@ from typing import Literal
 
 import numpy as np
 
-from jaxcal.array_types import Float, Int
-from jaxcal.errors import FormatError, InputError
+from jaxcal import FormatError, InputError
+from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quaternions
+from jaxcal.data.recording import Recording, make_images
 from jaxcal.io.columns import LENGTHS_MM, Columns, columns_of_header
 from jaxcal.io.readable import naming, quoted
 from jaxcal.io.table import Table, read_table
-from jaxcal.poses import QuaternionOrder, check_poses, rotations_from_quaternions
-from jaxcal.recording import Recording, make_images
+from jaxcal.runtime.array_types import Float, Int
 
 LengthUnit = Literal["mm", "cm", "m"]
 
@@ -132,7 +132,7 @@ def read_csv(
     Raises:
         FormatError: a file, a header or a row that cannot be read; file and line are named.
         InputError: units other than these, or images that cannot be used (see
-            :func:`jaxcal.recording.make_images`).
+            :func:`jaxcal.data.recording.make_images`).
     """
     if units not in (None, "px", "mm"):
         raise InputError(f"units must be px or mm, not {quoted(str(units))}")
@@ -181,7 +181,8 @@ def read_crosswire(
         FormatError: a file that cannot be read, a row of another length, something that is not a
             number, rows that do not make whole poses, or files of different lengths; the file and
             the line are named.
-        InputError: poses or pixels that cannot be used (see :func:`jaxcal.recording.make_images`).
+        InputError: poses or pixels that cannot be used (see
+        :func:`jaxcal.data.recording.make_images`).
     """
     transforms = read_table(transforms_path, header=False, separator="")
     rows = _fixed(transforms, (4,), "3 rotation numbers and a translation")

@@ -13,7 +13,7 @@ import re
 import tomllib
 from typing import Any
 
-from jaxcal.errors import FormatError
+from jaxcal import FormatError
 from jaxcal.io.readable import check_readable, one_line
 
 MAXIMUM_BYTES = 2**20

@@ -14,13 +14,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxcal.errors import FormatError
+from jaxcal import FormatError
+from jaxcal.data.poses import rotations_from_quaternions
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.lines import text_lines
 from jaxcal.io.readable import naming, quoted
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.table import parse_number
-from jaxcal.poses import rotations_from_quaternions
 
 TRACKER = "Tracker"
 MOST_ROWS = 1_000_000

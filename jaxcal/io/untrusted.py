@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 from h5py import h5a, h5d, h5g, h5l, h5o, h5s, h5t, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
-from jaxcal.errors import CalibrationError, FormatError
+from jaxcal import CalibrationError, FormatError
 from jaxcal.io.heap import CheckedFile
 from jaxcal.io.readable import one_line, quoted
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
-from jaxcal.errors import FormatError
+from jaxcal import FormatError
 from jaxcal.io.readable import check_readable, one_line, quoted
 
 MAXIMUM_BYTES = 8 * 2**20

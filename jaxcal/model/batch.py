@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxcal.data.problem import Problem
 from jaxcal.model import unrolled
 from jaxcal.model.parameters import EXTRA, Blocks, Parameters, block_slice, size
 from jaxcal.model.unrolled import Matrix, Vector
-from jaxcal.problem import Problem
 
 RIGID_UNKNOWNS = 9
 """X and the target; further unknowns follow them."""

@@ -9,8 +9,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from jaxcal.array_types import Bool, Float, HeldArray
-from jaxcal.trees import array_tree
+from jaxcal.runtime.array_types import Bool, Float, HeldArray
+from jaxcal.runtime.trees import array_tree
 
 Family = Literal["uniform", "bell", "gaussian", "student"]
 

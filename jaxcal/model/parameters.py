@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxcal.geometry import matrix_from_rotation, rotation_from_vector
+from jaxcal.data.geometry import matrix_from_rotation, rotation_from_vector
 from jaxcal.model.blocks import BLOCK_SIZE as BLOCK_SIZE
 from jaxcal.model.blocks import EXTRA as EXTRA
 from jaxcal.model.blocks import MEDIUM as MEDIUM

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxcal.data.problem import Problem
 from jaxcal.model.batch import Images, Iterate, targets
 from jaxcal.model.observations import Channels, Further, Points, on_circle
 from jaxcal.model.parameters import EXTRA, RIGID, Parameters
-from jaxcal.problem import Problem
 
 
 def _one_lane(

@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.model.distributions import Family
-from jaxcal.precision import in_standard_promotion
+from jaxcal.runtime.precision import in_standard_promotion
 
 NODES = 8
 """In each half of the interval."""

@@ -21,9 +21,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from jaxcal.array_types import Float
-from jaxcal.calibration import Calibration
-from jaxcal.closed_form import calibrate_closed_form
+from jaxcal import InputError
+from jaxcal.calibration.result import Calibration
+from jaxcal.data.problem import Problem
+from jaxcal.data.recording import Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
 from jaxcal.diagnostics.image_errors import Unknowns
@@ -41,10 +42,9 @@ from jaxcal.diagnostics.intervals import (
     tre_at,
     tre_over,
 )
-from jaxcal.errors import InputError
-from jaxcal.problem import Problem
-from jaxcal.recording import Recording
-from jaxcal.trees import map_arrays
+from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.trees import map_arrays
+from jaxcal.solvers.closed_form.single import calibrate_closed_form
 
 Word = Literal["good", "fair", "uncertain"]
 

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.calibration import Calibration
-from jaxcal.certificate import Certificate, certify
-from jaxcal.closed_form import calibrate_closed_form
-from jaxcal.dependence import independent
-from jaxcal.errors import InputError
+from jaxcal import InputError
+from jaxcal.calibration.result import Calibration
+from jaxcal.data.recording import Images, Recording
+from jaxcal.diagnostics.dependence import independent
 from jaxcal.model.blocks import EXTRA
-from jaxcal.recording import Images, Recording
+from jaxcal.solvers.closed_form.certificate import Certificate, certify
+from jaxcal.solvers.closed_form.single import calibrate_closed_form
 
 
 def certificate_record(result: Calibration, recording: Recording) -> dict[str, Any]:

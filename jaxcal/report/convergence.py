@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxcal.array_types import Float
-from jaxcal.calibration import Calibration
-from jaxcal.options import Options
-from jaxcal.problem import Problem
-from jaxcal.solve import calibrate
+from jaxcal.calibration.calibrate import calibrate
+from jaxcal.calibration.options import Options
+from jaxcal.calibration.result import Calibration
+from jaxcal.data.problem import Problem
+from jaxcal.runtime.array_types import Float
 
 KEPT = 200
 """Iterations that are drawn."""

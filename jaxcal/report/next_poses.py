@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal import design
-from jaxcal.calibration import Calibration
-from jaxcal.errors import InputError
-from jaxcal.recording import Recording
+from jaxcal import InputError, design
+from jaxcal.calibration.result import Calibration
+from jaxcal.data.recording import Recording
 
 COUNT = 3
 _CANDIDATES = 2000

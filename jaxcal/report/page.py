@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.array_types import Float
-from jaxcal.calibration import Calibration
+from jaxcal import InputError
+from jaxcal.calibration.result import Calibration
+from jaxcal.calibration.transform import SaveFormat, transform_from_record
+from jaxcal.data.recording import Recording
 from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.metrics import reconstruct
-from jaxcal.errors import InputError
 from jaxcal.io.atomic import write_text
-from jaxcal.recording import Recording
 from jaxcal.report import svg
 from jaxcal.report.certified import certificate_words
 from jaxcal.report.next_poses import next_poses_sentences
@@ -37,7 +37,7 @@ from jaxcal.report.verdict import (
     limits,
     where,
 )
-from jaxcal.transform import SaveFormat, transform_from_record
+from jaxcal.runtime.array_types import Float
 
 MOST_POSES, MOST_PLANES = 300, 60
 """Poses that are drawn in space, and planes of images;"""

@@ -13,14 +13,14 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from jaxcal.array_types import Float
-from jaxcal.calibration import Calibration
+from jaxcal import InputError
+from jaxcal.calibration.result import Calibration
 from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.influence import KINDS, in_image, influence_of
 from jaxcal.diagnostics.intervals import image_jacobian, tre_at
-from jaxcal.errors import InputError
 from jaxcal.report.accuracy import region_of
 from jaxcal.report.summary import recording_of
+from jaxcal.runtime.array_types import Float
 
 COLUMN_MM, PAGE_MM = 88.0, 180.0
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"

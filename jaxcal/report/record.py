@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 
 import jaxcal
-from jaxcal.array_types import Float
-from jaxcal.calibration import Calibration
+from jaxcal import InputError
+from jaxcal.calibration.result import Calibration
+from jaxcal.calibration.transform import FORMAT, VERSION
+from jaxcal.data.poses import rotation_angle
+from jaxcal.data.recording import Images, Recording, Truth
 from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.image_points import image_rows, unknown_names
 from jaxcal.diagnostics.metrics import reconstruction_precision
-from jaxcal.errors import InputError
-from jaxcal.image_points import image_rows, unknown_names
-from jaxcal.poses import rotation_angle
-from jaxcal.recording import Images, Recording, Truth
 from jaxcal.report.accuracy import accuracy_record, settle
 from jaxcal.report.certified import certificate_record
-from jaxcal.transform import FORMAT, VERSION
+from jaxcal.runtime.array_types import Float
 
 CONVENTION = {
     "units": "lengths in mm; rotations in rad where no unit is in the name",

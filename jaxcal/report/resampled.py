@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.calibration import Calibration
+from jaxcal.calibration.result import Calibration
 from jaxcal.report.accuracy import stated_at
 from jaxcal.report.record import plain
 
 if TYPE_CHECKING:
-    from jaxcal.resampling import Bootstrap, CrossValidation
+    from jaxcal.calibration.resampling import Bootstrap, CrossValidation
 
 INFLUENTIAL = 1.0
 """An image that moves X by more than this many of its SDs is worth naming."""

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.calibration import Calibration
-from jaxcal.errors import CalibrationError
-from jaxcal.recording import Images, Recording
+from jaxcal import CalibrationError
+from jaxcal.calibration.result import Calibration
+from jaxcal.data.recording import Images, Recording
 from jaxcal.report.record import calibration_record
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.array_types import Float
+from jaxcal.runtime.array_types import Float
 
 Number = float | int | np.floating
 

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.calibration import Calibration
-from jaxcal.errors import OutputError
+from jaxcal import OutputError
+from jaxcal.calibration.result import Calibration
+from jaxcal.data.recording import Recording
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.readable import one_line
-from jaxcal.recording import Recording
 from jaxcal.report.convergence import Curve
 from jaxcal.report.verdict import verdict
 

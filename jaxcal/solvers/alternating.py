@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.geometry import chord_angle
+from jaxcal.data.geometry import chord_angle
 from jaxcal.model import unrolled
 from jaxcal.model.batch import Images, Iterate, barrier, choose
 from jaxcal.model.observations import BoundedOffsets, Further, HeldOffsets, local_unknowns

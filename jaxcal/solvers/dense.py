@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxcal.precision import in_standard_promotion
+from jaxcal.runtime.precision import in_standard_promotion
 
 MAX_SWEEPS = 30
 

@@ -29,7 +29,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxcal.geometry import AnyArray
+from jaxcal.data.geometry import AnyArray
 from jaxcal.model import unrolled
 from jaxcal.model.unrolled import Vector
 from jaxcal.solvers.levenberg_marquardt import (

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from jaxcal.calibration.options import Options
 from jaxcal.model.batch import Images, Iterate
 from jaxcal.model.observations import Further, InPlane
 from jaxcal.model.unrolled import rows_of
-from jaxcal.options import Options
 from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate
 from jaxcal.solvers.other import Fit

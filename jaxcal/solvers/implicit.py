@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxcal.model.batch import Images, Iterate
 from jaxcal.model.observations import Medium, Observation
 from jaxcal.model.unrolled import rows_of
-from jaxcal.precision import in_standard_promotion
+from jaxcal.runtime.precision import in_standard_promotion
 from jaxcal.solvers import dense, reml
 from jaxcal.solvers.normal_equations import accumulate
 

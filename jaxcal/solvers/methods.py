@@ -15,6 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxcal.calibration.options import DEFAULT_MAX_ELEVATION_MM, Given, Plan
+from jaxcal.data.problem import Problem
+from jaxcal.data.sound import WATER_M_S
 from jaxcal.model.batch import Images, Iterate
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.observations import (
@@ -31,8 +34,6 @@ from jaxcal.model.observations import (
     variance_planes,
 )
 from jaxcal.model.parameters import MEDIUM
-from jaxcal.options import DEFAULT_MAX_ELEVATION_MM, Given, Plan
-from jaxcal.problem import Problem
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import alternate, bounded
 from jaxcal.solvers.auto import average_over_laws
@@ -41,7 +42,6 @@ from jaxcal.solvers.levenberg_marquardt import minimise
 from jaxcal.solvers.other import minimise_with, self_tuned_with
 from jaxcal.solvers.reml import floored, self_tuned
 from jaxcal.solvers.start import ConventionalStart, GivenStart, conventional
-from jaxcal.sound import WATER_M_S
 
 HELD_SIGMA = (0.5, 0.5, 1.0)
 """SDs of lateral position, range and offset (mm), where too few images leave them unknown."""

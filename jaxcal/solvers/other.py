@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxcal.calibration.options import Options
 from jaxcal.model.batch import Images, Iterate, choose, targets
 from jaxcal.model.observations import Further, Medium, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.model.unrolled import rows_of
-from jaxcal.options import Options
 from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate, component_sums
 from jaxcal.solvers.reml import update_at, with_floor

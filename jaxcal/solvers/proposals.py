@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxcal.data.problem import Problem
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points
-from jaxcal.problem import Problem
 from jaxcal.solvers import dense
 
 MOST_PROPOSALS, FEWEST_PROPOSALS = 512, 256

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jaxcal.conventional import Start
+from jaxcal.calibration.conventional import Start
 from jaxcal.model import unrolled
 from jaxcal.model.batch import Images, Iterate, barrier, choose, total
 from jaxcal.model.observations import InPlane

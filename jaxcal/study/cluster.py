@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from jaxcal.errors import CalibrationError, InputError, MissingExtraError
+from jaxcal import CalibrationError, InputError, MissingExtraError
 from jaxcal.io.readable import one_line
 from jaxcal.study.spec import Chunk, Spec, spec_from_canonical
 

@@ -14,11 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from jaxcal.geometry import chord_angle
-from jaxcal.model import unrolled
-from jaxcal.model.batch import Images, Iterate, targets, total
-from jaxcal.model.parameters import RIGID
-from jaxcal.options import (
+from jaxcal.calibration.options import (
     Method,
     Options,
     PriorName,
@@ -26,11 +22,15 @@ from jaxcal.options import (
     prepare,
     with_bound,
 )
-from jaxcal.pipeline import solve_problems
-from jaxcal.problem import Problem
-from jaxcal.segmentation.deviations import fit_deviations
-from jaxcal.simulation import Protocol, arrange, draw, draw_noise
+from jaxcal.calibration.pipeline import solve_problems
+from jaxcal.data.geometry import chord_angle
+from jaxcal.data.problem import Problem
+from jaxcal.data.segmentation.deviations import fit_deviations
+from jaxcal.model import unrolled
+from jaxcal.model.batch import Images, Iterate, targets, total
+from jaxcal.model.parameters import RIGID
 from jaxcal.solvers.start import ConventionalStart, conventional
+from jaxcal.study.simulation import Protocol, arrange, draw, draw_noise
 
 Kind = tuple[Method, PriorName]
 """A method and its prior."""
@@ -78,9 +78,9 @@ def experiments(
 ) -> tuple[Experiments, Iterate, Float[Array, "trials 3"]]:
     """Simulate a batch: its experiments, their truth, and the errors in them.
 
-    They are those of :func:`jaxcal.simulation.simulate`. The errors are root mean squares of the
-    lateral, range and elevational errors of each trial, mm, those that a tracker makes among them:
-    what self-tuned SDs estimate.
+    They are those of :func:`jaxcal.study.simulation.simulate`. The errors are root mean squares of
+    the lateral, range and elevational errors of each trial, mm, those that a tracker makes among
+    them: what self-tuned SDs estimate.
     """
     one = jax.vmap(lambda key: arrange(draw(key, protocol), protocol))(keys)
     elements = protocol.probe.element_lateral()

@@ -28,15 +28,15 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
-from jaxcal.compiler import fast_to_run, single_threaded
+from jaxcal.calibration.calibrate import Options
+from jaxcal.data.probe import LinearProbe
 from jaxcal.model.batch import Iterate
-from jaxcal.offsets import OffsetLaw, nominal_bound
-from jaxcal.precision import in_own_modes
-from jaxcal.probe import LinearProbe
-from jaxcal.simulation import Protocol
-from jaxcal.solve import Options
+from jaxcal.runtime.compiler import fast_to_run, single_threaded
+from jaxcal.runtime.precision import in_own_modes
 from jaxcal.solvers.start import ConventionalStart
 from jaxcal.study.lean import Experiments, Kind, Measured, begin, experiments, solve
+from jaxcal.study.offsets import OffsetLaw, nominal_bound
+from jaxcal.study.simulation import Protocol
 from jaxcal.study.spec import Chunk, Condition, MethodSpec, Spec
 
 LANES = {"cpu": 64}
@@ -222,7 +222,7 @@ def compile_pieces(function: Any, devices: Devices, *, pieces: int, fast: bool =
         devices: one, or several that share the pieces.
         pieces: so many of the function's arguments, the first ones, are given for every piece;
             further ones are for all of them.
-        fast: with the flags of :func:`jaxcal.compiler.fast_to_run`.
+        fast: with the flags of :func:`jaxcal.runtime.compiler.fast_to_run`.
     """
     platform = devices[0].platform
     options = (fast_to_run(platform) or {}) if fast else {}

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.calibration import Status
-from jaxcal.errors import FormatError, MissingExtraError
+from jaxcal import FormatError, MissingExtraError
+from jaxcal.calibration.result import Status
 from jaxcal.study.pipeline import COMPONENTS, bound_mm
 from jaxcal.study.store import UNITS, Store
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from jaxcal.errors import FormatError, InputError
+from jaxcal import FormatError, InputError
 from jaxcal.study.spec import Chunk, Spec
 from jaxcal.study.store import Store
 

@@ -8,7 +8,7 @@
     [conditions]              # a number, or a list of numbers: an axis of the grid
     images = 50               # calibration images
     test_images = 50          # noise-free in-plane test images
-    elevation_mm = [0.5, 1]   # size of the elevational offsets: bound or SD (jaxcal.offsets)
+    elevation_mm = [0.5, 1]   # size of the elevational offsets: bound or SD (jaxcal.study.offsets)
     elevation_distribution = "uniform"  # or normal, one-sided, heavy-tailed, triangular; or a list
     noise_mm = [0, 2]         # SD of the noise on every element's distance
     lateral_mm = 29.25        # the target's lateral position is uniform within +- this
@@ -28,7 +28,7 @@
     method = "alternating"    # or conventional, joint
     prior = "auto"            # joint only: auto, gaussian, uniform (self-tuned) or bounded
     max_elevation_mm = 1      # the bound that alternating and bounded are told; or
-    max_elevation_factor = 1  # ... this times the true bound (jaxcal.offsets.nominal_bound)
+    max_elevation_factor = 1  # ... this times the true bound (jaxcal.study.offsets.nominal_bound)
     tolerance_rad = 1e-3      # alternating: stop when X turns by less in a round
     tolerance_mm = 0.1        # ... and its origin moves by less
     max_rounds = 1000         # alternating: most rounds
@@ -57,10 +57,10 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
-from jaxcal.errors import InputError
+from jaxcal import InputError
+from jaxcal.data.probe import LinearProbe
 from jaxcal.io.readable import quoted
 from jaxcal.io.toml import load_toml, parse_toml
-from jaxcal.probe import LinearProbe
 
 MAXIMUM_BYTES = 2**20
 """Largest spec that is read."""

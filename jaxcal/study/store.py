@@ -27,7 +27,7 @@ import h5py
 import numpy as np
 
 import jaxcal
-from jaxcal.errors import FormatError, InputError, OutputError
+from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.readable import check_readable, one_line
 from jaxcal.io.untrusted import array, child, number, open_root, text

@@ -20,9 +20,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from jaxcal.errors import CalibrationError
+from jaxcal import CalibrationError
 from jaxcal.io.readable import one_line
-from jaxcal.isolated import python_command
+from jaxcal.runtime.isolated import python_command
 from jaxcal.study.spec import Chunk, Spec, spec_from_canonical
 
 MOST_DEATHS = 3

@@ -19,7 +19,7 @@ from hw.bench.run import Bench, Options, start_bench
 from hw.bench.world import make_world
 from hw.midplane.pattern_injection import bar
 from hw.ultrasound.receiver import UltrasoundStream
-from jaxcal.errors import InputError
+from jaxcal import InputError
 
 ROOT = Path(__file__).parents[2]
 

@@ -28,7 +28,7 @@ from hw.midplane.pattern_injection import (
 )
 from hw.midplane.terminal_image import Screen, picture
 from hw.poses import plan_poses
-from jaxcal.errors import InputError
+from jaxcal import InputError
 
 
 def stage() -> WorldStage:

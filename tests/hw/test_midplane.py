@@ -25,7 +25,7 @@ from hw.midplane.search import Echoes, PlacementError, Settings, coarse, first_s
 from hw.midplane.search import Walker as SearchWalker
 from hw.midplane.threshold_climb import threshold_climb
 from hw.poses import plan_poses
-from jaxcal.errors import InputError
+from jaxcal import InputError
 
 
 def by_pattern(stage, settings=None, start_mm=0.0):

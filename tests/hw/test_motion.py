@@ -27,7 +27,7 @@ from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.pose import ur_to_pose
 from hw.robot.safety import MotionPlan, confirm_unattended
-from jaxcal.isolated import import_path
+from jaxcal.runtime.isolated import import_path
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 

@@ -16,7 +16,7 @@ from hw.robot.kinematics import flange_of, inverse, model_named
 from hw.robot.safety import out_of_box_mm
 from hw.scene import Scene
 from hw.setup import Setup
-from jaxcal.errors import InputError
+from jaxcal import InputError
 
 SCENE = make_world(0).scene
 

@@ -11,8 +11,8 @@ from hw.bench.world import FULL_SCALE, make_world
 from hw.midplane.pattern_injection import bar
 from hw.poses import plan_poses
 from hw.rigid import rigid, rotation_matrix
-from jaxcal.errors import InputError
-from jaxcal.segmentation.image import localise
+from jaxcal import InputError
+from jaxcal.data.segmentation.image import localise
 
 
 def placed(world, lateral: float, elevation: float, axial: float, turn=(0.0, 0.0, 0.0)):
@@ -102,7 +102,7 @@ def test_worlds_differ_by_seed_and_their_drawing_is_off():
     np.testing.assert_array_equal(first.image_to_probe, make_world(0).image_to_probe)
     off = np.linalg.inv(first.scene.image_to_probe) @ first.image_to_probe
     assert 0 < np.abs(off[:3, 3]).max() <= 2.0
-    assert jaxcal.geometry.rotation_angle(np.eye(4), off) <= np.radians(1.5) * np.sqrt(3)
+    assert jaxcal.data.geometry.rotation_angle(np.eye(4), off) <= np.radians(1.5) * np.sqrt(3)
     with pytest.raises(InputError, match="no 'colour'"):
         make_world(0, colour=3)
     with pytest.raises(InputError, match="m/s"):

@@ -271,7 +271,7 @@ from types import SimpleNamespace
 import numpy as np
 from hw.recorder import Recorder
 from hw.recording_layout import Header
-from jaxcal.errors import CalibrationError
+from jaxcal import CalibrationError
 probe = {"kind": "linear", "elements": 8, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
 recorder = Recorder(sys.argv[1], Header(kind="time_of_flight", probe=probe))
 frame = np.full((128, 128), 7, np.uint8)

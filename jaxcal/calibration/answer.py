@@ -1,0 +1,459 @@
+"""From where a method stopped to a :class:`jaxcal.Calibration`, in plain array operations.
+
+What is computed here is there under jit, vmap and grad: offsets, SDs, covariance and status.
+Everything else about an answer is computed when it is read (:mod:`jaxcal.diagnostics`), from the
+problem and two p x p matrices:
+
+- S, the *information* of the shared unknowns: the normal matrix of the whitened residuals with the
+  offsets eliminated. Its inverse, times the residuals' variance where they are in mm, is the
+  covariance (the Cramer-Rao bound, where no offset rests on its bound).
+- D, the *design*: the same of the unweighted residuals with the offsets known.
+
+The status needs no spectrum. Rotations, scales and sound speed are multiplied by the lever arm L,
+the root mean square distance of the points from the image origin: all unknowns are then mm at the
+target. The poses are degenerate where the smallest eigenvalue of D is below a threshold times its
+trace; a direction is unknown where that of S is below variance / (L / 2)^2. Whether the smallest
+eigenvalue of A exceeds a number c is told by the pivots of A - c 1.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxcal.calibration.options import Given, Plan
+from jaxcal.calibration.result import Calibration, Convergence, Linearisation, Medium, Status
+from jaxcal.data.problem import Problem
+from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.diagnostics.uncertainty import AT_BOUND, LARGEST_SD, mm_at_target, threshold
+from jaxcal.model.distributions import OffsetLaw
+from jaxcal.model.parameters import Parameters, block_slice, size
+from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
+from jaxcal.solvers.dense import inverse_lanes_last
+from jaxcal.solvers.methods import nominal_sound_speed
+
+LEAST_GAP_MM = 1e-6
+"""An offset nearer to its bound than this is about to reach it."""
+
+LEAST_HOLD = 1e-6
+"""An offset held on its bound by less, in root mean square residuals, is about to leave it."""
+
+
+class Solved(eqx.Module):
+    """Where a method stopped; one problem, or a batch with leading axes on every array.
+
+    Attributes:
+        parameters: X, target and further unknowns; functions of the data, where the answer is to
+            be differentiated, and so are the following.
+        offset: offset unknowns, mm (of tracker noise: in its SDs); k = 0 where eliminated.
+        sigma: SDs that whiten the residuals, mm; None for residuals in mm.
+        bound: on the offsets, mm; None where there is none.
+        information: of the shared unknowns, offsets eliminated.
+        design: of the unweighted residuals, offsets known.
+        convergence: how the method ended.
+    """
+
+    parameters: Parameters
+    offset: Float[Array, "*batch k"]
+    sigma: Float[Array, "*batch components"] | None
+    bound: Float[Array, "*batch n"] | None
+    information: Float[Array, "*batch p p"]
+    design: Float[Array, "*batch p p"]
+    convergence: Convergence
+
+
+@runtime_checkable
+class Average(Protocol):
+    """An average over distributions of the offsets."""
+
+    @property
+    def covariance(self) -> Float[Array, "*batch p p"]:
+        """Of the shared unknowns."""
+        ...
+
+    @property
+    def elevation_sd(self) -> Float[Array, "*batch n"]:
+        """SDs of the offsets, mm."""
+        ...
+
+    @property
+    def law(self) -> OffsetLaw:
+        """What was found out about the distribution."""
+        ...
+
+
+def assemble(
+    solved: Solved, averaged: Average | None, problem: Problem, given: Given, plan: Plan
+) -> Calibration:
+    """A calibration but for its problem, which the front door adds (``with_problem``).
+
+    Args:
+        solved: where the method stopped.
+        averaged: the average over the offsets' distributions, where they were weighed; the
+            parameters and SDs of ``solved`` are then the average's.
+        problem: the images in use, with leading axes as in ``solved``.
+        given: numbers that came with the request, without leading axes.
+        plan: what is static about the request.
+    """
+    problem = problem.cleared(problem.mask)
+    parameters, blocks, mask = solved.parameters, plan.blocks, problem.mask
+    used = jnp.sum(mask, axis=-1)
+    errors = Errors.of(parameters, problem)
+    elevation = _elevation(solved, errors, given, problem)
+    in_plane = errors.squares(errors.q[1])
+
+    variance, bounds = jnp.ones_like(used), None
+    if solved.bound is not None:
+        bounds = ActiveBounds.of(errors, solved.offset, solved.bound, problem)
+        free = used - jnp.sum(bounds.resting, axis=-1)
+        variance = bounds.cost / jnp.maximum(3 * used - size(blocks) - free, 1.0)
+    elif plan.prior == "none":
+        variance = in_plane / jnp.maximum(3 * used - size(blocks), 1.0)
+
+    lever = jax.lax.stop_gradient(errors.lever(mask))
+    covariance, observed = covariance_and_observability(
+        solved.information,
+        solved.design,
+        variance,
+        mm_at_target(lever, blocks),
+        LARGEST_SD * lever,
+        bounded=plan.prior == "bounded",
+    )
+    if averaged is not None:
+        # What the Gaussian solution cannot tell at all stays unknown.
+        better = averaged.law.weighed[..., None, None] & jnp.isfinite(covariance)
+        covariance = jnp.where(better, averaged.covariance, covariance)
+    status = _status(solved, observed, used)
+    known = (status != Status.UNOBSERVABLE)[..., None, None]
+    covariance = jnp.where(known, covariance, jnp.nan)
+    channel_sigma = None if not plan.channels or solved.sigma is None else solved.sigma[..., 0]
+    tracker_sd = None
+    if given.tracker_sd is not None:
+        tracker_sd = jnp.broadcast_to(given.tracker_sd, used.shape)
+    return Calibration(
+        image_to_probe=_matrix(parameters),
+        point=parameters.point,
+        elevation=elevation,
+        sigma=_three_sigmas(solved, errors, elevation, problem, plan),
+        offset_law=None if averaged is None else averaged.law,
+        channel_sigma=channel_sigma,
+        unknowns_covariance=covariance,
+        scale_mm_per_px=problem.spacing * parameters.scale if problem.pixels else None,
+        medium=_medium(parameters, covariance, problem, given, plan),
+        rms=jnp.sqrt(in_plane / used),
+        mask=mask,
+        status_code=status,
+        differentiable=_is_differentiable(solved, bounds, observed, status, plan),
+        sigma_tuned=jnp.asarray(plan.self_tuning) & (used >= MINIMUM_SELF_TUNING),
+        convergence=solved.convergence,
+        linearisation=Linearisation(
+            information=solved.information,
+            design=solved.design,
+            variance=variance,
+            tracker_sd=tracker_sd,
+            average_elevation_sd=None if averaged is None else averaged.elevation_sd,
+        ),
+        problem=None,
+        method=plan.method,
+        prior=plan.reported_prior,
+        data="channels" if plan.channels else "points",
+        blocks=blocks,
+        robust=plan.robust,
+    )
+
+
+class Errors(eqx.Module):
+    """The target in every image, beside what was measured; arrays are (*batch, n).
+
+    Attributes:
+        q: lateral, elevational and axial coordinate of the target, mm; (0, 0, 1) where left out.
+        lateral: measured, mm.
+        distance: measured range, mm.
+        mask: 1 for used images.
+    """
+
+    q: tuple[Array, Array, Array]
+    lateral: Array
+    distance: Array
+    mask: Array
+
+    @classmethod
+    def of(cls, parameters: Parameters, problem: Problem) -> Errors:
+        """At some unknowns; the problem must be cleared of rubbish."""
+        mask, poses = problem.mask, problem.poses
+        # Written out in planes: products of 3x3 matrices, one an image, would be calls.
+        away = [parameters.point[..., j, None] - poses[..., j, 3] for j in range(3)]
+        probe = [
+            sum(poses[..., j, i] * away[j] for j in range(3)) - parameters.translation[..., i, None]
+            for i in range(3)
+        ]
+        q = [
+            sum(parameters.rotation[..., j, i, None] * probe[j] for j in range(3)) for i in range(3)
+        ]
+        unit = (problem.spacing * parameters.scale)[..., None, :]
+        lateral = problem.measurements[..., 0] * unit[..., 0]
+        distance = problem.measurements[..., 1] * unit[..., 1] + problem.face_offset[..., None]
+        distance = (distance - parameters.delay[..., None]) * parameters.sound_speed[..., None]
+        # The range has no derivative at 0, where an image left out may well put the target.
+        x, y, z = (
+            jnp.where(mask > 0, value, unused) for value, unused in zip(q, (0, 0, 1), strict=True)
+        )
+        return cls((x, y, z), lateral, distance, mask)
+
+    def squares(self, *planes: Array, axial: Array | None = None) -> Float[Array, "*batch"]:
+        """Sum over the images of |q - (lateral, 0, axial)|^2, axial the range by default.
+
+        The planes take the place of q's elevational component.
+        """
+        axial = self.distance if axial is None else axial
+        parts = (self.q[0] - self.lateral, *planes, self.q[2] - axial)
+        return jnp.sum(self.mask * sum(part**2 for part in parts), axis=-1)
+
+    def lever(self, mask: Array) -> Float[Array, "*batch"]:
+        """Root mean square distance of the measured points from the image origin, mm."""
+        squares = mask * (self.lateral**2 + self.distance**2)
+        return jnp.sqrt(jnp.sum(squares, axis=-1) / jnp.sum(mask, axis=-1))
+
+    def mean_squares(self) -> tuple[Array, Array]:
+        """Sums over the images of lateral and range error squared, mm^2."""
+        distance = jnp.sqrt(self.q[1] ** 2 + self.q[2] ** 2)
+        errors = (self.q[0] - self.lateral, distance - self.distance)
+        lateral, distance = (jnp.sum(self.mask * error**2, axis=-1) for error in errors)
+        return lateral, distance
+
+
+class ActiveBounds(eqx.Module):
+    """Offsets within bounds at a solution.
+
+    Attributes:
+        resting: 1 where an offset rests on its bound.
+        cost: sum of squared residuals q - p(y), mm^2.
+        gap: distance of the nearest free offset from its bound, mm.
+        hold: least force that holds an offset on its bound, in root mean square residuals; infinite
+            where none is held.
+    """
+
+    resting: Float[Array, "*batch n"]
+    cost: Float[Array, "*batch"]
+    gap: Float[Array, "*batch"]
+    hold: Float[Array, "*batch"]
+
+    @classmethod
+    def of(
+        cls, errors: Errors, y: Float[Array, "*batch n"], bound: Array, problem: Problem
+    ) -> ActiveBounds:
+        """At offsets y."""
+        distance, mask = errors.distance, errors.mask
+        axial = jnp.sqrt(jnp.maximum(distance**2 - y**2, (1e-6 * distance) ** 2))
+        slope = y / axial
+        elevational = errors.q[1] - y
+        cost = errors.squares(elevational, axial=axial)
+        limit = jnp.minimum(bound, LARGEST_ELEVATION * jnp.abs(distance))
+        # The derivative of half the cost by y pushes outwards where an offset rests.
+        force = slope * (errors.q[2] - axial) - elevational
+        near = jnp.abs(y) >= (1 - AT_BOUND) * limit
+        resting = mask * near * (jnp.sign(y) * force <= 0)
+        size = jnp.sqrt(1 + slope**2)
+        typical = jnp.sqrt(cost / (3 * jnp.sum(mask, axis=-1)))
+        typical = typical + jnp.finfo(typical.dtype).tiny
+        hold = jnp.where(resting > 0, jnp.abs(force) / size / typical[..., None], jnp.inf)
+        gap = jnp.where((resting > 0) | (mask == 0), jnp.inf, jnp.abs(limit - jnp.abs(y)))
+        return cls(resting, cost, jnp.min(gap, axis=-1), jnp.min(hold, axis=-1))
+
+
+class Observability(eqx.Module):
+    """What the pivots of two matrices tell of the unknowns.
+
+    Attributes:
+        degenerate: the poses do not determine the unknowns.
+        weak: some direction is not known in any useful sense.
+        singular: degenerate, or the information with the active bounds is singular.
+    """
+
+    degenerate: Bool[Array, "*batch"]
+    weak: Bool[Array, "*batch"]
+    singular: Bool[Array, "*batch"]
+
+
+def covariance_and_observability(
+    information: Float[Array, "*batch p p"],
+    design: Float[Array, "*batch p p"],
+    variance: Float[Array, "*batch"],
+    scale: Float[Array, "*batch p"],
+    reach: Float[Array, "*batch"],
+    *,
+    bounded: bool = False,
+) -> tuple[Float[Array, "*batch p p"], Observability]:
+    """Covariance (NaN where there is none) and observability, by one elimination.
+
+    Args:
+        information: of the unknowns, offsets eliminated.
+        design: of the unweighted residuals, offsets known.
+        variance: of the residuals that ``information`` is of.
+        scale: what makes every unknown's tangent mm at the target.
+        reach: a direction with a larger SD is not known in any useful sense, mm.
+        bounded: offsets are confined by bounds, and so is every direction: what matters of the
+            information is whether it is singular.
+    """
+    batch, count, eps = scale.shape[:-1], scale.shape[-1], float(jnp.finfo(scale.dtype).eps)
+    both, eye = scale[..., :, None] * scale[..., None, :], jnp.eye(count, dtype=scale.dtype)
+    weighted, unweighted = jax.lax.stop_gradient((information / both, design / both))
+    total = jnp.trace(weighted, axis1=-2, axis2=-1)
+    least = threshold(eps) * total if bounded else jax.lax.stop_gradient(variance / reach**2)
+    floor = threshold(eps) * jnp.trace(unweighted, axis1=-2, axis2=-1)
+    # A ridge at the level of rounding: an unobservable direction stays finite.
+    diagonal = jnp.diagonal(design if bounded else information, axis1=-2, axis2=-1)
+    ridge = jax.lax.stop_gradient(16 * eps * diagonal)
+    matrices = [
+        information + ridge[..., None] * eye,
+        weighted - least[..., None, None] * eye,
+        unweighted - floor[..., None, None] * eye,
+    ]
+    lanes_last = jnp.moveaxis(jnp.stack(matrices).reshape(-1, count, count), 0, -1)
+    inverse, log_determinant = inverse_lanes_last(lanes_last)
+    inverse = jnp.moveaxis(inverse.reshape(count, count, 3, -1)[:, :, 0], -1, 0)
+    inverse = inverse.reshape(*batch, count, count)
+    # The logarithm of a pivot that is not positive is not finite.
+    _, exceeds, observable = jnp.isfinite(log_determinant).reshape(3, *batch)
+
+    degenerate = jnp.logical_not(observable)
+    # Of nearly exact data, what rounding leaves of the smallest eigenvalue may be enough.
+    below = jnp.logical_not(exceeds) & (bounded | (eps * total < least))
+    found = Observability(
+        degenerate=degenerate, weak=below & (not bounded), singular=degenerate | (below & bounded)
+    )
+    covariance = variance[..., None, None] * 0.5 * (inverse + jnp.swapaxes(inverse, -1, -2))
+    return jnp.where(found.singular[..., None, None], jnp.nan, covariance), found
+
+
+def _status(
+    solved: Solved, observed: Observability, used: Float[Array, "*batch"]
+) -> Int[Array, "*batch"]:
+    parameters, convergence = solved.parameters, solved.convergence
+    finite = jnp.isfinite(convergence.cost)
+    for leaf, axes in (
+        (parameters.rotation, (-2, -1)),
+        (parameters.translation, -1),
+        (parameters.point, -1),
+        (parameters.scale, -1),
+    ):
+        finite = finite & jnp.all(jnp.isfinite(leaf), axis=axes)
+    failed = jnp.logical_not(finite) | (used < MINIMUM_IMAGES)
+    status = jnp.where(convergence.tolerance_met, Status.CONVERGED, Status.MAX_ITERATIONS)
+    status = jnp.where(observed.degenerate | observed.weak, Status.UNOBSERVABLE, status)
+    return jnp.where(failed, Status.FAILED, status).astype(jnp.int32)
+
+
+def _is_differentiable(
+    solved: Solved,
+    bounds: ActiveBounds | None,
+    observed: Observability,
+    status: Int[Array, "*batch"],
+    plan: Plan,
+) -> Bool[Array, "*batch"]:
+    """Whether the implicit function theorem's conditions hold at the solution."""
+    convergence = solved.convergence
+    still = 1e-6 if float(jnp.finfo(convergence.cost.dtype).eps) < 1e-10 else 1e-3
+    good = (status == Status.CONVERGED) & (convergence.stationarity <= still)
+    good = good & jnp.logical_not(jnp.any(convergence.sigma_floored, axis=-1))
+    if bounds is not None:
+        # An offset about to reach its bound, or to leave it, makes the answer's kink.
+        good = good & (bounds.gap > LEAST_GAP_MM) & (bounds.hold > LEAST_HOLD)
+        good = good & jnp.logical_not(observed.singular)
+    return good & plan.options.differentiate
+
+
+def _matrix(parameters: Parameters) -> Float[Array, "*batch 4 4"]:
+    top = jnp.concatenate([parameters.rotation, parameters.translation[..., None]], axis=-1)
+    bottom = jnp.asarray([0.0, 0.0, 0.0, 1.0], top.dtype)
+    bottom = jnp.broadcast_to(bottom, (*top.shape[:-2], 1, 4))
+    return jnp.concatenate([top, bottom], axis=-2)
+
+
+def _elevation(
+    solved: Solved, errors: Errors, given: Given, problem: Problem
+) -> Float[Array, "*batch n"]:
+    if solved.bound is not None:
+        return problem.mask * solved.offset
+    if given.tracker_sd is None:
+        return problem.mask * errors.q[1]
+    return problem.mask * (errors.q[1] + given.tracker_sd * solved.offset)
+
+
+def _three_sigmas(
+    solved: Solved,
+    errors: Errors,
+    elevation: Float[Array, "*batch n"],
+    problem: Problem,
+    plan: Plan,
+) -> Float[Array, "*batch 3"]:
+    """SDs of lateral position, range and offset, mm: those that whiten, or of the residuals."""
+    if solved.sigma is not None and not plan.channels:
+        return solved.sigma
+    if solved.sigma is not None:
+        point_sd = solved.sigma[..., :1] * _point_sd(errors, problem)
+        return jnp.concatenate([point_sd, solved.sigma[..., 1:]], axis=-1)
+    used = jnp.sum(problem.mask, axis=-1)
+    # The unknowns' degrees of freedom are shared equally by the three components.
+    freedom = jnp.maximum(used - size(plan.blocks) / 3, 1.0)
+    lateral, distance = (square / freedom for square in errors.mean_squares())
+    # Offsets within a bound have a root mean square within it, too.
+    own = used if solved.bound is not None else freedom
+    return jnp.sqrt(jnp.stack([lateral, distance, jnp.sum(elevation**2, axis=-1) / own], axis=-1))
+
+
+def _point_sd(errors: Errors, problem: Problem) -> Float[Array, "*batch 2"]:
+    """Root mean square SD of (lateral, axial) from an image's elements alone, per unit of theirs.
+
+    The inverse of the 2x2 information of Eq. 5 (or 6) with the offset held.
+    """
+    assert problem.channels is not None
+    channels, mask = problem.channels, problem.mask
+    target = jnp.stack(errors.q, axis=-1)[..., :, None, :]
+    apart = target - channels.elements[..., None, :, :]
+    distance = jnp.sqrt(jnp.sum(apart**2, axis=-1))
+    weight = mask[..., None] * channels.heard
+    lateral, axial = apart[..., 0] / distance, apart[..., 2] / distance
+    a, b, c = (
+        jnp.sum(weight * product, axis=-1) for product in (lateral**2, lateral * axial, axial**2)
+    )
+    # Weights are 0 or 1, so that their squares are themselves.
+    determinant = a * c - b**2
+    known = determinant > 0
+    variance = jnp.stack([c, a], axis=-1) / jnp.where(known, determinant, 1.0)[..., None]
+    known = (known & (mask > 0))[..., None]
+    return jnp.sqrt(jnp.sum(jnp.where(known, variance, 0.0), axis=-2) / jnp.sum(known, axis=-2))
+
+
+def _medium(
+    parameters: Parameters,
+    covariance: Float[Array, "*batch p p"],
+    problem: Problem,
+    given: Given,
+    plan: Plan,
+) -> Medium | None:
+    """Sound speed and delay in their units, with SDs; None where neither was estimated."""
+    blocks, speed = plan.blocks, nominal_sound_speed(problem)
+    found: dict[str, Array | None] = {}
+
+    def believed(which: int) -> Array | None:
+        sd = given.medium_sd
+        return None if sd is None else jnp.broadcast_to(sd[which], speed.shape)
+
+    if "sound-speed" in blocks:
+        at = block_slice(blocks, "sound-speed").start
+        estimate = speed * parameters.sound_speed
+        found["sound_speed_m_s"] = estimate
+        found["sound_speed_sd_m_s"] = estimate * jnp.sqrt(covariance[..., at, at])
+        found["sound_speed_prior_m_s"] = believed(0)
+    if "delay" in blocks:
+        at = block_slice(blocks, "delay").start
+        before = 0.0 if problem.delay is None else problem.delay
+        found["delay_s"] = before + parameters.delay / (1e3 * speed)
+        found["delay_sd_s"] = jnp.sqrt(covariance[..., at, at]) / (1e3 * speed)
+        found["delay_prior_s"] = believed(1)
+    return Medium(**found) if found else None

@@ -1,0 +1,241 @@
+"""The front door: one problem or a batch, by any method, to a :class:`Calibration`.
+
+What was asked for is checked in :mod:`jaxcal.calibration.options`. Conventional calibration of one
+problem has a closed form, which needs numpy only (:mod:`jaxcal.calibration.conventional`).
+Everything else, and everything inside somebody's jit, vmap or grad, is solved by the engine:
+:mod:`jaxcal.calibration.pipeline` is the way that every problem takes there, one pure function of
+arrays, which :mod:`jaxcal.runtime.programs` compiles.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.calibration.conventional import closed_form_answer
+from jaxcal.calibration.inputs import as_batch, as_problem, unknown_names
+from jaxcal.calibration.options import (
+    DELAY_SD_S,
+    SOUND_SPEED_SD_M_S,
+    Data,
+    Given,
+    Method,
+    Options,
+    Plan,
+    PriorName,
+    Request,
+    check_values,
+    prepare,
+    with_bound,
+)
+from jaxcal.calibration.result import Calibration
+from jaxcal.data.problem import Problem, is_traced
+from jaxcal.data.recording import Recording
+from jaxcal.diagnostics.dependence import independent
+from jaxcal.diagnostics.serial_correlation import widened
+from jaxcal.runtime.precision import (
+    in_own_modes,
+    inside_transformation,
+    require_float64,
+    with_dtype,
+)
+from jaxcal.solvers.closed_form.reduced_objective import FEWEST_IMAGES
+
+if TYPE_CHECKING:
+    from jax import Array
+
+
+@in_own_modes
+def calibrate(
+    problem: Problem | Recording,
+    method: Method = "joint",
+    prior: PriorName = "auto",
+    *,
+    max_elevation: float | np.ndarray | Array | None = None,
+    sigma: tuple[float, ...] | np.ndarray | Array | None = None,
+    tracker_sd: float | Array | None = None,
+    estimate: str | tuple[str, ...] = (),
+    data: Data = "auto",
+    sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S,
+    delay_sd: float | Array = DELAY_SD_S,
+    options: Options | None = None,
+    robust: bool = False,
+) -> Calibration:
+    """Find X, the target and the elevational offsets; nobody supplies a starting guess.
+
+    Args:
+        problem: one problem (a batch is handed to :func:`calibrate_batch`), or a recording.
+        method: ``joint`` (X, c and every offset together), ``alternating`` (the paper's Fig. 4) or
+            ``conventional`` (Eq. 7, every target in the plane).
+        prior: of the joint method. ``auto``: errors have self-tuned SDs, and the law of the
+            offsets, their mean and the noise are weighed by the data (:mod:`jaxcal.solvers.auto`).
+            ``uniform``: the same with offsets that are uniform between unknown edges.
+            ``gaussian``: offsets and errors are Gaussian, with the SDs of ``sigma`` or, without it,
+            self-tuned by REML. ``bounded``: |y_i| <= max_elevation with equal weights, the
+            alternation's objective. With given ``sigma``, ``auto`` is ``gaussian``.
+        max_elevation: bound m on |y|, mm, one number or (n,); overrides the problem's own. The
+            alternation and ``bounded`` take 1 mm where there is neither; ``auto`` and ``uniform``
+            cut the law of each image's offset there.
+        sigma: given SDs of lateral position, range and elevational offset, mm; on channels, of an
+            element's distance and the elevational offset.
+        tracker_sd: isotropic SD of the tracked position, mm, beside given ``sigma``.
+        estimate: further unknowns: ``scale`` (the pixels' size), ``sound-speed``, ``delay``; one
+            name, or several.
+        data: ``channels``: the joint method's residuals are those of every element's time of flight
+            (the recording must hold them); ``points``: those of the segmented points; ``auto``:
+            channels where they say more, on curvilinear probes and for sound speed or delay.
+        sound_speed_sd: how far the sound speed may be from nominal, m/s (joint only, not bounded).
+        delay_sd: how far the delay may be from nominal, s (joint only, not bounded).
+        options: tolerances and limits.
+        robust: first find the images that agree with each other, whatever up to nearly half of the
+            others are (:mod:`jaxcal.solvers.consensus`), and leave those out: ``outlier`` and
+            ``departure`` say which and why. Where no image is gravely wrong none is left out, and
+            the answer is the one without.
+
+    Returns:
+        A :class:`Calibration`; ask its ``status`` and ``warnings`` before using it. Frames of one
+        pose count once (:mod:`jaxcal.diagnostics.dependence`): the others are masked out in the
+        answer and in its ``problem``. Errors that are alike in successive images widen its
+        covariance (:mod:`jaxcal.diagnostics.serial_correlation`). Both are for one problem with
+        concrete arrays; under jit, vmap or grad, and in batches, images are taken for independent.
+
+    Raises:
+        InputError: options that contradict each other or the problem; with concrete arrays also
+            NaN, Inf and fewer than 4 different poses. Under jit, vmap or grad values cannot be
+            looked at, and such problems come back with status ``failed``.
+    """
+    problem, estimate = as_problem(problem, "jaxcal.calibrate"), unknown_names(estimate)
+    problem = _in_asked_precision(problem, options, "jaxcal.calibrate")
+    request = Request(
+        method,
+        prior,
+        max_elevation,
+        sigma,
+        tracker_sd,
+        estimate,
+        data,
+        sound_speed_sd,
+        delay_sd,
+        options,
+        robust,
+    )
+    plan, given = prepare(problem, request)
+    if problem.batch_shape:
+        from jaxcal.runtime.engine import solve_batch
+
+        return solve_batch(problem, given, plan, None)
+    check_values(problem)
+    problem = with_bound(problem, given)
+    if is_traced(problem, given):
+        return _solve_alone(problem, given, plan).with_problem(problem)
+    joined, found = independent(problem, estimate)
+    left = int(np.count_nonzero(np.asarray(joined.mask) > 0))
+    if left < FEWEST_IMAGES:
+        raise InputError(
+            f"{found.words or 'too few images'}: {left} images are left, and at least "
+            f"{FEWEST_IMAGES} are needed"
+        )
+    result = _solve_alone(joined, given, plan).with_problem(joined)
+    result = replace(result, notes=() if found.words is None else (found.words,))
+    return widened(result)
+
+
+def _solve_alone(problem: Problem, given: Given, plan: Plan) -> Calibration:
+    """One problem, without it in the result (traceable): in closed form, or by the engine."""
+    found = None
+    if not inside_transformation(problem, given):
+        found = closed_form_answer(problem, plan)
+    if found is None:
+        from jaxcal.runtime.engine import solve_problem
+
+        return solve_problem(problem, given, plan)
+    if "jax" in sys.modules:
+        from jaxcal.runtime.engine import as_jax_holds
+
+        return as_jax_holds(found, problem)
+    return found
+
+
+@in_own_modes
+def calibrate_batch(
+    problems: Problem | Sequence[Problem | Recording],
+    method: Method = "joint",
+    prior: PriorName = "auto",
+    *,
+    max_elevation: float | np.ndarray | Array | None = None,
+    sigma: tuple[float, ...] | np.ndarray | Array | None = None,
+    tracker_sd: float | Array | None = None,
+    estimate: str | tuple[str, ...] = (),
+    data: Data = "auto",
+    sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S,
+    delay_sd: float | Array = DELAY_SD_S,
+    options: Options | None = None,
+    robust: bool = False,
+    chunk: int | None = None,
+) -> Calibration:
+    """:func:`calibrate` for a batch: compiled, vmapped, in chunks of lanes.
+
+    A lane that is bad (NaN, degenerate) gets its own status and leaves its neighbours alone.
+
+    Plain problems are shared out among all of JAX's local devices: a processor is one device unless
+    ``jax.config.update("jax_num_cpu_devices", n)`` (or JAX_NUM_CPU_DEVICES=n) says before JAX's
+    first use that it is n, one a core. Results do not depend on it.
+
+    Args:
+        problems: leading axes of any shape; see :func:`jaxcal.stack`. A list of problems or
+            recordings with as many images each is stacked.
+        method: as for :func:`calibrate`, and so are the following.
+        prior: see there.
+        max_elevation: see there.
+        sigma: see there.
+        tracker_sd: see there.
+        estimate: see there.
+        data: see there.
+        sound_speed_sd: see there.
+        delay_sd: see there.
+        options: see there.
+        robust: see there; it takes longer than the solve.
+        chunk: lanes solved side by side; by default 64, on channels 8.
+
+    Returns:
+        A :class:`Calibration` whose arrays have the problems' leading axes.
+
+    Raises:
+        InputError: contradicting options, or problems without a leading axis.
+    """
+    problems = as_batch(problems, "jaxcal.calibrate_batch")
+    estimate = unknown_names(estimate)
+    if not problems.batch_shape:
+        raise InputError("calibrate_batch needs problems with a leading axis; use calibrate")
+    if chunk is not None and chunk < 1:
+        raise InputError(f"chunk must be at least 1, not {chunk}")
+    problems = _in_asked_precision(problems, options, "jaxcal.calibrate_batch")
+    request = Request(
+        method,
+        prior,
+        max_elevation,
+        sigma,
+        tracker_sd,
+        estimate,
+        data,
+        sound_speed_sd,
+        delay_sd,
+        options,
+        robust,
+    )
+    plan, given = prepare(problems, request)
+    from jaxcal.runtime.engine import solve_batch
+
+    return solve_batch(problems, given, plan, chunk)
+
+
+def _in_asked_precision(problem: Problem, options: Options | None, name: str) -> Problem:
+    precision = Options.precision if options is None else options.precision
+    if precision == "float64":
+        require_float64(name)
+    return with_dtype(problem, np.dtype(precision))

@@ -1,0 +1,213 @@
+"""Conventional calibration of one problem in numpy: the closed form, with all that is said of it.
+
+Eq. 7 has a closed-form global minimum with a proof (:mod:`jaxcal.solvers.closed_form.single`),
+found in less than a millisecond, where the engine's programs take seconds to import and to load. So
+where the answer is proved to be the only best one, it is *the* answer: :func:`closed_form_answer`
+is the one place that decides this, and the engine solves everything else.
+
+Covariance, status and SDs are those of :mod:`jaxcal.calibration.answer`, which computes them for
+every method under jit, vmap and grad; here they are computed from the images' errors and
+derivatives that diagnostics are made of.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from jaxcal.calibration.options import Plan
+from jaxcal.calibration.result import Calibration, Convergence, Linearisation, Medium, Status
+from jaxcal.data.problem import Problem
+from jaxcal.data.sound import WATER_M_S
+from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, threshold
+from jaxcal.model.blocks import EXTRA, Blocks, block_slice, size
+from jaxcal.runtime.array_types import Bool, Float, HeldArray
+from jaxcal.runtime.trees import array_tree, assembled, map_arrays
+from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS
+from jaxcal.solvers.closed_form.single import ClosedForm, calibrate_closed_form
+
+
+@array_tree
+class Start:
+    """Where methods begin that begin at the conventional fit: Eq. 7's minimum of one problem.
+
+    Attributes:
+        rotation: of X.
+        translation: of X, mm.
+        point: the target in the tracker's frame, mm.
+        scale: factors on the problem's [lateral, axial] spacing.
+        sound_speed: factor on the nominal one.
+        searched: the minimum is not proved to be the only one; descents from many rotations found
+            it.
+    """
+
+    rotation: Float[HeldArray, "*batch 3 3"]
+    translation: Float[HeldArray, "*batch 3"]
+    point: Float[HeldArray, "*batch 3"]
+    scale: Float[HeldArray, "*batch 2"]
+    sound_speed: Float[HeldArray, "*batch"]
+    searched: Bool[HeldArray, "*batch"]
+
+
+STATIONARY = 1e-6
+"""Largest gradient cosine of an answer through which derivatives are valid."""
+
+
+def closed_form_answer(problem: Problem, plan: Plan) -> Calibration | None:
+    """The conventional calibration where the closed form is proved to be the answer, else None.
+
+    None is for other methods and solvers, a robust search, float32, further unknowns that have no
+    closed form (a delay), images that leave something open, and minima without a proof.
+
+    Args:
+        problem: one problem with concrete, finite values and at least 4 used images.
+        plan: what is asked for.
+    """
+    options = plan.options
+    asked = plan.method == "conventional" and options.solver == "lm" and not plan.robust
+    estimate = tuple(name for name in EXTRA if name in plan.blocks)
+    if not asked or options.precision != "float64" or estimate not in CONSTRAINTS:
+        return None
+    problem = map_arrays(np.asarray, replace(problem, channels=None))
+    found = calibrate_closed_form(problem, estimate=estimate)
+    if not (found.certified and found.unique):
+        return None
+    return _with_uncertainty(found, problem, plan)
+
+
+def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
+    """Where a method begins, from the closed form of Eq. 7.
+
+    Args:
+        problem: one problem with concrete, finite values and at least 4 used images.
+        blocks: the free unknowns; those without a closed form begin at their nominal values.
+    """
+    known = replace(problem, spacing_known=True, channels=None)
+    found = calibrate_closed_form(known, estimate=("scale",) if "scale" in blocks else ())
+    unknowns = _unknowns(found, problem)
+    parts = {
+        "rotation": unknowns.rotation[0],
+        "translation": unknowns.translation[0],
+        "point": unknowns.point[0],
+        "scale": unknowns.scale[0],
+        "sound_speed": np.asarray(found.sound_speed_factor),
+        "searched": np.asarray(not (found.certified and found.unique)),
+    }
+    return assembled(Start, parts)
+
+
+def _with_uncertainty(found: ClosedForm, problem: Problem, plan: Plan) -> Calibration | None:
+    """The closed form as a calibration, but for its problem; None where poses are degenerate."""
+    blocks, eps = plan.blocks, float(np.finfo(float).eps)
+    seen = ImageErrors.of(_unknowns(found, problem), map_arrays(lambda a: a[None], problem), blocks)
+    plane = np.zeros_like(seen.mask)
+    residual, axial = seen.from_circle(plane)
+    rows = seen.circle_rows(plane, axial, blocks).reshape(-1, size(blocks))
+    errors = residual.ravel()
+    information = rows.T @ rows
+    used = float(seen.mask.sum())
+    objective = float(errors @ errors)
+    variance = objective / max(3 * used - size(blocks), 1.0)
+
+    # As jaxcal.calibration.answer: which directions are known, in mm at the target.
+    lever = seen.lever(seen.mask)
+    scaled = information / np.outer(*[mm_at_target(lever, blocks)[0]] * 2)
+    values = np.linalg.eigvalsh(scaled)
+    if values[0] <= threshold(eps) * values.sum():
+        return None
+    least = variance / (LARGEST_SD * lever[0]) ** 2
+    weak = values[0] <= least and eps * values.sum() < least
+    status = Status.UNOBSERVABLE if weak else Status.CONVERGED
+    covariance = variance * inverses(information[None], eps)[0]
+    if weak:
+        covariance = np.full_like(covariance, np.nan)
+
+    gradient = np.abs(errors @ rows)
+    length = np.sqrt(np.diag(information) * objective)
+    # Of exact data errors are rounding, and have no direction.
+    rounding = used * (64 * eps * lever[0]) ** 2
+    cosine = 0.0 if objective <= rounding else float(np.max(gradient / np.maximum(length, 1e-300)))
+    trace = None
+    if plan.options.trace:
+        trace = np.full(plan.options.trace, np.nan)
+        trace[0] = objective
+    none = np.zeros(())
+    return Calibration(
+        image_to_probe=found.image_to_probe,
+        point=found.point_mm,
+        elevation=np.where(seen.mask[0] > 0, seen.q[0, :, 1], 0.0),
+        sigma=_sigmas(seen, used, blocks),
+        offset_law=None,
+        channel_sigma=None,
+        unknowns_covariance=covariance,
+        scale_mm_per_px=found.scale_mm_per_px,
+        medium=_medium(found, covariance, problem, plan),
+        rms=np.asarray(np.sqrt(objective / used)),
+        mask=np.asarray(problem.mask, float),
+        status_code=np.asarray(status, np.int32),
+        differentiable=np.asarray(plan.options.differentiate and not weak and cosine <= STATIONARY),
+        sigma_tuned=np.asarray(False),
+        convergence=Convergence(
+            cost=np.asarray(objective),
+            stationarity=np.asarray(cosine),
+            tolerance_met=np.asarray(True),
+            iterations=np.asarray(0, np.int32),
+            variance_rounds=np.asarray(0, np.int32),
+            searched_start=np.asarray(False),
+            sigma_floored=np.zeros(3, bool),
+            rotation_change=none,
+            translation_change=none,
+            trace=trace,
+        ),
+        linearisation=Linearisation(
+            information=information,
+            design=information,
+            variance=np.asarray(variance),
+            tracker_sd=None,
+            average_elevation_sd=None,
+        ),
+        problem=None,
+        method=plan.method,
+        prior=plan.reported_prior,
+        data="points",
+        blocks=blocks,
+        robust=False,
+    )
+
+
+def _unknowns(found: ClosedForm, problem: Problem) -> Unknowns:
+    """The closed form's unknowns with a leading axis."""
+    scale = np.ones(2)
+    if found.scale_mm_per_px is not None:
+        scale = np.asarray(found.scale_mm_per_px) / np.asarray(problem.spacing)
+    x = found.image_to_probe[None]
+    return Unknowns(
+        x[:, :3, :3],
+        x[:, :3, 3],
+        found.point_mm[None],
+        scale[None],
+        np.array([found.sound_speed_factor]),
+        np.zeros(1),
+    )
+
+
+def _sigmas(seen: ImageErrors, used: float, blocks: tuple[str, ...]) -> Float[np.ndarray, 3]:
+    """SDs of lateral position, range and offset; each has lost a third of the unknowns."""
+    return np.sqrt((seen.errors[0] ** 2).sum(axis=0) / max(used - size(blocks) / 3, 1.0))
+
+
+def _medium(
+    found: ClosedForm, covariance: Float[np.ndarray, "p p"], problem: Problem, plan: Plan
+) -> Medium | None:
+    """The sound speed, where it was estimated."""
+    if "sound-speed" not in plan.blocks:
+        return None
+    nominal = WATER_M_S if problem.sound_speed is None else float(problem.sound_speed)
+    speed = nominal * found.sound_speed_factor
+    at = block_slice(plan.blocks, "sound-speed").start
+    return Medium(
+        sound_speed_m_s=np.asarray(speed),
+        sound_speed_sd_m_s=np.asarray(speed * np.sqrt(covariance[at, at])),
+    )

@@ -1,0 +1,68 @@
+"""What callers hand over in the place of a problem, and what to tell them if it is none."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from jaxcal import InputError
+from jaxcal.data.problem import Problem, stack
+from jaxcal.data.recording import Images, Recording
+
+_HOW = (
+    "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "
+    "a recording"
+)
+
+
+def as_problem(value: Any, name: str) -> Problem:
+    """The problem that was handed over, a recording's included.
+
+    Args:
+        value: a problem, a recording or one set of images.
+        name: of the function that was called, for messages.
+
+    Raises:
+        InputError: anything else, with what to do.
+    """
+    if isinstance(value, Problem):
+        return value
+    if isinstance(value, Recording | Images):
+        return Problem.from_recording(value)
+    if isinstance(value, str | os.PathLike):
+        raise InputError(
+            f"{name} takes a problem, not a path: {name}(jaxcal.load({os.fspath(value)!r})), or "
+            "import the file first (jaxcal import)"
+        )
+    if isinstance(value, list | tuple) and value and _are_problems(value):
+        raise InputError(
+            f"{name} takes one problem, not {len(value)}: jaxcal.calibrate_batch takes a list"
+        )
+    kind = "a dictionary" if isinstance(value, dict) else f"{type(value).__name__}"
+    raise InputError(f"{name} takes a problem or a recording, not {kind}: {_HOW}")
+
+
+def as_batch(value: Any, name: str) -> Problem:
+    """The batch of problems that was handed over; a list of problems or recordings is stacked.
+
+    Raises:
+        InputError: anything else, or problems that differ in their number of images or in parts.
+    """
+    if isinstance(value, list | tuple):
+        if not value:
+            raise InputError(f"{name} takes at least one problem; the list is empty")
+        return stack([as_problem(each, name) for each in value])
+    return as_problem(value, name)
+
+
+def unknown_names(estimate: Any) -> tuple[str, ...]:
+    """Further unknowns as a tuple: one name stands for itself, names may be separated by commas."""
+    if isinstance(estimate, str):
+        return tuple(name.strip() for name in estimate.split(",") if name.strip())
+    if estimate is None:
+        return ()
+    return tuple(estimate)
+
+
+def _are_problems(values: Any) -> bool:
+    return all(isinstance(each, Problem | Recording | Images) for each in values)

@@ -1,0 +1,343 @@
+"""What a caller may ask of a solve, and the checks that a request has to pass.
+
+Everything static about a solve is a :class:`Plan`, so that each combination is compiled once; the
+numbers that came with the request are a :class:`Given`, which is traced.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.data.problem import Problem
+from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.diagnostics.arrays import array_module, is_traced
+from jaxcal.model.blocks import EXTRA, MEDIUM, RIGID, Blocks
+from jaxcal.model.distributions import SHAPES, UNIFORM, Shape
+from jaxcal.runtime.array_types import AnyArray, Array, Float
+from jaxcal.runtime.trees import array_tree
+
+if TYPE_CHECKING:
+    import optimistix as optx
+
+Method = Literal["joint", "alternating", "conventional"]
+PriorName = Literal["auto", "gaussian", "uniform", "bounded"]
+Data = Literal["auto", "points", "channels"]
+
+LAWS: dict[str, tuple[Shape, ...]] = {"auto": SHAPES, "uniform": UNIFORM}
+"""The priors of the joint method that weigh laws of the offsets, and which."""
+
+DEFAULT_MAX_ELEVATION_MM = 1.0
+"""The bound on the offsets where none is given: the paper's."""
+
+SOUND_SPEED_SD_M_S = 20.0
+"""How far the sound speed may well be from its nominal value, m/s: some seven kelvin of water."""
+
+DELAY_SD_S = 1e-6
+"""How far the electronic delay may well be from its nominal value, s."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to solve; static, so each combination is compiled once.
+
+    Attributes:
+        solver: ``lm`` is ours. The conventional method also has ``gauss-newton`` and ``gradient``.
+            An optimistix least-squares solver, e.g. ``optimistix.Dogleg(1e-10, 1e-10)``, takes the
+            place of ours in the conventional method and, but for its prior ``bounded``, the joint
+            one; it begins where ours would, stops by its own rule, and takes longer in a batch.
+        gradient_tolerance: where ``gradient`` stops, relative.
+        tolerance_rad: the alternation stops when a round turns X by less than this (rad) and
+        tolerance_mm: moves its origin by less than this (mm). The defaults reproduce the paper.
+        max_rounds: most rounds of the alternation.
+        inner_steps: Gauss-Newton steps on X and c in each of its rounds.
+        max_iterations: most linearisations of the other solvers.
+        trace: how many values of the objective to keep in the result.
+        differentiate: False where nobody will differentiate the answer: inside a grad of the
+            caller it is then a constant, and derivatives are neither traced nor compiled.
+        precision: ``float64``, whatever the problem's arrays hold, or ``float32``, which is faster
+            on some devices and loses six digits.
+    """
+
+    solver: Literal["lm", "gauss-newton", "gradient"] | optx.AbstractLeastSquaresSolver = "lm"
+    gradient_tolerance: float = 1e-6
+    tolerance_rad: float = 1e-3
+    tolerance_mm: float = 0.1
+    max_rounds: int = 1000
+    inner_steps: int = 2
+    max_iterations: int = 100
+    trace: int = 0
+    differentiate: bool = True
+    precision: Literal["float64", "float32"] = "float64"
+
+    def __post_init__(self) -> None:
+        if _is_optimistix(self.solver):
+            _check_static(self.solver)
+        elif self.solver not in ("lm", "gauss-newton", "gradient"):
+            raise InputError(
+                "solver must be lm, gauss-newton, gradient or an optimistix least-squares solver, "
+                f"not {self.solver!r}"
+            )
+        if self.precision not in ("float64", "float32"):
+            raise InputError(f"precision must be float64 or float32, not {self.precision!r}")
+        for name in ("gradient_tolerance", "tolerance_rad", "tolerance_mm"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"{name} must be a positive number, not {value!r}")
+        for name, least in (
+            ("max_rounds", 1),
+            ("inner_steps", 1),
+            ("max_iterations", 1),
+            ("trace", 0),
+        ):
+            if getattr(self, name) < least:
+                raise InputError(f"{name} must be at least {least}, not {getattr(self, name)}")
+
+
+def _is_optimistix(solver: Any) -> TypeGuard[optx.AbstractLeastSquaresSolver]:
+    """Whether this is a least-squares solver of optimistix, which takes long to import."""
+    found = sys.modules.get("optimistix")
+    return found is not None and isinstance(solver, found.AbstractLeastSquaresSolver)
+
+
+def _check_static(solver: optx.AbstractLeastSquaresSolver) -> None:
+    """A solver is part of what is compiled, so its tolerances must be plain numbers."""
+    try:
+        hash(solver)
+    except TypeError:
+        raise InputError(
+            f"the settings of {type(solver).__name__} must be plain numbers, not arrays"
+        ) from None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything static about a solve: method, belief about the offsets, data, unknowns.
+
+    ``laws`` are those to weigh after the self-tuned Gaussian solve; none: that is the answer.
+    ``robust``: find the images that agree first, and leave the others out.
+    """
+
+    method: Method
+    prior: Literal["none", "gaussian", "bounded"]
+    self_tuning: bool
+    laws: tuple[Shape, ...]
+    channels: bool
+    blocks: Blocks
+    options: Options
+    robust: bool = False
+
+    @property
+    def other_solver(self) -> optx.AbstractLeastSquaresSolver | None:
+        """The caller's solver, where one was handed over."""
+        solver = self.options.solver
+        return solver if _is_optimistix(solver) else None
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether the solver takes one problem at a time: somebody else's and the historical do."""
+        return self.other_solver is not None or self.options.solver == "gradient"
+
+    @property
+    def reported_prior(self) -> str:
+        """The prior's name in the result: that of the laws which were weighed, if any were."""
+        names = [name for name, laws in LAWS.items() if laws == self.laws]
+        return names[0] if names else self.prior
+
+
+@array_tree
+class Given:
+    """Numbers given by the caller beside the problem.
+
+    Attributes:
+        sigma: SDs of (lateral, range, offset), or of (element distance, offset) on channels, mm.
+        tracker_sd: mm.
+        max_elevation: mm.
+        medium_sd: SDs of the sound speed (m/s) and the delay (s).
+    """
+
+    sigma: Float[AnyArray, " components"] | None
+    tracker_sd: Float[AnyArray, ""] | None
+    max_elevation: Float[AnyArray, "*images"] | None
+    medium_sd: Float[AnyArray, 2] | None
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a caller asks for, as it came; :func:`jaxcal.calibrate` documents each."""
+
+    method: Method = "joint"
+    prior: PriorName = "auto"
+    max_elevation: float | np.ndarray | Array | None = None
+    sigma: tuple[float, ...] | np.ndarray | Array | None = None
+    tracker_sd: float | Array | None = None
+    estimate: tuple[str, ...] = ()
+    data: Data = "auto"
+    sound_speed_sd: float | Array = SOUND_SPEED_SD_M_S
+    delay_sd: float | Array = DELAY_SD_S
+    options: Options | None = None
+    robust: bool = False
+
+
+def prepare(problem: Problem, request: Request) -> tuple[Plan, Given]:
+    """Check a request against its problem and sort it into what is static and what is traced.
+
+    Raises:
+        InputError: parts that contradict each other or the problem.
+    """
+    _check_names(request)
+    kind: Literal["none", "gaussian", "bounded"] = "gaussian"
+    if request.method == "conventional":
+        kind = "none"
+    elif request.method == "alternating" or request.prior == "bounded":
+        kind = "bounded"
+    _check_combination(request, kind)
+    _check_unknowns(problem, request)
+    channels = _uses_channels(problem, request, kind)
+    for name in ("sigma", "sound_speed_sd", "delay_sd"):
+        _check_size(name, getattr(request, name), np.finfo(float).tiny)
+    for name in ("tracker_sd", "max_elevation"):
+        _check_size(name, getattr(request, name), 0.0)
+
+    dtype = problem.mask.dtype
+
+    def array(value: Any) -> AnyArray | None:
+        # Of numbers a numpy array: JAX would compile their conversion.
+        return None if value is None else array_module(value).asarray(value, dtype)
+
+    blocks = RIGID + tuple(name for name in EXTRA if name in request.estimate)
+    medium = None
+    if kind == "gaussian" and any(name in blocks for name in MEDIUM):
+        believed = (request.sound_speed_sd, request.delay_sd)
+        medium = array_module(believed).stack([array(sd) for sd in believed])
+    given = Given(
+        array(request.sigma), array(request.tracker_sd), array(request.max_elevation), medium
+    )
+    components = 2 if channels else 3
+    if given.sigma is not None and given.sigma.shape != (components,):
+        names = "element distance, offset" if channels else "lateral, range, elevational"
+        raise InputError(f"sigma must be {components} numbers: {names}, mm")
+    tuning = kind == "gaussian" and request.sigma is None
+    options = Options() if request.options is None else request.options
+    laws: tuple[Shape, ...] = ()
+    if tuning and request.prior in LAWS:
+        laws = LAWS[request.prior]
+    plan = Plan(request.method, kind, tuning, laws, channels, blocks, options, bool(request.robust))
+    return plan, given
+
+
+def _check_names(request: Request) -> None:
+    if request.method not in ("joint", "alternating", "conventional"):
+        raise InputError(
+            f"method must be joint, alternating or conventional, not {request.method!r}"
+        )
+    if request.prior not in get_args(PriorName):
+        names = "auto, gaussian, uniform or bounded"
+        raise InputError(f"prior must be {names}, not {request.prior!r}")
+    if request.data not in ("auto", "points", "channels"):
+        raise InputError(f"data must be auto, points or channels, not {request.data!r}")
+    for name in request.estimate:
+        if name not in EXTRA:
+            raise InputError(f"cannot estimate {name!r}; there are: {', '.join(EXTRA)}")
+
+
+def _check_combination(request: Request, kind: str) -> None:
+    if kind != "gaussian" and (request.sigma is not None or request.tracker_sd is not None):
+        raise InputError("sigma and tracker_sd belong to the joint method's gaussian prior")
+    if request.tracker_sd is not None and request.sigma is None:
+        raise InputError("tracker_sd needs given sigma: self-tuned SDs contain the tracker's noise")
+    if request.sigma is not None and request.prior == "uniform":
+        raise InputError("the uniform prior tunes its SDs: sigma belongs to the gaussian one")
+    weighing = kind == "gaussian" and request.prior in LAWS and request.sigma is None
+    if request.max_elevation is not None and kind != "bounded" and not weighing:
+        raise InputError(
+            "max_elevation belongs to the alternating method and to the joint one's priors auto, "
+            "uniform (without given sigma) and bounded"
+        )
+    options = request.options
+    other = options is not None and _is_optimistix(options.solver)
+    if other and kind == "bounded":
+        raise InputError(
+            "another solver would not keep the offsets within their bounds: it goes with the "
+            "conventional method and the joint one's priors auto, uniform and gaussian"
+        )
+    historical = options is not None and options.solver == "gradient"
+    if request.estimate and historical and request.method == "conventional":
+        raise InputError(
+            f"the gradient solver moves X only: it cannot estimate the {request.estimate[0]}"
+        )
+
+
+def _check_unknowns(problem: Problem, request: Request) -> None:
+    if "scale" in request.estimate and not problem.pixels:
+        raise InputError("the points are in mm already: there is no pixel scale to estimate")
+    if "scale" in request.estimate and "sound-speed" in request.estimate:
+        raise InputError(
+            "sound speed and axial pixel scale are one and the same factor on the range: estimate "
+            "one of them"
+        )
+    if problem.pixels and not problem.spacing_known and "scale" not in request.estimate:
+        raise InputError(
+            'the pixels have no spacing_mm: give it, or estimate the scale (estimate=("scale",), '
+            "--estimate scale)"
+        )
+
+
+def _uses_channels(problem: Problem, request: Request, kind: str) -> bool:
+    if request.data == "channels":
+        if problem.channels is None:
+            raise InputError("data='channels' needs times of flight; this problem has points only")
+        if kind != "gaussian":
+            raise InputError("channels are solved by the joint method with the gaussian prior only")
+        if request.tracker_sd is not None:
+            raise InputError("tracker_sd is for points; on channels there is no such unknown")
+        return True
+    if request.data == "points" or problem.channels is None or kind != "gaussian":
+        return False
+    # A straight array's points with their covariances say all that its channels do, unless sound
+    # speed or delay are unknown, which bend the wavefront; a curved array's do not.
+    wanted = problem.curved or any(name in request.estimate for name in MEDIUM)
+    three = request.sigma is not None and np.size(request.sigma) == 3
+    return wanted and request.tracker_sd is None and not three
+
+
+def _check_size(name: str, value: object, least: float) -> None:
+    if value is None or is_traced(value):
+        return
+    numbers = np.asarray(value, dtype=float)
+    if not (np.isfinite(numbers).all() and (numbers >= least).all()):
+        unit = {"sound_speed_sd": "m/s", "delay_sd": "s"}.get(name, "mm")
+        wanted = "positive" if least > 0 else "not negative"
+        raise InputError(f"{name} must be finite and {wanted}, in {unit}, not {value!r}")
+
+
+def check_values(problem: Problem) -> None:
+    """Refuse NaN, Inf and too few images, where the values can be looked at.
+
+    Raises:
+        InputError: with the row named.
+    """
+    if is_traced(problem):
+        return
+    used = np.asarray(problem.mask) > 0
+    if used.sum() < MINIMUM_IMAGES:
+        raise InputError(
+            f"{int(used.sum())} used images are too few: at least {MINIMUM_IMAGES} are needed"
+        )
+    for name in ("poses", "measurements"):
+        values = np.asarray(getattr(problem, name))
+        bad = ~np.isfinite(values).reshape(len(used), -1).all(axis=1) & used
+        if bad.any():
+            raise InputError(f"{name} of image {np.flatnonzero(bad)[0]} hold NaN or Inf")
+
+
+def with_bound(problem: Problem, given: Given) -> Problem:
+    """The problem with the caller's bound on the offsets, where there is one."""
+    if given.max_elevation is None:
+        return problem
+    bound = array_module(given.max_elevation).broadcast_to(given.max_elevation, problem.mask.shape)
+    return replace(problem, max_elevation=bound)

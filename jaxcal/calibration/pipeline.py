@@ -1,0 +1,151 @@
+"""From a batch of problems to its calibrations, as one pure function of arrays.
+
+Images that do not agree are found first, where that was asked; then the plan's method
+(:mod:`jaxcal.solvers.methods`); then the answer is put together (:mod:`jaxcal.calibration.answer`).
+:mod:`jaxcal.calibration.calibrate` compiles it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxcal.calibration.answer import Solved, assemble
+from jaxcal.calibration.options import Given, Plan
+from jaxcal.calibration.result import Calibration, Convergence
+from jaxcal.data.problem import Problem
+from jaxcal.model.batch import Images
+from jaxcal.model.distributions import OffsetLaw
+from jaxcal.model.observations import (
+    BoundedOffsets,
+    Channels,
+    InPlane,
+    LocalUnknown,
+    local_unknowns,
+)
+from jaxcal.model.parameters import Blocks
+from jaxcal.runtime.precision import in_standard_promotion
+from jaxcal.solvers import methods
+from jaxcal.solvers.consensus import find_consensus, rigid_model
+from jaxcal.solvers.methods import Solution
+from jaxcal.solvers.normal_equations import accumulate
+from jaxcal.solvers.start import ConventionalStart, GivenStart
+
+
+def solve_problems(
+    problems: Problem,
+    given: Given,
+    plan: Plan,
+    agreed: Float[Array, "lanes n"] | None = None,
+    begun: ConventionalStart | GivenStart | None = None,
+) -> Calibration:
+    """Solve a batch of problems (one leading axis).
+
+    Args:
+        problems: the batch.
+        given: numbers that came with the request.
+        plan: what is static about it.
+        agreed: what :func:`agreed_images` found, where it was asked before.
+        begun: their conventional fits, where they have been made before.
+    """
+    if not plan.options.differentiate:
+        problems, given = jax.lax.stop_gradient((problems, given))
+    problems = problems.cleared(problems.mask)
+    if plan.robust:
+        if agreed is None:
+            # Which images are left out is piecewise constant in the data: no derivative passes.
+            seen = jax.lax.stop_gradient(problems.points_only())
+            agreed = jax.vmap(_one_at_a_time(plan.blocks))(seen)
+        problems = replace(problems, mask=agreed)
+    if plan.one_by_one:
+        solution = jax.lax.map(
+            lambda problem: _solved(jax.tree.map(lambda leaf: leaf[None], problem), given, plan),
+            problems,
+        )
+        solution = jax.tree.map(lambda leaf: leaf[:, 0], solution)
+    else:
+        solution = _solved(problems, given, plan, begun)
+    solved, averaged = solution
+    return assemble(solved, averaged, problems, given, plan)
+
+
+def _one_at_a_time(blocks: Blocks):
+    # One problem at a time, in a batch too: its finalists fill the vector units, and more problems
+    # at once would only leave the cache.
+    agreed = in_standard_promotion(lambda problem: agreed_images(problem, blocks))
+    return jax.custom_batching.sequential_vmap(agreed)
+
+
+def agreed_images(problem: Problem, blocks: Blocks) -> Float[Array, " n"]:
+    """1 for the used images of one problem that agree with each other."""
+    return find_consensus(jax.lax.stop_gradient(problem), rigid_model(blocks)).keep
+
+
+class Averaged(eqx.Module):
+    """The average over the offsets' laws, problems first.
+
+    Attributes:
+        covariance: of the unknowns.
+        elevation_sd: of the offsets, mm.
+        law: what was found out.
+    """
+
+    covariance: Float[Array, "lanes p p"]
+    elevation_sd: Float[Array, "lanes n"]
+    law: OffsetLaw
+
+
+def _solved(
+    problems: Problem, given: Given, plan: Plan, begun: ConventionalStart | GivenStart | None = None
+) -> tuple[Solved, Averaged | None]:
+    """The method's solution with its normal matrices, problems first."""
+    found = methods.solve(problems, given, plan, begun)
+    images = Images.of(problems, channels=plan.channels)
+    observation = found.observation
+    information = accumulate(found.place, observation, images, None, found.medium).stacked()
+    unweighted = InPlane.of(images)
+    if plan.channels:
+        unweighted = Channels(jnp.ones((2, images.lanes), images.mask.dtype))
+    design = accumulate(found.place, unweighted, images, None).stacked()
+    offset = jnp.zeros((images.lanes, 0), images.mask.dtype)
+    if isinstance(observation, LocalUnknown):
+        offset = local_unknowns(found.place, observation, images)
+        offset = found.offset if found.offset is not None else offset
+    solved = Solved(
+        parameters=found.place.parameters(),
+        offset=offset,
+        sigma=observation.sigma.T if observation.whitened else None,
+        bound=observation.bound if isinstance(observation, BoundedOffsets) else None,
+        information=jnp.moveaxis(information, -1, 0),
+        design=jnp.moveaxis(design, -1, 0),
+        convergence=_convergence(found, plan),
+    )
+    if found.covariance is None or found.elevation_sd is None or found.law is None:
+        return solved, None
+    covariance = jnp.moveaxis(found.covariance, -1, 0)
+    return solved, Averaged(covariance, found.elevation_sd, found.law)
+
+
+def _convergence(found: Solution, plan: Plan) -> Convergence:
+    floored = found.sigma_floored
+    if floored.shape[0] == 1:
+        floored = jnp.tile(floored, (3, 1))
+    if plan.channels:
+        # Lateral position and range both come from the elements' distances.
+        floored = jnp.stack([floored[0], floored[0], floored[1]])
+    return Convergence(
+        cost=found.cost,
+        stationarity=found.cosine,
+        tolerance_met=found.arrived,
+        iterations=found.iterations,
+        variance_rounds=found.variance_rounds,
+        searched_start=found.searched,
+        sigma_floored=floored.T,
+        rotation_change=found.rotation_change,
+        translation_change=found.translation_change,
+        trace=None if found.trace is None else found.trace.T,
+    )

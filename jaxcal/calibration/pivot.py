@@ -1,0 +1,270 @@
+"""Pivot calibration: the tip of a tracked tool from poses taken while it turns about its tip.
+
+The degenerate case of Eq. 7: B_i p = c for all i, with p the tip in the tool's frame and c the
+pivot point. It is the calibration with every measurement (0, 0), which makes p the translation of
+X, and with X's rotation held fixed: the free blocks are X's translation and the point. Solver,
+consensus, covariance and observability are the calibration's own.
+
+The errors of the three axes share one SD, so this is plain least squares on the images that agree.
+"""
+
+from __future__ import annotations
+
+from functools import cache, partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxcal import InputError
+from jaxcal.calibration.answer import covariance_and_observability
+from jaxcal.calibration.result import Status
+from jaxcal.data.geometry import check_poses
+from jaxcal.data.problem import Problem, is_traced
+from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
+from jaxcal.model.parameters import Parameters, retract
+from jaxcal.model.residuals import target_in_image
+from jaxcal.runtime import compiler
+from jaxcal.runtime.precision import in_own_modes, require_float64
+from jaxcal.solvers import dense
+from jaxcal.solvers.consensus import FEWEST_IMAGES, Model, departures, find_consensus, stands_out
+
+BLOCKS = ("translation", "point")
+AXES = ("x", "y", "z")
+"""Of the tool's frame: what a departure's components are."""
+_SUBSET = 4
+
+
+class Pivot(eqx.Module):
+    """A pivot calibration (or a batch, with leading axes).
+
+    Attributes:
+        tip: p in the tool's frame, mm.
+        point: c in the tracker's frame, mm.
+        covariance: of (tip, point), mm^2; NaN where the poses do not determine them.
+        sigma: SD of the error along one axis, mm.
+        rms: root mean square length of the errors B_i p - c over the used poses, mm.
+        residual: those errors in the tool's frame, mm; 0 where not used.
+        mask: 1 for used poses.
+        outlier: 1 where a pose does not fit the rest; a robust solve leaves it out.
+        departure: errors in robust SDs of the used poses', those of poses left out included.
+        status_code: a :class:`jaxcal.calibration.result.Status`.
+        information: of (tip, point) for errors with an SD of 1 mm.
+        robust: poses that do not fit the rest were left out (static).
+    """
+
+    tip: Float[Array, "*batch 3"]
+    point: Float[Array, "*batch 3"]
+    covariance: Float[Array, "*batch 6 6"]
+    sigma: Float[Array, "*batch"]
+    rms: Float[Array, "*batch"]
+    residual: Float[Array, "*batch n 3"]
+    mask: Float[Array, "*batch n"]
+    outlier: Float[Array, "*batch n"]
+    departure: Float[Array, "*batch n 3"]
+    status_code: Int[Array, "*batch"]
+    information: Float[Array, "*batch 6 6"]
+    robust: bool = eqx.field(static=True, default=True)
+
+    @property
+    def converged(self) -> Bool[Array, "*batch"]:
+        """Whether tip and point are determined (traceable)."""
+        return jnp.asarray(self.status_code == Status.CONVERGED)
+
+    @property
+    def status(self) -> str:
+        """converged, max_iterations, unobservable or failed (one calibration, concrete)."""
+        return Status(int(self.status_code)).name.lower()
+
+    @property
+    def weakest(self) -> Float[np.ndarray, "*batch 3"]:
+        """Unit vector of the least known direction of the tip, in the tool's frame (concrete)."""
+        weakest = self._weakest()[0][..., :3]
+        length = np.linalg.norm(weakest, axis=-1, keepdims=True)
+        return weakest / np.maximum(length, 1e-30)
+
+    @property
+    def weakest_sd(self) -> Float[np.ndarray, "*batch"]:
+        """SD along the least known direction of tip and point, mm; NaN where it has none."""
+        return self._weakest()[1]
+
+    def _weakest(self) -> tuple[np.ndarray, np.ndarray]:
+        information, sigma = np.asarray(self.information), np.asarray(self.sigma)
+        flat = information.reshape(-1, 6, 6)
+        found = Spectra.of(flat, flat, sigma.reshape(-1) ** 2, float(np.finfo(flat.dtype).eps))
+        return found.weakest.reshape(*sigma.shape, 6), found.weakest_sd.reshape(sigma.shape)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a person should know before using this answer (one calibration, concrete)."""
+        found = []
+        if self.status == "failed":
+            return ["the solve failed: its result holds no usable numbers"]
+        if self.status == "unobservable":
+            direction = ", ".join(f"{value:.2f}" for value in np.asarray(self.weakest))
+            found.append(
+                f"not observable: these poses do not determine the tip along ({direction}) of the "
+                "tool's frame; tilt the tool about a further axis"
+            )
+        named = messages.images_that_stand_out(self)
+        if named:
+            told = messages.listed_departures(self, AXES)
+            verb = "left out" if self.robust else "kept"
+            found.append(f"{verb} {len(named)} poses that do not fit the rest: {told}")
+        return found
+
+
+@in_own_modes
+def calibrate_pivot(
+    poses: Float[np.ndarray | Array, "*batch n rows 4"],
+    mask: Float[np.ndarray | Array, "*batch n"] | Bool[np.ndarray, " n"] | None = None,
+    *,
+    robust: bool = True,
+) -> Pivot:
+    """Find a tool's tip and the point about which it turned.
+
+    Args:
+        poses: tool -> tracker, mm, (n, 4, 4) or (n, 3, 4); concrete ones are checked and their
+            rotations projected to SO(3). Leading axes make a batch.
+        mask: 1 (or True) for poses to use; all by default.
+        robust: find the poses that agree, whatever up to nearly half of the others are, and leave
+            those out.
+
+    Raises:
+        InputError: concrete poses that are none, or fewer than 4 used ones.
+    """
+    if not is_traced(poses) and np.ndim(poses) == 3:
+        used = np.ones(len(poses), bool) if mask is None else np.asarray(mask) > 0
+        poses = check_poses(np.asarray(poses, dtype=np.float64), used)
+        if used.sum() < MINIMUM_IMAGES:
+            raise InputError(
+                f"{int(used.sum())} used poses are too few: at least {MINIMUM_IMAGES} are needed"
+            )
+    require_float64("jaxcal.calibrate_pivot")
+    array = jnp.asarray(poses, np.float64)
+    weight = jnp.ones(array.shape[:-2]) if mask is None else jnp.asarray(mask)
+    weight = jnp.broadcast_to(weight.astype(array.dtype), array.shape[:-2])
+    alone = compiler.is_whole_program(array, weight)
+    return _program(jax.default_backend() if alone else None)(array, weight, robust)
+
+
+@cache
+def _program(platform: str | None):
+    flags = None if platform is None else compiler.quick_to_compile(platform)
+    return jax.jit(_solve_all, static_argnums=2, compiler_options=flags)
+
+
+def _solve_all(
+    poses: Float[Array, "*batch n 4 4"], mask: Float[Array, "*batch n"], robust: bool
+) -> Pivot:
+    solve = partial(_solve, robust=robust)
+    for _ in poses.shape[:-3]:
+        solve = jax.vmap(solve)
+    return solve(poses, mask)
+
+
+def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bool) -> Pivot:
+    everything = Problem(
+        poses=poses,
+        measurements=jnp.zeros((*mask.shape, 2), poses.dtype),
+        mask=mask,
+        spacing=jnp.ones(2, poses.dtype),
+        face_offset=jnp.zeros((), poses.dtype),
+    )
+    model = Model(BLOCKS, _errors, _proposals, isotropic=True, subset=_SUBSET)
+    keep = find_consensus(everything, model).keep if robust else mask
+    problem = eqx.tree_at(lambda p: p.mask, everything, keep)
+    parameters = jax.tree.map(lambda leaf: leaf[0], _proposals(problem, keep[None]))
+    # The problem is linear: two steps take what the moments' rounding has left.
+    information, gradient = _normal(parameters, problem)
+    diagonal = jnp.diagonal(information)
+    step = dense.solve_symmetric(information, gradient, diagonal)
+    parameters = retract(parameters, -step, BLOCKS)
+    _, gradient = _normal(parameters, problem)
+    step = dense.solve_symmetric(information, gradient, diagonal)
+    parameters = retract(parameters, -step, BLOCKS)
+    _, departure = departures(parameters, everything, keep, model)
+    outlier = mask * (1 - keep)
+    if not robust:
+        judged = jnp.sum(mask) >= FEWEST_IMAGES
+        outlier = mask * judged * stands_out(departure, keep)
+    residual = _errors(parameters, problem)
+    used = jnp.sum(keep)
+    variance = jnp.sum(residual**2) / jnp.maximum(3 * used - 6, 1.0)
+    length = jnp.sqrt(jnp.sum(parameters.translation**2))
+    finite = jnp.all(jnp.isfinite(parameters.translation))
+    failed = jnp.logical_not(finite) | (jnp.sum(mask) < MINIMUM_IMAGES)
+    covariance, observed = covariance_and_observability(
+        information,
+        information,
+        variance,
+        jnp.ones(6, poses.dtype),
+        LARGEST_SD * jnp.maximum(length, _spread(problem)),
+    )
+    unknown = observed.degenerate | observed.weak
+    status = jnp.where(unknown, Status.UNOBSERVABLE, Status.CONVERGED)
+    return Pivot(
+        tip=parameters.translation,
+        point=parameters.point,
+        covariance=jnp.where(unknown, jnp.nan, covariance),
+        sigma=jnp.sqrt(variance),
+        rms=jnp.sqrt(jnp.sum(residual**2) / used),
+        residual=residual,
+        mask=keep,
+        outlier=outlier,
+        departure=departure,
+        status_code=jnp.where(failed, Status.FAILED, status).astype(jnp.int32),
+        information=information,
+        robust=robust,
+    )
+
+
+def _errors(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:
+    # The tip is the origin of a tool's "image".
+    return problem.mask[:, None] * target_in_image(parameters, problem)
+
+
+def _normal(
+    parameters: Parameters, problem: Problem
+) -> tuple[Float[Array, "6 6"], Float[Array, 6]]:
+    """The normal matrix of tip and point, and the gradient."""
+
+    def errors(tangent: Float[Array, 6]) -> Float[Array, "n 3"]:
+        return _errors(retract(parameters, tangent, BLOCKS), problem)
+
+    value, push = jax.linearize(errors, jnp.zeros(6, problem.mask.dtype))
+    jacobian = jax.vmap(push)(jnp.eye(6, dtype=problem.mask.dtype))
+    information = jnp.einsum("anm,bnm->ab", jacobian, jacobian)
+    return information, jnp.einsum("anm,nm->a", jacobian, value)
+
+
+def _spread(problem: Problem) -> Float[Array, ""]:
+    """Root mean square distance of the tool's origin from its mean, mm."""
+    total = jnp.sum(problem.mask)
+    origins = problem.poses[:, :3, 3]
+    mean = jnp.sum(problem.mask[:, None] * origins, axis=0) / total
+    return jnp.sqrt(jnp.sum(problem.mask[:, None] * (origins - mean) ** 2) / total)
+
+
+def _proposals(problem: Problem, subsets: Float[Array, "k n"]) -> Parameters:
+    """R_i p - c = -t_i for every subset at once, from each pose's moments."""
+    rotations, translations = problem.poses[:, :3, :3], problem.poses[:, :3, 3]
+    used = problem.mask
+    centre = jnp.sum(used[:, None] * translations, axis=0) / jnp.sum(used)
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=used.dtype), rotations.shape)
+    rows = jnp.concatenate([rotations, -eye, (centre - translations)[..., None]], axis=2)
+    rows = jnp.where(used[:, None, None] > 0, rows, 0.0)
+    moments = jnp.einsum("nia,nib->nab", rows, rows).reshape(len(used), -1)
+    systems = (subsets @ moments).reshape(-1, 7, 7)
+
+    def solve(system: Float[Array, "7 7"]) -> Parameters:
+        matrix, vector = system[:6, :6], system[:6, 6:]
+        ridge = 1e3 * jnp.finfo(system.dtype).eps * jnp.trace(matrix) / 6
+        found = dense.solve_positive(matrix + ridge * jnp.eye(6, dtype=matrix.dtype), vector)[:, 0]
+        return Parameters.of(jnp.eye(3, dtype=found.dtype), found[:3], found[3:] + centre)
+
+    return jax.vmap(solve)(systems)

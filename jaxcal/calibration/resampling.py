@@ -1,0 +1,372 @@
+"""Cross-validation and bootstrap: one problem solved many times over, as one batch.
+
+Cross-validation masks images out and looks at them through the calibration of the rest: what Eq. 8
+says of images that the calibration has not seen. Leaving out one image at a time also tells how
+much each image moves the answer (its influence). The bootstrap draws the images anew with
+replacement and tells how the answer scatters (reproducibility).
+
+All of it is :func:`jaxcal.calibrate_batch` on masks or rows of the same problem: pure functions of
+arrays (and a key), which work under jit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from jaxcal import InputError
+from jaxcal.calibration.calibrate import calibrate, calibrate_batch
+from jaxcal.calibration.result import Calibration
+from jaxcal.data.problem import Problem, is_traced
+from jaxcal.data.recording import MINIMUM_IMAGES, Recording
+from jaxcal.diagnostics.dependence import independent
+from jaxcal.diagnostics.metrics import calibration_reproducibility
+from jaxcal.model.parameters import Parameters
+from jaxcal.model.residuals import measured_points, measurement_residual
+from jaxcal.runtime.precision import in_own_modes
+from jaxcal.solvers import dense
+from jaxcal.solvers.methods import nominal_sound_speed
+
+LARGEST_RESAMPLES = 100_000
+
+
+class CrossValidation(eqx.Module):
+    """Images seen through calibrations that did not use them.
+
+    Attributes:
+        residual: (n, 3) lateral, range and elevational errors of each held-out image, mm; 0 where
+            not used.
+        cloud: (n, 3) the target as reconstructed from each held-out image (in the plane), less the
+            target of the calibration that held it out, mm.
+        precision: norm of the SD of that cloud (Eq. 8 for images that were not seen), mm.
+        rms: its root mean square length, mm.
+        log_density: (n,) log predictive density of each image's three errors under the Gaussian
+            SDs of the calibration that held it out; 0 where not used.
+        moved: (n, 6) [v, omega] by which leaving the image (its fold) out moves X, right
+            perturbation, mm and rad.
+        influence: (n,) length of that in SDs of X: sqrt(moved' Cov^-1 moved / 6); NaN without a
+            covariance.
+        image_to_probe: (folds, 4, 4) X of each fold.
+        converged: (folds,) whether its solve converged.
+        fold_cost: (n,) minimised objective of the calibration that held the image out.
+        mask: (n,) 1 for used images.
+        image_moved: (n,) root mean square over ``image_points`` of how far leaving the image (its
+            fold) out moves them, estimated pixel sizes included, mm.
+        image_points: (m, 2) [lateral, axial] of those points, mm: corners and middle of the box
+            that the measured points fill.
+    """
+
+    residual: Float[Array, "n 3"]
+    cloud: Float[Array, "n 3"]
+    precision: Float[Array, ""]
+    rms: Float[Array, ""]
+    log_density: Float[Array, " n"]
+    moved: Float[Array, "n 6"]
+    influence: Float[Array, " n"]
+    image_to_probe: Float[Array, "folds 4 4"]
+    converged: Float[Array, " folds"]
+    fold_cost: Float[Array, " n"]
+    mask: Float[Array, " n"]
+    image_moved: Float[Array, " n"]
+    image_points: Float[Array, "m 2"]
+
+
+class Bootstrap(eqx.Module):
+    """How the answer scatters when the images are drawn anew.
+
+    Attributes:
+        image_to_probe: (k, 4, 4) X of each resample.
+        converged: (k,) 1 where its solve converged; only those count below.
+        spread: (6,) SD of X about the full data's, [v, omega], mm and rad; a median-based one, so
+            that a few resamples without enough different images do not spoil it.
+        reproducibility: (m,) mean distance of an image point from its mean over the resamples, mm;
+            estimated pixel sizes count.
+        image_points: (m, 2) [lateral, axial] of those points, mm: corners and middle of the box
+            that the measured points fill.
+    """
+
+    image_to_probe: Float[Array, "k 4 4"]
+    converged: Float[Array, " k"]
+    spread: Float[Array, 6]
+    reproducibility: Float[Array, " m"]
+    image_points: Float[Array, "m 2"]
+
+
+@in_own_modes
+def cross_validate(
+    problem: Problem | Recording,
+    *,
+    folds: int | None = None,
+    result: Calibration | None = None,
+    **arguments: Any,
+) -> CrossValidation:
+    """Hold out each image (or each of some folds) in turn.
+
+    Args:
+        problem: one problem or a recording.
+        folds: image i belongs to fold i mod folds; by default every image is a fold of its own.
+        result: the calibration of all images, where it is at hand. Images that it left out
+            as outliers are neither used nor held out.
+        arguments: as for :func:`jaxcal.calibrate`.
+
+    Raises:
+        InputError: too few images or folds, or options that contradict each other.
+    """
+    problem = _one_problem(problem, arguments)
+    count = problem.images
+    folds = count if folds is None else folds
+    if not 2 <= folds <= count:
+        raise InputError(f"folds must be between 2 and the number of images {count}, not {folds}")
+    result = calibrate(problem, **arguments) if result is None else result
+    problem = replace(problem, mask=jnp.asarray(result.mask, problem.mask.dtype))
+    fold = np.arange(count) % folds
+    rest = jnp.asarray(fold[None, :] != np.arange(folds)[:, None], problem.mask.dtype)
+    _check_left(problem.mask, rest)
+    # What is an outlier was decided on all images.
+    options: dict[str, Any] = {**arguments, "robust": False}
+    fits = calibrate_batch(_many(problem, problem.mask * rest), **options)
+    held = jax.tree.map(lambda leaf: leaf[fold], fits)
+    errors, cloud = _seen(held, problem)
+    mask = problem.mask
+    used = jnp.sum(mask)
+    mean = jnp.sum(mask[:, None] * cloud, axis=0) / used
+    moved = jax.vmap(relative_twist, (None, 0))(
+        jnp.asarray(result.image_to_probe), held.image_to_probe
+    )
+    moved = mask[:, None] * moved
+    points = _corners(problem, result)
+    whole = jnp.asarray(result.image_to_probe)
+    image_moved = _apart(_with_scale(held, result), whole, points) * mask
+    density = -0.5 * jnp.sum((errors / held.sigma) ** 2 + jnp.log(2 * jnp.pi * held.sigma**2), 1)
+    return CrossValidation(
+        residual=errors,
+        cloud=cloud,
+        precision=jnp.sqrt(jnp.sum(mask[:, None] * (cloud - mean) ** 2) / (used - 1)),
+        rms=jnp.sqrt(jnp.sum(cloud**2) / used),
+        log_density=mask * density,
+        moved=moved,
+        influence=_in_sds(moved, jnp.asarray(result.covariance)),
+        image_to_probe=jnp.asarray(fits.image_to_probe),
+        converged=jnp.asarray(fits.converged, mask.dtype),
+        fold_cost=held.cost,
+        mask=mask,
+        image_moved=image_moved,
+        image_points=points,
+    )
+
+
+@in_own_modes
+def bootstrap(
+    problem: Problem | Recording,
+    resamples: int = 200,
+    key: Key[Array, ""] | int = 0,
+    *,
+    result: Calibration | None = None,
+    **arguments: Any,
+) -> Bootstrap:
+    """Draw the used images anew with replacement, and calibrate each draw.
+
+    Args:
+        problem: one problem or a recording.
+        resamples: how many draws.
+        key: of the draws, or a seed; draw k is fold_in(key, k).
+        result: the calibration of all images, where it is at hand. Images that it left out
+            as outliers are not drawn.
+        arguments: as for :func:`jaxcal.calibrate`.
+
+    Raises:
+        InputError: fewer than 2 resamples, or options that contradict each other.
+    """
+    problem = _one_problem(problem, arguments)
+    if not 2 <= resamples <= LARGEST_RESAMPLES:
+        raise InputError(f"resamples must be between 2 and {LARGEST_RESAMPLES}, not {resamples}")
+    root = jax.random.key(key) if isinstance(key, int) else key
+    result = calibrate(problem, **arguments) if result is None else result
+    mask = jnp.asarray(result.mask, problem.mask.dtype)
+    problem = replace(problem, mask=mask)
+    cumulative = jnp.cumsum(mask)
+
+    def draw(index: Array) -> Array:
+        uniform = jax.random.uniform(jax.random.fold_in(root, index), mask.shape, mask.dtype)
+        # The image at whose place the count of used ones passes the draw; unused ones never do.
+        chosen = jnp.searchsorted(cumulative, uniform * cumulative[-1], side="right")
+        return jnp.minimum(chosen, mask.shape[0] - 1)
+
+    rows = jax.vmap(draw)(jnp.arange(resamples))
+    # As many images as were used: the places of unused ones stay empty.
+    options: dict[str, Any] = {**arguments, "robust": False}
+    fits = calibrate_batch(_drawn(problem, rows, mask), **options)
+    converged = jnp.asarray(fits.converged, mask.dtype)
+    whole = jnp.asarray(result.image_to_probe)
+    drawn = jnp.asarray(fits.image_to_probe)
+    moved = jax.vmap(relative_twist, (None, 0))(whole, drawn)
+    moved = jnp.where(converged[:, None] > 0, jnp.abs(moved), jnp.nan)
+    points = _corners(problem, result)
+    # A resample that did not converge stands at the whole's X: it adds nothing to the scatter.
+    transforms = jnp.where(converged[:, None, None] > 0, _with_scale(fits, result), whole)
+    share = jnp.maximum(jnp.mean(converged), 1e-9)
+    return Bootstrap(
+        image_to_probe=drawn,
+        converged=converged,
+        spread=1.4826 * jnp.nanmedian(moved, axis=0),
+        reproducibility=jnp.asarray(calibration_reproducibility(transforms, points)) / share,
+        image_points=points,
+    )
+
+
+def relative_twist(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Float[Array, 6]:
+    """[v, omega] that take the first transform to the second: first Exp([v, omega]), mm and rad.
+
+    Exact for v, and for omega to third order: a calibration moves by fractions of a degree.
+    """
+    rotation = first[:3, :3].T @ second[:3, :3]
+    shift = first[:3, :3].T @ (second[:3, 3] - first[:3, 3])
+    turn = 0.5 * jnp.stack(
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    )
+    return jnp.concatenate([shift, turn])
+
+
+def _with_scale(fits: Calibration, result: Calibration) -> Float[Array, "k 4 4"]:
+    """X of many calibrations, stretched by their pixel sizes over those of the whole.
+
+    It takes a point of the image, in mm as the whole has it, to the probe. (A face offset, which
+    only pixels of known size have, is stretched along with the range.)
+    """
+    if fits.scale_mm_per_px is None or result.scale_mm_per_px is None:
+        return jnp.asarray(fits.image_to_probe)
+    ratio = jnp.asarray(fits.scale_mm_per_px) / jnp.asarray(result.scale_mm_per_px)
+    one = jnp.ones_like(ratio[:, 0])
+    stretch = jnp.stack([ratio[:, 0], one, ratio[:, 1], one], axis=1)
+    return jnp.asarray(fits.image_to_probe) * stretch[:, None]
+
+
+def _apart(
+    transforms: Float[Array, "k 4 4"], whole: Float[Array, "4 4"], points: Float[Array, "m 2"]
+) -> Float[Array, " k"]:
+    """Root mean square distance of image points under each transform and under the whole's."""
+    zero, one = jnp.zeros_like(points[:, 0]), jnp.ones_like(points[:, 0])
+    there = jnp.stack([points[:, 0], zero, points[:, 1], one])
+    moved = ((transforms - whole) @ there)[:, :3]
+    return jnp.sqrt(jnp.mean(jnp.sum(moved**2, axis=1), axis=1))
+
+
+def _one_problem(problem: Problem | Recording, arguments: dict[str, Any]) -> Problem:
+    """One problem; where its values can be looked at, every pose counts once."""
+    if isinstance(problem, Recording):
+        problem = Problem.from_recording(problem)
+    if problem.batch_shape:
+        raise InputError("resampling takes one problem at a time, not a batch")
+    if any(is_traced(leaf) for leaf in jax.tree.leaves(problem)):
+        return problem
+    alone = independent(problem, arguments.get("estimate", ()))[0]
+    # Where JAX's 64 bits are off a problem holds numpy arrays, which a traced index cannot index.
+    return jax.tree.map(jnp.asarray, alone)
+
+
+def _check_left(mask: Array, rest: Array) -> None:
+    if is_traced(mask):
+        return
+    least = int(np.min(np.sum(np.asarray(mask) * np.asarray(rest) > 0, axis=1)))
+    if least < MINIMUM_IMAGES:
+        raise InputError(
+            f"holding out a fold leaves {least} images: at least {MINIMUM_IMAGES} are needed"
+        )
+
+
+def _many(problem: Problem, masks: Float[Array, "k n"]) -> Problem:
+    """The same problem under many masks."""
+    count = masks.shape[0]
+    many = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), problem)
+    return replace(many, mask=masks)
+
+
+def _drawn(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Problem:
+    """The problem with other rows of images in each of k copies."""
+    count = problem.images
+
+    def pick(leaf: Array) -> Array:
+        return leaf[rows]
+
+    many = _many(problem, jnp.broadcast_to(mask, rows.shape))
+    changed: dict[str, Any] = {
+        name: pick(getattr(problem, name))
+        for name in ("poses", "measurements", "covariance", "max_elevation")
+        if getattr(problem, name) is not None
+    }
+    if problem.channels is not None:
+        assert many.channels is not None
+        changed["channels"] = replace(
+            many.channels,
+            distances=pick(problem.channels.distances),
+            heard=pick(problem.channels.heard),
+        )
+    assert rows.shape[1] == count
+    return replace(many, **changed)
+
+
+def _parameters(result: Calibration, problem: Problem) -> Parameters:
+    matrix = jnp.asarray(result.image_to_probe)
+    scale = None
+    if result.scale_mm_per_px is not None:
+        scale = jnp.asarray(result.scale_mm_per_px / problem.spacing)
+    found = Parameters.of(matrix[:3, :3], matrix[:3, 3], jnp.asarray(result.point), scale)
+    nominal = nominal_sound_speed(problem)
+    if result.sound_speed_m_s is not None:
+        found = replace(found, sound_speed=result.sound_speed_m_s / nominal)
+    if result.delay_s is not None:
+        before = 0.0 if problem.delay is None else problem.delay
+        found = replace(found, delay=(result.delay_s - before) * 1e3 * nominal)
+    return found
+
+
+def _seen(held: Calibration, problem: Problem) -> tuple[Array, Array]:
+    """Errors and reconstructed target of image i through calibration i."""
+
+    def one(result: Calibration, image: Array) -> tuple[Array, Array]:
+        parameters = _parameters(result, problem)
+        point = measured_points(parameters, problem)[image]
+        in_image = jnp.stack([point[0], jnp.zeros_like(point[0]), point[1]])
+        in_probe = parameters.rotation @ in_image + parameters.translation
+        pose = problem.poses[image]
+        there = pose[:3, :3] @ in_probe + pose[:3, 3]
+        return measurement_residual(parameters, problem)[image], there - parameters.point
+
+    errors, cloud = jax.vmap(one)(held, jnp.arange(problem.images))
+    return errors, problem.mask[:, None] * cloud
+
+
+def _in_sds(moved: Float[Array, "n 6"], covariance: Float[Array, "6 6"]) -> Float[Array, " n"]:
+    scale = jnp.sqrt(jnp.diagonal(covariance))
+    # In SDs of each unknown the matrix is a correlation, well scaled for elimination.
+    unit = moved / scale
+    solved = dense.solve_positive(covariance / (scale[:, None] * scale), unit.T)
+    return jnp.sqrt(jnp.sum(unit.T * solved, axis=0) / 6)
+
+
+def _corners(problem: Problem, result: Calibration) -> Float[Array, "5 2"]:
+    parameters = _parameters(jax.tree.map(jnp.asarray, result), problem)
+    points = measured_points(parameters, problem)
+    seen = problem.mask[:, None] > 0
+    low = jnp.min(jnp.where(seen, points, jnp.inf), axis=0)
+    high = jnp.max(jnp.where(seen, points, -jnp.inf), axis=0)
+    ends = jnp.stack([low, high])
+    return jnp.stack(
+        [
+            ends[0],
+            jnp.stack([high[0], low[1]]),
+            jnp.stack([low[0], high[1]]),
+            ends[1],
+            0.5 * (low + high),
+        ]
+    )

@@ -1,0 +1,561 @@
+"""The answer: transform, target and offsets, how certain they are, and what looked wrong."""
+
+from __future__ import annotations
+
+import enum
+import os
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxcal import CalibrationError, InputError
+from jaxcal.calibration.transform import AppliedPoints, ImageTransform, SaveFormat
+from jaxcal.data.problem import Problem
+from jaxcal.diagnostics.arrays import array_module, is_traced
+from jaxcal.diagnostics.image_points import IMAGE_BLOCKS, image_rows
+from jaxcal.model.blocks import Blocks
+from jaxcal.model.distributions import OffsetLaw
+from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
+from jaxcal.runtime.trees import array_tree, map_arrays, static
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from jaxcal.diagnostics.residual_checks import Inspection
+    from jaxcal.diagnostics.summary import Summary
+
+
+class Status(enum.IntEnum):
+    """How a solve ended; ``Calibration.status`` gives the name in lower case."""
+
+    CONVERGED = 0
+    MAX_ITERATIONS = 1
+    UNOBSERVABLE = 2
+    FAILED = 3
+
+
+@array_tree
+class Convergence:
+    """How the method ended.
+
+    Attributes:
+        cost: the minimised sum of squares, mm^2 (equal weights) or whitened.
+        stationarity: scaled KKT residual of that objective.
+        tolerance_met: the method's own stopping rule was met.
+        iterations: linearisations (joint, conventional) or rounds (alternating).
+        variance_rounds: variance updates of the self-tuning; 0 without.
+        searched_start: the closed-form start was unsound and one was searched for.
+        sigma_floored: which SDs rest on their floor.
+        rotation_change: X's last move in rad (alternating), else 0.
+        translation_change: X's last move in mm (alternating), else 0.
+        trace: objective after each of the first iterations, NaN beyond the last; None where none
+            was asked for.
+    """
+
+    cost: Float[AnyArray, "*batch"]
+    stationarity: Float[AnyArray, "*batch"]
+    tolerance_met: Bool[AnyArray, "*batch"]
+    iterations: Int[AnyArray, "*batch"]
+    variance_rounds: Int[AnyArray, "*batch"]
+    searched_start: Bool[AnyArray, "*batch"]
+    sigma_floored: Bool[AnyArray, "*batch 3"]
+    rotation_change: Float[AnyArray, "*batch"]
+    translation_change: Float[AnyArray, "*batch"]
+    trace: Float[AnyArray, "*batch trace"] | None
+
+
+@array_tree
+class Medium:
+    """Sound speed and delay, each None where it was not estimated.
+
+    Attributes:
+        sound_speed_m_s: estimate, m/s.
+        sound_speed_sd_m_s: its SD, m/s.
+        sound_speed_prior_m_s: SD that was believed before, m/s; None without such a belief.
+        delay_s: electronic delay, s.
+        delay_sd_s: its SD, s.
+        delay_prior_s: SD that was believed before, s; None without such a belief.
+    """
+
+    sound_speed_m_s: Float[AnyArray, "*batch"] | None = None
+    sound_speed_sd_m_s: Float[AnyArray, "*batch"] | None = None
+    sound_speed_prior_m_s: Float[AnyArray, "*batch"] | None = None
+    delay_s: Float[AnyArray, "*batch"] | None = None
+    delay_sd_s: Float[AnyArray, "*batch"] | None = None
+    delay_prior_s: Float[AnyArray, "*batch"] | None = None
+
+
+@array_tree
+class Linearisation:
+    """The normal matrices at the answer; tangents are in the order of ``Calibration.blocks``.
+
+    Attributes:
+        information: of the whitened residuals, offsets eliminated (mm, rad, log units).
+        design: of the unweighted residuals, offsets known.
+        variance: of the residuals that ``information`` is of: 1 where they are whitened, else mm^2.
+        tracker_sd: SD of the tracked position, mm, or None.
+        average_elevation_sd: SDs of the offsets under the average over distributions, mm, or None.
+    """
+
+    information: Float[AnyArray, "*batch p p"]
+    design: Float[AnyArray, "*batch p p"]
+    variance: Float[AnyArray, "*batch"]
+    tracker_sd: Float[AnyArray, "*batch"] | None
+    average_elevation_sd: Float[AnyArray, "*batch n"] | None
+
+
+@array_tree
+class Calibration:
+    """A calibration of one problem, or of a batch (then every array has the batch axes in front).
+
+    Units are mm and rad; X's perturbations are right ones, X Exp([v, omega]), so they are along and
+    about the image's axes (lateral, elevational, axial).
+
+    The attributes below are arrays of the solve, also under jit, vmap and grad. The properties are
+    computed on the host when they are first read, for the whole batch at once, with numpy
+    (:mod:`jaxcal.diagnostics`); reading one of them inside a transformation is an error.
+
+    Attributes:
+        image_to_probe: X, mm.
+        point: target in the tracker's frame, mm.
+        elevation: estimated elevational offset of the target in every image (q_iy), mm; 0 where an
+            image was left out.
+        sigma: SDs of lateral position, range and elevational offset, mm.
+        offset_law: what the data say of the offsets' law, their mean and the noise; None where no
+            laws were weighed.
+        channel_sigma: SD of an element's distance, mm; None for solves on points.
+        unknowns_covariance: of all unknowns, in the order of ``blocks`` (mm, rad, log units); NaN
+            where X is not observable.
+        scale_mm_per_px: [lateral, axial], or None for points in mm.
+        medium: sound speed and delay, or None where neither was estimated.
+        rms: root mean square of ``residual``'s length over the used images, mm.
+        mask: 1 for used images.
+        status_code: a :class:`Status`.
+        differentiable: gradients through this answer by the implicit function theorem are valid: a
+            stationary point, well determined, and no offset about to reach or leave its bound.
+        sigma_tuned: the SDs were estimated from the data.
+        convergence: how the method ended.
+        linearisation: the normal matrices, from which the properties are computed.
+        problem: the data that were solved, images left out included.
+        method: ``conventional``, ``alternating`` or ``joint`` (static).
+        prior: ``none``, ``bounded``, ``gaussian``, or, where laws of the offsets were weighed,
+            ``auto`` or ``uniform`` (static).
+        data: ``points`` or ``channels``: whose residuals were minimised (static).
+        blocks: the free unknowns (static).
+        robust: images that do not fit the rest were left out (static).
+        notes: what was done to the data before the solve, in words (static; one problem).
+    """
+
+    image_to_probe: Float[AnyArray, "*batch 4 4"]
+    point: Float[AnyArray, "*batch 3"]
+    elevation: Float[AnyArray, "*batch n"]
+    sigma: Float[AnyArray, "*batch 3"]
+    offset_law: OffsetLaw | None
+    channel_sigma: Float[AnyArray, "*batch"] | None
+    unknowns_covariance: Float[AnyArray, "*batch p p"]
+    scale_mm_per_px: Float[AnyArray, "*batch 2"] | None
+    medium: Medium | None
+    rms: Float[AnyArray, "*batch"]
+    mask: Float[AnyArray, "*batch n"]
+    status_code: Int[AnyArray, "*batch"]
+    differentiable: Bool[AnyArray, "*batch"]
+    sigma_tuned: Bool[AnyArray, "*batch"]
+    convergence: Convergence
+    linearisation: Linearisation
+    problem: Problem | None
+    method: str = static()
+    prior: str = static()
+    data: str = static()
+    blocks: Blocks = static()
+    robust: bool = static(default=False)
+    notes: tuple[str, ...] = static(default=())
+
+    @property
+    def converged(self) -> Bool[AnyArray, "*batch"]:
+        """Whether the answer is a converged and observable one (traceable)."""
+        converged = self.status_code == Status.CONVERGED
+        return array_module(converged).asarray(converged)
+
+    @property
+    def images_used(self) -> Int[AnyArray, "*batch"]:
+        """Number of used images (traceable)."""
+        xp = array_module(self.mask)
+        return xp.asarray(xp.sum(self.mask > 0, axis=-1))
+
+    @property
+    def covariance(self) -> Float[AnyArray, "*batch 6 6"]:
+        """Of X (v mm, omega rad), whatever the other unknowns; NaN where X is not observable."""
+        return self.unknowns_covariance[..., :6, :6]
+
+    @property
+    def point_covariance(self) -> Float[AnyArray, "*batch 3 3"]:
+        """Of the target in the tracker's frame, mm^2."""
+        return self.unknowns_covariance[..., 6:9, 6:9]
+
+    @property
+    def information(self) -> Float[AnyArray, "*batch p p"]:
+        """Information of all unknowns, offsets eliminated, per ``linearisation.variance``."""
+        return self.linearisation.information
+
+    @property
+    def cost(self) -> Float[AnyArray, "*batch"]:
+        """The minimised sum of squares: mm^2 (equal weights) or whitened."""
+        return self.convergence.cost
+
+    @property
+    def stationarity(self) -> Float[AnyArray, "*batch"]:
+        """Scaled KKT residual of the objective."""
+        return self.convergence.stationarity
+
+    @property
+    def tolerance_met(self) -> Bool[AnyArray, "*batch"]:
+        """The method's own stopping rule was met."""
+        return self.convergence.tolerance_met
+
+    @property
+    def iterations(self) -> Int[AnyArray, "*batch"]:
+        """Linearisations (joint, conventional) or rounds (alternating)."""
+        return self.convergence.iterations
+
+    @property
+    def variance_rounds(self) -> Int[AnyArray, "*batch"]:
+        """Variance updates of the self-tuning; 0 without."""
+        return self.convergence.variance_rounds
+
+    @property
+    def searched_start(self) -> Bool[AnyArray, "*batch"]:
+        """The closed-form start was unsound and one was searched for."""
+        return self.convergence.searched_start
+
+    @property
+    def sigma_floored(self) -> Bool[AnyArray, "*batch 3"]:
+        """Which SDs rest on their floor."""
+        return self.convergence.sigma_floored
+
+    @property
+    def rotation_change(self) -> Float[AnyArray, "*batch"]:
+        """X's last move in rad (alternating), else 0."""
+        return self.convergence.rotation_change
+
+    @property
+    def translation_change(self) -> Float[AnyArray, "*batch"]:
+        """X's last move in mm (alternating), else 0."""
+        return self.convergence.translation_change
+
+    @property
+    def trace(self) -> Float[AnyArray, "*batch trace"] | None:
+        """Objective after each of the first iterations; None where none was asked for."""
+        return self.convergence.trace
+
+    @property
+    def sound_speed_m_s(self) -> Float[AnyArray, "*batch"] | None:
+        """Estimated sound speed, m/s; None where it was not estimated."""
+        return None if self.medium is None else self.medium.sound_speed_m_s
+
+    @property
+    def sound_speed_sd_m_s(self) -> Float[AnyArray, "*batch"] | None:
+        """Its standard deviation, m/s."""
+        return None if self.medium is None else self.medium.sound_speed_sd_m_s
+
+    @property
+    def sound_speed_prior_m_s(self) -> Float[AnyArray, "*batch"] | None:
+        """SD of the sound speed that was believed before, m/s; None without such a belief."""
+        return None if self.medium is None else self.medium.sound_speed_prior_m_s
+
+    @property
+    def delay_s(self) -> Float[AnyArray, "*batch"] | None:
+        """Estimated electronic delay, s; None where it was not estimated."""
+        return None if self.medium is None else self.medium.delay_s
+
+    @property
+    def delay_sd_s(self) -> Float[AnyArray, "*batch"] | None:
+        """Its standard deviation, s."""
+        return None if self.medium is None else self.medium.delay_sd_s
+
+    @property
+    def delay_prior_s(self) -> Float[AnyArray, "*batch"] | None:
+        """SD of the delay that was believed before, s; None without such a belief."""
+        return None if self.medium is None else self.medium.delay_prior_s
+
+    @property
+    def status(self) -> str | np.ndarray:
+        """converged, max_iterations, unobservable or failed; an array of these for a batch.
+
+        Raises:
+            CalibrationError: under jit, vmap or grad, where text cannot be: use ``status_code``.
+        """
+        names = np.array([status.name.lower() for status in Status])
+        chosen = names[self._concrete(self.status_code)]
+        return str(chosen) if chosen.ndim == 0 else chosen
+
+    @cached_property
+    def _summary(self) -> Summary:
+        """Everything that is computed when it is read."""
+        from jaxcal.diagnostics.summary import summarise
+
+        if is_traced(self):
+            raise CalibrationError(
+                "diagnostics are computed on the host and are not there under jit, vmap or grad: "
+                "read them outside; status_code, converged and covariance are there"
+            )
+        return summarise(self)
+
+    @property
+    def elevation_sd(self) -> Float[np.ndarray, "*batch n"]:
+        """SD of ``elevation``, mm; NaN where an offset rests on its bound or is not known."""
+        return self._summary.elevation_sd
+
+    @property
+    def residual(self) -> Float[np.ndarray, "*batch n 3"]:
+        """q_i - p_i with p_i in the plane (y = 0), in the image frame, mm."""
+        return self._summary.residual
+
+    @property
+    def at_bound(self) -> Float[np.ndarray, "*batch n"]:
+        """1 where the offset rests on its bound."""
+        return self._summary.at_bound
+
+    @property
+    def condition(self) -> Float[np.ndarray, "*batch"]:
+        """Of the information about all unknowns, in scaled units (largest / smallest)."""
+        return self._summary.condition
+
+    @property
+    def weakest(self) -> Float[np.ndarray, "*batch p"]:
+        """Unit vector (scaled units) of the least known direction of all unknowns."""
+        return self._summary.weakest
+
+    @property
+    def weakest_sd(self) -> Float[np.ndarray, "*batch"]:
+        """Standard deviation along it, mm at the lever arm; NaN where it has none."""
+        return self._summary.weakest_sd
+
+    @property
+    def prior_direction(self) -> Float[np.ndarray, "*batch p"]:
+        """Direction that the measurements alone, without the offset's prior or bound, leave open.
+
+        A unit vector in scaled units; zeros where there is none.
+        """
+        return self._summary.prior_direction
+
+    @property
+    def inspection(self) -> Inspection:
+        """Images that stand out, the noise model's fit, and which poses to add."""
+        return self._summary.inspection
+
+    @property
+    def outlier(self) -> Float[np.ndarray, "*batch n"]:
+        """1 where an image does not fit the rest; a robust solve leaves it out."""
+        return self._summary.inspection.outlier
+
+    @property
+    def departure(self) -> Float[np.ndarray, "*batch n 3"]:
+        """Each image's lateral, range and elevational errors in robust SDs of those in use."""
+        return self._summary.inspection.departure
+
+    @cached_property
+    def wrong_frames(self) -> str | None:
+        """What is wrong with the data's frames or units, in words, and what to do (one problem).
+
+        None where nothing seems wrong; see :mod:`jaxcal.diagnostics.frame_checks`. An answer of
+        which something is said here is not to be used, whatever its residuals and standard
+        deviations are.
+        """
+        from jaxcal.diagnostics.frame_checks import wrong_frames
+
+        self._concrete(self.mask)
+        if self.problem is None or self.problem.batch_shape:
+            return None
+        return wrong_frames(replace(self.problem, mask=self.mask), self.blocks)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a person should know before using this answer, in words (one problem)."""
+        from jaxcal.diagnostics import messages
+
+        return messages.warnings(self)
+
+    @property
+    def observability(self) -> dict[str, float | str | None]:
+        """condition, weakest_direction (text), weakest_sd_mm, known_only_from_prior (text)."""
+        from jaxcal.diagnostics import messages
+
+        return messages.observability(self)
+
+    def __getitem__(self, index: Any) -> Calibration:
+        """Some calibrations of a batch.
+
+        Raises:
+            IndexError: beyond the batch, or for one calibration.
+        """
+        # As numpy indexes: it raises where jax would clip.
+        np.empty(self.mask.shape[:-1])[index]
+
+        def taken(leaf: AnyArray) -> AnyArray:
+            # A number of a numpy array is none any more.
+            return np.asarray(leaf[index]) if isinstance(leaf, np.ndarray) else leaf[index]
+
+        return map_arrays(taken, self)
+
+    def with_problem(self, problem: Problem) -> Calibration:
+        """The same with the data that were solved."""
+        return replace(self, problem=problem)
+
+    def image_transform(self) -> ImageTransform:
+        """The transform by itself: to apply it to pixels, and to save it for other programs.
+
+        Raises:
+            CalibrationError: under a JAX transformation.
+            InputError: of a batch.
+        """
+        from jaxcal.diagnostics.intervals import range_of_row_zero
+
+        answer = self.numpy()
+        if answer.image_to_probe.ndim != 2:
+            raise InputError("a batch holds many transforms: take one of its calibrations")
+        scale = answer.scale_mm_per_px
+        known = np.isfinite(answer.unknowns_covariance).all()
+        origin, factor = range_of_row_zero(answer)
+        rows = image_rows(answer.blocks)
+        return ImageTransform(
+            image_plane_to_probe=np.asarray(answer.image_to_probe),
+            scale_mm_per_px=None if scale is None else np.asarray(scale),
+            face_offset_mm=float(origin),
+            covariance=np.asarray(answer.covariance) if known else None,
+            error_mm=float(answer.rms),
+            converged=bool(self.converged),
+            source="the calibration",
+            range_factor=float(factor),
+            unknowns=tuple(block for block in answer.blocks if block in IMAGE_BLOCKS),
+            image_covariance=(
+                np.asarray(answer.unknowns_covariance)[rows[:, None], rows] if known else None
+            ),
+        )
+
+    def plus_matrix(self) -> Float[np.ndarray, "4 4"]:
+        """PLUS's ImageToProbe; see :meth:`jaxcal.ImageTransform.plus_matrix`."""
+        return self.image_transform().plus_matrix()
+
+    def apply(
+        self,
+        pixels: np.ndarray,
+        pose: np.ndarray | None = None,
+        *,
+        pixel_sd_px: float | tuple[float, float] = 0.0,
+    ) -> AppliedPoints:
+        """Image points in the probe's or the tracker's frame; see :meth:`ImageTransform.apply`."""
+        return self.image_transform().apply(pixels, pose, pixel_sd_px=pixel_sd_px)
+
+    def record(self, tre_points: tuple[tuple[float, float], ...] = ()) -> dict[str, Any]:
+        """What ``jaxcal calibrate --json`` prints, as plain values.
+
+        Args:
+            tre_points: further image points, in the images' unit, whose error is wanted.
+        """
+        from jaxcal.report.summary import record_of
+
+        return record_of(self, tre_points)
+
+    def verdict(self) -> list[str]:
+        """How accurate, what limits it and what to do, in sentences."""
+        from jaxcal.report.verdict import verdict
+
+        return verdict(self.record())
+
+    def save(self, path: str | os.PathLike[str], format: SaveFormat | None = None) -> None:
+        """Write the calibration, complete or not at all; :func:`jaxcal.load_calibration` reads it.
+
+        Args:
+            path: the file to make or replace.
+            format: as for :meth:`jaxcal.ImageTransform.save`; by default what the extension says.
+                ``json`` holds everything that is known of the calibration.
+
+        Raises:
+            InputError: a format that the extension does not tell, pixels that are not known, or a
+                batch.
+            OutputError: it could not be written; the file is as it was.
+        """
+        if format == "json" or (format is None and os.fspath(path).lower().endswith(".json")):
+            from jaxcal.report.write import write_json
+
+            write_json(path, self.record())
+        else:
+            self.image_transform().save(path, format)
+
+    def report(self, path: str | os.PathLike[str]) -> None:
+        """Write one page for a browser, as ``jaxcal calibrate --report`` does."""
+        from jaxcal.report.page import write_page
+        from jaxcal.report.summary import recording_of
+
+        write_page(path, self.record(), self, recording_of(self))
+
+    def plot_tre(self) -> Figure:
+        """Map of the error to expect over the image (matplotlib)."""
+        from jaxcal.report import plots
+
+        return plots.plot_tre(self)
+
+    def plot_residuals(self) -> Figure:
+        """Residual of every image (matplotlib)."""
+        from jaxcal.report import plots
+
+        return plots.plot_residuals(self)
+
+    def plot_offsets(self, truth: np.ndarray | None = None) -> Figure:
+        """Estimated elevational offsets (matplotlib), beside true ones (mm) where given."""
+        from jaxcal.report import plots
+
+        return plots.plot_offsets(self, truth)
+
+    def plot_influence(self) -> Figure:
+        """How far leaving out each image moves the calibration (matplotlib)."""
+        from jaxcal.report import plots
+
+        return plots.plot_influence(self)
+
+    def plot_limits(self) -> Figure:
+        """Where the errors come from (matplotlib)."""
+        from jaxcal.report import plots
+
+        return plots.plot_limits(self)
+
+    def __str__(self) -> str:
+        """Table and verdict; of a batch how many converged; traced: the names of the arrays."""
+        if self.problem is None or is_traced(self):
+            return repr(self)
+        from jaxcal.report import summary
+
+        if np.ndim(self.mask) != 1:
+            return summary.batch_text(self)
+        return summary.text_of(self)
+
+    def _repr_html_(self) -> str | None:
+        """For notebooks; None (so that the text is shown) where there is nothing to draw."""
+        traced = is_traced(self)
+        if self.problem is None or traced or np.ndim(self.mask) != 1:
+            return None
+        from jaxcal.report.summary import html_of
+
+        return html_of(self)
+
+    def numpy(self) -> Calibration:
+        """The same with numpy arrays (concrete values).
+
+        Raises:
+            CalibrationError: under a JAX transformation.
+        """
+        found = map_arrays(self._concrete, self)
+        if "_summary" in vars(self):
+            vars(found)["_summary"] = self._summary
+        return found
+
+    @staticmethod
+    def _concrete(value: AnyArray) -> np.ndarray:
+        if is_traced(value):
+            raise CalibrationError(
+                "text is not available under jit, vmap or grad; use the arrays (status_code, "
+                "converged, ...) there, and the text outside"
+            )
+        return np.asarray(value)

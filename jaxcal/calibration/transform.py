@@ -1,0 +1,504 @@
+"""A calibration in use: loaded, applied to pixels, saved for other programs. Numpy only.
+
+Two descriptions of the same thing. jaxcal's own is rigid and in mm: X = [a e z | t] takes the image
+plane (lateral, elevational, axial) to the probe, and a pixel is (s_u u, 0, s_v v + f) in it. PLUS's
+``ImageToProbe`` takes (u, v, 0, 1) in pixels to the probe and carries the pixel size:
+
+    M[:3, 0] = s_u a,  M[:3, 1] = s_v z,  M[:3, 2] = -(s_u + s_v) / 2 e,  M[:3, 3] = t + f z,
+
+where s_v is the pixel's size at the sound speed that was found, and f the range of row 0 there.
+
+The third column is *minus* the elevational axis: y = z cross x here, and z = x cross y there.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from jaxcal import FormatError, InputError
+from jaxcal.data.poses import check_poses
+from jaxcal.diagnostics.image_points import IMAGE_BLOCKS, UNKNOWNS, point_jacobian, unknown_names
+from jaxcal.io.atomic import atomic_path, write_text
+from jaxcal.io.frame_names import FramePair
+from jaxcal.io.readable import check_readable, naming, one_line, quoted
+from jaxcal.runtime.array_types import Float
+
+FORMAT = "jaxcal-calibration"
+VERSION = 1
+MAXIMUM_BYTES = 64 * 2**20
+
+SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
+
+_ROUNDING = 1e-13
+_SKEWED = 1e-3
+"""Cosine between the columns of a matrix from which on they are not taken for orthogonal."""
+
+
+@dataclass(frozen=True)
+class AppliedPoints:
+    """Where pixels are.
+
+    Attributes:
+        points: (n, 3), mm, in the tracker's frame where a pose was given, else in the probe's.
+        covariance: (n, 3, 3), mm^2; NaN where the calibration's is not known.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    covariance: Float[np.ndarray, "n 3 3"]
+
+
+@dataclass(frozen=True)
+class ImageTransform:
+    """A calibration without what it was made from.
+
+    Attributes:
+        image_plane_to_probe: (4, 4) X, rigid, mm, from (lateral, elevational, axial).
+        scale_mm_per_px: [lateral, axial]; None where points were in mm.
+        face_offset_mm: range of pixel row 0, or of a measured range of 0, mm.
+        covariance: (6, 6) of X's right perturbation X Exp([v, omega]), mm and rad; None if unknown.
+        range_factor: estimated sound speed over the nominal one, by which ranges are larger.
+        unknowns: blocks of estimated unknowns that move an image point, X's first.
+        image_covariance: (q, q) of all of these (mm, rad, log units); None: ``covariance`` alone.
+        error_mm: root mean square residual of the calibration, mm; None if unknown.
+        converged: whether the calibration can be used; None if unknown.
+        source: the file.
+    """
+
+    image_plane_to_probe: Float[np.ndarray, "4 4"]
+    scale_mm_per_px: Float[np.ndarray, 2] | None = None
+    face_offset_mm: float = 0.0
+    covariance: Float[np.ndarray, "6 6"] | None = None
+    error_mm: float | None = None
+    converged: bool | None = None
+    source: str = field(default="memory", compare=False)
+    range_factor: float = 1.0
+    unknowns: tuple[str, ...] = ("translation", "rotation")
+    image_covariance: Float[np.ndarray, "q q"] | None = None
+
+    def plus_matrix(self) -> Float[np.ndarray, "4 4"]:
+        """PLUS's ImageToProbe: (u, v, 0, 1), px, to the probe, mm.
+
+        Raises:
+            InputError: the calibration was made from points in mm, which have no pixels.
+        """
+        s_u, s_v = self._scale() * [1.0, self.range_factor]
+        lateral, elevational, axial, origin = self.image_plane_to_probe[:3].T
+        matrix = np.eye(4)
+        matrix[:3, 0] = s_u * lateral
+        matrix[:3, 1] = s_v * axial
+        matrix[:3, 2] = -(s_u + s_v) / 2 * elevational
+        matrix[:3, 3] = origin + self.face_offset_mm * axial
+        return matrix
+
+    def with_pixels(
+        self, size_mm: tuple[float, float], origin_px: tuple[float, float] = (0.0, 0.0)
+    ) -> ImageTransform:
+        """The same for pixels of a known size, of a calibration from points in mm.
+
+        Args:
+            size_mm: [lateral, axial] of a pixel.
+            origin_px: [u, v] of lateral 0, range 0.
+        """
+        if self.scale_mm_per_px is not None:
+            raise InputError("the calibration has pixels of its own: no other size is needed")
+        scale = np.array(size_mm, dtype=np.float64)
+        if not (np.isfinite(scale).all() and (scale > 0).all() and np.isfinite(origin_px).all()):
+            raise InputError("a pixel's size must be two positive numbers, its origin two numbers")
+        moved = self.image_plane_to_probe.copy()
+        moved[:3, 3] -= moved[:3, 0] * scale[0] * origin_px[0]
+
+        def shifted(covariance: np.ndarray | None) -> np.ndarray | None:
+            if covariance is None:
+                return None
+            # X' = X T with T a shift by d along lateral: the perturbation at the new origin.
+            adjoint = np.eye(len(covariance))
+            adjoint[:3, 3:6] = -_cross(np.array([-scale[0] * origin_px[0], 0.0, 0.0]))
+            return adjoint @ covariance @ adjoint.T
+
+        return replace(
+            self,
+            image_plane_to_probe=moved,
+            scale_mm_per_px=scale,
+            face_offset_mm=self.face_offset_mm - self.range_factor * float(scale[1] * origin_px[1]),
+            covariance=shifted(self.covariance),
+            image_covariance=shifted(self.image_covariance),
+        )
+
+    def apply(
+        self,
+        pixels: np.ndarray,
+        pose: np.ndarray | None = None,
+        *,
+        pixel_sd_px: float | tuple[float, float] = 0.0,
+    ) -> AppliedPoints:
+        """Take image points to the probe or the tracker, with their uncertainty.
+
+        Args:
+            pixels: (n, 2) or (2,): [u, v] px, or [lateral, range] mm where there are no pixels.
+            pose: (4, 4) or (n, 4, 4), probe -> tracker, mm; None: points in the probe's frame.
+            pixel_sd_px: SD of the points themselves, one number or [u, v] (mm without pixels).
+
+        Returns:
+            Points and covariances. They hold the calibration's covariance, that of estimated pixel
+            sizes, sound speed and delay included, and the points' own; not the pose's.
+
+        Raises:
+            InputError: shapes that do not agree, NaN or Inf, or a pose that is not rigid.
+        """
+        measured = np.asarray(pixels, dtype=np.float64)
+        measured = measured[None] if measured.ndim == 1 else measured
+        if measured.ndim != 2 or measured.shape[1] != 2 or not np.isfinite(measured).all():
+            raise InputError(f"pixels must be finite and have shape (n, 2), not {measured.shape}")
+        count = len(measured)
+        scale = np.ones(2) if self.scale_mm_per_px is None else self.scale_mm_per_px
+        plane = np.zeros((count, 3))
+        plane[:, 0] = scale[0] * measured[:, 0]
+        scale = scale * np.array([1.0, self.range_factor])
+        plane[:, 2] = scale[1] * measured[:, 1] + self.face_offset_mm
+        rotation = self.image_plane_to_probe[:3, :3]
+        points = plane @ rotation.T + self.image_plane_to_probe[:3, 3]
+        covariance = self._covariance(plane, rotation, scale, pixel_sd_px)
+        if pose is None:
+            return AppliedPoints(points, covariance)
+        given = np.asarray(pose, dtype=np.float64)
+        given = given[None] if given.ndim == 2 else given
+        if len(given) not in (1, count):
+            raise InputError(f"{count} pixels but {len(given)} poses: one, or as many, are needed")
+        poses = np.broadcast_to(check_poses(given), (count, 4, 4))
+        turn = poses[:, :3, :3]
+        points = np.einsum("nij,nj->ni", turn, points) + poses[:, :3, 3]
+        return AppliedPoints(points, turn @ covariance @ turn.swapaxes(1, 2))
+
+    def _covariance(
+        self,
+        plane: Float[np.ndarray, "n 3"],
+        rotation: Float[np.ndarray, "3 3"],
+        scale: Float[np.ndarray, 2],
+        pixel_sd_px: float | tuple[float, float],
+    ) -> Float[np.ndarray, "n 3 3"]:
+        """R (J C J' + S) R', in the probe's frame; J is :mod:`jaxcal.diagnostics.image_points`'."""
+        covariance, blocks = self.image_covariance, self.unknowns
+        if covariance is None:
+            covariance, blocks = self.covariance, ("translation", "rotation")
+        if covariance is None:
+            return np.full((len(plane), 3, 3), np.nan)
+        jacobian = point_jacobian(plane[:, [0, 2]], blocks, self.face_offset_mm, self.range_factor)
+        own = np.zeros(3)
+        own[[0, 2]] = np.broadcast_to(np.asarray(pixel_sd_px, dtype=np.float64), 2) * scale
+        inner = jacobian @ covariance @ jacobian.swapaxes(1, 2) + np.diag(own**2)
+        return rotation @ inner @ rotation.T
+
+    def _scale(self) -> Float[np.ndarray, 2]:
+        if self.scale_mm_per_px is None:
+            raise InputError(
+                f"{self.source}: was made from points in mm, so that there is no Image frame in "
+                "pixels: give the size of a pixel and the pixel of lateral 0, range 0 "
+                "(--pixel-size, --origin)"
+            )
+        return self.scale_mm_per_px
+
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        format: SaveFormat | None = None,
+        *,
+        frames: FramePair = ("Image", "Probe"),
+    ) -> None:
+        """Write the calibration, complete or not at all.
+
+        Args:
+            path: the file to make or replace.
+            format: ``json`` (ours), ``plus`` (a ``<Transform>`` to paste), ``slicer`` or ``itk``
+                (``.tfm``, ``.txt`` or ``.h5``), ``ros`` (YAML, metres), ``tusrec``
+                (``calib_matrix.csv``) or ``numpy`` (``.npy``: PLUS's matrix; ``.npz``: all). By
+                default what the extension says.
+            frames: names of the image's and the probe's frame.
+
+        Raises:
+            InputError: a format that the extension does not tell, or pixels that are not known.
+            OutputError: it could not be written; the file is as it was.
+        """
+        name = os.fspath(path)
+        chosen = _format_of(name) if format is None else format
+        if chosen in ("slicer", "itk"):
+            from jaxcal.io.itk import write_itk
+
+            write_itk(path, self.plus_matrix())
+        elif chosen == "numpy":
+            with atomic_path(path) as temporary, temporary.open("wb") as file:
+                if name.lower().endswith(".npz"):
+                    np.savez(file, **self._arrays())
+                else:
+                    np.save(file, self.plus_matrix())
+        else:
+            write_text(path, self.text(chosen, frames=frames))
+
+    def text(self, format: SaveFormat, *, frames: FramePair = ("Image", "Probe")) -> str:
+        """The text that :meth:`save` writes in a format; ``numpy`` prints PLUS's matrix.
+
+        Raises:
+            InputError: a name that is no format, or pixels that are not known.
+        """
+        if format == "json":
+            return json.dumps(self._record(), indent=2, allow_nan=False) + "\n"
+        if format == "plus":
+            from jaxcal.io.plus import transform_element
+
+            return transform_element(frames, self.plus_matrix(), error_mm=self.error_mm) + "\n"
+        if format in ("slicer", "itk"):
+            from jaxcal.io.itk import itk_text
+
+            return itk_text(self.plus_matrix())
+        if format == "ros":
+            from jaxcal.io.ros import ros_yaml
+
+            return ros_yaml(self.image_plane_to_probe, frames[1].lower(), frames[0].lower())
+        if format == "tusrec":
+            from jaxcal.io.tus_rec import calib_matrix
+
+            matrix = self.plus_matrix()
+            scale = self._scale() * [1.0, self.range_factor]
+            rigid = matrix.copy()
+            rigid[:3, :3] /= [*scale, scale.mean()]
+            return calib_matrix(rigid, scale)
+        if format == "numpy":
+            return np.array2string(self.plus_matrix(), separator=", ", floatmode="unique") + "\n"
+        raise InputError(f"{quoted(str(format))} is no format that is written")
+
+    def _arrays(self) -> dict[str, Any]:
+        arrays: dict[str, Any] = {"image_plane_to_probe": self.image_plane_to_probe}
+        if self.scale_mm_per_px is not None:
+            arrays |= {"plus_image_to_probe": self.plus_matrix(), "scale_mm_per_px": self._scale()}
+        if self.covariance is not None:
+            arrays["covariance"] = self.covariance
+        return arrays | {"face_offset_mm": self.face_offset_mm, "range_factor": self.range_factor}
+
+    def _record(self) -> dict[str, Any]:
+        scale, covariance, full = self.scale_mm_per_px, self.covariance, self.image_covariance
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "converged": self.converged,
+            "image_plane_to_probe": self.image_plane_to_probe.tolist(),
+            "plus_image_to_probe": None if scale is None else self.plus_matrix().tolist(),
+            "scale_mm_per_px": None if scale is None else scale.tolist(),
+            "face_offset_mm": self.face_offset_mm,
+            "range_factor": self.range_factor,
+            "covariance": None if covariance is None else covariance.tolist(),
+            "image_unknowns": unknown_names(self.unknowns),
+            "image_covariance": None if full is None else full.tolist(),
+            "rms_mm": self.error_mm,
+        }
+
+
+def _cross(vector: np.ndarray) -> Float[np.ndarray, "3 3"]:
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _format_of(name: str) -> SaveFormat:
+    lower = name.lower()
+    formats: dict[str, SaveFormat] = {
+        ".json": "json", ".xml": "plus", ".tfm": "slicer", ".txt": "slicer", ".h5": "itk",
+        ".yaml": "ros", ".yml": "ros", ".csv": "tusrec", ".npy": "numpy", ".npz": "numpy",
+    }  # fmt: skip
+    for extension, chosen in formats.items():
+        if lower.endswith(extension):
+            return chosen
+    raise InputError(f"{name}: its extension tells no format (there are {', '.join(formats)})")
+
+
+def transform_from_plus_matrix(
+    matrix: Float[np.ndarray, "4 4"], *, error_mm: float | None = None, source: str = "memory"
+) -> ImageTransform:
+    """The calibration of a PLUS ImageToProbe, whose third column is not looked at.
+
+    Args:
+        matrix: (u, v, 0, 1), px, to the probe, mm.
+        error_mm: as stated beside it.
+        source: for messages.
+
+    Raises:
+        InputError: NaN, a last row other than 0 0 0 1, a reflection, pixels without a size, or
+            columns that are not orthogonal to 1e-3: no rigid transform and pixel size makes them.
+    """
+    matrix = np.asarray(matrix, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(f"{source}: the matrix must be 4 x 4 and finite")
+    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
+        raise InputError(f"{source}: the matrix's last row is not 0 0 0 1")
+    scale = np.linalg.norm(matrix[:3, :2], axis=0)
+    if not (scale > 1e-9).all():
+        raise InputError(f"{source}: a column of the matrix is zero: the pixels have no size")
+    if np.linalg.det(matrix[:3, :3]) <= 0:
+        raise InputError(f"{source}: the matrix is a reflection, or flat")
+    lateral, axial = (matrix[:3, :2] / scale).T
+    if abs(lateral @ axial) > _SKEWED:
+        raise InputError(
+            f"{source}: rows and columns of pixels are "
+            f"{math.degrees(math.acos(lateral @ axial)):.3f} degrees apart: fCal fitted the matrix "
+            "without a constraint (OptimizationMethod NONE), so that it is no rigid transform and "
+            "pixel size"
+        )
+    # The nearest orthonormal pair, then y = z cross x.
+    u, _, vt = np.linalg.svd(np.stack([lateral, axial], axis=1), full_matrices=False)
+    lateral, axial = (u @ vt).T
+    transform = np.eye(4)
+    transform[:3, :3] = np.stack([lateral, np.cross(axial, lateral), axial], axis=1)
+    transform[:3, 3] = matrix[:3, 3]
+    return ImageTransform(transform, scale, error_mm=error_mm, source=source)
+
+
+def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
+    """Read a calibration; the file is not trusted, and JAX is not needed.
+
+    Args:
+        path: our JSON (of ``jaxcal calibrate --json`` or ``--out``, of any version), a
+            configuration or fCal result of PLUS (``.xml``), a transform of ITK (``.tfm``, ``.txt``,
+            ``.h5``), a ``calib_matrix.csv`` of TUS-REC, a YAML of easy_handeye, or PLUS's matrix as
+            ``.npy``.
+
+    Raises:
+        FormatError: not such a file.
+        InputError: matrices that cannot be used. Either is one line that starts with the path.
+    """
+    name = os.fspath(path)
+    lower = name.lower()
+    with naming(path):
+        if lower.endswith(".xml"):
+            return _load_plus(path)
+        if lower.endswith((".tfm", ".txt", ".h5")):
+            from jaxcal.io.itk import read_itk
+
+            return transform_from_plus_matrix(read_itk(path), source=name)
+        if lower.endswith(".csv"):
+            from jaxcal.io.tus_rec import read_calib_matrix
+
+            rigid, scale = read_calib_matrix(path)
+            matrix = rigid @ np.diag([*scale, scale.mean(), 1.0])
+            return transform_from_plus_matrix(matrix, source=name)
+        if lower.endswith((".yaml", ".yml")):
+            from jaxcal.io.ros import read_ros_yaml
+
+            return ImageTransform(read_ros_yaml(path), source=name)
+        if lower.endswith(".npy"):
+            return transform_from_plus_matrix(_load_npy(path), source=name)
+        return _load_json(path)
+
+
+def _load_plus(path: str | os.PathLike[str]) -> ImageTransform:
+    from jaxcal.io.plus import read_configuration, read_result
+    from jaxcal.io.xml import read_xml
+
+    name = os.fspath(path)
+    root, _ = read_xml(path)
+    found, error = None, None
+    if root.tag == "ProbeCalibrationResult":
+        result = read_result(path)
+        found, error = result.find("Image", "Probe"), result.calibration_error_mm
+    else:
+        found = read_configuration(path).find("Image", "Probe")
+        error = None if found is None else found.error_mm
+    if found is None:
+        raise FormatError("holds no transform from Image to Probe")
+    return transform_from_plus_matrix(found.matrix, error_mm=error, source=name)
+
+
+def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
+    check_readable(path, maximum_bytes=4096)
+    try:
+        return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+    except (OSError, ValueError, EOFError) as error:
+        raise FormatError(f"is not an array of numbers: {one_line(error)}") from None
+
+
+def _load_json(path: str | os.PathLike[str]) -> ImageTransform:
+    check_readable(path, maximum_bytes=MAXIMUM_BYTES)
+    try:
+        record = json.loads(Path(path).read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise FormatError(f"is not JSON: {one_line(error)}") from None
+    if not isinstance(record, dict):
+        raise FormatError("is not a calibration: a JSON object is needed")
+    return transform_from_record(record, source=os.fspath(path))
+
+
+def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> ImageTransform:
+    """The calibration in an object of ``jaxcal calibrate --json``, of this or an older version.
+
+    Raises:
+        FormatError: another format, a newer version, or a field that is missing or not as it
+            should be.
+    """
+    if record.get("format", FORMAT) != FORMAT:
+        raise FormatError(f"is not a calibration: its format is {quoted(str(record['format']))}")
+    version = record.get("version", 0)
+    if not isinstance(version, int) or version > VERSION:
+        raise FormatError(
+            f"is version {quoted(str(version))} of the calibration format; this jaxcal understands "
+            f"version {VERSION}: update jaxcal"
+        )
+    # Before version 1 the field had the name of PLUS's matrix, which is another.
+    key = "image_to_probe" if version == 0 else "image_plane_to_probe"
+    matrix = _array(record, key, (4, 4))
+    if matrix is None:
+        raise FormatError(f"is not a calibration: {key} is missing, or the solve had failed")
+    transform = check_poses(matrix[None], what=key)[0]
+    if np.abs(transform - matrix).max() < _ROUNDING:
+        transform = matrix  # what was written is what is read, to the last digit
+    scale = _array(record, "scale_mm_per_px", (2,))
+    if scale is not None and not (scale > 0).all():
+        raise FormatError("scale_mm_per_px must be positive")
+    offset = _array(record, "face_offset_mm", ())
+    factor = _array(record, "range_factor", ())
+    if factor is not None and not factor > 0:
+        raise FormatError("range_factor must be positive")
+    error = _array(record, "rms_mm", ())
+    converged = record.get("converged")
+    unknowns = _unknowns(record)
+    size = len(unknown_names(unknowns))
+    return ImageTransform(
+        transform,
+        scale,
+        0.0 if offset is None else float(offset),
+        _array(record, "covariance", (6, 6)),
+        None if error is None else float(error),
+        converged if isinstance(converged, bool) else None,
+        source,
+        1.0 if factor is None else float(factor),
+        unknowns,
+        _array(record, "image_covariance", (size, size)),
+    )
+
+
+def _unknowns(record: dict[str, Any]) -> tuple[str, ...]:
+    """The blocks whose tangents ``image_unknowns`` names."""
+    names = record.get("image_unknowns")
+    if names is None:
+        return ("translation", "rotation")
+    known = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    blocks = tuple(block for block in IMAGE_BLOCKS if known and UNKNOWNS[block][0] in names)
+    if not known or unknown_names(blocks) != names or blocks[:2] != ("translation", "rotation"):
+        raise FormatError("image_unknowns names other unknowns than those of an image point")
+    return blocks
+
+
+def _array(record: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray | None:
+    value = record.get(key)
+    if value is None:
+        return None
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise FormatError(f"{key} must be numbers of shape {shape}") from None
+    # NaN in the place of null: the solve had failed.
+    if array.shape != shape:
+        raise FormatError(f"{key} must have shape {shape}, it has {array.shape}")
+    return array if np.isfinite(array).all() else None

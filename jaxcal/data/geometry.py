@@ -1,0 +1,78 @@
+"""Rigid transforms in JAX: 4x4 matrices in millimetres whose rotations can be trusted.
+
+:mod:`jaxcal.data.poses` makes them from somebody else's matrices; its functions can be had here
+too.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxcal.data.poses import ROTATION_TOLERANCE as ROTATION_TOLERANCE
+from jaxcal.data.poses import check_poses as check_poses
+from jaxcal.data.poses import nearest_rotations as nearest_rotations
+from jaxcal.data.poses import rotation_angle as rotation_angle
+
+AnyArray = Array | np.ndarray
+"""Public functions of arrays take numpy's as well as JAX's."""
+
+_SMALL_ANGLE_SQUARED = 1e-2
+"""rad^2; below it a series replaces quotients, whose derivatives divide by powers of the angle."""
+_TERMS = 7
+"""The first term left out is below 1e-26, its second derivative below 1e-20."""
+
+
+def transform_points(
+    transform: Float[AnyArray, "*#batch 4 4"], points: Float[AnyArray, "*#batch 3"]
+) -> Float[Array, "*batch 3"]:
+    """Apply 4x4 rigid transforms to points (mm); leading axes broadcast."""
+    rotated = jnp.einsum("...ij,...j->...i", transform[..., :3, :3], points)
+    return rotated + transform[..., :3, 3]
+
+
+def matrix_from_rotation(
+    rotation: Float[Array, "3 3"], translation: Float[Array, 3]
+) -> Float[Array, "4 4"]:
+    """The 4x4 transform with the given rotation and translation (mm)."""
+    top = jnp.concatenate([rotation, translation[:, None]], axis=1)
+    bottom = jnp.asarray([[0.0, 0.0, 0.0, 1.0]], dtype=top.dtype)
+    return jnp.concatenate([top, bottom], axis=0)
+
+
+def rotation_from_vector(vector: Float[Array, 3]) -> Float[Array, "3 3"]:
+    """Rotation matrix of an axis times an angle (rad), by Rodrigues' formula.
+
+    Derivatives of every order that the solvers take are accurate everywhere, zero included.
+    """
+    squared = vector @ vector
+    small = squared < _SMALL_ANGLE_SQUARED
+    # The unused branch must stay finite, or its derivative would be NaN times zero.
+    angle = jnp.sqrt(jnp.where(small, 1.0, squared))
+    first = jnp.where(small, _series(squared, 1), jnp.sin(angle) / angle)
+    second = jnp.where(small, _series(squared, 2), 2 * (jnp.sin(angle / 2) / angle) ** 2)
+    x, y, z = vector
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    identity = jnp.eye(3, dtype=vector.dtype)
+    return (1 - second * squared) * identity + first * cross + second * jnp.outer(vector, vector)
+
+
+def _series(squared: Float[Array, ""], order: int) -> Float[Array, ""]:
+    """sin(t) / t (order 1) or (1 - cos(t)) / t^2 (order 2) of t^2, for small t."""
+    total = jnp.zeros_like(squared)
+    for power in reversed(range(_TERMS)):
+        total = total * squared + (-1) ** power / math.factorial(2 * power + order)
+    return total
+
+
+def chord_angle(difference: Float[Array, "3 3 *lanes"]) -> Float[Array, "*lanes"]:
+    """Angle (rad) between two rotations, from their difference; lanes last.
+
+    2 asin(|R1 - R2| / sqrt 8) keeps its digits near zero, where acos of the trace loses half.
+    """
+    chord = jnp.sqrt(jnp.sum(difference**2, axis=(0, 1)))
+    return 2 * jnp.arcsin(jnp.minimum(chord / math.sqrt(8.0), 1.0))

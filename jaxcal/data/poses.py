@@ -1,0 +1,192 @@
+"""Poses at the boundary: 4x4 matrices in millimetres, checked and projected to SE(3). Numpy only.
+
+This module is where somebody else's matrices and quaternions become poses whose rotations can be
+trusted. A rotation block within 1e-2 (Frobenius) of SO(3) is projected to it by SVD (text files
+and optical trackers round); anything farther is refused with its row named.
+
+Nothing here imports JAX, so that files can be read and converted without its start-up time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.runtime.array_types import Float
+
+ROTATION_TOLERANCE = 1e-2
+"""Largest Frobenius distance from SO(3) that is taken for rounding."""
+
+QUATERNION_TOLERANCE = 1e-2
+"""Largest distance of a quaternion's length from 1 that is taken for rounding."""
+
+QuaternionOrder = Literal["xyzw", "wxyz"]
+"""Whether the scalar comes last (ROS, Motive, scipy) or first (NDI)."""
+
+
+def nearest_rotations(
+    matrices: Float[np.ndarray, "n 3 3"],
+) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, " n"]]:
+    """The proper rotations nearest to 3x3 matrices, and how far away they were.
+
+    Args:
+        matrices: any 3x3 matrices, finite.
+
+    Returns:
+        rotations (n, 3, 3) in SO(3) and Frobenius distances (n,).
+
+    Source: Schoenemann 1966 (orthogonal Procrustes), restricted to det = +1.
+    """
+    u, _, vt = np.linalg.svd(matrices)
+    sign = np.linalg.det(u @ vt)
+    u = u.copy()
+    u[..., :, 2] *= sign[..., None]
+    rotations = u @ vt
+    return rotations, np.linalg.norm(rotations - matrices, axis=(-2, -1))
+
+
+def check_poses(
+    poses: np.ndarray,
+    used: np.ndarray | None = None,
+    *,
+    what: str = "pose",
+    labels: Sequence[str] | None = None,
+) -> Float[np.ndarray, "n 4 4"]:
+    """Check 4x4 poses (mm) and project their rotations to SO(3).
+
+    Args:
+        poses: (n, 4, 4), or (n, 3, 4) without the last row; mm.
+        used: (n,) bool; images left out are not checked and come back as the identity.
+        what: how an error names the array.
+        labels: how an error names each row, for instance "in line 7"; its number by default.
+
+    Returns:
+        (n, 4, 4) float64 poses whose rotation blocks are orthonormal.
+
+    Raises:
+        InputError: wrong shape, NaN or Inf, last row not 0 0 0 1, a reflection, or a block farther
+            than 1e-2 from a rotation; the row (image) is named.
+    """
+    poses = np.array(poses, dtype=np.float64)
+    if poses.ndim != 3 or poses.shape[1:] not in ((4, 4), (3, 4)):
+        raise InputError(f"{what} must have shape (n, 4, 4), it has {poses.shape}")
+    count = len(poses)
+    full = np.tile(np.eye(4), (count, 1, 1))
+    full[:, : poses.shape[1]] = poses
+    used = np.ones(count, bool) if used is None else np.asarray(used, bool)
+    full[~used] = np.eye(4)
+
+    def name(row: int) -> str:
+        return f"{what} {row if labels is None else labels[row]}"
+
+    bad = ~np.isfinite(full).all(axis=(1, 2))
+    if bad.any():
+        raise InputError(f"{name(int(np.flatnonzero(bad)[0]))} holds NaN or Inf")
+    bad = np.abs(full[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > 1e-6
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        raise InputError(
+            f"{name(row)} is not a rigid transform: its last row is {full[row, 3].tolist()}, "
+            "not [0, 0, 0, 1] (a transposed matrix?)"
+        )
+    rotations, distance = nearest_rotations(full[:, :3, :3])
+    bad = distance > ROTATION_TOLERANCE
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        if np.linalg.det(full[row, :3, :3]) < 0:
+            raise InputError(
+                f"{name(row)} is a reflection (determinant "
+                f"{np.linalg.det(full[row, :3, :3]):.3f}): convert it to a right-handed frame"
+            )
+        raise InputError(
+            f"{name(row)} is not a rotation: its 3x3 block is {distance[row]:.3g} away from "
+            f"the nearest one (at most {ROTATION_TOLERANCE:g} is taken for rounding)"
+        )
+    full[:, :3, :3] = rotations
+    full[:, 3] = [0.0, 0.0, 0.0, 1.0]
+    return full
+
+
+def rotation_angle(first: np.ndarray, second: np.ndarray) -> float:
+    """Angle (rad) between the rotations of two 4x4 transforms."""
+    relative = np.asarray(first)[:3, :3].T @ np.asarray(second)[:3, :3]
+    # 2 asin(|R - I| / sqrt 8) keeps its digits near zero, where acos of the trace loses half.
+    return float(2 * np.arcsin(min(1.0, np.linalg.norm(relative - np.eye(3)) / np.sqrt(8))))
+
+
+def rotations_from_quaternions(
+    quaternions: Float[np.ndarray, "n 4"],
+    order: QuaternionOrder,
+    *,
+    labels: Sequence[str] | None = None,
+) -> Float[np.ndarray, "n 3 3"]:
+    """Rotation matrices of unit quaternions.
+
+    Args:
+        quaternions: one a row, of length 1 to within 1e-2; they are normalised.
+        order: ``xyzw`` (scalar last) or ``wxyz`` (scalar first).
+        labels: how an error names each row, for instance "in line 7"; its number by default.
+
+    Raises:
+        InputError: a quaternion whose length is not 1, or NaN or Inf; the row is named.
+    """
+    values = np.asarray(quaternions, dtype=np.float64)
+    length = np.linalg.norm(values, axis=1)
+    bad = np.flatnonzero(~(np.abs(length - 1) < QUATERNION_TOLERANCE))
+    if len(bad):
+        row = int(bad[0])
+        name = row if labels is None else labels[row]
+        raise InputError(f"quaternion {name} has length {length[row]:g}, not 1")
+    values = values / length[:, None]
+    w, x, y, z = (values if order == "wxyz" else values[:, [3, 0, 1, 2]]).T
+    return np.stack([
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ], axis=-1).reshape(-1, 3, 3)  # fmt: skip
+
+
+def rotations_from_vectors(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Rotation matrices of axes times angles (rad), by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
+    cross = cross.reshape(*vectors.shape, 3)
+    # sin(t) / t and (1 - cos(t)) / t^2 by numpy's sinc, which is right at zero.
+    first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.eye(3) + first * cross + second * cross @ cross
+
+
+def quaternion_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
+    """Unit quaternion x y z w (scalar last, not negative) of a rotation matrix."""
+    return quaternions_from_rotations(np.asarray(rotation, dtype=np.float64)[None])[0]
+
+
+def quaternions_from_rotations(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
+    """Unit quaternions x y z w (scalar last, not negative) of rotation matrices.
+
+    Source: the eigenvector of Bar-Itzhack 2000, which is accurate for every angle.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(rotations, 0, -1)
+    matrices = np.array([
+        [xx - yy - zz, xy + yx, xz + zx, zy - yz],
+        [xy + yx, yy - xx - zz, yz + zy, xz - zx],
+        [xz + zx, yz + zy, zz - xx - yy, yx - xy],
+        [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+    ])  # fmt: skip
+    found = np.linalg.eigh(np.moveaxis(matrices, -1, 0))[1][:, :, -1]
+    return np.where(found[:, 3:] >= 0, found, -found)
+
+
+def inverse_poses(poses: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
+    """The inverses of rigid transforms."""
+    inverse = np.zeros_like(poses)
+    rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, poses[..., :3, 3])
+    inverse[..., 3, 3] = 1.0
+    return inverse

@@ -1,0 +1,249 @@
+"""Arrays that a solver eats. From here on everything is pure, batched and differentiable.
+
+Every array of a :class:`Problem` is floating, the mask included, so that ``jax.grad`` takes a whole
+problem as its argument; whatever is not an array (are the measurements pixels?) is static. A batch
+is the same class with leading axes on every array.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.data.probe import CurvilinearProbe
+from jaxcal.data.recording import Images, Kind, Recording, make_images
+from jaxcal.diagnostics.arrays import array_module
+from jaxcal.diagnostics.arrays import is_traced as is_traced
+from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
+from jaxcal.runtime.precision import in_own_modes
+from jaxcal.runtime.trees import array_tree, static
+
+if TYPE_CHECKING:
+    from jax.typing import DTypeLike
+
+
+@array_tree
+class Channels:
+    """What every element heard, for the solves on the times of flight themselves.
+
+    Attributes:
+        distances: one-way distances at the nominal sound speed and delay, mm; 0 where not heard.
+        heard: 1 where an element's time of flight is used, 0 where it is missing or rejected.
+        elements: positions in the image frame [lateral, elevational, axial], mm.
+    """
+
+    distances: Float[HeldArray, "*batch n elements"]
+    heard: Float[HeldArray, "*batch n elements"]
+    elements: Float[HeldArray, "*batch elements 3"]
+
+
+@array_tree
+class Problem:
+    """Tracked measurements of one target in n images; ``*batch`` may be empty.
+
+    Arrays are JAX's where JAX is imported, and otherwise numpy's, which JAX takes as well.
+
+    Attributes:
+        poses: probe -> tracker, mm.
+        measurements: [lateral, range] in mm, or [u, v] in px when ``pixels``.
+        mask: 1 where the image is used, 0 where it is left out (its values are then ignored).
+        spacing: [lateral, axial] mm per px (1 for points in mm); where pixels come without a known
+            spacing it only sets the unit of the estimated scale.
+        face_offset: range of pixel row 0, mm.
+        covariance: of the measurements, in their unit squared, or None. Its *shape* across images
+            and axes is used by the joint solver, whose sigmas scale it.
+        max_elevation: bound on |elevational offset| of each image, mm, or None.
+        sound_speed: the nominal one, by which times of flight became distances, m/s.
+        delay: the nominal electronic delay, already taken off the times of flight, s.
+        channels: the distances of every element, or None.
+        pixels: whether the measurements are pixels (static).
+        spacing_known: whether ``spacing`` was given (static); if not, the scale must be estimated.
+        curved: whether the elements lie on an arc (static): only the channels then tell lateral
+            position, range and elevational offset apart without bias.
+    """
+
+    poses: Float[HeldArray, "*batch n 4 4"]
+    measurements: Float[HeldArray, "*batch n 2"]
+    mask: Float[HeldArray, "*batch n"]
+    spacing: Float[HeldArray, "*batch 2"]
+    face_offset: Float[HeldArray, "*batch"]
+    covariance: Float[HeldArray, "*batch n 2 2"] | None = None
+    max_elevation: Float[HeldArray, "*batch n"] | None = None
+    sound_speed: Float[HeldArray, "*batch"] | None = None
+    delay: Float[HeldArray, "*batch"] | None = None
+    channels: Channels | None = None
+    pixels: bool = static(default=False)
+    spacing_known: bool = static(default=True)
+    curved: bool = static(default=False)
+
+    @property
+    def images(self) -> int:
+        """Number of images, those left out included."""
+        return self.mask.shape[-1]
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes; () for one problem."""
+        return self.mask.shape[:-1]
+
+    def cleared(self, used: Float[AnyArray, "*batch n"]) -> Problem:
+        """With harmless values where an image is not used: NaN times a mask of 0 is NaN, not 0.
+
+        The mask stays as it is, and so do all shapes.
+
+        Args:
+            used: 0 for images whose values are not to be read.
+        """
+        xp = array_module(self, used)
+
+        def keep(values: Any, instead: np.ndarray | float) -> Any:
+            shape = used.shape + (1,) * (values.ndim - used.ndim)
+            return xp.where(used.reshape(shape) > 0, values, xp.asarray(instead, values.dtype))
+
+        channels = self.channels
+        if channels is not None:
+            channels = Channels(
+                keep(channels.distances, 0.0), keep(channels.heard, 0.0), channels.elements
+            )
+        return replace(
+            self,
+            poses=keep(self.poses, np.eye(4)),
+            measurements=keep(self.measurements, 1.0),
+            covariance=None if self.covariance is None else keep(self.covariance, np.eye(2)),
+            max_elevation=None if self.max_elevation is None else keep(self.max_elevation, 1.0),
+            channels=channels,
+        )
+
+    def points_only(self) -> Problem:
+        """Without what says more than points and poses."""
+        return replace(
+            self,
+            channels=None,
+            covariance=None,
+            max_elevation=None,
+            sound_speed=None,
+            delay=None,
+        )
+
+    @classmethod
+    @in_own_modes
+    def from_recording(
+        cls, recording: Recording | Images, dtype: DTypeLike | None = None
+    ) -> Problem:
+        """The calibration images of a recording as arrays; times of flight are segmented first.
+
+        Args:
+            recording: a :class:`Recording`, or one set of :class:`Images`.
+            dtype: float64 by default.
+
+        Raises:
+            InputError: for times of flight that cannot be segmented, or come without a probe.
+        """
+        probe = recording.probe if isinstance(recording, Recording) else None
+        images = recording.calibration if isinstance(recording, Recording) else recording
+        dtype = np.float64 if dtype is None else dtype
+
+        # Not jax.numpy.asarray of a number, which JAX would compile.
+        put: Any = sys.modules["jax"].device_put if "jax" in sys.modules else lambda array: array
+
+        def array(values: np.ndarray | float) -> Any:
+            return put(np.asarray(values, dtype=dtype))
+
+        channels = None
+        raw = images.measurements if images.kind == "time_of_flight" else images.time_of_flight
+        if raw is not None and (probe is not None or images.kind == "time_of_flight"):
+            from jaxcal.data.segmentation.segment import segment
+
+            segmented = segment(recording)
+            if images.kind == "time_of_flight":
+                images = segmented.images
+            assert probe is not None
+            accepted = segmented.accepted & images.mask[:, None]
+            distances = np.where(accepted, probe.one_way_range_mm(raw), 0.0)
+            channels = Channels(
+                array(distances), array(accepted.astype(float)), array(probe.element_positions())
+            )
+        pixels = images.kind == "pixel"
+        known = not pixels or images.spacing_mm is not None
+        spacing = np.ones(2) if images.spacing_mm is None else np.asarray(images.spacing_mm)
+        return cls(
+            poses=array(images.poses),
+            measurements=array(images.measurements),
+            mask=array(images.mask.astype(float)),
+            spacing=array(spacing),
+            face_offset=array(images.face_offset_mm),
+            covariance=None if images.covariance is None else array(images.covariance),
+            max_elevation=None if images.max_elevation is None else array(images.max_elevation),
+            sound_speed=None if probe is None else array(probe.sound_speed_m_s),
+            delay=None if probe is None else array(probe.delay_s),
+            channels=channels,
+            pixels=pixels,
+            spacing_known=known,
+            curved=isinstance(probe, CurvilinearProbe),
+        )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        poses: np.ndarray,
+        measurements: np.ndarray,
+        *,
+        kind: Kind = "point",
+        mask: np.ndarray | None = None,
+        covariance: np.ndarray | None = None,
+        max_elevation: np.ndarray | float | None = None,
+        spacing_mm: np.ndarray | tuple[float, float] | None = None,
+        dtype: DTypeLike | None = None,
+    ) -> Problem:
+        """One checked problem from numpy arrays in memory; units as in :class:`Images`.
+
+        Args:
+            poses: (n, 4, 4) probe -> tracker, mm.
+            measurements: (n, 2) [lateral, range] mm, or [u, v] px with ``kind="pixel"``.
+            kind: ``point`` or ``pixel``.
+            mask: (n,) bool, True = used.
+            covariance: (n, 2, 2).
+            max_elevation: (n,) or one number, mm.
+            spacing_mm: [lateral, axial] mm/px; without it a pixel problem estimates its scale.
+            dtype: float64 by default.
+
+        Raises:
+            InputError: whatever cannot be a calibration problem, with the row named.
+        """
+        images = make_images(
+            poses,
+            measurements,
+            kind,
+            mask=mask,
+            covariance=covariance,
+            max_elevation=max_elevation,
+            spacing_mm=spacing_mm,
+        )
+        return cls.from_recording(images, dtype=dtype)
+
+
+@in_own_modes
+def stack(problems: list[Problem]) -> Problem:
+    """Problems of one structure as a batch with one leading axis.
+
+    Args:
+        problems: each of one problem, at least one.
+
+    Raises:
+        InputError: where they differ in the number of images or in what they hold.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    first = jax.tree.structure(problems[0])
+    for index, problem in enumerate(problems):
+        if jax.tree.structure(problem) != first or problem.images != problems[0].images:
+            raise InputError(
+                f"problem {index} differs from problem 0 in its number of images or in its parts; "
+                "pad it with images that are masked out"
+            )
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)

@@ -1,0 +1,341 @@
+"""What was measured: poses, image measurements and their circumstances, in numpy and with units.
+
+A :class:`Recording` is one file's worth of data as it came in; a :class:`jaxcal.Problem` is what a
+solver eats. Recordings are checked when they are made, so that everything downstream may trust
+shapes, units and finiteness.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.data.poses import check_poses
+from jaxcal.data.probe import Probe
+from jaxcal.runtime.array_types import Bool, Float
+
+MINIMUM_IMAGES = 4
+"""With fewer used images nothing can be solved: 3 residuals an image against 9 unknowns."""
+
+LARGEST = 1e7
+"""No coordinate in mm or px, no variance of one, is larger: ten kilometres."""
+
+Kind = Literal["point", "pixel", "time_of_flight"]
+_UNIT = {"point": "mm", "pixel": "px", "time_of_flight": "s"}
+
+
+@dataclass(frozen=True)
+class Images:
+    """One set of tracked images of the target.
+
+    Attributes:
+        poses: (n, 4, 4) probe -> tracker, mm; rotations projected to SO(3).
+        measurements: (n, 2) [lateral, range] in mm for ``point``; (n, 2) [u lateral, v axial] in px
+            for ``pixel``; (n, elements) one-way times in s for ``time_of_flight`` (NaN: no echo).
+        kind: which of the three.
+        mask: (n,) True where the image is used.
+        covariance: (n, 2, 2) mm^2 (px^2 for pixels), or None.
+        max_elevation: (n,) bound on |elevational offset|, mm, or None.
+        amplitude: (n,) received amplitude, arbitrary unit, or None.
+        time: (n,) s, or None.
+        spacing_mm: (2,) mm per px [lateral, axial] for pixels; None when unknown.
+        face_offset_mm: range of pixel row 0, mm.
+        time_of_flight: (n, elements) the times, s, that points were segmented from, or None.
+    """
+
+    poses: Float[np.ndarray, "n 4 4"]
+    measurements: Float[np.ndarray, "n columns"]
+    kind: Kind
+    mask: Bool[np.ndarray, " n"]
+    covariance: Float[np.ndarray, "n 2 2"] | None = None
+    max_elevation: Float[np.ndarray, " n"] | None = None
+    amplitude: Float[np.ndarray, " n"] | None = None
+    time: Float[np.ndarray, " n"] | None = None
+    spacing_mm: Float[np.ndarray, 2] | None = None
+    face_offset_mm: float = 0.0
+    time_of_flight: Float[np.ndarray, "n elements"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a simulation knows.
+
+    Attributes:
+        image_to_probe: (4, 4) X, mm.
+        point: (3,) target in the tracker's frame, mm.
+        elevation: (n,) elevational offsets, mm.
+    """
+
+    image_to_probe: Float[np.ndarray, "4 4"]
+    point: Float[np.ndarray, 3]
+    elevation: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording: images to calibrate with and, optionally, test images, truth and the probe.
+
+    Attributes:
+        calibration: the images to calibrate with.
+        test: the images of an independent test set, or None.
+        truth: what a simulation knows, or None.
+        probe: the transducer, or None.
+        source: the file that it came from, for messages.
+    """
+
+    calibration: Images
+    test: Images | None = None
+    truth: Truth | None = None
+    probe: Probe | None = None
+    source: str = field(default="memory", compare=False)
+
+    def __len__(self) -> int:
+        return len(self.calibration)
+
+
+def make_images(
+    poses: np.ndarray,
+    measurements: np.ndarray,
+    kind: Kind = "point",
+    *,
+    mask: np.ndarray | None = None,
+    covariance: np.ndarray | None = None,
+    max_elevation: np.ndarray | float | None = None,
+    amplitude: np.ndarray | None = None,
+    time: np.ndarray | None = None,
+    spacing_mm: np.ndarray | tuple[float, float] | None = None,
+    face_offset_mm: float = 0.0,
+    time_of_flight: np.ndarray | None = None,
+    minimum: int = MINIMUM_IMAGES,
+    where: str = "",
+) -> Images:
+    """Check somebody's arrays and make them one set of images.
+
+    Args:
+        poses: (n, 4, 4) probe -> tracker, mm.
+        measurements: see :class:`Images`.
+        kind: ``point``, ``pixel`` or ``time_of_flight``.
+        mask: (n,) bool, True = used; images left out may hold anything.
+        covariance: (n, 2, 2), symmetric positive definite.
+        max_elevation: (n,) or one number, mm, not negative.
+        amplitude: (n,).
+        time: (n,) s.
+        spacing_mm: [lateral, axial] mm per px, pixels only.
+        face_offset_mm: range of pixel row 0, mm.
+        time_of_flight: (n, elements) s, points only: the times that they were segmented from.
+        minimum: least number of used images (0 for a test set).
+        where: prefix of error messages, e.g. a file's name.
+
+    Returns:
+        The checked set; values of images left out are replaced by harmless ones.
+
+    Raises:
+        InputError: with the array and row named.
+    """
+    prefix = f"{where}: " if where else ""
+    try:
+        return _make_images(
+            poses, measurements, kind, mask, covariance, max_elevation, amplitude, time,
+            spacing_mm, face_offset_mm, time_of_flight, minimum,
+        )  # fmt: skip
+    except InputError as error:
+        raise type(error)(f"{prefix}{error}") from None
+
+
+def _make_images(
+    poses, measurements, kind, mask, covariance, max_elevation, amplitude, time,
+    spacing_mm, face_offset_mm, time_of_flight, minimum,
+) -> Images:  # fmt: skip
+    poses = np.asarray(poses, dtype=np.float64)
+    values = np.array(measurements, dtype=np.float64)
+    count = len(poses) if poses.ndim else 0
+    if values.ndim != 2:
+        raise InputError(f"{kind} must have two axes, it has shape {values.shape}")
+    if kind != "time_of_flight" and values.shape[1] != 2:
+        raise InputError(f"{kind} must have shape (n, 2), it has {values.shape}")
+    if len(values) != count:
+        raise InputError(f"{count} poses but {len(values)} rows of {kind}: they must match")
+    used = _mask(mask, count)
+    if used.sum() < minimum:
+        raise InputError(
+            f"{int(used.sum())} used images are too few: at least {minimum} are needed"
+        )
+    _check_magnitude("pose", poses, used)
+    checked = check_poses(poses, used)
+
+    if kind == "time_of_flight":
+        bad = np.isinf(values).any(axis=1) & used
+        values[~used] = np.nan
+    else:
+        values[~used] = 1.0
+        bad = ~np.isfinite(values).all(axis=1)
+    if bad.any():
+        raise InputError(f"{kind} {np.flatnonzero(bad)[0]} holds NaN or Inf")
+    if kind != "time_of_flight":
+        _check_magnitude(kind, values, used)
+    if kind == "point" and used.any():
+        bad = (values[:, 1] <= 0) & used
+        if bad.any():
+            raise InputError(f"point {np.flatnonzero(bad)[0]} has a range that is not positive")
+
+    spacing = None
+    if spacing_mm is not None:
+        spacing = np.asarray(spacing_mm, dtype=np.float64)
+        if spacing.shape != (2,) or not (np.isfinite(spacing).all() and (spacing > 0).all()):
+            raise InputError("spacing_mm must be two positive numbers [lateral, axial] in mm/px")
+        if kind != "pixel":
+            raise InputError(f"spacing_mm belongs to pixels, not to {kind} data")
+    if not np.isfinite(face_offset_mm):
+        raise InputError("face_offset_mm must be finite")
+    bound = max_elevation
+    if bound is not None:
+        bound = np.broadcast_to(np.asarray(bound, dtype=np.float64), (count,)).copy()
+    bound = _per_image("max_elevation", bound, count, used, fill=1.0)
+    if bound is not None and (bound < 0).any():
+        raise InputError(f"max_elevation {np.flatnonzero(bound < 0)[0]} is negative")
+
+    images = Images(
+        poses=checked,
+        measurements=values,
+        kind=kind,
+        mask=used,
+        covariance=_covariance(covariance, count, used),
+        max_elevation=bound,
+        amplitude=_per_image("amplitude", amplitude, count, used, fill=0.0),
+        time=_per_image("time", time, count, used, fill=0.0),
+        spacing_mm=spacing,
+        face_offset_mm=float(face_offset_mm),
+        time_of_flight=_raw_times(time_of_flight, kind, count, used),
+    )
+    _check_units(images)
+    return images
+
+
+def _raw_times(
+    times: np.ndarray | None, kind: Kind, count: int, used: np.ndarray
+) -> Float[np.ndarray, "n elements"] | None:
+    """Rows of images left out are kept: another segmentation may have a use for them."""
+    if times is None:
+        return None
+    if kind != "point":
+        raise InputError(f"time_of_flight beside the measurements belongs to points, not to {kind}")
+    times = np.array(times, dtype=np.float64)
+    if times.ndim != 2 or len(times) != count:
+        raise InputError(
+            f"time_of_flight must have shape ({count}, elements), it has {times.shape}"
+        )
+    infinite = np.isinf(times)
+    bad = infinite.any(axis=1) & used
+    if bad.any():
+        raise InputError(f"time_of_flight {np.flatnonzero(bad)[0]} holds Inf")
+    times[infinite] = np.nan
+    return times
+
+
+def _check_magnitude(name: str, values: np.ndarray, used: np.ndarray) -> None:
+    """Refuse what no unit makes sense of, before it overflows somewhere; NaN and Inf come later."""
+    rows = np.abs(values.reshape(len(used), -1)) if len(used) else np.zeros((0, 1))
+    bad = (np.isfinite(rows) & (rows > LARGEST)).any(axis=1) & used
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        raise InputError(
+            f"{name} {row} holds a number beyond {LARGEST:g}: that cannot be a measure"
+        )
+
+
+def _mask(mask: np.ndarray | None, count: int) -> Bool[np.ndarray, " n"]:
+    if mask is None:
+        return np.ones(count, bool)
+    mask = np.asarray(mask)
+    if mask.shape != (count,):
+        raise InputError(f"mask must have shape ({count},), it has {mask.shape}")
+    if mask.dtype != bool and not np.isin(mask, (0, 1)).all():
+        raise InputError("mask must hold booleans (True = used)")
+    return mask.astype(bool)
+
+
+def _per_image(
+    name: str, values: np.ndarray | None, count: int, used: np.ndarray, fill: float
+) -> Float[np.ndarray, " n"] | None:
+    if values is None:
+        return None
+    values = np.array(values, dtype=np.float64)
+    if values.shape != (count,):
+        raise InputError(f"{name} must have shape ({count},), it has {values.shape}")
+    values[~used] = fill
+    if not np.isfinite(values).all():
+        raise InputError(f"{name} {np.flatnonzero(~np.isfinite(values))[0]} is NaN or Inf")
+    return values
+
+
+def _covariance(
+    covariance: np.ndarray | None, count: int, used: np.ndarray
+) -> Float[np.ndarray, "n 2 2"] | None:
+    if covariance is None:
+        return None
+    values = np.array(covariance, dtype=np.float64)
+    if values.shape != (count, 2, 2):
+        raise InputError(f"covariance must have shape ({count}, 2, 2), it has {values.shape}")
+    values[~used] = np.eye(2)
+    _check_magnitude("covariance", values, used)
+    bad = ~np.isfinite(values).all(axis=(1, 2))
+    if bad.any():
+        raise InputError(f"covariance {np.flatnonzero(bad)[0]} holds NaN or Inf")
+    scale = np.abs(values).max(axis=(1, 2))
+    bad = np.abs(values[:, 0, 1] - values[:, 1, 0]) > 1e-6 * scale
+    bad |= np.linalg.eigvalsh((values + values.swapaxes(1, 2)) / 2)[:, 0] <= 1e-12 * scale
+    if bad.any():
+        raise InputError(
+            f"covariance {np.flatnonzero(bad)[0]} is not symmetric and positive definite"
+        )
+    return (values + values.swapaxes(1, 2)) / 2
+
+
+def _check_units(images: Images) -> None:
+    """Refuse metres where millimetres are due; only what no real set-up can look like."""
+    used = images.mask
+    if not used.any():
+        return
+    translation = images.poses[used, :3, 3]
+    spread = float(np.linalg.norm(translation - translation.mean(axis=0), axis=1).max())
+    reach = float(np.linalg.norm(translation, axis=1).max())
+    if images.kind == "point":
+        extent = float(np.abs(images.measurements[used]).max())
+        if extent < 0.5 and spread > 1.0:
+            raise InputError(
+                f"points reach only {extent:.3g} mm while the poses move by {spread:.3g} mm: "
+                "the points look like metres; give them in mm"
+            )
+        if extent < 0.5:
+            raise InputError(
+                f"points reach only {extent:.3g} mm from the image's origin: points and poses look "
+                "like metres; give both in mm"
+            )
+    elif images.kind == "pixel":
+        if images.spacing_mm is not None and images.spacing_mm.max() < 1e-3:
+            raise InputError(
+                f"the spacing is only {images.spacing_mm.max():.3g} mm per pixel: it looks like "
+                "metres; give it, and the poses, in mm"
+            )
+        spacing = 0.1 if images.spacing_mm is None else float(images.spacing_mm.max())
+        extent = float(np.ptp(images.measurements[used], axis=0).max()) * spacing
+    else:
+        extent = 50.0
+    # A probe whose every position lies within 5 mm of the tracker's origin, and whose moves are
+    # hundreds of times smaller than the target's path through the image, was recorded in metres.
+    if 0 < spread < 0.02 * extent and reach < 5.0:
+        raise InputError(
+            f"pose translations reach only {reach:.3g} while the target moves over {extent:.3g} mm "
+            "of the image: the poses look like metres; give them in mm"
+        )
+
+
+def unit_of(kind: Kind) -> str:
+    """The unit in which measurements of a kind are given."""
+    return _UNIT[kind]

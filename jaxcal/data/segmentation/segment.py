@@ -1,0 +1,362 @@
+"""From times of flight to points: checks, the fit, and what became of every frame.
+
+A frame without enough answers is left out and counted, never fatal; what cannot be times of flight
+in seconds is refused with its row named.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxcal import InputError
+from jaxcal.data.geometry import AnyArray
+from jaxcal.data.probe import CurvilinearProbe, Probe
+from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording, make_images
+from jaxcal.data.segmentation.time_of_flight import Fit, fit_in_plane, fit_out_of_plane, shortest
+from jaxcal.runtime.compiler import fast_to_run
+from jaxcal.runtime.precision import in_own_modes
+
+Method = Literal["least-squares", "shortest"]
+Scale = Literal["frame", "pooled"]
+
+MINIMUM_LINES = 8
+"""With fewer answers a frame's noise is anybody's guess, and an outlier is not seen."""
+
+_LONGEST_S = 2e-3
+# |elevation| is determined where its square lies this many SDs above zero.
+_SIGNIFICANT = 3.0
+# A frame this many times as noisy as the median one was fitted to something else.
+_NOISIEST = 5.0
+_MANY = 0.1
+# An answer this many SDs from the fit is not the target's.
+_FAR = 6.0
+
+
+@dataclass(frozen=True)
+class OutOfPlane:
+    """What a curved array's distances say of the elevation (Eq. 6); its sign is not resolved.
+
+    Attributes:
+        position: (n, 3) [lateral, axial, elevation squared], mm, mm, mm^2; the square may come out
+            negative: then noise hides the elevation. NaN for frames left out.
+        covariance: (n, 3, 3). It is that of the linearised problem: the well-determined
+            combination is lateral^2 + axial^2 + elevation squared, so that large errors of axial
+            and of the square lie on a parabola rather than on the covariance's long axis.
+        elevation: (n,) |elevational|, mm, the root of the square, or 0 where that is negative.
+        elevation_sd: (n,) by the delta method, sd(y^2) / (2 |y|), mm; NaN where not determined.
+        determined: (n,) whether the square is significantly (3 SD) above zero.
+    """
+
+    position: Float[np.ndarray, "n 3"]
+    covariance: Float[np.ndarray, "n 3 3"]
+    elevation: Float[np.ndarray, " n"]
+    elevation_sd: Float[np.ndarray, " n"]
+    determined: Bool[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """Segmented points, and what became of every frame.
+
+    Attributes:
+        images: of kind ``point``, with a covariance for each frame (none from the shortest time,
+            which does not tell its noise), the raw times beside them; frames that could not be
+            segmented are masked out.
+        method: ``least-squares`` or ``shortest``.
+        lines: (n,) elements that answered.
+        missing: (n,) elements that did not.
+        rejected: (n,) elements whose answer was given no weight.
+        failed: (n,) frames that were in use and have been masked out here.
+        accepted: (n, elements) which elements' answers stand: there, and near what was fitted.
+        noise_mm: (n,) SD of one distance from the residuals, mm; NaN where there is none.
+        out_of_plane: curved arrays by least squares only.
+        warnings: for a person.
+    """
+
+    images: Images
+    method: Method
+    lines: Int[np.ndarray, " n"]
+    missing: Int[np.ndarray, " n"]
+    rejected: Int[np.ndarray, " n"]
+    failed: Bool[np.ndarray, " n"]
+    accepted: Bool[np.ndarray, "n elements"]
+    noise_mm: Float[np.ndarray, " n"]
+    out_of_plane: OutOfPlane | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@in_own_modes
+def segment(
+    data: Recording | Images,
+    probe: Probe | None = None,
+    *,
+    method: Method = "least-squares",
+    robust: bool = True,
+    scale: Scale = "frame",
+    interpolate: bool = False,
+    minimum_lines: int = MINIMUM_LINES,
+    minimum_amplitude: float | None = None,
+) -> Segmentation:
+    """Segment the target in every frame of times of flight.
+
+    Points of a curved array are the in-plane fit, what an image would show: its own estimate of
+    the elevation is so uncertain (y^2 has an SD of hundreds of mm^2 for a mm of noise) that points
+    freed of it would be several times worse. It is in ``out_of_plane``, without a sign.
+
+    Args:
+        data: times of flight, or points that have their times of flight beside them; of a recording
+            the calibration images.
+        probe: the transducer; by default the recording's.
+        method: ``least-squares`` on every element (Eqs. 5 and 6) or ``shortest`` (Eqs. 2 and 3).
+        robust: bisquare weights against lines that are not the target's echo (up to a fifth of a
+            frame's are certainly seen); frames that are 5 times as noisy as the median one are
+            left out: they have more, and the fit found something else.
+        scale: noise of each ``frame`` by itself, or ``pooled``: the median over the frames, better
+            where all are alike and few lines answer.
+        interpolate: between elements, for ``shortest``.
+        minimum_lines: frames with fewer answers are left out.
+        minimum_amplitude: frames with less are left out; data without amplitudes are refused then.
+
+    Raises:
+        InputError: no times of flight, no probe, times for another number of elements, negative
+            times, microseconds; for a recording, fewer than 4 frames that can be segmented.
+    """
+    images = data.calibration if isinstance(data, Recording) else data
+    probe = data.probe if probe is None and isinstance(data, Recording) else probe
+    if method not in ("least-squares", "shortest"):
+        raise InputError(f"method must be least-squares or shortest, not {method!r}")
+    if scale not in ("frame", "pooled"):
+        raise InputError(f"scale must be frame or pooled, not {scale!r}")
+    times = images.measurements if images.kind == "time_of_flight" else images.time_of_flight
+    if times is None:
+        raise InputError(f"there are no times of flight to segment, only {images.kind}s")
+    if probe is None:
+        raise InputError(
+            "times of flight need a probe to be segmented: the recording has no /probe"
+        )
+    used = images.mask
+    check_times_of_flight(times, probe, used)
+    distances = np.where(used[:, None], probe.one_way_range_mm(times), np.nan)
+    lines = (np.isfinite(distances) & (distances > 0)).sum(axis=1)
+
+    floor = max(minimum_lines, 4) if method == "least-squares" else 1
+    failed = used & (lines < floor)
+    if minimum_amplitude is not None:
+        if images.amplitude is None:
+            raise InputError("minimum_amplitude was given, but these images have no amplitudes")
+        failed |= used & (images.amplitude < minimum_amplitude)
+
+    out_of_plane = None
+    accepted = np.isfinite(distances) & (distances > 0)
+    if method == "shortest":
+        points, covariance, noise, rejected = _shortest(distances, probe, interpolate)
+    else:
+        points, covariance, noise, rejected, full = _fit(distances, probe, robust, scale, failed)
+        failed |= used & (2 * rejected > lines)
+        if robust:
+            accepted &= _near(distances, probe, points if full is None else full[0], noise)
+        good = np.isfinite(covariance).all(axis=(1, 2))
+        failed |= used & ~good
+        if robust and (used & ~failed).any():
+            typical = max(float(np.median(noise[used & ~failed])), 1e-3)
+            failed |= used & (noise > _NOISIEST * typical)
+        if full is not None:
+            out_of_plane = _out_of_plane(*full, used & ~failed)
+    with np.errstate(invalid="ignore"):
+        failed |= used & ~(np.isfinite(points).all(axis=1) & (points[:, 1] > 0))
+    mask = used & ~failed
+    if isinstance(data, Recording) and mask.sum() < MINIMUM_IMAGES:
+        raise InputError(
+            f"only {int(mask.sum())} of {int(used.sum())} frames of times of flight could be "
+            f"segmented: at least {MINIMUM_IMAGES} are needed"
+        )
+    segmented = make_images(
+        images.poses,
+        points,
+        "point",
+        mask=mask,
+        covariance=covariance,
+        max_elevation=images.max_elevation,
+        amplitude=images.amplitude,
+        time=images.time,
+        time_of_flight=times,
+        minimum=0,
+    )
+    missing = np.where(used, probe.elements - lines, 0)
+    rejected = np.where(mask, rejected, 0)
+    return Segmentation(
+        images=segmented,
+        method=method,
+        lines=lines,
+        missing=missing,
+        rejected=rejected,
+        failed=failed,
+        accepted=accepted & mask[:, None],
+        noise_mm=np.where(mask, noise, np.nan),
+        out_of_plane=out_of_plane,
+        warnings=_warnings(used, failed, missing, rejected, probe.elements),
+    )
+
+
+def segment_recording(
+    recording: Recording, probe: Probe | None = None, **options: Any
+) -> tuple[Recording, Segmentation]:
+    """Segment a recording's calibration images, and its test images where they are raw.
+
+    Args:
+        recording: with times of flight.
+        probe: instead of the recording's.
+        options: of :func:`segment`.
+
+    Returns:
+        The recording with points in the place of times (which stay beside them), and what became of
+        the calibration frames.
+
+    Raises:
+        InputError: as :func:`segment`.
+    """
+    probe = recording.probe if probe is None else probe
+    found = segment(recording, probe, **options)
+    test = recording.test
+    if test is not None and test.kind == "time_of_flight":
+        try:
+            test = segment(test, probe, **options).images
+        except InputError as error:
+            raise type(error)(f"test images: {error}") from None
+        if not test.mask.any():
+            test = None
+    return replace(recording, calibration=found.images, test=test, probe=probe), found
+
+
+def check_times_of_flight(
+    times: Float[np.ndarray, "n columns"], probe: Probe, used: Bool[np.ndarray, " n"] | None = None
+) -> None:
+    """Refuse what cannot be one-way times of flight in seconds; NaN is no answer, and allowed.
+
+    Args:
+        times: (n, elements), s.
+        probe: the transducer.
+        used: (n,) rows to look at; all by default.
+
+    Raises:
+        InputError: another number of elements, a negative or infinite time, times so long that
+            they must be micro- or milliseconds; the row is named.
+    """
+    if times.shape[1] != probe.elements:
+        raise InputError(
+            f"time_of_flight has {times.shape[1]} columns, the probe has {probe.elements} elements"
+        )
+    used = np.ones(len(times), bool) if used is None else used
+    rows = np.where(used[:, None], times, np.nan)
+    for wrong, what in ((np.isinf(rows), "an infinite"), (rows < 0, "a negative")):
+        if wrong.any():
+            row, element = np.argwhere(wrong)[0]
+            raise InputError(
+                f"time_of_flight row {row} has {what} time, {rows[row, element]:.6g} s at element "
+                f"{element}"
+            )
+    # One line may hold nonsense; a whole frame that took metres of water is another unit.
+    answers = np.isfinite(rows).sum(axis=1)
+    late = (rows > _LONGEST_S).sum(axis=1)
+    wrong = (answers > 0) & (2 * late > answers)
+    if wrong.any():
+        row = int(np.flatnonzero(wrong)[0])
+        middle = float(np.nanmedian(rows[row]))
+        raise InputError(
+            f"time_of_flight row {row} has times about {middle:.4g} s, a path of "
+            f"{probe.sound_speed_m_s * middle:.3g} m: they look like microseconds; give seconds"
+        )
+
+
+def _shortest(
+    distances: np.ndarray, probe: Probe, interpolate: bool
+) -> tuple[np.ndarray, None, np.ndarray, np.ndarray]:
+    line, least = shortest(distances, pitch_mm=probe.pitch_mm if interpolate else None)
+    points = probe.image_to_cartesian(np.asarray(line), np.asarray(least))
+    return points, None, np.full(len(points), np.nan), np.zeros(len(points), int)
+
+
+def _fit(distances: np.ndarray, probe: Probe, robust: bool, scale: Scale, failed: np.ndarray):
+    """Points, covariances, noise, rejected lines and, curved arrays, [x, z, y^2] and covariance."""
+    curved = isinstance(probe, CurvilinearProbe)
+    fits = compiled_fit(curved, robust)(distances, probe.element_positions())
+    # Far out of the plane the in-plane fit has more than noise in its residuals; the other has not.
+    plane, whole = fits if curved else (fits, fits)
+    noise, rejected = np.asarray(whole.noise), np.asarray(whole.rejected).astype(int)
+
+    def scaled(fit) -> tuple[np.ndarray, np.ndarray]:
+        own = np.asarray(fit.noise)
+        alike = np.isfinite(own) & ~failed
+        variance = np.median(own[alike]) ** 2 if scale == "pooled" and alike.any() else own**2
+        covariance = np.asarray(fit.inverse_normal) * np.reshape(variance, (-1, 1, 1))
+        return np.asarray(fit.position), covariance
+
+    points, covariance = scaled(plane)
+    # A frame without any residual, such as a noise-free simulation, still needs a variance.
+    covariance = covariance + 1e-12 * np.eye(2)
+    noise = np.maximum(noise, 1e-6)
+    return points, covariance, noise, rejected, scaled(whole) if curved else None
+
+
+def _near(
+    distances: np.ndarray, probe: Probe, position: np.ndarray, noise: np.ndarray
+) -> Bool[np.ndarray, "n elements"]:
+    """Answers within several SDs of the fit: an unknown sound speed bends all, and none by more."""
+    apart = position[:, None, :2] - probe.element_positions()[:, [0, 2]]
+    square = np.sum(apart**2, axis=-1)
+    if position.shape[1] == 3:
+        square = square + position[:, 2:]
+    with np.errstate(invalid="ignore"):
+        return np.abs(distances - np.sqrt(np.maximum(square, 0.0))) <= _FAR * noise[:, None]
+
+
+def _out_of_plane(position: np.ndarray, covariance: np.ndarray, kept: np.ndarray) -> OutOfPlane:
+    position = np.where(kept[:, None], position, np.nan)
+    covariance = np.where(kept[:, None, None], covariance, np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        square, sd = position[:, 2], np.sqrt(covariance[:, 2, 2])
+        determined = square > _SIGNIFICANT * sd
+        elevation = np.sqrt(np.maximum(square, 0.0))
+        elevation_sd = np.where(determined, sd / (2 * elevation), np.nan)
+    return OutOfPlane(position, covariance, elevation, elevation_sd, determined)
+
+
+@lru_cache(maxsize=4)
+def compiled_fit(curved: bool, robust: bool):
+    """The fit as a compiled function of (distances, element positions); any leading axes.
+
+    Sums over the elements vectorise by the batches' flags; NaN and Inf are turned into weights
+    before any arithmetic.
+    """
+
+    def fit(distances: AnyArray, positions: AnyArray) -> Fit | tuple[Fit, Fit]:
+        if curved:
+            return fit_out_of_plane(distances, positions, robust=robust)
+        # What the compiler knows to be zero it does not compute with.
+        zero = jnp.zeros_like(positions[:, 0])
+        line = jnp.stack([jnp.asarray(positions)[:, 0], zero, zero], axis=-1)
+        return fit_in_plane(distances, line, robust=robust)
+
+    return jax.jit(fit, compiler_options=fast_to_run(jax.default_backend()))
+
+
+def _warnings(used, failed, missing, rejected, elements: int) -> tuple[str, ...]:
+    found = []
+    if failed.any():
+        rows = np.flatnonzero(failed)
+        named = ", ".join(map(str, rows[:8])) + (", ..." if len(rows) > 8 else "")
+        found.append(f"{len(rows)} of {int(used.sum())} frames could not be segmented: {named}")
+    kept = used & ~failed
+    total = max(int(kept.sum()) * elements, 1)
+    for name, count in (("did not answer", missing), ("were rejected as outliers", rejected)):
+        lost = int(count[kept].sum())
+        if lost > _MANY * total:
+            found.append(f"{lost} of {total} lines ({100 * lost / total:.0f} %) {name}")
+    return tuple(found)

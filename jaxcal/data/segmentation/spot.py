@@ -1,0 +1,290 @@
+"""A bright spot in an envelope: where it is to a fraction of a pixel, and how well that is known.
+
+To the envelope e a spot with the target's centre is fitted by least squares,
+
+    m = sqrt(b^2 + sum_j A_j^2 exp(-|L_j d|^2)),    d = (u, v) - centre,
+
+with one elliptical component for the active echo, whose point spread is wider laterally than
+axially, and two that share their centre for a crossing of two wires seen with the beam's thickness.
+
+Around a bright target the envelope is A g plus the in-phase part of the speckle, of variance
+sigma^2 and correlated over the width of a speckle, which is about that of the spot itself.
+Residuals of the fit cannot show such noise (it looks like a shift) and pixels are far from
+independent. So sigma and the correlation are measured on the background, and propagated through
+the fit: W C W', W the pseudo-inverse of the Jacobian.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.optimize import least_squares
+
+from jaxcal.data.segmentation.speckle import (
+    HALF_MAXIMUM,
+    NotFoundError,
+    Speckle,
+    decibel,
+    spread,
+)
+
+Target = Literal["echo", "cross"]
+
+FINEST_SD = 0.005
+"""No position is claimed to be better than this, px: no point spread is that symmetric."""
+
+_WINDOW = 2.5
+"""Half width of the fitted window, in SDs of the spot."""
+_LARGEST_WINDOW = 60
+"""Most pixels on each side of the centre; larger spots are fitted on their middle."""
+_HOLD = 0.01
+"""Weight of the start of the shape in the fit; a pixel of the target has 1."""
+_EXCESS = 2.0
+"""Squared residuals up to this many times what speckle explains are left to chance."""
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A fitted target.
+
+    Attributes:
+        position: [u, v], px.
+        covariance: (2, 2), px^2.
+        contrast_db: envelope over the background's root mean square, dB.
+        margin_db: over the next bright place, dB.
+        residual: root mean square of the fit's residual over the target's envelope.
+        width: SDs along u and v, px.
+    """
+
+    position: np.ndarray
+    covariance: np.ndarray
+    contrast_db: float
+    margin_db: float
+    residual: float
+    width: np.ndarray
+
+
+def saturated_pixels(values: np.ndarray) -> Bool[np.ndarray, "rows columns"]:
+    """Pixels cut off at the top: they only say that the echo was stronger."""
+    top = values == values.max()
+    return top if top.sum() >= 4 else np.zeros_like(top)
+
+
+def brightest(
+    envelope: np.ndarray, expected: np.ndarray | None, radius: float
+) -> tuple[tuple[int, int], Callable[[list[int]], float]]:
+    """Row and column of the brightest place, and how bright the next one is outside a distance."""
+    place = np.ones(envelope.shape, bool)
+    if expected is not None:
+        v, u = np.indices(envelope.shape)
+        place = np.hypot(u - expected[0], v - expected[1]) <= radius
+        if not place.any():
+            raise NotFoundError("the expected place lies outside the region")
+    candidates = np.where(place, envelope, 0.0)
+    peaks = local_maxima(candidates)
+    if len(peaks) == 0:
+        raise NotFoundError("nothing stands out: the region is flat")
+    heights = candidates[tuple(peaks.T)]
+
+    def rival(keep_out: list[int]) -> float:
+        away = (np.abs(peaks - peaks[0]) > keep_out).any(axis=1)
+        return float(heights[away].max()) if away.any() else 0.0
+
+    return (int(peaks[0, 0]), int(peaks[0, 1])), rival
+
+
+def local_maxima(values: Float[np.ndarray, "rows columns"]) -> Int[np.ndarray, "peaks 2"]:
+    """Pixels that none of their eight neighbours exceeds, highest first.
+
+    Of a plateau every pixel counts. Pixels of the least value do not, nor does any pixel where
+    every one of them equals its neighbours.
+
+    Returns:
+        Rows and columns; equal heights are in the order of the rows.
+    """
+    top = values == ndimage.maximum_filter(values, size=3, mode="nearest")
+    if top.all():
+        return np.empty((0, 2), int)
+    peaks = np.argwhere(top & (values > values.min()))
+    return peaks[np.argsort(-values[tuple(peaks.T)], kind="stable")]
+
+
+def half_maximum(
+    envelope: np.ndarray, peak: tuple[int, int]
+) -> tuple[Bool[np.ndarray, "rows columns"], tuple[float, float]]:
+    """The area around the peak above half of it, and the SDs along v and u of a spot of that size.
+
+    Of an ellipse filled evenly the variance is a quarter of its squared half axis.
+    """
+    areas: Any = ndimage.label(envelope >= 0.5 * envelope[peak], structure=np.ones((3, 3)))
+    labels = areas[0]
+    shape = labels == labels[peak]
+    rows, columns = np.nonzero(shape)
+    v, u = (np.sqrt((4 * np.var(k) + 1 / 3) / HALF_MAXIMUM) for k in (rows, columns))
+    return shape, (float(v), float(u))
+
+
+def fit_spot(
+    envelope: np.ndarray,
+    saturated: np.ndarray,
+    shape: np.ndarray,
+    extent: tuple[float, float],
+    speckle: Speckle,
+    target: Target,
+    contrast: float,
+    margin: float,
+) -> Spot:
+    """Least squares of the spot on a window, and its covariance from the background's speckle."""
+    rows, columns = np.nonzero(shape)
+    weights = envelope[rows, columns]
+    start = np.array([np.average(columns, weights=weights), np.average(rows, weights=weights)])
+    high, wide = envelope.shape
+    half = [int(np.clip(np.ceil(_WINDOW * sd), 3, _LARGEST_WINDOW)) for sd in extent]
+    middle_v, middle_u = round(start[1]), round(start[0])
+    v = np.arange(max(middle_v - half[0], 0), min(middle_v + half[0] + 1, high))
+    u = np.arange(max(middle_u - half[1], 0), min(middle_u + half[1] + 1, wide))
+    window = envelope[v[0] : v[-1] + 1, u[0] : u[-1] + 1]
+    use = ~saturated[v[0] : v[-1] + 1, u[0] : u[-1] + 1]
+    grid_v, grid_u = np.meshgrid(v, u, indexing="ij")
+    top = float(envelope[shape].max())
+
+    # exp(-|L d|^2) of the square of the envelope: L is the inverse of the spot's SD.
+    across, along = 1 / extent[1], 1 / extent[0]
+    if target == "echo":
+        first = [*start, np.log(speckle.sigma), np.log(top), np.log(across), np.log(along), 0.0]
+    else:
+        # Two wires, one leaning each way.
+        lean = 0.5 * min(across, along)
+        one = [np.log(top / np.sqrt(2)), np.log(across), np.log(along)]
+        first = [*start, np.log(speckle.sigma), *one, lean, *one, -lean]
+    first = np.array(first)
+    if np.sum(window[use] > 0.1 * top) < len(first):
+        raise NotFoundError("the display is saturated: only the spot's outline is left", contrast,
+                            margin)  # fmt: skip
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
+    def model(unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        du, dv = grid_u - unknowns[0], grid_v - unknowns[1]
+        floor = np.exp(2 * unknowns[2])
+        power = np.full(window.shape, floor)
+        slopes = [np.zeros(window.shape), np.zeros(window.shape), np.full(window.shape, 2 * floor)]
+        for log_height, log_a, log_b, c in unknowns[3:].reshape(-1, 4):
+            a, b = np.exp(log_a), np.exp(log_b)
+            p, q = a * du + c * dv, b * dv
+            part = np.exp(2 * log_height - p**2 - q**2)
+            power += part
+            slopes[0] += part * 2 * a * p
+            slopes[1] += part * (2 * c * p + 2 * b * q)
+            slopes += [2 * part, -2 * part * p * a * du, -2 * part * q**2, -2 * part * p * dv]
+        value = np.sqrt(power)
+        return value, np.stack(slopes, axis=-1) / (2 * value[..., None])
+
+    # Scaled so that the unknowns are of order 1; what shapes the spot is held near its start, too
+    # weakly to matter unless two components make one spot and only their sum is seen.
+    steps = _steps(first, extent)
+    hold = np.diag(_HOLD / steps)[3:]
+
+    def residual(unknowns: np.ndarray) -> np.ndarray:
+        pixels = (model(unknowns)[0] - window)[use] / top
+        return np.concatenate([pixels, hold @ (unknowns - first)])
+
+    def slope(unknowns: np.ndarray) -> np.ndarray:
+        return np.concatenate([model(unknowns)[1][use] / top, hold])
+
+    derivative: Any = slope  # scipy's types know only the names of difference schemes
+    with np.errstate(over="ignore", invalid="ignore"):
+        try:
+            fit = least_squares(
+                residual, first, jac=derivative, method="trf", x_scale=steps, ftol=1e-8, xtol=1e-6,
+                gtol=1e-8, max_nfev=40,
+            )  # fmt: skip
+        except (ValueError, np.linalg.LinAlgError):
+            raise NotFoundError("no spot could be fitted", contrast, margin) from None
+    unknowns = fit.x
+    moved = np.abs(unknowns[:2] - start)
+    if not np.isfinite(unknowns).all():
+        raise NotFoundError("no spot could be fitted", contrast, margin)
+    if (moved > 1 + np.array([extent[1], extent[0]])).any():
+        raise NotFoundError("the fit left the bright spot", contrast, margin)
+
+    value, _ = model(unknowns)
+    if not np.isfinite(value).all():
+        raise NotFoundError("no spot could be fitted", contrast, margin)
+    width = _width(unknowns)
+    misfit = float(np.mean((window - value)[use] ** 2))
+    weights = np.zeros((2, *window.shape))
+    jacobian = slope(unknowns)
+    inverse = np.linalg.pinv(jacobian, rcond=1e-9)[:2]
+    if np.abs(inverse @ jacobian - np.eye(2, len(first))).max() > 1e-3:
+        raise NotFoundError("the position is not determined", contrast, margin)
+    weights[:, use] = inverse[:, : use.sum()] / top
+    covariance = _propagate(weights, value, misfit, speckle, (width[1], width[0]), v, u)
+    if not np.isfinite(covariance).all():
+        raise NotFoundError("the position is not determined", contrast, margin)
+    # The shape may still be on its way where the data hardly determine it; the centre may not.
+    if (np.abs(inverse @ residual(unknowns)) > 0.1 * np.sqrt(np.diag(covariance))).any():
+        raise NotFoundError("no spot could be fitted", contrast, margin)
+    height = float(np.sqrt(np.sum(np.exp(2 * unknowns[3::4]))))
+    return Spot(
+        position=unknowns[:2],
+        covariance=covariance,
+        contrast_db=decibel(max(height, top) / (np.sqrt(2.0) * speckle.sigma)),
+        margin_db=margin,
+        residual=float(np.sqrt(misfit) / height),
+        width=width,
+    )
+
+
+def _steps(first: np.ndarray, extent: tuple[float, float]) -> np.ndarray:
+    """How far each unknown may sensibly move."""
+    lean = 0.5 * min(1 / extent[0], 1 / extent[1])
+    components = (len(first) - 3) // 4
+    return np.array([extent[1], extent[0], 1.0] + components * [0.5, 0.3, 0.3, lean])
+
+
+def _width(unknowns: np.ndarray) -> Float[np.ndarray, 2]:
+    """SDs along u and v of the brightest component of the fitted spot, px."""
+    components = unknowns[3:].reshape(-1, 4)
+    _, log_a, log_b, c = components[np.argmax(components[:, 0])]
+    factor = np.array([[np.exp(log_a), c], [0.0, np.exp(log_b)]])
+    inverse = np.linalg.pinv(factor)
+    return np.sqrt(np.diag(inverse @ inverse.T))
+
+
+def _propagate(
+    weights: np.ndarray,
+    value: np.ndarray,
+    misfit: float,
+    speckle: Speckle,
+    spot: tuple[float, float],
+    v: np.ndarray,
+    u: np.ndarray,
+) -> Float[np.ndarray, "2 2"]:
+    """Covariance of the centre, px^2, from correlated speckle under the fitted spot.
+
+    Args:
+        weights: (2, rows, columns) how the centre follows each pixel, zero for those not fitted.
+        value: (rows, columns) the fitted envelope.
+        misfit: mean squared residual.
+        speckle: the background's.
+        spot: SDs of the spot along v and u, px.
+        v: (rows,) of the window, px.
+        u: (columns,) of the window, px.
+    """
+    # Variance of a Rician envelope: that of a Rayleigh one without signal, sigma^2 under a strong
+    # one; in between an interpolation.
+    rayleigh = 2 - np.pi / 2
+    signal = np.maximum(value**2 - value.min() ** 2, 0.0) / (2 * speckle.sigma**2)
+    variance = speckle.sigma**2 * (1 - (1 - rayleigh) * np.exp(-signal))
+    covariance = spread(weights * np.sqrt(variance), speckle.size, v, u)
+    # A spot that is not of the fitted shape fits worse than speckle explains, and differs from it
+    # over lengths like its own.
+    expected = float(np.mean(variance[weights.any(axis=0)]))
+    if misfit > _EXCESS * expected:
+        covariance += spread(weights * np.sqrt(misfit - expected), spot, v, u)
+    return covariance + FINEST_SD**2 * np.eye(2)

@@ -1,0 +1,347 @@
+"""Time alignment: poses between samples, a device's clock against the host's, a stream's latency.
+
+A pose and an image that belong together carry stamps of different clocks. Three steps make one of
+them: :func:`fit_clock` takes device stamps to the host's clock; :func:`estimate_latency` finds
+what remains, the time by which images lag behind poses, from a motion that both show;
+:func:`interpolate_poses` gives the pose at an image's time, and refuses where it would have to
+guess.
+
+Numpy and scipy throughout: this runs once a recording, on hundreds of samples a second at most.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation, Slerp
+from scipy.stats import theilslopes
+
+from jaxcal import InputError
+from jaxcal.data.poses import check_poses
+
+MINIMUM_MOTION_MM = 8.0
+"""Least motion from which a latency is estimated."""
+
+_SHORTEST_OVERLAP_S = 1.0
+_RIVAL = 0.98
+_MINIMUM_CORRELATION = 0.8
+_MOST_STEPS = 1_000_000
+_PARABOLA_S = 0.005
+
+
+def _increasing(t: np.ndarray, what: str, minimum: int = 2) -> Float[np.ndarray, " n"]:
+    times = np.asarray(t, dtype=np.float64)
+    if times.ndim != 1 or len(times) < minimum:
+        raise InputError(f"{what} must be a row of {minimum} times or more, not {times.shape}")
+    if not np.isfinite(times).all():
+        raise InputError(f"{what} {np.flatnonzero(~np.isfinite(times))[0]} is not a number")
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if len(back):
+        raise InputError(f"{what} {back[0] + 1} is not later than the one before")
+    return times
+
+
+def can_interpolate(
+    t: np.ndarray,
+    query: np.ndarray,
+    *,
+    max_gap_s: float,
+    valid: np.ndarray | None = None,
+) -> Bool[np.ndarray, " m"]:
+    """Which query times lie between two valid poses that are near enough to one another.
+
+    Args:
+        t: (n,) times of the poses, s, increasing.
+        query: (m,) times asked for, s.
+        max_gap_s: longest time between neighbouring poses that is bridged.
+        valid: (n,) bool; False where a pose cannot be used. None: all can.
+
+    Raises:
+        InputError: times out of order or not numbers.
+    """
+    times = _increasing(t, "time of pose")
+    asked = np.asarray(query, dtype=np.float64)
+    usable = np.ones(len(times), bool) if valid is None else np.asarray(valid, bool)
+    if usable.shape != times.shape:
+        raise InputError(f"valid must have one value for each of {len(times)} poses")
+    inside = (asked >= times[0]) & (asked <= times[-1])
+    before = _interval(times, np.where(inside, asked, times[0]))
+    on_sample = asked == times[before]
+    on_next = asked == times[before + 1]
+    near = times[before + 1] - times[before] <= max_gap_s
+    between = usable[before] & usable[before + 1] & near
+    return inside & (
+        between | (on_sample & usable[before]) | (on_next & usable[before + 1])
+    )  # fmt: skip
+
+
+def _interval(times: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    return np.clip(np.searchsorted(times, asked, side="right") - 1, 0, len(times) - 2)
+
+
+def interpolate_poses(
+    t: np.ndarray,
+    poses: np.ndarray,
+    query: np.ndarray,
+    *,
+    max_gap_s: float,
+    valid: np.ndarray | None = None,
+) -> Float[np.ndarray, "m 4 4"]:
+    """Poses at other times: translation linearly, rotation along the shortest arc (slerp).
+
+    Args:
+        t: (n,) times of the poses, s, increasing.
+        poses: (n, 4, 4), mm.
+        query: (m,) times asked for, s.
+        max_gap_s: longest time between neighbouring poses that is bridged.
+        valid: (n,) bool; False where a pose cannot be used. None: all can.
+
+    Returns:
+        (m, 4, 4) poses, mm.
+
+    Raises:
+        InputError: a time before the first pose or after the last, in a gap, or next to a pose
+            that cannot be used; the time is named. :func:`can_interpolate` tells beforehand.
+    """
+    times = _increasing(t, "time of pose")
+    asked = np.asarray(query, dtype=np.float64)
+    if np.shape(poses)[:1] != times.shape:
+        raise InputError(f"there are {np.shape(poses)[0]} poses and {len(times)} times")
+    refused = np.flatnonzero(~can_interpolate(times, asked, max_gap_s=max_gap_s, valid=valid))
+    if len(refused):
+        row = int(refused[0])
+        raise InputError(
+            f"no pose for time {row} ({asked[row]:.6g} s): it is outside "
+            f"{times[0]:.6g} to {times[-1]:.6g} s, in a gap longer than {max_gap_s:g} s, or next "
+            "to a pose that cannot be used"
+        )
+    sound = check_poses(np.asarray(poses), None if valid is None else np.asarray(valid, bool))
+    before = _interval(times, asked)
+    first, second = sound[before], sound[before + 1]
+    share = (asked - times[before]) / (times[before + 1] - times[before])
+    turning = Slerp(times, Rotation.from_matrix(sound[:, :3, :3]))
+    result = np.tile(np.eye(4), (len(asked), 1, 1))
+    result[:, :3, :3] = turning(asked).as_matrix()
+    result[:, :3, 3] = first[:, :3, 3] + share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+    return result
+
+
+@dataclass(frozen=True)
+class ClockFit:
+    """A device's clock in terms of the host's: host = device + offset + drift (device - reference).
+
+    Attributes:
+        offset_s: host minus device at the reference, with the shortest delay in it: stamps alone
+            cannot tell a clock that is late from a message that is.
+        drift: seconds per second by which the host's clock gains.
+        reference_s: device time at which the offset is meant.
+        delay_s: (n,) what is left: by how much each sample was later (regression: or earlier)
+            than the line.
+        method: ``envelope`` or ``regression``.
+    """
+
+    offset_s: float
+    drift: float
+    reference_s: float
+    delay_s: Float[np.ndarray, " n"]
+    method: str
+
+    def to_host(self, t_device: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        """Host times (s) of device times."""
+        device = np.asarray(t_device, dtype=np.float64)
+        return device + self.offset_s + self.drift * (device - self.reference_s)
+
+
+def fit_clock(
+    t_device: np.ndarray,
+    t_host: np.ndarray,
+    *,
+    method: str = "envelope",
+) -> ClockFit:
+    """Offset and drift between a device's clock and the host's, from stamps of the same samples.
+
+    ``envelope``: messages come late, never early. The line sought lies under all samples (device,
+    host - device) and as near to them as can be, in the sum of distances: the edge of their lower
+    convex hull over the mean device time (Moon, Skelly and Towsley 1999, "Estimation and removal
+    of clock skew from network delay measurements", INFOCOM; there a linear programme). Load on
+    the host, which delays many samples by much, does not move it; a single stamp that is wrongly
+    early does.
+
+    ``regression``: the line through host stamps of equal jitter either way, which Theil and Sen's
+    median of slopes keeps from outliers; for device stamps that are a frame count times a period.
+
+    Args:
+        t_device: (n,) device times, s, increasing.
+        t_host: (n,) host times of arrival, s.
+        method: ``envelope`` or ``regression``.
+
+    Raises:
+        InputError: fewer than two samples, device times out of order, or values not finite.
+    """
+    device = _increasing(t_device, "device time")
+    host = np.asarray(t_host, dtype=np.float64)
+    if host.shape != device.shape or not np.isfinite(host).all():
+        raise InputError(f"host times must be {len(device)} numbers, one for each device time")
+    # Stamps since 1970 have few digits left for microseconds: count from the samples' own start.
+    reference = float(device[0])
+    x, y = device - reference, host - device
+    base = float(y[0])
+    if method == "envelope":
+        drift, level = _lower_envelope(x, y - base)
+    elif method == "regression":
+        drift = _theil_sen(x, y - base)
+        level = float(np.median(y - base - drift * x))
+    else:
+        raise InputError(f"method must be envelope or regression, not {method!r}")
+    return ClockFit(base + level, drift, reference, y - base - level - drift * x, method)
+
+
+def _theil_sen(x: np.ndarray, y: np.ndarray, most: int = 1000) -> float:
+    """Median of the slopes of all pairs; n^2, so of a long recording every so many samples."""
+    step = -(-len(x) // most)
+    fit: Any = theilslopes(y[::step], x[::step])
+    return float(fit.slope)
+
+
+def _lower_envelope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Slope and level of the edge of the lower convex hull above which the mean of x lies."""
+    hull: list[int] = []
+    for i in range(len(x)):
+        while len(hull) > 1:
+            a, b = hull[-2], hull[-1]
+            if (y[b] - y[a]) * (x[i] - x[a]) < (y[i] - y[a]) * (x[b] - x[a]):
+                break
+            hull.pop()
+        hull.append(i)
+    edge = int(np.clip(np.searchsorted(x[hull], x.mean(), side="right") - 1, 0, len(hull) - 2))
+    a, b = hull[edge], hull[edge + 1]
+    slope = float((y[b] - y[a]) / (x[b] - x[a]))
+    return slope, float(y[a] - slope * x[a])
+
+
+def motion_along_main_axis(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"]:
+    """Position (mm) along the direction in which a probe moved most, for :func:`estimate_latency`.
+
+    The sign of the direction is arbitrary.
+    """
+    positions = np.asarray(poses, dtype=np.float64)[:, :3, 3]
+    centred = positions - positions.mean(axis=0)
+    return centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
+
+
+@dataclass(frozen=True)
+class Latency:
+    """By how much images lag behind poses.
+
+    Attributes:
+        lag_s: an image stamped t shows what was at t - lag: its pose is the one at t - lag.
+        correlation: of the two motions at that lag, -1 to 1.
+        sd_s: standard deviation of the lag from the misfit of the two motions, s.
+    """
+
+    lag_s: float
+    correlation: float
+    sd_s: float
+
+
+def estimate_latency(
+    t_video: np.ndarray,
+    video: np.ndarray,
+    t_tracker: np.ndarray,
+    tracker_mm: np.ndarray,
+    *,
+    max_lag_s: float = 0.5,
+    step_s: float = 0.001,
+    minimum_motion_mm: float = MINIMUM_MOTION_MM,
+) -> Latency:
+    """Lag of the images behind the poses, from one motion that both show.
+
+    As in PLUS's temporal calibration (Lasso et al. 2014, IEEE Trans. Biomed. Eng. 61, 2527): the
+    probe is moved to and fro; the video's signal stays fixed, the tracker's is moved along the time
+    axis in steps of a millisecond, and the normalised correlation over the same samples tells how
+    well they agree. A parabola about the best gives the part of a step. The signals may
+    have any scale and sign.
+
+    Args:
+        t_video: (n,) stamps of the images, s, on the tracker's clock.
+        video: (n,) position of something at rest as the images show it, in any unit.
+        t_tracker: (m,) stamps of the poses, s.
+        tracker_mm: (m,) position of the probe, mm (:func:`motion_along_main_axis`).
+        max_lag_s: largest lag looked for, either way.
+        step_s: of the search.
+        minimum_motion_mm: least span of the tracker's motion.
+
+    Raises:
+        InputError: too little motion or overlap, signals that do not agree, a best lag at the edge
+            of the search, or several that fit alike (a periodic motion).
+    """
+    t_video, t_tracker = (
+        _increasing(t_video, "time of image", 8), _increasing(t_tracker, "time of pose", 8),
+    )  # fmt: skip
+    video, tracker = np.asarray(video, float), np.asarray(tracker_mm, float)
+    if video.shape != t_video.shape or tracker.shape != t_tracker.shape:
+        raise InputError("each motion must have one value for each of its times")
+    if not (np.isfinite(video).all() and np.isfinite(tracker).all()):
+        raise InputError("a motion holds NaN or Inf: leave those samples out")
+    if not (0 < step_s <= max_lag_s and max_lag_s / step_s <= _MOST_STEPS):
+        raise InputError(f"the step ({step_s:g} s) must be small against {max_lag_s:g} s")
+    # The same images at every lag, or lags with fewer of them would win by chance.
+    used = (t_video - max_lag_s >= t_tracker[0]) & (t_video + max_lag_s <= t_tracker[-1])
+    t, signal = t_video[used], video[used]
+    if len(t) < 8 or t[-1] - t[0] < _SHORTEST_OVERLAP_S:
+        raise InputError(
+            f"images and poses overlap by too little: {_SHORTEST_OVERLAP_S + 2 * max_lag_s:g} s or "
+            "more of both are needed"
+        )
+    during = tracker[(t_tracker >= t[0] - max_lag_s) & (t_tracker <= t[-1] + max_lag_s)]
+    span = float(np.ptp(during))
+    if span < minimum_motion_mm:
+        raise InputError(f"the probe moved by {span:.3g} mm; {minimum_motion_mm:g} are needed")
+    if np.ptp(signal) == 0:
+        raise InputError("the images show no motion")
+    steps = int(np.floor(max_lag_s / step_s + 1e-9))
+    lags = np.arange(-steps, steps + 1) * step_s
+    centred = signal - signal.mean()
+    centred = centred / np.linalg.norm(centred)
+    correlation = np.zeros(len(lags))
+    for i, lag in enumerate(lags):
+        moved = np.interp(t - lag, t_tracker, tracker)
+        moved -= moved.mean()
+        size = np.linalg.norm(moved)
+        correlation[i] = centred @ moved / size if size > 0 else 0.0
+    return _peak(lags, correlation, len(t))
+
+
+def _peak(lags: np.ndarray, correlation: np.ndarray, samples: int) -> Latency:
+    strength = np.abs(correlation)
+    best = int(np.argmax(strength))
+    if strength[best] < _MINIMUM_CORRELATION:
+        raise InputError(
+            f"images and poses do not show the same motion (correlation {strength[best]:.2f})"
+        )
+    if best in (0, len(lags) - 1):
+        raise InputError(f"the lag is {lags[best]:.3g} s or beyond: look for larger ones")
+    middle = strength[1:-1]
+    tops = 1 + np.flatnonzero((middle >= strength[:-2]) & (middle > strength[2:]))
+    for other in tops:
+        if other != best and strength[other] > _RIVAL * strength[best]:
+            raise InputError(
+                f"lags of {lags[best]:.3f} and {lags[other]:.3f} s fit alike: move the probe less "
+                "regularly"
+            )
+    # Interpolation between samples makes kinks of the size of a step, so the parabola spans more.
+    step = lags[1] - lags[0]
+    half = max(1, min(round(_PARABOLA_S / step), best, len(lags) - 1 - best))
+    near = slice(best - half, best + half + 1)
+    bend, slope, top = np.polyfit(lags[near] - lags[best], strength[near], 2)
+    if bend >= 0:
+        raise InputError("the best lag is no peak: move the probe farther or faster")
+    shift = float(np.clip(-slope / (2 * bend), -half * step, half * step))
+    # With unit signals the lag's variance is that of the misfit, (1 - r^2) / n, over the power of
+    # the slope, -r'' / r, times r^2.
+    top = min(float(top), 1.0)
+    sd = float(np.sqrt((1 - top**2) / (samples * top * -2 * bend)))
+    return Latency(float(lags[best]) + shift, float(correlation[best]), sd)

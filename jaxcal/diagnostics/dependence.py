@@ -1,0 +1,406 @@
+"""Images that say the same: repeated poses, and streams whose errors change slowly.
+
+Calibration takes the errors of different images for independent. They are not where a probe is held
+still while frames come in at 20 Hz: the target's offset from the image plane is one number for the
+whole hold, and so are the errors of tracking and speckle. Sixty frames of three holds determine
+three images' worth of unknowns, however small their residuals are.
+
+*Repeated poses.* Two poses are the same if no point within ``LEVER_MM`` of the tracked origin moves
+by more than ``SAME_POSE_MM`` between them. That is what an optical tracker errs by at such a lever
+(0.25 to 0.35 mm at a marker, more beyond it), less than the thickness of an ultrasound beam, and
+less than the offsets, so that such images share their offset and their speckle. Images linked by
+such pairs are one pose while they stay within ``HOLD_MM``; a longer chain is a slow sweep, and is
+cut into pieces of ``SAME_POSE_MM``. Every group becomes one image: mean pose, and mean point (the
+median from five frames on, so that one wrong click in a hold does no harm). Its errors are those
+*between* holds, which the solver estimates from the holds' residuals; what the errors *within* a
+hold leave in the mean is part of them. The other frames of a group are masked out.
+
+*Streams.* Images of a moving probe may differ in pose and still share slowly changing errors. The
+residuals of the conventional fit (closed form, :mod:`jaxcal.solvers.closed_form.single`) have an
+integrated autocorrelation time t, and n images are worth n / t. Where t reaches ``STREAM`` images
+and that is beyond chance, every t-th image is kept. Weaker correlation is left to
+:mod:`jaxcal.diagnostics.serial_correlation`.
+
+References: Wiles, Thompson and Frantz 2004 (accuracy of optical trackers); Sokal 1997,
+section 3 (integrated autocorrelation time); Liang and Zeger 1986 (clustered data).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.data.poses import nearest_rotations
+from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.runtime.array_types import Bool, Float, Int
+
+if TYPE_CHECKING:
+    from jaxcal.data.problem import Problem
+    from jaxcal.data.recording import Images
+    from jaxcal.solvers.closed_form.single import ClosedForm
+
+SAME_POSE_MM = 1.0
+"""Poses between which no point within the lever moves farther are the same."""
+
+LEVER_MM = 100.0
+"""The lever, from the tracked origin: about the distance of a target from the probe's marker."""
+
+HOLD_MM = 3.0
+"""Images linked by pairs of the same pose are one hold if they all lie within this."""
+
+ROBUST_FROM = 5
+"""The point of a group with so many frames is their median."""
+
+STREAM = 4.0
+"""A recording is a stream if its errors stay alike for so many images,"""
+SURE = 5.0
+"""and the correlation of successive ones is so many SDs from zero."""
+
+FEWEST_OF_STREAM = 40
+"""Shorter recordings are not examined for slowly changing errors."""
+
+ABSORBED = 6.0
+"""Independent elevational errors that the fit takes up: so many unknowns move them,"""
+LEAST_SHARE = 0.4
+"""but never more than leaves this share of them."""
+
+
+@dataclass(frozen=True)
+class Independent:
+    """Which images may be taken for independent.
+
+    Attributes:
+        group: (n,) number of each image's pose; -1 where it is not used.
+        keep: (n,) True for the one image that stands for its group.
+        frames: number of used images.
+        poses: number of different poses among them.
+        stride: of a stream, every so many poses are kept; otherwise 1.
+    """
+
+    group: Int[np.ndarray, " n"]
+    keep: Bool[np.ndarray, " n"]
+    frames: int
+    poses: int
+    stride: int = 1
+
+    @property
+    def images(self) -> int:
+        """How many images remain."""
+        return int(self.keep.sum())
+
+    @property
+    def words(self) -> str | None:
+        """What was done, for a person; None where all images are independent."""
+        if self.images == self.frames:
+            return None
+        if self.stride > 1:
+            worth = self.frames / self.images
+            return (
+                f"{self.frames} frames of a moving probe, whose errors stay alike for about "
+                f"{worth:.0f} frames: they count as {self.images} images"
+            )
+        return (
+            f"{self.frames} frames, {self.poses} different poses: the frames of each pose (within "
+            f"{SAME_POSE_MM:g} mm) count as one image"
+        )
+
+
+def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, Independent]:
+    """Let every pose count once.
+
+    Args:
+        data: one problem with concrete values, or one set of images with points.
+        estimate: what the calibration will estimate; with ``scale`` or unknown pixels, so do the
+            fits that are made here.
+
+    Returns:
+        The data, of the same shape: for every group one image has its mean pose and point, and the
+        others are masked out. The same object where all images are independent. And what was found.
+
+    Raises:
+        InputError: fewer than 4 different poses.
+    """
+    poses, mask = np.asarray(data.poses, dtype=float), np.asarray(data.mask) > 0
+    group = same_pose(poses, mask)
+    found = _represented(group, mask)
+    if found.poses < MINIMUM_IMAGES:
+        raise InputError(
+            f"{found.frames} images, but only {found.poses} different "
+            f"pose{'s' * (found.poses != 1)}: at least {MINIMUM_IMAGES} are needed (poses closer "
+            f"than {SAME_POSE_MM:g} mm count once)"
+        )
+    if found.poses < found.frames:
+        data = _joined(data, found)
+    if found.images >= FEWEST_OF_STREAM:
+        stride = _stride(data, estimate)
+        if stride > 1:
+            left = np.flatnonzero(found.keep)
+            keep = np.zeros_like(found.keep)
+            # The middle of every piece.
+            keep[left[stride // 2 :: stride]] = True
+            found = replace(found, keep=keep, stride=stride)
+            data = _changed(data, {"mask": keep})
+    return data, found
+
+
+def same_pose(
+    poses: Float[np.ndarray, "n 4 4"], mask: Bool[np.ndarray, " n"]
+) -> Int[np.ndarray, " n"]:
+    """Number of each image's pose, in order of first appearance; -1 where it is not used.
+
+    Args:
+        poses: probe -> tracker, mm.
+        mask: which images are used.
+    """
+    used = np.flatnonzero(mask)
+    group = np.full(len(mask), -1)
+    # Corners of a rigid body: the distance of two poses is at most twice that of their corners.
+    corners = np.concatenate(
+        [poses[used, :3, 3:], poses[used, :3, :3] * LEVER_MM + poses[used, :3, 3:]], axis=2
+    )
+    places = corners.transpose(0, 2, 1).reshape(len(used), 12)
+    first, second = _near(places, 2 * SAME_POSE_MM)
+    near = displacement(poses[used[first]], poses[used[second]]) <= SAME_POSE_MM
+    linked = _components(len(used), first[near], second[near])
+    label = np.arange(len(used))
+    for members in _split(linked):
+        label[members] = members[0] + _pieces(poses[used[members]])
+    _, order, inverse = np.unique(label, return_index=True, return_inverse=True)
+    group[used] = np.argsort(np.argsort(order))[inverse]
+    return group
+
+
+def displacement(
+    first: Float[np.ndarray, "*#k 4 4"], second: Float[np.ndarray, "*#k 4 4"]
+) -> Float[np.ndarray, "*k"]:
+    """By how much points within the lever of the tracked origin move at most, mm."""
+    shift = np.linalg.norm(first[..., :3, 3] - second[..., :3, 3], axis=-1)
+    # |R1 - R2| = sqrt(8) sin(angle / 2), and a chord is 2 L sin(angle / 2).
+    turn = np.linalg.norm(first[..., :3, :3] - second[..., :3, :3], axis=(-2, -1)) / np.sqrt(2)
+    return shift + LEVER_MM * turn
+
+
+def _near(
+    places: Float[np.ndarray, "n 12"], limit: float
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Pairs whose coordinates all differ by less than the limit."""
+    empty = np.zeros(0, int)
+    if len(places) < 2:
+        return empty, empty
+    # Sorted along one coordinate, partners are few places apart; a second one spares most of them.
+    along, across = np.argsort(-np.ptp(places, axis=0))[:2]
+    order = np.argsort(places[:, along], kind="stable")
+    line, found = places[order], []
+    first, second = line[:, along].copy(), line[:, across].copy()
+    for apart in range(1, len(line)):
+        close = first[apart:] - first[:-apart] < limit
+        if not close.any():
+            break
+        at = np.flatnonzero(close & (np.abs(second[apart:] - second[:-apart]) < limit))
+        at = at[(np.abs(line[at + apart] - line[at]) < limit).all(axis=1)]
+        found.append(np.stack([order[at], order[at + apart]]))
+    if not found:
+        return empty, empty
+    pairs = np.concatenate(found, axis=1)
+    return pairs[0], pairs[1]
+
+
+def _components(
+    count: int, first: Int[np.ndarray, " k"], second: Int[np.ndarray, " k"]
+) -> Int[np.ndarray, " n"]:
+    """The least number of every connected component."""
+    label = np.arange(count)
+    while True:
+        least = np.minimum(label[first], label[second])
+        after = label.copy()
+        np.minimum.at(after, first, least)
+        np.minimum.at(after, second, least)
+        after = after[after]
+        if np.array_equal(after, label):
+            return label
+        label = after
+
+
+def _split(label: Int[np.ndarray, " n"]) -> list[Int[np.ndarray, " m"]]:
+    """The members of every component that has several."""
+    order = np.argsort(label, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+    return [part for part in parts if len(part) > 1]
+
+
+def _pieces(poses: Float[np.ndarray, "m 4 4"]) -> Int[np.ndarray, " m"]:
+    """0 for all poses of a hold; pieces of a chain of poses, in order, by their first members."""
+    if displacement(poses, poses[:1]).max() <= HOLD_MM:
+        return np.zeros(len(poses), int)
+    leaders: list[int] = []
+    piece = np.zeros(len(poses), int)
+    for index, pose in enumerate(poses):
+        apart = displacement(poses[leaders], pose) if leaders else np.array([np.inf])
+        if apart.min() > SAME_POSE_MM:
+            leaders.append(index)
+            piece[index] = index
+        else:
+            piece[index] = leaders[int(np.argmin(apart))]
+    return piece
+
+
+def _represented(group: Int[np.ndarray, " n"], mask: Bool[np.ndarray, " n"]) -> Independent:
+    """The middle frame of every group stands for it."""
+    keep = np.zeros(len(group), bool)
+    used = np.flatnonzero(mask)
+    order = used[np.argsort(group[used], kind="stable")]
+    parts = np.split(order, np.flatnonzero(np.diff(group[order])) + 1) if len(order) else []
+    for part in parts:
+        keep[part[len(part) // 2]] = True
+    return Independent(group, keep, frames=len(used), poses=len(parts))
+
+
+_AVERAGED = ("measurements", "covariance", "max_elevation", "amplitude", "time", "time_of_flight")
+"""Arrays of images or problems that are averaged over a group."""
+
+
+def _joined(data: Any, found: Independent) -> Any:
+    """One image for every group, at the place of the one that is kept."""
+    values: dict[str, Any] = {"poses": np.array(data.poses)}
+    names = {field.name for field in fields(data)}
+    for name in _AVERAGED:
+        if name in names and getattr(data, name) is not None:
+            values[name] = np.array(getattr(data, name))
+    channels = getattr(data, "channels", None)
+    if channels is not None:
+        values["distances"] = np.array(channels.distances)
+        values["heard"] = np.array(channels.heard)
+    before = {name: each.copy() for name, each in values.items()}
+    for kept in np.flatnonzero(found.keep):
+        rows = np.flatnonzero(found.group == found.group[kept])
+        if len(rows) == 1:
+            continue
+        pose = before["poses"][rows].mean(axis=0)
+        pose[:3, :3] = nearest_rotations(pose[None, :3, :3])[0][0]
+        values["poses"][kept] = pose
+        for name in _AVERAGED:
+            if name in values:
+                values[name][kept] = _middle(before[name][rows], name)
+        if channels is not None:
+            weight = before["heard"][rows]
+            total = weight.sum(axis=0)
+            sums = (weight * before["distances"][rows]).sum(axis=0)
+            values["distances"][kept] = sums / np.where(total > 0, total, 1.0)
+            values["heard"][kept] = total >= 0.5 * len(rows)
+    if channels is not None:
+        heard = {name: values.pop(name) for name in ("distances", "heard")}
+        values["channels"] = _changed(channels, heard)
+    return _changed(data, {"mask": found.keep, **values})
+
+
+def _changed(data: Any, values: dict[str, Any]) -> Any:
+    """The data with other arrays, each of the kind that it replaces: numpy's or JAX's."""
+    after = {}
+    for name, value in values.items():
+        before = getattr(data, name)
+        if isinstance(value, np.ndarray) and not isinstance(before, np.ndarray):
+            import jax.numpy as jnp
+
+            value = jnp.asarray(value, before.dtype)
+        elif isinstance(value, np.ndarray):
+            value = value.astype(before.dtype)
+        after[name] = value
+    return replace(data, **after)
+
+
+def _middle(values: np.ndarray, name: str) -> Any:
+    """Of one group's values of an array, a frame each."""
+    if name == "time_of_flight":
+        heard = np.isfinite(values).mean(axis=0) >= 0.5
+        total = np.nansum(values, axis=0) / np.maximum(np.isfinite(values).sum(axis=0), 1)
+        return np.where(heard, total, np.nan)
+    if name == "measurements" and len(values) >= ROBUST_FROM:
+        return np.median(values, axis=0)
+    return values.mean(axis=0)
+
+
+def _stride(data: Images | Problem, estimate: tuple[str, ...]) -> int:
+    """Every which image of a stream is worth keeping; 1 for other recordings."""
+    errors = conventional_errors(data, estimate)
+    if errors is None:
+        return 1
+    time = 1.0
+    for values in clipped(errors).T:
+        correlation = autocorrelation(values)
+        if correlation[1] * np.sqrt(len(values)) > SURE:
+            time = max(time, correlation_time(correlation))
+    return int(time) if time >= STREAM else 1
+
+
+def clipped(errors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """Errors about their mean, wild ones cut at three robust SDs."""
+    middle = np.median(errors, axis=0)
+    limit = 3 * 1.4826 * np.median(np.abs(errors - middle), axis=0)
+    cut = np.clip(errors, middle - limit, middle + limit)
+    return cut - cut.mean(axis=0)
+
+
+def autocorrelation(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """At lags 0, 1, ..., by the fast Fourier transform; zeros where nothing varies."""
+    count = len(values)
+    power = np.abs(np.fft.rfft(values, 2 * count)) ** 2
+    found = np.fft.irfft(power)[:count]
+    return found / found[0] if found[0] > 0 else np.zeros(count)
+
+
+def correlation_time(correlation: Float[np.ndarray, " n"]) -> float:
+    """The integrated autocorrelation time, in images, of an exponential correlation.
+
+    It is twice the lag at which the correlation is 1 / e, and that is taken from the lag of one
+    half: sums over all lags scatter more. Halved is the correlation of successive images, which
+    spares noise that is independent. The fit has taken up what changes slowest, ``ABSORBED`` of the
+    independent errors.
+    """
+    below = np.flatnonzero(correlation[1:] < 0.5 * correlation[1])
+    if not len(below):
+        return float(len(correlation))
+    high, low = correlation[below[0]], correlation[below[0] + 1]
+    half = below[0] - 1 + (high - 0.5 * correlation[1]) / (high - low)
+    time = max(2 * half / np.log(2), 1.0)
+    return float(time / max(1 - ABSORBED * time / len(correlation), LEAST_SHARE))
+
+
+def conventional_errors(
+    data: Images | Problem, estimate: tuple[str, ...] = ()
+) -> Float[np.ndarray, "m 3"] | None:
+    """Lateral, range and elevational errors (mm) of the used images, in their order.
+
+    Args:
+        data: one problem with concrete values, or images with points.
+        estimate: what the calibration estimates.
+
+    Returns:
+        Of the conventional fit in closed form; None where there is none.
+    """
+    from jaxcal.solvers.closed_form.single import calibrate_closed_form
+
+    known = getattr(data, "spacing_known", True)
+    if getattr(data, "kind", "point") == "pixel":
+        known = getattr(data, "spacing_mm", None) is not None
+    free = ("scale",) if "scale" in estimate or not known else ()
+    try:
+        found = calibrate_closed_form(data, estimate=free)
+    except InputError:
+        return None
+    return _errors(found, data)
+
+
+def _errors(found: ClosedForm, data: Any) -> Float[np.ndarray, "m 3"]:
+    used = np.asarray(data.mask) > 0
+    poses = np.asarray(data.poses, dtype=float)[used]
+    points = np.asarray(data.measurements, dtype=float)[used]
+    if found.scale_mm_per_px is not None:
+        points = points * found.scale_mm_per_px
+    face = float(getattr(data, "face_offset_mm", getattr(data, "face_offset", 0.0)))
+    transform = found.image_to_probe
+    in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], found.point_mm - poses[:, :3, 3])
+    q = (in_probe - transform[:3, 3]) @ transform[:3, :3]
+    return np.stack([q[:, 0] - points[:, 0], q[:, 2] - points[:, 1] - face, q[:, 1]], axis=1)

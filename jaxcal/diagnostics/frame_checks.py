@@ -1,0 +1,286 @@
+"""Poses and points in wrong frames or units that fit badly as given and well as somebody meant.
+
+A calibration takes what it gets: poses from tracker to probe, rotations by columns instead of rows,
+one axis with the other sign all give a converged answer, with residuals of millimetres. So the
+conventional fit (Eq. 7) is made again under each of the common slips, in closed form with both
+scales free, which needs no start, no JAX and a few tenths of a millisecond. Where one of them fits
+far better, the data speak for it.
+
+*Far better* means two things. With n images and p unknowns (both fits have the same) and errors of
+unknown size, the likelihoods have the ratio (f / f')^((3 n - p) / 2), f being the sums of squares:
+it must exceed ``ODDS``, so that chance is ruled out although some twenty slips are tried. And f
+must exceed f' by ``FACTOR``, so that no imperfection of good data is mistaken for a slip.
+
+What no fit can see: points that are mirrored (u or v counted from the other side), or swapped where
+both axes have the same or an unknown scale. Eq. 7 knows the image's lateral and axial directions
+only, and the fit of such points is as good, with these directions reversed or exchanged: every
+point of *these* images goes where it belongs in the tracker's frame. Poses in a left-handed frame,
+rotations and translations alike, are as consistent. The calibration is wrong only for images with
+another orientation than those that it was made with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.data.poses import quaternions_from_rotations, rotations_from_quaternions
+from jaxcal.runtime.array_types import Float
+
+if TYPE_CHECKING:
+    from jaxcal.data.problem import Problem
+    from jaxcal.data.recording import Images
+    from jaxcal.solvers.closed_form.reduced_objective import ImageData
+
+ODDS = 1e6
+"""How much more probable the data must be under a slip."""
+
+FACTOR = 4.0
+"""By how much its sum of squares must be less: twice in root mean square."""
+
+UNKNOWNS = 11
+"""X, target and two scales."""
+
+MOST_IMAGES = 150
+"""Of longer recordings so many images, evenly spread, are looked at."""
+
+PIXELS_MM = (0.002, 3.0)
+"""A pixel is not smaller or larger."""
+
+SAME_SCALE = 1.25
+"""Under a slip of the poses, known scales must come out within this factor."""
+
+UNFIT, UNFIT_MM = 0.5, 5.0
+"""Images do not fit together if their median error exceeds this share of the target's motion, and
+this length: a third of wrong images does not bring it there."""
+
+UNITS = {1000.0: "metres", 100.0: "dm", 25.4: "inches", 10.0: "cm"}
+"""Units that are mistaken for mm, by their length in mm."""
+
+UNIT_WITHIN = 0.05
+"""A factor between poses and points is that of a unit if it is so near."""
+
+ANISOTROPY = 1.02
+"""Scales that differ by less do not tell whether u and v are swapped."""
+
+
+def wrong_frames(data: Problem | Images, estimate: tuple[str, ...] = ()) -> str | None:
+    """In one line, what is wrong with the frames or units and what to do; None if nothing is.
+
+    Args:
+        data: one problem with concrete values, or images with points.
+        estimate: what the calibration estimates.
+    """
+    from jaxcal.solvers.closed_form.reduced_objective import image_data
+
+    known = getattr(data, "spacing_known", True)
+    if getattr(data, "kind", "point") == "pixel":
+        known = getattr(data, "spacing_mm", None) is not None
+    try:
+        images, _ = image_data(data, () if known else ("scale",))
+    except InputError:
+        return None
+    rows = np.unique(np.linspace(0, len(images.points) - 1, MOST_IMAGES).astype(int))
+    count = len(rows)
+    if 3 * count <= UNKNOWNS:
+        return None
+    rotations, shifts, points = (
+        images.rotations[rows],
+        images.translations[rows],
+        images.points[rows],
+    )
+    before, scales = _free_fit(rotations, shifts, points)
+    if not np.isfinite(before) or before <= 0:
+        return None
+    best, told = before, None
+    for words, *other in _slips(rotations, shifts, points):
+        found, each = _free_fit(*other)
+        found *= count / len(other[2])
+        if found < best and _credible(each, images, known):
+            best, told = found, words
+    if told is not None and _far_better(before, best, count):
+        return _sentence(told, before, best, count)
+    if known and not {"scale", "sound-speed"} & set(estimate):
+        told = _wrong_scale(images, rows, before, scales)
+        if told is not None:
+            return told
+    apart, extent = _typical_error(rotations, shifts, points)
+    if 3 * count > 2 * UNKNOWNS and apart > max(UNFIT_MM, UNFIT * extent):
+        return (
+            f"the images do not fit together (typical error {apart:.2g} mm, of a target that moves "
+            f"by {extent:.2g} mm in them): do poses and points belong together, and in which "
+            "frames and conventions are the poses?"
+        )
+    return None
+
+
+def _typical_error(
+    rotations: Float[np.ndarray, "n 3 3"],
+    shifts: Float[np.ndarray, "n 3"],
+    points: Float[np.ndarray, "n 2"],
+) -> tuple[float, float]:
+    """Of the images under the best fit, by their median; and the target's motion in them, mm."""
+    from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS, ImageData, reduce
+    from jaxcal.solvers.closed_form.single import scalar_root
+
+    data = ImageData(rotations, shifts, points, 0.0, np.ones(2), True)
+    reduced = reduce(data, CONSTRAINTS[("scale",)])
+    found = scalar_root(reduced)
+    if found is None:
+        return 0.0, 0.0
+    x = found[1]
+    origin, target = reduced.origin_and_target(x)
+    seen = points @ x.reshape(2, 3)
+    error = np.einsum("nij,nj->ni", rotations, seen + origin) + shifts - target
+    extent = float(np.sqrt(np.mean(np.sum((seen - seen.mean(axis=0)) ** 2, axis=1))))
+    return float(np.median(np.linalg.norm(error, axis=1))), extent
+
+
+def _free_fit(
+    rotations: Float[np.ndarray, "n 3 3"],
+    shifts: Float[np.ndarray, "n 3"],
+    points: Float[np.ndarray, "n 2"],
+) -> tuple[float, Float[np.ndarray, 2]]:
+    """Least sum of squares of Eq. 7 (mm^2), and the factors on the points' two axes."""
+    from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS, ImageData, reduce
+    from jaxcal.solvers.closed_form.single import scalar_root
+
+    data = ImageData(rotations, shifts, points, 0.0, np.ones(2), True)
+    reduced = reduce(data, CONSTRAINTS[("scale",)])
+    found = scalar_root(reduced)
+    if found is None:
+        return np.inf, np.ones(2)
+    x = found[1]
+    scales = np.linalg.norm(x.reshape(2, 3), axis=1)
+    # Below this the sum of squares is rounding.
+    return max(float(reduced(x)), reduced.resolution), scales
+
+
+def _far_better(before: float, after: float, count: int) -> bool:
+    gained = 0.5 * (3 * count - UNKNOWNS) * np.log(before / after)
+    return bool(before > FACTOR * after and gained > np.log(ODDS))
+
+
+def _credible(scales: Float[np.ndarray, 2], images: ImageData, known: bool) -> bool:
+    """Whether a slip's scales could be those of the image."""
+    if known:
+        return bool((np.abs(np.log(scales)) < np.log(SAME_SCALE)).all())
+    size = scales * images.spacing
+    return bool((size > PIXELS_MM[0]).all() and (size < PIXELS_MM[1]).all())
+
+
+def _slips(
+    rotations: Float[np.ndarray, "n 3 3"],
+    shifts: Float[np.ndarray, "n 3"],
+    points: Float[np.ndarray, "n 2"],
+) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    """What may have been meant: words, rotations, translations and points."""
+    turned = np.swapaxes(rotations, 1, 2)
+    back = -np.einsum("nij,nj->ni", turned, shifts)
+    yield ("the poses are from the tracker to the probe: invert them", turned, back, points)
+    yield (
+        "the poses' rotations are transposed (columns for rows, or conjugate quaternions): "
+        "transpose the 3x3 blocks",
+        turned, shifts, points,
+    )  # fmt: skip
+    for words, order in (
+        ("first but is read as last", [1, 2, 3, 0]),
+        ("last but is read as first", [3, 0, 1, 2]),
+    ):
+        reordered = _with_quaternions_reordered(rotations, order)
+        yield (
+            f"the quaternions' scalar stands {words}: change its place",
+            reordered,
+            shifts,
+            points,
+        )
+    for axis, name in enumerate("xyz"):
+        signs = np.where(np.arange(3) == axis, -1.0, 1.0)
+        yield (
+            f"the poses' translations have the wrong sign along {name} (a left-handed frame, "
+            "converted by half?): reverse it",
+            rotations, shifts * signs, points,
+        )  # fmt: skip
+    for order, name in (
+        ([1, 0, 2], "x and y"), ([2, 1, 0], "x and z"), ([0, 2, 1], "y and z"),
+        ([1, 2, 0], "x, y and z"), ([2, 0, 1], "x, y and z"),
+    ):  # fmt: skip
+        yield (
+            f"the columns {name} of the poses' translations are exchanged: put them in order",
+            rotations, shifts[:, order], points,
+        )  # fmt: skip
+    if len(points) > 5:
+        yield (
+            "each point belongs to the pose of the row before: the two lists are one row out of "
+            "step",
+            rotations[:-1], shifts[:-1], points[1:],
+        )  # fmt: skip
+        yield (
+            "each point belongs to the pose of the row after: the two lists are one row out of "
+            "step",
+            rotations[1:], shifts[1:], points[:-1],
+        )  # fmt: skip
+
+
+def _with_quaternions_reordered(
+    rotations: Float[np.ndarray, "n 3 3"], order: list[int]
+) -> Float[np.ndarray, "n 3 3"]:
+    """Rotations whose quaternions' components, x y z w, were read in another order."""
+    found = quaternions_from_rotations(rotations)
+    return rotations_from_quaternions(found[:, order], "xyzw")
+
+
+def _wrong_scale(
+    images: ImageData, rows: np.ndarray, free: float, scales: Float[np.ndarray, 2]
+) -> str | None:
+    """Known scales under which the images fit far worse than under others."""
+    from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS, ImageData, reduce
+    from jaxcal.solvers.closed_form.single import descend, feasible, scalar_root
+
+    if (np.abs(np.log(scales)) < np.log(1.01)).all():
+        return None
+    chosen = ImageData(
+        images.rotations[rows], images.translations[rows], images.points[rows], 0.0,
+        np.ones(2), True,
+    )  # fmt: skip
+    reduced = reduce(chosen, CONSTRAINTS[()])
+    start = scalar_root(reduce(chosen, CONSTRAINTS[("scale",)]))
+    assert start is not None
+    before = float(reduced(descend(reduced, feasible(start[1], reduced.constraints)[None])))
+    count = len(rows)
+    if not _far_better(before, free, count):
+        return None
+    swapped = images.spacing[::-1] / images.spacing
+    if np.abs(np.log(swapped)).max() > np.log(ANISOTROPY) and np.allclose(
+        scales, swapped, rtol=0.3 * (np.abs(np.log(swapped)).max())
+    ):
+        return _sentence(
+            "u and v, or their two spacings, are exchanged: swap them", before, free, count
+        )
+    points = "the pixels' sizes" if images.pixels else "the points"
+    for unit, name in UNITS.items():
+        for factor, wrong, other in ((1 / unit, "the poses", points), (unit, points, "the poses")):
+            if (np.abs(np.log(scales / factor)) < UNIT_WITHIN).all():
+                told = f"{wrong} are in {name}, or {other} are {unit:g} times too large: give mm"
+                in_mm = unit if factor < 1 else 1.0
+                return _sentence(told, before, in_mm**2 * free, count)
+    if not images.pixels:
+        told = f"the points are {scales[0]:.3g} and {scales[1]:.3g} times as long as given"
+    else:
+        size = scales * images.spacing
+        told = (
+            f"the pixels are {size[0]:.4g} x {size[1]:.4g} mm, not {images.spacing[0]:.4g} x "
+            f"{images.spacing[1]:.4g}"
+        )
+    return _sentence(f"{told}: correct the spacing, or estimate the scale", before, free, count)
+
+
+def _sentence(words: str, before: float, after: float, count: int) -> str:
+    worse, better = np.sqrt(before / count), np.sqrt(after / count)
+    return (
+        f"it looks as if {words} (root mean square error {worse:.2g} mm as given, {better:.2g} mm "
+        "after that)"
+    )

@@ -1,0 +1,79 @@
+"""How a point of the image moves with the unknowns: shared by TRE, ``apply`` and pose design.
+
+A pixel (u, v) lies at p = (s_u u, 0, k (s_v v + f - delay)) in the image frame, with pixel sizes s,
+the factor k on the sound speed, the range f of row 0 and the delay in mm. Under the right
+perturbation X Exp([v, omega]) and steps of the logarithms of s and k, to first order
+
+    dp = v + omega x p + (x ds_u, 0, (z - o) ds_v + z dk - k ddelay),    o = k (f - delay),
+
+so that a pixel size that is too large and an origin that lies too deep can make up for each other:
+what is said of a point needs the covariance of all these unknowns, not of X alone.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxcal.runtime.array_types import Float
+
+if TYPE_CHECKING:
+    from jaxcal.model.parameters import Blocks
+
+IMAGE_BLOCKS = ("translation", "rotation", "scale", "sound-speed", "delay")
+"""Unknowns on which the place of an image point depends."""
+
+UNKNOWNS = {
+    "translation": ("v_lateral_mm", "v_elevational_mm", "v_axial_mm"),
+    "rotation": ("omega_lateral_rad", "omega_elevational_rad", "omega_axial_rad"),
+    "point": ("point_x_mm", "point_y_mm", "point_z_mm"),
+    "scale": ("log_scale_lateral", "log_scale_axial"),
+    "sound-speed": ("log_sound_speed",),
+    "delay": ("delay_mm",),
+}
+"""Names and units of the tangents of every block."""
+
+
+def unknown_names(blocks: Blocks) -> list[str]:
+    """Names, with units, of the tangents of these blocks, in order."""
+    return [name for block in blocks for name in UNKNOWNS[block]]
+
+
+def image_rows(blocks: Blocks) -> np.ndarray:
+    """Which of the tangents of these blocks move an image point (indices)."""
+    owner = [block for block in blocks for _ in UNKNOWNS[block]]
+    return np.array([k for k, block in enumerate(owner) if block in IMAGE_BLOCKS])
+
+
+def point_jacobian(
+    points: Float[Any, "*batch m 2"],
+    blocks: Blocks,
+    origin: Float[Any, "*batch"] | float = 0.0,
+    speed: Float[Any, "*batch"] | float = 1.0,
+    xp: Any = np,
+) -> Float[Any, "*batch m 3 p"]:
+    """Derivatives of image points by the unknowns (image frame; mm per mm, rad and log unit).
+
+    Args:
+        points: [lateral, axial], mm.
+        blocks: the unknowns, in order; the target's columns are zero.
+        origin: o, range of pixel row 0, mm.
+        speed: k, factor on the sound speed.
+        xp: numpy or jax.numpy.
+    """
+    x, z = points[..., 0], points[..., 1]
+    zero, one = xp.zeros_like(x), xp.ones_like(x)
+    origin = xp.asarray(origin)[..., None] * one
+    speed = xp.asarray(speed)[..., None] * one
+    # Columns of I and of omega x p with p = (x, 0, z); then those of the further unknowns.
+    columns = {
+        "translation": [(one, zero, zero), (zero, one, zero), (zero, zero, one)],
+        "rotation": [(zero, -z, zero), (z, zero, -x), (zero, x, zero)],
+        "point": [(zero, zero, zero)] * 3,
+        "scale": [(x, zero, zero), (zero, zero, z - origin)],
+        "sound-speed": [(zero, zero, z)],
+        "delay": [(zero, zero, -speed)],
+    }
+    chosen = [xp.stack(column, axis=-1) for block in blocks for column in columns[block]]
+    return xp.stack(chosen, axis=-1)

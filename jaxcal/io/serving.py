@@ -1,0 +1,139 @@
+"""A calibration served over OpenIGTLink, for Slicer: TRANSFORM messages to every client."""
+
+from __future__ import annotations
+
+import contextlib
+import selectors
+import socket
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.io.openigtlink import Message, Tracked, encode
+from jaxcal.runtime.array_types import Float
+
+PORT = 18945
+"""Beside 18944, which PlusServer takes."""
+
+MOST_CLIENTS = 32
+_LONGEST_NAME = 20
+
+
+class TransformServer:
+    """Sends a transform to whoever connects, at once and then again and again; a context manager.
+
+    A client that takes nothing for so long that the system's buffer is full is disconnected. What
+    clients send is thrown away.
+
+    Args:
+        name: device name, for instance ``ImageToProbe``; at most 20 bytes.
+        matrix: (4, 4), mm; sent as it is, row by row becoming column by column, in float32.
+        host: address to listen at; other machines can connect to none but their own network's.
+        port: 0 takes a free one.
+
+    Raises:
+        InputError: a name that is too long, a matrix that is not finite, or an address or port that
+            cannot be listened at.
+    """
+
+    def __init__(
+        self, name: str, matrix: Float[np.ndarray, "4 4"], host: str = "127.0.0.1", port: int = PORT
+    ) -> None:
+        if not 0 < len(name.encode()) <= _LONGEST_NAME:
+            raise InputError(f"{name!r}: a device's name has 1 to {_LONGEST_NAME} bytes")
+        if not np.isfinite(matrix).all():
+            raise InputError("the matrix holds NaN or Inf")
+        self._name, self._matrix = name, np.asarray(matrix, dtype=np.float64)
+        self._clients: set[socket.socket] = set()
+        self._listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self._listener.bind((host, port))
+            self._listener.listen()
+        except (OSError, OverflowError) as error:
+            self._listener.close()
+            reason = getattr(error, "strerror", None) or str(error)
+            raise InputError(f"cannot listen at {host}:{port}: {reason}") from None
+        self._listener.setblocking(False)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._listener, selectors.EVENT_READ)
+
+    def __enter__(self) -> TransformServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for client in list(self._clients):
+            self._drop(client)
+        self._selector.close()
+        self._listener.close()
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return int(self._listener.getsockname()[1])
+
+    @property
+    def clients(self) -> int:
+        """How many are connected."""
+        return len(self._clients)
+
+    def serve(self, period_s: float, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Send until stopped.
+
+        Args:
+            period_s: time between messages, s.
+            stopped: asked at least once a period.
+        """
+        due = time.monotonic()
+        while not stopped():
+            for key, _ in self._selector.select(max(0.0, due - time.monotonic())):
+                if key.fileobj is self._listener:
+                    self._accept()
+                else:
+                    self._listen_to(key.fileobj)  # pyright: ignore[reportArgumentType]
+            if time.monotonic() >= due:
+                for client in list(self._clients):
+                    self._send(client)
+                due = time.monotonic() + period_s
+
+    def _accept(self) -> None:
+        try:
+            client, _ = self._listener.accept()
+        except OSError:
+            return
+        if len(self._clients) >= MOST_CLIENTS:
+            client.close()
+            return
+        client.setblocking(False)
+        self._clients.add(client)
+        self._selector.register(client, selectors.EVENT_READ)
+        self._send(client)
+
+    def _listen_to(self, client: socket.socket) -> None:
+        try:
+            if client.recv(65536):
+                return
+        except BlockingIOError:
+            return
+        except OSError:
+            pass
+        self._drop(client)
+
+    def _send(self, client: socket.socket) -> None:
+        content = (Tracked(self._name, self._matrix),)
+        message = encode(Message("TRANSFORM", self._name, time.time(), content))
+        try:
+            sent = client.send(message)
+        except OSError:
+            sent = -1
+        # A message that was cut in two could not be told from the next one.
+        if sent != len(message):
+            self._drop(client)
+
+    def _drop(self, client: socket.socket) -> None:
+        self._clients.discard(client)
+        with contextlib.suppress(KeyError, ValueError):
+            self._selector.unregister(client)
+        client.close()

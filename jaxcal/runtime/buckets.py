@@ -1,0 +1,98 @@
+"""Sizes that problems are padded to, so that a few programs serve any number of images.
+
+A padded problem has further images that are masked: no answer depends on them. What a result holds
+for each image is cut back. Which axis of an array counts images is read from its annotation, where
+every class of jaxcal names it ``n``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from jaxcal.data.problem import Problem
+from jaxcal.runtime.trees import assembled
+
+T = TypeVar("T")
+
+SMALLEST = 8
+"""Images of the smallest bucket."""
+
+_SHAPE = re.compile(r"""\[[^\[\]]*["']([^"']*)["']\]""")
+
+
+def size(count: int) -> int:
+    """The bucket of a number of images or problems: 8, 12, 16, 24, 32, 48, 64, 96, 128, ..."""
+    bucket = SMALLEST
+    while bucket < count:
+        # Powers of two, and between each and the next half as much again.
+        bucket = bucket * 3 // 2 if bucket & (bucket - 1) == 0 else bucket * 4 // 3
+    return bucket
+
+
+def padded(problem: Problem) -> Problem:
+    """The problem with masked images up to its bucket's size, in numpy arrays where it grows.
+
+    Args:
+        problem: one, or a batch.
+    """
+    more = size(problem.images) - problem.images
+    if not more:
+        return problem
+    rows = [*range(problem.images), *[problem.images - 1] * more]  # a masked pose must be one, too
+    mask = np.asarray(problem.mask)
+    mask = np.concatenate([mask, np.zeros((*mask.shape[:-1], more), mask.dtype)], axis=-1)
+    longer = taken(problem, rows)
+    parts = {field.name: getattr(longer, field.name) for field in fields(longer)}
+    return assembled(Problem, parts | {"mask": mask})
+
+
+def taken(problem: Problem, rows: list[int]) -> Problem:
+    """Some images of a problem, in numpy arrays.
+
+    Args:
+        problem: without leading axes.
+        rows: which images, in order; the same may come again.
+    """
+    return _each_image(problem, lambda values, axis: np.take(np.asarray(values), rows, axis))
+
+
+def cut(result: T, images: int) -> T:
+    """A result for the first images only.
+
+    Args:
+        result: a :class:`jaxcal.Calibration` in numpy arrays, or what it holds.
+        images: how many there were before padding.
+    """
+
+    def first(values: Any, axis: int) -> Any:
+        rows: list[slice] = [slice(None)] * values.ndim
+        rows[axis] = slice(0, images)
+        return values[tuple(rows)]
+
+    return _each_image(result, first)
+
+
+def _each_image(tree: Any, change: Callable[[Any, int], Any]) -> Any:
+    """The tree with every array that has an axis of images changed."""
+    changed: dict[str, Any] = {}
+    for field in fields(tree):
+        value = getattr(tree, field.name)
+        axis = _axis_of_images(str(field.type))
+        if is_dataclass(value):
+            value = _each_image(value, change)
+        elif value is not None and axis is not None:
+            value = change(value, axis)
+        changed[field.name] = value
+    return assembled(type(tree), changed)
+
+
+def _axis_of_images(annotation: str) -> int | None:
+    """Counted from the last axis, since leading ones are a batch's; None where there is none."""
+    shape = _SHAPE.search(annotation)
+    names = shape[1].split() if shape else []
+    return names.index("n") - len(names) if "n" in names else None

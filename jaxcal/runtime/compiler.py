@@ -1,0 +1,155 @@
+"""Flags that XLA compiles our programs with, on a CPU; elsewhere its defaults stand.
+
+Two wishes contradict each other. Plain batches are solved by the million, and their inner loops
+should run as fast as the hardware allows: :func:`fast_to_run`. Of one problem, a person waits for
+the compiler and not for the answer: :func:`quick_to_compile`.
+
+Flags belong to a whole program, so none are given inside somebody else's jit, vmap or grad:
+:func:`is_whole_program`. They come and go with versions of XLA, so each is a wish: it is offered to
+the compiler once, and left out where the compiler does not know it (:func:`known`).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from jaxcal.runtime.precision import inside_transformation
+
+if TYPE_CHECKING:
+    from jax.typing import ArrayLike
+
+T = TypeVar("T")
+
+SWITCH = "JAXCAL_FAST_MATH"
+"""Environment variable; 0 leaves batches the compiler's default flags."""
+
+Flags = dict[str, Any]
+
+FAST_MATH: Flags = {
+    "xla_cpu_enable_fast_math": True,
+    "xla_cpu_fast_math_honor_nans": True,
+    "xla_cpu_fast_math_honor_infs": True,
+}
+"""The compiler must know all of these, or gets none."""
+
+_log = logging.getLogger(__name__)
+
+
+def known(platform: str, flags: Flags) -> Flags:
+    """Those of some compiler flags that the present compiler knows.
+
+    Args:
+        platform: ``cpu``, ``gpu`` or ``tpu``, as :func:`jax.default_backend` says it.
+        flags: wished for, by the names of XLA's debug options.
+
+    Returns:
+        The known ones. A flag that is not known is logged at level DEBUG and changes nothing.
+    """
+    items = tuple(flags.items())
+    if _are_known(platform, items):
+        return dict(flags)
+    found = {name: value for name, value in items if _are_known(platform, ((name, value),))}
+    # Without NaN and Inf, a bad lane would become a wrong answer: all three or none.
+    if not FAST_MATH.keys() <= found.keys():
+        found = {name: value for name, value in found.items() if FAST_MATH.get(name) != value}
+    return found
+
+
+@cache
+def _are_known(platform: str, flags: tuple[tuple[str, Any], ...]) -> bool:
+    import jax
+
+    # Tried on the smallest program; XLA refuses all flags of a call where it refuses one.
+    try:
+        with jax.default_device(jax.local_devices(backend=platform)[0]):
+            program = jax.jit(lambda x: x, compiler_options=dict(flags))
+            program.lower(np.float32(0)).compile()
+    except (jax.errors.JaxRuntimeError, ValueError, TypeError) as error:
+        _log.debug("compiler flags refused: %s (%s)", flags, error)
+        return False
+    return True
+
+
+def batch_wishes() -> Flags:
+    """Wishes for a program that solves batches on a CPU.
+
+    Sums over images vectorise only where their order is free, and that is what fast math allows;
+    NaN and Inf keep their meaning. Reruns are bitwise equal, and answers within 1e-12 mm of those
+    with default flags.
+    """
+    if os.environ.get(SWITCH, "1") == "0":
+        return {}
+    return FAST_MATH | {"xla_cpu_prefer_vector_width": 512}
+
+
+def fast_to_run(platform: str) -> Flags | None:
+    """Those of :func:`batch_wishes` that the compiler knows, or None where it has none."""
+    wishes = batch_wishes()
+    return known(platform, wishes) if platform == "cpu" and wishes else None
+
+
+def quick_to_compile(platform: str) -> Flags | None:
+    """Flags for the general road, or None.
+
+    Building every fusion with MLIR is half of the compiler's work with jax 0.10, and makes nothing
+    faster there that could be measured. jaxlib 0.11.2 dropped the flag.
+    """
+    return known(platform, {"xla_cpu_use_fusion_emitters": False}) if platform == "cpu" else None
+
+
+ONE_PROBLEM: Flags = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+}
+"""Wishes for a program that solves one problem and that a person waits for.
+
+Measured on the joint method with 54 images (jax 0.10.2): 8.5 s of compilation instead of 17.7, 37
+ms of run time instead of 20.
+"""
+
+
+def single_threaded(platform: str) -> Flags:
+    """Flags that keep a program on one thread, for processes that share the cores among them."""
+    return known(platform, {"xla_cpu_multi_thread_eigen": False}) if platform == "cpu" else {}
+
+
+def computed_once(make: Callable[[], T], witness: ArrayLike) -> T:
+    """What a function makes, as arrays that whoever reads them does not compute again.
+
+    On a CPU, XLA puts a loop that several others read into each of them, unless it holds what is
+    thought expensive (integer rounds and polynomials are not), and drops optimization_barrier
+    before it does. A branch is where that ends, provided that the compiler cannot tell that it is
+    always taken.
+
+    Args:
+        make: without arguments; what it closes over may be traced.
+        witness: a number that is not negative and, for an effect, an argument of the program and
+            the same for the whole batch. Where it is negative or NaN, everything is NaN, which
+            nobody takes for an answer.
+
+    Returns:
+        The same arrays as ``make()``, which have to be floating or complex.
+    """
+    import jax
+    import jax.core
+    import jax.numpy as jnp
+
+    taken = jnp.asarray(witness) >= 0
+    if not isinstance(taken, jax.core.Tracer):
+        return make()
+    nothing = jax.eval_shape(make)
+    return jax.lax.cond(
+        taken, make, lambda: jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), nothing)
+    )
+
+
+def is_whole_program(*arguments: object) -> bool:
+    """Whether arrays have values, so that what is called with them is a program of its own."""
+    return not inside_transformation(*arguments)

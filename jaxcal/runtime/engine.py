@@ -1,0 +1,204 @@
+"""What solves a problem or a batch by the engine: a kept program on a CPU, else one of JAX's own.
+
+On a CPU, machine code is kept between processes (:mod:`jaxcal.runtime.executables`) in sizes that
+serve many problems (:mod:`jaxcal.runtime.buckets`); a program that is found there is neither
+imported, traced nor compiled. On other devices, inside somebody's jit, vmap or grad, and with a
+solver of the caller's own, JAX compiles :mod:`jaxcal.runtime.programs` as it compiles anything.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.calibration.conventional import closed_form_start
+from jaxcal.calibration.options import Given, Plan, with_bound
+from jaxcal.calibration.result import Calibration
+from jaxcal.data.problem import Problem
+from jaxcal.runtime import buckets, compiler, executables
+from jaxcal.runtime.precision import in_own_modes, inside_transformation
+from jaxcal.runtime.trees import map_arrays
+
+BATCH_CHUNK = 64
+"""Problems solved side by side: enough to fill the vector units, few enough to stay in cache."""
+
+CHANNELS_CHUNK = 8
+"""The same for solves on channels, whose problems are a hundred times larger."""
+
+FEW_PROBLEMS = 1024
+"""Up to so many problems of a batch are padded to a bucket of images."""
+
+
+def solve_problem(problem: Problem, given: Given, plan: Plan) -> Calibration:
+    """One problem, but for the problem itself in the result (traceable).
+
+    Args:
+        problem: checked, with the caller's bound.
+        given: numbers that came with the request.
+        plan: what is static about it.
+    """
+    if _is_kept(problem, given, plan):
+        return _solve_kept(problem, given, plan)
+    return _solve_compiled(problem, given, plan)
+
+
+@in_own_modes
+def _solve_compiled(problem: Problem, given: Given, plan: Plan) -> Calibration:
+    """One problem by a program of JAX's own, which serves every method and prior."""
+    from jaxcal.runtime import programs
+
+    platform = None
+    if not inside_transformation(problem, given):
+        platform = _devices(problem)[0].platform
+    agreed = None
+    if plan.robust:
+        agreed = programs.agreement(platform)(problem.points_only(), plan.blocks)
+    return programs.one_problem(platform)(problem, given, agreed, None, plan)
+
+
+@in_own_modes
+def _solve_kept(problem: Problem, given: Given, plan: Plan) -> Calibration:
+    """One problem by programs that are kept, which serve every number of images of a bucket."""
+    padded = buckets.padded(problem)
+    given = replace(given, max_elevation=None)  # the problem has it
+    run = partial(executables.run, flags=compiler.ONE_PROBLEM)
+    label = _label(plan, padded.images)
+    agreed, used = None, problem
+    if plan.robust:
+        search = label | {"method": "robust", "prior": "none"}
+        points = padded.points_only()
+        agreed = run(
+            "jaxcal.calibration.pipeline:agreed_images", (points,), plan.blocks, label=search
+        )
+        used = replace(problem, mask=agreed[: problem.images])
+    start = None if plan.method == "conventional" else closed_form_start(used, plan.blocks)
+    arguments = (padded, given, agreed, start)
+    result = run("jaxcal.runtime.programs:solve_one", arguments, plan, label=label)
+    return as_jax_holds(buckets.cut(result, problem.images), problem)
+
+
+@in_own_modes
+def solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None) -> Calibration:
+    """A batch with its problems in the result (traceable).
+
+    Args:
+        problems: with leading axes.
+        given: numbers that came with the request.
+        plan: what is static about it.
+        chunk: problems solved side by side; None: by their kind.
+    """
+    shape = problems.batch_shape
+    problems = with_bound(problems, given)
+    flat = map_arrays(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
+    largest = chunk or (CHANNELS_CHUNK if plan.channels else BATCH_CHUNK)
+    count = flat.mask.shape[0]
+    if count and _is_kept(problems, given, plan):
+        result = _solve_chunks_kept(flat, given, plan, largest)
+    else:
+        result = _solve_chunks_compiled(flat, given, plan, largest)
+    result = map_arrays(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
+    return result.with_problem(problems)
+
+
+def _solve_chunks_kept(problems: Problem, given: Given, plan: Plan, largest: int) -> Calibration:
+    """A batch (one leading axis) by a program that serves all batches of nearly its size."""
+    count, images = problems.mask.shape
+    given = replace(given, max_elevation=None)  # the problems have it
+    chunk = min(buckets.size(count), largest)
+    pieces = -(-count // chunk)
+    padded = problems
+    if count <= FEW_PROBLEMS:
+        # Here a person waits for the compiler; of thousands, masked images would cost run time.
+        padded = buckets.padded(problems)
+    size = buckets.size(pieces) if pieces > 1 else 1
+    rows = np.arange(size * chunk) % count
+    padded = map_arrays(lambda leaf: np.asarray(leaf)[rows], padded)
+    label = _label(plan, padded.images) | {"problems": size * chunk}
+    result = executables.run(
+        "jaxcal.runtime.programs:solve_some_chunks",
+        (padded, given, np.asarray(pieces, np.int32)),
+        (plan, chunk),
+        flags=compiler.batch_wishes(),
+        label=label,
+    )
+    return as_jax_holds(buckets.cut(result, images), problems)
+
+
+def _solve_chunks_compiled(
+    problems: Problem, given: Given, plan: Plan, largest: int
+) -> Calibration:
+    """A batch (one leading axis) by JAX's own program, on all devices where it may go anywhere."""
+    import jax
+    import jax.numpy as jnp
+
+    from jaxcal.runtime import programs
+
+    count = problems.mask.shape[0]
+    alone = not inside_transformation(problems, given)
+    devices = _devices(problems) if alone else tuple(jax.local_devices())[:1]
+    # Chunks of one size, the last one filled up: a remainder would be compiled as a second program.
+    pieces = max(-(-count // largest), 1)
+    if pieces >= len(devices):
+        pieces = -(-pieces // len(devices)) * len(devices)
+    else:
+        devices = devices[:1]
+    lanes = max(-(-count // pieces), 1)
+    if count and pieces * lanes != count:
+        rows = jnp.arange(pieces * lanes) % count
+        problems = jax.tree.map(lambda leaf: leaf[rows], problems)
+    return programs.chunks(devices, alone)(problems, given, plan, lanes)
+
+
+def _label(plan: Plan, images: int) -> dict[str, Any]:
+    """What a kept program is, for ``jaxcal cache show``."""
+    return {
+        "method": plan.method,
+        "prior": plan.reported_prior,
+        "unknowns": ", ".join(plan.blocks),
+        "data": "channels" if plan.channels else "points",
+        "images": images,
+    }
+
+
+def _is_kept(problems: Problem, given: Given, plan: Plan) -> bool:
+    """Whether the program for it is one that is kept: whole, on one CPU, and of our own solvers."""
+    if inside_transformation(problems, given) or not executables.is_describable(plan):
+        return False
+    import jax
+
+    devices = _devices(problems)
+    interpreted = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
+    one = len(devices) == 1 or not problems.batch_shape
+    return one and devices[0].platform == "cpu" and not interpreted
+
+
+def as_jax_holds(result: Calibration, problem: Problem) -> Calibration:
+    """JAX's arrays, where the problem's are."""
+    import jax
+
+    return jax.device_put(result, next(iter(_held(problem)), None))
+
+
+def _devices(problems: Problem) -> tuple[Any, ...]:
+    """The devices that hold a problem's arrays, or all local ones where they may go anywhere."""
+    import jax
+
+    return _held(problems) or tuple(jax.local_devices())
+
+
+def _held(problems: Problem) -> tuple[Any, ...]:
+    """The devices that hold a problem's arrays; none where they may go anywhere."""
+    import jax
+
+    leaves = [leaf for leaf in jax.tree.leaves(problems) if isinstance(leaf, jax.Array)]
+    held = {frozenset(leaf.devices()) for leaf in leaves if leaf.committed}
+    if len(held) > 1:
+        raise InputError(
+            "the problem's arrays lie on different devices: put all of them on the same ones "
+            "(jax.device_put takes a whole problem)"
+        )
+    return tuple(sorted(held.pop(), key=lambda d: d.id)) if held else ()

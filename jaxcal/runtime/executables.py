@@ -1,0 +1,356 @@
+"""Programs of one problem, compiled once and kept: in this process and in the user's cache folder.
+
+Most of the time to a first answer is tracing and compiling. Both are spared where the program of
+the same plan and shapes was compiled before, by whichever process: :func:`run` then loads machine
+code and does not call the function at all.
+
+A program is kept under a key that says everything it depends on: the function's name, the static
+plan, the shapes and dtypes of all arrays, the compiler's flags, and this installation
+(:func:`installation`): jaxlib's binary, the processor's features, the versions of what is traced
+through, and the sources of jaxcal. Who may write such files is the subject of
+:mod:`jaxcal.runtime.program_cache`. None of JAX's settings is changed.
+
+Trees of arrays are described in words (:func:`describe`), so that neither pickles nor a trace are
+needed to put a result together. Programs that call out of XLA (LAPACK, callbacks) are compiled for
+this process only: their addresses mean nothing to the next one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import logging
+import os
+import platform
+import sys
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import jax
+import numpy as np
+from jaxlib import xla_client
+
+from jaxcal.runtime import compiler, program_cache
+from jaxcal.runtime.trees import assembled
+
+LOADED = 32
+"""Programs kept in this process; the least recently used gives way."""
+
+TRACED_THROUGH = ("jax", "jaxlib", "equinox", "optimistix", "numpy")
+"""Packages whose versions change what is compiled."""
+
+NOT_TRACED = ("cli", "report", "io")
+"""Folders of jaxcal that no compiled program comes from."""
+
+CPU_FACTS = (
+    "vendor_id", "cpu family", "model", "model name", "stepping", "flags", "Features",
+    "CPU implementer", "CPU architecture", "CPU variant", "CPU part", "isa",
+)  # fmt: skip
+"""Lines of /proc/cpuinfo that say what a processor can do."""
+
+JAX_SETTINGS = (
+    "jax_enable_x64", "jax_default_matmul_precision", "jax_default_prng_impl",
+    "jax_threefry_partitionable",
+)  # fmt: skip
+"""Settings of the caller that change what is traced."""
+
+Description = Any
+"""A tree in words: what JSON can hold."""
+
+_log = logging.getLogger(__name__)
+
+
+class NotDescribableError(TypeError):
+    """A tree holds something that cannot be said in words, such as a function."""
+
+
+@dataclass(frozen=True)
+class _Program:
+    executable: Any
+    device: Any
+    result: Description
+
+    def __call__(self, leaves: list[Any]) -> Any:
+        arrays = jax.device_put(leaves, self.device)
+        pieces = self.executable.execute_sharded(arrays).disassemble_into_single_device_arrays()
+        return rebuild(self.result, [np.asarray(shards[0]) for shards in pieces])
+
+
+_loaded: OrderedDict[str, _Program] = OrderedDict()
+_being_made: dict[str, Lock] = {}
+_lock = Lock()
+
+
+def run(
+    function: str | Callable[..., Any],
+    arguments: tuple[Any, ...],
+    plan: Any,
+    *,
+    flags: compiler.Flags,
+    label: dict[str, Any],
+) -> Any:
+    """``function(*arguments, plan)``, compiled, by the kept program where there is one.
+
+    Args:
+        function: a pure function of a module, or ``module:name``, which is imported and called
+            only where no program is kept.
+        arguments: trees of concrete arrays: modules and dataclasses of jaxcal, tuples, None.
+        plan: everything static about it.
+        flags: wished for; those unknown to the compiler are left out.
+        label: what the program is, for ``jaxcal cache show``.
+
+    Returns:
+        The function's result, as numpy arrays: JAX would compile every change of theirs.
+
+    Raises:
+        NotDescribableError: arguments or plan hold what cannot be said in words.
+    """
+    leaves: list[Any] = []
+    described = describe(arguments, leaves)
+    device = _device(leaves)
+    key = json.dumps({
+        "function": _name_of(function),
+        "plan": describe(plan, []),
+        "arguments": described,
+        "leaves": [[leaf.dtype.name, list(leaf.shape)] for leaf in leaves],
+        "device": [device.platform, device.id],
+        "flags": flags,
+        "settings": [str(getattr(jax.config, name, None)) for name in JAX_SETTINGS],
+        "installation": installation(),
+    }, sort_keys=True)  # fmt: skip
+    with _lock:
+        turn = _being_made.setdefault(key, Lock())
+    with turn:  # threads that need the same program wait for one of them
+        program = _recall(key)
+        if program is None:
+            program = _load(key, device)
+        if program is None:
+            program = _compile(
+                lambda flat: _found(function)(*rebuild(described, flat), plan),
+                leaves, device, flags, key, label,
+            )  # fmt: skip
+        _remember(key, program)
+    return program(leaves)
+
+
+def _name_of(function: str | Callable[..., Any]) -> str:
+    if isinstance(function, str):
+        return function
+    return f"{function.__module__}:{function.__qualname__}"
+
+
+def _found(function: str | Callable[..., Any]) -> Callable[..., Any]:
+    if not isinstance(function, str):
+        return function
+    module, name = function.split(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def forget() -> None:
+    """Drop the programs that this process holds; those on the disk stay."""
+    with _lock:
+        _loaded.clear()
+        _being_made.clear()
+
+
+def _recall(key: str) -> _Program | None:
+    with _lock:
+        return _loaded.get(key)
+
+
+def _remember(key: str, program: _Program) -> None:
+    with _lock:
+        _loaded[key] = program
+        _loaded.move_to_end(key)
+        while len(_loaded) > LOADED:
+            old, _ = _loaded.popitem(last=False)
+            _being_made.pop(old, None)
+
+
+def _load(key: str, device: Any) -> _Program | None:
+    kept = program_cache.read(key)
+    if kept is None:
+        return None
+    header, content = kept
+    try:
+        devices = xla_client.DeviceList((device,))
+        executable = device.client.deserialize_executable(content, executable_devices=devices)
+        return _Program(executable, device, header["result"])
+    # Whatever jaxlib makes of it: a program that does not load is compiled anew.
+    except Exception as error:
+        _log.debug("a compiled program in the cache is not used: %s", error)
+        return None
+
+
+def _compile(
+    function: Callable[[list[Any]], Any],
+    leaves: list[Any],
+    device: Any,
+    flags: compiler.Flags,
+    key: str,
+    label: dict[str, Any],
+) -> _Program:
+    _log.info("compiling, once; later runs are done in a second or two")
+    began = time.perf_counter()
+    results: list[Description] = []
+
+    def flat(*flat_leaves: Any) -> list[Any]:
+        found: list[Any] = []
+        results.append(describe(function(list(flat_leaves)), found))
+        return found
+
+    place = jax.sharding.SingleDeviceSharding(device)
+    shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place) for leaf in leaves]
+    known = compiler.known(device.platform, flags)
+    lowered = jax.jit(flat, keep_unused=True).lower(*shapes)
+    executable = lowered.compile(compiler_options=known).runtime_executable()
+    program = _Program(executable, device, results[0])
+    if "custom_call" in lowered.as_text():
+        return program
+    header = {
+        "label": label,
+        "result": program.result,
+        "seconds": round(time.perf_counter() - began, 3),
+    }
+    try:
+        # Before the first run: sorting makes comparators then, which cannot be serialised.
+        content = device.client.serialize_executable(executable)
+    except Exception as error:  # not every compiler's programs can be
+        _log.debug("a compiled program is not kept: %s", error)
+        return program
+    program_cache.write(key, header, content)
+    return program
+
+
+def _device(leaves: list[Any]) -> Any:
+    """Where the arrays are bound to, else JAX's default."""
+    for leaf in leaves:
+        if isinstance(leaf, jax.Array) and leaf.committed:
+            return next(iter(leaf.devices()))
+    default: Any = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return default if isinstance(default, jax.Device) else jax.local_devices(backend=default)[0]
+
+
+def describe(tree: Any, leaves: list[Any]) -> Description:
+    """A tree in words, which JSON can hold.
+
+    Args:
+        tree: of dataclasses of jaxcal (modules too), tuples, lists, None, numbers, texts, arrays.
+        leaves: the arrays are added to it.
+
+    Raises:
+        NotDescribableError: it holds anything else.
+    """
+    if isinstance(tree, (np.ndarray, np.generic, jax.Array)):
+        leaves.append(tree)
+        return {"leaf": len(leaves) - 1}
+    if tree is None or isinstance(tree, (bool, int, float, str)):
+        return tree
+    if isinstance(tree, (tuple, list)):
+        kind = "tuple" if isinstance(tree, tuple) else "list"
+        return {kind: [describe(part, leaves) for part in tree]}
+    kind = type(tree)
+    if is_dataclass(tree) and kind.__module__.split(".")[0] == "jaxcal":
+        return {
+            "class": f"{kind.__module__}:{kind.__qualname__}",
+            "fields": {
+                field.name: describe(getattr(tree, field.name), leaves) for field in fields(tree)
+            },
+        }
+    raise NotDescribableError(f"{kind.__module__}.{kind.__qualname__} cannot be described")
+
+
+def is_describable(tree: Any) -> bool:
+    """Whether :func:`describe` takes it."""
+    try:
+        describe(tree, [])
+    except NotDescribableError:
+        return False
+    return True
+
+
+def rebuild(description: Description, leaves: list[Any]) -> Any:
+    """The tree that :func:`describe` described, with other arrays."""
+    if isinstance(description, dict):
+        if "leaf" in description:
+            return leaves[description["leaf"]]
+        for name, kind in (("tuple", tuple), ("list", list)):
+            if name in description:
+                return kind(rebuild(part, leaves) for part in description[name])
+        module, name = description["class"].split(":")
+        if module.split(".")[0] != "jaxcal":
+            raise NotDescribableError(f"{module} is not part of jaxcal")
+        found: Any = importlib.import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+        parts = description["fields"].items()
+        return assembled(found, {field: rebuild(part, leaves) for field, part in parts})
+    return description
+
+
+@cache
+def installation() -> str:
+    """A digest of everything outside a plan that a compiled program depends on.
+
+    A few milliseconds. jaxlib's binary has 350 MB, whose digest would take 0.6 s: the list of
+    digests that was installed with it is taken, and the binaries' sizes and times of change, which
+    tell where one was replaced by hand.
+    """
+    facts: list[Any] = [sys.implementation.name, sys.version_info[:3], platform.machine()]
+    facts += [os.environ.get("XLA_FLAGS", ""), _processor()]
+    facts += [[name, metadata.version(name)] for name in TRACED_THROUGH]
+    facts.append(_digest(metadata.distribution("jaxlib").read_text("RECORD") or ""))
+    binaries = Path(importlib.import_module("jaxlib").__path__[0])
+    for path in sorted(binaries.iterdir()):
+        if path.suffix in (".so", ".dll", ".pyd", ".dylib"):
+            status = path.stat()
+            facts.append([path.name, status.st_size, status.st_mtime_ns])
+    facts.append(_sources())
+    return _digest(json.dumps(facts))
+
+
+def _sources() -> str:
+    """A digest of the sources that compiled programs come from: those who change one recompile."""
+    home = Path(__file__).parents[1]
+    found = hashlib.sha256()
+    for path in sorted(home.rglob("*.py")):
+        inside = path.relative_to(home)
+        if inside.parts[0] not in NOT_TRACED:
+            content = path.read_bytes()
+            found.update(f"{inside.as_posix()} {len(content)}\n".encode() + content)
+    return found.hexdigest()
+
+
+def _processor() -> str:
+    """What the processor can do, as far as the system says it."""
+    try:
+        with open("/proc/cpuinfo", "rb", buffering=0) as file:
+            first = file.read(8192).decode(errors="replace").split("\n\n")[0]
+    except OSError:
+        return "; ".join((platform.processor(), platform.platform(), _mac_processor()))
+    lines = [line for line in first.splitlines() if line.split(":")[0].strip() in CPU_FACTS]
+    return "\n".join(lines)
+
+
+def _mac_processor() -> str:
+    if sys.platform != "darwin":
+        return ""
+    import ctypes
+
+    found = ctypes.create_string_buffer(256)
+    size = ctypes.c_size_t(len(found))
+    library = ctypes.CDLL(None)
+    library.sysctlbyname(b"machdep.cpu.brand_string", found, ctypes.byref(size), None, 0)
+    return found.value.decode(errors="replace")
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,158 @@
+"""A guest in the caller's process: which of JAX's modes jaxcal computes in, and when.
+
+A calibration loses six digits in float32, so it is computed in float64, which JAX has switched off
+by default. jaxcal changes none of the process' settings. A public function that is called with
+values enters the modes that it needs and leaves them when it returns (:func:`in_own_modes`):
+
+- 64 bits. Where the caller has them switched off, results come back as numpy arrays, which keep
+  their 64 bits; JAX makes 32-bit arrays of them where the caller hands them on to JAX.
+- JAX's standard promotion of dtypes and ranks: strict promotion is a wish about the caller's code.
+- no ``debug_nans``, ``debug_infs``: a lane without an answer holds NaN on purpose, and says so.
+
+Inside a jit, vmap or grad of the caller, the number of bits is the caller's: arrays have lost
+theirs before any function sees them. A calibration there needs 64 bits, or a word that 32 will do
+(:func:`require_float64`); promotion is standard all the same.
+
+What needs no JAX does not import it: where nobody has, there are no modes to enter.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.runtime.trees import map_arrays
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+NO_64_BITS = (
+    "{name} computes in 64 bits, and JAX's are switched off inside this jit, vmap or grad. Call "
+    "the transformed function inside 'with jax.enable_x64(True):', or start Python with "
+    "JAX_ENABLE_X64=1"
+)
+
+
+def is_float64_on() -> bool:
+    """Whether JAX makes 64-bit arrays here and now; so does numpy where JAX is not imported."""
+    if "jax" not in sys.modules:
+        return True
+    import jax.numpy as jnp
+
+    return jnp.result_type(float) == np.float64
+
+
+def inside_transformation(*arguments: object) -> bool:
+    """Whether a jit, vmap or grad of somebody else looks at the code that runs now."""
+    if "jax" not in sys.modules:
+        return False
+    import jax
+    import jax.core
+
+    # Under jit even a constant is a tracer; under vmap and grad only what depends on an argument.
+    # device_put, since jax.numpy.zeros would be compiled.
+    leaves = jax.tree.leaves((arguments, jax.device_put(np.float32(0))))
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+
+
+@contextmanager
+def own_modes(*, bits_too: bool = True) -> Iterator[None]:
+    """JAX's modes as jaxcal's code is written for, in this thread.
+
+    Args:
+        bits_too: switch 64 bits on; not inside a transformation that began without.
+    """
+    import jax
+
+    with ExitStack() as stack:
+        if bits_too:
+            stack.enter_context(jax.enable_x64(True))
+            stack.enter_context(jax.debug_nans(False))
+            stack.enter_context(jax.debug_infs(False))
+        stack.enter_context(jax.numpy_dtype_promotion("standard"))
+        stack.enter_context(jax.numpy_rank_promotion("allow"))
+        yield
+
+
+def in_own_modes(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a public function: its body runs in :func:`own_modes`.
+
+    Called with values where the caller has 64 bits switched off, JAX arrays of its result (a
+    pytree) come back as numpy arrays.
+    """
+
+    @wraps(function)
+    def guest(*args: P.args, **kwargs: P.kwargs) -> T:
+        if inside_transformation(args, kwargs):
+            with own_modes(bits_too=False):
+                return function(*args, **kwargs)
+        if "jax" not in sys.modules:
+            return function(*args, **kwargs)
+        import jax
+
+        keep = is_float64_on()
+        with own_modes():
+            result = function(*args, **kwargs)
+            return result if keep else jax.tree.map(_without_jax, result)
+
+    return guest
+
+
+def in_standard_promotion(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a rule that JAX calls later, outside the public function that it belongs to.
+
+    Rules of differentiation and batching of a function that the caller compiled are traced when the
+    caller transforms it.
+    """
+
+    @wraps(function)
+    def rule(*args: P.args, **kwargs: P.kwargs) -> T:
+        with own_modes(bits_too=False):
+            return function(*args, **kwargs)
+
+    return rule
+
+
+def require_float64(name: str) -> None:
+    """Refuse to compute in 32 bits by accident.
+
+    Args:
+        name: of the function that was called.
+
+    Raises:
+        InputError: inside a transformation that began without 64 bits; it says what to do.
+    """
+    if not is_float64_on():
+        raise InputError(NO_64_BITS.format(name=name))
+
+
+def with_dtype(tree: T, dtype: Any) -> T:
+    """A pytree whose floating arrays, traced or not, have this dtype."""
+    if "jax" not in sys.modules:
+        floating = np.floating
+        return map_arrays(
+            lambda a: a.astype(dtype, copy=False) if np.issubdtype(a.dtype, floating) else a, tree
+        )
+    import jax
+    import jax.numpy as jnp
+
+    def cast(leaf: Any) -> Any:
+        floating = jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.dtype != dtype
+        return leaf.astype(dtype) if floating else leaf
+
+    return jax.tree.map(cast, tree)
+
+
+def _without_jax(leaf: Any) -> Any:
+    import jax
+    import jax.numpy as jnp
+
+    # A key has no numpy form.
+    is_key = isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return np.asarray(leaf) if isinstance(leaf, jax.Array) and not is_key else leaf

@@ -1,0 +1,119 @@
+"""The pure functions that are compiled, and their compiled forms in the hands of JAX.
+
+:mod:`jaxcal.runtime.engine` decides which of them solves a problem; on a CPU it keeps their machine
+code (:mod:`jaxcal.runtime.executables`) instead of compiling them here.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float, Int
+
+from jaxcal.calibration.conventional import Start
+from jaxcal.calibration.options import Given, Plan
+from jaxcal.calibration.pipeline import agreed_images, solve_problems
+from jaxcal.calibration.result import Calibration
+from jaxcal.data.problem import Problem
+from jaxcal.runtime import compiler
+from jaxcal.solvers.start import GivenStart
+
+
+def solve_one(
+    problem: Problem,
+    given: Given,
+    agreed: Float[Array, " n"] | None,
+    start: Start | None,
+    plan: Plan,
+) -> Calibration:
+    """One problem is a batch of one (traceable).
+
+    Args:
+        problem: checked.
+        given: numbers that came with the request.
+        agreed: 1 for the images to use, where a robust search was made before.
+        start: where methods but the conventional begin; without it the program finds one.
+        plan: what is static about the request.
+    """
+    alone = jax.tree.map(lambda leaf: leaf[None], (problem, agreed, start))
+    begun = None if start is None else GivenStart.of(alone[2], plan.blocks)
+    result = solve_problems(alone[0], given, plan, alone[1], begun)
+    return jax.tree.map(lambda leaf: leaf[0], result)
+
+
+@cache
+def one_problem(platform: str | None):
+    """The compiled solve of one problem; with a platform, as a program of its own."""
+    flags = None if platform is None else compiler.quick_to_compile(platform)
+    return jax.jit(solve_one, static_argnums=4, compiler_options=flags)
+
+
+@cache
+def agreement(platform: str | None):
+    """The compiled consensus of one problem's images, likewise."""
+    flags = None if platform is None else compiler.quick_to_compile(platform)
+    return jax.jit(agreed_images, static_argnums=1, compiler_options=flags)
+
+
+def solve_chunks(problems: Problem, given: Given, plan: Plan, chunk: int) -> Calibration:
+    """Solve a batch whose size is a multiple of the chunk's (traceable)."""
+    count = problems.mask.shape[0]
+    if count == chunk:
+        return solve_problems(problems, given, plan)
+    chunks = jax.tree.map(lambda leaf: leaf.reshape((-1, chunk, *leaf.shape[1:])), problems)
+    result = jax.lax.map(lambda part: solve_problems(part, given, plan), chunks)
+    return jax.tree.map(lambda leaf: leaf.reshape((count, *leaf.shape[2:])), result)
+
+
+def solve_some_chunks(
+    problems: Problem, given: Given, used: Int[Array, ""], how: tuple[Plan, int]
+) -> Calibration:
+    """Solve the first chunks of a batch, of which the others hold anything; theirs are zeros.
+
+    Args:
+        problems: a batch whose size is a multiple of the chunk's.
+        given: numbers that came with the request.
+        used: how many chunks to solve.
+        how: the plan and the chunk's size.
+    """
+    plan, chunk = how
+    count = problems.mask.shape[0]
+    if count == chunk:
+        return solve_problems(problems, given, plan)
+    parts = jax.tree.map(lambda leaf: leaf.reshape((-1, chunk, *leaf.shape[1:])), problems)
+
+    def solved(index: Array) -> Calibration:
+        return solve_problems(jax.tree.map(lambda leaf: leaf[index], parts), given, plan)
+
+    def body(index: Array, found: Calibration) -> Calibration:
+        one = solved(index)
+        return jax.tree.map(lambda all_of, part: all_of.at[index].set(part), found, one)
+
+    shapes = jax.eval_shape(solved, used)
+    empty = jax.tree.map(lambda leaf: jnp.zeros((count // chunk, *leaf.shape), leaf.dtype), shapes)
+    found = jax.lax.fori_loop(0, used, body, empty)
+    return jax.tree.map(lambda leaf: leaf.reshape((count, *leaf.shape[2:])), found)
+
+
+@cache
+def chunks(devices: tuple[Any, ...], alone: bool):
+    """The compiled solve of chunks, which several devices share; alone: a program of its own."""
+    options = compiler.fast_to_run(devices[0].platform) if alone else None
+    if len(devices) == 1:
+        return jax.jit(solve_chunks, static_argnums=(2, 3), compiler_options=options)
+    mesh, cut = Mesh(np.asarray(devices), ("problems",)), PartitionSpec("problems")
+
+    def spread(problems: Problem, given: Given, plan: Plan, chunk: int) -> Calibration:
+        def share(problems: Problem, given: Given) -> Calibration:
+            return solve_chunks(problems, given, plan, chunk)
+
+        specs = (cut, PartitionSpec())
+        mapped = jax.shard_map(share, mesh=mesh, in_specs=specs, out_specs=cut, check_vma=False)
+        return mapped(problems, given)
+
+    return jax.jit(spread, static_argnums=(2, 3), compiler_options=options)

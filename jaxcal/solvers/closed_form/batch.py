@@ -1,0 +1,404 @@
+"""Closed-form conventional calibration of many problems at once, and its derivatives.
+
+The mathematics is that of :mod:`jaxcal.solvers.closed_form.single`, written for arrays whose last
+axis counts problems. The images enter by about fifty sums; from there on a problem is a 6x6 matrix
+Q = C'C, a vector b = -C'g and the multipliers of its constraints:
+
+    (Q + sum_j l_j A_j) x = b,    x' A_j x = e_j.
+
+Newton's method on the dual starts at the multipliers of the orthonormal pair nearest to Q^-1 b. A
+step is taken if M stays positive definite and the constraints are better met; otherwise it is cut.
+The duality gap of :mod:`jaxcal.solvers.closed_form.certificate` is computed for every problem, and
+only that decides whether an answer is called certified.
+
+Derivatives follow from the implicit function theorem: with M = Q + sum_j l_j A_j and G = [A_j x],
+
+    M dx + G dl = db - dQ x,    G' dx = 0.
+
+They cost two solves with a factor that is known, in forward and reverse mode, and may be nested.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxcal import InputError
+from jaxcal.data.problem import Problem, is_traced
+from jaxcal.model import unrolled
+from jaxcal.model.unrolled import Matrix, Vector
+from jaxcal.runtime.precision import in_standard_promotion, own_modes, require_float64, with_dtype
+from jaxcal.solvers.closed_form.certificate import SINGULAR, TOLERANCE
+from jaxcal.solvers.closed_form.reduced_objective import (
+    CONSTRAINTS,
+    FEWEST_IMAGES,
+    ROUNDING,
+    Constraints,
+    check_estimate,
+)
+from jaxcal.solvers.closed_form.single import ClosedForm, calibrate_closed_form
+
+LANES = 256
+"""Problems in one call of the compiled program."""
+
+NEWTON_STEPS = 30
+MET = 500
+"""Constraints are met when they are off by less than this many roundings of |x|^2."""
+CUT = 0.25
+
+_FIELDS = tuple(ClosedForm.__dataclass_fields__)
+
+
+def _flatten(answer: ClosedForm) -> tuple[tuple[Any, ...], None]:
+    return tuple(getattr(answer, name) for name in _FIELDS), None
+
+
+def _unflatten(_: None, leaves: tuple[Any, ...]) -> ClosedForm:
+    # Not by the constructor: JAX also builds trees of things that are no arrays.
+    answer = object.__new__(ClosedForm)
+    for name, leaf in zip(_FIELDS, leaves, strict=True):
+        object.__setattr__(answer, name, leaf)
+    return answer
+
+
+jax.tree_util.register_pytree_node(ClosedForm, _flatten, _unflatten)
+
+
+def solve_batch(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
+    """Conventional calibrations of problems with any leading axes.
+
+    Args:
+        problems: concrete or traced.
+        estimate: as for :func:`jaxcal.calibrate_closed_form`.
+
+    Returns:
+        Arrays with the problems' leading axes. Concrete problems give numpy arrays in float64, and
+        those that this module does not certify are solved again, one by one, by
+        :func:`jaxcal.solvers.closed_form.single.solve`. A problem with NaN or fewer than 4 images
+        gives NaN.
+
+    Raises:
+        InputError: unknown names, a scale where there is none, or a transformation that began
+            without JAX's 64 bits.
+    """
+    check_estimate(estimate, problems.pixels, problems.spacing_known)
+    problems = replace(problems, covariance=None, max_elevation=None, channels=None,
+                       sound_speed=None, delay=None)  # fmt: skip
+    shape = problems.batch_shape
+    flat = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
+    if any(is_traced(leaf) for leaf in jax.tree.leaves(problems)):
+        with own_modes(bits_too=False):
+            require_float64("jaxcal.calibrate_closed_form")
+            answer = solve_lanes(with_dtype(flat, np.float64), estimate)
+    else:
+        answer = _concrete(jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), flat), estimate)
+    return jax.tree.map(lambda leaf: leaf.reshape((*shape, *leaf.shape[1:])), answer)
+
+
+_compiled = jax.jit(lambda problems, estimate: solve_lanes(problems, estimate), static_argnums=1)
+
+
+def _concrete(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
+    count = len(problems.mask)
+    lanes = min(LANES, count)
+    parts = []
+    with own_modes():
+        for start in range(0, count, lanes):
+            rows = slice(start, start + lanes)
+            part = jax.tree.map(lambda leaf, rows=rows: leaf[rows], problems)
+            short = lanes - len(part.mask)
+            if short:
+                part = jax.tree.map(
+                    lambda leaf, short=short: np.concatenate([leaf, np.repeat(leaf[:1], short, 0)]),
+                    part,
+                )
+            parts.append(_compiled(part, estimate))
+    answer = jax.tree.map(
+        lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves])[:count], *parts
+    )
+    for lane in np.flatnonzero(~answer.certified):
+        one = jax.tree.map(lambda leaf, lane=lane: leaf[lane], problems)
+        try:
+            alone = calibrate_closed_form(one, estimate=estimate)
+        except InputError:
+            continue
+        for name in _FIELDS:
+            if getattr(answer, name) is not None:
+                getattr(answer, name)[lane] = getattr(alone, name)
+    return answer
+
+
+def solve_lanes(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
+    """Solve problems with one leading axis by array operations alone.
+
+    Traceable and differentiable. Where the dual is not tight ``certified`` is False, and the
+    answer is NaN.
+    """
+    constraints = CONSTRAINTS[estimate]
+    mask = (problems.mask > 0).astype(problems.poses.dtype)
+    used = problems.cleared(mask)
+    points = used.measurements * used.spacing[:, None, :]
+    scaled = bool({"lateral", "common"} & set(constraints.free))
+    if not scaled:
+        face = jnp.stack([jnp.zeros_like(used.face_offset), used.face_offset], axis=1)
+        points = points + face[:, None, :]
+    rotations, translations = used.poses[:, :, :3, :3], used.poses[:, :, :3, 3]
+    count = jnp.sum(mask, axis=1)
+    share = mask / count[:, None]
+    mean = jnp.einsum("bn,bnk->bk", share, points)
+    centre = jnp.einsum("bn,bnk->bk", share, translations)
+    deviation = mask[:, :, None] * (points - mean[:, None])
+    away = mask[:, :, None] * (translations - centre[:, None])
+    weights = jnp.concatenate([deviation, mask[:, :, None]], axis=2)
+    # Whole poses, and R'b plane by plane: batched products of 3x3 matrices are slow.
+    flat = used.poses.reshape(*mask.shape, 16)
+    sums = jnp.einsum("bnk,bnf->bkf", weights, flat).reshape(-1, 3, 4, 4)
+    turned = sums[:, :, :3, :3]
+    back = [sum(rotations[:, :, i, j] * away[:, :, i] for i in range(3)) for j in range(3)]
+    pulled = jnp.einsum("bnk,bnj->bkj", weights, jnp.stack(back, axis=2))
+    spread = jnp.einsum("bnk,bnl->bkl", deviation, deviation)
+    size = jnp.sum(away**2, axis=(1, 2)) + spread[:, 0, 0] + spread[:, 1, 1]
+
+    full, rhs = _normal(
+        jnp.moveaxis(spread, 0, -1),
+        jnp.moveaxis(turned, 0, -1),
+        jnp.moveaxis(pulled, 0, -1),
+        count,
+    )
+    matrix, vector, origin = _eliminate(full, rhs)
+    x, values = _optimum(estimate, matrix, vector)
+    x = _feasible(x, constraints)
+    gap, definite = _gap(constraints, matrix, vector, x, values)
+
+    of_mean = jnp.stack(origin(list(x)))
+    lengths = jnp.sqrt(jnp.sum(x.reshape(2, 3, -1) ** 2, axis=1))
+    r1, r3 = x[:3] / lengths[0], x[3:] / lengths[1]
+    shift = of_mean - mean[:, 0] * x[:3] - mean[:, 1] * x[3:]
+    if scaled:
+        shift = shift - used.face_offset * r3
+    # Plane by plane: batched products of such small matrices are slow.
+    of_points = shift + used.face_offset * r3 if scaled else shift
+    seen = [
+        points[:, :, 0] * x[i, :, None] + points[:, :, 1] * x[3 + i, :, None]
+        + of_points[i, :, None]
+        for i in range(3)
+    ]  # fmt: skip
+    target, objective = [], jnp.zeros_like(count)
+    for i in range(3):
+        cloud = sum((rotations[:, :, i, j] * seen[j] for j in range(3)), translations[:, :, i])
+        target.append(jnp.sum(share * cloud, axis=1))
+        objective = objective + jnp.sum(mask * (cloud - target[i][:, None]) ** 2, axis=1)
+    rotation = jnp.stack([r1, jnp.cross(r3, r1, axis=0), r3], axis=1)
+    corner = jnp.zeros((len(mask), 4, 4), x.dtype).at[:, 3, 3].set(1.0)
+    transform = corner.at[:, :3, :3].set(jnp.moveaxis(rotation, -1, 0)).at[:, :3, 3].set(shift.T)
+    rounding = ROUNDING * jnp.finfo(x.dtype).eps
+    certified = definite & (count >= FEWEST_IMAGES)
+    certified = certified & (gap <= TOLERANCE * objective + rounding * size)
+    return ClosedForm(
+        image_to_probe=transform,
+        point_mm=jnp.stack(target, axis=1),
+        scale_mm_per_px=used.spacing * (lengths.T if scaled else 1.0) if used.pixels else None,
+        sound_speed_factor=lengths[1] if constraints.free == ("axial",) else jnp.ones_like(count),
+        rms_mm=jnp.sqrt(objective / count),
+        objective_mm2=objective,
+        certified=certified,
+        gap_mm2=jnp.where(definite, gap, jnp.inf),
+        # M is positive definite, and so are the normal equations of t and c.
+        unique=certified,
+    )
+
+
+def _normal(spread: Array, turned: Array, pulled: Array, count: Array) -> tuple[Matrix, Vector]:
+    """Normal equations of (a1, a3, t), c eliminated, as matrix and right side over the lanes."""
+    size = 9
+    full: Matrix = [[0] * size for _ in range(size)]
+    for a in range(2):
+        for b in range(2):
+            for i in range(3):
+                full[3 * a + i][3 * b + i] = spread[a, b]
+    for i in range(3):
+        full[6 + i][6 + i] = count
+    columns = [[turned[k, i, j] for k in range(3) for j in range(3)] for i in range(3)]
+    inverse = 1 / count
+    for p in range(size):
+        for q in range(p, size):
+            taken = sum(columns[i][p] * columns[i][q] for i in range(3)) * inverse
+            full[p][q] = full[q][p] = unrolled.add(full[p][q], -taken)
+    return full, [-pulled[k, j] for k in range(3) for j in range(3)]
+
+
+def _eliminate(full: Matrix, rhs: Vector) -> tuple[Array, Array, Any]:
+    """Eliminate t; Q, b, and t as a function of x."""
+    corner = [row[6:] for row in full[6:]]
+    factor, pivots = unrolled.cholesky(corner)
+
+    def half(column: Vector) -> Vector:
+        return unrolled.forward(factor, pivots, column)
+
+    halves = [half([full[6 + i][p] for i in range(3)]) for p in range(6)]
+    right = half(rhs[6:])
+    matrix = [[full[p][q] - unrolled.dot(halves[p], halves[q]) for q in range(6)] for p in range(6)]
+    vector = [rhs[p] - unrolled.dot(halves[p], right) for p in range(6)]
+
+    def origin(x: Vector) -> Vector:
+        known = [r - unrolled.dot([h[i] for h in halves], x) for i, r in enumerate(right)]
+        return unrolled.backward(factor, pivots, known)
+
+    stacked = jnp.stack([jnp.stack(row) for row in matrix])
+    return stacked, jnp.stack(vector), origin
+
+
+def _rows(stacked: Array) -> Matrix:
+    return [[stacked[i, j] for j in range(6)] for i in range(6)]
+
+
+def _with_multipliers(constraints: Constraints, matrix: Array, values: Array) -> Matrix:
+    """M as rows over the lanes."""
+    rows = _rows(matrix)
+    for each, value in zip(constraints.matrices, values, strict=True):
+        for i, j in zip(*np.nonzero(each), strict=True):
+            rows[i][j] = rows[i][j] + each[i, j] * value
+    return rows
+
+
+def _products(constraints: Constraints, x: Vector) -> list[Vector]:
+    """A_j x."""
+    return [
+        [
+            unrolled.add(*(each[i, j] * x[j] for j in np.flatnonzero(each[i])))
+            for i in range(6)
+        ]
+        for each in constraints.matrices
+    ]  # fmt: skip
+
+
+def _off(constraints: Constraints, x: Vector) -> Vector:
+    """How far x is from the constraints, x' A_j x - e_j."""
+    return [
+        unrolled.dot(x, product) - value
+        for product, value in zip(_products(constraints, x), constraints.values, strict=True)
+    ]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _optimum(
+    estimate: tuple[str, ...],
+    matrix: Float[Array, "6 6 lanes"],
+    vector: Float[Array, "6 lanes"],
+) -> tuple[Float[Array, "6 lanes"], Float[Array, "k lanes"]]:
+    """The x and the multipliers at the dual's maximum, by Newton's method; NaN where that fails."""
+    constraints = CONSTRAINTS[estimate]
+    first = jnp.stack(unrolled.solve(_rows(matrix), list(vector)))
+    start = _multipliers(constraints, matrix, vector, _feasible(first, constraints))
+    inside = jnp.zeros_like(start)
+    if not constraints.free:
+        # |x| is at most 1 there: far inside.
+        inside = inside.at[:2].set(jnp.sqrt(jnp.sum(vector**2, axis=0)))
+    lanes = vector.shape[1]
+
+    def evaluate(values: Array) -> tuple[Array, Array, Array]:
+        factor, pivots = unrolled.cholesky(_with_multipliers(constraints, matrix, values))
+        x = unrolled.backward(factor, pivots, unrolled.forward(factor, pivots, list(vector)))
+        slope = _off(constraints, x)
+        halves = [unrolled.forward(factor, pivots, p) for p in _products(constraints, x)]
+        curvature = [[2 * unrolled.dot(a, b) for b in halves] for a in halves]
+        step = unrolled.solve(curvature, slope)
+        length = unrolled.dot(x, x)
+        off = sum(jnp.abs(value) for value in slope) / (length + 1)
+        return jnp.stack(x), jnp.stack(step), off
+
+    def body(state: tuple) -> tuple:
+        index, values, step, x, off = state
+        trial = values + step
+        new_x, new_step, new_off = evaluate(trial)
+        better = new_off < off
+        # Comparisons with NaN are false: a trial outside is not better.
+        outside_at_first = (index == 0) & ~better
+        step = jnp.where(better, new_step, CUT * step)
+        step = jnp.where(outside_at_first, inside - start, step)
+        values = jnp.where(better, trial, values)
+        values = jnp.where(outside_at_first, start, values)
+        return (
+            index + 1,
+            values,
+            step,
+            jnp.where(better, new_x, x),
+            jnp.where(better, new_off, off),
+        )
+
+    def unfinished(state: tuple) -> Bool[Array, ""]:
+        index, _, _, _, off = state
+        return (index < NEWTON_STEPS) & jnp.any(off > MET * jnp.finfo(off.dtype).eps)
+
+    state = (
+        jnp.zeros((), jnp.int32),
+        start,
+        jnp.zeros_like(start),
+        jnp.full((6, lanes), jnp.nan, vector.dtype),
+        jnp.full(lanes, jnp.inf, vector.dtype),
+    )
+    _, values, _, x, _ = jax.lax.while_loop(unfinished, body, state)
+    return x, values
+
+
+@_optimum.defjvp
+@in_standard_promotion
+def _optimum_jvp(estimate: tuple[str, ...], primals: tuple, tangents: tuple) -> tuple:
+    constraints = CONSTRAINTS[estimate]
+    matrix, vector = primals
+    x, values = _optimum(estimate, matrix, vector)
+    factor, pivots = unrolled.cholesky(_with_multipliers(constraints, matrix, values))
+    moved = tangents[1] - jnp.einsum("ijl,jl->il", tangents[0], x)
+    half = unrolled.forward(factor, pivots, list(moved))
+    halves = [unrolled.forward(factor, pivots, p) for p in _products(constraints, list(x))]
+    curvature = [[unrolled.dot(a, b) for b in halves] for a in halves]
+    change = unrolled.solve(curvature, [unrolled.dot(each, half) for each in halves])
+    left = [half[i] - unrolled.dot([each[i] for each in halves], change) for i in range(6)]
+    slope = jnp.stack(unrolled.backward(factor, pivots, left))
+    return (x, values), (slope, jnp.stack(change))
+
+
+def _multipliers(constraints: Constraints, matrix: Array, vector: Array, x: Array) -> Array:
+    """Least squares for the multipliers that make x stationary."""
+    products = _products(constraints, list(x))
+    rest = vector - jnp.einsum("ijl,jl->il", matrix, x)
+    gram = [[unrolled.dot(a, b) for b in products] for a in products]
+    return jnp.stack(unrolled.solve(gram, [unrolled.dot(p, list(rest)) for p in products]))
+
+
+def _feasible(x: Float[Array, "6 lanes"], constraints: Constraints) -> Float[Array, "6 lanes"]:
+    """The nearest orthonormal pair, with the scales that are free."""
+    pair = x.reshape(2, 3, -1)
+    lengths = jnp.sqrt(jnp.sum(pair**2, axis=1))
+    a, b = pair[0] / lengths[0], pair[1] / lengths[1]
+    # The nearest orthonormal pair has the sum and the difference for its diagonals.
+    plus, minus = a + b, a - b
+    plus = plus / jnp.sqrt(jnp.sum(plus**2, axis=0))
+    minus = minus / jnp.sqrt(jnp.sum(minus**2, axis=0))
+    half = np.sqrt(0.5)
+    one = jnp.ones_like(lengths[0])
+    first, second = {
+        (): (one, one),
+        ("common",): (0.5 * (lengths[0] + lengths[1]),) * 2,
+        ("axial",): (one, lengths[1]),
+    }.get(constraints.free, (lengths[0], lengths[1]))
+    return jnp.concatenate([half * first * (plus + minus), half * second * (plus - minus)])
+
+
+def _gap(
+    constraints: Constraints, matrix: Array, vector: Array, x: Array, values: Array
+) -> tuple[Float[Array, " lanes"], Bool[Array, " lanes"]]:
+    """f(x) less the bound that the multipliers prove, and whether M is positive definite."""
+    rows = _with_multipliers(constraints, matrix, values)
+    factor, pivots = unrolled.cholesky(rows)
+    rest = [a - b for a, b in zip(unrolled.apply(rows, list(x)), vector, strict=True)]
+    half = unrolled.forward(factor, pivots, rest)
+    largest = sum(matrix[i, i] for i in range(6))
+    least = 1 / jnp.max(jnp.stack(pivots), axis=0) ** 2
+    return unrolled.dot(half, half), least > SINGULAR * largest

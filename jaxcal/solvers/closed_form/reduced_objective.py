@@ -1,0 +1,265 @@
+"""Eq. 7 with the target and the image's origin eliminated: six unknowns instead of twelve.
+
+With r1 and r3 the lateral and axial columns of X's rotation, s1 and s3 the pixel scales and
+a1 = s1 r1, a3 = s3 r3, the residual of image i in Eq. 7 is linear in (a1, a3, t, c):
+
+    e_i = R_i (u_i a1 + v_i a3 + t) + b_i - c.
+
+Linear least squares gives c and t for any a1, a3, and what remains of Eq. 7 is
+
+    f(x) = |C x + g|^2 + rest,    x = (a1, a3), C upper triangular, 6 x 6.
+
+Only the constraints on x depend on which scales are known (:data:`CONSTRAINTS`). The second column
+r2 = r3 x r1 does not occur, so no reflection can arise. A known offset f of the transducer's face
+turns v_i a3 into v_i a3 + f r3, which t takes up, so that the form is exact with it as well.
+
+This module needs numpy only. It holds no solver: :mod:`jaxcal.solvers.closed_form.single` minimises
+f, :mod:`jaxcal.solvers.closed_form.certificate` bounds it from below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.runtime.array_types import Bool, Float
+
+if TYPE_CHECKING:
+    from jaxcal.data.problem import Problem
+    from jaxcal.data.recording import Images, Recording
+
+FEWEST_IMAGES = 4
+"""Fewer give fewer than 12 equations."""
+
+RANK_TOLERANCE = 1e-11
+"""Singular values below this share of the largest possible one count as zero."""
+
+ROUNDING = 64
+"""Objectives are known up to this many roundings of the sum of squares of the data."""
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """What is known of the scales: x' A_j x = e_j for every j.
+
+    Attributes:
+        matrices: (k, 6, 6), A_j.
+        values: (k,), e_j.
+        free: which scales are unknown: ``()``, ``("common",)``, ``("axial",)`` or
+            ``("lateral", "axial")``.
+    """
+
+    matrices: Float[np.ndarray, "k 6 6"]
+    values: Float[np.ndarray, " k"]
+    free: tuple[str, ...]
+
+
+def _constraints() -> dict[tuple[str, ...], Constraints]:
+    one, two = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
+    both = np.array([[0.0, 1.0], [1.0, 0.0]])
+    table = {
+        (): ([one, two, both], [1.0, 1.0, 0.0], ()),
+        ("scale",): ([both], [0.0], ("lateral", "axial")),
+        ("common-scale",): ([one - two, both], [0.0, 0.0], ("common",)),
+        ("sound-speed",): ([one, both], [1.0, 0.0], ("axial",)),
+    }
+    return {
+        estimate: Constraints(
+            np.stack([np.kron(each, np.eye(3)) for each in small]), np.array(values), free
+        )
+        for estimate, (small, values, free) in table.items()
+    }
+
+
+CONSTRAINTS = _constraints()
+"""By what is estimated beside X and the target."""
+
+
+@dataclass(frozen=True)
+class ImageData:
+    """The images in use as plain arrays.
+
+    Attributes:
+        rotations: (n, 3, 3), of the poses.
+        translations: (n, 3), of the poses, mm.
+        points: (n, 2), what the scales multiply: [lateral, range] at the nominal spacing, mm.
+        face_offset: added to the range after scaling, mm.
+        spacing: (2,) nominal mm per px; ones for points in mm.
+        pixels: whether the measurements are pixels.
+    """
+
+    rotations: Float[np.ndarray, "n 3 3"]
+    translations: Float[np.ndarray, "n 3"]
+    points: Float[np.ndarray, "n 2"]
+    face_offset: float
+    spacing: Float[np.ndarray, 2]
+    pixels: bool
+
+
+@dataclass(frozen=True)
+class ReducedObjective:
+    """f(x) = |factor x + shift|^2 + rest, and how t and c follow from x.
+
+    Attributes:
+        factor: (6, 6), C, upper triangular; its rank may be less than 6.
+        shift: (6,), g, mm.
+        rest: mm^2.
+        resolution: f is known up to this much, mm^2 (rounding).
+        images: number of images in use.
+        origin_determined: whether the poses determine t and c (not if all rotations share an axis).
+        origin_map: (3, 7), t of the mean point as a linear function of (x, 1).
+        target_map: (3, 10), c as a linear function of (t of the mean point, x, 1), mm.
+        mean: (2,), mean of the points, mm.
+        constraints: on x.
+    """
+
+    factor: Float[np.ndarray, "6 6"]
+    shift: Float[np.ndarray, 6]
+    rest: float
+    resolution: float
+    images: int
+    origin_determined: bool
+    origin_map: Float[np.ndarray, "3 7"]
+    target_map: Float[np.ndarray, "3 10"]
+    mean: Float[np.ndarray, 2]
+    constraints: Constraints
+
+    def __call__(self, x: Float[np.ndarray, "*starts 6"]) -> Any:
+        """f(x), mm^2: a number, or one for every start."""
+        return np.sum((x @ self.factor.T + self.shift) ** 2, axis=-1) + self.rest
+
+    def origin_and_target(
+        self, x: Float[np.ndarray, 6]
+    ) -> tuple[Float[np.ndarray, 3], Float[np.ndarray, 3]]:
+        """The t and c that minimise Eq. 7 for x (those of least norm where several do), mm."""
+        of_mean = self.origin_map @ np.append(x, 1.0)
+        target = self.target_map @ np.concatenate([of_mean, x, [1.0]])
+        return of_mean - self.mean[0] * x[:3] - self.mean[1] * x[3:], target
+
+
+def image_data(
+    problem: Problem | Recording | Images, estimate: tuple[str, ...]
+) -> tuple[ImageData, Constraints]:
+    """The images in use and the constraints, from whatever a caller holds.
+
+    Raises:
+        InputError: unknown names, a scale where there is none, or unusable images.
+    """
+    estimate = tuple(estimate)
+    source: Any = getattr(problem, "calibration", problem)
+    if getattr(source, "kind", None) == "time_of_flight":
+        from jaxcal.data.problem import Problem
+
+        source = Problem.from_recording(problem)  # pyright: ignore[reportArgumentType]
+    if hasattr(source, "kind"):
+        pixels, known = source.kind == "pixel", source.spacing_mm is not None
+        spacing = np.asarray(source.spacing_mm, dtype=float) if known else np.ones(2)
+        known, face = known or not pixels, float(source.face_offset_mm)
+    else:
+        pixels, known = source.pixels, source.spacing_known
+        spacing, face = np.asarray(source.spacing, dtype=float), source.face_offset
+    check_estimate(estimate, pixels, known)
+    mask = np.asarray(source.mask)
+    if mask.ndim != 1:
+        raise InputError(f"one problem is wanted, not a batch with axes {mask.shape[:-1]}")
+    poses, measurements = (
+        np.asarray(values, dtype=float) for values in (source.poses, source.measurements)
+    )
+    data = used_images(poses, measurements, mask > 0, spacing, float(face), pixels)
+    return data, CONSTRAINTS[estimate]
+
+
+def check_estimate(estimate: tuple[str, ...], pixels: bool, spacing_known: bool) -> None:
+    """Refuse what has no closed form, and scales that are not there or not known.
+
+    Raises:
+        InputError: says which.
+    """
+    if estimate not in CONSTRAINTS:
+        named = " or ".join(repr(key) for key in CONSTRAINTS)
+        raise InputError(f"no closed form for estimate={estimate!r}; there is one for {named}")
+    scaled = bool({"scale", "common-scale"} & set(estimate))
+    if scaled and not pixels:
+        raise InputError("the points are in mm already: there is no pixel scale to estimate")
+    if not scaled and not spacing_known:
+        raise InputError('the pixels have no spacing_mm: give it, or estimate=("scale",)')
+
+
+def used_images(
+    poses: Float[np.ndarray, "n 4 4"],
+    measurements: Float[np.ndarray, "n 2"],
+    mask: Bool[np.ndarray, " n"],
+    spacing: Float[np.ndarray, 2],
+    face_offset: float,
+    pixels: bool,
+) -> ImageData:
+    """Arrays without the images that are left out.
+
+    Raises:
+        InputError: NaN, Inf, or fewer than 4 used images.
+    """
+    if np.count_nonzero(mask) < FEWEST_IMAGES:
+        raise InputError(
+            f"{np.count_nonzero(mask)} used images are too few: at least {FEWEST_IMAGES} are needed"
+        )
+    for name, values in (("poses", poses), ("measurements", measurements)):
+        bad = mask & ~np.isfinite(values).reshape(len(mask), -1).all(axis=1)
+        if bad.any():
+            raise InputError(f"{name} of image {np.flatnonzero(bad)[0]} hold NaN or Inf")
+    used = poses[mask]
+    points = measurements[mask] * spacing
+    return ImageData(used[:, :3, :3], used[:, :3, 3], points, face_offset, spacing, pixels)
+
+
+def reduce(data: ImageData, constraints: Constraints) -> ReducedObjective:
+    """Eliminate c, then t, by orthogonal transformations.
+
+    Squares of the factor are never formed, so that f and the distance of f(x) from its minimum keep
+    their digits where the data are exact or the poses nearly degenerate.
+    """
+    count = len(data.points)
+    points = data.points.copy()
+    # A sound speed multiplies the whole range, a pixel scale only what was measured in pixels.
+    if not constraints.free or constraints.free == ("axial",):
+        points[:, 1] += data.face_offset
+    mean, centre = points.mean(axis=0), data.translations.mean(axis=0)
+    points -= mean
+    away = data.translations - centre
+    columns = np.concatenate(
+        [
+            data.rotations,
+            data.rotations * points[:, :1, None],
+            data.rotations * points[:, 1:, None],
+            away[:, :, None],
+        ],
+        axis=2,
+    )
+    # c is the mean of what the images see; deviations from it are what remains.
+    target = columns.mean(axis=0)
+    columns = (columns - target).reshape(3 * count, 10)
+    target[:, 9] += centre
+    left, values, right = np.linalg.svd(columns[:, :3], full_matrices=False)
+    rank = int(np.count_nonzero(values > RANK_TOLERANCE * np.sqrt(count)))
+    left, right = left[:, :rank], right[:rank]
+    others = columns[:, 3:]
+    along = left.T @ others
+    others = others - left @ along
+    # Once more, against rounding where the rotations hardly differ.
+    others = others - left @ (left.T @ others)
+    triangle = np.asarray(np.linalg.qr(others, mode="r"))
+    size = float(np.sum(away**2) + np.sum(points**2))
+    return ReducedObjective(
+        factor=triangle[:6, :6],
+        shift=triangle[:6, 6],
+        rest=float(triangle[6, 6] ** 2),
+        resolution=ROUNDING * float(np.finfo(float).eps) * size,
+        images=count,
+        origin_determined=rank == 3,
+        origin_map=-right.T @ (along / values[:rank, None]),
+        target_map=target,
+        mean=mean,
+        constraints=constraints,
+    )

@@ -1,0 +1,169 @@
+"""A lower bound on Eq. 7 from a small semidefinite program, where three multipliers are too few.
+
+The dual of :mod:`jaxcal.solvers.closed_form.single` knows that a1 and a3 are orthogonal and of
+known length. More is true of a rotation: rows are orthonormal as columns are, and every column is
+the cross product of the two others. Each of these is a quadratic equation v' B_j v = 0 in v = (1,
+a1, a2, a3), or in v = (1, s, a1, a2, a3) with one common unknown scale s. With f = v' F v, any
+multipliers for which
+
+    Z = F - bound e0 e0' + sum_j lambda_j B_j
+
+is positive definite prove f >= bound: for a v that satisfies the equations, 0 <= v'Z v = f - bound.
+The largest such bound is found by a barrier method on the 21 or 22 multipliers, bound + weight ln
+det Z with falling weight, Newton's method for each. The iterates are strictly feasible, so that the
+bound holds wherever the iteration stops; how good the solver was decides only how tight it is.
+
+References: Briales and Gonzalez-Jimenez, "Convex global 3D registration with Lagrangian duality",
+CVPR 2017 (the redundant rotation constraints); Boyd and Vandenberghe, "Convex Optimization",
+section 11.6 (the barrier method).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from jaxcal.runtime.array_types import Float
+from jaxcal.solvers.closed_form.reduced_objective import ReducedObjective
+
+FALL = 0.15
+"""By which the barrier's weight is multiplied when its problem is solved."""
+CENTRED = 0.3
+"""Newton decrement at which the weight falls."""
+MOST_STEPS = 300
+
+
+@dataclass(frozen=True)
+class Relaxation:
+    """What the program proves.
+
+    Attributes:
+        gap: f at the given x less the proved bound, in f's unit; never negative.
+        x: (6,), the relaxation's own idea of the minimiser; it need not be a rotation.
+    """
+
+    gap: float
+    x: Float[np.ndarray, 6]
+
+
+@cache
+def _equations(scaled: bool) -> Float[np.ndarray, "m v v"]:
+    """Orthonormal basis of the matrices B_j; with a common scale s takes the place of 1."""
+    size, unit = (11, 1) if scaled else (10, 0)
+    first = size - 9
+
+    def column(k: int) -> list[int]:
+        return [first + 3 * k + i for i in range(3)]
+
+    found = []
+
+    def equation(*terms: tuple[int, int, float]) -> None:
+        matrix = np.zeros((size, size))
+        for i, j, value in terms:
+            matrix[i, j] += value / 2
+            matrix[j, i] += value / 2
+        found.append(matrix.ravel())
+
+    for i, j in itertools.combinations_with_replacement(range(3), 2):
+        right = (unit, unit, -1.0 if i == j else 0.0)
+        equation(*((a, b, 1.0) for a, b in zip(column(i), column(j), strict=True)), right)
+        equation(*((column(k)[i], column(k)[j], 1.0) for k in range(3)), right)
+    for i in range(3):
+        a, b, c = column(i), column((i + 1) % 3), column((i + 2) % 3)
+        for k in range(3):
+            p, q = (k + 1) % 3, (k + 2) % 3
+            equation((a[p], b[q], 1.0), (a[q], b[p], -1.0), (unit, c[k], -1.0))
+    # The rows' trace repeats the columns'.
+    _, values, right = np.linalg.svd(np.array(found), full_matrices=False)
+    return right[values > 1e-9].reshape(-1, size, size)
+
+
+def lower_bound(
+    reduced: ReducedObjective, x: Float[np.ndarray, 6], enough: float
+) -> Relaxation | None:
+    """Bound f from below.
+
+    Args:
+        reduced: with known scales or one common one.
+        x: a feasible point, near whose value of f the bound is wanted.
+        enough: stop when the gap is below this, mm^2.
+
+    Returns:
+        None where there is no such relaxation: scales of their own, or a common one with a singular
+        factor.
+    """
+    free = reduced.constraints.free
+    if free not in ((), ("common",)):
+        return None
+    scaled = bool(free)
+    equations = _equations(scaled)
+    count, size = equations.shape[:2]
+    first = size - 9
+    where = np.r_[first : first + 3, first + 6 : first + 9]
+    unit = float(np.linalg.norm(reduced.factor, 2)) ** 2
+    if unit == 0:
+        return None
+    squared = reduced.factor.T @ reduced.factor / unit
+    slope = reduced.factor.T @ reduced.shift / unit
+    cost = np.zeros((size, size))
+    cost[np.ix_(where, where)] = squared
+    cost[0, where] = cost[where, 0] = slope
+    # So that the bound sought is 0: f(x) = |Cx + g|^2 + rest.
+    cost[0, 0] = -(x @ squared @ x + 2 * slope @ x)
+    shape = np.zeros(size)
+    if scaled:
+        least = float(np.linalg.eigvalsh(squared)[0])
+        if least < 1e-12:
+            return None
+        shape[1:] = least * np.array([0.5, *[-0.5] * 3, *[0.5] * 3, *[-0.5] * 3])
+    else:
+        shape[1:] = 1.0
+        shape[0] = -3.0
+    start = np.diag(shape)
+    matrix = cost + start
+    # Schur's complement of the first row, and room below it.
+    rest = np.linalg.solve(matrix[1:, 1:], matrix[1:, 0])
+    bound = float(matrix[0, 0] - matrix[0, 1:] @ rest) - 1.0
+    corner = np.zeros((1, size, size))
+    corner[0, 0, 0] = -1.0
+    directions = np.concatenate([corner, equations])
+    multipliers = np.append(bound, np.einsum("jkl,kl->j", equations, start))
+    goal = np.zeros(count + 1)
+    goal[0] = 1.0
+    weight = max(-bound, 1e-3) / size
+    lower = np.linalg.cholesky(cost + np.tensordot(multipliers, directions, 1))
+    best = -bound
+    for _ in range(MOST_STEPS):
+        inverse = np.linalg.inv(lower)
+        turned = (inverse @ directions @ inverse.T).reshape(count + 1, -1)
+        slope_of_barrier = turned @ np.eye(size).ravel()
+        curvature = turned @ turned.T
+        step = np.linalg.solve(
+            curvature + 1e-14 * np.diag(np.diag(curvature)), goal / weight + slope_of_barrier
+        )
+        decrement = float(np.sqrt(max(step @ curvature @ step, 0.0)))
+        length = 1.0 if decrement < 0.25 else 1 / (1 + decrement)
+        for _ in range(30):
+            trial = multipliers + length * step
+            try:
+                lower = np.linalg.cholesky(cost + np.tensordot(trial, directions, 1))
+            except np.linalg.LinAlgError:
+                length /= 2
+                continue
+            multipliers = trial
+            break
+        else:
+            break
+        best = min(best, -float(multipliers[0]))
+        if decrement < CENTRED:
+            # On the central path the bound is within size * weight of the largest one.
+            if best <= enough / unit or weight * size < 0.02 * best or weight < 1e-15:
+                break
+            weight *= FALL
+    inverse = np.linalg.inv(lower)
+    moments = inverse.T @ inverse
+    ideal = moments[where, 0] / moments[0, 0]
+    return Relaxation(max(best, 0.0) * unit, ideal)

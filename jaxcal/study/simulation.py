@@ -1,0 +1,437 @@
+"""Simulated experiments after the paper's section 3.1, as a pure function of a key.
+
+The target is imaged in n poses: lateral position and depth uniform over the field, the elevational
+offset after one of the laws of :mod:`jaxcal.study.offsets`, the probe turned about a random axis by
+up to 30 degrees, and white noise on the distance to every element; lateral position and range are
+then segmented from the distances by least squares on Eq. 5. The tracker may err, too. Test images
+lie in the plane and carry no noise. The paper leaves the ranges open; ``experiments/paper_tables``
+says which choices come near its tables (``test_fraction`` is a fitted one).
+
+A curvilinear array sees a sector: the direction is uniform within 0.9 of its half angle, the depth
+counts from the arc. Its data are the distances themselves; the points beside them are the in-plane
+fit, which is what an image would show.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex64, Float, Key
+
+from jaxcal import InputError
+from jaxcal.data.geometry import matrix_from_rotation
+from jaxcal.data.probe import L14_5, CurvilinearProbe, Probe
+from jaxcal.data.problem import Channels, Problem, is_traced
+from jaxcal.data.recording import MINIMUM_IMAGES, Recording, Truth, make_images
+from jaxcal.data.segmentation.deviations import fit_deviations, halves
+from jaxcal.data.segmentation.time_of_flight import fit_in_plane
+from jaxcal.model import unrolled
+from jaxcal.runtime.compiler import computed_once, quick_to_compile
+from jaxcal.runtime.precision import in_own_modes, require_float64
+from jaxcal.study import draws
+from jaxcal.study.offsets import OffsetLaw, check_law, standard_offsets
+
+Scalar = float | Float[Array, ""]
+"""A number of a protocol: a plain one, or one that is traced and so shared by a compiled program
+among all the values it may take."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The distributions of a simulated experiment.
+
+    Counts, the law of the offsets and the probe shape the program that draws; every other field
+    may be a traced number (``dataclasses.replace`` inside the transformed function).
+
+    Attributes:
+        images: calibration images.
+        test_images: noise-free in-plane test images.
+        elevation_mm: bound (uniform, one-sided, triangular) or SD (normal, heavy-tailed) of the
+            elevational offsets.
+        elevation_distribution: their law, see :mod:`jaxcal.study.offsets`.
+        noise_mm: SD of the noise on each element's distance.
+        lateral_mm: the target's lateral position is uniform within +- this (linear probes).
+        depth_mm: its depth is uniform between these; curvilinear probes: its range from the arc.
+        rotation_rad: the probe is turned by up to this about a random axis.
+        test_fraction: test positions cover this fraction of the field (0.75: fitted).
+        probe: the transducer.
+        sector: curvilinear probes: directions cover this fraction of the array's half angle.
+        raw: keep the distances that the points come from; curvilinear probes always do.
+        tracker_mm: SD of the tracked position of every calibration pose, each axis.
+        tracker_rad: SD of its tracked rotation, about each of the probe's axes.
+    """
+
+    images: int = 50
+    test_images: int = 50
+    elevation_mm: Scalar = 1.0
+    elevation_distribution: OffsetLaw = "uniform"
+    noise_mm: Scalar = 0.5
+    lateral_mm: Scalar = 29.25
+    depth_mm: tuple[Scalar, Scalar] = (10.0, 90.0)
+    rotation_rad: Scalar = float(np.radians(30.0))
+    test_fraction: Scalar = 0.75
+    probe: Probe = L14_5
+    sector: Scalar = 0.9
+    raw: bool = False
+    tracker_mm: Scalar = 0.0
+    tracker_rad: Scalar = 0.0
+
+    def __post_init__(self) -> None:
+        if not MINIMUM_IMAGES <= self.images <= 100_000:
+            raise InputError(f"images must be between {MINIMUM_IMAGES} and 100000")
+        for name, largest, unit in (
+            ("elevation_mm", 1000, "mm"), ("noise_mm", 1000, "mm"),
+            ("tracker_mm", 1000, "mm"), ("tracker_rad", 1, "rad"),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not (is_traced(value) or (np.isfinite(value) and 0 <= value <= largest)):
+                raise InputError(f"{name} must be between 0 and {largest} {unit}, not {value}")
+        check_law(self.elevation_distribution)
+
+
+class Experiment(eqx.Module):
+    """One simulated experiment: what is measured, and what is true.
+
+    Attributes:
+        poses: B_i, probe -> tracker, mm.
+        points: segmented [lateral, range], mm.
+        covariance: of the points, mm^2; zero without noise.
+        elevation: true offsets y_i, mm.
+        image_to_probe: true X, mm.
+        point: true target in the tracker's frame, mm.
+        test_poses: poses of the test images.
+        test_points: their exact [lateral, range], mm.
+        distances: measured distance of the target to every element, mm, or None (not kept).
+    """
+
+    poses: Float[Array, "n 4 4"]
+    points: Float[Array, "n 2"]
+    covariance: Float[Array, "n 2 2"]
+    elevation: Float[Array, " n"]
+    image_to_probe: Float[Array, "4 4"]
+    point: Float[Array, 3]
+    test_poses: Float[Array, "m 4 4"]
+    test_points: Float[Array, "m 2"]
+    distances: Float[Array, "n elements"] | None = None
+
+    @in_own_modes
+    def problem(self, max_elevation: float | None = None, probe: Probe | None = None) -> Problem:
+        """The calibration images as a :class:`Problem` (traceable; without covariances).
+
+        Args:
+            max_elevation: bound on the offsets, mm.
+            probe: the protocol's, where the distances are to be handed over beside the points.
+        """
+        mask = jnp.ones(self.points.shape[0], self.points.dtype)
+        channels = None
+        if probe is not None and self.distances is not None:
+            heard = (self.distances > 0).astype(mask.dtype)
+            positions = jnp.asarray(probe.element_positions(), mask.dtype)
+            channels = Channels(heard * self.distances, heard, positions)
+        return Problem(
+            channels=channels,
+            sound_speed=None if probe is None else jnp.asarray(probe.sound_speed_m_s, mask.dtype),
+            delay=None if probe is None else jnp.asarray(probe.delay_s, mask.dtype),
+            curved=isinstance(probe, CurvilinearProbe),
+            poses=self.poses,
+            measurements=self.points,
+            mask=mask,
+            spacing=jnp.ones(2, mask.dtype),
+            face_offset=jnp.zeros((), mask.dtype),
+            max_elevation=None if max_elevation is None else max_elevation * mask,
+        )
+
+
+class Numbers(eqx.Module):
+    """The random numbers of one experiment but the noise, functions of its key and counts alone.
+
+    Attributes:
+        axis: of every rotation: of X, of the images', of the test images' poses.
+        turn: how far about it, as a part of the largest angle.
+        place: X's origin and the target, in their SDs.
+        position: of images and test images in their fields, each way between -1 and 1.
+        offset: of the law's size 1.
+        tracker: standard normals of the tracker's six errors, or None.
+    """
+
+    axis: Float[Array, "3 images"]
+    turn: Float[Array, " images"]
+    place: Float[Array, " 6"]
+    position: Float[Array, "2 others"]
+    offset: Float[Array, " n"]
+    tracker: Float[Array, "6 n"] | None
+
+
+_AXIS, _TURN, _PLACE, _POSITION, _NOISE, _TRACKER = range(6)
+"""Streams of :mod:`jaxcal.study.draws`; the offsets' key is folded in: their law has several."""
+
+
+class Planes(eqx.Module):
+    """Where everything is in one experiment, images minor, as the fused solvers read it.
+
+    Attributes:
+        rotation: R_i by rows. origin: b_i, mm.
+        exact: true lateral position and range (curvilinear: depth), mm. elevation: y_i, mm.
+        true_rotation: of X. true_translation: of X, mm. target: c, mm.
+        test_rotation: of the test images. test_origin: theirs, mm. test_point: exact lateral
+            position and range, mm.
+    """
+
+    rotation: Float[Array, "9 n"]
+    origin: Float[Array, "3 n"]
+    exact: Float[Array, "2 n"]
+    elevation: Float[Array, " n"]
+    true_rotation: Float[Array, "3 3"]
+    true_translation: Float[Array, " 3"]
+    target: Float[Array, " 3"]
+    test_rotation: Float[Array, "9 m"]
+    test_origin: Float[Array, "3 m"]
+    test_point: Float[Array, "2 m"]
+
+
+@in_own_modes
+def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
+    """Draw one experiment; vmap over keys for a batch.
+
+    Args:
+        key: a JAX key; for trial k of a study ``jax.random.fold_in(root, k)``, so that draws do not
+            depend on chunks or devices.
+        protocol: the distributions.
+    """
+    require_float64("jaxcal.simulate")
+    numbers, noise = draw(key, protocol), draw_noise(key, protocol)
+    planes = arrange(numbers, protocol)
+    distances = _distances(planes, noise, protocol)
+    if isinstance(protocol.probe, CurvilinearProbe):
+        fit = fit_in_plane(distances, jnp.asarray(protocol.probe.element_positions()))
+        points, inverse, kept = fit.position, fit.inverse_normal, True
+    else:
+        elements, kept = protocol.probe.element_lateral(), protocol.raw
+        size = jnp.asarray(protocol.noise_mm, planes.exact.dtype)
+        points = jnp.stack(
+            fit_deviations(noise, size, planes.exact[0], planes.exact[1], elements), axis=1
+        )
+        inverse = _inverse_normal(points, elements)
+    return Experiment(
+        poses=_matrices(planes.rotation, planes.origin),
+        points=points,
+        covariance=protocol.noise_mm**2 * inverse,
+        elevation=planes.elevation,
+        image_to_probe=matrix_from_rotation(planes.true_rotation, planes.true_translation),
+        point=planes.target,
+        test_poses=_matrices(planes.test_rotation, planes.test_origin),
+        test_points=planes.test_point.T,
+        distances=distances if kept else None,
+    )
+
+
+def draw(key: Key[Array, ""], protocol: Protocol) -> Numbers:
+    """All random numbers of one experiment; of the protocol only what is static counts."""
+    return computed_once(lambda: _numbers(key, protocol), protocol.noise_mm)
+
+
+def _numbers(key: Key[Array, ""], protocol: Protocol) -> Numbers:
+    n, images = protocol.images, protocol.images + protocol.test_images
+    position = draws.uniforms(key, _POSITION, 2 * images).reshape(2, images)
+    tracker = draws.normals(key, _TRACKER, 6 * n).reshape(6, n) if _tracked(protocol) else None
+    law = protocol.elevation_distribution
+    return Numbers(
+        axis=draws.unit_vectors(key, _AXIS, 1 + images),
+        turn=draws.uniforms(key, _TURN, 1 + images),
+        place=draws.normals(key, _PLACE, 6),
+        position=2 * position - 1,
+        offset=standard_offsets(jax.random.fold_in(key, 0), law, n),
+        tracker=tracker,
+    )
+
+
+def draw_noise(key: Key[Array, ""], protocol: Protocol) -> Complex64[Array, "n half"]:
+    """Standard normals of the elements.
+
+    Those of their first half are the real parts, those of the others the imaginary ones.
+    """
+    shape = (protocol.images, -(-protocol.probe.elements // 2))
+    return computed_once(lambda: draws.normal_pairs(key, _NOISE, shape), protocol.noise_mm)
+
+
+def arrange(numbers: Numbers, protocol: Protocol) -> Planes:
+    """Poses and targets as the random numbers say; nothing is measured yet."""
+    probe, n = protocol.probe, protocol.images
+    curved = isinstance(probe, CurvilinearProbe)
+    witness = protocol.noise_mm
+    width = protocol.sector * probe.half_angle_rad if curved else protocol.lateral_mm
+    shallow, deep = protocol.depth_mm
+    middle, half = 0.5 * (shallow + deep), 0.5 * abs(deep - shallow)
+    truth = _rotation(numbers.axis[:, :1], numbers.turn[:1] * np.pi, witness)
+    truth = jnp.stack(truth).reshape(3, 3)
+    translation, target = 50.0 * numbers.place[:3], 100.0 * numbers.place[3:]
+
+    def positions(drawn: Array, fraction: Scalar) -> tuple[Array, Array]:
+        across, depth = fraction * width * drawn[0], middle + fraction * half * drawn[1]
+        if not isinstance(probe, CurvilinearProbe):
+            return across, depth
+        return _from_sector(across, depth, probe.radius_mm)
+
+    lateral, depth = positions(numbers.position[:, :n], 1.0)
+    across, far = positions(numbers.position[:, n:], protocol.test_fraction)
+    elevation = protocol.elevation_mm * numbers.offset
+    turns = _rotation(numbers.axis[:, 1:], numbers.turn[1:] * protocol.rotation_rad, witness)
+    rotation, test_rotation = [row[:n] for row in turns], [row[n:] for row in turns]
+
+    def origin(rotation: list[Array], in_image: list[Array | int]) -> list[Array]:
+        # Poses put the target where it was drawn: t_i = c - R_i X p_i.
+        in_probe = unrolled.apply([list(row) for row in truth], in_image)
+        in_probe = [a + b for a, b in zip(in_probe, translation, strict=True)]
+        turned = unrolled.apply(_rows(rotation), in_probe)
+        return [c - value for c, value in zip(target, turned, strict=True)]
+
+    tracked, origins = rotation, origin(rotation, [lateral, elevation, depth])
+    if numbers.tracker is not None:
+        slip = unrolled.rotation([protocol.tracker_rad * error for error in numbers.tracker[3:]])
+        tracked = [entry for row in unrolled.product(_rows(rotation), slip) for entry in row]
+        origins = [
+            value + protocol.tracker_mm * error
+            for value, error in zip(origins, numbers.tracker[:3], strict=True)
+        ]
+    exact = jnp.stack([lateral, depth if curved else jnp.hypot(elevation, depth)])
+    return Planes(
+        rotation=jnp.stack(tracked), origin=jnp.stack(origins), exact=exact,
+        elevation=elevation, true_rotation=truth, true_translation=translation, target=target,
+        test_rotation=jnp.stack(test_rotation),
+        test_origin=jnp.stack(origin(test_rotation, [across, 0, far])),
+        test_point=jnp.stack([across, far]),
+    )  # fmt: skip
+
+
+def _distances(
+    planes: Planes, noise: Complex64[Array, "n half"], protocol: Protocol
+) -> Float[Array, "n elements"]:
+    """What the elements measure, mm."""
+    probe = protocol.probe
+    if isinstance(probe, CurvilinearProbe):
+        target = jnp.stack([planes.exact[0], planes.elevation, planes.exact[1]], -1)
+        elements = jnp.asarray(probe.element_positions())
+        exact = jnp.linalg.norm(target[:, None] - elements, axis=-1)
+    else:
+        along = planes.exact[0][:, None] - jnp.asarray(probe.element_lateral())
+        exact = jnp.hypot(along, planes.exact[1][:, None])
+    return exact + protocol.noise_mm * jnp.concatenate(halves(noise, probe.elements), axis=1)
+
+
+def _inverse_normal(
+    points: Float[Array, "n 2"], elements: Float[np.ndarray, " elements"]
+) -> Float[Array, "n 2 2"]:
+    """Inverse of J'J of Eq. 5 at the points."""
+    along, distance = points[:, :1] - elements, points[:, 1:]
+    far = jnp.hypot(along, distance)
+    jx, jr = along / far, distance / far
+    a, b, c = jnp.sum(jx * jx, 1), jnp.sum(jx * jr, 1), jnp.sum(jr * jr, 1)
+    rows = [jnp.stack([c, -b], axis=-1), jnp.stack([-b, a], axis=-1)]
+    return jnp.stack(rows, axis=-2) / (a * c - b * b)[:, None, None]
+
+
+def _rotation(
+    axis: Float[Array, "3 count"], angle: Float[Array, " count"], witness: Scalar
+) -> list[Array]:
+    """Nine planes of rotations by angles (rad) about axes.
+
+    By quaternions, which need no normalisation.
+    """
+    half = angle / (4 * np.pi)
+    scalar, sine = computed_once(lambda: draws.circle(half), witness)
+    vector = [sine * component for component in axis]
+    double = 2 / (scalar * scalar + unrolled.dot(vector, vector))
+    lever = unrolled.cross(vector)
+    square = unrolled.product(lever, lever)
+    return [
+        unrolled.add(
+            float(i == j), double * unrolled.add(unrolled.times(scalar, lever[i][j]), square[i][j])
+        )
+        for i in range(3)
+        for j in range(3)
+    ]
+
+
+def _rows(planes: list[Array]) -> list[list[Array]]:
+    return [planes[3 * i : 3 * i + 3] for i in range(3)]
+
+
+def _matrices(rotation: Float[Array, "9 n"], origin: Float[Array, "3 n"]) -> Float[Array, "n 4 4"]:
+    return jax.vmap(matrix_from_rotation)(rotation.T.reshape(-1, 3, 3), origin.T)
+
+
+def _from_sector(
+    angle: Float[Array, " count"], depth: Float[Array, " count"], radius: float
+) -> tuple[Float[Array, " count"], Float[Array, " count"]]:
+    """Lateral and axial from the direction (rad) and the range from the arc."""
+    lateral = (radius + depth) * jnp.sin(angle)
+    return lateral, depth * jnp.cos(angle) - 2 * radius * jnp.sin(angle / 2) ** 2
+
+
+def _tracked(protocol: Protocol) -> bool:
+    """Whether the tracker errs; a traced size may be anything."""
+    sizes = (protocol.tracker_mm, protocol.tracker_rad)
+    return any(is_traced(size) or bool(size > 0) for size in sizes)
+
+
+def times_of_flight(
+    distances: Float[np.ndarray, "*batch elements"], probe: Probe, clock_hz: float | None = None
+) -> Float[np.ndarray, "*batch elements"]:
+    """One-way times as the electronics would report them, s.
+
+    Args:
+        distances: measured, mm; what noise made negative is no answer (NaN).
+        probe: its sound speed and delay apply.
+        clock_hz: the counter's frequency: times are rounded to its period; None: not at all.
+
+    Raises:
+        InputError: a clock that is not positive.
+    """
+    times = probe.time_of_flight_s(np.where(np.asarray(distances) > 0, distances, np.nan))
+    if clock_hz is None:
+        return times
+    if not (np.isfinite(clock_hz) and clock_hz > 0):
+        raise InputError(f"the clock needs a positive frequency in Hz, not {clock_hz}")
+    return np.round(times * clock_hz) / clock_hz
+
+
+@in_own_modes
+def simulate_recording(
+    protocol: Protocol, seed: int = 0, *, clock_hz: float | None = None
+) -> Recording:
+    """One simulated experiment as a :class:`Recording` with truth and test set.
+
+    Args:
+        protocol: the distributions; where it is ``raw`` or its probe curvilinear, the calibration
+            images hold times of flight, otherwise points. Test images always hold points.
+        seed: of the draws.
+        clock_hz: times of flight are rounded to this clock.
+    """
+    curved = isinstance(protocol.probe, CurvilinearProbe)
+    if clock_hz is not None and not (protocol.raw or curved):
+        raise InputError("a clock rounds times of flight: it needs a raw simulation")
+    flags = quick_to_compile(jax.default_backend())
+    program = jax.jit(simulate, static_argnums=1, compiler_options=flags)
+    experiment = program(jax.random.key(seed), protocol)
+    array = {name: np.asarray(value) for name, value in vars(experiment).items()}
+    if experiment.distances is None:
+        calibration = make_images(
+            array["poses"],
+            array["points"],
+            covariance=array["covariance"] if protocol.noise_mm > 0 else None,
+            where="simulation",
+        )
+    else:
+        times = times_of_flight(array["distances"], protocol.probe, clock_hz)
+        calibration = make_images(array["poses"], times, "time_of_flight", where="simulation")
+    return Recording(
+        calibration=calibration,
+        test=make_images(array["test_poses"], array["test_points"], where="simulation"),
+        truth=Truth(array["image_to_probe"], array["point"], array["elevation"]),
+        probe=protocol.probe,
+        source=f"simulation (seed {seed})",
+    )
