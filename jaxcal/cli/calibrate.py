@@ -422,7 +422,7 @@ def _resampled(
     draws: int | None,
 ) -> dict[str, Any]:
     """What cross-validation and bootstrap add to the record."""
-    from jaxcal.calibration.result import resampling
+    from jaxcal.calibration import resampling
     from jaxcal.data.problem import Problem
     from jaxcal.report.resampled import bootstrap_record, cross_validation_record
 
