@@ -26,13 +26,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import special
 
 from jaxcal import InputError
 from jaxcal.data.sound import WATER_M_S
+from jaxcal.diagnostics import probability
 from jaxcal.diagnostics.arrays import array_module, traceable
 from jaxcal.diagnostics.image_points import image_rows, point_jacobian
 from jaxcal.diagnostics.uncertainty import TUNED
@@ -46,9 +46,13 @@ DIRECTIONS = 1024
 """Directions over which the distribution of an error is averaged. Quantiles are right to 0.5 %,
 lower ends of errors along a single axis to 5 %."""
 
-_BISECTIONS = 30
 _RADII = 4000
 """Values of rho^2 between which its distribution is interpolated."""
+_AT_ONCE = 32
+_SPARSE = 16
+"""Every so many directions give a start."""
+_MOST_STEPS = 60
+_NEARLY = 3e-6
 
 
 @traceable
@@ -97,11 +101,7 @@ def transform_intervals(
     """
     _check_level(level)
     left = np.asarray(degrees_of_freedom(calibration), float)
-    factor = np.where(
-        np.isfinite(left),
-        special.stdtrit(np.where(np.isfinite(left), left, 1.0), 0.5 + 0.5 * level),
-        special.ndtri(0.5 + 0.5 * level),
-    )
+    factor = probability.student_quantile(left, 0.5 + 0.5 * level)
     variance = np.diagonal(calibration.numpy().covariance, axis1=-2, axis2=-1)
     return factor[..., None] * np.sqrt(variance)
 
@@ -281,19 +281,53 @@ def _length_quantile(
     """Quantile of the length of vectors with these variances along their axes."""
     dimensions = variances.shape[1]
     total = variances.sum(axis=1)
-    total = np.where(total > 0, total, 1.0)
-    # |L u|^2 of every direction, as a share of the trace.
-    along = (variances / total[:, None]) @ (_directions(dimensions) ** 2).T
-    along = np.maximum(along, 1e-300)
-    grid, below = _radial(dimensions, freedom)
-    low = np.full(len(variances), np.log(1e-8))
-    high = np.full(len(variances), np.log(1e8))
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        share = np.interp(middle[:, None] - np.log(along), grid, below).mean(axis=1)
-        low, high = np.where(share < chance, middle, low), np.where(share < chance, high, middle)
-    found = np.exp(0.25 * (low + high))
-    return found * np.sqrt(np.where(variances.sum(axis=1) > 0, total, 0.0))
+    shares = np.where(total[:, None] > 0, variances, 1.0)
+    shares = shares / shares.sum(axis=1, keepdims=True)
+    squares = (_directions(dimensions) ** 2).T
+    radial = _radial(dimensions, freedom)
+    found = np.empty(len(variances))
+    # A few vectors at a time stay in the processor's cache.
+    for first in range(0, len(variances), _AT_ONCE):
+        rows = slice(first, first + _AT_ONCE)
+        # |L u|^2 of every direction, as a share of the trace.
+        along = np.log(np.maximum(shares[rows] @ squares, 1e-300))
+        start = np.full(len(along), radial.quantile(chance) - np.log(dimensions))
+        near = _solve(along[:, ::_SPARSE], radial, chance, start, 1e-2)
+        found[rows] = _solve(along, radial, chance, near, _NEARLY)
+    return np.exp(0.5 * found) * np.sqrt(total)
+
+
+def _solve(
+    along: Float[np.ndarray, "m d"],
+    radial: _Radial,
+    chance: float,
+    start: Float[np.ndarray, " m"],
+    near: float,
+) -> Float[np.ndarray, " m"]:
+    """The logarithms of r^2 where the mean over the directions reaches a probability.
+
+    Newton's method on the probability's logarithm, within a bracket.
+
+    Args:
+        along: logarithms of |L u|^2.
+        radial: the distribution of rho^2.
+        chance: the probability.
+        start: where to begin.
+        near: length of the last step; the error is of the order of its square.
+    """
+    at = start
+    low, high = np.full(len(at), radial.first), np.full(len(at), radial.last)
+    for _ in range(_MOST_STEPS):
+        below, slope = radial.mean(at[:, None] - along)
+        low, high = np.where(below < chance, at, low), np.where(below < chance, high, at)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            after = at - np.log(below / chance) * below / slope
+        after = np.where((after >= low) & (after <= high), after, 0.5 * (low + high))
+        step = np.abs(after - at).max()
+        at = after
+        if step < near:
+            break
+    return at
 
 
 @cache
@@ -305,18 +339,60 @@ def _directions(dimensions: int) -> Float[np.ndarray, "d k"]:
         golden = (1 + golden) ** (1 / (dimensions + 1))
     steps = golden ** -np.arange(1, dimensions + 1)
     uniform = (0.5 + np.arange(1, DIRECTIONS + 1)[:, None] * steps) % 1.0
-    normal = special.ndtri(np.clip(uniform, 1e-9, 1 - 1e-9))
+    normal = probability.normal_quantile(np.clip(uniform, 1e-9, 1 - 1e-9))
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
+@dataclass(frozen=True)
+class _Radial:
+    """Probabilities that rho^2 is below values whose logarithms are evenly spaced.
+
+    Attributes:
+        first: the least logarithm.
+        last: the largest.
+        below: the probabilities.
+        rise: from each to the next.
+    """
+
+    first: float
+    last: float
+    below: Float[np.ndarray, " r"]
+    rise: Float[np.ndarray, " r"]
+
+    @property
+    def spacing(self) -> float:
+        """Between two logarithms."""
+        return (self.last - self.first) / (len(self.below) - 1)
+
+    def quantile(self, chance: float) -> float:
+        """The logarithm where a probability is reached, to the spacing."""
+        return self.first + self.spacing * int(np.searchsorted(self.below, chance))
+
+    def mean(
+        self, values: Float[np.ndarray, "m d"]
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """Mean probability, by linear interpolation, and its slope; ``values`` are overwritten."""
+        values -= self.first
+        values *= 1 / self.spacing
+        np.clip(values, 0.0, len(self.below) - 1, out=values)
+        left = values.astype(np.intp)
+        values -= left
+        rise = self.rise.take(left)
+        values *= rise
+        values += self.below.take(left)
+        return values.mean(axis=1), rise.mean(axis=1) / self.spacing
+
+
 @cache
-def _radial(dimensions: int, freedom: float) -> tuple[Any, Any]:
-    """Logarithms of rho^2, and the probability that it is below them."""
-    grid = np.linspace(np.log(1e-9), np.log(1e9), _RADII)
-    square = np.exp(grid)
+def _radial(dimensions: int, freedom: float) -> _Radial:
+    """The distribution of rho^2."""
+    first, last = np.log(1e-9), np.log(1e9)
+    square = np.exp(np.linspace(first, last, _RADII))
     if np.isfinite(freedom):
-        return grid, special.fdtr(dimensions, freedom, square / dimensions)
-    return grid, special.chdtr(dimensions, square)
+        below = probability.f_below(dimensions, freedom, square / dimensions)
+    else:
+        below = probability.chi_squared_below(dimensions, square)
+    return _Radial(float(first), float(last), below, np.diff(below, append=below[-1]))
 
 
 def _check_level(level: float) -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal.calibration.result import Status
+from jaxcal.diagnostics.probability import student_quantile
 from jaxcal.study.pipeline import bound_mm
 from jaxcal.study.spec import Condition, Spec
 from jaxcal.study.store import Store
@@ -101,13 +102,11 @@ def summarise(store: Store) -> list[Cell]:
 
 def mean_interval(values: np.ndarray) -> tuple[float, float, float] | None:
     """Mean and Student's 95 % interval of the finite values; None of fewer than two."""
-    from scipy.special import stdtrit
-
     values = values[np.isfinite(values)]
     if len(values) < 2:
         return None
     mean, error = values.mean(), values.std(ddof=1) / np.sqrt(len(values))
-    half = stdtrit(len(values) - 1, 0.5 + CONFIDENCE / 2) * error
+    half = float(student_quantile(len(values) - 1, 0.5 + CONFIDENCE / 2)) * error
     return float(mean), float(mean - half), float(mean + half)
 
 
