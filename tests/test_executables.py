@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -190,12 +191,12 @@ def test_another_installation_has_other_programs(monkeypatch):
 
 def test_a_change_of_the_sources_makes_another_installation(tmp_path, monkeypatch):
     home = tmp_path / "jaxcal"
-    shutil.copytree(Path(executables.__file__).parent, home)
-    monkeypatch.setattr(executables, "__file__", str(home / "executables.py"))
+    shutil.copytree(Path(executables.__file__).parents[1], home)
+    monkeypatch.setattr(executables, "__file__", str(home / "runtime" / "executables.py"))
     before = executables._sources()
     (home / "cli" / "main.py").write_text("# no program comes from here")
     assert executables._sources() == before
-    solver = home / "solve.py"
+    solver = home / "solvers" / "start.py"
     solver.write_text(solver.read_text() + "\nCHANGED = True\n")
     assert executables._sources() != before
 
@@ -399,6 +400,38 @@ def test_where_the_folder_lies(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     inside = "Library/Caches" if sys.platform == "darwin" else ".cache"
     assert program_cache.private_folder() == tmp_path / inside / "jaxcal" / "programs"
+
+
+def test_programs_of_jaxs_own_cache_are_not_kept_as_ours(tmp_path):
+    """An executable that JAX loaded from its cache cannot be serialised once more."""
+    environment = os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "xla"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    assert answer_of(child(env=environment)) == 1
+    assert program_cache.clear() == 1
+    assert answer_of(child(env=environment)) == 1
+    assert answer_of(child(env=environment)) == 0
+
+
+def test_a_program_that_loads_and_does_not_run_is_compiled_anew(monkeypatch):
+    class Broken:
+        def execute_sharded(self, arrays):
+            raise jax.errors.JaxRuntimeError("NOT_FOUND: Function iota_kernel not found")
+
+    check(run())
+    load = executables._load
+
+    def broken(key, device):
+        found = load(key, device)
+        return found and replace(found, executable=Broken())
+
+    monkeypatch.setattr(executables, "_load", broken)
+    check(run())
+    assert traced == [FACTOR] * 2
+    monkeypatch.setattr(executables, "_load", load)
+    check(run())
+    assert traced == [FACTOR] * 2
 
 
 # -- disks and deaths

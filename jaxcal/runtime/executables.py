@@ -23,6 +23,7 @@ import json
 import logging
 import os
 import platform
+import secrets
 import sys
 import time
 from collections import OrderedDict
@@ -74,9 +75,19 @@ class NotDescribableError(TypeError):
 
 @dataclass(frozen=True)
 class _Program:
+    """A program that runs here.
+
+    Attributes:
+        executable: jaxlib's.
+        device: where it runs.
+        result: what it returns, in words.
+        from_disk: it was loaded, not compiled.
+    """
+
     executable: Any
     device: Any
     result: Description
+    from_disk: bool
 
     def __call__(self, leaves: list[Any]) -> Any:
         arrays = jax.device_put(leaves, self.device)
@@ -128,15 +139,28 @@ def run(
     }, sort_keys=True)  # fmt: skip
     with _lock:
         turn = _being_made.setdefault(key, Lock())
+
+    def compiled() -> _Program:
+        return _compile(
+            lambda flat: _found(function)(*rebuild(described, flat), plan),
+            leaves,
+            device,
+            flags,
+            key,
+            label,
+        )
+
     with turn:  # threads that need the same program wait for one of them
-        program = _recall(key)
-        if program is None:
-            program = _load(key, device)
-        if program is None:
-            program = _compile(
-                lambda flat: _found(function)(*rebuild(described, flat), plan),
-                leaves, device, flags, key, label,
-            )  # fmt: skip
+        program = _recall(key) or _load(key, device) or compiled()
+        _remember(key, program)
+    try:
+        return program(leaves)
+    except jax.errors.JaxRuntimeError as error:
+        if not program.from_disk:
+            raise
+        _log.debug("a compiled program in the cache does not run: %s", error)
+    with turn:
+        program = compiled()
         _remember(key, program)
     return program(leaves)
 
@@ -183,7 +207,7 @@ def _load(key: str, device: Any) -> _Program | None:
     try:
         devices = xla_client.DeviceList((device,))
         executable = device.client.deserialize_executable(content, executable_devices=devices)
-        return _Program(executable, device, header["result"])
+        return _Program(executable, device, header["result"], from_disk=True)
     # Whatever jaxlib makes of it: a program that does not load is compiled anew.
     except Exception as error:
         _log.debug("a compiled program in the cache is not used: %s", error)
@@ -207,12 +231,15 @@ def _compile(
         results.append(describe(function(list(flat_leaves)), found))
         return found
 
+    # A name of its own keeps JAX's compilation cache from handing out a loaded executable: once
+    # more serialised, such a one lacks its machine code.
+    flat.__name__ = f"kept_{secrets.token_hex(8)}"
     place = jax.sharding.SingleDeviceSharding(device)
     shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place) for leaf in leaves]
     known = compiler.known(device.platform, flags)
     lowered = jax.jit(flat, keep_unused=True).lower(*shapes)
     executable = lowered.compile(compiler_options=known).runtime_executable()
-    program = _Program(executable, device, results[0])
+    program = _Program(executable, device, results[0], from_disk=False)
     if "custom_call" in lowered.as_text():
         return program
     header = {
