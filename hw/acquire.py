@@ -18,10 +18,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from hw.acquire_live import Estimator
-from hw.choices import OPERATORS, PLACEMENTS, PLANS
+from hw.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
 from hw.errors import DeviceError, RefusedError
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
+from hw.midplane.image_scan import image_scan
 from hw.midplane.pattern_injection import (
     Operator,
     SkippedError,
@@ -102,6 +103,8 @@ class Request:
             terminal or before a window, or a rule.
         plan: one of :data:`PLANS`; ``optimal`` chooses from a pool as the images tell.
         until_tre_mm: with ``optimal``: stop once the predicted TRE is no larger than this.
+        phantom: one of :data:`PHANTOMS`: what is in the tank. Images of a cross-wire are placed and
+            segmented by what they show, those of the others by the electronics.
     """
 
     images: int = 60
@@ -112,8 +115,11 @@ class Request:
     operator: str = "simulated"
     plan: str = "sobol"
     until_tre_mm: float | None = None
+    phantom: str = PHANTOMS[0]
 
     def __post_init__(self) -> None:
+        if self.phantom not in PHANTOMS:
+            raise InputError(f"phantom must be one of {', '.join(PHANTOMS)}")
         if self.plan not in PLANS:
             raise InputError(f"plan must be one of {', '.join(PLANS)}")
         wanted = self.until_tre_mm
@@ -123,10 +129,23 @@ class Request:
             raise InputError("until_tre_mm needs the plan optimal")
         if self.placement not in PLACEMENTS:
             raise InputError(f"placement must be one of {', '.join(PLACEMENTS)}")
+        if self.placement not in PLACEMENTS_OF[self.phantom]:
+            fitting = " or ".join(PLACEMENTS_OF[self.phantom])
+            raise InputError(f"with the {self.phantom} placement is {fitting}")
         if self.operator not in OPERATORS:
             raise InputError(f"operator must be one of {', '.join(OPERATORS)}")
         if not 4 <= self.images <= MOST_IMAGES:
             raise InputError(f"images must be 4 to {MOST_IMAGES}, not {self.images}")
+
+    @property
+    def by_image(self) -> bool:
+        """Whether frames are placed and segmented, not the electronics' times of flight."""
+        return self.phantom == "cross-wire"
+
+    @property
+    def kind(self) -> str:
+        """What the selected images of the recording hold."""
+        return "point" if self.by_image else "time_of_flight"
 
 
 class Pause:
@@ -235,7 +254,9 @@ def acquire(
         OutputError: the recording cannot be made; nothing moved.
     """
     job = _prepare(setup, path, request)
-    estimator = Estimator(job.images, setup, job.progress)
+    if job.request.by_image and setup.ultrasound is None:
+        raise InputError(f"a {job.request.phantom} needs the images: add [ultrasound] to the setup")
+    estimator = Estimator(job.images, setup, job.progress, job.request.kind)
     pool = "" if job.images == len(job.targets) else f" from a pool of {len(job.targets)}"
     say(f"plan: {job.images} poses{pool}, {job.to_take} to go; compiling the estimate")
     estimator.warm_up(job.targets[: job.images])
@@ -312,7 +333,7 @@ def _open_recorder(path: str | os.PathLike[str], job: _Job) -> Recorder:
         return Recorder(path, time_offset_s=max(gap, 0.0))
     probe = job.setup.probe
     header = Header(
-        kind="time_of_flight",
+        kind=job.request.kind,
         probe={
             "kind": probe.kind, "elements": probe.elements, "pitch_mm": probe.pitch_mm,
             "sound_speed_m_s": probe.sound_speed_m_s, "delay_s": probe.delay_s,
@@ -375,6 +396,7 @@ def _run(
                 view.going(row)
                 try:
                     placement = _place(job, row, stage, estimator, operator, view)
+                    shot = _shoot(job, row, stage, session)
                 except SkippedError as error:
                     skipped.append(row)
                     view.given_up(row)
@@ -390,7 +412,7 @@ def _run(
                         raise
                     continue
                 failures = 0
-                _take(job, row, stage, session, recorder, estimator, placement, oracle, began)
+                _take(job, row, session, recorder, estimator, placement, shot, oracle, began)
                 view.taken(row, placement, estimator.answer)
                 say(estimator.line(job.images, placement))
     if oracle is not None:
@@ -463,6 +485,11 @@ def _place(
     start = estimator.expected_offset_mm(pose) if estimator.count >= _IMAGES_FOR_PREDICTION else 0.0
     start = float(np.clip(start, -_FURTHEST_START_MM, _FURTHEST_START_MM))
     stage.go_to(row)
+    if job.request.by_image:
+        bench = stage.image_bench(row, credible=job.request.placement == "none")
+        if job.request.placement == "image-scan":
+            return image_scan(bench, settings, start, watch=view.stop)
+        return first_seen(bench, settings, start, watch=view.stop)
     match job.request.placement:
         case "threshold-climb":
             return threshold_climb(stage, settings, start, watch=view.stop)
@@ -477,27 +504,49 @@ def _place(
     return first_seen(stage, settings, 0.0, watch=view.stop)
 
 
-def _take(
-    job: _Job, row: int, stage: ProbeStage, session: Session, recorder: Recorder,
-    estimator: Estimator, placement: Placement, oracle: Oracle | None, began: float,
-) -> None:  # fmt: skip
-    """Average the pose, listen, select the image, and solve again."""
-    setup, clock = job.setup, job.setup.clock
-    steady = session.poses.steady(setup.settle_s)
-    times, amplitude = median_times(session.listen(setup.frames, stage.arrived_s))
+@dataclass(frozen=True)
+class _Shot:
+    """What was measured where the probe was left."""
+
+    pose: np.ndarray
+    measurement: np.ndarray
+    amplitude: float
+
+
+def _shoot(job: _Job, row: int, stage: ProbeStage, session: Session) -> _Shot:
+    """Average the pose, and listen or look.
+
+    Raises:
+        PlacementError: no frame shows a credible target.
+        DeviceError: a device is in lasting trouble.
+    """
+    steady = session.poses.steady(job.setup.settle_s)
+    if job.request.by_image:
+        measurement, amplitude = stage.locate(row)
+    else:
+        heard = session.listen(job.setup.frames, stage.arrived_s)
+        measurement, amplitude = median_times(heard)
     session.check()
     session.record_image()
-    bracket = placement.bracket
+    return _Shot(steady.sample.pose, measurement, amplitude)
+
+
+def _take(
+    job: _Job, row: int, session: Session, recorder: Recorder, estimator: Estimator,
+    placement: Placement, shot: _Shot, oracle: Oracle | None, began: float,
+) -> None:  # fmt: skip
+    """Select the image, and solve again."""
+    clock, bracket = job.setup.clock, placement.bracket
     recorder.add_selected(
-        steady.sample.pose, times, kind="time_of_flight",
-        max_elevation=bracket.max_elevation_mm, amplitude=amplitude, t_host=clock.now(),
+        shot.pose, shot.measurement, kind=job.request.kind,
+        max_elevation=bracket.max_elevation_mm, amplitude=shot.amplitude, t_host=clock.now(),
         target=row,
         bracket=(bracket.centre_mm, bracket.low_mm, bracket.high_mm, bracket.sd_mm),
         offset=placement.offset_mm,
         true_elevation=float("nan") if oracle is None else oracle.elevation_mm(),
         seconds=clock.now() - began,
     )  # fmt: skip
-    estimate = estimator.add(steady.sample.pose, times, bracket.max_elevation_mm)
+    estimate = estimator.add(shot.pose, shot.measurement, bracket.max_elevation_mm)
     if estimate is not None:
         recorder.add_estimate({"t_host": np.array([clock.now()]), **estimate})
 

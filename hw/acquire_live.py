@@ -10,6 +10,7 @@ from hw.recording_check import Progress
 from hw.setup import Setup
 from jaxcal import InputError
 from jaxcal.calibration.result import Calibration
+from jaxcal.data.recording import Kind
 
 
 class Estimator:
@@ -19,25 +20,33 @@ class Estimator:
         capacity: images of the plan.
         setup: probe and scene.
         progress: of a recording that is resumed; its images are taken over.
+        kind: what an image holds, ``time_of_flight`` or ``point``.
 
     Raises:
         InputError: images of the recording that cannot be used.
     """
 
-    def __init__(self, capacity: int, setup: Setup, progress: Progress | None) -> None:
+    def __init__(
+        self,
+        capacity: int,
+        setup: Setup,
+        progress: Progress | None,
+        kind: str = "time_of_flight",
+    ) -> None:
         self._setup, self._capacity = setup, capacity
+        self._kind: Kind = "point" if kind == "point" else "time_of_flight"
         self._live = self._empty()
         self._result: Calibration | None = None
         self._left_out = 0
         if progress is not None:
             rows = zip(progress.poses, progress.measurements, progress.max_elevation, strict=True)
-            for pose, times, bound in rows:
-                self._add(pose, times, bound, last=False)
+            for pose, measurement, bound in rows:
+                self._add(pose, measurement, bound, last=False)
             self._result = self._solve()
 
     def _empty(self) -> LiveCalibration:
         return LiveCalibration(
-            self._capacity, kind="time_of_flight", probe=self._setup.probe, method="joint"
+            self._capacity, kind=self._kind, probe=self._setup.probe, method="joint"
         )
 
     @property
@@ -62,6 +71,13 @@ class Estimator:
         # Somewhat off the plane, as real images are: an exact fit is a degenerate problem.
         rng = np.random.default_rng(0)
         seen = seen[:, :3] + rng.normal(0, 0.2, (len(targets), 3))
+        if self._kind == "point":
+            points = np.column_stack([seen[:, 0], np.hypot(seen[:, 1], seen[:, 2])])
+            points += rng.normal(0, 0.1, points.shape)
+            for pose, point in zip(targets, points, strict=True):
+                live.put(pose, point, 1.0)
+            live.solve()
+            return
         distance = np.linalg.norm(seen[:, None] - probe.element_positions(), axis=-1)
         distance += rng.normal(0, 0.05, distance.shape)
         for pose, row in zip(targets, probe.time_of_flight_s(distance), strict=True):
@@ -69,10 +85,10 @@ class Estimator:
         live.solve()
 
     def add(
-        self, pose: np.ndarray, times: np.ndarray, bound: float
+        self, pose: np.ndarray, measurement: np.ndarray, bound: float
     ) -> dict[str, np.ndarray] | None:
         """Take an image and solve; a row of /estimate, or None with too few images."""
-        self._add(pose, times, bound, last=True)
+        self._add(pose, measurement, bound, last=True)
         result = self._result
         if result is None:
             return None
@@ -117,9 +133,9 @@ class Estimator:
             head += f" +- {mm:.2f} mm, {degrees:.2f} deg (SD)"
         return f"{head}; RMS {float(answer.rms):.2f} mm; {self._result.status}"
 
-    def _add(self, pose: np.ndarray, times: np.ndarray, bound: float, *, last: bool) -> None:
+    def _add(self, pose: np.ndarray, measurement: np.ndarray, bound: float, *, last: bool) -> None:
         try:
-            self._live.put(pose, times, bound)
+            self._live.put(pose, measurement, bound)
         except InputError:
             # In the file it is all the same; calibrate will say what is wrong with it.
             self._left_out += 1

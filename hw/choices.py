@@ -1,7 +1,18 @@
 """What an operator may choose by name. Imports nothing, so that ``--help`` costs nothing."""
 
-PLACEMENTS = ("amplitude-scan", "threshold-climb", "pattern-injection", "none")
+PLACEMENTS = ("amplitude-scan", "threshold-climb", "pattern-injection", "image-scan", "none")
 """How the target is brought into the mid-plane; the first is the default."""
+
+PHANTOMS = ("active-echo", "cross-wire", "hydrophone")
+"""What is in the tank; the first is the default."""
+
+PLACEMENTS_OF = {
+    "active-echo": ("amplitude-scan", "threshold-climb", "pattern-injection", "none"),
+    "cross-wire": ("image-scan", "none"),
+    "hydrophone": ("amplitude-scan", "none"),
+}
+"""What goes with which phantom, the default first: nothing is wired to a cross-wire, and a
+hydrophone never answers."""
 
 OPERATORS = ("person", "window", "simulated")
 """Who follows the injected pattern."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hw.choices import OPERATORS, PLACEMENTS, PLANS
+from hw.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
 from jaxcal import InputError, __version__
 from jaxcal.cli.common import POSITIVE, ExitCode, exit_code
 from jaxcal.cli.run import run
@@ -83,7 +83,14 @@ _bench_seed = click.option(
 @click.option(
     "--placement",
     type=click.Choice(PLACEMENTS),
-    help="How the target is brought into the mid-plane.  [default: amplitude-scan]",
+    help="How the target is brought into the mid-plane.  [default: amplitude-scan; image-scan with "
+    "a cross-wire]",
+)
+@click.option(
+    "--phantom",
+    type=click.Choice(PHANTOMS),
+    help="What is in the tank: an element that hears and answers, wires that only show in the "
+    "image, or a hydrophone that only hears.  [default: active-echo]",
 )
 @click.option(
     "--operator",
@@ -117,6 +124,7 @@ def acquire(
     plan: str | None,
     until_tre: float | None,
     placement: str | None,
+    phantom: str | None,
     operator: str | None,
     seed: int | None,
     every_frame: bool,
@@ -139,7 +147,7 @@ def acquire(
         raise InputError("--speed, --controller and --bench-seed need --bench")
     given = [name for name, value in (
         ("--images", images), ("--plan", plan), ("--until-tre", until_tre),
-        ("--placement", placement), ("--operator", operator),
+        ("--placement", placement), ("--phantom", phantom), ("--operator", operator),
         ("--seed", seed),
         ("--every-frame", every_frame or None), ("--bench-seed", bench_seed),
     ) if value is not None]  # fmt: skip
@@ -160,6 +168,7 @@ def acquire(
         check_resumable(recording)
         recorded = settings_of(recording)
         bench_seed = _recorded_bench(recorded, bench)
+        phantom = _recorded_phantom(recorded)
         operator = _recorded_operator(recorded)
     path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
     from jaxcal.cli.cache import enable_compilation_cache
@@ -172,13 +181,14 @@ def acquire(
         asks = placement == "pattern-injection" and not bench
         operator = "person" if asks else "simulated"
     if not resume:
+        phantom = phantom or PHANTOMS[0]
         request = Request(
-            images or 60, placement or PLACEMENTS[0], seed or 0, every_frame,
+            images or 60, placement or PLACEMENTS_OF[phantom][0], seed or 0, every_frame,
             (bench_seed or 0) if bench else None,
-            operator, plan or PLANS[0], until_tre,
+            operator, plan or PLANS[0], until_tre, phantom,
         )  # fmt: skip
     with ExitStack() as stack:
-        emulated = _started(stack, bench, bench_seed, speed, controller)
+        emulated = _started(stack, bench, bench_seed, speed, controller, phantom)
         setup = _setup_of(setup_path, emulated)
         if not bench and not move:
             return _dry_run(setup, path, request, preview)
@@ -267,15 +277,28 @@ def _recorded_operator(settings: dict[str, object]) -> str:
     return operator if isinstance(operator, str) and operator in OPERATORS else "simulated"
 
 
+def _recorded_phantom(settings: dict[str, object]) -> str:
+    asked = settings.get("request")
+    phantom = asked.get("phantom") if isinstance(asked, dict) else None
+    return phantom if isinstance(phantom, str) and phantom in PHANTOMS else PHANTOMS[0]
+
+
 def _started(
-    stack: ExitStack, bench: bool, seed: int | None, speed: float | None, controller: str | None
+    stack: ExitStack,
+    bench: bool,
+    seed: int | None,
+    speed: float | None,
+    controller: str | None,
+    phantom: str | None = None,
 ) -> Bench | None:
     if not bench:
         return None
     from hw.emulated import SPEED, start
 
     speed = SPEED if speed is None else speed
-    return stack.enter_context(start(seed or 0, speed, _POSE_HZ[controller or "cb"]))
+    return stack.enter_context(
+        start(seed or 0, speed, _POSE_HZ[controller or "cb"], phantom or PHANTOMS[0])
+    )
 
 
 def _setup_of(path: str | None, emulated: Bench | None) -> Setup:

@@ -13,20 +13,23 @@ SPEED = 5.0
 _IMAGES_WALL_HZ = 10.0
 
 
-def start(seed: int, speed: float, pose_hz: int = Options.pose_hz) -> Bench:
+def start(
+    seed: int, speed: float, pose_hz: int = Options.pose_hz, phantom: str = Options.phantom
+) -> Bench:
     """Start a bench for an acquisition.
 
     Args:
         seed: of the world.
         speed: bench seconds per second on the wall.
         pose_hz: of the robot, which says what series it is (:class:`hw.bench.run.Options`).
+        phantom: in the tank (:mod:`hw.bench.phantoms`).
 
     Raises:
         InputError: a speed that cannot be.
     """
     return start_bench(
         seed=seed, speed=speed, pose_hz=pose_hz, most_images_wall_hz=_IMAGES_WALL_HZ,
-        most_poses_wall_hz=min(max(62.5 * speed, 125.0), 1000.0),
+        most_poses_wall_hz=min(max(62.5 * speed, 125.0), 1000.0), phantom=phantom,
     )  # fmt: skip
 
 

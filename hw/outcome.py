@@ -82,7 +82,9 @@ def calibrate_and_print(path: str, outcome: Outcome, speed: float) -> dict[str, 
     from jaxcal.report.tables import calibration_table
     from jaxcal.report.verdict import verdict
 
-    recording, _ = segment_recording(load(path))
+    recording = load(path)
+    if recording.calibration.kind == "time_of_flight":
+        recording, _ = segment_recording(recording)
     record = calibration_record(calibrate(recording), recording)
     lines = [
         f"{outcome.images} images in {path}, {outcome.images / outcome.seconds * 60:.1f} a minute "

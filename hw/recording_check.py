@@ -88,7 +88,7 @@ class Progress:
         settings: how it was asked for.
         targets: (n, 4, 4) plan of poses, mm.
         poses: (k, 4, 4) of the selected images.
-        measurements: (k, elements) times of flight, s.
+        measurements: (k, elements) times of flight, s, or (k, 2) [lateral, range], mm.
         max_elevation: (k,) mm.
         taken: (k,) row of the plan of every image.
         true_elevation: (k,) mm, NaN on a real bench.
@@ -129,9 +129,7 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
                 settings=_settings(root),
                 targets=targets,
                 poses=_read(root, "calibration", "pose", (images, 4, 4)),
-                measurements=_read(
-                    root, "calibration", "time_of_flight", (images, UpTo(4096, "elements"))
-                ),
+                measurements=_measurements(root, images),
                 max_elevation=_read(root, "calibration", "max_elevation", (images,)),
                 taken=taken,
                 true_elevation=_read(root, "placement", "true_elevation", (images,)),
@@ -177,6 +175,14 @@ def _settings(root: Node) -> dict[str, object]:
     if not isinstance(found, dict):
         raise FormatError("has settings that are not a JSON object")
     return found
+
+
+def _measurements(root: Node, images: UpTo) -> np.ndarray:
+    """Points where the recording has them, else times of flight."""
+    node = group(root, "calibration")
+    if node is not None and child(node, "point") is not None:
+        return _read(root, "calibration", "point", (images, 2))
+    return _read(root, "calibration", "time_of_flight", (images, UpTo(4096, "elements")))
 
 
 def _read(

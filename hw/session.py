@@ -285,6 +285,26 @@ class Session:
         with self._changed:
             return self._image
 
+    def image_after(self, since: float) -> Image:
+        """The first B-mode frame that arrives after a moment.
+
+        Raises:
+            DeviceError: trouble while waiting.
+        """
+        deadline = self.clock.now() + self.clock.patience(self.watch.grace_s)
+        with self._changed:
+            while True:
+                image = self._image
+                if image is not None and image.t_host > since and image.array.dtype == np.uint8:
+                    return image
+                if self._failure is not None:
+                    raise self._failure
+                if self.clock.now() > max(deadline, since + self.watch.grace_s):
+                    break
+                self._changed.wait(self.clock.wall(0.1))
+        self.check()
+        raise StaleError("no B-mode frame came in time", device="ultrasound")
+
     def record_image(self) -> None:
         """Put the newest ultrasound frame into the recording, where not all of them go there."""
         image = self.latest_image()

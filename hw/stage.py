@@ -12,14 +12,24 @@ from collections.abc import Callable
 import numpy as np
 
 from hw.errors import RefusedError, StaleError
-from hw.midplane.search import Echoes
+from hw.midplane.image_scan import ImageBench, pixel_of, place_of
+from hw.midplane.search import Echoes, PlacementError
 from hw.rigid import turn_deg
 from hw.robot.motion import Motion
 from hw.robot.stream import PoseSample
 from hw.session import Session
 from hw.shapes import Float
+from hw.ultrasound.receiver import Image
 
 _MOST_HESITATIONS = 10
+_IMAGE_AGE_S = 0.2
+"""An image is at most so old when it arrives: a frame's time, the machine's and the network's
+(assumption; the emulated machine takes 0.05 s)."""
+_NEAR_MM = 12.0
+"""The drawing knows the target's place in the image better than this: mount and target are off by
+some millimetres and degrees."""
+_LOOKS = 5
+"""Frames to look at before a place without a credible target is given up."""
 
 
 class ProbeStage:
@@ -106,6 +116,46 @@ class ProbeStage:
         self._session.wait_until_clear()
         image = self._session.latest_image()
         return image.array if image is not None and image.array.dtype == np.uint8 else None
+
+    def whole_frame(self) -> Image:
+        """The next B-mode frame that began after the last move.
+
+        Raises:
+            DeviceError: no images come.
+        """
+        return self._session.image_after(self._arrived + _IMAGE_AGE_S)
+
+    def image_bench(self, row: int, *, credible: bool = False) -> ImageBench:
+        """What the procedures see of a phantom that only shows in the image.
+
+        Args:
+            row: of the plan: where the target should be.
+            credible: respond only where the segmentation finds the target.
+        """
+        image = self.whole_frame()
+        expected = self._session.setup.scene.expected(self._targets[row])[[0, 2]]
+        place = pixel_of(expected, image.spacing_mm, image.array.shape[1])
+        within = _NEAR_MM / max(image.spacing_mm)
+        return ImageBench(self, lambda: self.whole_frame().array, place, within, credible=credible)
+
+    def locate(self, row: int) -> tuple[Float[np.ndarray, 2], float]:
+        """[lateral, range] (mm) of the target in a frame where the probe stands, and its contrast.
+
+        Raises:
+            PlacementError: no credible target in several frames.
+        """
+        bench, spacing = self.image_bench(row), self.whole_frame().spacing_mm
+        columns = self.whole_frame().array.shape[1]
+        reason = ""
+        for _ in range(_LOOKS):
+            found = bench.locate()
+            if found.found[0]:
+                contrast = float(found.contrast_db[0])
+                return place_of(found.position[0], spacing, columns), contrast
+            reason = found.reason[0]
+        raise PlacementError(
+            f"no credible target in {_LOOKS} frames: {reason}", device="ultrasound"
+        )
 
     @property
     def arrived_s(self) -> float:

@@ -15,6 +15,7 @@ from hw.bench.active_echo import AuspisEmulator
 from hw.bench.arm import Arm
 from hw.bench.control import ControlServer
 from hw.bench.frames import Camera
+from hw.bench.phantoms import phantom_named
 from hw.bench.robot import CB_SERIES, E_SERIES, RobotProcess, model_of
 from hw.bench.ultrasound import ImageServer
 from hw.bench.world import World, make_world
@@ -47,6 +48,7 @@ class Options:
         repeatability_mm: SD of the arm's hidden error on each axis.
         robot_host: loopback address; empty: any free one.
         link: of the active echo: ``pty`` or ``tcp``.
+        phantom: in the tank, by name (:mod:`hw.bench.phantoms`).
         world: further changes of the world, by name (see :func:`hw.bench.world.make_world`).
     """
 
@@ -60,6 +62,7 @@ class Options:
     repeatability_mm: float = 0.1
     robot_host: str = ""
     link: str = "pty"
+    phantom: str = "active-echo"
     world: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -91,7 +94,9 @@ class Assembly:
 
     def __init__(self, options: Options) -> None:
         self.options = options
-        self.world: World = make_world(options.seed, **options.world)
+        self.world: World = make_world(
+            options.seed, phantom=phantom_named(options.phantom), **options.world
+        )
         self.clock = Clock(options.speed)
         start = pose_to_ur(hovering(self.world.scene))
         self.arm = Arm(

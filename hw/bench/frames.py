@@ -1,13 +1,16 @@
-"""B-mode frames of the simulated world: speckle, the active echo, its pattern, the cross-wires.
+"""B-mode frames of the simulated world: speckle, what the phantom shows, its injected pattern.
 
 Speckle is drawn once, as a field larger than a frame, and cut out at a new place for every frame; a
 spot is added to the envelope in its own small patch before log compression. So a 640 x 480 frame
 costs a fraction of a millisecond, whatever is in it.
 
-The element answers with one pulse a line: in the image a spot at its range, as long as it answers;
-an injected pattern is a bar of lines beneath it. Wires are passive: they show where the beam's
-thickness crosses them, a crossing with tails, beside the element at the same height (section 3.2 of
-the paper).
+The phantom of the world says which marks it leaves (:mod:`hw.bench.phantoms`); an injected pattern
+is a bar of lines beneath the mark. Beside the active echo element, at the same height (section 3.2
+of the paper), the tank holds cross-wires; they are passive and show where the beam crosses them.
+
+What the paper calls image quality is three things here (section 4.2): the transmit focus, at the
+target's depth or fixed; multiple reflections, as ghosts of loud echoes; and too short a delay
+between lines, which raises the background by late echoes of the line before.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hw.bench.phantoms import ActiveEcho, CrossWire, Mark
 from hw.bench.world import World
 from hw.shapes import Float, UInt8
 from jaxcal import InputError
@@ -25,33 +29,55 @@ DEPTH_MM = 90.0
 DECIBELS = 60.0
 
 _MARGIN = 160
-_SPECKLE = 10 ** (-34.0 / 20)
-_WIRE_HALF_MM = 30.0
-_MOST_SPOTS = 48
 _CUT = 3.5
 
 
 @dataclass(frozen=True)
 class Look:
-    """How bright things are, as envelopes of at most 1, and how large.
+    """How bright things are, as envelopes of at most 1, how large, and how good the images are.
+
+    All numbers are assumptions: the paper shows no frame. They are usual for 60 dB of a linear
+    array at 5 to 10 MHz.
 
     Attributes:
         echo: the active echo of a line at full amplitude.
-        wire: a wire in the mid-plane; 0: there are no cross-wires.
-        ghost: the echo's reflection, later by ``ghost_mm``; 0: none.
+        wire: a wire in the mid-plane; 0: there are no cross-wires beside the element.
+        ghost: the active echo's reflection over the echo, later by ``ghost_mm``; 0: none.
         ghost_mm: its detour.
+        ghost_share: share of the frames that show it.
         axial_mm: SD of a spot along the axial direction.
-        lateral_mm: likewise lateral.
-        beside_mm: where the wires cross, from the element, in the base frame.
+        lateral_mm: SD of a point's two-way spot along the lateral direction, in focus.
+        focus_mm: depth of the transmit focus; None: set to the target's depth in every image.
+        defocus: growth of the transmit beam's lateral SD per mm off its focus.
+        speckle_db: level of the background, dB below white.
+        beside_mm: where the wires beside the element cross, from it, in the base frame.
     """
 
     echo: float = 0.9
     wire: float = 0.25
     ghost: float = 0.08
     ghost_mm: float = 7.0
+    ghost_share: float = 0.5
     axial_mm: float = 0.35
     lateral_mm: float = 0.6
+    focus_mm: float | None = None
+    defocus: float = 0.05
+    speckle_db: float = 34.0
     beside_mm: tuple[float, float, float] = (12.0, 9.0, 0.0)
+
+    def two_way_mm(self, range_mm: float, target_mm: float) -> float:
+        """Lateral SD of a passive point's spot: the transmit beam times the receive beam, mm.
+
+        The receive aperture is focused at every depth; the transmit beam only at its focus.
+
+        Args:
+            range_mm: of the point.
+            target_mm: range at which the operator puts the focus, where it is not fixed.
+        """
+        focus = target_mm if self.focus_mm is None else self.focus_mm
+        receive = np.sqrt(2.0) * self.lateral_mm
+        transmit = np.hypot(receive, self.defocus * (range_mm - focus))
+        return float(1.0 / np.hypot(1.0 / receive, 1.0 / transmit))
 
 
 class Camera:
@@ -67,8 +93,10 @@ class Camera:
         self.world, self.look = world, Look() if look is None else look
         self.spacing_mm = (world.probe.width_mm / COLUMNS, DEPTH_MM / ROWS)
         rng = np.random.default_rng([seed, 0x5BEC])
-        self._envelope = _speckle(rng, self._sizes_px())
+        level = 10 ** (-self.look.speckle_db / 20)
+        self._envelope = level * _speckle(rng, self._sizes_px())
         self._levels = _compress(self._envelope)
+        self._wires = CrossWire(beside_mm=self.look.beside_mm)
 
     def _sizes_px(self) -> tuple[float, float]:
         """SDs of a spot, px: (axial, lateral)."""
@@ -108,65 +136,49 @@ class Camera:
         place = (slice(down, down + ROWS), slice(right, right + COLUMNS))
         levels = self._levels[place].copy()
         envelope = self._envelope[place]
-        patches: list[tuple[float, float, float]] = []
         look, world = self.look, self.world
-        loud = world.loudness(pose)
-        lateral, elevation, axial = world.target(pose)
-        distance = float(np.hypot(elevation, axial))
-        best = int(np.argmax(loud))
-        if loud[best] >= max(threshold, 1):
-            strength = look.echo * min(float(loud[best]) / world.beam.peak, 1.0)
-            patches.append((lateral, distance, strength))
-            if look.ghost > 0 and rng.random() < 0.5:
-                patches.append((lateral, distance + look.ghost_mm, strength * look.ghost))
-        if look.wire > 0:
-            patches += self._wires(pose)
-        self._draw(levels, envelope, patches)
-        if pattern and loud[best] >= max(threshold, 1):
+        marks = world.phantom.marks(world, pose, look, rng, threshold)
+        if look.wire > 0 and isinstance(world.phantom, ActiveEcho):
+            marks = marks + self._wires.marks(world, pose, look, rng)
+        self._draw(levels, envelope, marks)
+        if pattern and world.phantom.answers and world.loudness(pose).max() >= max(threshold, 1):
+            _, elevation, axial = world.target(pose)
             below = 0.5e3 * world.sound_speed_m_s * pattern_delay_s
-            self._inject(levels, pattern, distance + below)
+            self._inject(levels, pattern, float(np.hypot(elevation, axial)) + below)
         return levels
 
-    def _wires(self, pose: np.ndarray) -> list[tuple[float, float, float]]:
-        """Places of the wires that the beam's thickness shows: lateral, range, strength."""
-        world, look = self.world, self.look
-        x = world.image_to_probe
-        crossing = world.target_of(pose, world.point_mm + np.asarray(look.beside_mm))
-        shown = []
-        for direction in ((0.8, 0.6, 0.0), (-0.6, 0.8, 0.0)):
-            along = np.asarray(direction) @ pose[:3, :3] @ x[:3, :3]
-            width = float(world.beam.width_mm(crossing[2]))
-            steep = max(abs(along[1]), 2 * width / _WIRE_HALF_MM)
-            reach = 2 * width / steep
-            middle = float(np.clip(-crossing[1] / along[1], -_WIRE_HALF_MM, _WIRE_HALF_MM))
-            count = min(int(2 * reach / look.lateral_mm) + 2, _MOST_SPOTS)
-            for way in middle + reach * np.linspace(-1.0, 1.0, count):
-                at = crossing + way * along
-                if at[2] > 0 and abs(way) <= _WIRE_HALF_MM:
-                    strength = look.wire * float(np.exp(-0.5 * (at[1] / width) ** 2))
-                    shown.append((at[0], float(np.hypot(at[1], at[2])), strength))
-        return shown
-
-    def _draw(
-        self,
-        levels: np.ndarray,
-        envelope: np.ndarray,
-        patches: list[tuple[float, float, float]],
-    ) -> None:
-        """Add Gaussian spots to the envelope, each in its own patch, and compress again."""
-        tall, wide = self._sizes_px()
-        reach_v, reach_u = int(_CUT * tall) + 1, int(_CUT * wide) + 1
-        for lateral, distance, strength in patches:
-            u, v = self.pixel(lateral, distance)
+    def _draw(self, levels: np.ndarray, envelope: np.ndarray, marks: list[Mark]) -> None:
+        """Add spots to the envelope where they are, and compress again there."""
+        across, down = self.spacing_mm
+        patches = []
+        for mark in marks:
+            tall, wide = mark.axial_sd_mm / down, mark.lateral_sd_mm / across
+            reach_v, reach_u = int(_CUT * tall) + 1, int(_CUT * wide) + 1
+            u, v = self.pixel(mark.lateral_mm, mark.range_mm)
             top, bottom = max(int(v) - reach_v, 0), min(int(v) + reach_v + 2, ROWS)
             left, right = max(int(u) - reach_u, 0), min(int(u) + reach_u + 2, COLUMNS)
             if top >= bottom or left >= right:
                 continue
             column = np.exp(-0.5 * ((np.arange(top, bottom) - v) / tall) ** 2)
             row = np.exp(-0.5 * ((np.arange(left, right) - u) / wide) ** 2)
-            spot = strength * column[:, None] * row + envelope[top:bottom, left:right]
-            part = levels[top:bottom, left:right]
-            np.maximum(part, _compress(spot), out=part)
+            spot = mark.strength * column[:, None] * row
+            patches.append((mark.source, slice(top, bottom), slice(left, right), spot))
+        if not patches:
+            return
+        top, left = (min(patch[k].start for patch in patches) for k in (1, 2))
+        bottom, right = (max(patch[k].stop for patch in patches) for k in (1, 2))
+        total = envelope[top:bottom, left:right].copy()
+        for source in {patch[0] for patch in patches}:
+            alone = np.zeros_like(total)
+            for of, rows, columns, spot in patches:
+                if of == source:
+                    part = alone[
+                        rows.start - top : rows.stop - top,
+                        columns.start - left : columns.stop - left,
+                    ]
+                    np.maximum(part, spot, out=part)
+            total += alone
+        levels[top:bottom, left:right] = _compress(total)
 
     def _inject(self, levels: np.ndarray, pattern: bytes, distance: float) -> None:
         """Draw the bar: one column of lines each byte, as thick as two pulses."""
@@ -182,7 +194,7 @@ class Camera:
 
 
 def _speckle(rng: np.random.Generator, size_px: tuple[float, float]) -> Float[np.ndarray, "r c"]:
-    """Rayleigh envelope of fully developed speckle with the spot's own correlation."""
+    """Rayleigh envelope of fully developed speckle with a spot's own correlation; RMS 1."""
     shape = (ROWS + _MARGIN, COLUMNS + _MARGIN)
     field = rng.normal(size=(2, *shape))
     waves = np.fft.rfft2(field)
@@ -191,7 +203,7 @@ def _speckle(rng: np.random.Generator, size_px: tuple[float, float]) -> Float[np
     tall, wide = size_px
     waves *= np.exp(-2 * np.pi**2 * ((tall * down) ** 2 + (wide * across) ** 2))
     smooth = np.fft.irfft2(waves, shape)
-    smooth *= _SPECKLE / np.sqrt(2) / smooth.std()
+    smooth /= np.sqrt(2) * smooth.std()
     return np.hypot(smooth[0], smooth[1])
 
 

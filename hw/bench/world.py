@@ -1,7 +1,8 @@
-"""The simulated world: one probe, one active echo element in water, and what each of them notices.
+"""The simulated world: one probe, one phantom in water, and what each of them notices.
 
 Everything is a function of the *true* pose of the tool centre point (mm, tool -> base), and cheap
-enough for every frame. The element hears every transmitted line:
+enough for every frame. The phantom (:mod:`hw.bench.phantoms`) is the active echo element unless
+another one is put into the tank. The element hears every transmitted line:
 
     amplitude_k = peak sqrt(r_0 / r) exp(-(y - s)^2 / (2 w(r)^2)) cos(theta_k)^p
 
@@ -15,16 +16,19 @@ element of finite size that hears the most is not its middle, and depends on whe
 from. So it is fixed for a pose and differs from pose to pose: reading again, or searching longer,
 does *not* average it away, which is the harder of the two readings. It is a smooth random field
 over the orientation (correlation length three degrees) with a normal law of SD 0.3 mm, again the
-harder reading of "+-".
+harder reading of "+-". It is the paper's explanation of a mid-plane accuracy that is limited by the
+2 mm of the element (section 4.2), and is taken to be in proportion to a sensor's size.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
+from hw.bench.phantoms import ActiveEcho, Phantom, phantom_named
+from hw.bench.phantoms.phantom import ELEMENT_MM
 from hw.rigid import looking_rotation, rigid, rotation_matrix
 from hw.scene import Scene
 from hw.shapes import Bool, Float
@@ -35,7 +39,6 @@ FULL_SCALE = 4095
 """Largest amplitude that the electronics' 12-bit converter tells, counts."""
 
 _WAVES = 96
-_RANGE_OF_PEAK_MM = 20.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class Beam:
 
     Attributes:
         focus_mm: range at which the beam is thinnest.
-        thickness_mm: SD of the amplitude across the plane there.
+        thickness_mm: SD across the plane, there, of the amplitude that the paper's element reports.
         spread: growth of that SD per mm of range away from the focus, far from it.
         peak: amplitude in the mid-plane at 20 mm, counts.
         directivity: exponent of the cosine of the angle off an element's normal.
@@ -57,9 +60,13 @@ class Beam:
     directivity: float = 1.5
 
     def width_mm(self, range_mm: np.ndarray | float) -> np.ndarray | float:
-        """Elevational SD of the amplitude at a range, mm."""
+        """Elevational SD of the amplitude that the paper's element reports at a range, mm."""
         away = np.asarray(range_mm, float) - self.focus_mm
         return np.hypot(self.thickness_mm, self.spread * away)
+
+    def field_mm(self, range_mm: np.ndarray | float) -> np.ndarray | float:
+        """Elevational SD of the field itself, one way, mm (:mod:`hw.bench.phantoms.phantom`)."""
+        return np.sqrt(np.square(self.width_mm(range_mm)) - ELEMENT_MM**2 / 12.0)
 
 
 @dataclass(frozen=True)
@@ -111,6 +118,7 @@ class World:
         beam: elevational profile.
         noise: see there.
         seed: of the response's shift.
+        phantom: what is in the tank.
     """
 
     image_to_probe: Float[np.ndarray, "4 4"]
@@ -123,6 +131,7 @@ class World:
     beam: Beam = field(default_factory=Beam)
     noise: Noise = field(default_factory=Noise)
     seed: int = 0
+    phantom: Phantom = field(default_factory=ActiveEcho)
 
     def target(self, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, 3]:
         """The target in the image frame: q = X^-1 B^-1 c, mm."""
@@ -141,33 +150,30 @@ class World:
         lateral, elevation, axial = self.target(np.asarray(pose, float))
         return Place(float(lateral), float(np.hypot(elevation, axial)), float(elevation))
 
-    @cached_property
-    def _waves(self) -> tuple[np.ndarray, np.ndarray]:
-        rng = np.random.default_rng([self.seed, 0x5EED])
-        # Rotations an angle t apart differ by sqrt(2) t in the Frobenius norm.
-        length = np.sqrt(2) * np.radians(self.noise.response_correlation_deg)
-        return rng.normal(size=(_WAVES, 9)) / length, rng.uniform(0, 2 * np.pi, _WAVES)
+    def field(self, pose: Float[np.ndarray, "4 4"], stream: int = 0) -> float:
+        """A smooth random field over the orientation: mean 0, SD 1, three degrees long.
+
+        Args:
+            pose: of the tool centre point.
+            stream: another one is independent.
+        """
+        frequency, phase = _waves(self.seed, stream, self.noise.response_correlation_deg)
+        wave = np.cos(frequency @ pose[:3, :3].reshape(9) + phase)
+        return float(np.sqrt(2 / _WAVES) * wave.sum())
 
     def shift_mm(self, pose: Float[np.ndarray, "4 4"]) -> float:
         """Elevational place where the response is strongest, at this orientation, mm."""
-        frequency, phase = self._waves
-        wave = np.cos(frequency @ pose[:3, :3].reshape(9) + phase)
-        return float(self.noise.response_mm * np.sqrt(2 / _WAVES) * wave.sum())
+        size = self.noise.response_mm * self.phantom.response_scale
+        return float(size * self.field(pose)) if size > 0 else 0.0
 
     @cached_property
-    def _elements(self) -> np.ndarray:
+    def elements(self) -> Float[np.ndarray, " elements"]:
+        """Lateral positions of the probe's elements, mm."""
         return self.probe.element_lateral()
 
     def loudness(self, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " elements"]:
-        """Amplitude of every line at the element without noise or saturation, counts."""
-        lateral, elevation, axial = self.target(pose)
-        if axial <= 0:
-            return np.zeros(self.probe.elements)
-        across = lateral - self._elements
-        distance = np.hypot(across, axial)
-        off = (elevation - self.shift_mm(pose)) / self.beam.width_mm(distance)
-        gain = self.beam.peak * np.sqrt(_RANGE_OF_PEAK_MM / distance)
-        return gain * np.exp(-0.5 * off**2) * (axial / distance) ** self.beam.directivity
+        """Amplitude of every line at the phantom without noise or saturation, counts."""
+        return self.phantom.loudness(self, pose)
 
     def echo(
         self, pose: Float[np.ndarray, "4 4"], threshold: int, rng: np.random.Generator
@@ -186,12 +192,12 @@ class World:
         count, noise = self.probe.elements, self.noise
         normal = rng.standard_normal((3, count))
         amplitude = self.loudness(pose) * (1 + noise.amplitude * normal[0])
-        amplitude = np.rint(amplitude + noise.amplitude_counts * normal[1])
+        amplitude = np.rint(amplitude + self.phantom.noise_counts(self) * normal[1])
         amplitude = np.clip(amplitude, 0, FULL_SCALE)
         heard = amplitude >= max(threshold, 1)
 
         lateral, elevation, axial = self.target(pose)
-        way = np.sqrt((lateral - self._elements) ** 2 + elevation**2 + axial**2)
+        way = np.sqrt((lateral - self.elements) ** 2 + elevation**2 + axial**2)
         if noise.reflection > 0:
             late = rng.random(count) < noise.reflection
             way = way + late * rng.uniform(*noise.reflection_mm, size=count)
@@ -225,6 +231,15 @@ class World:
         return poses, points
 
 
+@lru_cache(maxsize=256)
+def _waves(seed: int, stream: int, correlation_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies and phases of the waves that make up a field."""
+    rng = np.random.default_rng([seed, 0x5EED] if stream == 0 else [seed, 0x5EED, stream])
+    # Rotations an angle t apart differ by sqrt(2) t in the Frobenius norm.
+    length = np.sqrt(2) * np.radians(correlation_deg)
+    return rng.normal(size=(_WAVES, 9)) / length, rng.uniform(0, 2 * np.pi, _WAVES)
+
+
 DRAWN = rigid(np.array([0.0, 0.0, np.radians(20.0)]), np.array([6.0, -4.0, 60.0]))
 """X as the drawing of the emulated mount has it: image -> tool centre point, mm."""
 
@@ -238,10 +253,11 @@ def make_world(seed: int = 0, **changes) -> World:
     Args:
         seed: of these, and of the response's shift.
         changes: any attribute of :class:`World`; those of ``noise`` and ``beam`` too, by their
-            names.
+            names. A phantom may be given by its name.
 
     Raises:
-        InputError: an unknown name, a sound speed or clock that is none.
+        InputError: an unknown name, a sound speed or clock that is none, a beam thinner than the
+            paper's element.
     """
     rng = np.random.default_rng([seed, 0x0B])
     off = rng.uniform(-1, 1, size=(3, 3))
@@ -249,6 +265,8 @@ def make_world(seed: int = 0, **changes) -> World:
     scene = Scene(DRAWN, TANK_MM, np.array([0.0, 0.0, -1.0]))
     world = World(DRAWN @ error, TANK_MM + 2.0 * off[2], scene, seed=seed)
     for name, value in changes.items():
+        if name == "phantom" and isinstance(value, str):
+            value = phantom_named(value)
         if name in Noise.__dataclass_fields__:
             world = replace(world, noise=replace(world.noise, **{name: value}))
         elif name in Beam.__dataclass_fields__:
@@ -259,4 +277,8 @@ def make_world(seed: int = 0, **changes) -> World:
             raise InputError(f"the simulated world has no {name!r}")
     if not 500 < world.sound_speed_m_s < 3000 or not 1e5 <= world.clock_hz <= 1e10:
         raise InputError("the sound speed must be in m/s and the clock in Hz")
+    if world.beam.thickness_mm <= ELEMENT_MM / np.sqrt(12.0):
+        raise InputError(
+            "the beam's thickness_mm is what an element of 2.08 mm reports: it must exceed 0.6 mm"
+        )
     return world

@@ -12,6 +12,7 @@ from hw.midplane.pattern_injection import bar
 from hw.poses import plan_poses
 from hw.rigid import rigid, rotation_matrix
 from jaxcal import InputError
+from jaxcal.data.geometry import rotation_angle
 from jaxcal.data.segmentation.image import localise
 
 
@@ -102,7 +103,7 @@ def test_worlds_differ_by_seed_and_their_drawing_is_off():
     np.testing.assert_array_equal(first.image_to_probe, make_world(0).image_to_probe)
     off = np.linalg.inv(first.scene.image_to_probe) @ first.image_to_probe
     assert 0 < np.abs(off[:3, 3]).max() <= 2.0
-    assert jaxcal.data.geometry.rotation_angle(np.eye(4), off) <= np.radians(1.5) * np.sqrt(3)
+    assert rotation_angle(np.eye(4), off) <= np.radians(1.5) * np.sqrt(3)
     with pytest.raises(InputError, match="no 'colour'"):
         make_world(0, colour=3)
     with pytest.raises(InputError, match="m/s"):

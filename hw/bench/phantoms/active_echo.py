@@ -1,0 +1,60 @@
+"""The active echo element: a PZT tube that hears every line and answers with a pulse.
+
+Its answer crosses the beam once, so that its mark in the image is as thick, across the plane, as
+what its electronics hear. It is loud: its reflections show in the image, and a person may take one
+for the element. It is 2 mm wide: the place on it that hears the most moves with the direction of
+the sound (:meth:`hw.bench.world.World.shift_mm`), and its mark is wider than a point's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hw.bench.phantoms.phantom import ELEMENT_MM, Mark, Sensor
+from hw.shapes import Float
+
+if TYPE_CHECKING:
+    from hw.bench.frames import Look
+    from hw.bench.world import World
+
+
+@dataclass(frozen=True)
+class ActiveEcho(Sensor):
+    """The paper's element: outer diameter 2.08 mm, length 2 mm (section 3.2).
+
+    Attributes:
+        size_mm: outer diameter.
+    """
+
+    size_mm: float = ELEMENT_MM
+
+    name = "active-echo"
+    answers = True
+    target = "echo"
+
+    def marks(
+        self,
+        world: World,
+        pose: Float[np.ndarray, "4 4"],
+        look: Look,
+        rng: np.random.Generator,
+        threshold: int = 0,
+    ) -> list[Mark]:
+        """The answer and, in a share of the frames, its reflection; nothing below the threshold."""
+        loud = self.loudness(world, pose)
+        best = float(loud.max())
+        if best < max(threshold, 1):
+            return []
+        lateral, elevation, axial = world.target(pose)
+        distance = float(np.hypot(elevation, axial))
+        strength = look.echo * min(best / world.beam.peak, 1.0)
+        # Received once, through the receive aperture alone, from a source of its own width.
+        wide = float(np.hypot(np.sqrt(2.0) * look.lateral_mm, self.size_mm / np.sqrt(12.0)))
+        found = [Mark(lateral, distance, strength, wide, look.axial_mm)]
+        if look.ghost > 0 and rng.random() < look.ghost_share:
+            ghost = strength * look.ghost
+            found.append(Mark(lateral, distance + look.ghost_mm, ghost, wide, look.axial_mm))
+        return found

@@ -1,0 +1,148 @@
+"""What every phantom of the simulated tank has in common.
+
+A phantom is asked two things at a true pose of the probe: how loud each transmitted line is at its
+sensor (the electronics), and which marks it leaves in a B-mode frame (the image).
+
+The probe's field across the image plane is Gaussian. :class:`hw.bench.world.Beam` states the
+profile that the electronics of the paper's element report; that element averages over its own
+diameter, so the field itself is thinner:
+
+    field(r)^2 = width(r)^2 - D^2 / 12,    D = 2.08 mm
+
+and a sensor of another size hears width^2 = field^2 + size^2 / 12 (variance of a uniform strip).
+A passive target is crossed by the field twice: its echo falls as the square of the field.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from hw.shapes import Float
+
+if TYPE_CHECKING:
+    from hw.bench.frames import Look
+    from hw.bench.world import World
+
+ELEMENT_MM = 2.08
+"""Outer diameter of the paper's PZT5H tube, mm (section 3.2)."""
+
+_RANGE_OF_PEAK_MM = 20.0
+"""Range at which the beam's peak amplitude is stated, mm."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """One Gaussian spot of the envelope in a B-mode frame.
+
+    Spots of one source are pieces of one thing: the strongest counts. Sources add up.
+
+    Attributes:
+        lateral_mm: its middle.
+        range_mm: its middle, from the element line.
+        strength: envelope at its middle; 1 is white.
+        lateral_sd_mm: SD of the envelope.
+        axial_sd_mm: SD of the envelope.
+        source: what it is a piece of.
+    """
+
+    lateral_mm: float
+    range_mm: float
+    strength: float
+    lateral_sd_mm: float
+    axial_sd_mm: float
+    source: int = 0
+
+
+@dataclass(frozen=True)
+class Phantom(ABC):
+    """One target in the tank.
+
+    Attributes:
+        name: on the command line.
+        heard: whether it is wired to the electronics.
+        answers: whether it transmits into the image, so that a pattern can be injected.
+        target: what the segmentation of frames looks for, ``echo`` or ``cross``.
+    """
+
+    name: ClassVar[str]
+    heard: ClassVar[bool]
+    answers: ClassVar[bool]
+    target: ClassVar[str]
+
+    @property
+    def response_scale(self) -> float:
+        """SD of the mid-plane shift of its response over that of the paper's element."""
+        return 0.0
+
+    def noise_counts(self, world: World) -> float:
+        """SD of the electronics' own noise with this sensor, counts."""
+        return world.noise.amplitude_counts
+
+    @abstractmethod
+    def loudness(self, world: World, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
+        """Amplitude of every line at its sensor, without noise or saturation, counts."""
+
+    @abstractmethod
+    def marks(
+        self,
+        world: World,
+        pose: Float[np.ndarray, "4 4"],
+        look: Look,
+        rng: np.random.Generator,
+        threshold: int = 0,
+    ) -> list[Mark]:
+        """What one frame shows of it.
+
+        Args:
+            world: where it is.
+            pose: true pose of the tool centre point, tool -> base, mm.
+            look: brightness, sizes and quality of the images.
+            rng: of this frame.
+            threshold: amplitude from which it answers, counts.
+        """
+
+
+@dataclass(frozen=True)
+class Sensor(Phantom):
+    """A phantom that hears the transmitted lines.
+
+    Attributes:
+        size_mm: of its sensitive part across the image plane.
+    """
+
+    size_mm: float = ELEMENT_MM
+
+    heard = True
+
+    @property
+    def response_scale(self) -> float:
+        """In proportion to its size (assumption): a point hears the most in the mid-plane."""
+        return self.size_mm / ELEMENT_MM
+
+    def width_mm(self, world: World, range_mm: np.ndarray | float) -> np.ndarray | float:
+        """Elevational SD of the amplitude that it reports, mm."""
+        return np.hypot(world.beam.field_mm(range_mm), self.size_mm / np.sqrt(12.0))
+
+    def loudness(self, world: World, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
+        """Amplitude of every line at it, counts; nothing behind the probe."""
+        lateral, elevation, axial = world.target(pose)
+        elements = world.elements
+        if axial <= 0:
+            return np.zeros(len(elements))
+        across = lateral - elements
+        distance = np.hypot(across, axial)
+        off = (elevation - world.shift_mm(pose)) / self.width_mm(world, distance)
+        gain = world.beam.peak * np.sqrt(_RANGE_OF_PEAK_MM / distance)
+        return gain * np.exp(-0.5 * off**2) * (axial / distance) ** world.beam.directivity
+
+
+def two_way(
+    world: World, elevation_mm: np.ndarray | float, range_mm: np.ndarray | float
+) -> np.ndarray | float:
+    """Echo of a passive point over that in the mid-plane: the square of the one-way field."""
+    off = np.asarray(elevation_mm, float) / world.beam.field_mm(range_mm)
+    return np.exp(-(off**2))

@@ -1,0 +1,173 @@
+"""Procedure 4: the same scan by what the image shows, for a phantom that nothing is wired to.
+
+Two wires show at one place only in the mid-plane, and twice as bright there as one of them; beside
+it they part. So the intensity of the brightest place near the expected one (its squared envelope)
+has its maximum in the mid-plane and falls to a quarter beside it, where
+:func:`hw.midplane.amplitude_scan.amplitude_scan` stops to look.
+
+The procedures hear :class:`ImageBench` as if it were the electronics: the intensity stands for the
+amplitude of every line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal, Protocol
+
+import numpy as np
+
+from hw.midplane.amplitude_scan import amplitude_scan
+from hw.midplane.bracket import Placement
+from hw.midplane.search import Echoes, Settings
+from hw.shapes import Float, UInt8
+from jaxcal.data.segmentation.image import Localisation, localise
+from jaxcal.data.segmentation.speckle import SMALLEST_REGION, NotFoundError, envelope_of
+from jaxcal.data.segmentation.spot import brightest
+
+Target = Literal["echo", "cross"]
+
+LINES = 16
+"""Lines that the intensity stands for; as many as the procedures ask to be answered, and more."""
+FULL_SCALE = 4000.0
+"""Intensity of a white pixel: below the converter's full scale, for nothing saturates here."""
+DISPLAY_DECIBELS = 60.0
+"""Dynamic range of the display over its levels (assumption: usual, and only a scale)."""
+COARSE_MM, FINE_MM = 1.0, 0.15
+"""Largest steps; half a coarse one is the least that crosses the maximum."""
+SEEN_DB = 14.0
+"""A place this far over the background's root mean square is no speckle: in a frame's region
+speckle alone reaches about 12 dB (jaxcal.data.segmentation.image)."""
+
+
+class Mover(Protocol):
+    """What moves the probe."""
+
+    def move(self, offset_mm: float) -> float:
+        """Go there, arrive, settle; the offset as tracked, mm."""
+        ...
+
+
+class ImageBench:
+    """A bench whose response is what B-mode frames show near an expected place.
+
+    Args:
+        mover: moves the probe.
+        see: the next whole frame that began after the last move.
+        expected_px: [u, v] where the target should be.
+        within_px: look no farther from there.
+        target: ``echo`` or ``cross``.
+        credible: answer only where :func:`jaxcal.data.segmentation.image.localise` finds the target; it
+            takes longer than the brightest place.
+    """
+
+    def __init__(
+        self,
+        mover: Mover,
+        see: Callable[[], UInt8[np.ndarray, "rows columns"]],
+        expected_px: tuple[float, float],
+        within_px: float,
+        target: Target = "cross",
+        *,
+        credible: bool = False,
+    ) -> None:
+        self._mover, self._see = mover, see
+        self._expected, self._within = expected_px, within_px
+        self._target: Target = target
+        self._credible = credible
+
+    def move(self, offset_mm: float) -> float:
+        """Go there, arrive, settle; returns the offset as tracked, mm."""
+        return self._mover.move(offset_mm)
+
+    def set_threshold(self, threshold: int) -> None:
+        """An image has no threshold."""
+
+    def read(self, frames: int) -> Echoes:
+        """Intensity of the brightest place in whole frames; one frame for three of the echo's."""
+        told = [self._intensity(self._see()) for _ in range(-(-frames // 3))]
+        amplitude = np.repeat(np.array(told)[:, None], LINES, axis=1)
+        return Echoes(amplitude, amplitude > 0)
+
+    def locate(self) -> Localisation:
+        """The target in the next frame."""
+        return localise(self._see(), self._target, near=self._expected, within_px=self._within)
+
+    def _intensity(self, frame: np.ndarray) -> float:
+        if self._credible:
+            found = localise(frame, self._target, near=self._expected, within_px=self._within)
+            if not found.found[0]:
+                return 0.0
+        return brightest_intensity(frame, self._expected, self._within)
+
+
+def brightest_intensity(
+    frame: UInt8[np.ndarray, "rows columns"], expected_px: tuple[float, float], within_px: float
+) -> float:
+    """Squared envelope of the brightest place near an expected one; 0 where nothing stands out."""
+    # Only the neighbourhood: a whole frame takes ten times as long.
+    reach = int(within_px) + SMALLEST_REGION
+    first_column, first_row = (max(int(value) - reach, 0) for value in expected_px)
+    last_column, last_row = (max(int(value) + reach, 0) for value in expected_px)
+    values = frame[first_row:last_row, first_column:last_column].astype(float)
+    if min(values.shape) < SMALLEST_REGION or np.ptp(values) == 0:
+        return 0.0
+    place = np.asarray(expected_px, float) - [first_column, first_row]
+    try:
+        envelope = envelope_of(values, frame.dtype, "log", DISPLAY_DECIBELS / 255.0)
+        (row, column), _ = brightest(envelope, place, within_px)
+    except NotFoundError:
+        return 0.0
+    # The median of Rayleigh speckle is sqrt(ln 2) of its root mean square.
+    rms = float(np.median(envelope)) / np.sqrt(np.log(2.0))
+    if 20 * np.log10(max(envelope[row, column], 1e-9) / max(rms, 1e-9)) < SEEN_DB:
+        return 0.0
+    white = 10 ** ((values[row, column] / 255.0 - 1.0) * DISPLAY_DECIBELS / 20.0)
+    return FULL_SCALE * float(white) ** 2
+
+
+def image_scan(
+    bench: ImageBench,
+    settings: Settings | None = None,
+    start_mm: float = 0.0,
+    watch: Callable[[float, float, int], None] | None = None,
+) -> Placement:
+    """Scan with the robot, fit the maximum of the intensity, go there.
+
+    Args:
+        bench: looks at frames.
+        settings: steps and caps; the response's stated accuracy, which is of the active echo
+            element, is not used.
+        start_mm: where the mid-plane is expected, as an offset from the plan's pose.
+        watch: told of every stop.
+
+    Raises:
+        PlacementError: given up; the probe is at the last good place.
+    """
+    settings = Settings() if settings is None else settings
+    # Wires part within half a millimetre: coarse steps of two would pass over the crossing.
+    settings = replace(
+        settings,
+        response_sd_mm=0.0,
+        coarse_mm=min(settings.coarse_mm, COARSE_MM),
+        fine_mm=min(settings.fine_mm, FINE_MM),
+    )
+    placement = amplitude_scan(bench, settings, start_mm, watch)
+    return replace(placement, procedure="image-scan")
+
+
+def pixel_of(
+    place_mm: Float[np.ndarray, 2], spacing_mm: tuple[float, float], columns: int
+) -> tuple[float, float]:
+    """[u, v] of [lateral, range]: lateral counts from the middle column, range from row 0."""
+    return (
+        float(place_mm[0] / spacing_mm[0] + 0.5 * (columns - 1)),
+        float(place_mm[1] / spacing_mm[1]),
+    )
+
+
+def place_of(
+    pixel: Float[np.ndarray, 2], spacing_mm: tuple[float, float], columns: int
+) -> Float[np.ndarray, 2]:
+    """[lateral, range] of [u, v], mm; the inverse of :func:`pixel_of`."""
+    return np.array([(pixel[0] - 0.5 * (columns - 1)) * spacing_mm[0], pixel[1] * spacing_mm[1]])
