@@ -50,6 +50,7 @@ class Look:
         focus_mm: depth of the transmit focus; None: set to the target's depth in every image.
         defocus: growth of the transmit beam's lateral SD per mm off its focus.
         speckle_db: level of the background, dB below white.
+        face: envelope of the ringing at the probe's face; 0: none.
         beside_mm: where the wires beside the element cross, from it, in the base frame.
     """
 
@@ -63,6 +64,7 @@ class Look:
     focus_mm: float | None = None
     defocus: float = 0.05
     speckle_db: float = 34.0
+    face: float = 0.0
     beside_mm: tuple[float, float, float] = (12.0, 9.0, 0.0)
 
     def two_way_mm(self, range_mm: float, target_mm: float) -> float:
@@ -96,6 +98,7 @@ class Camera:
         level = 10 ** (-self.look.speckle_db / 20)
         self._envelope = level * _speckle(rng, self._sizes_px())
         self._levels = _compress(self._envelope)
+        self._face = self.look.face * _ringing(np.arange(ROWS) * self.spacing_mm[1])
         self._wires = CrossWire(beside_mm=self.look.beside_mm)
 
     def _sizes_px(self) -> tuple[float, float]:
@@ -141,6 +144,9 @@ class Camera:
         if look.wire > 0 and isinstance(world.phantom, ActiveEcho):
             marks = marks + self._wires.marks(world, pose, look, rng)
         self._draw(levels, envelope, marks)
+        if self.look.face > 0:
+            rows = int(np.sum(self._face > 1e-3))
+            np.maximum(levels[:rows], _compress(self._face[:rows, None]), out=levels[:rows])
         if pattern and world.phantom.answers and world.loudness(pose).max() >= max(threshold, 1):
             _, elevation, axial = world.target(pose)
             below = 0.5e3 * world.sound_speed_m_s * pattern_delay_s
@@ -205,6 +211,14 @@ def _speckle(rng: np.random.Generator, size_px: tuple[float, float]) -> Float[np
     smooth = np.fft.irfft2(waves, shape)
     smooth /= np.sqrt(2) * smooth.std()
     return np.hypot(smooth[0], smooth[1])
+
+
+def _ringing(range_mm: np.ndarray) -> Float[np.ndarray, " rows"]:
+    """Bands under the probe's face: the pulse to and fro in the lens, a millimetre apart.
+
+    Assumption: their distance and decay (1.5 mm) are those of common linear probes.
+    """
+    return np.exp(-range_mm / 1.5) * (0.6 + 0.4 * np.cos(2 * np.pi * range_mm))
 
 
 def _compress(envelope: np.ndarray) -> UInt8[np.ndarray, "rows columns"]:

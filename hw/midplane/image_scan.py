@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -40,6 +40,7 @@ SEEN_DB = 14.0
 speckle alone reaches about 12 dB (jaxcal.data.segmentation.image)."""
 
 
+@runtime_checkable
 class Mover(Protocol):
     """What moves the probe."""
 
@@ -57,8 +58,8 @@ class ImageBench:
         expected_px: [u, v] where the target should be.
         within_px: look no farther from there.
         target: ``echo`` or ``cross``.
-        credible: answer only where :func:`jaxcal.data.segmentation.image.localise` finds the target; it
-            takes longer than the brightest place.
+        credible: answer only where :func:`jaxcal.data.segmentation.image.localise` finds the
+            target; it takes longer than the brightest place.
     """
 
     def __init__(

@@ -31,7 +31,7 @@ SCATTER_MM = 0.1
 DIRECTIONS = ((0.8, 0.6, 0.0), (-0.6, 0.8, 0.0))
 """Of the wires in the base frame: level, at right angles (assumption: the paper does not tell)."""
 _HALF_MM = 30.0
-_MOST_MARKS = 48
+_MOST_MARKS = 49
 _FIRST_SOURCE = 10
 """Of the wires; what stands beside them in the tank has smaller numbers."""
 _REACH = 3.0
@@ -82,7 +82,8 @@ class CrossWire(Phantom):
             steep = max(abs(along[1]), _REACH * width / _HALF_MM)
             reach = _REACH * width / steep
             middle = float(np.clip(-crossing[1] / (np.sign(along[1]) * steep), -_HALF_MM, _HALF_MM))
-            count = min(int(2 * reach / look.lateral_mm) + 2, _MOST_MARKS)
+            # An odd number: one piece lies in the plane.
+            count = min(2 * int(reach / look.lateral_mm) + 3, _MOST_MARKS)
             for way in middle + reach * np.linspace(-1.0, 1.0, count):
                 at = crossing + way * along
                 if at[2] <= 0 or abs(way) > _HALF_MM:
