@@ -34,9 +34,9 @@ from jaxtyping import Array
 from jaxcal import Calibration, Problem, Protocol, calibrate_batch, predicted_tre, simulate
 from jaxcal.calibration.options import Method, PriorName
 from jaxcal.data.probe import L14_5
-from jaxcal.diagnostics.image_points import unknown_names
 from jaxcal.diagnostics.intervals import tre_at, tre_over
 from jaxcal.io.atomic import atomic_path
+from jaxcal.model import unknowns
 from jaxcal.study.offsets import OFFSET_LAWS, OffsetLaw
 
 SEED = 20261126
@@ -209,7 +209,7 @@ def stated_before(result: Calibration, points: np.ndarray) -> float:
         result, blocks=result.blocks[:3],
         unknowns_covariance=result.unknowns_covariance[:, :9, :9],
     )  # fmt: skip
-    left = np.asarray(jnp.sum(result.mask > 0, axis=-1)) - len(unknown_names(result.blocks)) / 3
+    left = np.asarray(jnp.sum(result.mask > 0, axis=-1)) - unknowns.size(result.blocks) / 3
     factor = left / (left - 2) if result.prior == "none" else 1.0
     told = np.asarray(predicted_tre(alone, places(result, points)))
     return rms(np.sqrt(factor)[..., None] * told if result.prior == "none" else told)

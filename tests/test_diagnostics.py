@@ -60,9 +60,12 @@ def scene():
         pixels=True,
     )
     there = jax.tree.map(np.asarray, there)
-    mine = Unknowns(
-        x[0][None], x[1][None], point[None], unknowns.scale[None], np.array([1.02]), np.array([0.3])
-    )
+    further = {
+        "scale": list(unknowns.scale[:, None]),
+        "sound-speed": [np.array([1.02])],
+        "delay": [np.array([0.3])],
+    }
+    mine = Unknowns(x[0][None], x[1][None], point[None], further)
     return data, unknowns, there, mine
 
 

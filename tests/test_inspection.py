@@ -72,7 +72,7 @@ def scores():
 
     def run(errors):
         parameters, data = jax.tree.map(np.asarray, fit(errors))
-        unknowns = Unknowns(**vars(parameters))
+        unknowns = Unknowns(parameters.rotation, parameters.translation, parameters.point)
         seen = ImageErrors.of(unknowns, data, RIGID)
         rows = (seen.rows / SIGMA[:, None]).reshape(len(errors), -1, 9)
         inverse = inverses(np.swapaxes(rows, 1, 2) @ rows, np.finfo(float).eps)

@@ -33,6 +33,7 @@ from jaxcal.diagnostics.uncertainty import AT_BOUND, LARGEST_SD, mm_at_target, t
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.parameters import Parameters, block_slice, size
 from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
+from jaxcal.model.unknowns import EXTRA, TABLE, measured
 from jaxcal.solvers.dense import inverse_lanes_last
 from jaxcal.solvers.methods import nominal_sound_speed
 
@@ -194,10 +195,14 @@ class Errors(eqx.Module):
         q = [
             sum(parameters.rotation[..., j, i, None] * probe[j] for j in range(3)) for i in range(3)
         ]
-        unit = (problem.spacing * parameters.scale)[..., None, :]
-        lateral = problem.measurements[..., 0] * unit[..., 0]
-        distance = problem.measurements[..., 1] * unit[..., 1] + problem.face_offset[..., None]
-        distance = (distance - parameters.delay[..., None]) * parameters.sound_speed[..., None]
+        points = problem.measurements * problem.spacing[..., None, :]
+        further = {
+            name: [values[..., k, None] for k in range(TABLE[name].size)]
+            for name, values in ((name, parameters.further(name)) for name in EXTRA)
+        }
+        lateral, distance = measured(
+            points[..., 0], points[..., 1], problem.face_offset[..., None], further
+        )
         # The range has no derivative at 0, where an image left out may well put the target.
         x, y, z = (
             jnp.where(mask > 0, value, unused) for value, unused in zip(q, (0, 0, 1), strict=True)

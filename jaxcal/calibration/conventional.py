@@ -22,7 +22,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.sound import WATER_M_S
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, threshold
-from jaxcal.model.blocks import EXTRA, Blocks, block_slice, size
+from jaxcal.model.unknowns import EXTRA, Blocks, block_slice, size
 from jaxcal.runtime.array_types import Bool, Float, HeldArray
 from jaxcal.runtime.trees import array_tree, assembled, map_arrays
 from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS
@@ -91,7 +91,7 @@ def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
         "rotation": unknowns.rotation[0],
         "translation": unknowns.translation[0],
         "point": unknowns.point[0],
-        "scale": unknowns.scale[0],
+        "scale": np.ravel(unknowns.further.get("scale", np.ones(2))),
         "sound_speed": np.asarray(found.sound_speed_factor),
         "searched": np.asarray(not (found.certified and found.unique)),
     }
@@ -179,18 +179,12 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: Plan) -> Calibr
 
 def _unknowns(found: ClosedForm, problem: Problem) -> Unknowns:
     """The closed form's unknowns with a leading axis."""
-    scale = np.ones(2)
+    further = {"sound-speed": [np.array([found.sound_speed_factor])]}
     if found.scale_mm_per_px is not None:
-        scale = np.asarray(found.scale_mm_per_px) / np.asarray(problem.spacing)
+        factors = np.asarray(found.scale_mm_per_px) / np.asarray(problem.spacing)
+        further["scale"] = list(factors[:, None])
     x = found.image_to_probe[None]
-    return Unknowns(
-        x[:, :3, :3],
-        x[:, :3, 3],
-        found.point_mm[None],
-        scale[None],
-        np.array([found.sound_speed_factor]),
-        np.zeros(1),
-    )
+    return Unknowns(x[:, :3, :3], x[:, :3, 3], found.point_mm[None], further)
 
 
 def _sigmas(seen: ImageErrors, used: float, blocks: tuple[str, ...]) -> Float[np.ndarray, 3]:

@@ -16,8 +16,8 @@ from jaxcal import InputError
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.diagnostics.arrays import array_module, is_traced
-from jaxcal.model.blocks import EXTRA, MEDIUM, RIGID, Blocks
 from jaxcal.model.distributions import SHAPES, UNIFORM, Shape
+from jaxcal.model.unknowns import EXTRA, MEDIUM, RIGID, Blocks
 from jaxcal.runtime.array_types import AnyArray, Array, Float
 from jaxcal.runtime.trees import array_tree
 

@@ -14,9 +14,8 @@ from jaxcal import CalibrationError, InputError
 from jaxcal.calibration.transform import AppliedPoints, ImageTransform, SaveFormat
 from jaxcal.data.problem import Problem
 from jaxcal.diagnostics.arrays import array_module, is_traced
-from jaxcal.diagnostics.image_points import IMAGE_BLOCKS, image_rows
-from jaxcal.model.blocks import Blocks
 from jaxcal.model.distributions import OffsetLaw
+from jaxcal.model.unknowns import TABLE, Blocks, in_image
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
 from jaxcal.runtime.trees import array_tree, map_arrays, static
 
@@ -418,7 +417,7 @@ class Calibration:
         scale = answer.scale_mm_per_px
         known = np.isfinite(answer.unknowns_covariance).all()
         origin, factor = range_of_row_zero(answer)
-        rows = image_rows(answer.blocks)
+        rows = in_image(answer.blocks)
         return ImageTransform(
             image_plane_to_probe=np.asarray(answer.image_to_probe),
             scale_mm_per_px=None if scale is None else np.asarray(scale),
@@ -428,7 +427,7 @@ class Calibration:
             converged=bool(self.converged),
             source="the calibration",
             range_factor=float(factor),
-            unknowns=tuple(block for block in answer.blocks if block in IMAGE_BLOCKS),
+            unknowns=tuple(name for name in answer.blocks if TABLE[name].in_image),
             image_covariance=(
                 np.asarray(answer.unknowns_covariance)[rows[:, None], rows] if known else None
             ),

@@ -24,10 +24,11 @@ import numpy as np
 
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_poses
-from jaxcal.diagnostics.image_points import IMAGE_BLOCKS, UNKNOWNS, point_jacobian, unknown_names
+from jaxcal.diagnostics.image_points import point_jacobian
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.readable import check_readable, naming, one_line, quoted
+from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.runtime.array_types import Float
 
 FORMAT = "jaxcal-calibration"
@@ -292,7 +293,7 @@ class ImageTransform:
             "face_offset_mm": self.face_offset_mm,
             "range_factor": self.range_factor,
             "covariance": None if covariance is None else covariance.tolist(),
-            "image_unknowns": unknown_names(self.unknowns),
+            "image_unknowns": tangent_names(self.unknowns),
             "image_covariance": None if full is None else full.tolist(),
             "rms_mm": self.error_mm,
         }
@@ -463,7 +464,7 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     error = _array(record, "rms_mm", ())
     converged = record.get("converged")
     unknowns = _unknowns(record)
-    size = len(unknown_names(unknowns))
+    size = len(tangent_names(unknowns))
     return ImageTransform(
         transform,
         scale,
@@ -484,8 +485,8 @@ def _unknowns(record: dict[str, Any]) -> tuple[str, ...]:
     if names is None:
         return ("translation", "rotation")
     known = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    blocks = tuple(block for block in IMAGE_BLOCKS if known and UNKNOWNS[block][0] in names)
-    if not known or unknown_names(blocks) != names or blocks[:2] != ("translation", "rotation"):
+    blocks = tuple(row.name for row in TABLE.values() if known and row.tangents[0] in names)
+    if not known or tangent_names(blocks) != names or blocks[:2] != ("translation", "rotation"):
         raise FormatError("image_unknowns names other unknowns than those of an image point")
     return blocks
 

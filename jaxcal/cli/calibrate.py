@@ -20,6 +20,7 @@ from jaxcal.cli.common import (
     progress,
     verdict_code,
 )
+from jaxcal.model.unknowns import EXTRA
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
@@ -31,7 +32,6 @@ MOST_FOLDS = 100
 """With more images than this, cross-validation holds out several at a time."""
 
 EXPORTS = ("plus", "slicer", "itk", "ros", "tusrec", "numpy")
-UNKNOWNS = ("scale", "sound-speed", "delay")
 
 
 @dataclass(frozen=True)
@@ -347,8 +347,8 @@ def unknowns(estimate: str | None) -> tuple[str, ...]:
         return ()
     names = tuple(name.strip() for name in estimate.split(","))
     for name in names:
-        if name not in UNKNOWNS:
-            raise InputError(f"cannot estimate {name!r}; there are: {', '.join(UNKNOWNS)}")
+        if name not in EXTRA:
+            raise InputError(f"cannot estimate {name!r}; there are: {', '.join(EXTRA)}")
     return names
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.design.noise import Noise
-from jaxcal.model.blocks import RIGID, block_slice
+from jaxcal.model.unknowns import RIGID, block_slice
 from jaxcal.runtime.array_types import Float
 
 if TYPE_CHECKING:

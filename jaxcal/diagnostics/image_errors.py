@@ -1,31 +1,32 @@
 """Every image's errors at an answer, and their derivatives by the unknowns.
 
 With q = X^-1 B^-1 c the target in an image's frame (:mod:`jaxcal.model.residuals`), a step of the
-unknowns X Exp([v, w]), c + d, and of the logarithms of scales and sound speed moves
+unknowns X Exp([v, w]), c + d moves
 
-    q                by  -v + [q]x w + M d,   M = R' B_R',
-    lateral x        by  x ds_lateral,
-    range r          by  s (u_axial ds_axial + (u_axial + face - delay) ds - ddelay),
+    q    by  -v + [q]x w + M d,    M = R' B_R',
 
-with u_axial the scaled axial pixel coordinate, s the factor on the sound speed and delay in mm. The
-three errors of an image are q_x - x, |(q_y, q_z)| - r and the offset q_y.
+and further unknowns move the measured lateral position x and range r
+(:func:`jaxcal.model.unknowns.measured`). The three errors of an image are q_x - x, |(q_y, q_z)| - r
+and the offset q_y.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxcal.data.sound import WATER_M_S
-from jaxcal.model.blocks import block_slice, size
+from jaxcal.model import unknowns as model
+from jaxcal.model.unknowns import RIGID, TINY, further_derivatives, size
 from jaxcal.runtime.array_types import Float
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
     from jaxcal.data.problem import Problem
-    from jaxcal.model.blocks import Blocks
+    from jaxcal.model.unknowns import Blocks
 
 Array = np.ndarray
 
@@ -38,34 +39,37 @@ class Unknowns:
         rotation: of X.
         translation: of X, mm.
         point: the target in the tracker's frame, mm.
-        scale: factors on the problem's [lateral, axial] spacing.
-        sound_speed: factor on the nominal one.
-        delay: mm at the nominal sound speed.
+        further: free further unknowns by name, an array (k,) for each component: factors on the
+            problem's spacing and on its sound speed, delay in mm at the nominal sound speed.
     """
 
     rotation: Float[Array, "k 3 3"]
     translation: Float[Array, "k 3"]
     point: Float[Array, "k 3"]
-    scale: Float[Array, "k 2"]
-    sound_speed: Float[Array, " k"]
-    delay: Float[Array, " k"]
+    further: Mapping[str, Sequence[Float[Array, " k"]]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, answer: Calibration, problem: Problem) -> Unknowns:
         """Of calibrations with one leading axis."""
         x = np.asarray(answer.image_to_probe)
-        scale, speed, delay = np.ones((len(x), 2)), np.ones(len(x)), np.zeros(len(x))
+        further = {}
         nominal = np.full(len(x), WATER_M_S)
         if problem.sound_speed is not None:
             nominal = np.asarray(problem.sound_speed)
         if answer.scale_mm_per_px is not None:
-            scale = np.asarray(answer.scale_mm_per_px) / np.asarray(problem.spacing)
+            factors = np.asarray(answer.scale_mm_per_px) / np.asarray(problem.spacing)
+            further["scale"] = list(factors.T)
         if answer.sound_speed_m_s is not None:
-            speed = np.asarray(answer.sound_speed_m_s) / nominal
+            further["sound-speed"] = [np.asarray(answer.sound_speed_m_s) / nominal]
         if answer.delay_s is not None:
             before = 0.0 if problem.delay is None else np.asarray(problem.delay)
-            delay = (np.asarray(answer.delay_s) - before) * 1e3 * nominal
-        return cls(x[:, :3, :3], x[:, :3, 3], np.asarray(answer.point), scale, speed, delay)
+            further["delay"] = [(np.asarray(answer.delay_s) - before) * 1e3 * nominal]
+        return cls(x[:, :3, :3], x[:, :3, 3], np.asarray(answer.point), further)
+
+    def along(self, axes: int) -> dict[str, list[Array]]:
+        """Further unknowns with axes of length 1 behind the leading one."""
+        behind = (...,) + (None,) * axes
+        return {name: [part[behind] for part in parts] for name, parts in self.further.items()}
 
 
 @dataclass(frozen=True)
@@ -116,10 +120,10 @@ class ImageErrors:
         q = (turned @ away[..., None])[..., 0] - home[:, None]
         q = np.where(used[..., None], q, [0.0, 0.0, 1.0])
 
-        unit = problem.spacing * unknowns.scale
-        speed, delay = unknowns.sound_speed[:, None], unknowns.delay[:, None]
-        lateral, axial = np.moveaxis(measured * unit[:, None], -1, 0)
-        distance = (axial + np.asarray(problem.face_offset)[:, None] - delay) * speed
+        across, deep = np.moveaxis(measured * np.asarray(problem.spacing)[:, None], -1, 0)
+        face = np.asarray(problem.face_offset)[:, None]
+        further = unknowns.along(1)
+        lateral, distance = model.measured(across, deep, face, further)
         elevation = q[..., 1] + shift
         far = np.hypot(elevation, q[..., 2])
         errors = np.stack([q[..., 0] - lateral, far - distance, elevation], axis=-1)
@@ -129,14 +133,10 @@ class ImageErrors:
         rows[..., 0, :], rows[..., 2, :] = along[..., 0, :], along[..., 1, :]
         rows[..., 1, :] = (elevation / far)[..., None] * along[..., 1, :]
         rows[..., 1, :] += (q[..., 2] / far)[..., None] * along[..., 2, :]
-        if "scale" in blocks:
-            at = block_slice(blocks, "scale").start
-            rows[..., 0, at] = -lateral
-            rows[..., 1, at + 1] = -axial * speed
-        if "sound-speed" in blocks:
-            rows[..., 1, block_slice(blocks, "sound-speed").start] = -distance
-        if "delay" in blocks:
-            rows[..., 1, block_slice(blocks, "delay").start] = speed
+        for column, moved in further_derivatives(
+            lambda values: model.measured(across, deep, face, values), further, blocks
+        ):
+            rows[..., 0, column], rows[..., 1, column] = -moved[0], -moved[1]
         rows *= mask[..., None, None]
         return cls(q, turned, lateral, distance, mask[..., None] * errors, rows, mask)
 
@@ -158,7 +158,7 @@ class ImageErrors:
     ) -> Float[Array, "k n 3 p"]:
         """Derivatives of :meth:`from_circle` by the unknowns, the elevation held."""
         rows = motion(self.q, self.turned, blocks) * self.mask[..., None, None]
-        further = size(("translation", "rotation", "point"))
+        further = size(RIGID)
         # The measured point moves by the unknowns between a measurement and mm.
         rows[..., 0, further:] = self.rows[..., 0, further:]
         stretch = self.distance / axial
@@ -189,12 +189,14 @@ def channel_rows(
     elements = np.asarray(channels.elements)
     apart = seen.q[:, :, None] - elements[:, None]
     far = np.linalg.norm(apart, axis=-1)
-    speed = unknowns.sound_speed[:, None, None]
-    rows = (apart / (far * speed)[..., None]) @ motion(seen.q, seen.turned, blocks)
-    if "sound-speed" in blocks:
-        rows[..., block_slice(blocks, "sound-speed").start] = -far / speed
-    if "delay" in blocks:
-        rows[..., block_slice(blocks, "delay").start] = 1.0
+    further = unknowns.along(2)
+    # By the distance itself, too, by a complex step.
+    gain = np.imag(model.heard(far + 1j * TINY, further)) / TINY
+    rows = (gain / far)[..., None] * (apart @ motion(seen.q, seen.turned, blocks))
+    for column, (change,) in further_derivatives(
+        lambda values: [model.heard(far, values)], further, blocks
+    ):
+        rows[..., column] = change
     weight = seen.mask[..., None] * np.nan_to_num(np.asarray(channels.heard))
     rows = np.where(weight[..., None] > 0, rows, 0.0) * weight[..., None]
     return rows.reshape(len(rows), -1, rows.shape[-1])

@@ -21,30 +21,6 @@ from jaxcal.runtime.array_types import Float
 if TYPE_CHECKING:
     from jaxcal.model.parameters import Blocks
 
-IMAGE_BLOCKS = ("translation", "rotation", "scale", "sound-speed", "delay")
-"""Unknowns on which the place of an image point depends."""
-
-UNKNOWNS = {
-    "translation": ("v_lateral_mm", "v_elevational_mm", "v_axial_mm"),
-    "rotation": ("omega_lateral_rad", "omega_elevational_rad", "omega_axial_rad"),
-    "point": ("point_x_mm", "point_y_mm", "point_z_mm"),
-    "scale": ("log_scale_lateral", "log_scale_axial"),
-    "sound-speed": ("log_sound_speed",),
-    "delay": ("delay_mm",),
-}
-"""Names and units of the tangents of every block."""
-
-
-def unknown_names(blocks: Blocks) -> list[str]:
-    """Names, with units, of the tangents of these blocks, in order."""
-    return [name for block in blocks for name in UNKNOWNS[block]]
-
-
-def image_rows(blocks: Blocks) -> np.ndarray:
-    """Which of the tangents of these blocks move an image point (indices)."""
-    owner = [block for block in blocks for _ in UNKNOWNS[block]]
-    return np.array([k for k, block in enumerate(owner) if block in IMAGE_BLOCKS])
-
 
 def point_jacobian(
     points: Float[Any, "*batch m 2"],

@@ -36,13 +36,14 @@ from jaxcal.diagnostics.uncertainty import (
     own_covariance,
     quadratic,
 )
+from jaxcal.model.unknowns import heard
 from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.trees import map_arrays
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
     from jaxcal.data.problem import Problem
-    from jaxcal.model.blocks import Blocks
+    from jaxcal.model.unknowns import Blocks
 
 Array = np.ndarray
 
@@ -230,16 +231,16 @@ def _on_channels(
     elements = np.asarray(channels.elements)[0]
     rows = rows.reshape(len(used), len(elements), -1)[used] / element_sd
     far = np.linalg.norm(seen.q[0][used, None] - elements, axis=-1)
-    model = far / unknowns.sound_speed[0] + unknowns.delay[0]
-    heard = np.nan_to_num(np.asarray(channels.heard))[0][used]
+    model = heard(far[None], unknowns.along(2))[0]
+    listened = np.nan_to_num(np.asarray(channels.heard))[0][used]
     measured = np.nan_to_num(np.asarray(channels.distances))[0][used]
-    errors = np.where(heard > 0, model - measured, 0.0) / element_sd
+    errors = np.where(listened > 0, model - measured, 0.0) / element_sd
     offset = seen.errors[0][used, 2:] / sigma[2]
     errors = np.concatenate([errors, offset], axis=1)
     rows = np.concatenate([rows, seen.rows[0][used, 2:] / sigma[2]], axis=1)
     # Lateral position and range come from the same elements: they count as the range.
     kind = np.array([1] * len(elements) + [2])
-    log_sd = heard.sum(axis=1) * np.log(element_sd) + np.log(sigma[2])
+    log_sd = listened.sum(axis=1) * np.log(element_sd) + np.log(sigma[2])
     return _Errors(errors, rows, kind, log_sd, used, len(used))
 
 

@@ -34,9 +34,9 @@ from jaxcal import InputError
 from jaxcal.data.sound import WATER_M_S
 from jaxcal.diagnostics import probability
 from jaxcal.diagnostics.arrays import array_module, traceable
-from jaxcal.diagnostics.image_points import image_rows, point_jacobian
+from jaxcal.diagnostics.image_points import point_jacobian
 from jaxcal.diagnostics.uncertainty import TUNED
-from jaxcal.model.blocks import size
+from jaxcal.model.unknowns import in_image, size
 from jaxcal.runtime.array_types import AnyArray, Float
 
 if TYPE_CHECKING:
@@ -241,7 +241,7 @@ def tre_over(
         level: probability that the interval holds the actual value.
     """
     answer = calibration.numpy()
-    rows = image_rows(answer.blocks)
+    rows = in_image(answer.blocks)
     jacobian = image_jacobian(answer, np.asarray(points, float))[..., rows]
     weight = np.einsum("...mia,...mib->...ab", jacobian, jacobian) / jacobian.shape[-3]
     covariance = np.asarray(answer.unknowns_covariance, float)[..., rows[:, None], rows]

@@ -13,8 +13,8 @@ import numpy as np
 from jaxcal.diagnostics.offset_fit import contradicted
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK, MISFITS
 from jaxcal.diagnostics.uncertainty import TUNED
-from jaxcal.model.blocks import BLOCK_SIZE
 from jaxcal.model.distributions import FAMILIES
+from jaxcal.model.unknowns import TABLE, block_slice
 from jaxcal.runtime.array_types import AnyArray
 
 if TYPE_CHECKING:
@@ -50,30 +50,6 @@ class HasOutliers(Protocol):
         ...
 
 
-_AXES = {
-    "translation": ("lateral", "elevational", "axial"),
-    "rotation": ("lateral", "elevational", "axial"),
-    "point": ("x", "y", "z"),
-    "scale": ("lateral", "axial"),
-    "sound-speed": ("",),
-    "delay": ("",),
-}
-_NOUN = {
-    "translation": "translation along the {} axis",
-    "rotation": "rotation about the {} axis",
-    "point": "target position along the tracker's {}",
-    "scale": "{} pixel scale",
-    "sound-speed": "sound speed{}",
-    "delay": "delay{}",
-}
-_OBLIQUE = {
-    "translation": "translation along an oblique axis (lateral {:.2f}, elevational {:.2f}, "
-    "axial {:.2f})",
-    "rotation": "rotation about an oblique axis (lateral {:.2f}, elevational {:.2f}, axial {:.2f})",
-    "point": "target position along the tracker's ({:.2f}, {:.2f}, {:.2f})",
-    "scale": "both pixel scales ({:.2f}, {:.2f})",
-}
-
 COMPONENTS = ("lateral", "range", "elevational")
 SUSPECTED = 0.02
 """Share of recordings with Gaussian errors in which some image is suspected by chance."""
@@ -100,10 +76,9 @@ def direction_in_words(vector: AnyArray, blocks: tuple[str, ...]) -> str:
         vector: components in scaled units (mm at the lever arm), in the order of ``blocks``.
         blocks: the unknowns.
     """
-    parts, start = {}, 0
+    parts = {}
     for block in blocks:
-        parts[block] = np.asarray(vector[start : start + BLOCK_SIZE[block]], dtype=float)
-        start += BLOCK_SIZE[block]
+        parts[block] = np.asarray(vector[block_slice(blocks, block)], dtype=float)
     size = {block: float(np.linalg.norm(part)) for block, part in parts.items()}
     total = float(np.linalg.norm(vector))
     if not np.isfinite(total) or total == 0:
@@ -122,12 +97,12 @@ def direction_in_words(vector: AnyArray, blocks: tuple[str, ...]) -> str:
 
 
 def _block_in_words(block: str, part: np.ndarray) -> str:
-    unit = part / np.linalg.norm(part)
+    row, unit = TABLE[block], part / np.linalg.norm(part)
     largest = int(np.argmax(np.abs(unit)))
     if abs(unit[largest]) > 0.9:
-        return _NOUN[block].format(_AXES[block][largest])
+        return row.words.format(row.axes[largest])
     unit = unit * np.sign(unit[largest])
-    return _OBLIQUE[block].format(*unit)
+    return row.oblique.format(*unit)
 
 
 def observability(result: Calibration) -> dict[str, float | str | None]:
@@ -213,7 +188,7 @@ def poses_to_add(result: Calibration) -> str:
     if not gain.max() > 0:
         return "add images with the probe tilted about each of its axes"
     worth = gain >= WORTH * gain.max()
-    tilts = [name for name, good in zip(_AXES["rotation"], worth[:3], strict=True) if good]
+    tilts = [name for name, good in zip(TABLE["rotation"].axes, worth[:3], strict=True) if good]
     parts = []
     if tilts:
         listed = " and ".join([", ".join(tilts[:-1]), tilts[-1]] if tilts[1:] else tilts)

@@ -24,15 +24,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal.diagnostics.uncertainty import TUNED, Uncertainty, Whitened, inverses, quadratic
-from jaxcal.model.blocks import block_slice
 from jaxcal.model.outliers import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
+from jaxcal.model.unknowns import block_slice, further_derivatives, measured
 from jaxcal.runtime.array_types import Bool, Float
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
     from jaxcal.data.problem import Problem
     from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
-    from jaxcal.model.blocks import Blocks
+    from jaxcal.model.unknowns import Blocks
 
 Array = np.ndarray
 
@@ -266,18 +266,17 @@ def gains(
 
     errors = np.einsum("kmip,kp->kmi", motion(q, turned, blocks), step)
     errors = errors[..., [0, 2, 1]]
-    # The same places with unknowns between a measurement and mm.
-    speed, delay = unknowns.sound_speed[:, None], unknowns.delay[:, None]
-    face = np.asarray(problem.face_offset)[:, None]
-    if "scale" in blocks:
-        lateral, axial = step[:, block_slice(blocks, "scale")].T[..., None]
-        errors[..., 0] -= places[..., 0] * lateral
-        errors[..., 1] -= (places[..., 1] - face) * speed * axial
-    if "sound-speed" in blocks:
-        change = step[:, block_slice(blocks, "sound-speed")]
-        errors[..., 1] -= (places[..., 1] - delay) * speed * change
-    if "delay" in blocks:
-        errors[..., 1] += speed * step[:, block_slice(blocks, "delay")]
+    # The same places with the unknowns between a measurement and mm, of which it is a linear
+    # function: what would have been measured there is told by two others.
+    face, further = np.asarray(problem.face_offset)[:, None], unknowns.along(1)
+    one = np.ones_like(places[..., 0])
+    offset, end = (np.stack(measured(k * one, k * one, face, further), -1) for k in (0, 1))
+    across, deep = np.moveaxis((places - offset) / (end - offset), -1, 0)
+    for column, (lateral, distance) in further_derivatives(
+        lambda values: measured(across, deep, face, values), further, blocks
+    ):
+        errors[..., 0] -= lateral * step[:, column, None]
+        errors[..., 1] -= distance * step[:, column, None]
     sigma = np.maximum(np.asarray(answer.sigma), 1e-9)[:, None]
     noticed = np.sqrt(np.sum((errors / sigma) ** 2, axis=2))
     return noticed.reshape(-1, 5, 2).max(axis=2)

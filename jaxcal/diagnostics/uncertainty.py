@@ -22,15 +22,15 @@ import numpy as np
 
 from jaxcal.calibration.options import DEFAULT_MAX_ELEVATION_MM
 from jaxcal.diagnostics.arrays import array_module
-from jaxcal.model.blocks import BLOCK_SIZE, block_slice
 from jaxcal.model.thresholds import LARGEST_ELEVATION
+from jaxcal.model.unknowns import TABLE, block_slice
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
     from jaxcal.data.problem import Problem
     from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
-    from jaxcal.model.blocks import Blocks
+    from jaxcal.model.unknowns import Blocks
 
 Array = np.ndarray
 
@@ -175,8 +175,8 @@ def mm_at_target(lever: Float[AnyArray, "*batch"], blocks: Blocks) -> Any:
     Of a traced lever arm a traced array.
     """
     xp, one = array_module(lever), 0 * lever + 1
-    turning = ("rotation", "scale", "sound-speed")
-    each = [lever if name in turning else one for name in blocks for _ in range(BLOCK_SIZE[name])]
+    rows = [TABLE[name] for name in blocks]
+    each = [lever if row.lever else one for row in rows for _ in row.tangents]
     return xp.stack(each, axis=-1)
 
 

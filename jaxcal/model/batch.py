@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from jaxcal.data.problem import Problem
 from jaxcal.model import unrolled
 from jaxcal.model.parameters import EXTRA, Blocks, Parameters, block_slice, size
+from jaxcal.model.unknowns import step_between, stepped
 from jaxcal.model.unrolled import Matrix, Vector
 
 RIGID_UNKNOWNS = 9
@@ -140,8 +141,7 @@ class Iterate(eqx.Module):
         rotation: of X.
         translation: of X, mm.
         point: c, mm.
-        extras: further unknowns: factors of scale and sound speed, delay in mm, in the order of
-            the blocks.
+        extras: components of the free further unknowns, in the order of the blocks.
         blocks: which unknowns are free (static).
     """
 
@@ -154,13 +154,9 @@ class Iterate(eqx.Module):
     @classmethod
     def of(cls, parameters: Parameters, blocks: Blocks) -> Iterate:
         """From parameters with a leading axis."""
-        values = {
-            "scale": parameters.scale.T,
-            "sound-speed": parameters.sound_speed[None],
-            "delay": parameters.delay[None],
-        }
         none = jnp.zeros((0, parameters.point.shape[0]), parameters.point.dtype)
-        extras = jnp.concatenate([none, *(values[name] for name in EXTRA if name in blocks)])
+        free = [parameters.further(name).T for name in EXTRA if name in blocks]
+        extras = jnp.concatenate([none, *free])
         rotation = jnp.moveaxis(parameters.rotation, 0, -1)
         return cls(rotation, parameters.translation.T, parameters.point.T, extras, blocks)
 
@@ -180,14 +176,9 @@ class Iterate(eqx.Module):
         """With a leading axis; what is not free is nominal."""
         rotation = jnp.moveaxis(self.rotation, -1, 0)
         found = jax.vmap(Parameters.of)(rotation, self.translation.T, self.point.T)
-        scale, speed, delay = (self.extra(name) for name in EXTRA)
-        return Parameters(
-            found.rotation,
-            found.translation,
-            found.point,
-            found.scale if scale is None else scale.T,
-            found.sound_speed if speed is None else speed[0],
-            found.delay if delay is None else delay[0],
+        free = {name: self.extra(name) for name in EXTRA}
+        return found.with_further(
+            {name: value.T for name, value in free.items() if value is not None}
         )
 
     def moved(self, step: Vector) -> Iterate:
@@ -203,7 +194,7 @@ class Iterate(eqx.Module):
             at = RIGID_UNKNOWNS
             parts = []
             for value, name in zip(extras, _extra_names(self.blocks), strict=True):
-                parts.append(value + step[at] if name == "delay" else value * jnp.exp(step[at]))
+                parts.append(stepped(name, value, step[at], jnp.exp))
                 at += 1
             extras = jnp.stack(parts)
         return Iterate(
@@ -226,7 +217,7 @@ class Iterate(eqx.Module):
         parts.append(other.point - self.point)
         names = _extra_names(self.blocks)
         for here, there, name in zip(self.extras, other.extras, names, strict=True):
-            parts.append((there - here if name == "delay" else jnp.log(there / here))[None])
+            parts.append(step_between(name, here, there, jnp.log)[None])
         return jnp.concatenate(parts)
 
 

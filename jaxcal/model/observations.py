@@ -34,8 +34,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.model.batch import RIGID_UNKNOWNS, Images, Iterate, targets, whole
-from jaxcal.model.parameters import EXTRA, Blocks, block_slice
 from jaxcal.model.thresholds import LARGEST_ELEVATION
+from jaxcal.model.unknowns import (
+    EXTRA,
+    MEDIUM,
+    TABLE,
+    Blocks,
+    block_slice,
+    heard,
+    measured,
+    step_between,
+    stepped,
+)
 from jaxcal.model.unrolled import Vector, add
 
 TRACKER_STEPS = 4
@@ -43,50 +53,37 @@ TRACKER_STEPS = 4
 
 
 class Further(eqx.Module):
-    """The further unknowns as an image sees them, one plane (lanes, 1) each; None: not free.
+    """The free further unknowns as an image sees them (:mod:`jaxcal.model.unknowns`).
 
     Attributes:
-        scale: factors on lateral and axial spacing, or None.
-        sound_speed: factor on the speed by which times became distances, or None.
-        delay: what the system adds to a distance, mm, or None.
+        values: by name, a plane (lanes, 1) for each component.
     """
 
-    scale: Vector | None
-    sound_speed: Array | None
-    delay: Array | None
+    values: dict[str, Vector]
 
     @classmethod
     def of(cls, iterate: Iterate, tangent: Vector) -> Further:
-        """The iterate's, moved by tangents (log units, mm)."""
-        scale, speed, delay = (_moved(iterate, name, tangent) for name in EXTRA)
-        return cls(scale, None if speed is None else speed[0], None if delay is None else delay[0])
+        """The iterate's, moved by tangents."""
+        values = {}
+        for name in EXTRA:
+            components = iterate.extra(name)
+            if components is not None:
+                at = block_slice(iterate.blocks, name)
+                steps = tangent[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
+                values[name] = [
+                    stepped(name, value[:, None], step, jnp.exp)
+                    for value, step in zip(components, steps, strict=True)
+                ]
+        return cls(values)
 
     def points(self, images: Images) -> tuple[Array, Array]:
-        """Lateral position and range of every image, mm.
+        """Lateral position and range of every image, mm."""
+        return measured(images.lateral, images.axial, images.face[:, None], self.values)
 
-        Pixels are multiplied by their scale; a range is a time of flight in disguise and follows
-        sound speed and delay, while lateral positions come from where the elements are.
-        """
-        lateral, axial = images.lateral, images.axial
-        if self.scale is not None:
-            lateral, axial = lateral * self.scale[0], axial * self.scale[1]
-        distance = axial + images.face[:, None]
-        if self.delay is not None:
-            distance = distance - self.delay
-        if self.sound_speed is not None:
-            distance = distance * self.sound_speed
-        return lateral, distance
-
-
-def _moved(iterate: Iterate, name: str, tangent: Vector) -> Vector | None:
-    values = iterate.extra(name)
-    if values is None:
-        return None
-    at = block_slice(iterate.blocks, name)
-    steps = tangent[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
-    if name == "delay":
-        return [value[:, None] + step for value, step in zip(values, steps, strict=True)]
-    return [value[:, None] * jnp.exp(step) for value, step in zip(values, steps, strict=True)]
+    def heard(self, distance: Array) -> Array:
+        """What elements measure of targets at distances (lanes, n, elements), mm."""
+        planes = {name: [v[..., None] for v in value] for name, value in self.values.items()}
+        return heard(distance, planes)
 
 
 class Component(eqx.Module):
@@ -248,11 +245,7 @@ class Channels(Observation):
         square = 0.0
         for value, element in zip(q, channels.elements, strict=True):
             square = square + (value[..., None] - element[:, None, :]) ** 2
-        exact = jnp.sqrt(square)
-        if further.sound_speed is not None:
-            exact = exact / further.sound_speed[..., None]
-        if further.delay is not None:
-            exact = exact + further.delay[..., None]
+        exact = further.heard(jnp.sqrt(square))
         return [Component([exact - channels.distances], channels.heard), Component([q[1]])]
 
     def count(self, images: Images) -> Float[Array, "2 lanes"]:
@@ -469,9 +462,9 @@ class Medium(eqx.Module):
     def deviations(self, iterate: Iterate) -> list[tuple[int, Array, Array]]:
         """Place, deviation from nominal and its precision, of every further unknown there is."""
         found = []
-        for name, sd in zip(("sound-speed", "delay"), self.sd, strict=True):
+        for name, sd in zip(MEDIUM, self.sd, strict=True):
             value = iterate.extra(name)
             if value is not None:
-                away = jnp.log(value[0]) if name == "sound-speed" else value[0]
+                away = step_between(name, TABLE[name].nominal, value[0], jnp.log)
                 found.append((block_slice(self.blocks, name).start, away, 1 / (sd * sd)))
         return found

@@ -1,25 +1,27 @@
 """The unknowns other than the offsets, in named blocks, and how a step moves them.
 
 X steps on its manifold by the right perturbation X Exp([v, omega]), so v (mm) and omega (rad) are
-along and about the image's own axes (lateral, elevational, axial). Pixel scales and sound speed
-step in their logarithm, which keeps them positive. A solver is told which blocks are free; the rest
-stay fixed. :mod:`jaxcal.model.blocks` holds their names and sizes, which can be had here too.
+along and about the image's own axes (lateral, elevational, axial). How further unknowns step is
+said in :mod:`jaxcal.model.unknowns`, whose names can be had here too. A solver is told which blocks
+are free; the rest stay fixed.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.data.geometry import matrix_from_rotation, rotation_from_vector
-from jaxcal.model.blocks import BLOCK_SIZE as BLOCK_SIZE
-from jaxcal.model.blocks import EXTRA as EXTRA
-from jaxcal.model.blocks import MEDIUM as MEDIUM
-from jaxcal.model.blocks import RIGID as RIGID
-from jaxcal.model.blocks import Blocks as Blocks
-from jaxcal.model.blocks import block_slice as block_slice
-from jaxcal.model.blocks import size as size
+from jaxcal.model.unknowns import EXTRA as EXTRA
+from jaxcal.model.unknowns import MEDIUM as MEDIUM
+from jaxcal.model.unknowns import RIGID as RIGID
+from jaxcal.model.unknowns import TABLE, stepped
+from jaxcal.model.unknowns import Blocks as Blocks
+from jaxcal.model.unknowns import block_slice as block_slice
+from jaxcal.model.unknowns import size as size
 
 
 class Parameters(eqx.Module):
@@ -55,6 +57,21 @@ class Parameters(eqx.Module):
         scale = jnp.ones(2, translation.dtype) if scale is None else scale
         return cls(rotation, translation, point, scale, one, jnp.zeros_like(one))
 
+    def further(self, name: str) -> Float[Array, "*batch k"]:
+        """A further unknown's components, last."""
+        value = getattr(self, TABLE[name].field)
+        return value if value.ndim == self.point.ndim else value[..., None]
+
+    def with_further(self, values: dict[str, Float[Array, "*batch k"]]) -> Parameters:
+        """With other values of further unknowns, components last."""
+        fields = {
+            TABLE[name].field: value
+            if getattr(self, TABLE[name].field).ndim == value.ndim
+            else value[..., 0]
+            for name, value in values.items()
+        }
+        return replace(self, **fields)
+
     def matrix(self) -> Float[Array, "4 4"]:
         """X as a 4x4 matrix, mm."""
         return matrix_from_rotation(self.rotation, self.translation)
@@ -66,17 +83,22 @@ def retract(parameters: Parameters, tangent: Float[Array, " p"], blocks: Blocks)
     def part(name: str) -> Float[Array, " k"]:
         if name in blocks:
             return tangent[block_slice(blocks, name)]
-        return jnp.zeros(BLOCK_SIZE[name], tangent.dtype)
+        return jnp.zeros(TABLE[name].size, tangent.dtype)
 
     # R Exp([v, w]) with Exp's translation taken as v itself: the same first order as SE(3)'s
     # exponential, defined for any step, and cheaper. Rotations are kept as matrices: the residuals
     # need nothing else, and a product of quaternions to get there doubles what XLA must compile.
     turn = rotation_from_vector(part("rotation"))
-    return Parameters(
+    moved = replace(
+        parameters,
         rotation=parameters.rotation @ turn,
         translation=parameters.translation + parameters.rotation @ part("translation"),
         point=parameters.point + part("point"),
-        scale=parameters.scale * jnp.exp(part("scale")),
-        sound_speed=parameters.sound_speed * jnp.exp(part("sound-speed")[0]),
-        delay=parameters.delay + part("delay")[0],
+    )
+    return moved.with_further(
+        {
+            name: stepped(name, parameters.further(name), part(name), jnp.exp)
+            for name in EXTRA
+            if name in blocks
+        }
     )

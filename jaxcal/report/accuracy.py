@@ -243,13 +243,12 @@ def _comparison(
         return None
     x, point = np.asarray(other.image_to_probe), np.asarray(other.point_mm)
     spacing = np.asarray(problem.spacing, float)
-    scale = np.ones(2)
+    scale, further = np.ones(2), {}
     if other.scale_mm_per_px is not None:
         scale = np.asarray(other.scale_mm_per_px) / spacing
+        further["scale"] = list(scale[:, None])
     alone = _batch_of_one(problem)
-    unknowns = Unknowns(
-        x[None, :3, :3], x[None, :3, 3], point[None], scale[None], np.ones(1), np.zeros(1)
-    )
+    unknowns = Unknowns(x[None, :3, :3], x[None, :3, 3], point[None], further)
     sigma = np.asarray(answer.sigma, float)
     if not np.isfinite(sigma).all():
         return None

@@ -14,8 +14,8 @@ from jaxcal.calibration.transform import FORMAT, VERSION
 from jaxcal.data.poses import rotation_angle
 from jaxcal.data.recording import Images, Recording, Truth
 from jaxcal.diagnostics import messages
-from jaxcal.diagnostics.image_points import image_rows, unknown_names
 from jaxcal.diagnostics.metrics import reconstruction_precision
+from jaxcal.model.unknowns import in_image, tangent_names
 from jaxcal.report.accuracy import accuracy_record, settle
 from jaxcal.report.certified import certificate_record
 from jaxcal.runtime.array_types import Float
@@ -76,7 +76,7 @@ def calibration_record(
     precision, precision_set = _precision(answer, recording, test)
     scale = answer.scale_mm_per_px
     transform = answer.image_transform()
-    full, rows = answer.unknowns_covariance, image_rows(answer.blocks)
+    full, rows = answer.unknowns_covariance, in_image(answer.blocks)
     known = bool(np.isfinite(full).all())
     record: dict[str, Any] = {
         "format": FORMAT,
@@ -99,7 +99,7 @@ def calibration_record(
         "sigma_range_mm": answer.sigma[1],
         "sigma_elevation_mm": answer.sigma[2],
         "covariance": answer.covariance if known else None,
-        "image_unknowns": unknown_names(transform.unknowns),
+        "image_unknowns": tangent_names(transform.unknowns),
         "image_covariance": full[rows[:, None], rows] if known else None,
         "point_covariance_mm2": answer.point_covariance if known else None,
         "observability": result.observability,

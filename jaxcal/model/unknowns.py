@@ -1,0 +1,222 @@
+"""The unknowns other than the offsets: a table with a row for each. Needs no JAX.
+
+X and the target are those of Eq. 7. *Further* unknowns stand between what was measured and mm:
+:func:`measured` and :func:`heard` say how, in arithmetic that numpy, JAX and complex numbers share.
+Whatever else has to know of an unknown (steps, derivatives, names, words) reads it from here: a
+further unknown is a row, its line in :func:`measured`, and its field in
+:class:`jaxcal.model.parameters.Parameters`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+Blocks = tuple[str, ...]
+"""Names of free unknowns, in the table's order; X and the target come first."""
+
+Values = Mapping[str, Sequence[Any]]
+"""Further unknowns that are free, by name: one array for each component."""
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """One row of the table.
+
+    Attributes:
+        name: as a caller asks for it (``estimate``).
+        tangents: names of its components in records, with the unit of their steps.
+        step: how a step moves a component: ``frame`` along and about the axes of X, ``add``
+            in its own unit, ``factor`` by its logarithm, which keeps it positive.
+        lever: whether a step has to be multiplied by the lever arm to be mm at the target.
+        in_image: whether the place of an image point depends on it.
+        words: one component in words, with a place for the axis.
+        axes: what goes there.
+        oblique: several components in words; empty for a single one.
+    """
+
+    name: str
+    tangents: tuple[str, ...]
+    step: Literal["frame", "add", "factor"]
+    lever: bool
+    in_image: bool
+    words: str
+    axes: tuple[str, ...] = ("",)
+    oblique: str = ""
+
+    @property
+    def size(self) -> int:
+        """Number of its components."""
+        return len(self.tangents)
+
+    @property
+    def field(self) -> str:
+        """Its name where a name in Python is wanted."""
+        return self.name.replace("-", "_")
+
+    @property
+    def nominal(self) -> float:
+        """Its value where it is not free."""
+        return 1.0 if self.step == "factor" else 0.0
+
+
+_IMAGE_AXES = ("lateral", "elevational", "axial")
+
+TABLE = {
+    row.name: row
+    for row in (
+        Unknown(
+            "translation", ("v_lateral_mm", "v_elevational_mm", "v_axial_mm"), "frame",
+            lever=False, in_image=True,
+            words="translation along the {} axis", axes=_IMAGE_AXES,
+            oblique="translation along an oblique axis (lateral {:.2f}, elevational {:.2f}, "
+            "axial {:.2f})",
+        ),
+        Unknown(
+            "rotation", ("omega_lateral_rad", "omega_elevational_rad", "omega_axial_rad"), "frame",
+            lever=True, in_image=True,
+            words="rotation about the {} axis", axes=_IMAGE_AXES,
+            oblique="rotation about an oblique axis (lateral {:.2f}, elevational {:.2f}, "
+            "axial {:.2f})",
+        ),
+        Unknown(
+            "point", ("point_x_mm", "point_y_mm", "point_z_mm"), "add",
+            lever=False, in_image=False,
+            words="target position along the tracker's {}", axes=("x", "y", "z"),
+            oblique="target position along the tracker's ({:.2f}, {:.2f}, {:.2f})",
+        ),
+        Unknown(
+            "scale", ("log_scale_lateral", "log_scale_axial"), "factor",
+            lever=True, in_image=True,
+            words="{} pixel scale", axes=("lateral", "axial"),
+            oblique="both pixel scales ({:.2f}, {:.2f})",
+        ),
+        Unknown(
+            "sound-speed", ("log_sound_speed",), "factor",
+            lever=True, in_image=True, words="sound speed{}",
+        ),
+        Unknown("delay", ("delay_mm",), "add", lever=False, in_image=True, words="delay{}"),
+    )
+}  # fmt: skip
+"""In the order of a step's components."""
+
+RIGID: Blocks = ("translation", "rotation", "point")
+"""The unknowns of Eq. 7: X and the target."""
+
+EXTRA: Blocks = tuple(name for name in TABLE if name not in RIGID)
+"""Further unknowns: what a caller may ask for beside X and the target."""
+
+TINY = 1e-20
+"""A complex step: its square is nothing beside a number of double precision."""
+
+MEDIUM = ("sound-speed", "delay")
+"""Those between a time of flight and a distance, of which something is known before."""
+
+
+def measured(lateral: Any, axial: Any, face: Any, values: Values) -> tuple[Any, Any]:
+    """Lateral position and range of a point, mm, after the further unknowns.
+
+    Pixels are multiplied by their scale. A range is a time of flight in disguise and follows
+    sound speed and delay, while lateral positions come from where the elements are.
+
+    Args:
+        lateral: at the nominal scale, mm.
+        axial: range from pixel row 0 at the nominal scale, mm.
+        face: range of pixel row 0, mm.
+        values: free unknowns: factors on the lateral and axial scale, factor on the sound speed,
+            delay in mm at the nominal speed.
+    """
+    if "scale" in values:
+        across, along = values["scale"]
+        lateral, axial = lateral * across, axial * along
+    distance = axial + face
+    if "delay" in values:
+        distance = distance - values["delay"][0]
+    if "sound-speed" in values:
+        distance = distance * values["sound-speed"][0]
+    return lateral, distance
+
+
+def heard(distance: Any, values: Values) -> Any:
+    """What an element measures of a target at a distance (mm), mm at the nominal sound speed."""
+    if "sound-speed" in values:
+        distance = distance / values["sound-speed"][0]
+    if "delay" in values:
+        distance = distance + values["delay"][0]
+    return distance
+
+
+def stepped(name: str, value: Any, step: Any, exp: Callable[[Any], Any]) -> Any:
+    """A component of a further unknown after a step.
+
+    Args:
+        name: of the unknown.
+        value: of the component.
+        step: its tangent.
+        exp: the exponential of numpy or of JAX.
+    """
+    return value * exp(step) if TABLE[name].step == "factor" else value + step
+
+
+def step_between(name: str, here: Any, there: Any, log: Callable[[Any], Any]) -> Any:
+    """The step that :func:`stepped` takes from one value to another."""
+    return log(there / here) if TABLE[name].step == "factor" else there - here
+
+
+def further_derivatives(
+    function: Callable[[Values], Sequence[Any]], values: Values, blocks: Blocks
+) -> list[tuple[int, list[np.ndarray]]]:
+    """Derivatives of real functions by the steps of the free further unknowns, in numpy.
+
+    By a complex step, which has no rounding error worth the name (Squire and Trapp, SIAM Review 40,
+    1998): the function must be analytic, as :func:`measured` and :func:`heard` are.
+
+    Args:
+        function: of the values; a sequence of arrays.
+        values: where; what is missing is nominal.
+        blocks: the free unknowns.
+
+    Returns:
+        For each tangent its place among those of the blocks, and the derivatives.
+    """
+    found = []
+    for name in EXTRA:
+        if name not in blocks:
+            continue
+        first, row = block_slice(blocks, name).start, TABLE[name]
+        here = values.get(name, [np.array(row.nominal)] * row.size)
+        for k in range(row.size):
+            moved = list(here)
+            moved[k] = stepped(name, here[k], 1j * TINY, np.exp)
+            at = function({**values, name: moved})
+            found.append((first + k, [np.imag(array) / TINY for array in at]))
+    return found
+
+
+def size(blocks: Blocks) -> int:
+    """Number of scalar unknowns in the given blocks."""
+    return sum(TABLE[name].size for name in blocks)
+
+
+def block_slice(blocks: Blocks, name: str) -> slice:
+    """Where a block lies in the tangent vector of the given blocks."""
+    start = 0
+    for block in blocks:
+        if block == name:
+            return slice(start, start + TABLE[block].size)
+        start += TABLE[block].size
+    raise KeyError(name)
+
+
+def tangent_names(blocks: Blocks) -> list[str]:
+    """Names, with units, of the tangents of these blocks, in order."""
+    return [name for block in blocks for name in TABLE[block].tangents]
+
+
+def in_image(blocks: Blocks) -> np.ndarray:
+    """Which of the tangents of these blocks move an image point (indices)."""
+    moving = [TABLE[block].in_image for block in blocks for _ in TABLE[block].tangents]
+    return np.flatnonzero(moving)
