@@ -20,7 +20,6 @@ from jaxcal.cli.common import (
     progress,
     verdict_code,
 )
-from jaxcal.model.unknowns import EXTRA
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
@@ -343,6 +342,8 @@ def _request(
 
 def unknowns(estimate: str | None) -> tuple[str, ...]:
     """The names in the option --estimate."""
+    from jaxcal.model.unknowns import EXTRA
+
     if estimate is None:
         return ()
     names = tuple(name.strip() for name in estimate.split(","))
