@@ -1,6 +1,7 @@
 """Monte-Carlo studies: a grid of conditions x methods x trials, computed in resumable chunks.
 
 spec.py     what is to be computed, from a TOML file
+own.py      what the engine asks of a study, for studies of one's own
 pipeline.py one chunk: draw, segment, solve by every method, compare with the truth
 store.py    one HDF5 file per chunk; what is there, what is missing
 run.py      the missing chunks, here or on a cluster (cluster.py)
@@ -14,13 +15,19 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from jaxcal.study.own import ArraySpec as ArraySpec
+    from jaxcal.study.own import Study as Study
     from jaxcal.study.results import open_results as open_results
     from jaxcal.study.run import run_study as run_study
+    from jaxcal.study.spec import Chunk as Chunk
     from jaxcal.study.spec import Spec as Spec
     from jaxcal.study.spec import load_spec as load_spec
 
 _HOME = {
+    "ArraySpec": "jaxcal.study.own",
+    "Chunk": "jaxcal.study.spec",
     "Spec": "jaxcal.study.spec",
+    "Study": "jaxcal.study.own",
     "load_spec": "jaxcal.study.spec",
     "open_results": "jaxcal.study.results",
     "run_study": "jaxcal.study.run",

@@ -20,7 +20,8 @@ import numpy as np
 
 from jaxcal import CalibrationError, InputError, MissingExtraError
 from jaxcal.io.readable import one_line
-from jaxcal.study.spec import Chunk, Spec, spec_from_canonical
+from jaxcal.study.own import Study, study_from, where_defined
+from jaxcal.study.spec import Chunk
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -32,7 +33,7 @@ CONNECT_SECONDS = 30
 
 
 def compute_on_cluster(
-    spec: Spec, chunks: list[Chunk], scheduler: Any
+    spec: Study, chunks: list[Chunk], scheduler: Any
 ) -> Iterator[tuple[Chunk, dict[str, np.ndarray], str]]:
     """Compute chunks on worker processes; yields them as they are done.
 
@@ -64,17 +65,19 @@ def _connect(scheduler: Any) -> Client:
         raise InputError(f"no Dask scheduler answers at {scheduler}: {one_line(error)}") from None
 
 
-def compute_from_text(canonical: str, index: int) -> tuple[dict[str, np.ndarray], str]:
-    """What a worker does: chunk ``index`` of the spec with this canonical text."""
-    from jaxcal.study.pipeline import compute_chunk, device_name
+def compute_from_text(
+    canonical: str, where: tuple[tuple[str, str], ...], index: int
+) -> tuple[dict[str, np.ndarray], str]:
+    """What a worker does: chunk ``index`` of the study with this canonical text and class."""
+    from jaxcal.study.pipeline import device_name
 
-    spec = _spec(canonical)
-    return compute_chunk(spec, spec.chunk(index)), device_name()
+    spec = _spec(canonical, where)
+    return spec.compute(spec.chunk(index)), device_name()
 
 
 @lru_cache(maxsize=4)
-def _spec(canonical: str) -> Spec:
-    return spec_from_canonical(canonical)
+def _spec(canonical: str, where: tuple[tuple[str, str], ...]) -> Study:
+    return study_from(dict(where), canonical)
 
 
 def _threads(client: Client) -> dict[str, int]:
@@ -83,17 +86,18 @@ def _threads(client: Client) -> dict[str, int]:
 
 
 def _distribute(
-    client: Client, spec: Spec, chunks: list[Chunk]
+    client: Client, spec: Study, chunks: list[Chunk]
 ) -> Iterator[tuple[Chunk, dict[str, np.ndarray], str]]:
     from distributed import as_completed
 
     canonical, waiting = spec.canonical(), list(reversed(chunks))
+    where = tuple(where_defined(spec).items())
     by_key: dict[Any, Chunk] = {}
     done = as_completed([], loop=client.loop)
 
     def hand_out() -> None:
         chunk = waiting.pop()
-        future = client.submit(compute_from_text, canonical, chunk.index, pure=False)
+        future = client.submit(compute_from_text, canonical, where, chunk.index, pure=False)
         by_key[future.key] = chunk
         done.add(future)
 

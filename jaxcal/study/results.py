@@ -10,7 +10,8 @@ import numpy as np
 from jaxcal import FormatError, MissingExtraError
 from jaxcal.calibration.result import Status
 from jaxcal.study.pipeline import COMPONENTS, bound_mm
-from jaxcal.study.store import UNITS, Store
+from jaxcal.study.spec import UNITS, Spec
+from jaxcal.study.store import Store
 
 if TYPE_CHECKING:
     import xarray
@@ -70,7 +71,7 @@ def open_results(folder: str | os.PathLike[str], *, incomplete: bool = False) ->
     return xarray.Dataset(variables, coordinates, attributes)
 
 
-def read_all(store: Store, *, incomplete: bool = False) -> dict[str, np.ndarray]:
+def read_all(store: Store[Spec], *, incomplete: bool = False) -> dict[str, np.ndarray]:
     """Every array of a study with the conditions (in counting order) as its first axis.
 
     Raises:

@@ -13,7 +13,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from jaxcal import FormatError, InputError
-from jaxcal.study.spec import Chunk, Spec
+from jaxcal.study.own import Study
+from jaxcal.study.spec import Chunk
 from jaxcal.study.store import Store
 
 try:
@@ -70,7 +71,7 @@ class Summary:
 
 
 def run_study(
-    spec: Spec,
+    spec: Study,
     folder: str | os.PathLike[str],
     *,
     resume: bool = False,
@@ -84,7 +85,8 @@ def run_study(
     files are then the same as without the interruption (on one machine).
 
     Args:
-        spec: the study.
+        spec: the study: a :class:`jaxcal.study.Spec`, or one of one's own
+            (:class:`jaxcal.study.Study`).
         folder: where its files are.
         resume: continue what is there; without it a folder that holds a study is refused.
         workers: processes on this machine, each on cores of its own; 0 computes in this process.
@@ -137,7 +139,7 @@ def _missing(store: Store, watcher: Watcher) -> tuple[list[Chunk], int]:
 
 
 def _computed(
-    spec: Spec, missing: list[Chunk], workers: int, scheduler: Any
+    spec: Study, missing: list[Chunk], workers: int, scheduler: Any
 ) -> Generator[Computed]:
     if not missing:
         return
@@ -154,11 +156,11 @@ def _computed(
         yield from _compute_here(spec, missing)
 
 
-def _compute_here(spec: Spec, missing: Iterable[Chunk]) -> Iterator[Computed]:
-    from jaxcal.study.pipeline import compute_chunk, device_name
+def _compute_here(spec: Study, missing: Iterable[Chunk]) -> Iterator[Computed]:
+    from jaxcal.study.pipeline import device_name
 
     for chunk in missing:
-        yield chunk, compute_chunk(spec, chunk), device_name()
+        yield chunk, spec.compute(chunk), device_name()
 
 
 @contextmanager

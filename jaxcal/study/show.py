@@ -77,7 +77,7 @@ class Cell:
     rows: tuple[Row, ...]
 
 
-def summarise(store: Store) -> list[Cell]:
+def summarise(store: Store[Spec]) -> list[Cell]:
     """The table of a study, as far as it is done.
 
     Raises:
@@ -152,7 +152,7 @@ def shown_axes(spec: Spec) -> list[str]:
     return [name for name, values in spec.axes if len(values) > 1]
 
 
-def as_record(store: Store, cells: list[Cell]) -> dict[str, Any]:
+def as_record(store: Store[Spec], cells: list[Cell]) -> dict[str, Any]:
     """The table as one JSON-able object."""
     spec = store.spec
     return {

@@ -57,10 +57,13 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
+import numpy as np
+
 from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
 from jaxcal.io.readable import quoted
 from jaxcal.io.toml import load_toml, parse_toml
+from jaxcal.study.own import ArraySpec
 
 MAXIMUM_BYTES = 2**20
 """Largest spec that is read."""
@@ -92,6 +95,18 @@ AXES = (
     "noise_mm",
 )
 """The fields of ``[conditions]`` in the order in which the grid is counted, the last fastest."""
+
+UNITS = {
+    "rp": "mm",
+    "rotation_error": "rad",
+    "translation_error": "mm",
+    "point_error": "mm",
+    "sigma": "mm",
+    "realised": "mm",
+    "status": "1",
+    "iterations": "1",
+}
+"""Of every array of a chunk."""
 
 _COUNTS = {"images": (4, 100_000), "test_images": (2, 100_000)}
 _LIMITS = {
@@ -252,6 +267,30 @@ class Spec:
     def sha256(self) -> str:
         """Hash of :meth:`canonical`; every file of the study carries it."""
         return hashlib.sha256(self.canonical().encode()).hexdigest()
+
+    @classmethod
+    def from_canonical(cls, text: str) -> Spec:
+        """:func:`spec_from_canonical`."""
+        return spec_from_canonical(text)
+
+    def arrays(self, chunk: Chunk) -> dict[str, ArraySpec]:
+        """What a chunk's file holds."""
+        methods, trials = len(self.methods), chunk.stop - chunk.start
+        shapes = {"sigma": (methods, trials, 3), "realised": (trials, 3)}
+        return {
+            name: ArraySpec(
+                unit,
+                shapes.get(name, (methods, trials)),
+                "i" if name in ("status", "iterations") else "f",
+            )
+            for name, unit in UNITS.items()
+        }
+
+    def compute(self, chunk: Chunk) -> dict[str, np.ndarray]:
+        """All results of one chunk (:func:`jaxcal.study.pipeline.compute_chunk`)."""
+        from jaxcal.study.pipeline import compute_chunk
+
+        return compute_chunk(self, chunk)
 
 
 def load_spec(path: str | os.PathLike[str]) -> Spec:

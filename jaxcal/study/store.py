@@ -22,6 +22,7 @@ import re
 import tempfile
 from contextlib import suppress
 from pathlib import Path
+from typing import Any, Generic, TypeVar, overload
 
 import h5py
 import numpy as np
@@ -31,25 +32,17 @@ from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.readable import check_readable, one_line
 from jaxcal.io.untrusted import array, child, number, open_root, text
-from jaxcal.study.spec import MAXIMUM_BYTES, Chunk, Spec, spec_from_canonical
+from jaxcal.study.own import Study
+from jaxcal.study.spec import MAXIMUM_BYTES, Chunk, Spec
 
 FORMAT = "jaxcal-study-chunk"
 VERSION = 1
 
-UNITS = {
-    "rp": "mm",
-    "rotation_error": "rad",
-    "translation_error": "mm",
-    "point_error": "mm",
-    "sigma": "mm",
-    "realised": "mm",
-    "status": "1",
-    "iterations": "1",
-}
-"""Of every array of a chunk."""
+
+S = TypeVar("S", bound=Study)
 
 
-class Store:
+class Store(Generic[S]):
     """The files of one study.
 
     Attributes:
@@ -57,12 +50,12 @@ class Store:
         spec: what it computes.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], spec: Spec) -> None:
+    def __init__(self, folder: str | os.PathLike[str], spec: S) -> None:
         self.folder = Path(folder)
         self.spec = spec
 
     @classmethod
-    def create(cls, folder: str | os.PathLike[str], spec: Spec, *, resume: bool) -> Store:
+    def create(cls, folder: str | os.PathLike[str], spec: S, *, resume: bool) -> Store[S]:
         """Make the folder of a study, or take up one that is there.
 
         Args:
@@ -76,7 +69,7 @@ class Store:
         """
         store = cls(folder, spec)
         if store._spec_path.exists():
-            found = read_spec(folder)
+            found = read_spec(folder, type(spec))
             if found.sha256 != spec.sha256:
                 raise InputError(
                     f"{folder}: holds the results of another spec (it differs in "
@@ -92,14 +85,14 @@ class Store:
         write_text(store._spec_path, spec.canonical() + "\n")
         return store
 
-    @classmethod
-    def open(cls, folder: str | os.PathLike[str]) -> Store:
+    @staticmethod
+    def open(folder: str | os.PathLike[str]) -> Store[Spec]:
         """The study in a folder, for reading.
 
         Raises:
             FormatError: there is none.
         """
-        return cls(folder, read_spec(folder))
+        return Store(folder, read_spec(folder))
 
     def path(self, chunk: Chunk) -> Path:
         """The file of a chunk."""
@@ -123,7 +116,7 @@ class Store:
 
         Args:
             chunk: which.
-            results: of :func:`jaxcal.study.pipeline.compute_chunk`.
+            results: as :meth:`jaxcal.study.Study.compute` returns them.
             device: what computed it.
 
         Raises:
@@ -134,9 +127,12 @@ class Store:
         path = self.path(chunk)
         start = chunk.condition * self.spec.trials
         # JAX may have been told to run in 32 bits; the file's types do not depend on it.
+        wanted = self.spec.arrays(chunk)
         results = {
-            name: values.astype(np.float64, copy=False) if values.dtype.kind == "f" else values
-            for name, values in results.items()
+            name: results[name].astype(np.float64, copy=False)
+            if results[name].dtype.kind == "f"
+            else results[name]
+            for name in wanted
         }
         with atomic_path(path) as temporary:
             # HDF5 only meets a full disk when it closes the file, and then loses the reason; a
@@ -158,6 +154,7 @@ class Store:
                     "jax": jax.__version__,
                     "device": device,
                 },
+                {name: array_spec.unit for name, array_spec in wanted.items()},
             )
             with temporary.open("wb") as stream:
                 stream.write(image)
@@ -195,17 +192,12 @@ class Store:
                 if number(root, name) != value:
                     raise FormatError(f"its {name} is not {value}")
             checksum = text(root, "checksum")
-            methods, trials = len(self.spec.methods), chunk.stop - chunk.start
             results = {}
-            for name in UNITS:
+            for name, wanted in self.spec.arrays(chunk).items():
                 node = child(root, name)
                 if node is None:
                     raise FormatError(f"has no {name}")
-                shape = (methods, trials)
-                if name in ("sigma", "realised"):
-                    shape = (methods, trials, 3) if name == "sigma" else (trials, 3)
-                kinds = "i" if name in ("status", "iterations") else "f"
-                results[name] = array(node, shape, kinds)
+                results[name] = array(node, wanted.shape, wanted.kind)
         if checksum != _checksum(results):
             raise FormatError("is damaged: its checksum is wrong")
         return results
@@ -241,8 +233,16 @@ class Store:
                     left.unlink()
 
 
-def read_spec(folder: str | os.PathLike[str]) -> Spec:
+@overload
+def read_spec(folder: str | os.PathLike[str]) -> Spec: ...
+@overload
+def read_spec(folder: str | os.PathLike[str], kind: type[Study]) -> Study: ...
+def read_spec(folder: str | os.PathLike[str], kind: type[Any] = Spec) -> Any:
     """The spec of the study in a folder.
+
+    Args:
+        folder: of the study.
+        kind: its class.
 
     Raises:
         FormatError: there is none, or it is damaged.
@@ -254,16 +254,18 @@ def read_spec(folder: str | os.PathLike[str]) -> Spec:
         raise FormatError(f"{folder}: holds no study (no spec.json)")
     check_readable(path, maximum_bytes=8 * MAXIMUM_BYTES)
     try:
-        return spec_from_canonical(path.read_text(encoding="utf-8").strip())
+        return kind.from_canonical(path.read_text(encoding="utf-8").strip())
     except (InputError, UnicodeDecodeError):
         raise FormatError(f"{path}: is damaged, or of another version of jaxcal") from None
 
 
-def _pack(results: dict[str, np.ndarray], attributes: dict[str, str | int]) -> bytes:
+def _pack(
+    results: dict[str, np.ndarray], attributes: dict[str, str | int], units: dict[str, str]
+) -> bytes:
     # track_order and times would make two files of the same content differ.
     with h5py.File.in_memory() as file:
         file.attrs.update(attributes)
-        for name, unit in UNITS.items():
+        for name, unit in units.items():
             dataset = file.create_dataset(name, data=results[name], track_times=False)
             dataset.attrs["units"] = unit
         file.flush()
@@ -272,16 +274,18 @@ def _pack(results: dict[str, np.ndarray], attributes: dict[str, str | int]) -> b
 
 def _checksum(results: dict[str, np.ndarray]) -> str:
     digest = hashlib.sha256()
-    for name in UNITS:
-        values = np.ascontiguousarray(results[name])
+    for name in results:
+        values = np.asarray(results[name], order="C")
         values = values.astype(values.dtype.newbyteorder("<"), copy=False)
         digest.update(f"{name} {values.dtype.str} {values.shape}\n".encode())
         digest.update(values.tobytes())
     return digest.hexdigest()
 
 
-def _difference(found: Spec, wanted: Spec) -> str:
+def _difference(found: Study, wanted: Study) -> str:
     """Which parts of two specs differ, in words."""
+    if not (isinstance(found, Spec) and isinstance(wanted, Spec)):
+        return "its description"
     names = ("name", "seed", "trials", "chunk_trials", "probe")
     parts = [name for name in names if getattr(found, name) != getattr(wanted, name)]
     parts += [name for name, values in found.axes if wanted.axis(name) != values]

@@ -23,7 +23,8 @@ import numpy as np
 from jaxcal import CalibrationError
 from jaxcal.io.readable import one_line
 from jaxcal.runtime.isolated import python_command
-from jaxcal.study.spec import Chunk, Spec, spec_from_canonical
+from jaxcal.study.own import Study, study_from, where_defined
+from jaxcal.study.spec import Chunk
 
 MOST_DEATHS = 3
 """Workers that may die over one chunk before the study gives up."""
@@ -40,7 +41,7 @@ class Worker:
         cores: that the process is kept on.
     """
 
-    def __init__(self, spec: Spec, cores: set[int]) -> None:
+    def __init__(self, spec: Study, cores: set[int]) -> None:
         cache = None
         if "jax" in sys.modules:
             # Where this process keeps its compiled programs its workers may, too.
@@ -57,7 +58,9 @@ class Worker:
         assert self.process.stdout is not None
         self._to, self._from = self.process.stdin, self.process.stdout
         with contextlib.suppress(OSError):
-            self._say({"spec": spec.canonical(), "cores": sorted(cores)})
+            self._say({
+                "spec": spec.canonical(), "where": where_defined(spec), "cores": sorted(cores),
+            })  # fmt: skip
 
     def compute(self, chunk: Chunk) -> tuple[dict[str, np.ndarray], str] | None:
         """A chunk's arrays and the device that computed them; None where the worker died.
@@ -98,7 +101,7 @@ class Worker:
 
 
 def compute_on_workers(
-    spec: Spec, chunks: list[Chunk], groups: list[set[int]]
+    spec: Study, chunks: list[Chunk], groups: list[set[int]]
 ) -> Iterator[tuple[Chunk, dict[str, np.ndarray], str]]:
     """Compute chunks on worker processes; yields them as they are done.
 
@@ -190,17 +193,17 @@ def main() -> None:
     if given["cores"] and hasattr(os, "sched_setaffinity"):
         # Before JAX is imported, which counts them.
         os.sched_setaffinity(0, given["cores"])
-    spec = spec_from_canonical(given["spec"])
+    spec = study_from(given["where"], given["spec"])
     for line in requests:
         _answer(answers, spec, json.loads(line)["chunk"])
 
 
-def _answer(answers: BinaryIO, spec: Spec, index: int) -> None:
-    from jaxcal.study.pipeline import compute_chunk, device_name
+def _answer(answers: BinaryIO, spec: Study, index: int) -> None:
+    from jaxcal.study.pipeline import device_name
 
     try:
-        arrays = compute_chunk(spec, spec.chunk(index))
-        found = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+        arrays = spec.compute(spec.chunk(index))
+        found = {name: np.asarray(values, order="C") for name, values in arrays.items()}
         described = [[name, values.dtype.str, list(values.shape)] for name, values in found.items()]
         header: dict[str, Any] = {"arrays": described, "device": device_name()}
     except Exception as error:

@@ -1,0 +1,126 @@
+"""Studies of one's own: what the engine asks of a study, and how workers find its class.
+
+:class:`jaxcal.study.spec.Spec` is the study that a TOML file describes. Any other class with the
+same few members runs through the same engine: in chunks that are resumed, in this process, on
+workers or on a Dask cluster.
+
+A worker is told the class by module and name and imports it. A module that belongs to no installed
+package (a script's neighbour) is looked for in the folder that this process found it in, and
+nowhere else; a Dask worker on another machine must have that folder, too.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+
+import numpy as np
+
+from jaxcal import InputError
+
+if TYPE_CHECKING:
+    from jaxcal.study.spec import Chunk
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """One array of a chunk's results.
+
+    Attributes:
+        unit: of its numbers, ``1`` for none.
+        shape: all axes.
+        kind: ``f`` for floats, ``i`` for integers.
+    """
+
+    unit: str
+    shape: tuple[int, ...]
+    kind: Literal["f", "i"] = "f"
+
+
+@runtime_checkable
+class Study(Protocol):
+    """What the engine needs of a study; results of a chunk depend on nothing but the study."""
+
+    @property
+    def trials(self) -> int:
+        """Trials in each condition."""
+        ...
+
+    @property
+    def condition_count(self) -> int:
+        """Conditions."""
+        ...
+
+    @property
+    def chunk_count(self) -> int:
+        """Files."""
+        ...
+
+    @property
+    def sha256(self) -> str:
+        """Hash of :meth:`canonical`."""
+        ...
+
+    def canonical(self) -> str:
+        """Everything about the study as one JSON text."""
+        ...
+
+    @classmethod
+    def from_canonical(cls, text: str) -> Study:
+        """The study that the text was made from.
+
+        Raises:
+            InputError: the text does not come from there.
+        """
+        ...
+
+    def chunk(self, index: int) -> Chunk:
+        """The trials of file ``index``."""
+        ...
+
+    def arrays(self, chunk: Chunk) -> dict[str, ArraySpec]:
+        """What a chunk's file holds."""
+        ...
+
+    def compute(self, chunk: Chunk) -> dict[str, np.ndarray]:
+        """The arrays of a chunk."""
+        ...
+
+
+def where_defined(study: Study) -> dict[str, str]:
+    """How a worker finds the class of a study: module, name and, of a loose module, its folder.
+
+    Raises:
+        InputError: a class of the main script, or one inside a function.
+    """
+    kind = type(study)
+    if kind.__module__ == "__main__" or "." in kind.__qualname__:
+        raise InputError(
+            f"workers cannot import {kind.__qualname__}: define it at the top of a module"
+        )
+    found = {"module": kind.__module__, "name": kind.__name__}
+    if "." not in kind.__module__:
+        file = getattr(sys.modules[kind.__module__], "__file__", None)
+        if file is not None:
+            found["folder"] = str(Path(file).resolve().parent)
+    return found
+
+
+def study_from(where: dict[str, str], canonical: str) -> Study:
+    """The study of this canonical text, by :func:`where_defined`.
+
+    Raises:
+        InputError: there is no such class, or the text is not of it.
+    """
+    folder = where.get("folder")
+    if folder is not None and folder not in sys.path:
+        # Behind everything that is installed: it shadows nothing.
+        sys.path.append(folder)
+    try:
+        kind = getattr(importlib.import_module(where["module"]), where["name"])
+    except (ImportError, AttributeError, KeyError) as error:
+        raise InputError(f"the study's class cannot be imported: {error}") from None
+    return kind.from_canonical(canonical)

@@ -1,0 +1,110 @@
+"""A study of one's own runs through the engine: here, on workers, resumed; its class is found."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import numpy as np
+import pytest
+
+from jaxcal import FormatError, InputError
+from jaxcal.study import run_study
+from jaxcal.study.own import Study, study_from, where_defined
+from jaxcal.study.store import Store
+
+MODULE = """
+import dataclasses, hashlib, json
+import numpy as np
+from jaxcal import InputError
+from jaxcal.study import ArraySpec, Chunk
+
+
+@dataclasses.dataclass(frozen=True)
+class Squares:
+    seed: int = 3
+    trials: int = 5
+    condition_count: int = 3
+
+    chunk_count = property(lambda self: self.condition_count)
+
+    def canonical(self):
+        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+
+    @property
+    def sha256(self):
+        return hashlib.sha256(self.canonical().encode()).hexdigest()
+
+    @classmethod
+    def from_canonical(cls, text):
+        try:
+            return cls(**json.loads(text))
+        except TypeError:
+            raise InputError("is not of this study") from None
+
+    def chunk(self, index):
+        return Chunk(index, index, 0, self.trials)
+
+    def arrays(self, chunk):
+        return {"square": ArraySpec("mm", (2, self.trials)), "count": ArraySpec("1", (), "i")}
+
+    def compute(self, chunk):
+        rng = np.random.default_rng([self.seed, chunk.index])
+        return {"count": np.array(chunk.index), "square": rng.normal(size=(2, self.trials)) ** 2}
+"""
+
+
+@pytest.fixture(scope="module")
+def squares(tmp_path_factory):
+    """A class in a loose module, as a script has it."""
+    folder = tmp_path_factory.mktemp("loose")
+    (folder / "loose_squares.py").write_text(MODULE)
+    sys.path.insert(0, str(folder))
+    yield importlib.import_module("loose_squares").Squares
+    sys.path.remove(str(folder))
+
+
+def test_the_engine_takes_it_here_and_on_workers_and_resumes(squares, tmp_path):
+    study = squares()
+    assert isinstance(study, Study)
+    run_study(study, tmp_path / "here")
+    summary = run_study(study, tmp_path / "workers", workers=2)
+    assert (summary.chunks, summary.computed, summary.trials) == (3, 3, 15)
+    here, workers = (Store(tmp_path / name, study) for name in ("here", "workers"))
+    for index in here.present():
+        chunk = study.chunk(index)
+        first, second = here.read(chunk), workers.read(chunk)
+        assert list(first) == ["square", "count"]
+        np.testing.assert_array_equal(first["square"], study.compute(chunk)["square"])
+        np.testing.assert_array_equal(first["square"], second["square"])
+        assert int(first["count"]) == index
+    here.path(study.chunk(1)).unlink()
+    assert run_study(study, tmp_path / "here", resume=True).computed == 1
+    with pytest.raises(InputError, match="differs in its description"):
+        run_study(squares(seed=4), tmp_path / "here", resume=True)
+
+
+def test_a_file_of_other_arrays_is_refused(squares, tmp_path):
+    study = squares()
+    run_study(study, tmp_path / "study")
+    other = squares(trials=6)
+    with pytest.raises(FormatError, match="another spec"):
+        Store(tmp_path / "study", other).read(other.chunk(0))
+    with pytest.raises(FormatError, match="damaged, or of another version"):
+        Store.open(tmp_path / "study")
+
+
+def test_the_class_must_be_one_that_a_worker_can_import(squares):
+    where = where_defined(squares())
+    assert where["module"] == "loose_squares"
+    assert study_from(where, squares().canonical()) == squares()
+
+    class Inside(squares):
+        pass
+
+    with pytest.raises(InputError, match="cannot import"):
+        where_defined(Inside())
+    with pytest.raises(InputError, match="cannot be imported"):
+        study_from({"module": "no_such_module", "name": "Squares"}, "{}")
+    with pytest.raises(InputError, match="not of this study"):
+        study_from(where, '{"colour": 1}')
