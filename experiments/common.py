@@ -78,13 +78,13 @@ def open_study(name: str, *, trials: int | None, quick: bool):
         spec = replace(spec, trials=trials, chunk_trials=min(trials, spec.chunk_trials))
     enable_compilation_cache()
     folder = here / "studies" / (f"{name}_quick" if quick else name)
-    summary = run_study(spec, folder, resume=True, watcher=_Lines())
+    summary = run_study(spec, folder, resume=True, watcher=Lines())
     if summary.trials:
         print(f"{name}: {summary.trials} trials in {summary.seconds:.0f} s")
     return open_results(folder)
 
 
-class _Lines:
+class Lines:
     """Tells now and then how far a study is."""
 
     def begin(self, trials: int, done: int) -> None:

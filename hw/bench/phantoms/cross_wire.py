@@ -45,10 +45,12 @@ class CrossWire(Phantom):
     Attributes:
         wire_mm: diameter.
         beside_mm: where they cross, from the world's target, in the base frame.
+        directions: of the two wires, unit vectors in the base frame.
     """
 
     wire_mm: float = WIRE_MM
     beside_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    directions: tuple[tuple[float, float, float], tuple[float, float, float]] = DIRECTIONS
 
     name = "cross-wire"
     heard = False
@@ -76,7 +78,7 @@ class CrossWire(Phantom):
         # Sound returns from the surface that faces the probe.
         front = 0.5 * self.wire_mm
         found = []
-        for wire, direction in enumerate(DIRECTIONS):
+        for wire, direction in enumerate(self.directions):
             along = np.asarray(direction) @ pose[:3, :3] @ x[:3, :3]
             width = float(world.beam.field_mm(crossing[2])) / np.sqrt(2.0)
             steep = max(abs(along[1]), _REACH * width / _HALF_MM)
