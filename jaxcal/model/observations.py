@@ -10,7 +10,7 @@ An *observation* turns q, and further unknowns such as the pixels' scale, into r
 groups (*components*) that share one SD. Nothing else in the package knows residuals: derivatives
 are derived from these functions (:mod:`jaxcal.model.derivatives`), sums over the images are made
 by :mod:`jaxcal.solvers.normal_equations`, and every method is a loop on those. A further
-observation is one class here and a line where :mod:`jaxcal.calibration.options` chooses.
+observation is one class here and a line where :mod:`jaxcal.solvers.methods` chooses.
 
 - :class:`Points`: errors of lateral position and range, and the offset itself (y_i = q_y), each
   with its SD; :class:`OwnCovariances`: the same with a covariance for every image.
