@@ -20,7 +20,15 @@ from hw.clock import REAL, Clock
 from hw.errors import Device, DeviceError, LostError, StaleError
 from hw.shapes import Float
 from hw.ultrasound.framing import MessageDecoder
-from jaxcal.io.openigtlink import RF_DEVICE, Message, Picture, Pixels, Status, Tracked
+from jaxcal.io.openigtlink import (
+    RF_DEVICE,
+    Message,
+    Picture,
+    Pixels,
+    Status,
+    Tracked,
+    TrackedFrame,
+)
 
 DEVICE: Device = "ultrasound"
 PORT = 18944
@@ -70,7 +78,8 @@ class Transform:
         t_device: the sender's time stamp, s; NaN where it sends none.
         name: ``<From>To<To>``, e.g. ``ProbeToTracker``.
         matrix: (4, 4), mm, From -> To, as sent.
-        valid: finite, and within 1e-2 of a rigid transform (trackers round).
+        valid: finite, within 1e-2 of a rigid transform (trackers round), and of a status that is OK
+            where one is sent.
     """
 
     t_host: float
@@ -290,6 +299,11 @@ class UltrasoundStream:
             case tuple():
                 for tracked in message.content:
                     self._take_transform(message, tracked)
+            case TrackedFrame() if self._device in (None, message.device):
+                # Before the image, so that they are there when it is read.
+                for tracked in message.content.transforms:
+                    self._take_transform(message, tracked)
+                self._take_image(message, message.content.picture)
             case Status():
                 self._status = message.content
             case _:
@@ -335,7 +349,7 @@ class UltrasoundStream:
         self._transforms.append(
             Transform(
                 message.t_host, message.t_device, tracked.name, tracked.matrix,
-                _is_rigid(tracked.matrix),
+                _is_rigid(tracked.matrix) and tracked.status in ("", "OK"),
             )
         )  # fmt: skip
 

@@ -19,7 +19,8 @@ TIMES_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _NAMES = {
     "time": ("time", "t", "timestamp", "timestamps", "stamp", "seconds"),
     "frame": ("frame", "framenumber", "frameindex", "index", "image", "imagenumber"),
-    "ignored": ("name", "filename", "file", "label", "comment"),
+    "file": ("file", "filename", "imagefile", "png"),
+    "ignored": ("name", "label", "comment"),
     "valid": ("valid", "status", "state", "ok", "used"),
     "u": ("u", "column", "col", "pixelu", "pixelx"),
     "v": ("v", "row", "pixelv", "pixely"),
@@ -57,6 +58,7 @@ class Columns:
         point: 2 columns, u v or lateral range; None without.
         time: s.
         frame: number of an image.
+        file: name of an image's file.
         valid: whether a row counts.
         length_mm: one unit of translations in mm.
         point_unit: ``px`` or a unit of length; None where the header does not say.
@@ -70,6 +72,7 @@ class Columns:
     point: tuple[int, ...] | None = None
     time: int | None = None
     frame: int | None = None
+    file: int | None = None
     valid: int | None = None
     length_mm: float | None = None
     point_unit: str | None = None
@@ -129,7 +132,7 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
         width=len(names), matrix=matrix,
         translation=None if matrix is not None else translation,
         quaternion=quaternion_columns, point=point,
-        time=roles.get("time"), frame=roles.get("frame"), valid=roles.get("valid"),
+        time=roles.get("time"), frame=roles.get("frame"), file=roles.get("file"), valid=roles.get("valid"),
         length_mm=_length(lengths, names, list(units)),
         point_unit=point_unit, time_s=TIMES_S[time_unit or "s"],
     )  # fmt: skip

@@ -1,5 +1,7 @@
 """OpenIGTLink messages: header, CRC-64, and the contents IMAGE, TRANSFORM, TDATA and STATUS.
 
+PlusServer's own TRACKEDFRAME is in :mod:`jaxcal.io.tracked_frame`.
+
 Written from the public protocol (versions 1 to 3, header versions 1 and 2): a header of 58 bytes,
 big-endian ``version u16, type char[12], device char[20], time stamp u32 s + u32 of 2^-32 s, body
 size u64, CRC-64 of the body u64``; in header version 2 the body begins with an extended header
@@ -8,8 +10,8 @@ trusted: sizes are bounded, counts must agree with sizes, and nothing is allocat
 not arrived. The protocol's CRC is the body's: a wrong bit in a header's name or time stamp
 passes, since nothing tells. The CRC-64 is ECMA-182, not reflected, zero at the start.
 
-Units: translations are mm; an image's spacing is mm per pixel. Only plane images of one
-component, uint8 (B-mode) or int16, are taken. No wire format for RF channel data is public; that
+Units: translations are mm; an image's spacing is mm per pixel. Only plane images are taken: of one
+component, uint8 (B-mode) or int16, or in colour of three uint8, which become grey. No wire format for RF channel data is public; that
 such data come as an int16 IMAGE of the device ``RF``, samples down and lines across, is **an
 assumption**.
 """
@@ -38,6 +40,11 @@ _IMAGE = struct.Struct(">HBBBB3H12f6H")
 _TRANSFORM = struct.Struct(">12f")
 _TRACKED = struct.Struct(">20sBB12f")
 _STATUS = struct.Struct(">Hq20s")
+_METADATA = struct.Struct(">HHI")
+_MOST_METADATA = 64
+_US_ASCII = 3
+_TRANSFORM_STATUS = "TransformStatus"
+"""Under this name PlusServer sends the status with a TRANSFORM."""
 _SMALL = 1 << 16
 _MOST_TRACKED = 256
 _LARGEST = {
@@ -45,7 +52,8 @@ _LARGEST = {
     "TDATA": _MOST_TRACKED * _TRACKED.size + _SMALL,
     "STATUS": _SMALL,
 }
-_SCALARS = {3: np.dtype(np.uint8), 4: np.dtype(np.int16)}
+_UINT8, _INT16 = 3, 4
+_SCALARS = {_UINT8: np.dtype(np.uint8), _INT16: np.dtype(np.int16)}
 _BIG_ENDIAN, _LITTLE_ENDIAN = 1, 2
 _LPS = 2
 _BYTES = {2: 1, 3: 1, 4: 2, 5: 2, 6: 4, 7: 4, 10: 4, 11: 8}
@@ -74,10 +82,12 @@ class Tracked:
     Attributes:
         name: by the convention ``<From>To<To>``, e.g. ``ProbeToTracker``.
         matrix: (4, 4), mm, as sent: nothing says that it is rigid.
+        status: as PlusServer says it (``OK``, ``OUT_OF_VIEW``...); empty where nothing is said.
     """
 
     name: str
     matrix: Float[np.ndarray, "4 4"]
+    status: str = ""
 
 
 @dataclass(frozen=True)
@@ -90,7 +100,20 @@ class Status:
     text: str
 
 
-Content = Picture | tuple[Tracked, ...] | Status | None
+@dataclass(frozen=True)
+class TrackedFrame:
+    """Content of PlusServer's TRACKEDFRAME (:mod:`jaxcal.io.tracked_frame`).
+
+    Attributes:
+        picture: the image, turned to the orientation MF; its pixel size is not known (1, 1).
+        transforms: with their statuses.
+    """
+
+    picture: Picture
+    transforms: tuple[Tracked, ...]
+
+
+Content = Picture | tuple[Tracked, ...] | TrackedFrame | Status | None
 
 
 @dataclass(frozen=True)
@@ -205,53 +228,92 @@ def decode_body(header: Header, body: bytes, t_host: float = math.nan) -> Messag
     Raises:
         ContentError: sizes that do not agree, or an image of a kind that is not taken.
     """
-    content, message_id = _content_bytes(header, body)
-    read = {"IMAGE": _image, "TRANSFORM": _transform, "TDATA": _tdata, "STATUS": _status}
-    found = read[header.kind](content, header) if header.kind in read else None
+    content, metadata, message_id = _content_bytes(header, body)
+    found: Content = None
+    match header.kind:
+        case "IMAGE":
+            found = _image(content)
+        case "TRANSFORM":
+            found = _transform(content, header.device, metadata.get(_TRANSFORM_STATUS, ""))
+        case "TDATA":
+            found = _tdata(content)
+        case "STATUS":
+            found = _status(content)
+        case "TRACKEDFRAME":
+            # That module needs this one.
+            from jaxcal.io.tracked_frame import decode_tracked_frame
+
+            found = decode_tracked_frame(content)
     return Message(header.kind, header.device, header.t_device, found, message_id, t_host)
 
 
-def _content_bytes(header: Header, body: bytes) -> tuple[memoryview, int]:
+def _content_bytes(header: Header, body: bytes) -> tuple[memoryview, dict[str, str], int]:
+    """Content, metadata and message id."""
     view = memoryview(body)
     if header.version == 1:
-        return view, 0
+        return view, {}, 0
     if len(view) < _EXTENDED.size:
         raise ContentError("an extended header that is cut off")
     size, names, metadata, message_id = _EXTENDED.unpack_from(view)
     end = len(view) - names - metadata
     if not _EXTENDED.size <= size <= end:
         raise ContentError("an extended header whose sizes do not agree")
-    return view[size:end], message_id
+    return view[size:end], _metadata(view[end:], names), message_id
 
 
-def _image(content: memoryview, _: Header) -> Picture:
+def _metadata(view: memoryview, size: int) -> dict[str, str]:
+    """Names and values: a table of their sizes, then their texts one behind the other."""
+    if size < 2:
+        return {}
+    count = int.from_bytes(view[:2], "big")
+    if count > _MOST_METADATA or size != 2 + count * _METADATA.size:
+        raise ContentError("metadata whose sizes do not agree")
+    found, place = {}, size
+    for index in range(count):
+        name_size, _, value_size = _METADATA.unpack_from(view, 2 + index * _METADATA.size)
+        middle, end = place + name_size, place + name_size + value_size
+        if end > len(view):
+            raise ContentError("metadata that is cut off")
+        found[_text(bytes(view[place:middle]))] = _text(bytes(view[middle:end]))
+        place = end
+    return found
+
+
+def _image(content: memoryview) -> Picture:
     if len(content) < _IMAGE.size:
         raise ContentError("an image that is cut off")
     version, components, scalar, endian, _axes, *numbers = _IMAGE.unpack_from(content)
     width, height, depth = numbers[:3]
     if version != 1 or endian not in (_BIG_ENDIAN, _LITTLE_ENDIAN):
         raise ContentError("an image header of unknown form")
-    if components != 1 or scalar not in _SCALARS:
+    if (components, scalar) != (3, _UINT8) and (components != 1 or scalar not in _SCALARS):
         raise ContentError(
-            f"an image of {components} components of scalar type {scalar}; one of uint8 or int16 "
-            "is taken"
+            f"an image of {components} components of scalar type {scalar}; one of uint8 or int16, "
+            "or three of uint8, are taken"
         )
     if depth != 1 or not (width and height):
         raise ContentError(f"a volume of {width} x {height} x {depth} voxels is no plane image")
     if numbers[15:18] != [0, 0, 0] or numbers[18:21] != [width, height, depth]:
         raise ContentError("a part of an image; only whole ones are taken")
     kind = _SCALARS[scalar].newbyteorder(">" if endian == _BIG_ENDIAN else "<")
-    if len(content) != _IMAGE.size + width * height * kind.itemsize:
+    if len(content) != _IMAGE.size + width * height * components * kind.itemsize:
         raise ContentError(f"{len(content)} bytes are not an image of {width} x {height} pixels")
     across, down = np.array(numbers[3:9], float).reshape(2, 3)
     # The wire has float32: 0.1 mm, not 0.10000000149.
     spacing = (float(f"{np.linalg.norm(across):.7g}"), float(f"{np.linalg.norm(down):.7g}"))
     if not all(math.isfinite(step) and step > 0 for step in spacing):
         raise ContentError(f"an image spacing of {spacing} mm")
-    pixels = np.frombuffer(content, kind, offset=_IMAGE.size).reshape(height, width)
-    pixels = pixels.astype(_SCALARS[scalar], copy=False)
+    pixels = np.frombuffer(content, kind, offset=_IMAGE.size).reshape(height, width, components)
+    pixels = grey_of(pixels).astype(_SCALARS[scalar], copy=False)
     pixels.setflags(write=False)
     return Picture(pixels, spacing)
+
+
+def grey_of(pixels: np.ndarray) -> np.ndarray:
+    """(rows, columns) of (rows, columns, 1 or 3); colour becomes grey by ITU-R BT.601's weights."""
+    if pixels.shape[2] == 1:
+        return pixels[:, :, 0]
+    return np.rint(pixels @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
 
 
 def _matrix(numbers: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
@@ -260,13 +322,13 @@ def _matrix(numbers: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
     return matrix
 
 
-def _transform(content: memoryview, header: Header) -> tuple[Tracked, ...]:
+def _transform(content: memoryview, device: str, status: str) -> tuple[Tracked, ...]:
     if len(content) != _TRANSFORM.size:
         raise ContentError(f"{len(content)} bytes are not a transform")
-    return (Tracked(header.device, _matrix(_TRANSFORM.unpack(content))),)
+    return (Tracked(device, _matrix(_TRANSFORM.unpack(content)), status),)
 
 
-def _tdata(content: memoryview, _: Header) -> tuple[Tracked, ...]:
+def _tdata(content: memoryview) -> tuple[Tracked, ...]:
     if len(content) % _TRACKED.size or len(content) > _MOST_TRACKED * _TRACKED.size:
         raise ContentError(f"{len(content)} bytes are not tracking data")
     return tuple(
@@ -275,7 +337,7 @@ def _tdata(content: memoryview, _: Header) -> tuple[Tracked, ...]:
     )
 
 
-def _status(content: memoryview, _: Header) -> Status:
+def _status(content: memoryview) -> Status:
     if len(content) < _STATUS.size:
         raise ContentError("a status that is cut off")
     code, subcode, name = _STATUS.unpack_from(content)
@@ -293,24 +355,43 @@ def encode(message: Message) -> bytes:
     Raises:
         ValueError: a content that does not go with the kind, or a name that is too long.
     """
+    metadata = {}
     match message.content:
         case Picture() if message.kind == "IMAGE":
             content = _encode_image(message.content)
         case (Tracked(),) if message.kind == "TRANSFORM":
             content = _encode_matrix(message.content[0].matrix)
+            if message.content[0].status:
+                metadata = {_TRANSFORM_STATUS: message.content[0].status}
         case tuple() if message.kind == "TDATA":
             content = b"".join(_encode_tracked(each) for each in message.content)
         case Status(code, subcode, name, text) if message.kind == "STATUS":
             content = _STATUS.pack(code, subcode, name.encode()) + text.encode() + b"\0"
         case None:
             content = b""
+        case TrackedFrame() if message.kind == "TRACKEDFRAME":
+            from jaxcal.io.tracked_frame import encode_tracked_frame
+
+            content = encode_tracked_frame(message.content, message.t_device)
         case _:
             raise ValueError(f"{message.kind} cannot hold {type(message.content).__name__}")
     version = 1
-    if message.message_id:
+    if message.message_id or metadata:
         version = 2
-        content = _EXTENDED.pack(_EXTENDED.size, 0, 0, message.message_id) + content
+        names, values = _encode_metadata(metadata)
+        head = _EXTENDED.pack(_EXTENDED.size, len(names), len(values), message.message_id)
+        content = head + content + names + values
     return encode_header(version, message, content) + content
+
+
+def _encode_metadata(metadata: dict[str, str]) -> tuple[bytes, bytes]:
+    if not metadata:
+        return b"", b""
+    table, texts = [len(metadata).to_bytes(2, "big")], []
+    for name, value in metadata.items():
+        texts += [name.encode(), value.encode()]
+        table.append(_METADATA.pack(len(texts[-2]), _US_ASCII, len(texts[-1])))
+    return b"".join(table), b"".join(texts)
 
 
 def encode_header(version: int, message: Message, body: bytes) -> bytes:

@@ -75,6 +75,21 @@ class Hdf5Pixels:
 
 
 @dataclass(frozen=True)
+class FolderPixels:
+    """Pixels in PNG files of one folder, MF-oriented if nothing else is said.
+
+    Attributes:
+        paths: n files.
+        columns: of a frame, px.
+        rows: of a frame, px.
+    """
+
+    paths: tuple[Path, ...]
+    columns: int
+    rows: int
+
+
+@dataclass(frozen=True)
 class TrackedSequence:
     """A sequence of n frames.
 
@@ -91,7 +106,7 @@ class TrackedSequence:
     valid: Mapping[FramePair, Bool[np.ndarray, " n"]]
     time: Float[np.ndarray, " n"]
     image_valid: Bool[np.ndarray, " n"]
-    pixels: Pixels | Hdf5Pixels | None = None
+    pixels: Pixels | Hdf5Pixels | FolderPixels | None = None
     source: str = field(default="memory", compare=False)
 
     def __len__(self) -> int:
@@ -157,6 +172,10 @@ class TrackedSequence:
         if isinstance(pixels, Hdf5Pixels):
             yield from _hdf5_images(pixels, numbers, orientation or "MF", self.source)
             return
+        if isinstance(pixels, FolderPixels):
+            for number in numbers:
+                yield _oriented(_png_image(pixels, number), orientation or "MF")
+            return
         stored = pixels.orientation if orientation is None else orientation
         if pixels.kind != "BRIGHTNESS":
             raise FormatError(f"{self.source}: holds {quoted(pixels.kind)} data, not B-mode images")
@@ -191,6 +210,16 @@ def _hdf5_images(
                 yield _oriented(row(node, number), orientation)
     except FormatError as error:
         raise FormatError(f"{source}: {error}") from None
+
+
+def _png_image(pixels: FolderPixels, number: int) -> np.ndarray:
+    # Pillow, which other sequences do not need.
+    from jaxcal.io.png import read_png
+
+    frame = read_png(pixels.paths[number])
+    if frame.shape != (pixels.rows, pixels.columns):
+        raise FormatError(f"{pixels.paths[number]}: has another size than when it was looked at")
+    return frame
 
 
 def _grey(content: bytes, pixels: Pixels) -> np.ndarray:

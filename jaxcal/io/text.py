@@ -42,6 +42,7 @@ class PoseTable:
         kind: of the points.
         time: (n,) s.
         frame: (n,) number of the image.
+        file: n names of images' files.
         skipped: rows that were left out as invalid.
     """
 
@@ -52,6 +53,7 @@ class PoseTable:
     kind: Literal["pixel", "point"] = "pixel"
     time: Float[np.ndarray, " n"] | None = None
     frame: Int[np.ndarray, " n"] | None = None
+    file: tuple[str, ...] | None = None
     skipped: int = 0
 
     def __len__(self) -> int:
@@ -95,6 +97,9 @@ def read_pose_table(
         frame = None
         if columns.frame is not None:
             frame = _whole_numbers(table, columns.frame, rows)
+        file = None
+        if columns.file is not None:
+            file = tuple(table.rows[row][columns.file].strip().strip('"') for row in rows)
         return PoseTable(
             name=table.name,
             lines=[table.lines[row] for row in rows],
@@ -103,6 +108,7 @@ def read_pose_table(
             kind="pixel" if kind == "pixel" else "point",
             time=None if columns.time is None else _times(table, columns, rows),
             frame=frame,
+            file=file,
             skipped=skipped,
         )
 

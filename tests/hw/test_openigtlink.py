@@ -170,7 +170,7 @@ def test_pixels_cannot_be_written() -> None:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"image": np.zeros((1, 4, 5, 3), np.uint8)}, "3 components"),
+        ({"image": np.zeros((1, 4, 5, 2), np.uint8)}, "2 components"),
         ({"image": np.zeros((1, 4, 5), np.float32)}, "scalar type 10"),
         ({"image": np.zeros((3, 4, 5), np.uint8)}, "volume of 5 x 4 x 3"),
         ({"ijk_to_world_matrix": np.zeros((4, 4))}, "spacing"),

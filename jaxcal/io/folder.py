@@ -1,0 +1,143 @@
+"""A folder of PNG images, and the table that says which pose belongs to which of them."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+
+from jaxcal import FormatError, InputError
+from jaxcal.io.png import png_size
+from jaxcal.io.readable import one_line, quoted
+from jaxcal.io.sequence import FolderPixels, TrackedSequence
+from jaxcal.io.text import PoseTable
+
+MOST_IMAGES = 100_000
+PROBE_TO_TRACKER = ("Probe", "Tracker")
+
+
+def read_folder(path: str | os.PathLike[str]) -> TrackedSequence:
+    """The PNG images of a folder in the order of their numbers; no poses, no times.
+
+    Args:
+        path: of the folder. ``b2.png`` comes before ``b10.png``; other files are passed over.
+
+    Raises:
+        FormatError: no such folder, no PNG in it, images of different sizes, a link to another
+            folder; one line that starts with the path.
+    """
+    folder, name = Path(path), os.fspath(path)
+    try:
+        paths = [entry for entry in folder.iterdir() if entry.suffix.lower() == ".png"]
+    except OSError as error:
+        raise FormatError(f"{name}: cannot be read: {one_line(error)}") from None
+    if not paths:
+        raise FormatError(f"{name}: holds no PNG images")
+    if len(paths) > MOST_IMAGES:
+        raise FormatError(f"{name}: holds {len(paths)} images (at most {MOST_IMAGES})")
+    inside = folder.resolve()
+    for each in paths:
+        if each.resolve().parent != inside:
+            raise FormatError(f"{each}: is a link to another folder")
+    paths.sort(key=lambda each: _natural(each.name))
+    size = png_size(paths[0])
+    for each in paths[1:]:
+        other = png_size(each)
+        if other != size:
+            raise FormatError(
+                f"{each}: has {other[0]} x {other[1]} px, {paths[0].name} has {size[0]} x {size[1]}"
+            )
+    count = len(paths)
+    return TrackedSequence(
+        {}, {}, np.full(count, np.nan), np.ones(count, bool),
+        FolderPixels(tuple(paths), *size), name,
+    )  # fmt: skip
+
+
+def with_pose_table(images: TrackedSequence, table: PoseTable) -> tuple[TrackedSequence, list[str]]:
+    """Images with the poses of a table.
+
+    Args:
+        images: of :func:`read_folder`.
+        table: of poses from probe to tracker. Rows belong to images by a column ``file``, by a
+            column ``frame`` (the number that ends the name of the file), or, without either, in
+            their order; then there must be as many.
+
+    Returns:
+        The sequence, in which images without a pose are not valid; and what there is to say.
+
+    Raises:
+        InputError: rows that belong to no image or to the same one; one line with file and line.
+    """
+    assert isinstance(images.pixels, FolderPixels)
+    if table.poses is None:
+        raise InputError(f"{table.name}: holds no poses")
+    if table.points is not None:
+        raise InputError(
+            f"{table.name}: holds points as well as poses: import it by itself, without images"
+        )
+    rows = _rows(images, images.pixels.paths, table)
+    values, counts = np.unique(rows, return_counts=True)
+    if (counts > 1).any():
+        name = images.pixels.paths[int(values[counts > 1][0])].name
+        raise InputError(f"{table.name}: has two poses for {quoted(name)}")
+    count = len(images)
+    poses, valid = np.full((count, 4, 4), np.nan), np.zeros(count, bool)
+    poses[rows], valid[rows] = table.poses, True
+    time = np.full(count, np.nan)
+    if table.time is not None:
+        time[rows] = table.time
+    notes = [f"{table.name}: {table.skipped} invalid rows left out"] if table.skipped else []
+    missing = count - len(rows)
+    if missing:
+        notes.append(f"{missing} of {count} images have no pose in {table.name}")
+    return TrackedSequence(
+        {PROBE_TO_TRACKER: poses}, {PROBE_TO_TRACKER: valid}, time, images.image_valid,
+        images.pixels, images.source,
+    ), notes  # fmt: skip
+
+
+def _rows(images: TrackedSequence, paths: tuple[Path, ...], table: PoseTable) -> np.ndarray:
+    """Which image each row of the table is of."""
+    if table.file is not None:
+        places = {path.name: index for index, path in enumerate(paths)}
+        places |= {path.stem: index for path, index in zip(paths, places.values(), strict=True)}
+        named = [re.split(r"[/\\]", text)[-1] for text in table.file]
+        unknown = [row for row, text in enumerate(named) if text not in places]
+        if unknown:
+            raise InputError(
+                f"{table.name}:{table.lines[unknown[0]]}: there is no image "
+                f"{quoted(named[unknown[0]])} in {images.source}"
+            )
+        return np.array([places[text] for text in named])
+    if table.frame is not None:
+        numbers: dict[int, int] = {}
+        for index, path in enumerate(paths):
+            digits = re.search(r"(\d{1,9})$", path.stem)
+            if digits is None:
+                raise InputError(
+                    f"{path}: its name does not end in a number, by which {table.name} would "
+                    "name it: use a column file"
+                )
+            if numbers.setdefault(int(digits[1]), index) != index:
+                raise InputError(f"{path}: another image has the number {int(digits[1])} too")
+        unknown = [row for row, frame in enumerate(table.frame) if int(frame) not in numbers]
+        if unknown:
+            raise InputError(
+                f"{table.name}:{table.lines[unknown[0]]}: no image in {images.source} has the "
+                f"number {table.frame[unknown[0]]}"
+            )
+        return np.array([numbers[int(frame)] for frame in table.frame])
+    if len(table) != len(images):
+        raise InputError(
+            f"{table.name}: {len(table)} poses, but {images.source} has {len(images)} images: name "
+            "the images in a column file or frame"
+        )
+    return np.arange(len(table))
+
+
+def _natural(name: str) -> list[tuple[int, int | str]]:
+    parts = re.split(r"(\d{1,18})", name)
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts]

@@ -1,0 +1,119 @@
+"""PlusServer's TRACKEDFRAME: an image, and the transforms that were tracked with it.
+
+The body as PlusLib writes it (``igtlPlusTrackedFrameMessage``), big-endian but for the pixels and
+the embedded matrix, which are in the sender's order and which PLUS itself does not turn round:
+
+    scalar type u16, components u16, image type u16 (1 B-mode, 5 colour), columns, rows, slices u16,
+    size of the pixels u32, size of the XML u32, orientation u16, embedded transform 16 float32
+    XML: <TrackedFrame Timestamp=...><FrameField Name="ProbeToTrackerTransform" Value="16 numbers"/>
+         <FrameField Name="ProbeToTrackerTransformStatus" Value="OK"/>...</TrackedFrame>
+    pixels
+
+The embedded transform takes pixels to some frame by PLUS's present calibration, which is what is to
+be found: it is not used.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from jaxcal import FormatError
+from jaxcal.io.frame_names import split_name
+from jaxcal.io.openigtlink import ContentError, Picture, Tracked, TrackedFrame, grey_of
+from jaxcal.io.xml import parse_xml
+
+_HEAD = struct.Struct(">HHH3HIIH64s")
+_UINT8 = 3
+_BRIGHTNESS, _COLOUR = 1, 5
+_ORIENTATIONS = {0: "", 1: "UF", 2: "UF", 3: "UN", 4: "UN", 5: "MF", 6: "MF", 8: "MN", 9: "MN"}
+"""PLUS's enumeration; of B-mode images only, 0 where it does not know."""
+_MOST_XML = 2**18
+_MOST_TRANSFORMS = 256
+_TRANSFORM, _STATUS = "Transform", "TransformStatus"
+
+
+def decode_tracked_frame(content: memoryview) -> TrackedFrame:
+    """The content of a body.
+
+    Raises:
+        ContentError: sizes that do not agree, RF data, volumes, or XML that is none.
+    """
+    if len(content) < _HEAD.size:
+        raise ContentError("a tracked frame that is cut off")
+    scalar, components, kind, columns, rows, slices, size, xml_size, orientation, _ = (
+        _HEAD.unpack_from(content)
+    )
+    if len(content) != _HEAD.size + size + xml_size or xml_size > _MOST_XML:
+        raise ContentError("a tracked frame whose sizes do not agree")
+    if scalar != _UINT8 or components not in (1, 3) or kind not in (0, _BRIGHTNESS, _COLOUR):
+        raise ContentError(
+            f"a tracked frame of {components} components of scalar type {scalar}, image type "
+            f"{kind}; B-mode of uint8 is taken"
+        )
+    if slices > 1 or not (columns and rows) or size != columns * rows * components:
+        raise ContentError(f"a tracked frame of {columns} x {rows} x {slices} voxels, {size} bytes")
+    if orientation not in _ORIENTATIONS:
+        raise ContentError(f"a tracked frame of orientation {orientation}, which no B-mode image has")
+    xml = bytes(content[_HEAD.size : _HEAD.size + xml_size])
+    pixels = np.frombuffer(content, np.uint8, offset=_HEAD.size + xml_size)
+    stored = _ORIENTATIONS[orientation] or "MF"
+    frame = grey_of(pixels.reshape(rows, columns, components))
+    frame = frame[:, ::-1] if stored[0] == "U" else frame
+    frame = np.ascontiguousarray(frame[::-1] if stored[1] == "N" else frame)
+    frame.setflags(write=False)
+    return TrackedFrame(Picture(frame, (1.0, 1.0)), _transforms(xml.rstrip(b"\0")))
+
+
+def encode_tracked_frame(frame: TrackedFrame, t: float, orientation: int = 5) -> bytes:
+    """The content of a message, as PlusServer sends it; for an image that is stored as it is."""
+    rows, columns = frame.picture.array.shape
+    fields = []
+    for tracked in frame.transforms:
+        values = " ".join(repr(float(value)) for value in tracked.matrix.ravel())
+        fields += [(tracked.name + _STATUS, tracked.status or "OK"),
+                   (tracked.name + _TRANSFORM, values)]  # fmt: skip
+    lines = [
+        f'<TrackedFrame Timestamp="{t!r}" ImageDataValid="true" NumberOfBits="8" '
+        f'NumberOfScalarComponents="1" FrameSize="{columns} {rows} 1">',
+        *(f"  <FrameField Name={quoteattr(n)} Value={quoteattr(v)} />" for n, v in fields),
+        "</TrackedFrame>\n",
+    ]
+    xml = "\n".join(lines).encode()
+    head = _HEAD.pack(
+        _UINT8, 1, _BRIGHTNESS, columns, rows, 1, columns * rows, len(xml), orientation,
+        np.eye(4, dtype="<f4").tobytes(),
+    )  # fmt: skip
+    return head + xml + np.ascontiguousarray(frame.picture.array, np.uint8).tobytes()
+
+
+def _transforms(xml: bytes) -> tuple[Tracked, ...]:
+    try:
+        root = parse_xml(xml)
+    except FormatError as error:
+        raise ContentError(f"a tracked frame whose XML cannot be read: {error}") from None
+    fields = {
+        field.attributes.get("Name", ""): field.attributes.get("Value", "")
+        for field in root.all("FrameField")
+    }
+    found = []
+    for name, text in fields.items():
+        if not name.endswith(_TRANSFORM) or split_name(name.removesuffix(_TRANSFORM)) is None:
+            continue
+        status = fields.get(name.removesuffix(_TRANSFORM) + _STATUS, "")
+        found.append(Tracked(name.removesuffix(_TRANSFORM), _matrix(text.split()), status))
+        if len(found) > _MOST_TRANSFORMS:
+            raise ContentError(f"a tracked frame with more than {_MOST_TRANSFORMS} transforms")
+    return tuple(found)
+
+
+def _matrix(words: Sequence[str]) -> np.ndarray:
+    try:
+        if len(words) != 16:
+            raise ValueError
+        return np.array([float(word) for word in words]).reshape(4, 4)
+    except ValueError:
+        raise ContentError("a tracked frame with a transform that is not 16 numbers") from None

@@ -1,0 +1,150 @@
+"""The file of points placed by hand: a table with frame, u and v, complete after every click.
+
+    # jaxcal pick of sweep.igs.mha: 420 x 300 px, 16 frames
+    # skipped: 3 9
+    frame,u,v
+    0,123.25,45.5
+
+``jaxcal import`` reads it as any other table of points. The two comments are for going on later:
+the first says what the points belong to, the second in which frames there is nothing to place.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxcal import FormatError, InputError
+from jaxcal.io.atomic import write_text
+from jaxcal.io.readable import check_readable
+from jaxcal.io.text import read_pose_table
+
+_HEAD = "# jaxcal pick of "
+_SKIPPED = "# skipped:"
+_MOST_BYTES = 2**24
+Point = tuple[float, float]
+
+
+class Picks:
+    """Points placed in the frames of one sequence; every change is on the disk when it returns.
+
+    Args:
+        path: of the table; one that is there is gone on with.
+        name: of the sequence.
+        size: columns and rows of its frames, px.
+        count: of its frames.
+        shown: numbers of the frames to place points in.
+
+    Attributes:
+        points: [u, v] by the number of the frame, px.
+        skipped: numbers of the frames without one.
+
+    Raises:
+        FormatError: a file that this did not write, or one of another sequence.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        name: str,
+        size: tuple[int, int],
+        count: int,
+        shown: Sequence[int],
+    ) -> None:
+        self.path, self.shown, self.size = os.fspath(path), list(shown), size
+        self._head = f"{_HEAD}{name}: {size[0]} x {size[1]} px, {count} frames"
+        self.points: dict[int, Point] = {}
+        self.skipped: set[int] = set()
+        self._before: list[tuple[int, Point | None, bool]] = []
+        if Path(path).exists():
+            self._load(count)
+
+    @property
+    def next_frame(self) -> int | None:
+        """The first frame that was neither picked nor skipped; None where there is none."""
+        return next((k for k in self.shown if k not in self.points and k not in self.skipped), None)
+
+    def pick(self, frame: int, u: float, v: float) -> None:
+        """Put the point of a frame to a place.
+
+        Raises:
+            InputError: no such frame, or no place in it.
+            OutputError: the table cannot be written; nothing has changed.
+        """
+        if not (np.isfinite([u, v]).all() and _inside(u, self.size[0]) and _inside(v, self.size[1])):
+            raise InputError(f"({u}, {v}) is not in the frame")
+        self._change(frame, (float(u), float(v)), False)
+
+    def skip(self, frame: int) -> None:
+        """Say that a frame has no point.
+
+        Raises:
+            InputError: no such frame.
+            OutputError: the table cannot be written; nothing has changed.
+        """
+        self._change(frame, None, True)
+
+    def undo(self) -> int | None:
+        """Take the last change back; the frame that it was in, or None where there was none.
+
+        Raises:
+            OutputError: the table cannot be written; nothing has changed.
+        """
+        if not self._before:
+            return None
+        frame, point, skipped = self._before[-1]
+        self._put(frame, point, skipped)
+        self._before.pop()
+        return frame
+
+    def _change(self, frame: int, point: Point | None, skipped: bool) -> None:
+        if frame not in self.shown:
+            raise InputError(f"frame {frame} is not shown")
+        before = (frame, self.points.get(frame), frame in self.skipped)
+        self._put(frame, point, skipped)
+        self._before.append(before)
+
+    def _put(self, frame: int, point: Point | None, skipped: bool) -> None:
+        points = {k: place for k, place in self.points.items() if k != frame}
+        if point is not None:
+            points[frame] = point
+        others = {k for k in self.skipped if k != frame} | ({frame} if skipped else set())
+        rows = [f"{k},{points[k][0]!r},{points[k][1]!r}" for k in sorted(points)]
+        told = " ".join(map(str, sorted(others)))
+        head = [self._head, f"{_SKIPPED} {told}".rstrip(), "frame,u,v"]
+        write_text(self.path, "\n".join([*head, *rows, ""]))
+        self.points, self.skipped = points, others
+
+    def _load(self, count: int) -> None:
+        check_readable(self.path, maximum_bytes=_MOST_BYTES)
+        lines = Path(self.path).read_text("utf-8", errors="replace").splitlines()
+        if not lines[0].startswith(_HEAD):
+            raise FormatError(f"{self.path}: exists and was not made by jaxcal pick: name another")
+        if lines[0] != self._head:
+            raise FormatError(
+                f"{self.path}: has points of {lines[0].removeprefix(_HEAD)!r}, not of "
+                f"{self._head.removeprefix(_HEAD)!r}: name another file"
+            )
+        told = lines[1].removeprefix(_SKIPPED) if len(lines) > 1 else ""
+        if not re.fullmatch(r"[\d ]*", told):
+            raise FormatError(f"{self.path}: line 2 does not list skipped frames")
+        self.skipped = {int(number) for number in told.split() if len(number) < 10}
+        if len(lines) > 3:
+            table = read_pose_table(self.path)
+            if table.frame is None or table.points is None:
+                raise FormatError(f"{self.path}: has no columns frame, u and v")
+            self.points = {
+                int(frame): (float(u), float(v))
+                for frame, (u, v) in zip(table.frame, table.points, strict=True)
+            }
+        if any(frame >= count for frame in [*self.points, *self.skipped]):
+            raise FormatError(f"{self.path}: names a frame that the sequence has not")
+
+
+def _inside(place: float, size: int) -> bool:
+    """Pixel centres lie at integers, so that a frame begins at -1/2."""
+    return -0.5 <= place <= size - 0.5
