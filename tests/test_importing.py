@@ -75,7 +75,7 @@ MATRIX = [f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)]
 )  # fmt: skip
 def test_headers_are_read(tmp_path, lines):
     (tmp_path / "t.csv").write_text("\n".join(lines))
-    recording, notes = import_files([tmp_path / "t.csv"])
+    recording, notes, _ = import_files([tmp_path / "t.csv"])
     images = recording.calibration
     np.testing.assert_allclose(images.poses, POSES, atol=1e-11)
     np.testing.assert_allclose(images.measurements, PIXELS, rtol=1e-14)
@@ -118,7 +118,7 @@ def test_invalid_rows_are_counted(tmp_path):
     (tmp_path / "t.csv").write_text("\n".join([*lines, *more]))
     with pytest.raises(FormatError, match=r"t\.csv:8: the row is marked as invalid"):
         import_files([tmp_path / "t.csv"])
-    recording, notes = import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True))
+    recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True))
     assert len(recording) == 6
     assert notes == [f"{tmp_path / 't.csv'}: 2 invalid rows left out"]
 
@@ -169,7 +169,7 @@ def test_times_that_go_back(tmp_path):
         InputError, match=r"t\.csv:5: the time stamp is not later than the one before"
     ):
         import_files([tmp_path / "t.csv"])
-    recording, notes = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
+    recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
     assert recording.calibration.time is None
     assert "not kept" in notes[0]
 
@@ -273,7 +273,7 @@ def fcsv(sign):
 )
 def test_points_of_a_sequence(tmp_path, sequence, name, text, points):
     (tmp_path / name).write_text(text)
-    recording, notes = import_files([sequence, tmp_path / name], ImportOptions(points=points))
+    recording, notes, _ = import_files([sequence, tmp_path / name], ImportOptions(points=points))
     images = recording.calibration
     np.testing.assert_allclose(images.poses, POSES[KEPT], atol=1e-11)
     np.testing.assert_allclose(images.measurements, PIXELS[KEPT], rtol=1e-14)

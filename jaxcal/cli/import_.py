@@ -88,8 +88,8 @@ def import_(sources: tuple[str, ...], out: str, **options: Any) -> int:
     from jaxcal.io.importing import ImportOptions, import_files
 
     with progress("importing"):
-        recording, notes = import_files(sources, ImportOptions(**options))
-    save(recording, out)
+        recording, notes, frames = import_files(sources, ImportOptions(**options))
+    save(recording, out, frames)
     images = recording.calibration
     unscaled = images.kind == "pixel" and images.spacing_mm is None
     hint = "; their size is not known: calibrate with --estimate scale" if unscaled else ""

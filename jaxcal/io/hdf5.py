@@ -12,7 +12,8 @@
                  pixel has attrs spacing_mm [lateral, axial] and face_offset_mm, both optional
     /test        optional, as /calibration
     /truth       optional; image_to_probe (4, 4), point (3,), elevation (n,) [mm]
-    /segmentation  written by ``jaxcal segment``, for other programs; not read (see _write_fate)
+    /segmentation  where the points came from, for other programs; not read (see _write_fate,
+                 _write_frames)
 
 Where both ``point`` and ``time_of_flight`` are there, the points were segmented from the times: the
 points are what is read, and the times are kept beside them. Datasets may have a ``units``
@@ -42,6 +43,7 @@ from jaxcal.data.recording import (
 )
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.readable import check_readable, quoted
+from jaxcal.io.target_search import FATES, FrameResults
 from jaxcal.io.untrusted import (
     Node,
     UpTo,
@@ -96,7 +98,7 @@ def load(path: str | os.PathLike[str]) -> Recording:
 def save(
     recording: Recording,
     path: str | os.PathLike[str],
-    segmentation: Segmentation | None = None,
+    segmentation: Segmentation | FrameResults | None = None,
 ) -> None:
     """Write a recording, complete or not at all; what it writes is what :func:`load` reads.
 
@@ -114,7 +116,9 @@ def save(
     image = io.BytesIO()
     with h5py.File(image, "w") as file:
         _write(file, recording)
-        if segmentation is not None:
+        if isinstance(segmentation, FrameResults):
+            _write_frames(file.create_group("segmentation"), segmentation)
+        elif segmentation is not None:
             _write_fate(file.create_group("segmentation"), segmentation)
     _read(io.BytesIO(image.getvalue()), os.fspath(path))
     with atomic_path(path) as temporary:
@@ -352,6 +356,16 @@ def _write_fate(target: h5py.Group, found: Segmentation) -> None:
         _put(target, "out_of_plane", found.out_of_plane.position, "mm, mm, mm^2")
         _put(target, "out_of_plane_covariance", found.out_of_plane.covariance, _FREE)
         _put(target, "elevation_determined", found.out_of_plane.determined, _FREE)
+
+
+def _write_frames(target: h5py.Group, found: FrameResults) -> None:
+    """What became of every frame of a sequence; ``frame`` are those of /calibration, in order."""
+    target.attrs["method"] = found.target
+    target.attrs["fates"] = ", ".join(FATES)
+    _put(target, "frame", found.found, _FREE)
+    _put(target, "fate", found.fate, _FREE)
+    _put(target, "contrast", found.contrast_db, "dB")
+    _put(target, "margin", found.margin_db, "dB")
 
 
 def _put(target: h5py.Group, name: str, values: np.ndarray, unit: str) -> h5py.Dataset:

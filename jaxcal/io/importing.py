@@ -11,29 +11,26 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal import FormatError, InputError
-from jaxcal.data.poses import QuaternionOrder
-from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
-from jaxcal.io.frame_names import capitalised
-from jaxcal.io.readable import naming, quoted
-from jaxcal.io.sequence import TrackedSequence
+from jaxcal.io.folder import read_folder, with_pose_table
+from jaxcal.io.frame_names import FramePair, capitalised
+from jaxcal.io.frame_points import Assignment, points_of_markups, points_of_table
+from jaxcal.io.poses_by_time import with_poses_by_time
+from jaxcal.io.readable import quoted
+from jaxcal.io.sequence import FolderPixels, TrackedSequence
 from jaxcal.io.sequence_files import EXTENSIONS, read_sequence
 from jaxcal.io.slicer import EXTENSIONS as MARKUPS
-from jaxcal.io.slicer import pixels_from_markups, read_markups
+from jaxcal.io.target_search import FrameResults, search_target
 from jaxcal.io.text import LengthUnit, PoseTable, read_crosswire, read_pose_table, recording_of
 from jaxcal.io.trackers import is_tracker_export, read_tracker
-from jaxcal.runtime.array_types import Bool, Float, Int
-
-Points = Literal["order", "labels"]
-"""How points without a time or a frame's number belong to frames: one for each frame in their
-order, or by the number that ends each point's label, frames counted from 0."""
-
-_SLACK = 0.5
-"""A point belongs to the frame nearest in time, within this part of the median interval."""
+from jaxcal.data.poses import QuaternionOrder
+from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
 
 
 @dataclass(frozen=True)
@@ -54,6 +51,10 @@ class ImportOptions:
         region: (first column, first row, columns, rows) to look in, px.
         orientation: of the stored pixels, where the file does not say.
         ignore_time: time stamps that repeat or go back are no error, and are not kept.
+        poses: file with the poses of the frames: a table for a folder of images; a sequence, a
+            tracker's export or a table with times for a sequence.
+        lag_s: with ``poses``: an image stamped t shows what was at t - lag.
+        spacing_from: DICOM clip that states the pixel size.
     """
 
     source: str | None = None
@@ -63,26 +64,43 @@ class ImportOptions:
     quaternion: QuaternionOrder | None = None
     pose_units: LengthUnit | None = None
     skip_invalid: bool = False
-    points: Points | None = None
+    points: Assignment | None = None
     target_kind: Literal["echo", "cross"] = "echo"
     region: tuple[int, int, int, int] | None = None
     orientation: Literal["MF", "UF", "MN", "UN"] | None = None
     ignore_time: bool = False
+    poses: str | os.PathLike[str] | None = None
+    lag_s: float = 0.0
+    spacing_from: str | os.PathLike[str] | None = None
+
+
+class Imported(NamedTuple):
+    """A recording and how it came to be.
+
+    Attributes:
+        recording: of the files.
+        notes: what was assumed, left out and counted, in words.
+        frames: what became of every frame, where the target was looked for in them.
+    """
+
+    recording: Recording
+    notes: list[str]
+    frames: FrameResults | None = None
 
 
 def import_files(
     sources: Sequence[str | os.PathLike[str]], options: ImportOptions | None = None
-) -> tuple[Recording, list[str]]:
+) -> Imported:
     """Make a recording of other programs' files.
 
     Args:
-        sources: one of: a table with poses and points; a sequence or a tracker's export with points
-            (a table or Slicer's markups); a sequence with frames, which are segmented; the
-            cross-wire pair POSES POINTS.
+        sources: one of: a table with poses and points; a sequence, a folder of PNG or a tracker's
+            export with points (a table or Slicer's markups); a sequence or folder with frames,
+            which are segmented; the cross-wire pair POSES POINTS.
         options: what is asked for.
 
     Returns:
-        The recording, and what was assumed, left out and counted, in words.
+        The recording, and what there is to say of it.
 
     Raises:
         InputError: files that cannot be read or do not belong together; one line that names the
@@ -91,15 +109,17 @@ def import_files(
     options = options or ImportOptions()
     kinds = [_kind(source) for source in sources]
     tracked = [
-        source for source, kind in zip(sources, kinds, strict=True)
-        if kind in ("sequence", "tracker", "scan")
+        source for source, kind in zip(sources, kinds, strict=True) if kind in _SEQUENCES
     ]  # fmt: skip
     if tracked:
-        return _from_sequence(sources, kinds, tracked, options)
+        return _from_sequence(sources, tracked, options)
+    if options.poses is not None:
+        raise InputError("--poses goes with a sequence or a folder of PNG images")
+    options = replace(options, spacing_mm=_spacing(None, options), spacing_from=None)
     if len(sources) == 2 and "markups" not in kinds:
         if options.units == "mm":
             raise InputError("a pair of text files holds pixels: --units mm does not go with it")
-        return read_crosswire(*sources, spacing_mm=options.spacing_mm), []
+        return Imported(read_crosswire(*sources, spacing_mm=options.spacing_mm), [])
     if len(sources) != 1 or kinds[0] != "table":
         raise InputError(
             f"{os.fspath(sources[0])}: holds no poses: a sequence, a tracker's export or a table "
@@ -108,11 +128,21 @@ def import_files(
     table = _table(sources[0], options)
     notes = _skipped(table)
     table, said = _with_good_time(table, options)
-    return recording_of(table, options.spacing_mm), notes + said
+    return Imported(recording_of(table, options.spacing_mm), notes + said)
+
+
+_SEQUENCES = ("sequence", "tracker", "scan", "folder")
+
+
+def is_sequence(source: str | os.PathLike[str]) -> bool:
+    """Whether a source is one of frames or tracking: a sequence, a folder, a tracker's export."""
+    return _kind(source) in _SEQUENCES
 
 
 def _kind(source: str | os.PathLike[str]) -> str:
     name = os.fspath(source).lower()
+    if Path(source).is_dir():
+        return "folder"
     if name.endswith(EXTENSIONS):
         return "sequence"
     if name.endswith(MARKUPS):
@@ -120,7 +150,10 @@ def _kind(source: str | os.PathLike[str]) -> str:
     if name.endswith((".h5", ".hdf5")):
         return "scan"
     if name.endswith((".xml", ".png", ".dcm", ".vtk", ".seq.mrb", ".mrb")):
-        raise FormatError(f"{os.fspath(source)}: is not a recording that can be imported")
+        raise FormatError(
+            f"{os.fspath(source)}: is not a recording that can be imported (PNG images: name their "
+            "folder)"
+        )
     return "tracker" if is_tracker_export(source) else "table"
 
 
@@ -159,58 +192,138 @@ def _without_time(
 
 def _from_sequence(
     sources: Sequence[str | os.PathLike[str]],
-    kinds: list[str],
     tracked: list[str | os.PathLike[str]],
     options: ImportOptions,
-) -> tuple[Recording, list[str]]:
+) -> Imported:
     if len(tracked) > 1 or len(sources) > 2:
         raise InputError(
             f"{', '.join(str(source) for source in sources)}: one sequence, and at most one file "
-            "of points, make a recording"
+            "of points, make a recording (poses in another file: --poses)"
         )
-    kind = kinds[list(sources).index(tracked[0])]
-    sequence = _read_tracked(tracked[0], kind)
-    start, end, notes = _frames(sequence, options)
+    sequence, notes = open_sequence(tracked[0], options)
+    poses, valid, said = tracked_poses(sequence, options)
+    notes += said
+    spacing = _spacing(sequence, options)
+    points = next((source for source in sources if source not in tracked), None)
+    if points is None:
+        return _segmented(sequence, poses, valid, spacing, options, notes)
+    if os.fspath(points).lower().endswith(MARKUPS):
+        placed = points_of_markups(points, sequence, options.points)
+    else:
+        placed = points_of_table(_table(points, options), sequence, options.points)
+    used = valid[placed.rows]
+    notes += placed.notes
+    if (~used).any():
+        notes.append(f"{int((~used).sum())} points left out: their frame's tracking was not OK")
+    rows = placed.rows[used]
+    time, said = _time(sequence, rows, options)
+    images = make_images(
+        poses[rows], placed.points[used], placed.kind, time=time,
+        spacing_mm=spacing, where=sequence.source,
+    )  # fmt: skip
+    return Imported(Recording(images, source=sequence.source), notes + said)
+
+
+def open_sequence(
+    source: str | os.PathLike[str], options: ImportOptions
+) -> tuple[TrackedSequence, list[str]]:
+    """A sequence of any kind with the poses that belong to it, and what there is to say.
+
+    Args:
+        source: a sequence, a folder of PNG, a tracker's export or a TUS-REC scan.
+        options: ``poses`` names the file of the poses where they are not in ``source``.
+
+    Raises:
+        InputError: files that cannot be read or do not belong together; one line.
+    """
+    sequence = _read_tracked(source)
+    if options.poses is None:
+        return sequence, []
+    if isinstance(sequence.pixels, FolderPixels):
+        if _kind(options.poses) != "table":
+            raise InputError(
+                f"{options.poses}: the poses of a folder of images come from a table with columns "
+                "file or frame"
+            )
+        return with_pose_table(sequence, _table(options.poses, options))
+    if _kind(options.poses) == "table":
+        table = _table(options.poses, options)
+        if table.poses is None or table.time is None:
+            raise InputError(f"{table.name}: needs columns of times and of poses")
+        found, valid = table.poses, np.ones(len(table), bool)
+        pair, time, said = ("Probe", "Tracker"), table.time, _skipped(table)
+    else:
+        tracking = _read_tracked(options.poses)
+        start, end, said = _frames(tracking, options)
+        found, valid = tracking.poses(start, end)
+        pair, time = (start, end), tracking.time
+    name = os.fspath(options.poses)
+    merged, more = with_poses_by_time(sequence, time, found, valid, pair, name, options.lag_s)
+    return merged, said + more
+
+
+def tracked_poses(
+    sequence: TrackedSequence, options: ImportOptions
+) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"], list[str]]:
+    """Poses of a sequence, where they can be used, and what was assumed and left out.
+
+    Raises:
+        InputError: no way between the frames, or no frame with tracking.
+    """
+    if options.poses is None:
+        start, end, notes = _frames(sequence, options)
+    else:
+        # Said when they were matched.
+        (start, end), notes = next(iter(sequence.transforms)), []
     poses, valid = sequence.poses(start, end)
     lost = len(sequence) - int(valid.sum())
-    if lost:
+    if lost and options.poses is None:
         notes.append(f"{lost} of {len(sequence)} frames left out: their tracking was not OK")
     if not valid.any():
         raise InputError(f"{sequence.source}: no frame has tracking from {start} to {end}")
-    points = next((source for source in sources if source not in tracked), None)
-    if points is None:
-        return _segmented(sequence, poses, valid, options, notes)
-    rows, measured, point_kind, said = _points(points, sequence, options)
-    notes += said
-    used = valid[rows]
-    if (~used).any():
-        notes.append(f"{int((~used).sum())} points left out: their frame's tracking was not OK")
-    rows, measured = rows[used], measured[used]
-    time, said = _time(sequence, rows, options)
-    images = make_images(
-        poses[rows], measured, point_kind, time=time,
-        spacing_mm=options.spacing_mm, where=sequence.source,
-    )  # fmt: skip
-    return Recording(images, source=sequence.source), notes + said
+    return poses, valid, notes
 
 
-def _read_tracked(source: str | os.PathLike[str], kind: str) -> TrackedSequence:
-    if kind == "tracker":
-        return read_tracker(source)
-    if kind == "scan":
-        from jaxcal.io.tus_rec import read_scan
+def _read_tracked(source: str | os.PathLike[str]) -> TrackedSequence:
+    match _kind(source):
+        case "tracker":
+            return read_tracker(source)
+        case "scan":
+            from jaxcal.io.tus_rec import read_scan
 
-        return read_scan(source)
+            return read_scan(source)
+        case "folder":
+            return read_folder(source)
     return read_sequence(source)
+
+
+def _spacing(
+    sequence: TrackedSequence | None, options: ImportOptions
+) -> tuple[float, float] | None:
+    """The pixel size that is stated, or read from a clip of the same image size."""
+    if options.spacing_from is None:
+        return options.spacing_mm
+    if options.spacing_mm is not None:
+        raise InputError("give either --spacing or --spacing-from")
+    from jaxcal.io.dicom import read_pixel_size
+
+    stated = read_pixel_size(options.spacing_from)
+    pixels = None if sequence is None else sequence.pixels
+    if pixels is not None and (pixels.columns, pixels.rows) != (stated.columns, stated.rows):
+        raise InputError(
+            f"{options.spacing_from}: its images are {stated.columns} x {stated.rows} px, the "
+            f"frames {pixels.columns} x {pixels.rows}: their pixels need not be of one size "
+            "(--spacing states it)"
+        )
+    return stated.spacing_mm
 
 
 def _frames(sequence: TrackedSequence, options: ImportOptions) -> tuple[str, str, list[str]]:
     """The frames of the poses, and what was assumed about them."""
-    pairs = list(sequence.transforms)
+    pairs: list[FramePair] = list(sequence.transforms)
     if not pairs:
         raise InputError(
-            f"{sequence.source}: holds no transforms: its poses are in another file, which must be "
-            "merged first (PLUS: EditSequenceFile --operation=MIX)"
+            f"{sequence.source}: holds no transforms: name the file with its poses (--poses)"
         )
     names = sequence.frames()
     tools = list(dict.fromkeys(source for source, _ in pairs if source != "Reference"))
@@ -252,147 +365,36 @@ def _time(
     )
 
 
-def _points(
-    source: str | os.PathLike[str], sequence: TrackedSequence, options: ImportOptions
-) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "m 2"], Literal["pixel", "point"], list[str]]:
-    """Frames that points are in, the points, what they are, and what there is to say."""
-    name = os.fspath(source)
-    if name.lower().endswith(MARKUPS):
-        markups = read_markups(source)
-        with naming(source):
-            pixels = pixels_from_markups(markups)
-            rows = _rows_of_markups(markups.labels, sequence, options)
-        said = [f"{name}: {markups.unplaced} points were not placed"] if markups.unplaced else []
-        return _distinct(rows, name), pixels, "pixel", said
-    table = _table(source, options)
-    if table.points is None:
-        raise InputError(f"{name}: holds no points (columns u and v, or lateral and range)")
-    with naming(source):
-        rows = _rows_of_table(table, sequence, options)
-    return _distinct(rows, name), table.points, table.kind, _skipped(table)
-
-
-def _distinct(rows: Int[np.ndarray, " m"], name: str) -> Int[np.ndarray, " m"]:
-    values, counts = np.unique(rows, return_counts=True)
-    if (counts > 1).any():
-        raise InputError(f"{name}: frame {values[counts > 1][0]} has more than one point")
-    return rows
-
-
-def _in_range(rows: Int[np.ndarray, " m"], sequence: TrackedSequence) -> Int[np.ndarray, " m"]:
-    bad = np.flatnonzero((rows < 0) | (rows >= len(sequence)))
-    if len(bad):
-        raise InputError(
-            f"frame {rows[bad[0]]} is not in the sequence, which has frames 0 to "
-            f"{len(sequence) - 1}"
-        )
-    return rows
-
-
-def _in_order(count: int, sequence: TrackedSequence) -> Int[np.ndarray, " m"]:
-    if count != len(sequence):
-        raise InputError(f"{count} points, but the sequence has {len(sequence)} frames")
-    return np.arange(count)
-
-
-def _rows_of_markups(
-    labels: Sequence[str], sequence: TrackedSequence, options: ImportOptions
-) -> Int[np.ndarray, " m"]:
-    if options.points is None:
-        raise InputError(
-            "say how points belong to frames: --points labels (each label ends in a frame's "
-            "number, from 0) or --points order (one point for each frame)"
-        )
-    if options.points == "order":
-        return _in_order(len(labels), sequence)
-    rows = []
-    for index, label in enumerate(labels):
-        digits = label[len(label.rstrip("0123456789")) :]
-        if not digits or len(digits) > 9:
-            raise InputError(
-                f"point {index + 1}: its label {quoted(label)} does not end in a frame's number"
-            )
-        rows.append(int(digits))
-    return _in_range(np.array(rows, dtype=np.int64), sequence)
-
-
-def _rows_of_table(
-    table: PoseTable, sequence: TrackedSequence, options: ImportOptions
-) -> Int[np.ndarray, " m"]:
-    if table.frame is not None:
-        return _in_range(table.frame, sequence)
-    if table.time is not None and np.isfinite(sequence.time).all() and len(sequence) > 1:
-        return _nearest_in_time(table, sequence)
-    if options.points == "order" or len(table) == len(sequence):
-        return _in_order(len(table), sequence)
-    raise InputError(
-        "has neither a column frame nor time stamps that the sequence has: which frames are the "
-        "points in?"
-    )
-
-
-def _nearest_in_time(table: PoseTable, sequence: TrackedSequence) -> Int[np.ndarray, " m"]:
-    assert table.time is not None
-    order = np.argsort(sequence.time, kind="stable")
-    time = sequence.time[order]
-    slack = _SLACK * float(np.median(np.diff(time)))
-    after = np.clip(np.searchsorted(time, table.time), 1, len(time) - 1)
-    nearer = after - (table.time - time[after - 1] < time[after] - table.time)
-    far = np.flatnonzero(np.abs(time[nearer] - table.time) > slack)
-    if len(far):
-        raise InputError(
-            f"line {table.lines[int(far[0])]}: no frame was taken at {table.time[far[0]]:.6g} s "
-            f"(the sequence lasts from {time[0]:.6g} to {time[-1]:.6g} s)"
-        )
-    return order[nearer]
-
-
 def _segmented(
     sequence: TrackedSequence,
     poses: Float[np.ndarray, "n 4 4"],
     valid: Bool[np.ndarray, " n"],
+    spacing: tuple[float, float] | None,
     options: ImportOptions,
     notes: list[str],
-) -> tuple[Recording, list[str]]:
-    """The target looked for in every frame that was tracked, one frame in memory at a time."""
-    if sequence.pixels is None:
+) -> Imported:
+    """The target looked for in every frame that was tracked."""
+    results = search_target(
+        sequence, valid, options.target_kind, region=options.region, orientation=options.orientation
+    )
+    counts, used = results.counts, results.found
+    blank, hidden = counts["image not OK"], counts["not credible"]
+    if blank:
+        notes.append(f"{blank} frames left out: their image was not OK")
+    if len(used) < MINIMUM_IMAGES:
+        most = next(iter(results.reasons), "there are no frames")
         raise InputError(
-            f"{sequence.source}: holds no pixels: name a file with the target's points as well"
+            f"{sequence.source}: only {len(used)} of {len(used) + hidden} frames show a credible "
+            f"target, at least {MINIMUM_IMAGES} are needed (most often: {most}); place the points "
+            "by hand: jaxcal pick"
         )
-    from jaxcal.data.segmentation.image import localise
-
-    blank = valid & ~sequence.image_valid
-    if blank.any():
-        notes.append(f"{int(blank.sum())} frames left out: their image was not OK")
-    rows = np.flatnonzero(valid & sequence.image_valid)
-    found: list[int] = []
-    reasons: list[str] = []
-    position: list[np.ndarray] = []
-    covariance: list[np.ndarray] = []
-    search: dict[str, Any] = {"region": options.region}
-    for row, frame in zip(
-        rows, sequence.images(rows, orientation=options.orientation), strict=True
-    ):
-        with naming(f"{sequence.source}: frame {row}"):
-            located = localise(frame, options.target_kind, **search)
-        if located.found[0]:
-            found.append(int(row))
-            position.append(located.position[0])
-            covariance.append(located.covariance[0])
-        else:
-            reasons.append(located.reason[0].partition(":")[0])
-    if len(found) < MINIMUM_IMAGES:
-        most = max(set(reasons), key=reasons.count) if reasons else "there are no frames"
-        raise InputError(
-            f"{sequence.source}: only {len(found)} of {len(rows)} frames show a credible target, "
-            f"at least {MINIMUM_IMAGES} are needed (most often: {most})"
+    if hidden:
+        notes.append(
+            f"{hidden} of {len(used) + hidden} frames left out: no credible target in them"
         )
-    if reasons:
-        notes.append(f"{len(reasons)} of {len(rows)} frames left out: no credible target in them")
-    used = np.array(found)
     time, said = _time(sequence, used, options)
     images = make_images(
-        poses[used], np.array(position), "pixel", covariance=np.array(covariance), time=time,
-        spacing_mm=options.spacing_mm, where=sequence.source,
+        poses[used], results.position[used], "pixel", covariance=results.covariance[used],
+        time=time, spacing_mm=spacing, where=sequence.source,
     )  # fmt: skip
-    return Recording(images, source=sequence.source), notes + said
+    return Imported(Recording(images, source=sequence.source), notes + said, results)

@@ -1,0 +1,147 @@
+"""Which frames of a sequence the points of another file belong to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.runtime.array_types import Float, Int
+from jaxcal.io.readable import naming, quoted
+from jaxcal.io.sequence import TrackedSequence
+from jaxcal.io.slicer import pixels_from_markups, read_markups
+from jaxcal.io.text import PoseTable
+
+Assignment = Literal["order", "labels"]
+"""How points without a time or a frame's number belong to frames: one for each frame in their
+order, or by the number that ends each point's label, frames counted from 0."""
+
+_SLACK = 0.5
+"""A point belongs to the frame nearest in time, within this part of the median interval."""
+
+
+class FramePoints(NamedTuple):
+    """Points and the frames that they are in.
+
+    Attributes:
+        rows: (m,) numbers of the frames, none twice.
+        points: (m, 2): [u, v] px, or [lateral, range] mm.
+        kind: of the points.
+        notes: what was left out, in words.
+    """
+
+    rows: Int[np.ndarray, " m"]
+    points: Float[np.ndarray, "m 2"]
+    kind: Literal["pixel", "point"]
+    notes: list[str]
+
+
+def points_of_markups(
+    source: str | os.PathLike[str], sequence: TrackedSequence, assignment: Assignment | None
+) -> FramePoints:
+    """Points placed in Slicer.
+
+    Raises:
+        InputError: a list that cannot be read, or points that belong to no frame, or to the same.
+    """
+    name = os.fspath(source)
+    markups = read_markups(source)
+    with naming(source):
+        pixels = pixels_from_markups(markups)
+        rows = _rows_of_markups(markups.labels, sequence, assignment)
+    notes = [f"{name}: {markups.unplaced} points were not placed"] if markups.unplaced else []
+    return FramePoints(_distinct(rows, name), pixels, "pixel", notes)
+
+
+def points_of_table(
+    table: PoseTable, sequence: TrackedSequence, assignment: Assignment | None
+) -> FramePoints:
+    """Points of a table, by frame, by time, or in order.
+
+    Raises:
+        InputError: no points, or points that belong to no frame, or to the same.
+    """
+    if table.points is None:
+        raise InputError(f"{table.name}: holds no points (columns u and v, or lateral and range)")
+    with naming(table.name):
+        rows = _rows_of_table(table, sequence, assignment)
+    notes = [f"{table.name}: {table.skipped} invalid rows left out"] if table.skipped else []
+    return FramePoints(_distinct(rows, table.name), table.points, table.kind, notes)
+
+
+def _distinct(rows: Int[np.ndarray, " m"], name: str) -> Int[np.ndarray, " m"]:
+    values, counts = np.unique(rows, return_counts=True)
+    if (counts > 1).any():
+        raise InputError(f"{name}: frame {values[counts > 1][0]} has more than one point")
+    return rows
+
+
+def _in_range(rows: Int[np.ndarray, " m"], sequence: TrackedSequence) -> Int[np.ndarray, " m"]:
+    bad = np.flatnonzero((rows < 0) | (rows >= len(sequence)))
+    if len(bad):
+        raise InputError(
+            f"frame {rows[bad[0]]} is not in the sequence, which has frames 0 to "
+            f"{len(sequence) - 1}"
+        )
+    return rows
+
+
+def _in_order(count: int, sequence: TrackedSequence) -> Int[np.ndarray, " m"]:
+    if count != len(sequence):
+        raise InputError(f"{count} points, but the sequence has {len(sequence)} frames")
+    return np.arange(count)
+
+
+def _rows_of_markups(
+    labels: Sequence[str], sequence: TrackedSequence, assignment: Assignment | None
+) -> Int[np.ndarray, " m"]:
+    if assignment is None:
+        raise InputError(
+            "say how points belong to frames: --points labels (each label ends in a frame's "
+            "number, from 0) or --points order (one point for each frame)"
+        )
+    if assignment == "order":
+        return _in_order(len(labels), sequence)
+    rows = []
+    for index, label in enumerate(labels):
+        digits = label[len(label.rstrip("0123456789")) :]
+        if not digits or len(digits) > 9:
+            raise InputError(
+                f"point {index + 1}: its label {quoted(label)} does not end in a frame's number"
+            )
+        rows.append(int(digits))
+    return _in_range(np.array(rows, dtype=np.int64), sequence)
+
+
+def _rows_of_table(
+    table: PoseTable, sequence: TrackedSequence, assignment: Assignment | None
+) -> Int[np.ndarray, " m"]:
+    if table.frame is not None:
+        return _in_range(table.frame, sequence)
+    if table.time is not None and np.isfinite(sequence.time).all() and len(sequence) > 1:
+        return _nearest_in_time(table, sequence)
+    if assignment == "order" or len(table) == len(sequence):
+        return _in_order(len(table), sequence)
+    raise InputError(
+        "has neither a column frame nor time stamps that the sequence has: which frames are the "
+        "points in?"
+    )
+
+
+def _nearest_in_time(table: PoseTable, sequence: TrackedSequence) -> Int[np.ndarray, " m"]:
+    assert table.time is not None
+    order = np.argsort(sequence.time, kind="stable")
+    time = sequence.time[order]
+    slack = _SLACK * float(np.median(np.diff(time)))
+    after = np.clip(np.searchsorted(time, table.time), 1, len(time) - 1)
+    nearer = after - (table.time - time[after - 1] < time[after] - table.time)
+    far = np.flatnonzero(np.abs(time[nearer] - table.time) > slack)
+    if len(far):
+        raise InputError(
+            f"line {table.lines[int(far[0])]}: no frame was taken at {table.time[far[0]]:.6g} s "
+            f"(the sequence lasts from {time[0]:.6g} to {time[-1]:.6g} s)"
+        )
+    return order[nearer]

@@ -1,0 +1,82 @@
+"""Frames from one file, poses from another, matched by their time stamps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.io.frame_names import FramePair
+from jaxcal.io.sequence import TrackedSequence
+from jaxcal.data.timing import can_interpolate, interpolate_poses
+
+LONGEST_GAP = 5.0
+"""Longest time between two poses that is bridged, in median intervals."""
+
+
+def with_poses_by_time(
+    images: TrackedSequence,
+    time: Float[np.ndarray, " m"],
+    poses: Float[np.ndarray, "m 4 4"],
+    valid: Bool[np.ndarray, " m"],
+    pair: FramePair,
+    source: str,
+    lag_s: float = 0.0,
+) -> tuple[TrackedSequence, list[str]]:
+    """A sequence's frames with poses interpolated at their times.
+
+    Args:
+        images: with times; transforms of its own are dropped.
+        time: (m,) of the poses, s, on the same clock.
+        poses: (m, 4, 4), mm.
+        valid: (m,) which of them can be used.
+        pair: from which frame to which they lead.
+        source: file of the poses, for messages.
+        lag_s: an image stamped t shows what was at t - lag.
+
+    Returns:
+        The sequence, valid where a pose could be interpolated; and what there is to say.
+
+    Raises:
+        InputError: images or poses without times, times that go back, or no image between poses.
+    """
+    if not np.isfinite(images.time).all():
+        raise InputError(
+            f"{images.source}: states no times, by which poses of {source} would be found"
+        )
+    known = np.isfinite(time)
+    if known.sum() < 2:
+        raise InputError(f"{source}: states no times: its poses cannot be matched to the images")
+    time, poses, valid = time[known], poses[known], valid[known]
+    back = np.flatnonzero(np.diff(time) < 0)
+    if len(back):
+        raise InputError(
+            f"{source}: the time stamp of pose {back[0] + 1} is before the one before it: two "
+            "recordings in one?"
+        )
+    # A tracker that was asked faster than it measures gives the same pose twice.
+    first = np.concatenate([[True], np.diff(time) > 0])
+    time, poses, valid = time[first], poses[first], valid[first]
+    if len(time) < 2:
+        raise InputError(f"{source}: all its poses have one time stamp")
+    gap = LONGEST_GAP * float(np.median(np.diff(time)))
+    asked = images.time - lag_s
+    between = can_interpolate(time, asked, max_gap_s=gap, valid=valid)
+    if not between.any():
+        raise InputError(
+            f"{images.source}: no image lies between poses of {source}: images are from "
+            f"{asked.min():.6g} to {asked.max():.6g} s, poses from {time[0]:.6g} to "
+            f"{time[-1]:.6g} s: are they of one clock?"
+        )
+    found = np.full((len(images), 4, 4), np.nan)
+    found[between] = interpolate_poses(time, poses, asked[between], max_gap_s=gap, valid=valid)
+    notes = [f"poses of {source} at the images' times" + (f" less {lag_s:g} s" if lag_s else "")]
+    lost = int((~between).sum())
+    if lost:
+        notes.append(
+            f"{lost} of {len(images)} images have no pose near their time (gaps of up to "
+            f"{gap:.3g} s are bridged)"
+        )
+    return replace(images, transforms={pair: found}, valid={pair: between}), notes

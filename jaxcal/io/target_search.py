@@ -1,0 +1,109 @@
+"""The target looked for in the frames of a sequence, and what became of every frame.
+
+One frame is in memory at a time. A frame counts as ``found``; as ``not credible`` where nothing in
+it can be told from speckle (:mod:`jaxcal.data.segmentation.image` has the reasons); as ``not tracked``
+where a transform's status was not OK; as ``image not OK`` where the file marks its pixels so.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.runtime.array_types import Bool, Float, Int
+from jaxcal.io.readable import naming
+from jaxcal.io.sequence import TrackedSequence
+
+FATES = ("found", "not credible", "not tracked", "image not OK")
+FOUND, NOT_CREDIBLE, NOT_TRACKED, IMAGE_NOT_OK = range(4)
+
+
+@dataclass(frozen=True)
+class FrameResults:
+    """What became of each of n frames.
+
+    Attributes:
+        target: what was looked for, ``echo`` or ``cross``.
+        fate: (n,) index into :data:`FATES`.
+        reason: n texts: why no target was credible; empty elsewhere.
+        position: (n, 2) [u, v], px; NaN where not found.
+        covariance: (n, 2, 2), px^2; NaN where not found.
+        contrast_db: (n,) the target's envelope over the background, dB; NaN where not measured.
+        margin_db: (n,) over the next bright place, dB; NaN likewise.
+    """
+
+    target: str
+    fate: Int[np.ndarray, " n"]
+    reason: tuple[str, ...]
+    position: Float[np.ndarray, "n 2"]
+    covariance: Float[np.ndarray, "n 2 2"]
+    contrast_db: Float[np.ndarray, " n"]
+    margin_db: Float[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.fate)
+
+    @property
+    def found(self) -> Int[np.ndarray, " m"]:
+        """Numbers of the frames in which the target was found."""
+        return np.flatnonzero(self.fate == FOUND)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of frames by fate."""
+        return {name: int((self.fate == number).sum()) for number, name in enumerate(FATES)}
+
+    @property
+    def reasons(self) -> dict[str, int]:
+        """Number of frames by the reason for which no target was credible, the commonest first."""
+        short = (self.reason[k].partition(":")[0] for k in np.flatnonzero(self.fate == NOT_CREDIBLE))
+        return dict(Counter(short).most_common())
+
+
+def search_target(
+    sequence: TrackedSequence,
+    tracked: Bool[np.ndarray, " n"],
+    target: Literal["echo", "cross"],
+    *,
+    region: tuple[int, int, int, int] | None = None,
+    orientation: str | None = None,
+) -> FrameResults:
+    """Look for the target in every frame that was tracked.
+
+    Args:
+        sequence: with pixels.
+        tracked: (n,) whether a frame's pose can be used.
+        target: ``echo``, one bright spot, or ``cross``, a crossing of wires.
+        region: (first column, first row, columns, rows) to look in, px.
+        orientation: of the stored pixels, where the file does not say.
+
+    Raises:
+        FormatError: pixels that cannot be read.
+        InputError: no pixels, or a region that leaves the frames.
+    """
+    from jaxcal.data.segmentation.image import localise
+
+    if sequence.pixels is None:
+        raise InputError(
+            f"{sequence.source}: holds no pixels: name a file with the target's points as well"
+        )
+    count = len(sequence)
+    fate = np.where(tracked, np.where(sequence.image_valid, NOT_CREDIBLE, IMAGE_NOT_OK), NOT_TRACKED)
+    reason = [""] * count
+    position, covariance = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
+    contrast, margin = np.full(count, np.nan), np.full(count, np.nan)
+    rows = np.flatnonzero(fate == NOT_CREDIBLE)
+    search: dict[str, Any] = {"region": region}
+    for row, frame in zip(rows, sequence.images(rows, orientation=orientation), strict=True):
+        with naming(f"{sequence.source}: frame {row}"):
+            located = localise(frame, target, **search)
+        contrast[row], margin[row] = located.contrast_db[0], located.margin_db[0]
+        reason[row] = located.reason[0]
+        if located.found[0]:
+            fate[row] = FOUND
+            position[row], covariance[row] = located.position[0], located.covariance[0]
+    return FrameResults(target, fate, tuple(reason), position, covariance, contrast, margin)
