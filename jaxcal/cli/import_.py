@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
 from jaxcal import InputError
-from jaxcal.cli.common import POSITIVE, ExitCode, progress
+from jaxcal.cli.common import ExitCode, progress
+from jaxcal.cli.sequence_options import search_options, tracking_options
 
 
 @click.command("import")
 @click.argument("sources", nargs=-1, required=True, type=click.Path(), metavar="SOURCE...")
 @click.argument("out", type=click.Path(), metavar="OUT.h5")
-@click.option(
-    "--spacing",
-    "spacing_mm",
-    type=POSITIVE,
-    nargs=2,
-    metavar="LATERAL AXIAL",
-    help="Size of a pixel, mm.",
-)
 @click.option(
     "--units",
     type=click.Choice(["px", "mm"]),
@@ -43,45 +37,23 @@ from jaxcal.cli.common import POSITIVE, ExitCode, progress
     is_flag=True,
     help="Leave out, and count, rows of tables that are marked as invalid or have gaps.",
 )
-@click.option("--from", "source", metavar="FRAME", help="Tracked frame on the probe, e.g. Probe.")
-@click.option("--to", "target", metavar="FRAME", help="Frame the target rests in, e.g. Reference.")
+@tracking_options
 @click.option(
     "--points",
     type=click.Choice(["labels", "order"]),
     help="How points of Slicer belong to frames: by the number that ends each label (frames count "
     "from 0), or one for each frame.",
 )
-@click.option(
-    "--target",
-    "target_kind",
-    type=click.Choice(["echo", "cross"]),
-    default="echo",
-    show_default=True,
-    help="What to look for in frames: one bright spot, or a crossing of wires.",
-)
-@click.option(
-    "--region",
-    type=int,
-    nargs=4,
-    metavar="COLUMN ROW COLUMNS ROWS",
-    help="Part of the frames to look in, px: its first column and row, and its size.",
-)
-@click.option(
-    "--orientation",
-    type=click.Choice(["MF", "UF", "MN", "UN"]),
-    help="Orientation of the frames, if their file does not say it.",
-)
-@click.option(
-    "--ignore-time", is_flag=True, help="If times repeat or go back, import without them."
-)
+@search_options
 def import_(sources: tuple[str, ...], out: str, **options: Any) -> int:
     """Turn other programs' files into a recording, OUT.h5.
 
     SOURCE is one of: a table (CSV) with a pose and a point in each row; a tracked sequence of PLUS
-    or Slicer (.igs.mha, .igs.mhd, .igs.nrrd, .seq.nrrd) whose frames show the target; such a
-    sequence, or an export of NDI ToolBox or Motive, and a file of points (a table with frame or
-    time, u and v, or Slicer's .mrk.json or .fcsv); or POSES (three rows of four numbers for each
-    image) and POINTS (a row "u v" in pixels). docs/reference/formats.md says what each must hold.
+    or Slicer (.igs.mha, .igs.mhd, .igs.nrrd, .seq.nrrd), or a folder of PNG with --poses, whose
+    frames show the target; such a sequence, or an export of NDI ToolBox or Motive, and a file of
+    points (a table with frame or time, u and v, or Slicer's .mrk.json or .fcsv); or POSES (three
+    rows of four numbers for each image) and POINTS (a row "u v" in pixels).
+    docs/reference/formats.md says what each must hold.
     """
     _check(sources, out, options)
     from jaxcal.io.hdf5 import save
@@ -107,7 +79,15 @@ def _check(sources: tuple[str, ...], out: str, options: dict[str, Any]) -> None:
         )
     if options["spacing_mm"] is not None and options["units"] == "mm":
         raise click.BadParameter("points in mm have no pixel size", param_hint="--spacing")
-    # Whoever forgets OUT.h5 names a source last: it must not be overwritten.
+    check_out(sources, out)
+
+
+def check_out(sources: Sequence[str], out: str) -> None:
+    """See that nothing but a recording is replaced: whoever forgets OUT.h5 names a source last.
+
+    Raises:
+        InputError: something else is there, or it is one of the sources.
+    """
     try:
         with Path(out).open("rb") as existing:
             start = existing.read(8)

@@ -14,6 +14,7 @@ from jaxcal.cli.calibrate import calibrate
 from jaxcal.cli.demo import demo
 from jaxcal.cli.export import export
 from jaxcal.cli.import_ import import_
+from jaxcal.cli.pick import pick
 from jaxcal.cli.pivot import pivot
 from jaxcal.cli.plan import plan
 from jaxcal.cli.run import run
@@ -39,6 +40,7 @@ for _command in (
     simulate,
     import_,
     segment,
+    pick,
     calibrate,
     export,
     apply,

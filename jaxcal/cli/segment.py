@@ -1,7 +1,8 @@
-"""``jaxcal segment``: times of flight to points with covariances."""
+"""``jaxcal segment``: times of flight, or the frames of a sequence, to points with covariances."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,6 +18,7 @@ from jaxcal.cli.common import (
     print_page,
     progress,
 )
+from jaxcal.cli.sequence_options import search_options, tracking_options
 
 if TYPE_CHECKING:
     from jaxcal.data.probe import Probe
@@ -65,8 +67,12 @@ if TYPE_CHECKING:
     metavar="OUT.h5",
     help="By default REC-segmented.h5, beside REC. The name of REC itself replaces it.",
 )
+@tracking_options
+@search_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@click.pass_context
 def segment(
+    context: click.Context,
     recording: str,
     method: Literal["least-squares", "shortest"],
     robust: bool,
@@ -76,14 +82,28 @@ def segment(
     temperature: float | None,
     out: str | None,
     as_json: bool,
+    **frames: Any,
 ) -> int:
-    """Segment the times of flight of REC into points with covariances.
+    """Segment times of flight, or the frames of a sequence, into points with covariances.
 
-    OUT.h5 holds everything jaxcal reads from REC, the times of flight included, with the points
-    beside them; "jaxcal calibrate" then uses the points. Frames with too few answers are masked out
-    and counted. The points of a curvilinear probe are the in-plane fit; what its times say of the
-    elevation, which has no sign, is written to the group segmentation.
+    REC is a recording with times of flight; or a tracked sequence of PLUS or Slicer (.igs.mha, .igs.mhd, .igs.nrrd,
+    .seq.nrrd), or a folder of PNG with --poses: then the target is looked for in every frame, and
+    OUT.h5 has those in which it was found (--from to --ignore-time belong to these).
+
+    Of a recording OUT.h5 holds everything jaxcal reads from REC, the times of flight included, with
+    the points beside them; "jaxcal calibrate" then uses the points. Frames with too few answers are
+    masked out and counted. The points of a curvilinear probe are the in-plane fit; what its times
+    say of the elevation, which has no sign, is written to the group segmentation.
     """
+    of_frames = _is_of_frames(recording)
+    others = _TIMES if of_frames else tuple(frames)
+    for parameter in context.command.params:
+        given = context.get_parameter_source(parameter.name or "")
+        if parameter.name in others and given is click.core.ParameterSource.COMMANDLINE:
+            kind = "times of flight" if of_frames else "sequences"
+            raise InputError(f"{recording}: {parameter.opts[0]} is an option for {kind}")
+    if of_frames:
+        return _segment_frames(recording, out, as_json, frames)
     if interpolate and method != "shortest":
         raise InputError("--interpolate needs --method shortest")
     if method == "shortest" and scale != "frame":
@@ -104,14 +124,83 @@ def segment(
             segmented, found = segment_recording(data, probe, interpolate=interpolate, **options)
         except InputError as error:
             raise type(error)(f"{recording}: {error}") from None
-    source = Path(recording)
-    target = str(source.with_name(f"{source.stem}-segmented.h5")) if out is None else out
+    target = _default_out(recording) if out is None else out
     save(segmented, target, found)
     record = _record(found, target)
     if as_json:
         print_json(record)
     else:
         _print(record)
+    return ExitCode.CONVERGED
+
+
+_TIMES = (
+    "method",
+    "robust",
+    "scale",
+    "interpolate",
+    "sound_speed",
+    "temperature",
+)
+"""Options that belong to times of flight."""
+
+
+def _is_of_frames(source: str) -> bool:
+    from jaxcal.io.sequence_files import EXTENSIONS
+
+    return Path(source).is_dir() or source.lower().endswith(EXTENSIONS)
+
+
+def _default_out(source: str) -> str:
+    """Beside the source: ``a.h5`` and ``a.igs.mha`` become ``a-segmented.h5``."""
+    path = Path(os.path.abspath(source)) if Path(source).is_dir() else Path(source)
+    stem = path.name.split(".")[0] if _is_of_frames(source) else path.stem
+    return str(path.with_name(f"{stem}-segmented.h5"))
+
+
+def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[str, Any]) -> int:
+    """A sequence's frames; what became of each is counted and said."""
+    from jaxcal.cli.import_ import check_out
+    from jaxcal.io.hdf5 import save
+    from jaxcal.io.importing import ImportOptions, import_files
+    from jaxcal.io.target_search import FATES
+
+    target = _default_out(source) if out is None else out
+    check_out([source], target)
+    with progress("segmenting"):
+        recording, notes, found = import_files([source], ImportOptions(**options))
+    assert found is not None
+    save(recording, target, found)
+    images = recording.calibration
+    if as_json:
+        print_json({
+            "out": target, "method": found.target, "frames": len(found), **{
+                name.replace(" ", "_"): count for name, count in found.counts.items()
+            },
+            "reasons": found.reasons,
+            "images": len(images), "spacing_mm":
+                None if images.spacing_mm is None else images.spacing_mm.tolist(),
+            "per_frame": [
+                {"frame": k, "fate": FATES[fate], "reason": found.reason[k] or None}
+                for k, fate in enumerate(found.fate)
+            ],
+            "notes": notes,
+        })  # fmt: skip
+        return ExitCode.CONVERGED
+    unscaled = images.spacing_mm is None
+    hint = "; a pixel's size is not known: calibrate with --estimate scale" if unscaled else ""
+    counts = found.counts
+    first = f"{target}: {counts['found']} of {len(found)} frames segmented ({found.target}){hint}"
+    others = ", ".join(f"{count} {name}" for name, count in counts.items()
+                       if count and name != "found")  # fmt: skip
+    lines = [first, *([f"- other frames: {others}"] if others else [])]
+    lines += [f"- not credible: {count} x {why}" for why, count in found.reasons.items()]
+    if counts["not credible"] > counts["found"]:
+        lines.append(
+            f"- few show a credible target: look at --region and --target, or place the points by "
+            f"hand: jaxcal pick {source}"
+        )
+    print_page(*lines, *(f"- {note}" for note in notes if "left out" not in note))
     return ExitCode.CONVERGED
 
 

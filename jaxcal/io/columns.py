@@ -132,7 +132,8 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
         width=len(names), matrix=matrix,
         translation=None if matrix is not None else translation,
         quaternion=quaternion_columns, point=point,
-        time=roles.get("time"), frame=roles.get("frame"), file=roles.get("file"), valid=roles.get("valid"),
+        time=roles.get("time"), frame=roles.get("frame"), file=roles.get("file"),
+        valid=roles.get("valid"),
         length_mm=_length(lengths, names, list(units)),
         point_unit=point_unit, time_s=TIMES_S[time_unit or "s"],
     )  # fmt: skip

@@ -113,7 +113,9 @@ def _region(name: str, region: Dataset, data: Dataset) -> PixelSize:
         if not _PLAUSIBLE_MM[0] <= step <= _PLAUSIBLE_MM[1]:
             raise FormatError(f"{name}: a pixel of {step:g} mm is not plausible")
         spacing.append(float(f"{step:.12g}"))
-    edges = [_whole(region, f"RegionLocation{edge}") for edge in ("MinX0", "MinY0", "MaxX1", "MaxY1")]
+    edges = [
+        _whole(region, f"RegionLocation{edge}") for edge in ("MinX0", "MinY0", "MaxX1", "MaxY1")
+    ]
     if any(edge is None for edge in edges):
         raise FormatError(f"{name}: a region has no location")
     left, top, right, bottom = (int(edge or 0) for edge in edges)

@@ -9,11 +9,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.runtime.array_types import Float, Int
 from jaxcal.io.readable import naming, quoted
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.slicer import pixels_from_markups, read_markups
 from jaxcal.io.text import PoseTable
+from jaxcal.runtime.array_types import Float, Int
 
 Assignment = Literal["order", "labels"]
 """How points without a time or a frame's number belong to frames: one for each frame in their

@@ -16,8 +16,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal import FormatError, InputError
+from jaxcal.data.poses import QuaternionOrder
+from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
 from jaxcal.io.folder import read_folder, with_pose_table
 from jaxcal.io.frame_names import FramePair, capitalised
 from jaxcal.io.frame_points import Assignment, points_of_markups, points_of_table
@@ -29,8 +30,7 @@ from jaxcal.io.slicer import EXTENSIONS as MARKUPS
 from jaxcal.io.target_search import FrameResults, search_target
 from jaxcal.io.text import LengthUnit, PoseTable, read_crosswire, read_pose_table, recording_of
 from jaxcal.io.trackers import is_tracker_export, read_tracker
-from jaxcal.data.poses import QuaternionOrder
-from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
+from jaxcal.runtime.array_types import Bool, Float, Int
 
 
 @dataclass(frozen=True)
@@ -282,6 +282,34 @@ def tracked_poses(
     if not valid.any():
         raise InputError(f"{sequence.source}: no frame has tracking from {start} to {end}")
     return poses, valid, notes
+
+
+def frames_to_show(
+    sequence: TrackedSequence, options: ImportOptions, every: int = 1
+) -> tuple[list[int], tuple[int, int], list[str]]:
+    """Frames in which a person is to place points.
+
+    Args:
+        sequence: with pixels; without any transforms every image is shown.
+        options: which poses are needed.
+        every: of the frames that can be used, every n-th.
+
+    Returns:
+        Numbers of the frames, their columns and rows, and what was left out, in words.
+
+    Raises:
+        InputError: no pixels, or no frame that can be used.
+    """
+    if sequence.pixels is None:
+        raise InputError(f"{sequence.source}: holds no pixels, only transforms")
+    usable, notes = sequence.image_valid, []
+    if sequence.transforms:
+        _, valid, notes = tracked_poses(sequence, options)
+        usable = usable & valid
+    if not usable.any():
+        raise InputError(f"{sequence.source}: no frame can be used")
+    shown = [int(number) for number in np.flatnonzero(usable)[::every]]
+    return shown, (sequence.pixels.columns, sequence.pixels.rows), notes
 
 
 def _read_tracked(source: str | os.PathLike[str]) -> TrackedSequence:

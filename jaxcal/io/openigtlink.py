@@ -11,9 +11,9 @@ not arrived. The protocol's CRC is the body's: a wrong bit in a header's name or
 passes, since nothing tells. The CRC-64 is ECMA-182, not reflected, zero at the start.
 
 Units: translations are mm; an image's spacing is mm per pixel. Only plane images are taken: of one
-component, uint8 (B-mode) or int16, or in colour of three uint8, which become grey. No wire format for RF channel data is public; that
-such data come as an int16 IMAGE of the device ``RF``, samples down and lines across, is **an
-assumption**.
+component, uint8 (B-mode) or int16, or in colour of three uint8, which become grey. No wire format
+for RF channel data is public; that such data come as an int16 IMAGE of the device ``RF``, samples
+down and lines across, is **an assumption**.
 """
 
 from __future__ import annotations

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.data.timing import can_interpolate, interpolate_poses
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.sequence import TrackedSequence
-from jaxcal.data.timing import can_interpolate, interpolate_poses
+from jaxcal.runtime.array_types import Bool, Float
 
 LONGEST_GAP = 5.0
 """Longest time between two poses that is bridged, in median intervals."""

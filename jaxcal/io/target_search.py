@@ -1,8 +1,9 @@
 """The target looked for in the frames of a sequence, and what became of every frame.
 
 One frame is in memory at a time. A frame counts as ``found``; as ``not credible`` where nothing in
-it can be told from speckle (:mod:`jaxcal.data.segmentation.image` has the reasons); as ``not tracked``
-where a transform's status was not OK; as ``image not OK`` where the file marks its pixels so.
+it can be told from speckle (the reasons are those of :mod:`jaxcal.data.segmentation.image`); as
+``not tracked`` where a transform's status was not OK; as ``image not OK`` where the file marks its
+pixels so.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.io.readable import naming
 from jaxcal.io.sequence import TrackedSequence
+from jaxcal.runtime.array_types import Bool, Float, Int
 
 FATES = ("found", "not credible", "not tracked", "image not OK")
 FOUND, NOT_CREDIBLE, NOT_TRACKED, IMAGE_NOT_OK = range(4)
@@ -60,7 +61,9 @@ class FrameResults:
     @property
     def reasons(self) -> dict[str, int]:
         """Number of frames by the reason for which no target was credible, the commonest first."""
-        short = (self.reason[k].partition(":")[0] for k in np.flatnonzero(self.fate == NOT_CREDIBLE))
+        short = (
+            self.reason[k].partition(":")[0] for k in np.flatnonzero(self.fate == NOT_CREDIBLE)
+        )
         return dict(Counter(short).most_common())
 
 
@@ -92,7 +95,9 @@ def search_target(
             f"{sequence.source}: holds no pixels: name a file with the target's points as well"
         )
     count = len(sequence)
-    fate = np.where(tracked, np.where(sequence.image_valid, NOT_CREDIBLE, IMAGE_NOT_OK), NOT_TRACKED)
+    fate = np.where(
+        tracked, np.where(sequence.image_valid, NOT_CREDIBLE, IMAGE_NOT_OK), NOT_TRACKED
+    )
     reason = [""] * count
     position, covariance = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
     contrast, margin = np.full(count, np.nan), np.full(count, np.nan)

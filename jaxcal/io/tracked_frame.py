@@ -57,7 +57,9 @@ def decode_tracked_frame(content: memoryview) -> TrackedFrame:
     if slices > 1 or not (columns and rows) or size != columns * rows * components:
         raise ContentError(f"a tracked frame of {columns} x {rows} x {slices} voxels, {size} bytes")
     if orientation not in _ORIENTATIONS:
-        raise ContentError(f"a tracked frame of orientation {orientation}, which no B-mode image has")
+        raise ContentError(
+            f"a tracked frame of orientation {orientation}, which no B-mode image has"
+        )
     xml = bytes(content[_HEAD.size : _HEAD.size + xml_size])
     pixels = np.frombuffer(content, np.uint8, offset=_HEAD.size + xml_size)
     stored = _ORIENTATIONS[orientation] or "MF"

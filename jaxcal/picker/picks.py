@@ -75,7 +75,9 @@ class Picks:
             InputError: no such frame, or no place in it.
             OutputError: the table cannot be written; nothing has changed.
         """
-        if not (np.isfinite([u, v]).all() and _inside(u, self.size[0]) and _inside(v, self.size[1])):
+        if not (
+            np.isfinite([u, v]).all() and _inside(u, self.size[0]) and _inside(v, self.size[1])
+        ):
             raise InputError(f"({u}, {v}) is not in the frame")
         self._change(frame, (float(u), float(v)), False)
 

@@ -196,9 +196,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send_frame(self, rest: str) -> None:
         number = rest.removeprefix("frame/").removesuffix(".png")
-        if rest != f"frame/{number}.png" or not number.isdecimal() or len(number) > 9:
-            self._refuse(HTTPStatus.NOT_FOUND)
-        elif int(number) not in self.page.picks.shown:
+        if (
+            rest != f"frame/{number}.png"
+            or not number.isdecimal()
+            or len(number) > 9
+            or int(number) not in self.page.picks.shown
+        ):
             self._refuse(HTTPStatus.NOT_FOUND)
         else:
             try:

@@ -54,7 +54,10 @@ def browsing(folder: Path, size: tuple[int, int] = (720, 480)) -> Iterator:
 
 
 def addresses(browser) -> set[str]:
-    """Hosts that the page asked for, or opened a socket to, since this was asked last."""
+    """Hosts that the page asked for, or opened a socket to, since this was asked last.
+
+    The browser's own pages (a new tab) are not what is asked about.
+    """
     import json
     from urllib.parse import urlparse
 
@@ -62,6 +65,8 @@ def addresses(browser) -> set[str]:
     for entry in browser.get_log("performance"):
         message = json.loads(entry["message"])["message"]
         asked = message["params"].get("request", message["params"]).get("url", "")
+        if asked.startswith(("chrome:", "chrome-untrusted:")):
+            continue
         if message["method"] in ("Network.requestWillBeSent", "Network.webSocketCreated"):
             hosts.add(urlparse(asked).hostname)
     return hosts - {None}

@@ -17,6 +17,7 @@ from jaxcal.io.openigtlink import Message, Picture, Tracked, TrackedFrame, encod
 
 RNG = np.random.default_rng(0)
 IMAGE = RNG.integers(0, 256, (5, 7), np.uint8)
+PIXELS = IMAGE.tobytes()
 POSE = np.array([[0.0, -1, 0, 12.5], [1, 0, 0, -3], [0, 0, 1, 1e3], [0, 0, 0, 1]])
 XML = (
     '<TrackedFrame Timestamp="1.5" ImageDataValid="true" NumberOfBits="8" '
@@ -30,7 +31,7 @@ XML = (
 )
 
 
-def body(xml=XML, pixels=IMAGE.tobytes(), **changes) -> bytes:
+def body(xml=XML, pixels=PIXELS, **changes) -> bytes:
     """As PlusLib's igtlPlusTrackedFrameMessage packs it, field by field."""
     fields = {
         "scalar": 3, "components": 1, "kind": 1, "columns": 7, "rows": 5, "slices": 1,

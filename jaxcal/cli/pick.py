@@ -1,0 +1,82 @@
+"""``jaxcal pick``: points placed by hand, on a page of this machine."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from jaxcal.cli.common import ExitCode
+from jaxcal.cli.sequence_options import tracking_options
+
+
+@click.command()
+@click.argument("frames", type=click.Path(), metavar="SOURCE")
+@click.argument("picks", type=click.Path(), metavar="[PICKS.csv]", required=False)
+@tracking_options
+@click.option(
+    "--every",
+    type=click.IntRange(1),
+    default=1,
+    metavar="N",
+    help="Show every N-th of the frames that have tracking.",
+)
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    metavar="N",
+    help="Of the page, on 127.0.0.1; by default any that is free.",
+)
+def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) -> int:
+    """Place the target's point in each frame of SOURCE by a click, and save them in PICKS.csv.
+
+    For frames in which `jaxcal import` finds no credible target. SOURCE is a sequence or a folder
+    of PNG. Prints the address of a page that only this machine, and only who has the address, can
+    open. Every click is saved at once; the same command goes on where it was ended. By default
+    PICKS.csv is beside SOURCE and has its name.
+    """
+    from jaxcal.io.importing import ImportOptions, frames_to_show, open_sequence
+    from jaxcal.picker.frames import Frames
+    from jaxcal.picker.picks import Picks
+    from jaxcal.picker.server import Picker
+
+    asked = ImportOptions(**options)
+    sequence, _ = open_sequence(frames, asked)
+    shown, size, notes = frames_to_show(sequence, asked, every)
+    name = Path(os.path.abspath(frames)).name
+    out = str(Path(frames).parent / f"{name.split('.')[0]}-picks.csv") if picks is None else picks
+    placed = Picks(out, name, size, len(sequence), shown)
+    pictures = Frames(sequence, asked.orientation)
+    # What cannot be shown is said here, not on the page.
+    pictures.png(shown[0])
+    for note in notes:
+        click.echo(f"- {note}")
+    with Picker(placed, pictures, name, port) as page:
+        try:
+            click.echo(f"{len(shown)} frames to show; open {page.url}")
+            click.echo("Finish on the page, or Ctrl-C, ends; every click is saved")
+            while not page.wait(0.5):
+                pass
+        except KeyboardInterrupt:
+            click.echo()
+    _tell(placed, frames, out, options)
+    return ExitCode.CONVERGED
+
+
+def _tell(placed: Any, source: str, out: str, options: dict[str, Any]) -> None:
+    count, left = len(placed.points), len(placed.shown) - len(placed.points) - len(placed.skipped)
+    if not placed.points and not placed.skipped:
+        click.echo(f"no points; {out} was not made")
+        return
+    click.echo(
+        f"{out}: {count} points, {len(placed.skipped)} frames skipped"
+        + (f", {left} still to do (the same command goes on)" if left else "")
+    )
+    if count:
+        given = [f"--{name} {options[key]}" for name, key in
+                 (("poses", "poses"), ("from", "source"), ("to", "target"),
+                  ("orientation", "orientation")) if options[key]]  # fmt: skip
+        click.echo(" ".join(["next: jaxcal import", source, out, "OUT.h5", *given]))

@@ -1,0 +1,95 @@
+"""Options of the commands that read tracked sequences: which poses, which part of the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from jaxcal.cli.common import POSITIVE
+
+Command = Callable[..., Any]
+
+_TRACKING = (
+    click.option(
+        "--from", "source", metavar="FRAME", help="Tracked frame on the probe, e.g. Probe."
+    ),
+    click.option(
+        "--to", "target", metavar="FRAME", help="Frame the target rests in, e.g. Reference."
+    ),
+    click.option(
+        "--poses",
+        "--poses-from",
+        "poses",
+        type=click.Path(),
+        metavar="FILE",
+        help="File with the poses of the frames: for a folder of PNG a table with a column file "
+        "or frame (or a row for each image); for a sequence another sequence, a tracker's export "
+        "or a table, matched by time.",
+    ),
+    click.option(
+        "--lag",
+        "lag_s",
+        type=float,
+        default=0.0,
+        metavar="SECONDS",
+        help="With --poses: an image stamped t shows what was at t - SECONDS.",
+    ),
+    click.option(
+        "--orientation",
+        type=click.Choice(["MF", "UF", "MN", "UN"]),
+        help="Orientation of the frames, if their file does not say it.",
+    ),
+)
+_SEARCH = (
+    click.option(
+        "--target",
+        "target_kind",
+        type=click.Choice(["echo", "cross"]),
+        default="echo",
+        show_default=True,
+        help="What to look for in frames: one bright spot, or a crossing of wires.",
+    ),
+    click.option(
+        "--region",
+        type=int,
+        nargs=4,
+        metavar="COLUMN ROW COLUMNS ROWS",
+        help="Part of the frames to look in, px: its first column and row, and its size.",
+    ),
+    click.option(
+        "--spacing",
+        "spacing_mm",
+        type=POSITIVE,
+        nargs=2,
+        metavar="LATERAL AXIAL",
+        help="Size of a pixel, mm.",
+    ),
+    click.option(
+        "--spacing-from",
+        type=click.Path(),
+        metavar="CLIP.dcm",
+        help="DICOM clip of the same machine and depth, which states the size of a pixel "
+        "(jaxcal[dicom]).",
+    ),
+    click.option(
+        "--ignore-time", is_flag=True, help="If times repeat or go back, import without them."
+    ),
+)
+
+
+def tracking_options(command: Command) -> Command:
+    """Add the options that say which poses the frames have."""
+    return _with(command, _TRACKING)
+
+
+def search_options(command: Command) -> Command:
+    """Add the options that say what to look for, where, and how large a pixel is."""
+    return _with(command, _SEARCH)
+
+
+def _with(command: Command, options: tuple[Callable[[Command], Command], ...]) -> Command:
+    for option in reversed(options):
+        command = option(command)
+    return command
