@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -195,6 +195,96 @@ def acquire(
         if preview is not None:
             _preview(setup, request, preview)
         return _acquire(setup, path, request, emulated, unattended, operator, view)
+
+
+@commands.command("free-hand")
+@click.argument("server", metavar="HOST[:PORT]")
+@click.argument("recording", type=click.Path(), required=False)
+@click.option(
+    "--images", type=click.IntRange(4, 1000), default=30, show_default=True, help="To take."
+)
+@click.option("--from", "source", metavar="FRAME", help="Tracked frame on the probe, e.g. Probe.")
+@click.option("--to", "target_frame", metavar="FRAME", help="Frame the target rests in.")
+@click.option("--device", metavar="NAME", help="Of the images, where several are sent.")
+@click.option(
+    "--target",
+    type=click.Choice(["echo", "cross"]),
+    default="echo",
+    show_default=True,
+    help="What to look for: one bright spot, or a crossing of wires.",
+)
+@click.option(
+    "--region",
+    type=int,
+    nargs=4,
+    metavar="COLUMN ROW COLUMNS ROWS",
+    help="Part of the frames to look in, px.",
+)
+@click.option(
+    "--spacing", "spacing_mm", type=POSITIVE, nargs=2, metavar="LATERAL AXIAL",
+    help="Size of a pixel, mm.",
+)  # fmt: skip
+@click.option(
+    "--lag",
+    "lag_s",
+    type=float,
+    default=0.0,
+    metavar="SECONDS",
+    help="An image stamped t shows what was at t - SECONDS.",
+)
+@click.option("--resume", is_flag=True, help="Go on with RECORDING, as it was begun.")
+def free_hand(
+    server: str, recording: str | None, resume: bool, target: str,
+    region: tuple[int, int, int, int] | None, **options: Any,
+) -> int:  # fmt: skip
+    """Acquire with a hand-held probe: images and poses of a PlusServer or any OpenIGTLink tracker.
+
+    Connects to HOST (port 18944), which must send IMAGE and TRANSFORM, or TRACKEDFRAME. Hold the
+    probe still over the target: an image is taken by itself where the target is credible and the
+    pose differs from those before. What is still missing is said. RECORDING is the file to make (by
+    default one named after the time); afterwards it is calibrated, as jaxcal calibrate would.
+    """
+    from hw.freehand.acquire import FreeHand, acquire_free_hand
+    from hw.freehand.guide import Rules
+    from hw.freehand.terminal import TerminalPerson
+
+    if resume and recording is None:
+        raise InputError("--resume needs the RECORDING to go on with")
+    host, _, port = server.partition(":")
+    if not host or not ((port.isdecimal() and 0 < int(port) < 65536) or not port):
+        raise click.BadParameter(f"{server!r} is not HOST or HOST:PORT", param_hint="HOST[:PORT]")
+    path = recording or f"free-hand-{datetime.now():%Y%m%d-%H%M%S}.h5"
+    rules = Rules(target="cross" if target == "cross" else "echo", region=region)
+    asked = FreeHand(host, int(port or 18944), rules=rules, **options)
+    from hw.acquire import Pause
+    from hw.keys import Keyboard
+    from hw.midplane.terminal_image import Screen
+
+    screen = Screen(sys.stderr)
+    with Keyboard(Pause(), (), screen.say) as keyboard, keyboard.asking():
+        acquire_free_hand(path, asked, TerminalPerson(screen, keyboard), resume=resume)
+        screen.clear()
+    return _calibrated(path)
+
+
+def _calibrated(path: str) -> int:
+    """Calibrate from a finished free-hand recording and print what came of it."""
+    from jaxcal.calibration.calibrate import calibrate
+    from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.cli.common import print_page
+    from jaxcal.io.hdf5 import load
+    from jaxcal.report.record import calibration_record
+    from jaxcal.report.tables import calibration_table
+    from jaxcal.report.verdict import verdict
+
+    enable_compilation_cache()
+    data = load(path)
+    scale = () if data.calibration.spacing_mm is not None else ("scale",)
+    record = calibration_record(calibrate(data, estimate=scale), data)
+    hint = " --estimate scale" if scale else ""
+    again = f"{path}: again, with a report: jaxcal calibrate {path}{hint} --report report.html"
+    print_page(calibration_table(record), *verdict(record), "", again)
+    return exit_code([record])
 
 
 @commands.command()

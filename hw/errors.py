@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-Device = Literal["robot", "active echo", "ultrasound"]
+Device = Literal["robot", "active echo", "ultrasound", "tracker"]
 
 
 class DeviceError(Exception):

@@ -106,7 +106,7 @@ class Keyboard:
     def read(self, timeout_s: float) -> str | None:
         """The next key's name within :meth:`asking`; None if none came in time."""
         try:
-            return self._keys.get(timeout=timeout_s)
+            return self._keys.get(timeout=timeout_s) if timeout_s > 0 else self._keys.get_nowait()
         except queue.Empty:
             return None
 

@@ -228,6 +228,35 @@ class Recorder:
         self._rows("placement", {name: np.array([value]) for name, value in values.items()})
         self.sync()
 
+    def add_pixel(
+        self, pose: np.ndarray, pixel: np.ndarray, covariance: np.ndarray, time_s: float
+    ) -> None:
+        """Take an image of a free-hand acquisition: when this returns it is on the disk.
+
+        Args:
+            pose: (4, 4) probe -> tracker, mm.
+            pixel: (2,) [u, v], px.
+            covariance: (2, 2), px^2.
+            time_s: of the image.
+
+        Raises:
+            OutputError: the writer failed, or did not answer in time.
+        """
+        self._rows("calibration", {
+            "pose": pose[None], "pixel": pixel[None], "covariance": covariance[None],
+            "mask": np.array([True]), "time": np.array([time_s]),
+        })  # fmt: skip
+        self.sync()
+
+    def leave_out(self, row: int) -> None:
+        """Mask a selected image: it was taken back.
+
+        Raises:
+            OutputError: the writer failed, or did not answer in time.
+        """
+        self._put({"do": "leave out", "row": row})
+        self.sync()
+
     def add_estimate(self, columns: Mapping[str, np.ndarray]) -> None:
         """Append a row to /estimate (see the layout): the calibration so far."""
         self._rows("estimate", columns)

@@ -95,6 +95,8 @@ def _serve(writer: RecordingWriter, source: RawIOBase, answer) -> None:
             case "put":
                 name = message["name"]
                 writer.put(message["group"], name, columns[name], message["unit"])
+            case "leave out":
+                writer.leave_out(message["row"])
             case "copy":
                 writer.copy(*message["from"], *message["to"])
             case "attributes":

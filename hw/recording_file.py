@@ -33,6 +33,7 @@ from hw.recording_layout import (
     FRAME_TYPES,
     LARGEST_SETTINGS,
     LAYOUT,
+    SELECTED,
     STATIC,
     VERSION,
     Column,
@@ -156,6 +157,17 @@ class RecordingWriter:
             dataset.resize(stop, axis=0)
             dataset[start:stop] = values
         self.rows[name] = stop
+
+    def leave_out(self, row: int) -> None:
+        """Mask a selected image.
+
+        Raises:
+            FormatError: there is no such row.
+        """
+        mask = _columns(self._file, "calibration")["mask"]
+        if not 0 <= row < len(mask):
+            raise FormatError(f"/calibration has no row {row}")
+        mask[row] = False
 
     def put(self, name: str, key: str, values: np.ndarray, unit: str) -> None:
         """Write an array of /plan, /test or /truth, once; the same name again replaces it."""
@@ -373,17 +385,20 @@ def _write_skeleton(file: h5py.File, header: Header) -> None:
     file.attrs["created_utc"] = utc_now()
     file.attrs["software"] = f"jaxcal {__version__}"
     file.attrs["transform_convention"] = (
-        "4x4, row-major, mm; pose maps the probe (the robot's tool centre point) to the robot base"
+        "4x4, row-major, mm; pose maps the probe (the robot's tool centre point, or the tracked "
+        "frame) to the robot base or the tracker"
     )
-    probe = file.create_group("probe")
+    if header.probe:
+        file.create_group("probe")
     for key, value in header.probe.items():
-        probe.attrs[key] = value
-    sizes = {"lines": header.lines, "elements": int(header.probe["elements"])}
-    other = {"time_of_flight": "point", "point": "time_of_flight"}[header.kind]
+        file["probe"].attrs[key] = value
+    sizes = {"lines": header.lines, "elements": int(header.probe.get("elements", 0))}
     for name, columns in LAYOUT.items():
         target = file.create_group(name)
-        wanted = {k: v for k, v in columns.items() if (name, k) != ("calibration", other)}
-        if name != "us":
+        kept = SELECTED[header.kind] if name == "calibration" else columns
+        wanted = {key: column for key, column in columns.items() if key in kept}
+        # Frames tell their size when they come; a bench without active echo has no lines.
+        if name != "us" and (name != "ae" or header.lines):
             _make_columns(target, wanted, sizes)
     file["us"].attrs["orientation"] = "MF"
     for name, values in (header.attributes or {}).items():

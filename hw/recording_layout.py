@@ -14,7 +14,8 @@ A superset of the smallest valid recording (:mod:`jaxcal.io.hdf5`): once ``compl
     /clock       device, offset, drift, reference, residual: t_host = t_device + offset
                  + drift (t_device - reference) [s]; t_host of the fit
     /calibration the selected images: pose, time_of_flight or point, max_elevation, amplitude, mask,
-                 time; target: the row of /plan that the image belongs to
+                 time; target: the row of /plan that the image belongs to. Free-hand: pose, pixel,
+                 covariance, mask, time
     /placement   one row for each selected image: the target's elevational offset lies in [low,
                  high], centre, sd; offset of the probe from the plan's pose; true_elevation
                  (emulated bench, else NaN) [mm]; seconds that the placement took
@@ -99,6 +100,8 @@ LAYOUT: dict[str, dict[str, Column]] = {
         "pose": _POSE,
         "time_of_flight": Column(("elements",), "f8", "s", 1),
         "point": Column((2,), "f8", "mm", 1),
+        "pixel": Column((2,), "f8", "px", 1),
+        "covariance": Column((2, 2), "f8", "px^2", 1),
         "max_elevation": _MM,
         "amplitude": Column((), "f8", "1", 1),
         "mask": Column((), "?", "1", 1),
@@ -127,6 +130,14 @@ LAYOUT: dict[str, dict[str, Column]] = {
 }
 """What may be appended to; a row is appended to all columns of its group, or to none."""
 
+SELECTED = {
+    "time_of_flight": ("pose", "time_of_flight", "max_elevation", "amplitude", "mask", "time",
+                       "target"),
+    "point": ("pose", "point", "max_elevation", "amplitude", "mask", "time", "target"),
+    "pixel": ("pose", "pixel", "covariance", "mask", "time"),
+}  # fmt: skip
+"""Columns of /calibration by what the selected images hold."""
+
 STATIC = ("plan", "test", "truth")
 """Groups of arrays that are written once."""
 
@@ -139,9 +150,11 @@ class Header:
     """What a recording is told when it is made.
 
     Attributes:
-        kind: what the selected images hold, ``time_of_flight`` or ``point``.
-        probe: attributes of /probe (kind, elements, pitch_mm, sound_speed_m_s, ...).
-        lines: transmitted lines of the active echo element (times of flight in a frame).
+        kind: what the selected images hold, one of :data:`SELECTED`.
+        probe: attributes of /probe (kind, elements, pitch_mm, sound_speed_m_s, ...); empty: no
+            /probe.
+        lines: transmitted lines of the active echo element (times of flight in a frame); 0: there
+            is none.
         attributes: of other groups, by name: {"ae": {"clock_hz": 1e8}}.
         settings: JSON text of how the acquisition was asked for; what ``--resume`` goes by.
     """

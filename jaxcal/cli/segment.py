@@ -86,9 +86,9 @@ def segment(
 ) -> int:
     """Segment times of flight, or the frames of a sequence, into points with covariances.
 
-    REC is a recording with times of flight; or a tracked sequence of PLUS or Slicer (.igs.mha, .igs.mhd, .igs.nrrd,
-    .seq.nrrd), or a folder of PNG with --poses: then the target is looked for in every frame, and
-    OUT.h5 has those in which it was found (--from to --ignore-time belong to these).
+    REC is a recording with times of flight; or a tracked sequence of PLUS or Slicer (.igs.mha,
+    .igs.mhd, .igs.nrrd, .seq.nrrd), or a folder of PNG with --poses: then the target is looked for
+    in every frame, and OUT.h5 has those in which it was found (options from --from on).
 
     Of a recording OUT.h5 holds everything jaxcal reads from REC, the times of flight included, with
     the points beside them; "jaxcal calibrate" then uses the points. Frames with too few answers are

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import FormatError, MissingExtraError
-from jaxcal.io.readable import check_readable, one_line, quoted
+from jaxcal.io.readable import check_readable, naming, one_line, quoted
 
 if TYPE_CHECKING:
     from pydicom import Dataset
@@ -61,10 +61,12 @@ def read_pixel_size(path: str | os.PathLike[str]) -> PixelSize:
     name = os.fspath(path)
     check_readable(path)
     data = _dataset(name)
-    regions = data.get("SequenceOfUltrasoundRegions") or []
+    with naming(name):
+        regions = _value(data, "SequenceOfUltrasoundRegions") or []
     if len(regions) > _MOST_REGIONS:
         raise FormatError(f"{name}: claims {len(regions)} ultrasound regions")
-    found = [_region(name, region, data) for region in regions if _is_picture(region)]
+    with naming(name):
+        found = [_region(name, region, data) for region in regions if _is_picture(region)]
     if not found:
         raise FormatError(
             f"{name}: states no pixel size (no two-dimensional ultrasound region in cm): measure "

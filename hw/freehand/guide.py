@@ -1,0 +1,224 @@
+"""When an image is taken, and what the person who holds the probe is told meanwhile.
+
+An image is taken by itself once the probe has been held still for a moment, a credible target is in
+it, and it differs from those before: another orientation, or the target elsewhere in the image.
+The pose is the mean over the moment. What is still missing is said in words: parts of the image
+where the target has not been, and orientations that all lie about one axis.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hw.freehand.posed import PosedImage
+from hw.shapes import Float
+from jaxcal import InputError
+from jaxcal.data.segmentation.image import localise
+from jaxcal.data.segmentation.spot import Target
+
+_COLUMN_NAMES, _ROW_NAMES = ("left", "middle", "right"), ("upper", "central", "lower")
+_LEAST_IN_CELL = 1
+_WIDE_DEG = 12.0
+"""SD of the orientations about an axis that is enough to determine the transform well."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """When an image is taken.
+
+    Attributes:
+        hold_s: the probe must be still for so long, s.
+        still_mm: and move by no more than this meanwhile.
+        still_deg: nor turn by more than this.
+        different_deg: an image differs from another by so large a turn,
+        different_part: or by so large a part of the frame between the targets' places.
+        target: what to look for.
+        region: (first column, first row, columns, rows) to look in, px.
+    """
+
+    hold_s: float = 0.6
+    still_mm: float = 0.7
+    still_deg: float = 0.5
+    different_deg: float = 5.0
+    different_part: float = 0.12
+    target: Target = "echo"
+    region: tuple[int, int, int, int] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("hold_s", "still_mm", "still_deg", "different_deg", "different_part"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InputError(f"{name} must be positive, not {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Taken:
+    """An image that was taken.
+
+    Attributes:
+        pose: (4, 4) mean over the moment, mm.
+        pixel: [u, v] of the target, px.
+        covariance: (2, 2), px^2.
+        time: s.
+        posed: the frame in the middle of the moment.
+    """
+
+    pose: Float[np.ndarray, "4 4"]
+    pixel: Float[np.ndarray, " 2"]
+    covariance: Float[np.ndarray, "2 2"]
+    time: float
+    posed: PosedImage | None = None
+
+
+@dataclass(frozen=True)
+class Look:
+    """What one image led to.
+
+    Attributes:
+        words: what the person is told.
+        taken: the image, if it was taken.
+        pixel: where the target was seen, px.
+    """
+
+    words: str
+    taken: Taken | None = None
+    pixel: tuple[float, float] | None = None
+
+
+@dataclass
+class Guide:
+    """Looks at one image after the other.
+
+    Attributes:
+        rules: see there.
+        taken: images that count, those of a resumed recording first.
+    """
+
+    rules: Rules = field(default_factory=Rules)
+    taken: list[Taken] = field(default_factory=list)
+    _moment: deque[PosedImage] = field(default_factory=deque)
+    _tried: float = -np.inf
+    _words: str = ""
+
+    def look(self, posed: PosedImage) -> Look:
+        """What to say of an image; it is taken where all holds."""
+        rules, moment = self.rules, self._moment
+        if posed.pose is None:
+            moment.clear()
+            return Look(f"not tracked: {posed.why}")
+        if moment and posed.time <= moment[-1].time:
+            moment.clear()
+        moment.append(posed)
+        while moment[-1].time - moment[0].time > rules.hold_s * 1.2:
+            moment.popleft()
+        poses = np.array([each.pose for each in moment])
+        shift, turn = _spread(poses)
+        if shift > rules.still_mm or turn > rules.still_deg:
+            # The newest alone may be still.
+            while len(moment) > 1 and moment[-1].time - moment[0].time > 0.3 * rules.hold_s:
+                moment.popleft()
+            return Look("moving: bring the target into the image and hold still")
+        if moment[-1].time - moment[0].time < 0.9 * rules.hold_s:
+            return Look("hold still")
+        if posed.time - self._tried < 0.5 * rules.hold_s:
+            return Look(self._words)
+        self._tried = posed.time
+        look = self._judge(moment[len(moment) // 2], _mean(poses))
+        self._words = look.words
+        return look
+
+    def forget(self) -> None:
+        """Begin a new moment: after an image was taken or taken back."""
+        self._moment.clear()
+        self._tried, self._words = -np.inf, ""
+
+    def _judge(self, middle: PosedImage, pose: Float[np.ndarray, "4 4"]) -> Look:
+        rules, frame = self.rules, middle.image.array
+        located = localise(frame, rules.target, region=rules.region)
+        if not located.found[0]:
+            return Look(f"no credible target: {located.reason[0]}")
+        pixel = located.position[0]
+        where = (float(pixel[0]), float(pixel[1]))
+        same = self._like(pose, pixel, frame.shape)
+        if same is not None:
+            return Look(
+                f"as in image {same + 1}: turn the probe, or bring the target elsewhere in the "
+                "image",
+                pixel=where,
+            )
+        taken = Taken(pose, pixel, located.covariance[0], middle.time, middle)
+        self.taken.append(taken)
+        self.forget()
+        return Look(f"taken: {len(self.taken)}", taken, where)
+
+    def _like(self, pose: np.ndarray, pixel: np.ndarray, shape: tuple[int, ...]) -> int | None:
+        """The image that this one does not differ from."""
+        for index, other in enumerate(self.taken):
+            turn = Rotation.from_matrix(other.pose[:3, :3].T @ pose[:3, :3]).magnitude()
+            moved = np.abs(pixel - other.pixel) / [shape[1], shape[0]]
+            near = np.max(moved) < self.rules.different_part
+            if np.degrees(turn) < self.rules.different_deg and near:
+                return index
+        return None
+
+    def advice(self, size: tuple[int, int]) -> str:
+        """What is still missing, in words.
+
+        Args:
+            size: columns and rows of the part of the frame that is looked at, px.
+        """
+        if not self.taken:
+            return "bring the target into the image and hold the probe still"
+        missing = []
+        cell = self._empty_cell(size)
+        if cell is not None:
+            missing.append(f"bring the target to the {cell} of the image")
+        if len(self.taken) >= 3:
+            spread = orientation_sds(np.array([each.pose for each in self.taken]))
+            if spread[0] < _WIDE_DEG:
+                missing.append(
+                    f"turn the probe more (its orientations differ by {spread[0]:.0f} degrees)"
+                )
+            elif spread[1] < _WIDE_DEG:
+                missing.append("turn it about another axis: tilt and rock it, not only one of both")
+        return "; ".join(missing) or "well covered: any other pose helps"
+
+    def _empty_cell(self, size: tuple[int, int]) -> str | None:
+        left, top, wide, high = self.rules.region or (0, 0, *size)
+        counts = np.zeros((3, 3), int)
+        for each in self.taken:
+            column = int(np.clip((each.pixel[0] - left) / wide * 3, 0, 2))
+            row = int(np.clip((each.pixel[1] - top) / high * 3, 0, 2))
+            counts[row, column] += 1
+        empty = np.argwhere(counts < _LEAST_IN_CELL)
+        if not len(empty):
+            return None
+        # Farthest from where it has been.
+        seen = np.argwhere(counts >= _LEAST_IN_CELL)
+        away = np.linalg.norm(empty[:, None] - seen[None], axis=2).min(axis=1)
+        row, column = empty[int(np.argmax(away))]
+        return f"{_ROW_NAMES[row]} {_COLUMN_NAMES[column]}"
+
+
+def orientation_sds(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " 3"]:
+    """SDs of orientations about their principal axes, degrees, the largest first."""
+    rotations = Rotation.from_matrix(poses[:, :3, :3])
+    turns = np.degrees((rotations.mean().inv() * rotations).as_rotvec())
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(turns.T @ turns / len(turns))[::-1], 0.0))
+
+
+def _spread(poses: Float[np.ndarray, "n 4 4"]) -> tuple[float, float]:
+    """Largest distance (mm) and turn (degrees) from the newest pose."""
+    shift = np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1).max()
+    turns = Rotation.from_matrix(poses[-1, :3, :3].T @ poses[:, :3, :3]).magnitude()
+    return float(shift), float(np.degrees(turns.max()))
+
+
+def _mean(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "4 4"]:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_matrix(poses[:, :3, :3]).mean().as_matrix()
+    pose[:3, 3] = poses[:, :3, 3].mean(axis=0)
+    return pose

@@ -1,0 +1,206 @@
+"""Images of an OpenIGTLink stream with the poses that belong to them.
+
+Transforms come under their names (``ProbeToTracker``), with the image (PlusServer's TRACKEDFRAME)
+or by themselves (TRANSFORM, TDATA), before it or after it. The pose of an image is that of the
+same time stamp, or between the two around it. Stamps are the sender's, which PlusServer gives to
+images and transforms alike; where either has none, times of arrival are used and said.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from hw.errors import DeviceError, StaleError
+from hw.shapes import Float
+from hw.ultrasound.receiver import Image, Transform, UltrasoundStream
+from jaxcal.data.poses import inverse_poses
+from jaxcal.data.timing import interpolate_poses
+from jaxcal.io.frame_names import FramePair, capitalised, path_between, split_name
+
+LISTEN_S = 5.0
+"""So long the first image and the first transform are waited for."""
+_MORE_S = 0.5
+"""Of listening after the first of both, so that all names are known."""
+_LONGEST_GAP_S = 0.2
+_LATEST_S = 0.4
+"""So long an image waits for the pose after it."""
+_SAME_S = 1e-6
+_KEPT = 1024
+_ONE_CLOCK_S = 60.0
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """An image and where the probe was.
+
+    Attributes:
+        image: as it came.
+        time: s, of the clock that images and poses share.
+        pose: (4, 4) probe -> tracker or reference, mm; None where there is none.
+        why: why there is none, in words.
+    """
+
+    image: Image
+    time: float
+    pose: Float[np.ndarray, "4 4"] | None
+    why: str = ""
+
+
+class PosedImages:
+    """Reads a stream that was started.
+
+    Args:
+        stream: of images and transforms.
+        source: tracked frame on the probe; None: ``Probe``, or the only one there is.
+        target: frame that the target rests in; None: ``Reference`` where it is tracked, else
+            ``Tracker``.
+        lag_s: an image stamped t shows what was at t - lag.
+
+    Attributes:
+        pair: the frames of the poses.
+        names: of all transforms that came.
+        device: of the images.
+        by_arrival: whether times of arrival are used.
+
+    Raises:
+        DeviceError: no images, no transforms, or none that lead from the one frame to the other.
+    """
+
+    def __init__(
+        self,
+        stream: UltrasoundStream,
+        source: str | None = None,
+        target: str | None = None,
+        lag_s: float = 0.0,
+    ) -> None:
+        self._stream, self._lag = stream, lag_s
+        self._samples: dict[str, deque[Transform]] = {}
+        self._waiting: deque[tuple[Image, float]] = deque()
+        self._listen()
+        self.names = sorted(self._samples)
+        self.device = self._waiting[0][0].device
+        pairs = {name: pair for name in self.names if (pair := split_name(name)) is not None}
+        self.pair = _chosen(pairs, source, target)
+        self._steps = path_between(list(pairs.values()), *self.pair) or []
+        if not self._steps:
+            known = ", ".join(self.names)
+            raise DeviceError(
+                f"no transforms lead from {self.pair[0]} to {self.pair[1]}; the stream has {known}",
+                device="tracker",
+            )
+        self._needed = [list(pairs)[index] for index, _ in self._steps]
+        stamps = [self._waiting[0][0].t_device]
+        stamps += [self._samples[name][0].t_device for name in self._needed]
+        apart = np.ptp(stamps) if np.isfinite(stamps).all() else np.inf
+        self.by_arrival = bool(apart > _ONE_CLOCK_S)
+
+    def read(self, timeout_s: float) -> PosedImage:
+        """The next image; it may wait a moment for the pose after it.
+
+        Raises:
+            StaleError: no image in time.
+            LostError: the connection is gone.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._take()
+            if self._waiting:
+                image, arrived = self._waiting[0]
+                posed = self._posed(image, time.monotonic() - arrived > _LATEST_S)
+                if posed is not None:
+                    self._waiting.popleft()
+                    return posed
+            elif time.monotonic() > deadline:
+                raise StaleError(
+                    f"no new image for {timeout_s:g} s: is the machine frozen?", device="ultrasound"
+                )
+            time.sleep(0.005)
+
+    def _listen(self) -> None:
+        """Until images and transforms have come, and a moment longer."""
+        started = time.monotonic()
+        both: float | None = None
+        while both is None or time.monotonic() - both < _MORE_S:
+            self._take()
+            if both is None and self._waiting and self._samples:
+                both = time.monotonic()
+            if both is None and time.monotonic() - started > LISTEN_S:
+                missing = "images" if not self._waiting else "transforms"
+                reason = self._stream.statistics().reason
+                raise DeviceError(
+                    f"{self._stream.address} sent no {missing} within {LISTEN_S:g} s"
+                    + (f" that can be used ({reason})" if reason else "")
+                    + ": does its configuration send IMAGE and TRANSFORM, or TRACKEDFRAME?",
+                    device="ultrasound" if not self._waiting else "tracker",
+                )
+            time.sleep(0.01)
+
+    def _take(self) -> None:
+        for transform in self._stream.transforms():
+            # A peer may invent names without end.
+            if transform.name in self._samples or len(self._samples) < 256:
+                kept = self._samples.setdefault(transform.name, deque(maxlen=_KEPT))
+                kept.append(transform)
+        now = time.monotonic()
+        # With the transforms above; what comes between waits for the next time.
+        if self._waiting and len(self._waiting) > 64:
+            return
+        self._waiting.extend((image, now) for image in self._stream.drain() if not image.is_rf)
+
+    def _posed(self, image: Image, late: bool) -> PosedImage | None:
+        """The image with its pose or the reason why it has none; None where it must wait."""
+        moment = image.t_host if self.by_arrival else image.t_device
+        pose = np.eye(4)
+        for name, (_, inverted) in zip(self._needed, self._steps, strict=True):
+            found = self._at(name, moment - self._lag, late)
+            if found is None:
+                return None
+            if isinstance(found, str):
+                return PosedImage(image, moment, None, found)
+            pose = (inverse_poses(found[None])[0] if inverted else found) @ pose
+        return PosedImage(image, moment, pose)
+
+    def _at(self, name: str, moment: float, late: bool) -> np.ndarray | str | None:
+        samples = self._samples[name]
+        before: Transform | None = None
+        for sample in reversed(samples):
+            stamp = sample.t_host if self.by_arrival else sample.t_device
+            if abs(stamp - moment) <= _SAME_S:
+                return sample.matrix if sample.valid else f"{name} is not tracked"
+            if stamp < moment:
+                if before is None:
+                    return f"{name} has stopped coming" if late else None
+                times = [stamp, before.t_host if self.by_arrival else before.t_device]
+                if not (sample.valid and before.valid):
+                    return f"{name} is not tracked"
+                if times[1] - times[0] > _LONGEST_GAP_S:
+                    return f"{name} comes too seldom ({times[1] - times[0]:.2f} s apart)"
+                both = np.stack([sample.matrix, before.matrix])
+                return interpolate_poses(
+                    np.array(times), both, np.array([moment]), max_gap_s=_LONGEST_GAP_S
+                )[0]
+            before = sample
+        return f"{name} began after this image"
+
+
+def _chosen(pairs: dict[str, FramePair], source: str | None, target: str | None) -> FramePair:
+    """From which frame to which poses are taken."""
+    frames = {frame for pair in pairs.values() for frame in pair}
+    tools = list(dict.fromkeys(start for start, _ in pairs.values() if start != "Reference"))
+    start = None if source is None else capitalised(source)
+    if start is None:
+        start = "Probe" if "Probe" in tools else tools[0] if len(tools) == 1 else None
+    if start is None:
+        known = ", ".join(tools) or "none"
+        raise DeviceError(
+            f"name the tracked frame on the probe (--from); there are {known}", device="tracker"
+        )
+    if target is not None:
+        return start, capitalised(target)
+    if "Reference" in frames and start != "Reference":
+        return start, "Reference"
+    return start, next((end for begin, end in pairs.values() if begin == start), "Tracker")

@@ -1,0 +1,51 @@
+"""The person at a terminal: the newest frame in half blocks, what is said of it, and keys."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from hw.keys import Keyboard
+from hw.midplane.terminal_image import COLUMNS, ROWS, Screen, picture
+
+KEYS = "u: take the last image back, q: finish, Ctrl-C: stop (it can be resumed)"
+_PERIOD_S = 0.15
+_OTHER_ROWS = 5
+
+
+class TerminalPerson:
+    """See :class:`hw.freehand.acquire.Person`.
+
+    Args:
+        screen: where to show it.
+        keyboard: what the person types; asked within its ``asking``.
+    """
+
+    def __init__(self, screen: Screen, keyboard: Keyboard | None) -> None:
+        self._screen, self._keyboard = screen, keyboard
+        self._shown, self._words = 0.0, ""
+
+    def show(self, frame: np.ndarray, words: str, advice: str) -> None:
+        """Paint frame and words, a few times a second."""
+        now = time.monotonic()
+        if now - self._shown < _PERIOD_S and words == self._words:
+            return
+        self._shown, self._words = now, words
+        rows = []
+        if self._screen.pictures and frame.dtype == np.uint8:
+            columns, lines = self._screen.size
+            height = min(ROWS, lines - _OTHER_ROWS)
+            if height > 0:
+                rows += picture(frame, min(COLUMNS, columns - 1), height)
+        self._screen.show([*rows, f"> {words}", f"missing: {advice}", KEYS])
+
+    def say(self, line: str) -> None:
+        """A line that stays."""
+        self._screen.say(line)
+
+    def key(self) -> str | None:
+        """The next key; None where there was none, or no terminal."""
+        if self._keyboard is None or not self._keyboard.there:
+            return None
+        return self._keyboard.read(0.0)

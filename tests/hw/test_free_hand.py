@@ -1,0 +1,269 @@
+"""A hand-held probe: sockets, an emulated PlusServer in a process of its own, a scripted person."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from plus_server import COLUMNS, ROWS, SPACING_MM, TARGET_MM, holds, image_to_probe
+from scipy.spatial.transform import Rotation
+
+import jaxcal
+from hw.cli import main
+from hw.errors import DeviceError
+from hw.freehand.acquire import FreeHand, FreeHandStopped, acquire_free_hand
+from hw.freehand.guide import Guide, Rules, Taken, orientation_sds
+from hw.freehand.posed import PosedImage, PosedImages
+from hw.ultrasound.receiver import Image, UltrasoundStream
+from jaxcal import FormatError, InputError
+
+SERVER = Path(__file__).with_name("plus_server.py")
+
+
+@contextmanager
+def plus_server(**asked) -> Iterator[int]:
+    """Its port."""
+    process = subprocess.Popen(
+        [sys.executable, str(SERVER), json.dumps(asked)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        yield json.loads(process.stdout.readline())["port"]
+    finally:
+        process.kill()
+        process.communicate()
+
+
+class Scripted:
+    """Presses a key after a line that matches; keeps what was shown."""
+
+    def __init__(self, **presses: str) -> None:
+        self.lines: list[str] = []
+        self.words: set[str] = set()
+        self.advice: set[str] = set()
+        self._presses, self._pending = presses, []
+
+    def show(self, frame: np.ndarray, words: str, advice: str) -> None:
+        assert frame.shape == (ROWS, COLUMNS)
+        self.words.add(re.sub(r"[\d.]+", "#", words))
+        self.advice.add(advice)
+
+    def say(self, line: str) -> None:
+        self.lines.append(line)
+        for pattern in list(self._presses):
+            if re.search(pattern.replace("_", " "), line):
+                self._pending.append(self._presses.pop(pattern))
+
+    def key(self) -> str | None:
+        key = self._pending.pop(0) if self._pending else None
+        if key == "ctrl-c":
+            raise KeyboardInterrupt
+        return key
+
+
+def check(path: Path, order: list[int], seed: int = 1, count: int = 9) -> None:
+    """The recording's images are those of the poses that were held."""
+    poses, pixels = holds(count, seed)
+    images = jaxcal.load(path).calibration
+    used = images.mask
+    assert used.sum() == len(order)
+    shift = images.poses[used][:, :3, 3] - poses[order][:, :3, 3]
+    assert np.abs(shift).max() < 0.1
+    turn = images.poses[used][:, :3, :3].swapaxes(1, 2) @ poses[order][:, :3, :3]
+    assert Rotation.from_matrix(turn).magnitude().max() < 1e-3
+    error = images.measurements[used] - pixels[order]
+    assert np.abs(error).max() < 0.6
+    found = np.einsum("ni,nij,nj->n", error, np.linalg.inv(images.covariance[used]), error)
+    assert found.mean() < 8
+
+
+@pytest.mark.parametrize("mode", ["tracked", "separate"])
+def test_a_run_from_the_command_line_to_a_calibration(tmp_path, mode, capsys):
+    path = tmp_path / "rec.h5"
+    with plus_server(mode=mode, poses=14) as port:
+        arguments = [f"127.0.0.1:{port}", str(path), "--images", "12"]
+        assert main(["free-hand", *arguments]) == 0
+    told = capsys.readouterr()
+    assert "poses from Probe to Reference" in told.err
+    assert "image 12/12" in told.err
+    assert "the images agree to" in told.err
+    assert "jaxcal calibrate" in told.out
+    check(path, list(range(12)), count=14)
+    with h5py.File(path) as file:
+        assert file.attrs["complete"]
+        assert file["us/frames"].shape == (12, ROWS, COLUMNS)
+        assert {b"started", b"finished"} <= set(file["events/kind"][()])
+    found = jaxcal.calibrate(jaxcal.load(path), "conventional", estimate="scale").numpy()
+    truth = image_to_probe()
+    turn = Rotation.from_matrix(found.image_to_probe[:3, :3].T @ truth[:3, :3]).magnitude()
+    assert np.degrees(turn) < 2
+    assert np.linalg.norm(found.image_to_probe[:3, 3] - truth[:3, 3]) < 1.5
+    np.testing.assert_allclose(found.point, TARGET_MM, atol=1.0)
+    assert SPACING_MM[0] > SPACING_MM[1]
+
+
+def test_what_is_not_taken_is_said(tmp_path):
+    """Out of view, nothing credible, and a pose that was there before; u takes an image back."""
+    person = Scripted(image_3="u")
+    order = [0, 1, 2, 1, 3, 4, 5, 6]
+    with plus_server(mode="separate", order=order, lost=[3], hidden=[4]) as port:
+        asked = FreeHand("127.0.0.1", port, images=5)
+        assert acquire_free_hand(tmp_path / "r.h5", asked, person) == 5
+    assert "not tracked: ProbeToTracker is not tracked" in person.words
+    assert any(words.startswith("no credible target: nothing stands out") for words in person.words)
+    assert any(words.startswith("as in image #") for words in person.words)
+    assert {"moving: bring the target into the image and hold still", "hold still"} <= person.words
+    assert any(line.startswith("taken back: the last image; 2 are left") for line in person.lines)
+    assert any("bring the target to the" in advice for advice in person.advice)
+    # The third was taken back while its pose was still held, and so taken again; or not.
+    images = jaxcal.load(tmp_path / "r.h5").calibration
+    assert (len(images), int(images.mask.sum())) == (6, 5)
+    assert not images.mask[2]
+
+
+def test_a_lost_stream_is_gone_on_with(tmp_path):
+    path, person = tmp_path / "r.h5", Scripted()
+    asked = {"mode": "tracked", "poses": 9}
+    with plus_server(**asked, dies_after=110) as port:
+        wanted = FreeHand("127.0.0.1", port, images=7)
+        with pytest.raises(FreeHandStopped, match="has closed the connection") as stopped:
+            acquire_free_hand(path, wanted, person)
+    assert stopped.value.exit_code == 4
+    assert re.search(r"[3-5] of 7 images are in .*r\.h5; go on with: jaxcal-hw free-hand",
+                     str(stopped.value))  # fmt: skip
+    with pytest.raises(FormatError, match="incomplete"):
+        jaxcal.load(path)
+    with h5py.File(path) as file:
+        before = len(file["calibration/pose"])
+    with plus_server(**asked, first=before) as port:
+        again = FreeHand("127.0.0.1", port)
+        interrupting = Scripted(image_6="ctrl-c")
+        with pytest.raises(FreeHandStopped, match="interrupted; 6 of 7") as stopped:
+            acquire_free_hand(path, again, interrupting, resume=True)
+        assert stopped.value.exit_code == 130
+        assert acquire_free_hand(path, again, Scripted(), resume=True) == 7
+    poses, _ = holds(9, 1)
+    images = jaxcal.load(path).calibration
+    away = np.linalg.norm(images.poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
+    assert len(images) == 7
+    assert away.min(axis=1).max() < 0.1
+    assert len(set(away.argmin(axis=1))) == 7
+
+
+def test_too_few_images_stay_resumable(tmp_path):
+    with plus_server(mode="tracked") as port:
+        asked = FreeHand("127.0.0.1", port, images=9)
+        with pytest.raises(FreeHandStopped, match="1 images are too few: 4 are needed"):
+            acquire_free_hand(tmp_path / "r.h5", asked, Scripted(image_1="q"))
+
+
+def test_ctrl_c_at_a_terminal(tmp_path):
+    pytest.importorskip("pty", reason="there are no pseudo-terminals here")
+    from terminal import Terminal
+
+    command = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
+    with plus_server(mode="tracked") as port:
+        arguments = ["-c", command, "free-hand", f"127.0.0.1:{port}", "r.h5"]
+        with Terminal(arguments, tmp_path) as person:
+            person.wait_for(r"image 1/30: target at", 60)
+            person.wait_for("missing: bring the target to the", 60)
+            person.type("u")
+            person.wait_for("taken back: the last image; ", 60)
+            person.wait_for(r"image \d/30: target at", 60)
+            person.type("\x03")
+            assert person.finish(60) == 130
+            assert person.shown.count("▀") > 1000
+            assert "go on with: jaxcal-hw free-hand" in person.shown.replace("\r\n", " ")
+            assert "Traceback" not in person.shown
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"source": "Needle"}, "no transforms lead from Needle to Reference; the stream has Probe"),
+        ({"target_frame": "Table"}, "no transforms lead from Probe to Table"),
+        ({"device": "Other"}, "sent no images within"),
+    ],
+)
+def test_streams_that_cannot_be_used(tmp_path, monkeypatch, options, message):
+    monkeypatch.setattr("hw.freehand.posed.LISTEN_S", 1.0)
+    with plus_server(mode="separate") as port, pytest.raises(DeviceError, match=message):
+        acquire_free_hand(tmp_path / "r.h5", FreeHand("127.0.0.1", port, **options), Scripted())
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_server(tmp_path, capsys):
+    assert main(["free-hand", "127.0.0.1:1", str(tmp_path / "r.h5")]) == 4
+    error = capsys.readouterr().err
+    assert "no OpenIGTLink server at 127.0.0.1:1" in error
+    assert error.count("\n") == 1
+    for wrong in ("host:0", "host:99999", ":1", "host:x"):
+        assert main(["free-hand", wrong]) == 2
+
+
+def test_poses_between_stamps():
+    """A tracker faster than the images, with stamps of its own: poses are interpolated."""
+    with plus_server(mode="separate") as port, UltrasoundStream("127.0.0.1", port) as stream:
+        posed = PosedImages(stream, None, None, lag_s=0.025)
+        assert posed.pair == ("Probe", "Reference")
+        images = [posed.read(3.0) for _ in range(12)]
+        samples = {name: list(posed._samples[name]) for name in posed._needed}
+    held = [each for each in images if each.pose is not None]
+    assert len(held) > 8
+    for each in held:
+        moment = each.time - 0.025
+        poses = []
+        for name in ("ProbeToTracker", "ReferenceToTracker"):
+            before = max(
+                (s for s in samples[name] if s.t_device <= moment), key=lambda s: s.t_device
+            )
+            after = min(
+                (s for s in samples[name] if s.t_device >= moment), key=lambda s: s.t_device
+            )
+            # Half way between two.
+            poses.append(0.5 * (before.matrix + after.matrix))
+        expected = np.linalg.inv(poses[1]) @ poses[0]
+        np.testing.assert_allclose(each.pose, expected, atol=2e-3)
+
+
+def still(pose: np.ndarray, t: float, frame: np.ndarray) -> PosedImage:
+    return PosedImage(Image(t, t, 1, frame, (1.0, 1.0), "Image"), t, pose)
+
+
+def test_advice_names_what_is_missing():
+    rng = np.random.default_rng(0)
+
+    def guide(turns, places) -> Guide:
+        taken = []
+        for turn, place in zip(turns, places, strict=True):
+            pose = np.eye(4)
+            pose[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+            taken.append(Taken(pose, np.array(place, float), np.eye(2), 0.0))
+        return Guide(Rules(), taken)
+
+    everywhere = [(50 + 100 * (k % 3), 50 + 100 * (k // 3)) for k in range(9)]
+    few = guide([[0.0, 0, 0]] * 3, [(50, 50), (60, 40), (55, 55)])
+    assert "bring the target to the lower right" in few.advice((300, 300))
+    assert "turn the probe more (its orientations differ by 0 degrees)" in few.advice((300, 300))
+    one_axis = guide([[0.1 * k - 0.4, 0, 0] for k in range(9)], everywhere)
+    assert one_axis.advice((300, 300)).startswith("turn it about another axis")
+    good = guide(rng.normal(0, 0.5, (9, 3)), everywhere)
+    assert good.advice((300, 300)) == "well covered: any other pose helps"
+    sds = orientation_sds(np.array([each.pose for each in one_axis.taken]))
+    np.testing.assert_allclose(sds, [np.degrees(np.std(0.1 * np.arange(9))), 0, 0], atol=1e-5)
+
+
+def test_rules_that_cannot_be():
+    with pytest.raises(InputError, match="hold_s must be positive"):
+        Rules(hold_s=0.0)
+    with pytest.raises(InputError, match="images must be 4 to 1000"):
+        FreeHand("localhost", images=3)

@@ -1,0 +1,476 @@
+"""Recordings from frames: segmented sequences, folders of PNG, poses of another file, DICOM."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import warnings
+import zlib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation, Slerp
+
+import jaxcal
+from jaxcal import FormatError, InputError, MissingExtraError
+from jaxcal.cli.main import main
+from jaxcal.io.dicom import read_pixel_size
+from jaxcal.io.importing import ImportOptions, import_files
+from jaxcal.io.png import encode_png, png_size, read_png
+from jaxcal.io.sequence_files import read_sequence, write_sequence
+
+ROWS, COLUMNS, COUNT = 110, 150, 9
+PAIR = ("Probe", "Tracker")
+RNG = np.random.default_rng(4)
+POINTS = RNG.uniform([25, 25], [COLUMNS - 25, ROWS - 25], (COUNT, 2))
+POSES = np.tile(np.eye(4), (COUNT, 1, 1))
+POSES[:, :3, :3] = Rotation.random(COUNT, random_state=3).as_matrix()
+POSES[:, :3, 3] = RNG.uniform(-150, 150, (COUNT, 3))
+NOT_TRACKED, HIDDEN, BLANK = 2, 5, 7
+
+
+def speckle(rng, u=None, v=None) -> np.ndarray:
+    """Log-compressed speckle with one bright echo."""
+    noise = [gaussian_filter(rng.normal(size=(ROWS, COLUMNS)), (1.2, 2.0)) for _ in range(2)]
+    field = (noise[0] + 1j * noise[1]) / np.hypot(np.std(noise[0]), np.std(noise[1]))
+    if u is not None:
+        rows, columns = np.indices(field.shape)
+        field += 30 * np.exp(-0.5 * (((rows - v) / 1.2) ** 2 + ((columns - u) / 2.0) ** 2))
+    decibels = 20 * np.log10(np.abs(field) + 1e-6)
+    return np.clip(255 * (decibels + 20) / 60, 0, 255).astype(np.uint8)
+
+
+FRAMES = [speckle(RNG, *(POINTS[k] if k != HIDDEN else ())) for k in range(COUNT)]
+FOUND = [k for k in range(COUNT) if k not in (NOT_TRACKED, HIDDEN, BLANK)]
+
+
+@pytest.fixture(params=["f.igs.mha", "f.igs.mhd", "f.igs.nrrd", "f.seq.nrrd"])
+def sequence(request, tmp_path):
+    """Nine frames: one not tracked, one without a target, one whose image was not OK."""
+    path = tmp_path / request.param
+    valid = {PAIR: np.arange(COUNT) != NOT_TRACKED}
+    write_sequence(path, {PAIR: POSES}, np.arange(COUNT) / 20, valid=valid, images=FRAMES)
+    text = path.read_bytes()
+    name = b"Status" if request.param.endswith("nrrd") else b"ImageStatus"
+    separator = b":=" if request.param.endswith("nrrd") else b" = "
+    old = b"Seq_Frame%04d_%s%sOK" % (BLANK, name, separator)
+    assert text.count(old) == 1
+    path.write_bytes(text.replace(old, old[:-2] + b"INVALID"))
+    return path
+
+
+def test_segment_a_sequence(tmp_path, sequence, capsys):
+    """From frames to a recording with points: what became of every frame is counted and said."""
+    assert main(["segment", str(sequence), "--spacing", "0.2", "0.15"]) == 0
+    said = capsys.readouterr().out
+    assert "f-segmented.h5: 6 of 9 frames segmented (echo)" in " ".join(said.split())
+    assert "1 not credible, 1 not tracked, 1 image not OK" in said
+    assert "not credible: 1 x nothing stands out" in said
+    images = jaxcal.load(tmp_path / "f-segmented.h5").calibration
+    np.testing.assert_allclose(images.poses, POSES[FOUND], atol=1e-9)
+    np.testing.assert_allclose(images.time, np.array(FOUND) / 20)
+    np.testing.assert_array_equal(images.spacing_mm, [0.2, 0.15])
+    error = images.measurements - POINTS[FOUND]
+    assert np.abs(error).max() < 0.5
+    scaled = np.einsum("ni,nij,nj->n", error, np.linalg.inv(images.covariance), error)
+    assert scaled.mean() < 6
+    with h5py.File(tmp_path / "f-segmented.h5") as file:
+        np.testing.assert_array_equal(file["segmentation/frame"], FOUND)
+        fates = file["segmentation"].attrs["fates"].split(", ")
+        told = [fates[fate] for fate in file["segmentation/fate"]]
+    assert [told[k] for k in (NOT_TRACKED, HIDDEN, BLANK)] == [
+        "not tracked", "not credible", "image not OK"]  # fmt: skip
+    out = tmp_path / "other.h5"
+    assert main(["segment", str(sequence), "--json", "--out", str(out)]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert [record[key] for key in ("frames", "found", "not_credible", "not_tracked")] == [
+        9,
+        6,
+        1,
+        1,
+    ]
+    assert [each["frame"] for each in record["per_frame"] if each["fate"] == "found"] == FOUND
+    assert "dB over the background" in record["per_frame"][HIDDEN]["reason"]
+
+
+def test_where_nothing_is_credible_the_way_on_is_named(tmp_path, capsys):
+    path = tmp_path / "n.igs.mha"
+    frames = [speckle(RNG) for _ in range(4)]
+    write_sequence(path, {PAIR: POSES[:4]}, np.arange(4.0), images=frames)
+    assert main(["segment", str(path)]) == 2
+    assert "only 0 of 4 frames show a credible target" in (error := capsys.readouterr().err)
+    assert error.rstrip().endswith("place the points by hand: jaxcal pick")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["n.igs.mha"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--method", "shortest"], "--method is an option for times of flight"),
+        (["--no-robust"], "is an option for times of flight"),
+        (["--region", "140", "0", "40", "40"], "leaves the 150 x 110 px frame"),
+        (["--out", "f.igs.mha"], "exists and is not a recording"),
+        (["--from", "Stylus"], "no transforms lead from 'Stylus'"),
+    ],
+)
+def test_segment_refuses(tmp_path, monkeypatch, arguments, message, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_sequence("f.igs.mha", {PAIR: POSES}, np.arange(COUNT) / 20, images=FRAMES)
+    assert main(["segment", "f.igs.mha", *arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert [entry.name for entry in tmp_path.iterdir()] == ["f.igs.mha"]
+
+
+# Folders.
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Nine images; b2 comes before b10."""
+    path = tmp_path / "images"
+    path.mkdir()
+    for number, frame in enumerate(FRAMES):
+        (path / f"b{number + 2}.png").write_bytes(encode_png(frame))
+    (path / "notes.txt").write_text("not an image")
+    return path
+
+
+def pose_table(path: Path, first: str, cells, rows=range(COUNT)) -> Path:
+    """A table with one column more, or none."""
+    quaternions = Rotation.from_matrix(POSES[:, :3, :3]).as_quat()
+    head = f"{first}x,y,z,qx,qy,qz,qw"
+    lines = [
+        cells(k) + ",".join(repr(float(x)) for x in [*POSES[k, :3, 3], *quaternions[k]])
+        for k in rows
+    ]
+    path.write_text("\n".join([head, *lines]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("first", "cells"),
+    [
+        ("file,", lambda k: f"b{k + 2}.png,"),
+        ("file,", lambda k: f"C:\\data\\b{k + 2}.png,"),
+        ("filename,", lambda k: f"b{k + 2},"),
+        ("frame,", lambda k: f"{k + 2},"),
+        ("", lambda k: ""),
+        ("time,frame,", lambda k: f"{k / 20},{k + 2},"),
+    ],
+)
+def test_a_folder_with_poses(tmp_path, folder, first, cells, capsys):
+    rows = range(COUNT) if not first else [*range(COUNT)][::-1] if "time" not in first else range(9)
+    table = pose_table(tmp_path / "poses.csv", first, cells, rows)
+    out = str(tmp_path / "out.h5")
+    assert main(["import", str(folder), out, "--poses", str(table)]) == 0
+    assert "no credible target" in capsys.readouterr().out
+    images = jaxcal.load(out).calibration
+    found = [k for k in range(COUNT) if k != HIDDEN]
+    np.testing.assert_allclose(images.poses, POSES[found], atol=1e-9)
+    assert np.abs(images.measurements - POINTS[found]).max() < 0.5
+    if "time" in first:
+        np.testing.assert_allclose(images.time, np.array(found) / 20)
+
+
+def test_images_without_a_pose_are_counted(tmp_path, folder):
+    table = pose_table(tmp_path / "p.csv", "frame,", lambda k: f"{k + 2},", rows=[0, 1, 3, 4, 6])
+    recording, notes, frames = import_files([folder], ImportOptions(poses=table))
+    assert len(recording) == 5
+    assert f"4 of 9 images have no pose in {table}" in notes
+    assert frames.counts["not tracked"] == 4
+
+
+@pytest.mark.parametrize(
+    ("first", "cells", "rows", "message"),
+    [
+        ("file,", lambda k: "c1.png,", range(4), "p.csv:2: there is no image 'c1.png'"),
+        ("file,", lambda k: "b3.png,", range(4), "two poses for 'b3.png'"),
+        ("frame,", lambda k: f"{k},", range(4), "p.csv:2: no image in"),
+        ("", lambda k: "", range(4), "4 poses, but"),
+        ("u,v,", lambda k: "1,1,", range(COUNT), "holds points as well as poses"),
+    ],
+)
+def test_poses_that_do_not_belong(tmp_path, folder, first, cells, rows, message, capsys):
+    table = pose_table(tmp_path / "p.csv", first, cells, rows)
+    assert main(["import", str(folder), str(tmp_path / "o.h5"), "--poses", str(table)]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "o.h5").exists()
+
+
+def test_a_folder_alone_asks_for_its_poses(tmp_path, folder, capsys):
+    assert main(["import", str(folder), str(tmp_path / "o.h5")]) == 2
+    assert "name the file with its poses (--poses)" in capsys.readouterr().err
+
+
+def test_a_folder_and_points(tmp_path, folder):
+    """Frames count from 0 in the order of the files."""
+    table = pose_table(tmp_path / "p.csv", "", lambda k: "")
+    lines = [f"{k},{u!r},{v!r}" for k, (u, v) in enumerate(POINTS.tolist())]
+    (tmp_path / "uv.csv").write_text("\n".join(["frame,u,v", *lines]))
+    recording, _, frames = import_files([folder, tmp_path / "uv.csv"], ImportOptions(poses=table))
+    np.testing.assert_allclose(recording.calibration.measurements, POINTS)
+    assert frames is None
+
+
+# PNG files, which are not trusted.
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "P", "1", "RGB", "RGBA", "I;16"])
+def test_png_of_every_kind(tmp_path, mode):
+    grey = RNG.integers(0, 256, (12, 17), dtype=np.uint8)
+    if mode == "I;16":
+        expected = RNG.integers(0, 65536, (12, 17), dtype=np.uint16)
+        Image.fromarray(expected).save(tmp_path / "a.png")
+    elif mode.startswith("RGB"):
+        colours = RNG.integers(0, 256, (12, 17, len(mode)), dtype=np.uint8)
+        Image.fromarray(colours).save(tmp_path / "a.png")
+        expected = np.rint(colours[:, :, :3] @ [0.299, 0.587, 0.114])
+    else:
+        expected = 255 * (grey > 127) if mode == "1" else grey
+        Image.fromarray(expected.astype(np.uint8)).convert(mode).save(tmp_path / "a.png")
+    assert png_size(tmp_path / "a.png") == (17, 12)
+    np.testing.assert_array_equal(read_png(tmp_path / "a.png"), expected)
+
+
+def png(columns: int, rows: int, data: bytes) -> bytes:
+    def chunk(name: bytes, content: bytes) -> bytes:
+        crc = zlib.crc32(name + content)
+        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", crc)
+
+    head = struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (png(60_000, 60_000, zlib.compress(bytes(10**6))), "claims"),
+        (png(2**31 - 1, 2**31 - 1, b""), "claims|not a PNG"),
+        (png(100, 100, zlib.compress(bytes(500))), "is damaged"),
+        (png(100, 100, b"x"), "is damaged"),
+        (png(9, 9, zlib.compress(bytes(90)))[:44], "damaged"),
+        (b"GIF89a" + bytes(100), "is not a PNG file"),
+        (b"root:x:0:0", "is not a PNG file"),
+    ],
+)
+def test_png_that_lies(tmp_path, content, message):
+    (tmp_path / "a.png").write_bytes(content)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(FormatError, match=message):
+            read_png(tmp_path / "a.png")
+
+
+def test_folders_that_lie(tmp_path, folder, capsys):
+    table = pose_table(tmp_path / "p.csv", "", lambda k: "")
+    arguments = ["import", str(folder), str(tmp_path / "o.h5"), "--poses", str(table)]
+    outside = tmp_path / "outside.png"
+    outside.write_bytes(encode_png(FRAMES[0]))
+    (folder / "b99.png").symlink_to(outside)
+    assert main(arguments) == 2
+    assert "b99.png: is a link to another folder" in capsys.readouterr().err
+    (folder / "b99.png").unlink()
+    os.mkfifo(folder / "b99.png")
+    assert main(arguments) == 2
+    assert "is not an ordinary file" in capsys.readouterr().err
+    (folder / "b99.png").unlink()
+    (folder / "b99.png").write_bytes(encode_png(FRAMES[0][:50]))
+    assert main(arguments) == 2
+    assert "b99.png: has 150 x 50 px, b2.png has 150 x 110" in capsys.readouterr().err
+    assert not (tmp_path / "o.h5").exists()
+
+
+# Poses from another file, by time.
+
+MOMENTS = np.arange(200) / 50 + 100.0
+
+
+def moving(t: np.ndarray) -> np.ndarray:
+    """A smooth motion."""
+    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    turns = np.stack([0.5 * np.sin(t), 0.3 * np.cos(1.3 * t), 0.2 * t], axis=1)
+    poses[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+    poses[:, :3, 3] = np.stack([50 * np.sin(t), 20 * np.cos(t), 5 * t], axis=1)
+    return poses
+
+
+@pytest.mark.parametrize("kind", ["sequence", "table"])
+@pytest.mark.parametrize("lag", [0.0, 0.125])
+def test_poses_by_time(tmp_path, kind, lag, capsys):
+    times = 100.3 + np.arange(COUNT) * 0.37
+    write_sequence(tmp_path / "i.igs.mha", {}, times, images=FRAMES)
+    if kind == "sequence":
+        poses = tmp_path / "t.igs.mha"
+        lost = np.abs(MOMENTS - (times[3] - lag)) > 0.03
+        write_sequence(poses, {PAIR: moving(MOMENTS)}, MOMENTS, valid={PAIR: lost})
+    else:
+        poses = tmp_path / "t.csv"
+        rows = [
+            ",".join(repr(float(x)) for x in [t, *pose[:3].ravel()])
+            for t, pose in zip(MOMENTS, moving(MOMENTS), strict=True)
+        ]
+        names = ["time", *(f"m{i}{j}" for i in range(1, 4) for j in range(1, 5))]
+        poses.write_text("\n".join([",".join(names), *rows]))
+    out = str(tmp_path / "o.h5")
+    arguments = ["import", str(tmp_path / "i.igs.mha"), out, "--poses-from", str(poses)]
+    assert main([*arguments, "--lag", str(lag)]) == 0
+    said = capsys.readouterr().out
+    used = [k for k in range(COUNT) if k != HIDDEN and (k != 3 or kind == "table")]
+    assert ("1 of 9 images have no pose near their time" in said) == (kind == "sequence")
+    images = jaxcal.load(out).calibration
+    np.testing.assert_allclose(images.time, times[used])
+    there = times[used] - lag
+    whole = moving(MOMENTS)
+    turns = Slerp(MOMENTS, Rotation.from_matrix(whole[:, :3, :3]))(there).as_matrix()
+    np.testing.assert_allclose(images.poses[:, :3, :3], turns, atol=1e-9)
+    for axis in range(3):
+        places = np.interp(there, MOMENTS, whole[:, axis, 3])
+        np.testing.assert_allclose(images.poses[:, axis, 3], places, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        (MOMENTS + 1e6, "are they of one clock?"),
+        (MOMENTS[::-1], "is before the one before it"),
+        (np.full(200, np.nan), "states no times"),
+        (np.full(200, 101.0), "one time stamp"),
+    ],
+)
+def test_poses_of_other_times(tmp_path, times, message):
+    from jaxcal.io.poses_by_time import with_poses_by_time
+
+    write_sequence(tmp_path / "i.mha", {}, 100.3 + np.arange(COUNT) * 0.37, images=FRAMES)
+    images = read_sequence(tmp_path / "i.mha")
+    with pytest.raises(InputError, match=message):
+        with_poses_by_time(images, times, moving(MOMENTS), np.ones(200, bool), PAIR, "t.mha")
+
+
+def test_real_images_and_tracking_in_two_files(tmp_path, real_data):
+    """PLUS's temporal calibration: poses of the one file at the times of the other."""
+    video = real_data / "plus" / "WaterTankBottomTranslationVideoBuffer.igs.mha"
+    tracker = real_data / "plus" / "WaterTankBottomTranslationTrackerBuffer.igs.mha"
+    frames, tracked = read_sequence(video), read_sequence(tracker)
+    pair = next(iter(tracked.transforms))
+    (tmp_path / "p.csv").write_text(
+        "\n".join(["frame,u,v", *(f"{k},{k}.5,{k}.25" for k in range(0, len(frames), 7))])
+    )
+    options = ImportOptions(poses=tracker, source=pair[0], target=pair[1], ignore_time=True)
+    recording, notes, _ = import_files([video, tmp_path / "p.csv"], options)
+    poses, valid = tracked.poses(*pair)
+    times = recording.calibration.time
+    assert times is not None
+    assert len(times) > 10
+    assert valid.sum() > 100
+    places = np.interp(times, tracked.time[valid], poses[valid, 0, 3])
+    np.testing.assert_allclose(recording.calibration.poses[:, 0, 3], places, atol=0.05)
+    assert any("at the images' times" in note for note in notes)
+
+
+# DICOM.
+
+
+def dicom_clip(path: Path, regions, size=(COLUMNS, ROWS), change=None) -> Path:
+    """A clip as an ultrasound machine writes it, small."""
+    pydicom = pytest.importorskip("pydicom", reason="pydicom is not installed (jaxcal[dicom])")
+    from pydicom.dataset import Dataset, FileMetaDataset
+
+    data = Dataset()
+    data.file_meta = FileMetaDataset()
+    data.file_meta.TransferSyntaxUID = pydicom.uid.ExplicitVRLittleEndian
+    data.file_meta.MediaStorageSOPClassUID = pydicom.uid.UltrasoundMultiFrameImageStorage
+    data.file_meta.MediaStorageSOPInstanceUID = "1.2.3"
+    data.SOPClassUID, data.SOPInstanceUID = data.file_meta.MediaStorageSOPClassUID, "1.2.3"
+    data.Columns, data.Rows = size
+    data.SequenceOfUltrasoundRegions = []
+    for given in regions:
+        item = Dataset()
+        values = {
+            "RegionSpatialFormat": 1, "RegionDataType": 1, "RegionFlags": 0,
+            "RegionLocationMinX0": 10, "RegionLocationMinY0": 5,
+            "RegionLocationMaxX1": 99, "RegionLocationMaxY1": 80,
+            "PhysicalUnitsXDirection": 3, "PhysicalUnitsYDirection": 3,
+            "PhysicalDeltaX": 0.02, "PhysicalDeltaY": 0.015,
+        } | given  # fmt: skip
+        for name, value in values.items():
+            setattr(item, name, value)
+        data.SequenceOfUltrasoundRegions.append(item)
+    if change is not None:
+        change(data)
+    data.save_as(path, enforce_file_format=True)
+    return path
+
+
+def test_pixel_size_from_dicom(tmp_path, capsys):
+    clip = dicom_clip(tmp_path / "c.dcm", [{}, {"RegionSpatialFormat": 3, "PhysicalDeltaX": 9.0}])
+    found = read_pixel_size(clip)
+    assert found.spacing_mm == (0.2, 0.15)
+    assert (found.columns, found.rows, found.region) == (COLUMNS, ROWS, (10, 5, 90, 76))
+    path = tmp_path / "f.igs.mha"
+    write_sequence(path, {PAIR: POSES}, np.arange(COUNT) / 20, images=FRAMES)
+    assert main(["segment", str(path), "--spacing-from", str(clip)]) == 0
+    assert "calibrate with --estimate" not in capsys.readouterr().out
+    images = jaxcal.load(tmp_path / "f-segmented.h5").calibration
+    np.testing.assert_array_equal(images.spacing_mm, [0.2, 0.15])
+    other = dicom_clip(tmp_path / "d.dcm", [{}], size=(640, 480))
+    assert main(["segment", str(path), "--spacing-from", str(other)]) == 2
+    assert "its images are 640 x 480 px, the frames 150 x 110" in capsys.readouterr().err
+    arguments = ["--spacing-from", str(clip), "--spacing", "1", "1"]
+    assert main(["segment", str(path), *arguments]) == 2
+    assert "either --spacing or --spacing-from" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("regions", "message"),
+    [
+        ([], "states no pixel size"),
+        ([{"RegionSpatialFormat": 2}], "states no pixel size"),
+        ([{"PhysicalUnitsXDirection": 4}], r"codes \[4, 3\], not cm"),
+        ([{"PhysicalDeltaX": 0.0}], "0 mm is not plausible"),
+        ([{"PhysicalDeltaX": 2.0}], "20 mm is not plausible"),
+        ([{}, {"PhysicalDeltaY": 0.03}], "regions with different pixel sizes"),
+    ],
+)
+def test_dicom_without_a_pixel_size(tmp_path, regions, message):
+    with pytest.raises(FormatError, match=message):
+        read_pixel_size(dicom_clip(tmp_path / "c.dcm", regions))
+
+
+def test_dicom_that_lies(tmp_path):
+    clip = dicom_clip(tmp_path / "c.dcm", [{}])
+    good = clip.read_bytes()
+    rng = np.random.default_rng(0)
+    for trial in range(60):
+        content = bytearray(good)
+        for place in rng.integers(132, len(good), 3):
+            content[place] = rng.integers(256)
+        clip.write_bytes(bytes(content) if trial % 3 else bytes(content[: rng.integers(len(good))]))
+        told = ""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                found = read_pixel_size(clip)
+                assert min(found.spacing_mm) > 0
+            except FormatError as error:
+                told = str(error)
+        assert not told or told.startswith(str(clip))
+    clip.write_bytes(good.replace(b"1.2.840.10008.1.2.1\0", b"1.2.840.10008.1.2.1.99\0"))
+    with pytest.raises(FormatError):
+        read_pixel_size(clip)
+    clip.write_bytes(b"root:x:0:0")
+    with pytest.raises(FormatError, match="is not a DICOM file"):
+        read_pixel_size(clip)
+
+
+def test_the_extra_is_named(tmp_path, monkeypatch):
+    import sys
+
+    (tmp_path / "c.dcm").write_bytes(b"x")
+    monkeypatch.setitem(sys.modules, "pydicom", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'jaxcal\[dicom\]'"):
+        read_pixel_size(tmp_path / "c.dcm")
