@@ -6,6 +6,7 @@ import json
 import re
 import sys
 import time
+from base64 import b64decode
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -211,3 +212,48 @@ def test_in_a_browser_without_a_network(tmp_path, text, width, scheme):
     wrong = [entry for entry in entries
              if entry["method"] in ("Log.entryAdded", "Runtime.exceptionThrown")]  # fmt: skip
     assert wrong == []
+
+
+PRINTED = """
+const dark = (colour) => colour.match(/[0-9.]+/g).slice(0, 3).every((part) => part < 110);
+const shown = (e) => e.getClientRects().length > 0;
+const cut = [...document.querySelectorAll("pre, .wide, table, p, figure")].filter(shown)
+  .filter((e) => e.scrollWidth > e.clientWidth + 1)
+  .map((e) => e.textContent.slice(0, 40));
+const pale = [...document.querySelectorAll("h1, h2, p, td, pre, svg text, figcaption")]
+  .filter(shown)
+  .filter((e) => !dark(getComputedStyle(e)[e.closest("svg") ? "fill" : "color"]))
+  // White words stand on coloured bars.
+  .filter((e) => !e.getAttribute("style"))
+  .map((e) => e.textContent.slice(0, 40));
+return {cut, pale, buttons: [...document.querySelectorAll("button, .screen")].filter(shown).length};
+"""
+
+
+def test_on_paper(tmp_path, text):
+    """A4 by a person whose screen is dark: light, whole, nothing over anything else."""
+    (tmp_path / "cal.html").write_text(text)
+    with browsing(tmp_path / "profile") as browser:
+        # 210 mm less two margins of 14 mm, at 96 px an inch.
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", {
+            "width": 688, "height": 1017, "deviceScaleFactor": 1, "mobile": False,
+        })  # fmt: skip
+        features = [{"name": "prefers-color-scheme", "value": "dark"}]
+        browser.execute_cdp_cmd(
+            "Emulation.setEmulatedMedia", {"media": "print", "features": features}
+        )
+        browser.get((tmp_path / "cal.html").as_uri())
+        for _ in range(100):
+            time.sleep(0.1)
+            if browser.execute_script("return document.readyState") == "complete":
+                break
+        seen, printed = browser.execute_script(CHECK), browser.execute_script(PRINTED)
+        pdf = browser.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})["data"]
+    assert seen["found"] == []
+    assert seen["wide"] <= 688
+    assert seen["back"] == "rgb(255, 255, 255)"
+    assert min(seen["drawn"]) > 20
+    assert printed == {"cut": [], "pale": [], "buttons": 0}
+    content = b64decode(pdf)
+    assert content.startswith(b"%PDF")
+    assert 3 <= content.count(b"/Type /Page\n") <= 8

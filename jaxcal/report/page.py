@@ -321,14 +321,15 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     close = _close_up(answer, cloud, shown)
     views = (
         ("scene-all", whole, "Planes of the images (blue) and the target (orange), in the "
-         "tracker's frame. Drag, or use the arrow keys, to turn."),
+         "tracker's frame."),
         ("scene-target", close, "The target as each image puts it (green; does not fit the rest: "
          "orange), and the estimate with its 95 % ellipsoid (lines)."),
     )  # fmt: skip
     parts = [
         f'<figure>{_embedded(name, data)}<svg class="scene" viewBox="0 0 380 300" role="img" '
         f'tabindex="0" aria-label="{escape(words)}" data-scene="{name}"></svg>'
-        f"<figcaption>{escape(words)}</figcaption></figure>"
+        f'<figcaption>{escape(words)} <span class="screen">Drag, or use the arrow keys, to turn.'
+        "</span></figcaption></figure>"
         for name, data, words in views
     ]
     place = ", ".join(_number(record, f"point_mm.{k}", ".3f") for k in range(3))
