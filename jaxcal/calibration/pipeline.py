@@ -25,6 +25,7 @@ from jaxcal.model.observations import (
     Channels,
     InPlane,
     LocalUnknown,
+    Points,
     local_unknowns,
 )
 from jaxcal.model.parameters import Blocks
@@ -32,7 +33,7 @@ from jaxcal.runtime.precision import in_standard_promotion
 from jaxcal.solvers import methods
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.solvers.methods import Solution
-from jaxcal.solvers.normal_equations import accumulate
+from jaxcal.solvers.normal_equations import accumulate, component_sums, stacked
 from jaxcal.solvers.start import ConventionalStart, GivenStart
 
 
@@ -106,11 +107,7 @@ def _solved(
     found = methods.solve(problems, given, plan, begun)
     images = Images.of(problems, channels=plan.channels)
     observation = found.observation
-    information = accumulate(found.place, observation, images, None, found.medium).stacked()
-    unweighted = InPlane.of(images)
-    if plan.channels:
-        unweighted = Channels(jnp.ones((2, images.lanes), images.mask.dtype))
-    design = accumulate(found.place, unweighted, images, None).stacked()
+    information, design = _normal_matrices(found, images)
     offset = jnp.zeros((images.lanes, 0), images.mask.dtype)
     if isinstance(observation, LocalUnknown):
         offset = local_unknowns(found.place, observation, images)
@@ -128,6 +125,22 @@ def _solved(
         return solved, None
     covariance = jnp.moveaxis(found.covariance, -1, 0)
     return solved, Averaged(covariance, found.elevation_sd, found.law)
+
+
+def _normal_matrices(
+    found: Solution, images: Images
+) -> tuple[Float[Array, "p p lanes"], Float[Array, "p p lanes"]]:
+    """The weighted normal matrix at a solution, and that of the unweighted components."""
+    observation, place = found.observation, found.place
+    if isinstance(observation, (Points, Channels)):
+        # One pass for both.
+        sums = component_sums(place, observation, images, None, found.medium)
+        weighted = sums.weighed(1 / observation.sigma**2).stacked()
+        return weighted, stacked(jnp.sum(sums.matrix, axis=0))
+    weighted = accumulate(place, observation, images, None, found.medium).stacked()
+    if isinstance(observation, InPlane):
+        return weighted, weighted
+    return weighted, accumulate(place, InPlane.of(images), images, None).stacked()
 
 
 def _convergence(found: Solution, plan: Plan) -> Convergence:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.data.problem import Problem
@@ -20,6 +21,10 @@ from jaxcal.model import unrolled
 from jaxcal.model.parameters import EXTRA, Blocks, Parameters, block_slice, size
 from jaxcal.model.unknowns import step_between, stepped
 from jaxcal.model.unrolled import Matrix, Vector
+
+_CROSS_PLACES = np.array([[0, 2, 1], [2, 0, 0], [1, 0, 0]])
+_CROSS_SIGNS = np.array([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])[..., None]
+"""[v]x has the entries of v at these places with these signs."""
 
 RIGID_UNKNOWNS = 9
 """X and the target; further unknowns follow them."""
@@ -181,14 +186,13 @@ class Iterate(eqx.Module):
             {name: value.T for name, value in free.items() if value is not None}
         )
 
-    def moved(self, step: Vector) -> Iterate:
+    def moved(self, step: Float[Array, "p lanes"] | Vector) -> Iterate:
         """The step taken, as :func:`jaxcal.model.parameters.retract` takes it to third order.
 
         The turn is Cayley's, which is a rotation for any step and needs no sine.
         """
-        here = [unrolled.rows_of(row) for row in self.rotation]
-        turned = unrolled.product(here, unrolled.rotation(step[3:6]))
-        along = unrolled.apply(here, step[:3])
+        if isinstance(step, list):
+            step = jnp.stack(step)
         extras = self.extras
         if self.unknowns > RIGID_UNKNOWNS:
             at = RIGID_UNKNOWNS
@@ -197,10 +201,11 @@ class Iterate(eqx.Module):
                 parts.append(stepped(name, value, step[at], jnp.exp))
                 at += 1
             extras = jnp.stack(parts)
+        turn = _cayley(step[3:6])
         return Iterate(
-            jnp.stack([jnp.stack(row) for row in turned]),
-            self.translation + jnp.stack(along),
-            self.point + jnp.stack(step[6:9]),
+            jnp.sum(self.rotation[:, :, None] * turn, axis=1),
+            self.translation + jnp.sum(self.rotation * step[:3], axis=1),
+            self.point + step[6:RIGID_UNKNOWNS],
             extras,
             self.blocks,
         )
@@ -219,6 +224,21 @@ class Iterate(eqx.Module):
         for here, there, name in zip(self.extras, other.extras, names, strict=True):
             parts.append(step_between(name, here, there, jnp.log)[None])
         return jnp.concatenate(parts)
+
+
+def _cayley(vector: Float[Array, "3 lanes"]) -> Float[Array, "3 3 lanes"]:
+    """:func:`jaxcal.model.unrolled.rotation` of vectors, lanes last."""
+    half = 0.5 * vector
+    square = jnp.sum(half * half, axis=0)
+    cross = picked(half, _CROSS_PLACES) * _CROSS_SIGNS.astype(half.dtype)
+    eye = np.eye(3, dtype=half.dtype)[..., None]
+    bent = half[:, None] * half - square * eye
+    return eye + (2 / (1 + square)) * (cross + bent)
+
+
+def picked(array: Float[Array, k * rest], places: np.ndarray) -> Float[Array, "*places *rest"]:
+    """The entries at known places of the first axis, in one operation."""
+    return array.at[places].get(mode="promise_in_bounds")
 
 
 def _extra_names(blocks: Blocks) -> list[str]:

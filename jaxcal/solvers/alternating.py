@@ -100,7 +100,7 @@ def alternate(
         for k in range(len(matrix)):
             matrix[k][k] = matrix[k][k] * (1 + 16 * eps)
         move = unrolled.solve(matrix, [-value for value in unrolled.rows_of(normal.gradient)])
-        return barrier(place.moved(unrolled.rows_of(barrier(jnp.stack(move))))), held
+        return barrier(place.moved(barrier(jnp.stack(move)))), held
 
     def one_round(state: _State) -> _State:
         held = HeldOffsets.of(barrier(local_unknowns(state.place, observation, images)), images)

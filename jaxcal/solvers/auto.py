@@ -107,12 +107,13 @@ def average_over_laws(
     used, unknowns = images.used, place.unknowns
     common = tune(place, observation, images, medium)
     model = Linearised.of(common, common.sigma)
-    answers = answers_under(model, images, bound, shapes)
+    sites = sites_at(model, images, bound)
+    answers = answers_under(model, sites, shapes)
     own = jnp.zeros_like(used)
     if variances is not None and isinstance(observation, Points):
         other, more_probable = with_own_covariances(common, observation, images, variances, medium)
         own = jax.nn.sigmoid(more_probable)
-        beside = answers_under(other, images, bound, shapes)
+        beside = answers_under(other, sites_at(other, images, bound), shapes)
         answers = Answers.joined(
             answers.shared(1 - own),
             beside.seen_from(model.place.step_to(other.place), other.mean - model.mean).shared(own),
@@ -123,8 +124,7 @@ def average_over_laws(
     step, covariance = median(answers, model.offsets_metric())
     step, covariance = barrier((step, covariance))
 
-    q, turned = targets(model.place, images)
-    direction = Sites.of(q, turned, images.mask, model.mean, None).direction
+    direction = sites.direction
     across = [[covariance[i, j][:, None] for j in SEEN] for i in SEEN]
     variance = unrolled.dot(direction, unrolled.apply(across, direction))
 
@@ -255,19 +255,18 @@ class Answers(eqx.Module):
         )
 
 
-def answers_under(
-    model: Linearised,
-    images: Images,
-    bound: Float[Array, "lanes n"] | None,
-    shapes: tuple[Shape, ...],
-) -> Answers:
-    """The answers under the laws on a linearised problem."""
+def sites_at(model: Linearised, images: Images, bound: Float[Array, "lanes n"] | None) -> Sites:
+    """The offsets of a linearised problem, as the laws see them."""
     q, turned = targets(model.place, images)
-    sites = barrier(Sites.of(q, turned, images.mask, model.mean, bound))
+    return barrier(Sites.of(q, turned, images.mask, model.mean, bound))
+
+
+def answers_under(model: Linearised, sites: Sites, shapes: tuple[Shape, ...]) -> Answers:
+    """The answers under the laws on a linearised problem."""
     sd = model.sigma[-1]
     known = marginal(model.information, model.gradient, (MEAN_SD * sd) ** -2.0, model.mean)
-    stretch = jnp.asarray([shape.stretch for shape in shapes], images.mask.dtype)
-    prior = jnp.asarray([shape.prior for shape in shapes], images.mask.dtype)
+    stretch = jnp.asarray([shape.stretch for shape in shapes], sd.dtype)
+    prior = jnp.asarray([shape.prior for shape in shapes], sd.dtype)
     families: list[Family] = [shape.family for shape in shapes]
     squares, pull = barrier(seen(model.squares, model.pull))
     found = propagate(known, sites, squares, pull, families, stretch[:, None] * sd)

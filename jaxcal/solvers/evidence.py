@@ -29,10 +29,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxcal.model.batch import Images, Iterate, barrier
+from jaxcal.model.batch import Images, Iterate, barrier, picked
 from jaxcal.model.observations import Medium, Observation
 from jaxcal.solvers import dense
-from jaxcal.solvers.normal_equations import ComponentSums, component_sums, pairs
+from jaxcal.solvers.normal_equations import (
+    ComponentSums,
+    component_sums,
+    pairs,
+    square_places,
+    stacked,
+)
 from jaxcal.solvers.offset_mean import MEAN_SD, believed, gained, influences, trust_in
 from jaxcal.solvers.reml import helmert, least_sigma
 
@@ -117,8 +123,9 @@ class System(eqx.Module):
             gradient = gradient + jnp.concatenate([slope, jnp.zeros_like(slope[:1])])
             cost = cost + away
         flat, border, gradient = barrier((normal.curvature, border, gradient))
-        rows = [jnp.concatenate([row_of(flat, k), border[k, None]]) for k in range(unknowns)]
-        inverse, log_determinant = dense.inverse_lanes_last(jnp.stack([*rows, border]))
+        whole = jnp.concatenate([stacked(flat), border[:-1, None]], axis=1)
+        whole = jnp.concatenate([whole, border[None]])
+        inverse, log_determinant = dense.inverse_lanes_last(whole)
         step = -dense.product_lanes_last(inverse, gradient)
         # At the minimum, which is a small step away.
         cost = cost + jnp.sum(gradient * step, axis=0)
@@ -127,8 +134,10 @@ class System(eqx.Module):
     def traces(self, matrix: Float[Array, "q q lanes"]) -> Float[Array, "k lanes"]:
         """tr(A N_k) of every component, A symmetric."""
         last = matrix.shape[0] - 1
-        twice = [(1 if i == j else 2) * matrix[i, j] for i, j in pairs(last)]
-        found = jnp.sum(barrier(jnp.stack(twice)) * self.sums.matrix, axis=1)
+        rows, columns = (np.array(each) for each in zip(*pairs(last), strict=True))
+        twice = np.where(rows == columns, 1.0, 2.0)[:, None]
+        flat = picked(matrix.reshape(-1, matrix.shape[-1]), (last + 1) * rows + columns)
+        found = jnp.sum(barrier(twice * flat) * self.sums.matrix, axis=1)
         crossed = jnp.sum(2 * matrix[last, :last] * self.border[:last], axis=0)
         own = crossed + matrix[last, last] * self.border[last]
         return found + np.eye(len(found))[-1][:, None] * own
@@ -136,9 +145,7 @@ class System(eqx.Module):
 
 def row_of(flat: Float[Array, "triangle lanes"], k: int) -> Float[Array, "p lanes"]:
     """A row of a symmetric matrix from its upper triangle."""
-    size = int((2 * flat.shape[0]) ** 0.5)
-    places = pairs(size)
-    return jnp.stack([flat[places.index((min(k, j), max(k, j)))] for j in range(size)])
+    return picked(flat, square_places(int((2 * flat.shape[0]) ** 0.5))[k])
 
 
 def tune(
@@ -165,9 +172,8 @@ def tune(
     def sums_at(place: Iterate) -> ComponentSums:
         return barrier(component_sums(place, observation, images, None, medium))
 
-    def one_round(_: Array, state: tuple) -> tuple:
-        place, mean, sigma, _ = state
-        system = System.of(sums_at(place), mean)
+    def improved(sums: ComponentSums, place: Iterate, mean: Array, sigma: Array) -> tuple:
+        system = System.of(sums, mean)
         inverse, step, _ = barrier(system.solved(sigma, mean))
         moved, share = influences(
             place, observation, images, 1 / sigma**2, mean, along=inverse[:, -1], step=step
@@ -191,9 +197,22 @@ def tune(
 
         none = jnp.zeros((place.unknowns + 1, mean.shape[0]), mean.dtype)
         sigma, step = jax.lax.fori_loop(0, UPDATES, update, (sigma, none))
-        return barrier((place.moved(list(step[:-1])), mean + step[-1], sigma, trust))
+        return barrier((place.moved(step[:-1]), mean + step[-1], sigma, trust))
+
+    # The sums are made in one place, for rounds and result: they are half of the program.
+    def one_round(index: Array, state: tuple) -> tuple:
+        place, mean, sigma, trust, _ = state
+        sums = sums_at(place)
+        place, mean, sigma, trust = jax.lax.cond(
+            index < rounds,
+            lambda: improved(sums, place, mean, sigma),
+            lambda: (place, mean, sigma, trust),
+        )
+        return place, mean, sigma, trust, sums
 
     zero = jnp.zeros_like(start[0])
-    state = (place, zero, start, zero + 1)
-    place, mean, sigma, trust = jax.lax.fori_loop(0, rounds, one_round, state)
-    return NoiseModel(place, mean, sigma, sums_at(place), trust)
+    shapes = jax.eval_shape(sums_at, place)
+    none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    state = (place, zero, start, zero + 1, none)
+    place, mean, sigma, trust, sums = jax.lax.fori_loop(0, rounds + 1, one_round, state)
+    return NoiseModel(place, mean, sigma, sums, trust)

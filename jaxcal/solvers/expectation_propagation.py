@@ -45,11 +45,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.model import unrolled
-from jaxcal.model.batch import RIGID_UNKNOWNS, barrier, total
+from jaxcal.model.batch import RIGID_UNKNOWNS, barrier, picked, total
 from jaxcal.model.shapes import Family, Moments, tilted
 from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.solvers import dense
-from jaxcal.solvers.normal_equations import pairs, stacked
+from jaxcal.solvers.normal_equations import pairs, square_places, stacked
 
 SWEEPS = 3
 """Sweeps under each law, from the sites of the one before; a family's first gets twice as many."""
@@ -177,27 +177,26 @@ def marginal(
         mean: b here, mm.
     """
     unknowns = gradient.shape[0]
-    full = unrolled.symmetric(unrolled.rows_of(information))
     # b moves q_iy against s - v_y: in (s, b), b takes v_y's information along.
-    for i in range(unknowns):
-        full[i].append(-full[i][ELEVATION])
-    full.append([full[j][unknowns] for j in range(unknowns)])
-    full[unknowns].append(full[ELEVATION][ELEVATION] + precision)
-    force = jnp.concatenate([-gradient, (gradient[ELEVATION] - precision * mean)[None]])
-    others, seen = hidden(unknowns), [*SEEN]
-
-    def block(rows: list[int], columns: list[int]) -> Array:
-        return jnp.stack([jnp.stack([full[i][j] for j in columns]) for i in rows])
-
-    own, mixed, left = barrier((block(others, others), block(others, seen), block(seen, seen)))
+    order = np.array([*hidden(unknowns), *SEEN])
+    is_mean = order == unknowns
+    from_flat = np.where(is_mean, ELEVATION, order)
+    places = square_places(unknowns)[np.ix_(from_flat, from_flat)]
+    sign = np.where(is_mean, -1.0, 1.0)
+    last = is_mean[:, None, None] & is_mean[:, None]
+    full = picked(information, places) * (sign[:, None] * sign)[..., None]
+    full = full + jnp.where(last, precision, 0.0)
+    force = -picked(gradient, from_flat) * sign[:, None]
+    force = force - jnp.where(is_mean[:, None], precision * mean, 0.0)
+    count = len(order) - len(SEEN)
+    own, mixed, left = barrier((full[:count, :count], full[:count, count:], full[count:, count:]))
     spread, _ = dense.inverse_lanes_last(own)
     slope = barrier(-dense.product_lanes_last(spread, mixed))
-    pull = jnp.stack([force[k] for k in others])
+    pull = force[:count]
     return barrier(
         Marginal(
             left + dense.product_lanes_last(jnp.swapaxes(mixed, 0, 1), slope),
-            jnp.stack([force[k] for k in seen])
-            + dense.product_lanes_last(jnp.swapaxes(slope, 0, 1), pull),
+            force[count:] + dense.product_lanes_last(jnp.swapaxes(slope, 0, 1), pull),
             dense.product_lanes_last(spread, pull),
             slope,
             spread,
@@ -300,9 +299,8 @@ def seen(
     squares: Float[Array, "triangle lanes"], pull: Float[Array, "p lanes"]
 ) -> tuple[Float[Array, "6 6 lanes"], Float[Array, "6 lanes"]]:
     """Of sums of h_i h_i' (upper triangle) and h_i o_i over all unknowns, those for z."""
-    places = pairs(pull.shape[0])
-    matrix = jnp.stack([squares[places.index((SEEN[i], SEEN[j]))] for i, j in TRIANGLE])
-    return stacked(matrix), jnp.stack([pull[k] for k in SEEN])
+    at = np.array(SEEN)
+    return picked(squares, square_places(pull.shape[0])[np.ix_(at, at)]), picked(pull, at)
 
 
 def _solved(information: Float[Array, "6 6 lanes"], rhs: Float[Array, "6 lanes"]) -> _Belief:

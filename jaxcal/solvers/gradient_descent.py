@@ -20,7 +20,6 @@ from jaxtyping import Array, Float
 from jaxcal.calibration.options import Options
 from jaxcal.model.batch import Images, Iterate
 from jaxcal.model.observations import Further, InPlane
-from jaxcal.model.unrolled import rows_of
 from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate
 from jaxcal.solvers.other import Fit
@@ -65,7 +64,7 @@ def pairwise_gradient(start: Iterate, images: Images, options: Options) -> Fit:
     rest = jnp.zeros(start.unknowns - 6, lever.dtype)
 
     def moved(tangent: Float[Array, 6]) -> Iterate:
-        return start.moved(rows_of(jnp.concatenate([unit * tangent, rest])[:, None]))
+        return start.moved(jnp.concatenate([unit * tangent, rest])[:, None])
 
     def target(place: Iterate) -> Float[Array, "3 lanes"]:
         return jnp.sum(images.mask * reconstructed(place, images), axis=2) / count

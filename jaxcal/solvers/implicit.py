@@ -21,7 +21,6 @@ from jaxtyping import Array, Float
 
 from jaxcal.model.batch import Images, Iterate
 from jaxcal.model.observations import Medium, Observation
-from jaxcal.model.unrolled import rows_of
 from jaxcal.runtime.precision import in_standard_promotion
 from jaxcal.solvers import dense, reml
 from jaxcal.solvers.normal_equations import accumulate
@@ -92,7 +91,7 @@ def _self_tuned_jvp(primals: tuple, tangents: tuple) -> tuple:
     count = place.unknowns
 
     def conditions(unknowns: Array, *data) -> Array:
-        moved, log_sigma = place.moved(rows_of(unknowns[:count])), unknowns[count:]
+        moved, log_sigma = place.moved(unknowns[:count]), unknowns[count:]
         normal, updated = reml.update_at(moved, jnp.exp(log_sigma), *data)
         return jnp.concatenate([normal.gradient, log_sigma - jnp.log(updated)])
 

@@ -37,7 +37,6 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxcal.model import unrolled
 from jaxcal.model.batch import Images, Iterate, barrier, choose
 from jaxcal.model.observations import LocalUnknown, Medium, Observation
-from jaxcal.model.unrolled import Vector
 from jaxcal.solvers.normal_equations import Normal, accumulate
 
 ENOUGH = 1e-4
@@ -229,23 +228,23 @@ def gradient_cosine(normal: Normal, vanished: Float[Array, " lanes"]) -> Float[A
 
 def damped_step(
     normal: Normal, damping: Float[Array, " lanes"]
-) -> tuple[Vector, Float[Array, " lanes"], Bool[Array, " lanes"]]:
+) -> tuple[Float[Array, "p lanes"], Float[Array, " lanes"], Bool[Array, " lanes"]]:
     """The damped step, the decrease of half the cost that it predicts, and whether it is lost.
 
     It is lost where the matrix is not positive definite; the step is zero there.
     """
     matrix, gradient = normal.matrix(), unrolled.rows_of(normal.gradient)
     damping = damping + 16 * jnp.finfo(damping.dtype).eps
-    diagonal = [jnp.where(entry > 0, entry, 1.0) for entry in normal.diagonal()]
-    for k, entry in enumerate(diagonal):
-        matrix[k][k] = matrix[k][k] + damping * entry
+    diagonal = normal.diagonal()
+    diagonal = jnp.where(diagonal > 0, diagonal, 1.0)
+    for k, entry in enumerate(unrolled.rows_of(damping * diagonal)):
+        matrix[k][k] = matrix[k][k] + entry
     move = unrolled.solve(matrix, [-value for value in gradient])
-    move = unrolled.rows_of(barrier(jnp.stack(move)))
-    lost = jnp.logical_not(jnp.isfinite(sum(move)))
-    move = [jnp.where(lost, 0.0, value) for value in move]
-    heavy = sum(d * m * m for d, m in zip(diagonal, move, strict=True))
-    predicted = 0.5 * (damping * heavy - unrolled.dot(gradient, move))
-    return unrolled.rows_of(barrier(jnp.stack(move))), predicted, lost
+    move = barrier(jnp.stack(move))
+    lost = jnp.logical_not(jnp.isfinite(jnp.sum(move, axis=0)))
+    move = jnp.where(lost, 0.0, move)
+    held = damping * diagonal * move - normal.gradient
+    return barrier(move), 0.5 * jnp.sum(held * move, axis=0), lost
 
 
 def iterate_once(

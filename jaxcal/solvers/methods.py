@@ -276,7 +276,7 @@ def _attached(
         observation = observation.with_sigma(sigma)
     else:
         step = implicit.optimum(found.place, observation, images, medium)
-    place = found.place.moved([*step])
+    place = found.place.moved(step)
     offset = found.offset
     if isinstance(observation, BoundedOffsets):
         offset = local_unknowns(place, observation, images)

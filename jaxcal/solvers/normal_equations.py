@@ -31,10 +31,11 @@ from functools import cache
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.model import derivatives, unrolled
-from jaxcal.model.batch import RIGID_UNKNOWNS, Images, Iterate, targets, total
+from jaxcal.model.batch import RIGID_UNKNOWNS, Images, Iterate, picked, targets, total
 from jaxcal.model.observations import Component, Further, LocalUnknown, Medium, Observation
 from jaxcal.model.unrolled import Entry, Matrix, Vector
 
@@ -46,6 +47,15 @@ IN_IMAGE = 3
 def pairs(unknowns: int) -> list[tuple[int, int]]:
     """Places of the upper triangle in a flat row."""
     return [(i, j) for i in range(unknowns) for j in range(i, unknowns)]
+
+
+@cache
+def square_places(unknowns: int) -> np.ndarray:
+    """Where a flat upper triangle has the entries of the full matrix."""
+    places = np.zeros((unknowns, unknowns), int)
+    for place, (i, j) in enumerate(pairs(unknowns)):
+        places[i, j] = places[j, i] = place
+    return places
 
 
 class Term(eqx.Module):
@@ -313,12 +323,12 @@ class Normal(eqx.Module):
         if self.squares is not None:
             return self.squares
         places = diagonal_places(self.gradient.shape[0])
-        return jnp.stack([self.curvature[k] for k in places])
+        return picked(self.curvature, np.array(places))
 
 
 def stacked(flat: Float[Array, "triangle lanes"]) -> Float[Array, "p p lanes"]:
     """A symmetric matrix from its upper triangle."""
-    return jnp.stack([jnp.stack(row) for row in unrolled.symmetric(unrolled.rows_of(flat))])
+    return picked(flat, square_places(int((2 * flat.shape[0]) ** 0.5)))
 
 
 def diagonal_places(unknowns: int) -> tuple[int, ...]:

@@ -17,7 +17,6 @@ from jaxcal.calibration.options import Options
 from jaxcal.model.batch import Images, Iterate, choose, targets
 from jaxcal.model.observations import Further, Medium, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
-from jaxcal.model.unrolled import rows_of
 from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate, component_sums
 from jaxcal.solvers.reml import update_at, with_floor
@@ -87,14 +86,14 @@ def minimise_with(
     """
 
     def residual(step: Array, _: None) -> Array:
-        moved = start.moved(rows_of(step[:, None]))
+        moved = start.moved(step[:, None])
         return whitened_residuals(moved, observation, images, medium)[:, 0]
 
     still = jnp.zeros(start.unknowns, images.mask.dtype)
     found = optx.least_squares(
         residual, solver, still, max_steps=options.max_iterations, throw=False
     )
-    place = start.moved(rows_of(found.value[:, None]))
+    place = start.moved(found.value[:, None])
     normal = accumulate(place, observation, images, None, medium)
     rounding = Rounding.of(start, observation, images)
     trace = None

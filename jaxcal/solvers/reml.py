@@ -35,7 +35,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.model import unrolled
 from jaxcal.model.batch import Images, Iterate, barrier, choose
 from jaxcal.model.observations import Medium, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
@@ -346,7 +345,7 @@ def self_tuned(
             cost=cost,
             change=change,
             cosine=cosine,
-            candidate=choose(retry, place, place.moved(unrolled.rows_of(barrier(move)))),
+            candidate=choose(retry, place, place.moved(barrier(move))),
             proposed=jnp.where(retry, sigma, after),
             retry=retry,
             weighed=weighed,

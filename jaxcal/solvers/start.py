@@ -29,14 +29,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from jaxcal.calibration.conventional import Start
 from jaxcal.model import unrolled
 from jaxcal.model.batch import Images, Iterate, barrier, choose, total
 from jaxcal.model.observations import InPlane
 from jaxcal.model.parameters import Blocks, Parameters
-from jaxcal.model.unrolled import Matrix, Vector
+from jaxcal.solvers import dense
 from jaxcal.solvers.levenberg_marquardt import Descent, minimise
 
 LEAST_PIVOT = 1e-10
@@ -83,38 +83,43 @@ class GivenStart(eqx.Module):
         return cls(Iterate.of(parameters, blocks), start.searched)
 
 
-class ImageSums(eqx.Module):
-    """Sums over the images; points and pose origins are taken from their means.
+class Reduced(eqx.Module):
+    """The least-squares problem of the start with c and t eliminated; lanes last.
+
+    Half its objective is a'Qa / 2 - b'a, a = (a1, a3) in probe coordinates; points and pose origins
+    are taken from their means.
 
     Attributes:
         count: used images.
         mean: of lateral position and range, mm.
         face: range of pixel row 0, mm; the mean range holds it.
         centre: of the poses' origins, mm.
-        xx: of lateral squared, and so on.
-        xz: see there.
-        zz: see there.
-        lateral: of lateral times R_i, 3x3.
-        axial: of range times R_i.
-        rotation: of R_i.
-        pulled: of lateral, range and 1 times R_i'(centre - b_i).
+        matrix: Q.
+        rhs: b.
+        squares: sums of squares of lateral position and range, mm^2.
+        turned: sums of lateral times R_i, range times R_i, side by side.
+        rotation: sum of R_i.
+        pulled: sum of R_i'(centre - b_i).
+        spread: inverse of t's normal matrix, c eliminated.
+        least: least part of a diagonal entry that the other unknowns leave.
     """
 
-    count: Array
-    mean: Vector
-    face: Array
-    centre: Vector
-    xx: Array
-    xz: Array
-    zz: Array
-    lateral: Matrix
-    axial: Matrix
-    rotation: Matrix
-    pulled: list[Vector]
+    count: Float[Array, " lanes"]
+    mean: Float[Array, "2 lanes"]
+    face: Float[Array, " lanes"]
+    centre: Float[Array, "3 lanes"]
+    matrix: Float[Array, "6 6 lanes"]
+    rhs: Float[Array, "6 lanes"]
+    squares: Float[Array, "2 lanes"]
+    turned: Float[Array, "3 6 lanes"]
+    rotation: Float[Array, "3 3 lanes"]
+    pulled: Float[Array, "3 lanes"]
+    spread: Float[Array, "3 3 lanes"]
+    least: Float[Array, " lanes"]
 
     @classmethod
-    def of(cls, images: Images) -> ImageSums:
-        """Two passes: the means, and the rest."""
+    def of(cls, images: Images) -> Reduced:
+        """Two passes over the images: the means, and the rest."""
         count = images.used
         points = [images.lateral, images.distance]
         mean = [jnp.sum(images.mask * plane, axis=1) / count for plane in points]
@@ -123,103 +128,112 @@ class ImageSums(eqx.Module):
         away = [c[:, None] - plane for plane, c in zip(images.origin, centre, strict=True)]
         turn = [[images.rotation[3 * i + j] for j in range(3)] for i in range(3)]
         back = unrolled.apply(unrolled.transpose(turn), away)
-        flat = [entry for row in turn for entry in row]
         planes = [x * x, x * z, z * z]
         for weight in (x, z, images.mask):
-            planes += [weight * entry for entry in flat] + [weight * entry for entry in back]
-        sums = unrolled.rows_of(barrier(jnp.stack(total(planes))))
-        parts = [sums[3 + 12 * k : 15 + 12 * k] for k in range(3)]
-        lateral, axial, rotation = ([part[3 * i : 3 * i + 3] for i in range(3)] for part in parts)
-        pulled = [part[9:] for part in parts]
-        xx, xz, zz = sums[:3]
-        return cls(count, mean, images.face, centre, xx, xz, zz, lateral, axial, rotation, pulled)
+            planes += [weight * entry for row in turn for entry in row]
+            planes += [weight * entry for entry in back]
+        sums = barrier(jnp.stack(total(planes)))
+        parts = sums[3:].reshape(3, 12, -1)
+        lateral, axial, rotation = parts[:, :9].reshape(3, 3, 3, -1)
+        turned = jnp.concatenate([lateral, axial], axis=1)
+
+        # c is the mean of B_i X p_i; then t.
+        def squared(first: Array, second: Array) -> Array:
+            return dense.product_lanes_last(jnp.swapaxes(first, 0, 1), second) / count
+
+        eye = jnp.eye(3, dtype=x.dtype)[..., None]
+        ridge = 2e-12 + 32 * jnp.finfo(x.dtype).eps
+        own = barrier(count * (1 + ridge) * eye - squared(rotation, rotation))
+        spread, _ = dense.inverse_lanes_last(own)
+        mixed = squared(rotation, turned)
+        follows = barrier(dense.product_lanes_last(spread, mixed))
+        back_from_t = jnp.swapaxes(mixed, 0, 1)
+        # S (x) I: sums of squares and products of the points' coordinates.
+        square = jnp.stack([jnp.stack(sums[:2]), jnp.stack(sums[1:3])])
+        whole = square[:, None, :, None] * eye[None, :, None]
+        matrix = whole.reshape(6, 6, -1) - squared(turned, turned)
+        matrix = barrier(matrix - dense.product_lanes_last(back_from_t, follows))
+        pulled = parts[2, 9:]
+        rhs = parts[:2, 9:].reshape(6, -1)
+        rhs = rhs + dense.product_lanes_last(jnp.swapaxes(follows, 0, 1), pulled)
+        squares = jnp.stack([sums[0], sums[2]])
+        left = jnp.stack([count * spread[k, k] for k in range(3)])
+        return cls(
+            count,
+            jnp.stack(mean),
+            images.face,
+            jnp.stack(centre),
+            matrix,
+            rhs,
+            squares,
+            turned,
+            rotation,
+            pulled,
+            spread,
+            1 / jnp.max(left, axis=0),
+        )
+
+    def with_rotation(self, lateral: Array, axial: Array, blocks: Blocks) -> Iterate:
+        """X's origin, the target and free scales by linear least squares with X's rotation held.
+
+        Args:
+            lateral: its first column, (3, lanes).
+            axial: its last.
+            blocks: the free unknowns.
+        """
+        one = jnp.ones_like(self.count)
+        scale = jnp.stack([one, one])
+        if "scale" in blocks:
+            # A negative scale means a rotation far off; its magnitude still is the best guess.
+            tiny = jnp.finfo(one.dtype).tiny
+            scale = jnp.maximum(jnp.abs(self._scales(lateral, axial)), tiny)
+        columns = jnp.concatenate([scale[0] * lateral, scale[1] * axial])
+        seen = dense.product_lanes_last(self.turned, columns)
+        pull = dense.product_lanes_last(jnp.swapaxes(self.rotation, 0, 1), seen) / self.count
+        of_mean = barrier(dense.product_lanes_last(self.spread, self.pulled + pull))
+        target = seen + dense.product_lanes_last(self.rotation, of_mean)
+        depth = scale[1] * (self.mean[1] - self.face) + self.face
+        zero = jnp.zeros_like(one)
+        nominal = {"scale": [*scale], "sound-speed": [one], "delay": [zero]}
+        extras = [value for name, values in nominal.items() if name in blocks for value in values]
+        return Iterate(
+            jnp.stack([lateral, jnp.cross(axial, lateral, axis=0), axial], axis=1),
+            of_mean - scale[0] * self.mean[0] * lateral - depth * axial,
+            self.centre + target / self.count,
+            jnp.stack(extras) if extras else jnp.zeros((0, *one.shape), one.dtype),
+            blocks,
+        )
+
+    def _scales(self, lateral: Array, axial: Array) -> Float[Array, "2 lanes"]:
+        """The best factors of two columns of a rotation."""
+        forces = [dense.product_lanes_last(self.matrix[:, :3], lateral),
+                  dense.product_lanes_last(self.matrix[:, 3:], axial)]  # fmt: skip
+        first, mixed, second = (
+            jnp.sum(lateral * forces[0][:3], axis=0),
+            jnp.sum(axial * forces[0][3:], axis=0),
+            jnp.sum(axial * forces[1][3:], axis=0),
+        )
+        ridge = 16 * jnp.finfo(first.dtype).eps
+        held = jnp.where(self.squares > 0, ridge * self.squares, 1.0)
+        first, second = first + held[0], second + held[1]
+        right, deep = (
+            jnp.sum(lateral * self.rhs[:3], axis=0),
+            jnp.sum(axial * self.rhs[3:], axis=0),
+        )
+        determinant = first * second - mixed * mixed
+        return (
+            jnp.stack([second * right - mixed * deep, first * deep - mixed * right]) / determinant
+        )
 
 
-def from_rotation(rotation: Matrix, sums: ImageSums, blocks: Blocks) -> Iterate:
-    """X's origin, the target and free scales by linear least squares with X's rotation held."""
-    zero, count = jnp.zeros_like(sums.count), sums.count
-    lateral, axial = ([row[k] for row in rotation] for k in (0, 2))
-    (x, z), centre = sums.mean, sums.centre
-    across = unrolled.apply(sums.lateral, lateral), unrolled.apply(sums.axial, axial)
-    free = "scale" in blocks
-    size = 8 if free else 6
-    # Unknowns t (that of the mean point), c and, where they are free, the scales.
-    matrix: Matrix = [[zero] * size for _ in range(size)]
-    for i in range(3):
-        matrix[i][i] = matrix[3 + i][3 + i] = count * (1 + 1e-12)
-        for j in range(3):
-            matrix[3 + i][j] = matrix[j][3 + i] = -sums.rotation[i][j]
-    # Deviations of x and z, and of the origins, sum to nothing.
-    if free:
-        matrix[6][6], matrix[7][7] = sums.xx, sums.zz
-        for k, column in enumerate(across):
-            for i in range(3):
-                matrix[3 + i][6 + k] = matrix[6 + k][3 + i] = -column[i]
-        drawn = [
-            unrolled.dot(lateral, sums.pulled[0]),
-            unrolled.dot(axial, sums.pulled[1]),
-        ]
-        rhs = [*sums.pulled[2], *[zero] * 3, *drawn]
-    else:
-        rhs = [*sums.pulled[2], *(a + b for a, b in zip(*across, strict=True))]
-    length = [jnp.sqrt(jnp.where(matrix[k][k] > 0, matrix[k][k], 1.0)) for k in range(size)]
-    unit = [[matrix[i][j] / (length[i] * length[j]) for j in range(size)] for i in range(size)]
-    ridge = 16 * jnp.finfo(count.dtype).eps
-    for k in range(size):
-        unit[k][k] = unit[k][k] + ridge
-    solved = unrolled.solve(unit, [value / by for value, by in zip(rhs, length, strict=True)])
-    found = unrolled.rows_of(barrier(jnp.stack(solved)))
-    found = [value / by for value, by in zip(found, length, strict=True)]
-    one = jnp.ones_like(count)
-    scale = [one, one]
-    if free:
-        # A negative scale means a rotation far off; its magnitude still is the best guess.
-        tiny = jnp.finfo(count.dtype).tiny
-        scale = [jnp.maximum(jnp.abs(value), tiny) for value in found[6:]]
-    depth = scale[1] * (z - sums.face) + sums.face
-    shift = [
-        t - scale[0] * x * a - depth * b for t, a, b in zip(found[:3], lateral, axial, strict=True)
-    ]
-    nominal = {"scale": scale, "sound-speed": [one], "delay": [zero]}
-    extras = [value for name, values in nominal.items() if name in blocks for value in values]
-    return Iterate(
-        jnp.stack([jnp.stack(row) for row in rotation]),
-        jnp.stack(shift),
-        jnp.stack([c + d for c, d in zip(centre, found[3:6], strict=True)]),
-        jnp.stack(extras) if extras else jnp.zeros((0, *count.shape), count.dtype),
-        blocks,
-    )
-
-
-def closed_form(images: Images, blocks: Blocks) -> tuple[Iterate, Bool[Array, " lanes"], ImageSums]:
+def closed_form(images: Images, blocks: Blocks) -> tuple[Iterate, Bool[Array, " lanes"], Reduced]:
     """The start, whether it is sound, and the sums that it is made of."""
-    sums = ImageSums.of(images)
-    size = 12
-    full: Matrix = [[0] * size for _ in range(size)]
-    products = [[sums.xx, sums.xz], [sums.xz, sums.zz]]
-    for a in range(2):
-        for b in range(2):
-            for i in range(3):
-                full[3 * a + i][3 * b + i] = products[a][b]
-    for i in range(3):
-        full[6 + i][6 + i] = full[9 + i][9 + i] = sums.count
-        for j in range(3):
-            for k, matrix in enumerate((sums.lateral, sums.axial, sums.rotation)):
-                full[9 + j][3 * k + i] = full[3 * k + i][9 + j] = -matrix[j][i]
-    length = [jnp.sqrt(jnp.where(full[k][k] > 0, full[k][k], 1.0)) for k in range(size)]
-    inverse = [1 / value for value in length]
-    unit = [
-        [unrolled.times(full[i][j], inverse[i] * inverse[j]) for j in range(size)]
-        for i in range(size)
-    ]
-    rhs = [*sums.pulled[0], *sums.pulled[1], *sums.pulled[2], *[jnp.zeros_like(sums.count)] * 3]
-    rhs = [a * b for a, b in zip(rhs, inverse, strict=True)]
-    factor, pivots = unrolled.cholesky(unit)
-    least = 1 / jnp.max(jnp.stack(pivots), axis=0) ** 2
-    solved = unrolled.backward(factor, pivots, unrolled.forward(factor, pivots, rhs))
-    flat = [a * b for a, b in zip(solved[:6], inverse[:6], strict=True)]
-    columns = barrier(jnp.stack([*flat, least]))
-    a, b, least = columns[:3], columns[3:6], columns[6]
+    sums = Reduced.of(images)
+    inverse, _ = dense.inverse_lanes_last(sums.matrix)
+    columns = barrier(dense.product_lanes_last(inverse, sums.rhs))
+    left = jnp.stack([sums.squares[k // 3] * inverse[k, k] for k in range(6)])
+    least = jnp.minimum(sums.least, 1 / jnp.max(left, axis=0))
+    a, b = columns[:3], columns[3:]
     long, deep = jnp.sqrt(jnp.sum(a * a, axis=0)), jnp.sqrt(jnp.sum(b * b, axis=0))
     cosine = jnp.abs(jnp.sum(a * b, axis=0)) / (long * deep)
     # Comparisons with NaN are false: whatever went wrong is not sound.
@@ -236,9 +250,7 @@ def closed_form(images: Images, blocks: Blocks) -> tuple[Iterate, Bool[Array, " 
     plus = plus / jnp.sqrt(jnp.sum(plus**2, axis=0))
     minus = minus / jnp.sqrt(jnp.sum(minus**2, axis=0))
     lateral, axial = (plus + minus) / jnp.sqrt(2.0), (plus - minus) / jnp.sqrt(2.0)
-    middle = jnp.cross(axial, lateral, axis=0)
-    rotation = [[lateral[i], middle[i], axial[i]] for i in range(3)]
-    return from_rotation(rotation, sums, blocks), sound, sums
+    return sums.with_rotation(lateral, axial, blocks), sound, sums
 
 
 def conventional(
@@ -270,10 +282,8 @@ def conventional(
     def one_round(state: tuple) -> tuple:
         index, best = state
         cube = cubes[jnp.maximum(index - 1, 0)]
-        rotation = [
-            [jnp.broadcast_to(cube[i, j], (images.lanes,)) for j in range(3)] for i in range(3)
-        ]
-        first = choose(index == 0, start, from_rotation(rotation, sums, blocks))
+        cube = jnp.broadcast_to(cube[..., None], (3, 3, images.lanes))
+        first = choose(index == 0, start, sums.with_rotation(cube[:, 0], cube[:, 2], blocks))
         fit = fit_from(barrier(first), observation, images)
         lower = (fit.cost < best.cost) | ~jnp.isfinite(best.cost)
         better = (index == 0) | (lower & ~sound)
