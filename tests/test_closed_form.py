@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from jaxcal.io.text import read_crosswire
 from jaxcal.report.certified import certificate_record, certificate_words
-from jaxcal.solvers.closed_form.reduced_objective import image_data, reduce
+from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS, image_data, reduce
 from jaxcal.solvers.closed_form.rotation_relaxation import lower_bound
 from jaxcal.solvers.closed_form.single import solve
 
@@ -263,6 +263,23 @@ def test_degenerate_sets_are_not_called_unique(kind, estimate):
     best = best_of_scipy(images, estimate, starts=3)
     assert answer.objective_mm2 <= best * (1 + 1e-9) + 1e-6
     assert answer.objective_mm2 - answer.gap_mm2 <= best * (1 + 1e-9) + 1e-6
+
+
+def test_what_fits_as_well_to_rounding_is_not_called_unique(monkeypatch):
+    """The one problem of the study's 100,000 that was: exact points on a line, unknown scales.
+
+    M was positive definite, just: what fits within the gap of 6e-8 mm^2 lies in a ball of radius 2.
+    """
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "experiments")
+    import closed_form_study as study
+
+    rng = np.random.default_rng([study.SEED, 2])
+    for _ in range(1120):
+        drawn = study.draw(rng)
+    assert (drawn.family, drawn.estimate, drawn.noise) == ("collinear", ("scale",), 0.0)
+    _, certificate = solve(reduce(drawn.data, CONSTRAINTS[drawn.estimate]))
+    assert certificate.certified
+    assert not certificate.unique
 
 
 @pytest.mark.parametrize("estimate", ESTIMATES)

@@ -31,7 +31,6 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxcal.data.geometry import AnyArray
 from jaxcal.model import unrolled
-from jaxcal.model.unrolled import Vector
 from jaxcal.solvers.levenberg_marquardt import (
     Descent,
     Rounding,
@@ -58,17 +57,16 @@ class Flat(eqx.Module):
     rest: Float[Array, "n 1"] | None = None
     limit: Float[Array, "n 1"] | None = None
 
-    def moved(self, step: Vector) -> Flat:
+    def moved(self, step: Float[Array, "p 1"]) -> Flat:
         """After a step of the shared unknowns."""
-        by = jnp.stack(step)
         local = self.local
         if local is not None:
             assert self.slope is not None
             assert self.rest is not None
             assert self.limit is not None
-            along = local - self.rest - jnp.sum(self.slope * by, axis=1)
+            along = local - self.rest - jnp.sum(self.slope * step, axis=1)
             local = jnp.clip(along, -self.limit, self.limit)
-        return Flat(self.shared + by, local, self.slope, self.rest, self.limit)
+        return Flat(self.shared + step, local, self.slope, self.rest, self.limit)
 
 
 class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):

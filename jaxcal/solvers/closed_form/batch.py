@@ -34,7 +34,7 @@ from jaxcal.data.problem import Problem, is_traced
 from jaxcal.model import unrolled
 from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.runtime.precision import in_standard_promotion, own_modes, require_float64, with_dtype
-from jaxcal.solvers.closed_form.certificate import SINGULAR, TOLERANCE
+from jaxcal.solvers.closed_form.certificate import NEARBY, SINGULAR, TOLERANCE
 from jaxcal.solvers.closed_form.reduced_objective import (
     CONSTRAINTS,
     FEWEST_IMAGES,
@@ -174,7 +174,7 @@ def solve_lanes(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     matrix, vector, origin = _eliminate(full, rhs)
     x, values = _optimum(estimate, matrix, vector)
     x = _feasible(x, constraints)
-    gap, definite = _gap(constraints, matrix, vector, x, values)
+    gap, least, definite = _gap(constraints, matrix, vector, x, values)
 
     of_mean = jnp.stack(origin(list(x)))
     lengths = jnp.sqrt(jnp.sum(x.reshape(2, 3, -1) ** 2, axis=1))
@@ -200,6 +200,9 @@ def solve_lanes(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     rounding = ROUNDING * jnp.finfo(x.dtype).eps
     certified = definite & (count >= FEWEST_IMAGES)
     certified = certified & (gap <= TOLERANCE * objective + rounding * size)
+    # What fits as well lies in a ball about the dual's minimiser, see the certificate.
+    ball = 4 * (gap + rounding * size)
+    alone = ball <= NEARBY**2 * least * jnp.sum(x * x, axis=0)
     return ClosedForm(
         image_to_probe=transform,
         point_mm=jnp.stack(target, axis=1),
@@ -210,7 +213,7 @@ def solve_lanes(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
         certified=certified,
         gap_mm2=jnp.where(definite, gap, jnp.inf),
         # M is positive definite, and so are the normal equations of t and c.
-        unique=certified,
+        unique=certified & alone,
     )
 
 
@@ -393,12 +396,12 @@ def _feasible(x: Float[Array, "6 lanes"], constraints: Constraints) -> Float[Arr
 
 def _gap(
     constraints: Constraints, matrix: Array, vector: Array, x: Array, values: Array
-) -> tuple[Float[Array, " lanes"], Bool[Array, " lanes"]]:
-    """f(x) less the bound that the multipliers prove, and whether M is positive definite."""
+) -> tuple[Float[Array, " lanes"], Float[Array, " lanes"], Bool[Array, " lanes"]]:
+    """f(x) less the bound that the multipliers prove, M's least pivot, whether it is definite."""
     rows = _with_multipliers(constraints, matrix, values)
     factor, pivots = unrolled.cholesky(rows)
     rest = [a - b for a, b in zip(unrolled.apply(rows, list(x)), vector, strict=True)]
     half = unrolled.forward(factor, pivots, rest)
     largest = sum(matrix[i, i] for i in range(6))
     least = 1 / jnp.max(jnp.stack(pivots), axis=0) ** 2
-    return unrolled.dot(half, half), least > SINGULAR * largest
+    return unrolled.dot(half, half), least, least > SINGULAR * largest

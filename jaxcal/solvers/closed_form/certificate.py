@@ -42,6 +42,9 @@ SHIFTS = (0.0, 1e-15, 1e-14, 1e-12, 1e-9, 1e-6, 1e-4, 1e-2)
 ORTHONORMAL = 1e-6
 """A transform whose rotation stretches by more is refused; less is rounding, and is removed."""
 
+NEARBY = 0.01
+"""Answers that differ by less than this share of x are the same one."""
+
 SINGULAR = 1e-11
 """M is called singular where its least eigenvalue is below this share of C'C's largest."""
 
@@ -156,7 +159,7 @@ def certify_point(
         of_multipliers = min(of_multipliers, gap_of_multipliers(reduced, x, each))
         if of_multipliers + excess <= enough:
             break
-    unique = of_multipliers + excess <= enough and _definite(reduced, candidates[0])
+    unique = of_multipliers + excess <= enough and _alone(reduced, x, candidates[0], excess)
     gap = min(gap, of_multipliers)
     if gap + excess > enough:
         gap = min(gap, unconstrained_gap(reduced, x))
@@ -168,11 +171,25 @@ def certify_point(
     )
 
 
-def _definite(reduced: ReducedObjective, values: Float[np.ndarray, " k"]) -> bool:
+def _alone(
+    reduced: ReducedObjective,
+    x: Float[np.ndarray, 6],
+    values: Float[np.ndarray, " k"],
+    excess: float,
+) -> bool:
+    """Whether all that fits as well as x lies close to it.
+
+    With M positive definite, f(y) is above the bound by at least |y - x*|^2 times M's least
+    eigenvalue, x* the dual's minimiser, for every y that satisfies the constraints: what fits as
+    well as x lies, as x does, in a ball about x*.
+    """
     added = np.tensordot(values, reduced.constraints.matrices, 1)
     squared = reduced.factor.T @ reduced.factor
     least = np.linalg.eigvalsh(squared + added)[0]
-    return bool(least > SINGULAR * np.linalg.norm(squared, 2))
+    if not least > SINGULAR * np.linalg.norm(squared, 2):
+        return False
+    above = duality_gap(reduced, x, values) + excess + reduced.resolution
+    return bool(4 * above <= (NEARBY * np.linalg.norm(x)) ** 2 * least)
 
 
 def certify(
