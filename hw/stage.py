@@ -22,7 +22,7 @@ from hw.shapes import Float
 from hw.ultrasound.receiver import Image
 
 _MOST_HESITATIONS = 10
-_IMAGE_AGE_S = 0.2
+IMAGE_AGE_S = 0.2
 """An image is at most so old when it arrives: a frame's time, the machine's and the network's
 (assumption; the emulated machine takes 0.05 s)."""
 _NEAR_MM = 12.0
@@ -123,7 +123,7 @@ class ProbeStage:
         Raises:
             DeviceError: no images come.
         """
-        return self._session.image_after(self._arrived + _IMAGE_AGE_S)
+        return self._session.image_after(self._arrived + IMAGE_AGE_S)
 
     def image_bench(self, row: int, *, credible: bool = False) -> ImageBench:
         """What the procedures see of a phantom that only shows in the image.

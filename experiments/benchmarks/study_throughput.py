@@ -78,10 +78,14 @@ def pool() -> list[ProcessPoolExecutor]:
     ]
 
 
+WHERE = (("module", "jaxcal.study.spec"), ("name", "Spec"))
+"""Of the class that the study's text is of (jaxcal.study.own)."""
+
+
 def study_share(canonical: str, chunks: list[int]) -> tuple[int, float]:
     """A worker's share of the study; returns how many trials it was, and their CPU seconds."""
     begun = time.process_time()
-    trials = sum(compute_from_text(canonical, index)[0]["rp"].shape[1] for index in chunks)
+    trials = sum(compute_from_text(canonical, WHERE, index)[0]["rp"].shape[1] for index in chunks)
     return trials, time.process_time() - begun
 
 

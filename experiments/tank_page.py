@@ -1,0 +1,195 @@
+"""The tables of docs/results/paper-experiment.md, from the tables in results/."""
+
+from __future__ import annotations
+
+import csv
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from tank_run import Run
+
+from jaxcal.io.atomic import write_text
+
+PAGE = Path(__file__).parents[1] / "docs" / "results" / "paper-experiment.md"
+RESULTS = Path(__file__).parent / "results"
+FIGURES = ("", "_sensitivity", "_planning", "_bounds")
+_BLOCK = "<!-- table: {} -->\n{}\n<!-- end -->"
+_PATTERN = re.compile(r"<!-- table: ([\w-]+) -->\n.*?<!-- end -->", re.DOTALL)
+
+
+def picture(name: str) -> Path:
+    """Where the site has a figure of results/."""
+    ending = name.replace("_", "-")
+    return PAGE.parents[1] / "images" / f"paper-experiment{ending}.png"
+
+
+def rows(name: str) -> list[dict[str, str]]:
+    """A table of results/."""
+    with (RESULTS / f"paper_experiment{name}.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def markdown(header: list[str], lines: list[list[str]]) -> str:
+    """A table for the page."""
+    found = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    return "\n".join(found + ["| " + " | ".join(line) + " |" for line in lines])
+
+
+def number(row: dict[str, str], name: str, form: str = ".2f") -> str:
+    """A number of a row; empty stays empty."""
+    return format(float(row[name]), form) if row[name] else ""
+
+
+def cells() -> str:
+    """Table 4, ours beside the paper's."""
+    chosen = [row for row in rows("") if row["paper_rp_mm"]]
+    return markdown(
+        ["experiment", "calibrate/test", "paper", "ours", "best of 3", "X alone", "test's own"],
+        [
+            [
+                row["experiment"],
+                row["calibrate_test"],
+                number(row, "paper_rp_mm"),
+                f"{number(row, 'rp_mm')} ± {number(row, 'ci95_half_mm')}",
+                f"{number(row, 'best_of_3_mm')} ± {number(row, 'best_ci95_half_mm')}",
+                f"{number(row, 'exact_mm', '.3f')} ± {number(row, 'exact_ci95_half_mm', '.3f')}",
+                number(row, "test_scatter_mm"),
+            ]
+            for row in chosen
+        ],
+    )
+
+
+def joint() -> str:
+    """The columns that the paper does not have: joint estimation, experiment 4."""
+    chosen = [
+        row
+        for row in rows("")
+        if row["experiment"] == "Exp. 4" and row["calibrate_test"].endswith("/Opt")
+    ]
+    return markdown(
+        ["calibrate/test", "method", "RP", "X alone"],
+        [
+            [
+                row["calibrate_test"],
+                row["method"],
+                f"{number(row, 'rp_mm')} ± {number(row, 'ci95_half_mm')}",
+                f"{number(row, 'exact_mm', '.3f')} ± {number(row, 'exact_ci95_half_mm', '.3f')}",
+            ]
+            for row in chosen
+        ],
+    )
+
+
+def statements() -> str:
+    """Every statement with its evidence."""
+    return markdown(
+        ["section", "statement", "verdict", "evidence"],
+        [
+            [row["section"], row["statement"], row["verdict"], row["evidence"]]
+            for row in rows("_statements")
+        ],
+    )
+
+
+def sensitivity() -> str:
+    """Errors of X against each number."""
+    return markdown(
+        [
+            "",
+            "value",
+            "AE",
+            "CW",
+            "Auto-AE",
+            "Auto-AE, joint",
+            "AE over CW, %",
+            "joint over without, %",
+        ],
+        [
+            [
+                row["axis"],
+                f"{float(row['value']):g}",
+                *(
+                    f"{number(row, f'{name}_exact_mm', '.3f')} ± "
+                    f"{number(row, f'{name}_ci95_half_mm', '.3f')}"
+                    for name in ("ae", "cw", "auto_ae")
+                ),
+                number(row, "auto_ae_joint_exact_mm", ".3f"),
+                f"{number(row, 'ae_over_cw_exact_percent', '+.0f')} ± "
+                f"{number(row, 'ae_over_cw_exact_half', '.0f')}",
+                f"{number(row, 'joint_over_without_exact_percent', '+.0f')} ± "
+                f"{number(row, 'joint_over_without_exact_half', '.0f')}",
+            ]
+            for row in rows("_sensitivity")
+        ],
+    )
+
+
+def times() -> str:
+    """Minutes to a wanted precision, robot without pose error."""
+    chosen = [row for row in rows("_planning_times") if float(row["accuracy_mm"]) == 0]
+    wanted = list(dict.fromkeys(row["wanted_rp_mm"] for row in chosen))
+    pairs = list(dict.fromkeys((row["placement"], row["method"]) for row in chosen))
+    by_key = {(r["placement"], r["method"], r["wanted_rp_mm"]): r for r in chosen}
+    return markdown(
+        ["placement", "method", *(f"{value} mm" for value in wanted)],
+        [
+            [*pair, *(number(by_key[*pair, value], "minutes", ".1f") or "-" for value in wanted)]
+            for pair in pairs
+        ],
+    )
+
+
+def bounds() -> str:
+    """Mean RP of every arm, 60 images."""
+    chosen = [row for row in rows("_bounds") if row["images"] == "60"]
+    scenarios = list(dict.fromkeys(row["scenario"] for row in chosen))
+    arms = list(dict.fromkeys(row["arm"] for row in chosen))
+    by_key = {(row["scenario"], row["arm"]): row for row in chosen}
+    return markdown(
+        ["", *scenarios],
+        [[arm, *(number(by_key[name, arm], "rp_mm", ".3f") for name in scenarios)] for arm in arms],
+    )
+
+
+def validation() -> str:
+    """The fast model against the bench."""
+    return markdown(
+        ["quantity", "experiment", "fast model, mm", "bench, mm"],
+        [
+            [
+                row["quantity"],
+                row["experiment"],
+                number(row, "fast_model", ".3f") or "-",
+                number(row, "bench", ".3f"),
+            ]
+            for row in rows("_validation")
+        ],
+    )
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "cells": cells,
+    "joint": joint,
+    "statements": statements,
+    "sensitivity": sensitivity,
+    "times": times,
+    "bounds": bounds,
+    "validation": validation,
+}
+
+
+def renewed(text: str) -> str:
+    """The page with the tables as results/ has them."""
+    return _PATTERN.sub(lambda m: _BLOCK.format(m[1], TABLES[m[1]]()), text)
+
+
+def page(run: Run) -> None:
+    """Write the page's tables; the quick run's are not for it."""
+    if not run.quick:
+        write_text(PAGE, renewed(PAGE.read_text(encoding="utf-8")))
+        for name in FIGURES:
+            shutil.copyfile(RESULTS / f"paper_experiment{name}.png", picture(name))
+        print(PAGE)
