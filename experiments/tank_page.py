@@ -45,7 +45,8 @@ def number(row: dict[str, str], name: str, form: str = ".2f") -> str:
 def cells() -> str:
     """Table 4, ours beside the paper's."""
     chosen = [row for row in rows("") if row["paper_rp_mm"]]
-    return markdown(
+    inside = sum(row["paper_in_95_range"] == "True" for row in chosen)
+    table = markdown(
         ["experiment", "calibrate/test", "paper", "ours", "best of 3", "X alone", "test's own"],
         [
             [
@@ -59,6 +60,10 @@ def cells() -> str:
             ]
             for row in chosen
         ],
+    )
+    return (
+        f"{table}\n\nThe paper's figure lies within the range of 95 % of our experiments in "
+        f"{inside} of {len(chosen)} cells."
     )
 
 
