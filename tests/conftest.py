@@ -15,7 +15,12 @@ from pathlib import Path
 # Nearly all of the tests' time is compilation: building each fusion with MLIR is most of that (with
 # jax 0.10), optimising it with LLVM comes next. What XLA does to a program as a whole stays as it
 # is for users.
-QUICK = ("--xla_backend_optimization_level=0", "--xla_cpu_use_fusion_emitters=false")
+QUICK = (
+    "--xla_backend_optimization_level=0",
+    "--xla_cpu_use_fusion_emitters=false",
+    # Both cores are busy anyway; programs cut in parts for several threads take longer altogether.
+    "--xla_cpu_parallel_codegen_split_count=1",
+)
 
 
 def _known_flags() -> str:
@@ -43,13 +48,21 @@ os.environ["XLA_FLAGS"] = (
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# One cache of compiled programs for all workers and for every process that a test starts: each
-# program is compiled once. It is new for each run, so that a run never depends on the last one.
+# One cache of compiled programs for all workers and for every process that a test starts, ours and
+# JAX's own: each program is compiled once. It is new for each run, so that a run never depends on
+# the last one.
 if "JAXCAL_TEST_CACHE" not in os.environ:
     os.environ["JAXCAL_TEST_CACHE"] = tempfile.mkdtemp(prefix="jaxcal-tests-")
     atexit.register(shutil.rmtree, os.environ["JAXCAL_TEST_CACHE"], ignore_errors=True)
 os.environ["XDG_CACHE_HOME"] = os.environ["JAXCAL_TEST_CACHE"]
+os.environ["JAX_COMPILATION_CACHE_DIR"] = os.path.join(os.environ["JAXCAL_TEST_CACHE"], "jax")
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 os.environ.pop("JAXCAL_NO_CACHE", None)
+
+# The bytecode of sources is kept: every process that a test starts would compile them anew.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import gc
 

@@ -22,9 +22,13 @@ METHODS = {
     "alternating": {"method": "alternating", "max_elevation": 2.0},
     "auto": {},
 }
-PROBLEMS = [
-    simulated(seed, images=12, elevation_mm=2.0, noise_mm=0.5, test_images=4) for seed in (1, 2)
-]
+
+
+@pytest.fixture(scope="module")
+def problems() -> list[jaxcal.Problem]:
+    return [
+        simulated(seed, images=12, elevation_mm=2.0, noise_mm=0.5, test_images=4) for seed in (1, 2)
+    ]
 
 
 def test_buckets_grow_by_a_half_or_a_third():
@@ -34,9 +38,9 @@ def test_buckets_grow_by_a_half_or_a_third():
     assert all(buckets.size(n) <= 1.5 * n for n in range(8, 2000))
 
 
-def test_every_axis_of_images_is_known():
+def test_every_axis_of_images_is_known(problems):
     """What holds a number for each image is padded and cut; nothing else is."""
-    result = jaxcal.calibrate(PROBLEMS[0], "conventional").numpy()
+    result = jaxcal.calibrate(problems[0], "conventional").numpy()
     cut = buckets.cut(result, 9)
     before, after = dict(shapes(result)), dict(shapes(cut))
     changed = {name for name in before if before[name] != after[name]}
@@ -105,11 +109,11 @@ def same(one: jaxcal.Calibration, other: jaxcal.Calibration, images: int) -> Non
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_masked_images_beyond_the_bucket_change_nothing(name):
+def test_masked_images_beyond_the_bucket_change_nothing(name, problems):
     """From 5 to 12 images, some of them masked, in the buckets of 12 and of 16."""
     smaller = simulated(3, images=8, elevation_mm=2.0, noise_mm=0.5, test_images=4)
     sources = [
-        *PROBLEMS,
+        *problems,
         jax.tree.map(jnp.asarray, buckets.taken(smaller, [*range(8), 0])),
     ]  # nine: one comes twice
 
@@ -133,8 +137,8 @@ def test_masked_images_beyond_the_bucket_change_nothing(name):
     holds()
 
 
-def test_the_answer_is_that_of_the_unpadded_problem():
-    nine = select(PROBLEMS[0], slice(0, 9))
+def test_the_answer_is_that_of_the_unpadded_problem(problems):
+    nine = select(problems[0], slice(0, 9))
     plan, given = prepare(nine, Request(method="conventional"))
     solved = jax.jit(programs.solve_one, static_argnums=4)(nine, given, None, None, plan)
     exact = solved.with_problem(nine)
@@ -143,10 +147,10 @@ def test_the_answer_is_that_of_the_unpadded_problem():
     same(exact, found, 9)
 
 
-def test_every_number_of_images_in_a_bucket_is_one_program(tmp_path, monkeypatch):
+def test_every_number_of_images_in_a_bucket_is_one_program(tmp_path, monkeypatch, problems):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     executables.forget()
     for count in (9, 10, 11, 12):
-        jaxcal.calibrate(select(PROBLEMS[0], slice(0, count)), "alternating")
+        jaxcal.calibrate(select(problems[0], slice(0, count)), "alternating")
     (entry,) = program_cache.entries()
     assert entry.header["label"]["images"] == 12

@@ -14,13 +14,13 @@ fit, which is what an image would show.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex64, Float, Key
+from jaxtyping import Array, Complex64, Float, Int, Key
 
 from jaxcal import InputError
 from jaxcal.data.geometry import matrix_from_rotation
@@ -30,7 +30,8 @@ from jaxcal.data.recording import MINIMUM_IMAGES, Recording, Truth, make_images
 from jaxcal.data.segmentation.deviations import fit_deviations, halves
 from jaxcal.data.segmentation.time_of_flight import fit_in_plane
 from jaxcal.model import unrolled
-from jaxcal.runtime.compiler import computed_once, quick_to_compile
+from jaxcal.runtime import executables
+from jaxcal.runtime.compiler import ONE_PROBLEM, computed_once
 from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.study import draws
 from jaxcal.study.offsets import OffsetLaw, check_law, standard_offsets
@@ -399,6 +400,37 @@ def times_of_flight(
     return np.round(times * clock_hz) / clock_hz
 
 
+NUMBERS = (
+    "elevation_mm", "noise_mm", "lateral_mm", "depth_mm", "rotation_rad", "test_fraction", "sector",
+    "tracker_mm", "tracker_rad",
+)  # fmt: skip
+"""Fields of a protocol that a program takes as numbers: one serves all their values."""
+
+
+def _drawn(seed: int, protocol: Protocol) -> Experiment:
+    """One experiment by a program that is kept, where programs are."""
+    names = NUMBERS if _tracked(protocol) else NUMBERS[:-2]
+    sizes = tuple(np.asarray(getattr(protocol, name), np.float64) for name in names)
+    shape = replace(protocol, **{name: getattr(_SHAPE, name) for name in NUMBERS})
+    arguments = (np.asarray(seed, np.int64), sizes)
+    if jax.default_backend() != "cpu":
+        return jax.jit(_from_numbers, static_argnums=2)(*arguments, shape)
+    label = {"method": "simulation", "images": protocol.images}
+    return executables.run(_from_numbers, arguments, shape, flags=ONE_PROBLEM, label=label)
+
+
+_SHAPE = Protocol()
+
+
+def _from_numbers(
+    seed: Int[Array, ""], sizes: tuple[Float[Array, "*_"], ...], shape: Protocol
+) -> Experiment:
+    """Draw an experiment of a protocol whose numbers are traced."""
+    numbers = dict(zip(NUMBERS, sizes, strict=False))  # a perfect tracker has none
+    shallow, deep = numbers.pop("depth_mm")
+    return simulate(jax.random.key(seed), replace(shape, depth_mm=(shallow, deep), **numbers))
+
+
 @in_own_modes
 def simulate_recording(
     protocol: Protocol, seed: int = 0, *, clock_hz: float | None = None
@@ -414,9 +446,7 @@ def simulate_recording(
     curved = isinstance(protocol.probe, CurvilinearProbe)
     if clock_hz is not None and not (protocol.raw or curved):
         raise InputError("a clock rounds times of flight: it needs a raw simulation")
-    flags = quick_to_compile(jax.default_backend())
-    program = jax.jit(simulate, static_argnums=1, compiler_options=flags)
-    experiment = program(jax.random.key(seed), protocol)
+    experiment = _drawn(seed, protocol)
     array = {name: np.asarray(value) for name, value in vars(experiment).items()}
     if experiment.distances is None:
         calibration = make_images(
