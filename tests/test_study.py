@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 
 import jaxcal
 from jaxcal import FormatError, InputError
@@ -22,7 +21,16 @@ from jaxcal.cli.main import main
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.study import load_spec, open_results, run_study
 from jaxcal.study.offsets import OFFSET_LAWS, nominal_bound, standard_deviation, standard_offsets
-from jaxcal.study.pipeline import Block, _options, bound_mm, compute_chunk, protocol, trial_keys
+from jaxcal.study.pipeline import (
+    Block,
+    _options,
+    bound_mm,
+    compute_chunk,
+    numbers_of,
+    protocol,
+    shape_of,
+    trial_keys,
+)
 from jaxcal.study.show import as_csv, as_record, mean_interval, summarise
 from jaxcal.study.simulation import simulate
 from jaxcal.study.spec import AXES, parse_spec, spec_from_canonical
@@ -58,35 +66,16 @@ def small(trials: int = 10, chunk: int = 4) -> str:
 
 
 @pytest.fixture(scope="module")
-def programs(tmp_path_factory):
-    """Compiled programs of this module and of its processes, compiled once."""
-    folder = tmp_path_factory.mktemp("programs")
-    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
-    before = [getattr(jax.config, name) for name in names]
-    for name, value in zip(names, (str(folder), 0.2), strict=True):
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
-    yield folder
-    for name, value in zip(names, before, strict=True):
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
-
-
-@pytest.fixture(scope="module")
-def finished(programs, tmp_path_factory):
+def finished(tmp_path_factory):
     """A study that nobody disturbed."""
     folder = tmp_path_factory.mktemp("study") / "finished"
     run_study(parse_spec(small()), folder)
     return folder
 
 
-def process(arguments, programs, before=()):
-    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(programs),
-                   "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}  # fmt: skip
+def process(arguments, before=()):
     command = [*before, sys.executable, "-m", "jaxcal.cli.main", "study", *map(str, arguments)]
-    return subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )  # fmt: skip
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -270,14 +259,14 @@ def test_results_are_labelled(finished):
     assert len(np.unique(data.realised)) == data.realised.size
 
 
-def test_results_do_not_depend_on_the_chunks(finished, programs, tmp_path):
+def test_results_do_not_depend_on_the_chunks(finished, tmp_path):
     run_study(parse_spec(small(chunk=7)), tmp_path / "other")
     one, two = open_results(finished), open_results(tmp_path / "other")
     for name in one.data_vars:
         np.testing.assert_array_equal(one[name], two[name], err_msg=str(name))
 
 
-def test_missing_and_damaged_chunks_are_computed_again(finished, programs, tmp_path, capsys):
+def test_missing_and_damaged_chunks_are_computed_again(finished, tmp_path, capsys):
     folder, path = tmp_path / "copy", tmp_path / "spec.toml"
     path.write_text(small())
     run_study(parse_spec(small()), folder)
@@ -392,12 +381,12 @@ def test_unwritable_folder(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_full_disk(finished, programs, tmp_path):
+def test_full_disk(finished, tmp_path):
     """No file may grow beyond 4 KiB, a real refusal by the system: nothing half is left."""
     path, folder = tmp_path / "spec.toml", tmp_path / "out"
     path.write_text(small())
     run = ["run", path, "--out", folder]
-    child = process(run, programs, before=("bash", "-c", 'ulimit -f 4; exec "$@"', "bash"))
+    child = process(run, before=("bash", "-c", 'ulimit -f 4; exec "$@"', "bash"))
     out, err = child.communicate(timeout=120)
     assert child.returncode == 2, err
     last = err.strip().splitlines()[-1]
@@ -409,8 +398,8 @@ def test_full_disk(finished, programs, tmp_path):
     assert files(folder) == files(finished)
 
 
-def start_and_wait(run, programs, folder, count):
-    child = process(run, programs)
+def start_and_wait(run, folder, count):
+    child = process(run)
     deadline = time.monotonic() + 120
     while len(Store(folder, parse_spec(LONG)).present()) < count:
         if time.monotonic() > deadline or child.poll() is not None:
@@ -430,7 +419,7 @@ def long_study(finished, tmp_path_factory):
     return folder
 
 
-def kill_and_resume(kills, long_study, programs, tmp_path, seed):
+def kill_and_resume(kills, long_study, tmp_path, seed):
     random = np.random.default_rng(seed)
     path, folder = tmp_path / "spec.toml", tmp_path / "killed"
     path.write_text(LONG)
@@ -438,32 +427,32 @@ def kill_and_resume(kills, long_study, programs, tmp_path, seed):
     total = parse_spec(LONG).chunk_count
     counts = np.sort(random.choice(np.arange(total - 10), kills, replace=False))
     for count in counts:
-        child = start_and_wait(run, programs, folder, count)
+        child = start_and_wait(run, folder, count)
         time.sleep(random.uniform(0, 0.02))
         child.kill()
         child.communicate()
         assert child.returncode == -signal.SIGKILL
     assert len(Store(folder, parse_spec(LONG)).present()) < total
-    child = process(run, programs)
+    child = process(run)
     _, err = child.communicate(timeout=300)
     assert child.returncode == 0, err
     assert open_results(folder).identical(open_results(long_study))
     assert files(folder) == files(long_study)
 
 
-def test_killed_and_resumed(long_study, programs, tmp_path):
-    kill_and_resume(2, long_study, programs, tmp_path, 1)
+def test_killed_and_resumed(long_study, tmp_path):
+    kill_and_resume(2, long_study, tmp_path, 1)
 
 
 @pytest.mark.slow
-def test_killed_ten_times_and_resumed(long_study, programs, tmp_path):
-    kill_and_resume(10, long_study, programs, tmp_path, 2)
+def test_killed_ten_times_and_resumed(long_study, tmp_path):
+    kill_and_resume(10, long_study, tmp_path, 2)
 
 
-def test_interrupted(long_study, programs, tmp_path):
+def test_interrupted(long_study, tmp_path):
     path, folder = tmp_path / "spec.toml", tmp_path / "out"
     path.write_text(LONG)
-    child = start_and_wait(["run", path, "--out", folder], programs, folder, 5)
+    child = start_and_wait(["run", path, "--out", folder], folder, 5)
     child.send_signal(signal.SIGINT)
     _, told = child.communicate(timeout=120)
     assert child.returncode == 130
@@ -481,7 +470,7 @@ def test_two_processes_do_not_share_a_folder(finished, tmp_path, capsys):
     assert "is being computed by another process" in capsys.readouterr().err
 
 
-def test_full_file_system(finished, programs, tmp_path):
+def test_full_file_system(finished, tmp_path):
     """The same on a file system of 48 KiB, where the system lets us have one."""
     small_disk, kept, path = tmp_path / "disk", tmp_path / "kept", tmp_path / "spec.toml"
     small_disk.mkdir()
@@ -492,7 +481,7 @@ def test_full_file_system(finished, programs, tmp_path):
         pytest.skip("no file system may be mounted here; test_full_disk (slow) has a limit instead")
     script = f'{mount}; "$@"; code=$?; cp -a {small_disk}/out {kept}; exit $code'
     child = process(
-        ["run", path, "--out", small_disk / "out"], programs,
+        ["run", path, "--out", small_disk / "out"],
         before=("unshare", "-rm", "bash", "-c", script, "bash"),
     )  # fmt: skip
     _, err = child.communicate(timeout=120)
@@ -506,12 +495,10 @@ def test_full_file_system(finished, programs, tmp_path):
 
 
 @pytest.mark.slow
-def test_several_devices_share_a_block(finished, programs, tmp_path):
+def test_several_devices_share_a_block(finished, tmp_path):
     path, folder = tmp_path / "spec.toml", tmp_path / "out"
     path.write_text(small())
-    child = process(
-        ["run", path, "--out", folder], programs, before=("env", "JAX_NUM_CPU_DEVICES=2")
-    )
+    child = process(["run", path, "--out", folder], before=("env", "JAX_NUM_CPU_DEVICES=2"))
     _, err = child.communicate(timeout=300)
     assert child.returncode == 0, err
     assert "2 x cpu" in Store.open(folder).versions(parse_spec(small()).chunk(0))
@@ -522,7 +509,7 @@ def test_several_devices_share_a_block(finished, programs, tmp_path):
 
 
 @pytest.mark.slow
-def test_self_tuned_and_bounded_methods(programs):
+def test_self_tuned_and_bounded_methods():
     """Every method of a spec through the pipeline; bounds are those that were asked for."""
     text = (
         small(trials=64, chunk=64).replace("images = 6", "images = 20")
@@ -559,6 +546,15 @@ def blocks(text, trials):
     """A block of each condition, and a way to what public calls say of a method on its draws."""
     spec = parse_spec(text)
     devices = tuple(jax.local_devices())
+    shape = shape_of(spec.condition(0), spec.probe)
+
+    @jax.jit
+    def draw(indices, numbers):
+        keys = trial_keys(indices, jnp.asarray(spec.seed))
+        drawn = jax.vmap(lambda key: simulate(key, shape.protocol(numbers)))(keys)
+        return drawn, jax.vmap(lambda experiment: experiment.problem())(drawn)
+
+    measure = jax.jit(jax.vmap(reconstruction_precision))
     for k in range(spec.condition_count):
         condition = spec.condition(k)
         indices = (k * spec.trials + np.arange(trials, dtype=np.uint32)).reshape(2, -1)
@@ -566,17 +562,15 @@ def blocks(text, trials):
 
         def whole(method, condition=condition, indices=indices):
             bound = bound_mm(method, condition) if method.bounded else None
-            keys = trial_keys(jnp.asarray(indices.ravel()), jnp.asarray(spec.seed))
-            drawn = jax.vmap(lambda key: simulate(key, protocol(condition, spec.probe)))(keys)
-            problems = jax.vmap(lambda experiment: experiment.problem())(drawn)
+            drawn, problems = draw(jnp.asarray(indices.ravel()), numbers_of(condition))
             found = jaxcal.calibrate_batch(
                 problems, method.method, method.prior, max_elevation=bound, options=_options(method)
             )
             x = np.asarray(found.image_to_probe)
             away = x[:, :3, 3] - np.asarray(drawn.image_to_probe)[:, :3, 3]
-            precision = jax.vmap(reconstruction_precision)(x, drawn.test_poses, drawn.test_points)
+            rp = measure(x, drawn.test_poses, drawn.test_points)
             return {
-                "rp": precision,
+                "rp": rp,
                 "translation_error": np.linalg.norm(away, axis=1),
                 "point_error": np.linalg.norm(found.point - drawn.point, axis=1),
                 "sigma": found.sigma,
@@ -587,7 +581,7 @@ def blocks(text, trials):
         yield spec, block, whole
 
 
-def test_what_a_study_computes_is_what_calibrations_say(programs):
+def test_what_a_study_computes_is_what_calibrations_say():
     """Oracle: calibrate_batch on the same draws, and everything measured from its results.
 
     Parallel poses leave X open: no status says otherwise.
