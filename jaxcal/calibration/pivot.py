@@ -28,7 +28,7 @@ from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
-from jaxcal.runtime import compiler
+from jaxcal.runtime import buckets, compiler, executables
 from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import FEWEST_IMAGES, Model, departures, find_consensus, stands_out
@@ -149,13 +149,31 @@ def calibrate_pivot(
     weight = jnp.ones(array.shape[:-2]) if mask is None else jnp.asarray(mask)
     weight = jnp.broadcast_to(weight.astype(array.dtype), array.shape[:-2])
     alone = compiler.is_whole_program(array, weight)
-    return _program(jax.default_backend() if alone else None)(array, weight, robust)
+    platform = jax.default_backend() if alone else None
+    if platform == "cpu" and array.ndim == 3:
+        found = _solve_kept(np.asarray(array), np.asarray(weight), robust)
+        return jax.device_put(found, next(iter(array.devices())) if array.committed else None)
+    return _program(platform)(array, weight, robust)
 
 
 @cache
 def _program(platform: str | None):
     flags = None if platform is None else compiler.quick_to_compile(platform)
     return jax.jit(_solve_all, static_argnums=2, compiler_options=flags)
+
+
+def _solve_kept(
+    poses: Float[np.ndarray, "n 4 4"], mask: Float[np.ndarray, " n"], robust: bool
+) -> Pivot:
+    """One calibration by a kept program, which serves every number of poses of a bucket."""
+    count = len(mask)
+    padded = buckets.size(count)
+    rows = np.minimum(np.arange(padded), count - 1)  # a masked pose must be one, too
+    weight = np.where(np.arange(padded) < count, mask[rows], 0.0)
+    label = {"method": "pivot", "images": padded, "robust": robust}
+    arguments = (poses[rows], weight)
+    found = executables.run(_solve_all, arguments, robust, flags=compiler.ONE_PROBLEM, label=label)
+    return buckets.cut(found, count)
 
 
 def _solve_all(

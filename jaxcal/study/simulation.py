@@ -401,9 +401,16 @@ def times_of_flight(
 
 
 NUMBERS = (
-    "elevation_mm", "noise_mm", "lateral_mm", "depth_mm", "rotation_rad", "test_fraction", "sector",
-    "tracker_mm", "tracker_rad",
-)  # fmt: skip
+    "elevation_mm",
+    "noise_mm",
+    "lateral_mm",
+    "depth_mm",
+    "rotation_rad",
+    "test_fraction",
+    "sector",
+    "tracker_mm",
+    "tracker_rad",
+)
 """Fields of a protocol that a program takes as numbers: one serves all their values."""
 
 
@@ -411,7 +418,7 @@ def _drawn(seed: int, protocol: Protocol) -> Experiment:
     """One experiment by a program that is kept, where programs are."""
     names = NUMBERS if _tracked(protocol) else NUMBERS[:-2]
     sizes = tuple(np.asarray(getattr(protocol, name), np.float64) for name in names)
-    shape = replace(protocol, **{name: getattr(_SHAPE, name) for name in NUMBERS})
+    shape = replace(protocol, **{name: getattr(Protocol, name) for name in NUMBERS})
     arguments = (np.asarray(seed, np.int64), sizes)
     if jax.default_backend() != "cpu":
         return jax.jit(_from_numbers, static_argnums=2)(*arguments, shape)
@@ -419,12 +426,7 @@ def _drawn(seed: int, protocol: Protocol) -> Experiment:
     return executables.run(_from_numbers, arguments, shape, flags=ONE_PROBLEM, label=label)
 
 
-_SHAPE = Protocol()
-
-
-def _from_numbers(
-    seed: Int[Array, ""], sizes: tuple[Float[Array, "*_"], ...], shape: Protocol
-) -> Experiment:
+def _from_numbers(seed: Int[Array, ""], sizes: tuple[Array, ...], shape: Protocol) -> Experiment:
     """Draw an experiment of a protocol whose numbers are traced."""
     numbers = dict(zip(NUMBERS, sizes, strict=False))  # a perfect tracker has none
     shallow, deep = numbers.pop("depth_mm")
