@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import h5py
 import numpy as np
@@ -22,6 +23,9 @@ from hw.choices import PHANTOMS
 from hw.midplane.amplitude_scan import amplitude_scan, fit_peak
 from hw.midplane.image_scan import ImageBench, image_scan, pixel_of, place_of
 from hw.poses import plan_poses
+from hw.recorder import Recorder
+from hw.recording_check import check_resumable, read_progress, settings_of
+from hw.recording_layout import Header
 from jaxcal import InputError
 from jaxcal.data.segmentation.image import localise
 
@@ -199,6 +203,35 @@ def test_requests_name_what_goes_with_a_phantom():
     with pytest.raises(InputError, match="there are: active-echo"):
         phantom_named("wall")
     assert [phantom_named(name).name for name in PHANTOMS] == list(PHANTOMS)
+
+
+def test_an_interrupted_recording_of_points_is_resumed_with_them(tmp_path):
+    path = tmp_path / "rec.h5"
+    world = make_world(2, phantom="cross-wire")
+    poses, points = world.test_set(6)
+    request = Request(6, "image-scan", 0, bench=2, phantom="cross-wire")
+    settings = json.dumps({"request": asdict(request)})
+    probe = {"kind": "linear", "elements": 128, "pitch_mm": 58.5 / 128, "sound_speed_m_s": 1490.0}
+    with Recorder(path, Header(kind=request.kind, probe=probe, settings=settings)) as recorder:
+        recorder.put("plan", "targets", poses, "mm")
+        for row in range(4):
+            recorder.add_selected(
+                poses[row],
+                points[row],
+                kind=request.kind,
+                max_elevation=0.3,
+                amplitude=30.0,
+                t_host=float(row),
+                target=row,
+                bracket=(0.0, -0.3, 0.3, 0.1),
+            )
+    check_resumable(path)
+    progress = read_progress(path)
+    np.testing.assert_array_equal(progress.measurements, points[:4])
+    assert progress.taken.tolist() == [0, 1, 2, 3]
+    asked = settings_of(path)["request"]
+    assert isinstance(asked, dict)
+    assert Request(**asked) == request
 
 
 @pytest.mark.slow
