@@ -70,6 +70,21 @@ def test_the_test_sets_own_scatter_is_its_errors_added_up(tank):
     assert own["Auto-AE"] == pytest.approx(element, rel=0.06)
 
 
+def test_the_robots_pose_error_is_in_all_three_axes_of_the_scatter(tank):
+    """A search finds the true plane, so that the reported one is off by what the robot errs."""
+    wrong = tank.Tank(accuracy_mm=0.8, speed_m_s=0.0, repeatability_mm=0.0)
+    found = tank.draw(wrong, (9,), range(6))
+    one = found.sets["OH"][0]
+    for trial in range(6):
+        rng = np.random.default_rng([9, trial])
+        rng.uniform(-1, 1, size=(2, 3))  # the mount
+        plan = tank.orientations(wrong.images, wrong.cone_deg, wrong.turn_deg, trial)
+        errors = tank.pose_errors(wrong, plan.rotations, rng)
+        x = found.image_to_probe[trial]
+        rp = float(reconstruction_precision(x, one.poses[trial], one.points[trial]))
+        assert rp == pytest.approx(float(np.linalg.norm(errors.std(axis=0, ddof=1))), rel=0.02)
+
+
 def test_the_wires_part_by_the_width_of_their_marks(tank):
     condition = tank.Tank(quality="Exp. 3")
     wires = np.array([[1.0, -1.0], [2.0, -0.5]])
