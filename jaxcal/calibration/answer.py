@@ -33,7 +33,7 @@ from jaxcal.diagnostics.uncertainty import AT_BOUND, LARGEST_SD, mm_at_target, t
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.parameters import Parameters, block_slice, size
 from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
-from jaxcal.model.unknowns import EXTRA, TABLE, measured
+from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, measured
 from jaxcal.solvers.dense import inverse_lanes_last
 from jaxcal.solvers.methods import nominal_sound_speed
 
@@ -157,6 +157,7 @@ def assemble(
             variance=variance,
             tracker_sd=tracker_sd,
             average_elevation_sd=None if averaged is None else averaged.elevation_sd,
+            further=_further(parameters, blocks),
         ),
         problem=None,
         method=plan.method,
@@ -165,6 +166,12 @@ def assemble(
         blocks=blocks,
         robust=plan.robust,
     )
+
+
+def _further(parameters: Parameters, blocks: Blocks) -> Float[Array, "*batch k"] | None:
+    """The free further unknowns side by side; None where there are none."""
+    free = [parameters.further(name) for name in EXTRA if name in blocks]
+    return jnp.concatenate(free, axis=-1) if free else None
 
 
 class Errors(eqx.Module):

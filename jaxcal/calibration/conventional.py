@@ -101,7 +101,8 @@ def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
 def _with_uncertainty(found: ClosedForm, problem: Problem, plan: Plan) -> Calibration | None:
     """The closed form as a calibration, but for its problem; None where poses are degenerate."""
     blocks, eps = plan.blocks, float(np.finfo(float).eps)
-    seen = ImageErrors.of(_unknowns(found, problem), map_arrays(lambda a: a[None], problem), blocks)
+    unknowns = _unknowns(found, problem)
+    seen = ImageErrors.of(unknowns, map_arrays(lambda a: a[None], problem), blocks)
     plane = np.zeros_like(seen.mask)
     residual, axial = seen.from_circle(plane)
     rows = seen.circle_rows(plane, axial, blocks).reshape(-1, size(blocks))
@@ -124,6 +125,8 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: Plan) -> Calibr
     if weak:
         covariance = np.full_like(covariance, np.nan)
 
+    parts = [unknowns.further[name] for name in EXTRA if name in blocks]
+    further = [part[0] for block in parts for part in block]
     gradient = np.abs(errors @ rows)
     length = np.sqrt(np.diag(information) * objective)
     # Of exact data errors are rounding, and have no direction.
@@ -167,6 +170,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: Plan) -> Calibr
             variance=np.asarray(variance),
             tracker_sd=None,
             average_elevation_sd=None,
+            further=np.array(further) if further else None,
         ),
         problem=None,
         method=plan.method,

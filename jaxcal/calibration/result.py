@@ -96,6 +96,8 @@ class Linearisation:
         variance: of the residuals that ``information`` is of: 1 where they are whitened, else mm^2.
         tracker_sd: SD of the tracked position, mm, or None.
         average_elevation_sd: SDs of the offsets under the average over distributions, mm, or None.
+        further: values of the free further unknowns in the order of ``Calibration.blocks``, factors
+            on nominal ones and mm (:func:`jaxcal.model.unknowns.measured`); None without any.
     """
 
     information: Float[AnyArray, "*batch p p"]
@@ -103,6 +105,7 @@ class Linearisation:
     variance: Float[AnyArray, "*batch"]
     tracker_sd: Float[AnyArray, "*batch"] | None
     average_elevation_sd: Float[AnyArray, "*batch n"] | None
+    further: Float[AnyArray, "*batch k"] | None
 
 
 @array_tree

@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.data.sound import WATER_M_S
 from jaxcal.model import unknowns as model
-from jaxcal.model.unknowns import RIGID, TINY, further_derivatives, size
+from jaxcal.model.unknowns import RIGID, TINY, further_derivatives, size, split_further
 from jaxcal.runtime.array_types import Float
 
 if TYPE_CHECKING:
@@ -49,21 +48,10 @@ class Unknowns:
     further: Mapping[str, Sequence[Float[Array, " k"]]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, answer: Calibration, problem: Problem) -> Unknowns:
+    def of(cls, answer: Calibration) -> Unknowns:
         """Of calibrations with one leading axis."""
-        x = np.asarray(answer.image_to_probe)
-        further = {}
-        nominal = np.full(len(x), WATER_M_S)
-        if problem.sound_speed is not None:
-            nominal = np.asarray(problem.sound_speed)
-        if answer.scale_mm_per_px is not None:
-            factors = np.asarray(answer.scale_mm_per_px) / np.asarray(problem.spacing)
-            further["scale"] = list(factors.T)
-        if answer.sound_speed_m_s is not None:
-            further["sound-speed"] = [np.asarray(answer.sound_speed_m_s) / nominal]
-        if answer.delay_s is not None:
-            before = 0.0 if problem.delay is None else np.asarray(problem.delay)
-            further["delay"] = [(np.asarray(answer.delay_s) - before) * 1e3 * nominal]
+        x, values = np.asarray(answer.image_to_probe), answer.linearisation.further
+        further = {} if values is None else split_further(np.asarray(values), answer.blocks)
         return cls(x[:, :3, :3], x[:, :3, 3], np.asarray(answer.point), further)
 
     def along(self, axes: int) -> dict[str, list[Array]]:

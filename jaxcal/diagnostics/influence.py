@@ -174,7 +174,7 @@ def _influence(
 def _whitened(answer: Calibration, problem: Problem | None) -> _Errors:
     """Of a calibration with one leading axis of length 1."""
     assert problem is not None
-    blocks, unknowns = answer.blocks, Unknowns.of(answer, problem)
+    blocks, unknowns = answer.blocks, Unknowns.of(answer)
     seen = ImageErrors.of(unknowns, problem, blocks)
     used = np.asarray(answer.mask)[0] > 0
     if answer.data == "channels":

@@ -88,7 +88,7 @@ def _in_sds(result: Calibration) -> tuple[Float[np.ndarray, "m 3"], Float[np.nda
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
     problem = answer.problem
     assert problem is not None
-    unknowns = Unknowns.of(answer, problem)
+    unknowns = Unknowns.of(answer)
     seen = ImageErrors.of(unknowns, problem, answer.blocks)
     if answer.prior in TUNED:
         if answer.linearisation.tracker_sd is not None:

@@ -90,7 +90,7 @@ def _piece(answer: Calibration, eps: float) -> dict[str, Array]:
     """Of calibrations with one leading axis."""
     problem = answer.problem
     assert problem is not None
-    unknowns = Unknowns.of(answer, problem)
+    unknowns = Unknowns.of(answer)
     seen = ImageErrors.of(unknowns, problem, answer.blocks)
     shifted = seen
     if answer.linearisation.tracker_sd is not None:

@@ -211,6 +211,17 @@ def block_slice(blocks: Blocks, name: str) -> slice:
     raise KeyError(name)
 
 
+def split_further(values: Any, blocks: Blocks) -> dict[str, list[Any]]:
+    """Arrays (..., k) of all free further unknowns as components of each, by name."""
+    first = size(RIGID)
+    found = {}
+    for name in EXTRA:
+        if name in blocks:
+            at = block_slice(blocks, name)
+            found[name] = [values[..., k - first] for k in range(at.start, at.stop)]
+    return found
+
+
 def tangent_names(blocks: Blocks) -> list[str]:
     """Names, with units, of the tangents of these blocks, in order."""
     return [name for block in blocks for name in TABLE[block].tangents]
