@@ -23,6 +23,7 @@ phantoms, e.g. Melvaer et al. 2012; the projection is Schoenemann's.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from functools import partial
 
 import equinox as eqx
@@ -35,7 +36,8 @@ from jaxcal.calibration.conventional import Start
 from jaxcal.model import unrolled
 from jaxcal.model.batch import Images, Iterate, barrier, choose, total
 from jaxcal.model.observations import InPlane
-from jaxcal.model.parameters import Blocks, Parameters
+from jaxcal.model.parameters import EXTRA, Blocks, Parameters
+from jaxcal.model.unknowns import TABLE
 from jaxcal.solvers import dense
 from jaxcal.solvers.levenberg_marquardt import Descent, minimise
 
@@ -76,10 +78,8 @@ class GivenStart(eqx.Module):
     @classmethod
     def of(cls, start: Start, blocks: Blocks) -> GivenStart:
         """Of starts with a leading axis."""
-        nominal = jnp.zeros_like(start.sound_speed)
-        parameters = Parameters(
-            start.rotation, start.translation, start.point, start.scale, start.sound_speed, nominal
-        )
+        plain = jax.vmap(Parameters.of)(start.rotation, start.translation, start.point, start.scale)
+        parameters = replace(plain, sound_speed=start.sound_speed)
         return cls(Iterate.of(parameters, blocks), start.searched)
 
 
@@ -193,9 +193,9 @@ class Reduced(eqx.Module):
         of_mean = barrier(dense.product_lanes_last(self.spread, self.pulled + pull))
         target = seen + dense.product_lanes_last(self.rotation, of_mean)
         depth = scale[1] * (self.mean[1] - self.face) + self.face
-        zero = jnp.zeros_like(one)
-        nominal = {"scale": [*scale], "sound-speed": [one], "delay": [zero]}
-        extras = [value for name, values in nominal.items() if name in blocks for value in values]
+        free = {name: [TABLE[name].nominal * one] * TABLE[name].size for name in EXTRA}
+        free["scale"] = [*scale]
+        extras = [value for name in EXTRA if name in blocks for value in free[name]]
         return Iterate(
             jnp.stack([lateral, jnp.cross(axial, lateral, axis=0), axial], axis=1),
             of_mean - scale[0] * self.mean[0] * lateral - depth * axial,
