@@ -233,10 +233,10 @@ def _cayley(vector: Float[Array, "3 lanes"]) -> Float[Array, "3 3 lanes"]:
     cross = picked(half, _CROSS_PLACES) * _CROSS_SIGNS.astype(half.dtype)
     eye = np.eye(3, dtype=half.dtype)[..., None]
     bent = half[:, None] * half - square * eye
-    return eye + (2 / (1 + square)) * (cross + bent)
+    return jnp.asarray(eye) + (2 / (1 + square)) * (cross + bent)
 
 
-def picked(array: Float[Array, k * rest], places: np.ndarray) -> Float[Array, "*places *rest"]:
+def picked(array: Float[Array, "k ..."], places: np.ndarray) -> Float[Array, "*places ..."]:
     """The entries at known places of the first axis, in one operation."""
     return array.at[places].get(mode="promise_in_bounds")
 
