@@ -66,6 +66,10 @@ HEADER = [
 ]
 
 
+EXACT_ROBOT = "element_mm, robot without pose error"
+"""The element's size once more: beside the pose error that Table 4 asks for it hardly shows."""
+
+
 def sensitivity(run: Run) -> None:
     """Vary one number at a time; table and figure."""
     base = Tank()
@@ -74,11 +78,16 @@ def sensitivity(run: Run) -> None:
         for value in values:
             given = int(value) if axis == "images" else value
             conditions.append((axis, value, replace(base, **{axis: given})))
-    grid = run.grid(TankStudy, tuple(tank for _, _, tank in conditions))
-    data = run.study("paper_experiment_sensitivity", grid)
+    still = [
+        (EXACT_ROBOT, size, replace(base, element_mm=size, accuracy_mm=0.0))
+        for size in AXES["element_mm"]
+    ]
     rows = []
-    for c, (axis, value, _) in enumerate(conditions):
-        rows.append([axis, value, run.trials, *conclusions(data, c)])
+    for name, chosen in (("sensitivity", conditions), ("sensitivity_exact_robot", still)):
+        grid = run.grid(TankStudy, tuple(tank for _, _, tank in chosen))
+        data = run.study(f"paper_experiment_{name}", grid)
+        for c, (axis, value, _) in enumerate(chosen):
+            rows.append([axis, value, run.trials, *conclusions(data, c)])
     write_table(run.folder / "paper_experiment_sensitivity.csv", HEADER, rows)
     for row in rows:
         print(
@@ -94,6 +103,7 @@ def sensitivity(run: Run) -> None:
 def statements(rows: list[list]) -> list[list[str]]:
     """What sections 4.2 and 4.3 say of sizes, with our evidence."""
     sizes = {row[1]: row for row in rows if row[0] == "element_mm"}
+    still = {row[1]: row for row in rows if row[0] == EXACT_ROBOT}
     small, paper = sizes[0.01], sizes[2.08]
     exact = 100 * (small[7] / paper[7] - 1)
     judged = 100 * (small[10] / paper[10] - 1)
@@ -103,17 +113,19 @@ def statements(rows: list[list]) -> list[list[str]]:
         [
             "4.2",
             "the element's 2 mm limit its mid-plane localisation; that may be why AE is no better",
-            "holds in part" if exact < 0 else "does not hold",
+            "holds in part" if still[0.01][7] < 0.9 * still[2.08][7] else "does not hold",
             f"with an element of 0.01 mm the error of X from Auto-AE changes by {exact:+.1f} % "
             f"({paper[7]:.3f} to {small[7]:.3f} mm), RP of AE on the hydrophone by "
-            f"{judged:+.1f} %; with a robot without pose error the error of X from Auto-AE is "
-            f"{accuracy[0.0][7]:.3f} mm",
+            f"{judged:+.1f} %; with a robot without pose error the error of X from Auto-AE goes "
+            f"from {still[2.08][7]:.3f} to {still[0.01][7]:.3f} mm",
         ],
         [
             "4.3",
             "the active element would ideally be as small as possible",
-            "holds" if exact < 0 else "does not hold",
-            "error of X from Auto-AE by size: "
+            "holds" if still[0.01][7] < 0.9 * still[2.08][7] else "does not hold",
+            "error of X from Auto-AE by size, robot without pose error: "
+            + ", ".join(f"{size:g} mm {row[7]:.3f} mm" for size, row in still.items())
+            + "; beside the pose error of Table 4: "
             + ", ".join(f"{size:g} mm {row[7]:.3f} mm" for size, row in sizes.items()),
         ],
         [
@@ -123,6 +135,15 @@ def statements(rows: list[list]) -> list[list[str]]:
             f"error of X from CW {thin[5]:.3f} mm with a beam of {thin[1]:g} mm and "
             f"{thick[5]:.3f} mm with {thick[1]:g} mm; from Auto-AE {thin[7]:.3f} and "
             f"{thick[7]:.3f} mm",
+        ],
+        [
+            "4.3",
+            "the errors are larger than in simulation because transducer and active point are no "
+            "point sources",
+            "does not hold" if abs(judged) < 5 else "holds in part",
+            f"with an active point of 0.01 mm RP on the hydrophone changes by {judged:+.1f} %; a "
+            f"robot without pose error brings it from {accuracy[0.55][10]:.2f} to "
+            f"{accuracy[0.0][10]:.2f} mm (the transducer is a line of points here)",
         ],
         [
             "4.3",
