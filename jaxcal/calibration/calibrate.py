@@ -39,6 +39,7 @@ from jaxcal.data.recording import Recording
 from jaxcal.diagnostics.dependence import independent
 from jaxcal.diagnostics.serial_correlation import widened
 from jaxcal.runtime.precision import (
+    importing_jax,
     in_own_modes,
     inside_transformation,
     require_float64,
@@ -161,6 +162,7 @@ def _solve_alone(problem: Problem, given: Given, plan: Plan) -> Calibration:
     return found
 
 
+@importing_jax
 @in_own_modes
 def calibrate_batch(
     problems: Problem | Sequence[Problem | Recording],

@@ -155,7 +155,7 @@ def _table(rows: list[dict[str, Any]]) -> Any:
     return table
 
 
-def _ago(seconds: float) -> str:
+def _ago(seconds: int) -> str:
     for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= length:
             return f"{seconds / length:.0f} {unit} ago"

@@ -19,7 +19,7 @@ from jaxcal.data.recording import Images, Kind, Recording, make_images
 from jaxcal.diagnostics.arrays import array_module
 from jaxcal.diagnostics.arrays import is_traced as is_traced
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
-from jaxcal.runtime.precision import in_own_modes
+from jaxcal.runtime.precision import importing_jax, in_own_modes
 from jaxcal.runtime.trees import array_tree, static
 
 if TYPE_CHECKING:
@@ -226,6 +226,7 @@ class Problem:
         return cls.from_recording(images, dtype=dtype)
 
 
+@importing_jax
 @in_own_modes
 def stack(problems: list[Problem]) -> Problem:
     """Problems of one structure as a batch with one leading axis.

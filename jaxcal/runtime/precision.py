@@ -18,6 +18,7 @@ What needs no JAX does not import it: where nobody has, there are no modes to en
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -102,6 +103,20 @@ def in_own_modes(function: Callable[P, T]) -> Callable[P, T]:
             return result if keep else jax.tree.map(_without_jax, result)
 
     return guest
+
+
+def importing_jax(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a public function that cannot do without JAX, outside :func:`in_own_modes`.
+
+    Where the function itself imported JAX, it would have begun in the caller's modes.
+    """
+
+    @wraps(function)
+    def after_import(*args: P.args, **kwargs: P.kwargs) -> T:
+        importlib.import_module("jax")
+        return function(*args, **kwargs)
+
+    return after_import
 
 
 def in_standard_promotion(function: Callable[P, T]) -> Callable[P, T]:
