@@ -14,6 +14,9 @@ PLACEMENTS_OF = {
 """What goes with which phantom, the default first: nothing is wired to a cross-wire, and a
 hydrophone never answers."""
 
+HAND_PLACEMENTS = ("none", "pattern-injection")
+"""Of a probe that a person holds; the first is the default."""
+
 OPERATORS = ("person", "window", "simulated")
 """Who follows the injected pattern."""
 

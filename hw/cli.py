@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from hw.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
+from hw.choices import HAND_PLACEMENTS, OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
 from jaxcal import InputError, __version__
 from jaxcal.cli.common import POSITIVE, ExitCode, exit_code
 from jaxcal.cli.run import run
@@ -232,24 +232,50 @@ def acquire(
     metavar="SECONDS",
     help="An image stamped t shows what was at t - SECONDS.",
 )
+@click.option(
+    "--placement",
+    type=click.Choice(HAND_PLACEMENTS),
+    default=HAND_PLACEMENTS[0],
+    show_default=True,
+    help="How the target is found: by segmenting the images, or by the bar that the active echo "
+    "element injects and you follow (needs --setup).",
+)
+@click.option(
+    "--setup",
+    "setup_path",
+    type=click.Path(),
+    metavar="TOML",
+    help="For pattern injection: [active_echo] url, [probe], and [scene] image_to_probe as drawn.",
+)
 @click.option("--resume", is_flag=True, help="Go on with RECORDING, as it was begun.")
 def free_hand(
-    server: str, recording: str | None, resume: bool, target: str,
-    region: tuple[int, int, int, int] | None, **options: Any,
-) -> int:  # fmt: skip
+    server: str,
+    recording: str | None,
+    resume: bool,
+    target: str,
+    region: tuple[int, int, int, int] | None,
+    placement: str,
+    setup_path: str | None,
+    **options: Any,
+) -> int:
     """Acquire with a hand-held probe: images and poses of a PlusServer or any OpenIGTLink tracker.
 
     Connects to HOST (port 18944), which must send IMAGE and TRANSFORM, or TRACKEDFRAME. Hold the
     probe still over the target: an image is taken by itself where the target is credible and the
-    pose differs from those before. What is still missing is said. RECORDING is the file to make (by
-    default one named after the time); afterwards it is calibrated, as jaxcal calibrate would.
+    pose differs from those before. What is still missing is said. With --placement
+    pattern-injection you slide the probe across the mid-plane, back to where the injected bar is
+    longest, and accept with Enter. RECORDING is the file to make (by default one named after the
+    time); afterwards it is calibrated, as jaxcal calibrate would.
     """
     from hw.freehand.acquire import FreeHand, acquire_free_hand
     from hw.freehand.guide import Rules
-    from hw.freehand.terminal import TerminalPerson
+    from hw.freehand.terminal import INJECTION_KEYS, KEYS, TerminalPerson
 
     if resume and recording is None:
         raise InputError("--resume needs the RECORDING to go on with")
+    injected = placement == "pattern-injection"
+    if injected != (setup_path is not None):
+        raise InputError("--placement pattern-injection and --setup TOML go together")
     host, _, port = server.partition(":")
     if not host or not ((port.isdecimal() and 0 < int(port) < 65536) or not port):
         raise click.BadParameter(f"{server!r} is not HOST or HOST:PORT", param_hint="HOST[:PORT]")
@@ -262,7 +288,17 @@ def free_hand(
 
     screen = Screen(sys.stderr)
     with Keyboard(Pause(), (), screen.say) as keyboard, keyboard.asking():
-        acquire_free_hand(path, asked, TerminalPerson(screen, keyboard), resume=resume)
+        person = TerminalPerson(screen, keyboard, INJECTION_KEYS if injected else KEYS)
+        if setup_path is not None:
+            from hw.freehand.injection import acquire_by_injection
+            from hw.setup import load_hand_held
+
+            if not keyboard.there:
+                raise InputError("pattern injection needs a terminal to read keys from")
+            setup = load_hand_held(setup_path)
+            acquire_by_injection(path, asked, setup, person, resume=resume)
+        else:
+            acquire_free_hand(path, asked, person, resume=resume)
         screen.clear()
     return _calibrated(path)
 
@@ -272,6 +308,7 @@ def _calibrated(path: str) -> int:
     from jaxcal.calibration.calibrate import calibrate
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.cli.common import print_page
+    from jaxcal.data.segmentation.segment import segment_recording
     from jaxcal.io.hdf5 import load
     from jaxcal.report.record import calibration_record
     from jaxcal.report.tables import calibration_table
@@ -279,7 +316,10 @@ def _calibrated(path: str) -> int:
 
     enable_compilation_cache()
     data = load(path)
-    scale = () if data.calibration.spacing_mm is not None else ("scale",)
+    if data.calibration.kind == "time_of_flight":
+        data, _ = segment_recording(data)
+    images = data.calibration
+    scale = ("scale",) if images.kind == "pixel" and images.spacing_mm is None else ()
     record = calibration_record(calibrate(data, estimate=scale), data)
     hint = " --estimate scale" if scale else ""
     again = f"{path}: again, with a report: jaxcal calibrate {path}{hint} --report report.html"

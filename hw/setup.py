@@ -20,7 +20,9 @@ from hw.poses import Extent
 from hw.robot.kinematics import model_named
 from hw.robot.limits import FURTHEST_TIP_MM, Limits, hull_of, numbers
 from hw.scene import Scene
+from hw.shapes import Float
 from jaxcal import InputError
+from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import LinearProbe
 from jaxcal.io.readable import quoted
 from jaxcal.io.toml import load_toml
@@ -110,6 +112,55 @@ class Setup:
         return Limits.from_mapping(
             {"hull_mm": hull, **self.limits, "tip_mm": tip.tolist(), "arm_model": model}
         )
+
+
+@dataclass(frozen=True)
+class HandHeldSetup:
+    """An active echo element and a probe that a person holds.
+
+    Attributes:
+        active_echo_url: serial port, pty or ``socket://host:port``.
+        probe: the transducer.
+        image_to_probe: (4, 4) X as drawn or measured with a ruler, mm: image frame to the tracked
+            frame on the probe.
+        search: stated accuracies, and the threshold of the response.
+    """
+
+    active_echo_url: str
+    image_to_probe: Float[np.ndarray, "4 4"]
+    probe: LinearProbe = field(default_factory=LinearProbe)
+    search: Settings = field(default_factory=Settings)
+
+
+def load_hand_held(path: str | os.PathLike[str]) -> HandHeldSetup:
+    """Read the description of a bench without a robot: [active_echo], [probe], [scene], [search].
+
+    Of [scene] only ``image_to_probe`` is needed, to the tracked frame on the probe.
+
+    Raises:
+        FormatError: no such file, or not TOML.
+        InputError: unknown or missing keys, numbers that are none; like the other one line that
+            starts with the path.
+    """
+    tables = load_toml(path, maximum_bytes=_LARGEST_BYTES)
+    names = ("active_echo", "probe", "scene", "search")
+    try:
+        for name in tables:
+            if name not in names:
+                raise InputError(f"[{quoted(name)}] is not known; there are {', '.join(names)}")
+        found = {name: _table(tables, name) for name in names}
+        if "url" not in found["active_echo"]:
+            raise InputError("[active_echo] needs url")
+        if "image_to_probe" not in found["scene"]:
+            raise InputError("[scene] needs image_to_probe")
+        found["probe"].pop("housing_mm", None)
+        drawn = _numbers("image_to_probe", found["scene"]["image_to_probe"], (4, 4))
+        drawn = check_poses(drawn[None], what="[scene] image_to_probe")[0]
+        probe = LinearProbe(**found["probe"])
+        _check_width(probe)
+        return HandHeldSetup(found["active_echo"]["url"], drawn, probe, Settings(**found["search"]))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def controller_arm(model: str, version: str) -> str | None:
@@ -242,7 +293,11 @@ def _check_lengths(setup: Setup, tip_at_tcp: bool) -> None:
             f"[scene] point_mm is {away:g} mm from the robot's base: it is in mm, "
             f"{_TARGET_MM[0]:g} to {_TARGET_MM[1]:g} away"
         )
-    width = setup.probe.elements * setup.probe.pitch_mm
+    _check_width(setup.probe)
+
+
+def _check_width(probe: LinearProbe) -> None:
+    width = probe.elements * probe.pitch_mm
     if not _WIDTH_MM[0] <= width <= _WIDTH_MM[1]:
         raise InputError(
             f"[probe] elements and pitch_mm make an array {width:g} mm wide: pitch_mm is in mm, "

@@ -236,6 +236,39 @@ def test_real_configurations(real_data, name):
         assert new[found.end :] == old[had[0].end :]
 
 
+DRESSES = {
+    "crlf": lambda text: re.sub(rb"\r?\n", b"\r\n", text),
+    "lf": lambda text: text.replace(b"\r\n", b"\n"),
+    "bom": lambda text: b"\xef\xbb\xbf" + text,
+    "tabs": lambda text: re.sub(rb"(?m)^ +", b"\t\t", text),
+    "single quotes": lambda text: re.sub(rb'="([^"\'<>]*)"', rb"='\1'", text),
+    "comments": lambda text: re.sub(
+        rb"(<Transform )", b"<!-- <Transform From='Image' To='Probe'/> a > b -->\\1", text
+    ),
+    "one line": lambda text: re.sub(rb"\r?\n[ \t]*", b" ", text),
+}
+"""Other editors' hands; with the real files as they are, more than twenty configurations."""
+
+
+@pytest.mark.parametrize("dress", DRESSES)
+def test_real_configurations_in_another_dress(real_data, dress):
+    """Of three real files no byte changes but those of the one element."""
+    for path in sorted((real_data / "plus").glob("PlusDeviceSet_*.xml")):
+        old = DRESSES[dress](path.read_bytes())
+        new, _ = patched_configuration(old, IMAGE, MATRIX)
+        found = found_element(parse_xml(new))
+        matrix = np.array(found.attributes["Matrix"].split(), float).reshape(4, 4)
+        np.testing.assert_allclose(matrix, MATRIX, rtol=1e-14)
+        had = [t for t in parse_xml(old).all("CoordinateDefinitions/Transform")
+               if {t.attributes["From"], t.attributes["To"]} == set(IMAGE)]  # fmt: skip
+        if had:
+            assert new[: had[0].start] == old[: had[0].start]
+            assert new[found.end :] == old[had[0].end :]
+        else:
+            assert old.startswith(new[: found.start].rstrip())
+            assert old.endswith(new[found.end :].lstrip())
+
+
 def test_fcal_result_reproduces_its_errors(real_data):
     """Each error of PLUS's report from wires, points and poses alone: fixes every convention."""
     folder = real_data / "plus"

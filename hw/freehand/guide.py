@@ -115,7 +115,7 @@ class Guide:
         while moment[-1].time - moment[0].time > rules.hold_s * 1.2:
             moment.popleft()
         poses = np.array([each.pose for each in moment])
-        shift, turn = _spread(poses)
+        shift, turn = spread_of(poses)
         if shift > rules.still_mm or turn > rules.still_deg:
             # The newest alone may be still.
             while len(moment) > 1 and moment[-1].time - moment[0].time > 0.3 * rules.hold_s:
@@ -126,7 +126,7 @@ class Guide:
         if posed.time - self._tried < 0.5 * rules.hold_s:
             return Look(self._words)
         self._tried = posed.time
-        look = self._judge(moment[len(moment) // 2], _mean(poses))
+        look = self._judge(moment[len(moment) // 2], mean_pose(poses))
         self._words = look.words
         return look
 
@@ -210,14 +210,15 @@ def orientation_sds(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " 3"
     return np.sqrt(np.maximum(np.linalg.eigvalsh(turns.T @ turns / len(turns))[::-1], 0.0))
 
 
-def _spread(poses: Float[np.ndarray, "n 4 4"]) -> tuple[float, float]:
+def spread_of(poses: Float[np.ndarray, "n 4 4"]) -> tuple[float, float]:
     """Largest distance (mm) and turn (degrees) from the newest pose."""
     shift = np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1).max()
     turns = Rotation.from_matrix(poses[-1, :3, :3].T @ poses[:, :3, :3]).magnitude()
     return float(shift), float(np.degrees(turns.max()))
 
 
-def _mean(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "4 4"]:
+def mean_pose(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Mean of poses that are nearly the same."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_matrix(poses[:, :3, :3]).mean().as_matrix()
     pose[:3, 3] = poses[:, :3, 3].mean(axis=0)

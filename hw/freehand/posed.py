@@ -98,6 +98,12 @@ class PosedImages:
         apart = np.ptp(stamps) if np.isfinite(stamps).all() else np.inf
         self.by_arrival = bool(apart > _ONE_CLOCK_S)
 
+    @property
+    def behind(self) -> int:
+        """Images that have come and were not read."""
+        self._take()
+        return len(self._waiting)
+
     def read(self, timeout_s: float) -> PosedImage:
         """The next image; it may wait a moment for the pose after it.
 

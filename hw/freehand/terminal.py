@@ -10,8 +10,11 @@ from hw.keys import Keyboard
 from hw.midplane.terminal_image import COLUMNS, ROWS, Screen, picture
 
 KEYS = "u: take the last image back, q: finish, Ctrl-C: stop (it can be resumed)"
+INJECTION_KEYS = (
+    "Enter: accept, s: begin the sweep anew, u: take the last image back, q: finish, Ctrl-C: stop"
+)
 _PERIOD_S = 0.15
-_OTHER_ROWS = 5
+_OTHER_ROWS = 8
 
 
 class TerminalPerson:
@@ -20,25 +23,26 @@ class TerminalPerson:
     Args:
         screen: where to show it.
         keyboard: what the person types; asked within its ``asking``.
+        keys: what they do, in words.
     """
 
-    def __init__(self, screen: Screen, keyboard: Keyboard | None) -> None:
-        self._screen, self._keyboard = screen, keyboard
-        self._shown, self._words = 0.0, ""
+    def __init__(self, screen: Screen, keyboard: Keyboard | None, keys: str = KEYS) -> None:
+        self._screen, self._keyboard, self._keys = screen, keyboard, keys
+        self._shown = 0.0
 
     def show(self, frame: np.ndarray, words: str, advice: str) -> None:
         """Paint frame and words, a few times a second."""
         now = time.monotonic()
-        if now - self._shown < _PERIOD_S and words == self._words:
+        if now - self._shown < _PERIOD_S:
             return
-        self._shown, self._words = now, words
+        self._shown = now
         rows = []
         if self._screen.pictures and frame.dtype == np.uint8:
             columns, lines = self._screen.size
             height = min(ROWS, lines - _OTHER_ROWS)
             if height > 0:
                 rows += picture(frame, min(COLUMNS, columns - 1), height)
-        self._screen.show([*rows, f"> {words}", f"missing: {advice}", KEYS])
+        self._screen.show([*rows, *words.split("\n"), f"next: {advice}", self._keys])
 
     def say(self, line: str) -> None:
         """A line that stays."""

@@ -184,7 +184,7 @@ def test_ctrl_c_at_a_terminal(tmp_path):
         arguments = ["-c", command, "free-hand", f"127.0.0.1:{port}", "r.h5"]
         with Terminal(arguments, tmp_path) as person:
             person.wait_for(r"image 1/30: target at", 60)
-            person.wait_for("missing: bring the target to the", 60)
+            person.wait_for("next: bring the target to the", 60)
             person.type("u")
             person.wait_for("taken back: the last image; ", 60)
             person.wait_for(r"image \d/30: target at", 60)

@@ -1,0 +1,446 @@
+"""Pattern injection with a hand-held probe: the paper's free-hand procedure (section 2.1).
+
+The active echo element draws what it hears into the ultrasound image, as a bar that is longest in
+the mid-plane of the beam (:mod:`hw.midplane.pattern_injection`). A person moves the probe across
+the plane by hand, back to where the bar is longest, holds it still and accepts. The tracker tells
+where the probe was at every frame of the element, so that the sweep itself is the scan: its maximum
+(:func:`hw.midplane.amplitude_scan.fit_peak`) says how far beside the mid-plane the image was taken.
+
+Places are the probe's along the image's elevational axis *at the target*, from the drawing of probe
+and image: a hand that tilts the probe moves the plane at the target as well.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+from collections import deque
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from hw.active_echo.device import ActiveEcho, EchoFrame
+from hw.errors import DeviceError, StaleError
+from hw.freehand.acquire import FreeHand, FreeHandStopped, Person
+from hw.freehand.guide import mean_pose, spread_of
+from hw.freehand.posed import PosedImage, PosedImages
+from hw.midplane.amplitude_scan import fit_peak
+from hw.midplane.bracket import Bracket, widened
+from hw.midplane.live_view import describe, profile
+from hw.midplane.pattern_injection import View, bar, bar_length, sides_seen
+from hw.midplane.search import Echoes, PlacementError, Settings
+from hw.recorder import Recorder
+from hw.recording_check import settings_of
+from hw.recording_layout import Header
+from hw.session import median_times
+from hw.setup import HandHeldSetup
+from hw.shapes import Float
+from hw.ultrasound.receiver import UltrasoundStream
+from jaxcal import CalibrationError, InputError
+from jaxcal.data.poses import inverse_poses
+from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.data.timing import interpolate_poses
+
+_SILENCE_S = 3.0
+_DELAY_TICKS = 400
+_PATTERN_PERIOD_S = 0.1
+_LONGEST_GAP_S = 0.3
+"""Between two images with poses, in which the place of the hand is interpolated."""
+_ANOTHER_DEG = 5.0
+"""A hand that has turned the probe by more than this is at another pose: a new sweep."""
+_FASTEST_MM_S = 6.0
+"""Of a hand: image, pose and echo are known to belong together to some 50 ms, which at this speed
+is 0.3 mm, as much as the element's own accuracy. Faster frames are not used."""
+_RECENT = 32
+_SHOW_PERIOD_S = 0.1
+_KEPT_S = 60.0
+"""Of a sweep: what is older is forgotten, or the hand's drift would blur the maximum."""
+_BESIDE_MM = 1.0
+"""Farther from the maximum nobody means to accept."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One frame of the element and where the probe was.
+
+    Attributes:
+        t: arrival, s.
+        offset_mm: of the probe along the elevational axis at the target.
+        peak: amplitude, counts; 0 where the element was not heard.
+    """
+
+    t: float
+    offset_mm: float
+    peak: float
+
+
+def acquire_by_injection(
+    path: str | os.PathLike[str],
+    asked: FreeHand,
+    setup: HandHeldSetup,
+    person: Person,
+    *,
+    resume: bool = False,
+) -> int:
+    """Run until enough images are accepted or the person ends it.
+
+    Args:
+        path: the recording: to make, or with ``resume`` to go on with.
+        asked: server, frames and number of images.
+        setup: element, probe and the drawing of both.
+        person: shown what goes on; ``enter`` accepts, ``s`` begins the sweep anew, ``u`` takes the
+            last image back, ``q`` ends.
+        resume: go on with ``path``.
+
+    Returns:
+        Number of images; the file is complete then.
+
+    Raises:
+        FreeHandStopped: interrupted, a device was lost, or too few images; it can be resumed.
+        DeviceError: a device that is not there, or a stream that cannot be used.
+        OutputError: the recording cannot be made.
+    """
+    if resume and "injection" not in settings_of(path):
+        raise InputError(f"{path}: was not begun with pattern injection by hand")
+    probe = setup.probe
+    with contextlib.ExitStack() as stack:
+        stream = stack.enter_context(UltrasoundStream(asked.host, asked.port, device=asked.device))
+        posed = PosedImages(stream, asked.source, asked.target_frame, asked.lag_s)
+        person.say(f"images of {posed.device!r}; poses from {posed.pair[0]} to {posed.pair[1]}")
+        echo = stack.enter_context(ActiveEcho(setup.active_echo_url, lines=probe.elements))
+        stack.callback(_switch_off, echo)
+        echo.set_threshold(setup.search.low_threshold)
+        echo.stream(True)
+        recorder = _recorder(path, asked, setup, posed, echo, resume)
+        run = _Run(asked, setup, person, posed, echo, recorder)
+        try:
+            with recorder:
+                return run.go()
+        except KeyboardInterrupt:
+            reason, interrupted = "interrupted", True
+        except (DeviceError, CalibrationError) as error:
+            reason, interrupted = str(error), False
+    raise FreeHandStopped(
+        f"{reason}; {run.count} of {asked.images} images are in {recorder.kept}; go on with the "
+        "same command and --resume",
+        interrupted=interrupted,
+    )
+
+
+def _recorder(
+    path: str | os.PathLike[str], asked: FreeHand, setup: HandHeldSetup, posed: PosedImages,
+    echo: ActiveEcho, resume: bool,
+) -> Recorder:  # fmt: skip
+    if resume:
+        return Recorder(path)
+    probe = setup.probe
+    known = {"pair": posed.pair, "images": asked.images, "scene": setup.image_to_probe.tolist()}
+    header = Header(
+        kind="time_of_flight",
+        probe={
+            "kind": probe.kind, "elements": probe.elements, "pitch_mm": probe.pitch_mm,
+            "sound_speed_m_s": probe.sound_speed_m_s, "delay_s": probe.delay_s,
+        },
+        lines=probe.elements,
+        attributes={"ae": {"clock_hz": echo.clock_hz()}},
+        settings=json.dumps({"injection": {**known, "search": asdict(setup.search)}}),
+    )  # fmt: skip
+    return Recorder(path, header)
+
+
+def _switch_off(echo: ActiveEcho) -> None:
+    """Injection off again, whatever happened."""
+    with contextlib.suppress(DeviceError):
+        echo.inject(False)
+
+
+class _Run:
+    """One run over open devices and an open recording."""
+
+    def __init__(
+        self, asked: FreeHand, setup: HandHeldSetup, person: Person, posed: PosedImages,
+        echo: ActiveEcho, recorder: Recorder,
+    ) -> None:  # fmt: skip
+        self._asked, self._setup, self._person = asked, setup, person
+        self._posed, self._echo, self._recorder = posed, echo, recorder
+        self._next_row = recorder.rows.get("calibration", 0)
+        self._rows = list(range(self._next_row))
+        self._images: deque[PosedImage] = deque(maxlen=_RECENT)
+        self._waiting: list[EchoFrame] = []
+        self._held: deque[tuple[float, np.ndarray, EchoFrame]] = deque()
+        self._pattern: tuple[int, int] | None = None
+        self._patterned = 0.0
+        self._heard, self._shown = time.monotonic(), 0.0
+        self._begin()
+
+    @property
+    def count(self) -> int:
+        """Images that count."""
+        return len(self._rows)
+
+    def go(self) -> int:
+        """Until enough is accepted, or the person ends it."""
+        self._note("started", f"{self._asked.images - self.count} images to take")
+        while self.count < self._asked.images:
+            key = self._person.key()
+            if key == "q":
+                break
+            if key == "s":
+                self._begin()
+            elif key == "u":
+                self._take_back()
+            self._look()
+            if key == "enter":
+                self._message = self._accept()
+            self._show()
+        if self.count < MINIMUM_IMAGES:
+            raise InputError(f"{self.count} images are too few: {MINIMUM_IMAGES} are needed")
+        self._note("finished", f"{self.count} images")
+        self._recorder.finish()
+        return self.count
+
+    # The sweep
+
+    def _begin(self) -> None:
+        """A new sweep; places count from where the element is heard first."""
+        self._samples: deque[Sample] = deque()
+        self._origin: tuple[np.ndarray, np.ndarray] | None = None
+        self._held.clear()
+        self._message, self._hurried = "", False
+
+    def _look(self) -> None:
+        # Whoever looks at a bar must see where the probe is now, however busy the machine is.
+        self._images.append(self._posed.read(_SILENCE_S))
+        for _ in range(self._posed.behind - 1):
+            self._images.append(self._posed.read(_SILENCE_S))
+        frames = self._echo.drain()
+        now = time.monotonic()
+        if frames:
+            self._heard = now
+        elif now - self._heard > _SILENCE_S:
+            raise StaleError(
+                f"no frame for {_SILENCE_S:g} s: is the frame trigger unplugged?",
+                device="active echo",
+            )
+        self._recorder.add_echo(frames)
+        self._waiting += frames
+        later = []
+        for frame in self._waiting:
+            pose = self._pose_at(frame.t_host)
+            if isinstance(pose, bool):
+                later += [frame] if pose else []
+            elif not self._too_fast():
+                self._sample(frame, pose)
+        self._waiting = later[-256:]
+        self._inject(now)
+
+    def _pose_at(self, t: float) -> np.ndarray | bool:
+        """The pose at a time of arrival; True where it may still come, False where none is."""
+        images = list(self._images)
+        if not images or t > images[-1].image.t_host:
+            return True
+        for before, after in pairwise(images):
+            times = np.array([before.image.t_host, after.image.t_host])
+            if not times[0] <= t <= times[1]:
+                continue
+            if before.pose is None or after.pose is None or np.diff(times)[0] > _LONGEST_GAP_S:
+                return False
+            if times[1] <= times[0]:
+                return after.pose
+            both = np.stack([before.pose, after.pose])
+            return interpolate_poses(times, both, np.array([t]), max_gap_s=_LONGEST_GAP_S)[0]
+        return False
+
+    def _too_fast(self) -> bool:
+        """Whether the hand moves so fast that times do not say where it was."""
+        first, last = self._images[max(len(self._images) - 4, 0)], self._images[-1]
+        passed = last.image.t_host - first.image.t_host
+        if self._origin is None or first.pose is None or last.pose is None or passed <= 0:
+            return False
+        moved = abs(self._offset(last.pose) - self._offset(first.pose))
+        self._hurried = moved / passed > _FASTEST_MM_S
+        return self._hurried
+
+    def _sample(self, frame: EchoFrame, pose: Float[np.ndarray, "4 4"]) -> None:
+        answered = np.isfinite(frame.tof_s)
+        amplitude = np.where(answered, frame.amplitude, 0.0)
+        echoes = Echoes(amplitude[None].astype(float), answered[None])
+        self._loudest_line = echoes.loudest_line
+        if self._origin is not None:
+            turn = spread_of(np.stack([self._origin[0], pose]))[1]
+            if turn > _ANOTHER_DEG:
+                self._begin()
+        if self._origin is None and echoes.heard:
+            self._origin = pose, self._target_of(frame, echoes.loudest_line)
+        if self._origin is None:
+            return
+        offset = self._offset(pose)
+        self._samples.append(Sample(frame.t_host, offset, echoes.peak))
+        while self._samples[-1].t - self._samples[0].t > _KEPT_S:
+            self._samples.popleft()
+        self._held.append((frame.t_host, pose, frame))
+        hold = self._asked.rules.hold_s
+        while self._held[-1][0] - self._held[0][0] > hold:
+            self._held.popleft()
+
+    def _target_of(self, frame: EchoFrame, line: int) -> Float[np.ndarray, " 4"]:
+        """The target in the image frame, roughly: below the loudest line, at the shortest range."""
+        probe = self._setup.probe
+        lateral = probe.element_positions()[line, 0]
+        distance = float(np.nanmin(probe.one_way_range_mm(frame.tof_s)))
+        return np.array([lateral, 0.0, distance, 1.0])
+
+    def _offset(self, pose: Float[np.ndarray, "4 4"]) -> float:
+        """Of the probe along the elevational axis, where the target is, mm."""
+        assert self._origin is not None
+        origin, target = self._origin
+        x = self._setup.image_to_probe
+        there = inverse_poses((pose @ x)[None])[0] @ origin @ x @ target
+        return -float(there[1])
+
+    def _inject(self, now: float) -> None:
+        """Draw the bar anew where it changes, but not more often than an eye follows."""
+        if not self._samples or now - self._patterned < _PATTERN_PERIOD_S:
+            return
+        length = bar_length(self._samples[-1].peak, self._loudest)
+        if self._pattern == (length, self._loudest_line):
+            return
+        self._pattern, self._patterned = (length, self._loudest_line), now
+        self._echo.load_pattern(bar(length, self._loudest_line, self._setup.probe.elements))
+        self._echo.inject(True, _DELAY_TICKS)
+
+    @property
+    def _loudest(self) -> float:
+        return max((sample.peak for sample in self._samples), default=0.0)
+
+    # What the person sees and decides
+
+    def _view(self) -> View | None:
+        if not self._samples:
+            return None
+        loudest = self._loudest
+        seen = tuple((s.offset_mm, bar_length(s.peak, loudest)) for s in self._samples)
+        last = self._samples[-1]
+        longest = max(length for _, length in seen)
+        return View(seen[-1][1], longest, last.offset_mm, 0.0, last.peak, seen)
+
+    def _show(self) -> None:
+        now = time.monotonic()
+        if now - self._shown < _SHOW_PERIOD_S:
+            return
+        self._shown = now
+        frame = self._images[-1].image.array
+        title = f"image {self.count + 1} of {self._asked.images}"
+        view = self._view()
+        if view is None:
+            reason = self._images[-1].why or "the element is not heard"
+            words = f"{title}: {reason}: bring the probe over it"
+            self._person.show(frame, words, "nothing heard yet")
+            return
+        rows = [f"{title}: {describe(view, 0.0).rpartition(',')[0]}", *profile(view)]
+        if self._hurried:
+            rows.append(f"too fast: at most {_FASTEST_MM_S:g} mm a second")
+        elif self._message:
+            rows.append(self._message)
+        self._person.show(frame, "\n".join(rows), hand_advice(view, self._peak()))
+
+    def _accept(self) -> str:
+        """Take the image if it can be; else what is missing."""
+        view = self._view()
+        if view is None or not view.length:
+            return "the element is not heard here"
+        if not all(sides_seen(view.seen)):
+            return "look at both sides first: the bar must be seen to shrink on each"
+        held, rules = list(self._held), self._asked.rules
+        if not held or held[-1][0] - held[0][0] < 0.8 * rules.hold_s:
+            return f"hold still for {rules.hold_s:g} s, then accept"
+        poses = np.array([pose for _, pose, _ in held])
+        shift, turn = spread_of(poses)
+        if shift > rules.still_mm or turn > rules.still_deg:
+            return f"the probe moved ({shift:.1f} mm, {turn:.1f} degrees): hold still, then accept"
+        try:
+            bracket, where = self._bracket([frame.t_host for *_, frame in held])
+        except PlacementError as error:
+            return str(error.args[0])
+        if abs(bracket.centre_mm) > _BESIDE_MM:
+            way = "up" if bracket.centre_mm > 0 else "down"
+            return f"the bar is longest {abs(bracket.centre_mm):.1f} mm further {way}"
+        self._keep(poses, [frame for *_, frame in held], bracket, where)
+        return ""
+
+    def _peak(self) -> float:
+        """Where the bar is longest, mm: the fitted maximum, or the loudest place without one."""
+        offsets, peaks = self._sweep()
+        try:
+            return fit_peak(offsets, peaks, self._setup.search.full_scale).place_mm
+        except PlacementError:
+            return float(offsets[int(np.argmax(peaks))])
+
+    def _sweep(self) -> tuple[np.ndarray, np.ndarray]:
+        offsets = np.array([sample.offset_mm for sample in self._samples])
+        return offsets, np.array([sample.peak for sample in self._samples])
+
+    def _bracket(self, times: list[float]) -> tuple[Bracket, float]:
+        """Where the target's offset lies in what was just held, and the probe's place."""
+        settings: Settings = self._setup.search
+        offsets, peaks = self._sweep()
+        peak = fit_peak(offsets, peaks, settings.full_scale)
+        now = np.isin([sample.t for sample in self._samples], times)
+        where = float(offsets[now].mean())
+        centre, half = peak.place_mm - where, settings.factor * peak.sd_mm
+        return widened(
+            centre, centre - half, centre + half, peak.sd_mm, settings.hidden_sd_mm, settings.factor
+        ), where
+
+    def _keep(
+        self, poses: np.ndarray, frames: list[EchoFrame], bracket: Bracket, where: float
+    ) -> None:
+        times, amplitude = median_times(frames)
+        self._recorder.add_images([self._images[-1].image])
+        self._recorder.add_selected(
+            mean_pose(poses), times, kind="time_of_flight",
+            max_elevation=bracket.max_elevation_mm, amplitude=amplitude,
+            t_host=frames[-1].t_host, target=self._next_row,
+            bracket=(bracket.centre_mm, bracket.low_mm, bracket.high_mm, bracket.sd_mm),
+            offset=where,
+        )  # fmt: skip
+        self._rows.append(self._next_row)
+        self._next_row += 1
+        self._person.say(
+            f"image {self.count}/{self._asked.images}: offset {bracket.centre_mm:+.2f} in "
+            f"[{bracket.low_mm:+.2f}, {bracket.high_mm:+.2f}] mm"
+        )
+        self._begin()
+
+    def _take_back(self) -> None:
+        if not self._rows:
+            return
+        self._recorder.leave_out(self._rows.pop())
+        self._note("taken back", f"the last image; {self.count} are left")
+
+    def _note(self, kind: str, text: str) -> None:
+        self._recorder.add_event(kind, text, time.monotonic())
+        self._person.say(f"{kind}: {text}")
+
+
+def hand_advice(view: View, peak_mm: float) -> str:
+    """What to do next, in words: both flanks must be seen before the maximum counts.
+
+    Args:
+        view: of the sweep so far.
+        peak_mm: where the bar is longest.
+    """
+    below, above = sides_seen(view.seen)
+    if not below:
+        return "slide the probe slowly down (-) until the bar is clearly shorter"
+    if not above:
+        return "slide it slowly up (+) through the longest bar until it is clearly shorter again"
+    away = peak_mm - view.offset_mm
+    if view.length >= view.longest // 2 and abs(away) <= 0.5 * _BESIDE_MM:
+        return "here it is longest: hold still, Enter accepts"
+    if abs(away) <= 0.5 * _BESIDE_MM:
+        return "it was longest here and is not now: s begins the sweep anew"
+    return f"go {abs(away):.1f} mm {'up (+)' if away > 0 else 'down (-)'}, where the bar is longest"

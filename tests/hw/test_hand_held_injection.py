@@ -1,0 +1,324 @@
+"""Pattern injection by hand: emulated tracker, ultrasound machine and element, a scripted hand."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+pytest.importorskip("serial", reason="pyserial is not installed (jaxcal[serial])")
+
+import jaxcal
+from hw.bench.active_echo import AuspisEmulator
+from hw.bench.frames import Camera
+from hw.bench.ultrasound import ImageServer
+from hw.bench.world import make_world
+from hw.cli import main
+from hw.clock import REAL
+from hw.freehand.acquire import FreeHand, FreeHandStopped
+from hw.freehand.injection import acquire_by_injection, hand_advice
+from hw.midplane.pattern_injection import View
+from hw.poses import Extent, plan_poses
+from hw.recorder import Recorder
+from hw.recording_layout import Header
+from hw.setup import HandHeldSetup, load_hand_held
+from jaxcal import InputError
+
+WORLD = make_world(3)
+REACH_MM, RATE_MM_S = 7.0, 5.0
+
+
+class Hand:
+    """Holds the probe over the target and slides it along its elevational axis."""
+
+    def __init__(self) -> None:
+        self.poses = plan_poses(8, WORLD.scene, Extent(), 4).poses
+        self.row, self.offset, self.aim = 0, -2.0, -2.0
+        self._rng = np.random.default_rng(0)
+        self._lock, self._at = threading.Lock(), time.monotonic()
+
+    def go(self, aim: float) -> None:
+        with self._lock:
+            self.aim = float(np.clip(aim, -REACH_MM, REACH_MM))
+
+    def next_pose(self) -> None:
+        with self._lock:
+            self.row, self.offset, self.aim = self.row + 1, -2.0, -2.0
+
+    def pose(self, _: float) -> np.ndarray:
+        with self._lock:
+            now = time.monotonic()
+            step = RATE_MM_S * (now - self._at)
+            self._at = now
+            self.offset += float(np.clip(self.aim - self.offset, -step, step))
+            pose = self.poses[self.row % len(self.poses)].copy()
+            along = pose[:3, :3] @ WORLD.image_to_probe[:3, 1]
+            pose[:3, 3] += self.offset * along + self._rng.normal(0, 0.02, 3)
+            return pose
+
+
+class Bench:
+    """Element, machine and tracker, which see one hand."""
+
+    def __init__(self) -> None:
+        self.hand = Hand()
+        rng, camera = np.random.default_rng(1), Camera(WORLD, seed=0)
+
+        def hear(t: float, threshold: int):
+            times, amplitude = WORLD.echo(self.hand.pose(t), threshold, rng)
+            return times + 0.25 / WORLD.clock_hz, amplitude
+
+        self.echo = AuspisEmulator(
+            hear, clock=REAL, rate_hz=30.0, lines=WORLD.probe.elements, clock_hz=WORLD.clock_hz
+        )
+
+        def see(t: float) -> np.ndarray:
+            injection = self.echo.injection
+            pattern = injection.pattern if injection.on and injection.pattern else None
+            return camera.frame(
+                self.hand.pose(t), rng, threshold=self.echo.threshold, pattern=pattern,
+                pattern_delay_s=injection.delay_ticks / WORLD.clock_hz,
+            )  # fmt: skip
+
+        self.images = ImageServer(
+            see, clock=REAL, rate_hz=25.0, spacing_mm=camera.spacing_mm,
+            transforms=lambda t: {"ProbeToTracker": self.hand.pose(t)},
+        )  # fmt: skip
+
+    @property
+    def setup(self) -> HandHeldSetup:
+        return HandHeldSetup(
+            active_echo_url=self.echo.path, probe=WORLD.probe,
+            image_to_probe=np.asarray(WORLD.scene.image_to_probe, float),
+        )  # fmt: skip
+
+    @property
+    def asked(self) -> FreeHand:
+        return FreeHand(self.images.host, self.images.port, images=4)
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    bench = Bench()
+    with bench.echo, bench.images:
+        yield bench
+
+
+class Person:
+    """Does what the advice says; a key is pressed when the advice asks for it."""
+
+    def __init__(self, hand: Hand, **lines: str) -> None:
+        self.hand, self.lines, self.advice = hand, [], set()
+        self.words = ""
+        self._keys, self._on, self._pressed = [], lines, 0.0
+        self._there, self._deadline = time.monotonic(), time.monotonic() + 120
+
+    def show(self, frame: np.ndarray, words: str, advice: str) -> None:
+        assert frame.dtype == np.uint8
+        self.words += f"{words}\n"
+        self.advice.add(re.sub(r"[\d.]+", "#", advice))
+        now = time.monotonic()
+        assert now < self._deadline, f"it takes for ever: {words}\n{advice}"
+        if "Enter accepts" not in advice:
+            self._there = now
+        if "s begins the sweep anew" in advice or now - self._there > 4.0:
+            # Where a sweep came to nothing a person begins another one.
+            self._there = now
+            self._keys.append("s")
+        elif "nothing heard" in advice:
+            # As a person would look for it: to and fro.
+            if self.hand.offset == self.hand.aim:
+                self.hand.go(REACH_MM if self.hand.aim <= 0 else -REACH_MM)
+        elif "down (-) until" in advice:
+            self.hand.go(-REACH_MM)
+        elif "up (+) through" in advice:
+            self.hand.go(REACH_MM)
+        elif (found := re.match(r"go ([\d.]+) mm (up|down)", advice)) is not None:
+            way = 1 if found[2] == "up" else -1
+            self.hand.go(self.hand.offset + way * float(found[1]))
+        elif "Enter accepts" in advice and time.monotonic() - self._pressed > 0.4:
+            self.hand.go(self.hand.offset)
+            self._pressed = time.monotonic()
+            self._keys.append("enter")
+
+    def say(self, line: str) -> None:
+        self.lines.append(line)
+        if line.startswith("image "):
+            self.hand.next_pose()
+        for pattern in list(self._on):
+            if line.startswith(pattern.replace("_", " ")):
+                self._keys.append(self._on.pop(pattern))
+
+    def key(self) -> str | None:
+        key = self._keys.pop(0) if self._keys else None
+        if key == "ctrl-c":
+            raise KeyboardInterrupt
+        return key
+
+
+def test_a_person_follows_the_bar_by_hand(tmp_path, bench):
+    path, person = tmp_path / "r.h5", Person(bench.hand, image_3="u")
+    stopping = Person(bench.hand, image_2="ctrl-c")
+    with pytest.raises(FreeHandStopped, match="interrupted; 2 of 4 images") as stopped:
+        acquire_by_injection(path, bench.asked, bench.setup, stopping)
+    assert stopped.value.exit_code == 130
+    assert acquire_by_injection(path, bench.asked, bench.setup, person, resume=True) == 4
+    assert any(line.startswith("taken back: the last image; ") for line in person.lines)
+    assert not bench.echo.injection.on
+    assert "#" * 25 in person.words
+    assert any("slide it slowly up" in advice for advice in person.advice)
+    with h5py.File(path) as file:
+        mask = np.asarray(file["calibration/mask"])
+        poses = np.asarray(file["calibration/pose"])
+        low, high, centre = (np.asarray(file[f"placement/{k}"]) for k in ("low", "high", "centre"))
+        bound = np.asarray(file["calibration/max_elevation"])
+        assert file["us/frames"].shape[0] == len(mask) == 5
+        assert file.attrs["complete"]
+        assert len(file["ae/tof_ticks"]) > 100
+    assert mask.sum() == 4
+    # What the drawing of the probe does not know (it is off by degrees) moves all of them alike.
+    true = np.array([WORLD.truth(pose).elevation_mm for pose in poses])
+    assert ((low <= true) & (true <= high)).mean() >= 4 / 5
+    assert (high - low < 4).all()
+    assert (np.abs(centre) < 1).all()
+    np.testing.assert_allclose(bound, np.maximum(np.abs(low), np.abs(high)))
+    assert np.abs(true).max() < 1.5
+    recording = jaxcal.load(path)
+    assert (recording.calibration.kind, len(recording)) == ("time_of_flight", 5)
+    assert recording.probe is not None
+    times = recording.calibration.measurements[mask]
+    shortest = np.nanmin(recording.probe.one_way_range_mm(times), axis=1)
+    expected = [WORLD.truth(pose).range_mm for pose in poses[mask]]
+    np.testing.assert_allclose(shortest, expected, atol=1.0)
+
+
+def test_enter_is_refused_until_both_sides_were_seen(tmp_path, bench):
+    class Hasty(Person):
+        def show(self, frame: np.ndarray, words: str, advice: str) -> None:
+            if "nothing heard" in advice:
+                super().show(frame, words, advice)
+            self.words += f"{words}\n"
+            if "mm |" in words:
+                self._keys.append("enter")
+            if "look at both sides first" in self.words:
+                self._keys.append("q")
+
+    person = Hasty(bench.hand)
+    with pytest.raises(FreeHandStopped, match="0 images are too few"):
+        acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, person)
+    Recorder(tmp_path / "o.h5", Header("pixel", {}, 0, None, "{}")).close()
+    with pytest.raises(InputError, match="was not begun with pattern injection"):
+        acquire_by_injection(tmp_path / "o.h5", bench.asked, bench.setup, person, resume=True)
+
+
+def test_an_element_that_falls_silent_ends_the_run(tmp_path, bench, monkeypatch):
+    monkeypatch.setattr("hw.freehand.injection._SILENCE_S", 0.7)
+    person = Person(bench.hand)
+
+    def unplug() -> None:
+        time.sleep(1.5)
+        bench.echo.stale(True)
+
+    threading.Thread(target=unplug, daemon=True).start()
+    with pytest.raises(FreeHandStopped, match="active echo: no frame for"):
+        acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, person)
+
+
+SETUP = """
+[active_echo]
+url = "{url}"
+
+[probe]
+elements = 128
+pitch_mm = 0.457
+sound_speed_m_s = 1490.0
+
+[scene]
+image_to_probe = {x}
+"""
+
+
+def test_from_the_command_line(tmp_path, bench):
+    """A person at a terminal: title, bar, advice; Ctrl-C ends and switches injection off."""
+    pytest.importorskip("pty", reason="there are no pseudo-terminals here")
+    from terminal import Terminal
+
+    x = np.asarray(WORLD.scene.image_to_probe, float).tolist()
+    setup = tmp_path / "hand.toml"
+    setup.write_text(SETUP.format(url=bench.echo.path, x=x))
+    command = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
+    server = f"{bench.images.host}:{bench.images.port}"
+    arguments = [
+        "free-hand",
+        server,
+        "r.h5",
+        "--placement",
+        "pattern-injection",
+        "--setup",
+        str(setup),
+    ]
+    with Terminal(["-c", command, *arguments], tmp_path) as person:
+        person.wait_for("image 1 of 30: the element is not heard", 60)
+        bench.hand.go(REACH_MM)
+        person.wait_for(r"image 1 of 30: +[+-]\d+\.\d\d mm \|#", 60)
+        person.wait_for(r"next: (slide|here|go)", 60)
+        while bench.hand.offset != REACH_MM:
+            time.sleep(0.05)
+        time.sleep(1.0)
+        person.type("\r")
+        person.wait_for("the element is not heard here", 60)
+        away = person.wait_for(r"go ([\d.]+) mm down", 60)[1]
+        bench.hand.go(bench.hand.offset - float(away))
+        person.wait_for("Enter accepts", 60)
+        time.sleep(1.5)
+        person.type("\r")
+        person.wait_for(r"image 1/30: offset [+-]\d\.\d\d in \[", 60)
+        person.type("\x03")
+        assert person.finish(60) == 130
+        assert "Traceback" not in person.shown
+    assert not bench.echo.injection.on
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[probe]", "[robot]\nhost = 'x'\n[probe]", "is not known; there are active_echo"),
+        ('url = "a"', "", r"\[active_echo\] needs url"),
+        ("image_to_probe", "image_to_prob", "image_to_prob"),
+        ("pitch_mm = 0.457", "pitch_mm = 0.000457", "the array"),
+    ],
+)
+def test_setups_that_are_refused(tmp_path, old, new, message):
+    text = SETUP.format(url="a", x=np.eye(4).tolist())
+    (tmp_path / "s.toml").write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=message):
+        load_hand_held(tmp_path / "s.toml")
+
+
+def test_options_that_belong_together(tmp_path):
+    assert main(["free-hand", "localhost", "--placement", "pattern-injection"]) == 2
+    assert main(["free-hand", "localhost", "--setup", "x.toml"]) == 2
+
+
+def test_advice():
+    def view(seen, at):
+        lengths = [length for _, length in seen]
+        return View(seen[-1][1], max(lengths), at, 0.0, 100.0, tuple(seen))
+
+    profile = [(x / 2, max(0, 31 - abs(x) * 4)) for x in range(-6, 7)]
+    assert "down (-)" in hand_advice(view(profile[6:9], 1.0), 0.0)
+    assert "up (+) through" in hand_advice(view(profile[:8], 0.5), 0.0)
+    assert hand_advice(view(profile, 3.0), 0.0).startswith("go 3.0 mm down")
+    there = view([*profile, (0.1, 31)], 0.1)
+    assert "Enter accepts" in hand_advice(there, 0.0)
+
+
+def test_what_is_no_setup_is_named(tmp_path: Path):
+    with pytest.raises(InputError, match="no such file"):
+        load_hand_held(tmp_path / "none.toml")
