@@ -86,6 +86,7 @@ def check(path: Path, order: list[int], seed: int = 1, count: int = 9) -> None:
     assert found.mean() < 8
 
 
+@pytest.mark.slow
 def test_a_run_from_the_command_line_to_a_calibration(tmp_path, capsys):
     path = tmp_path / "rec.h5"
     with plus_server(mode="tracked", poses=14) as port:
