@@ -241,7 +241,7 @@ def test_a_phantom_is_swapped_on_the_command_line_and_ends_in_a_calibration(tmp_
     pytest.importorskip("serial", reason="pyserial is not installed (jaxcal[serial])")
     path = tmp_path / "rec.h5"
     command = [sys.executable, "-m", "hw", "acquire", str(path), "--bench", "--phantom", phantom]
-    command += ["--images", "8", "--bench-seed", "3", "--speed", "10"]
+    command += ["--images", "8", "--bench-seed", "3", "--speed", "5"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=540)
     assert done.returncode in (0, 3), done.stderr
     assert re.search(r"error against truth +[0-9.]+ mm", done.stdout)
