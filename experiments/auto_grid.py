@@ -29,7 +29,7 @@ from common import ELEVATIONS_MM, NOISES_MM, arguments, machine, results_folder,
 from jaxtyping import Array
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision
-from jaxcal.backend import RIGID, BoundedOffsets, Images, Iterate, Parameters
+from jaxcal.backend import RIGID, BoundedOffsets, ImagePlanes, Iterate, Parameters
 from jaxcal.calibration.options import Options
 from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.io.atomic import atomic_path
@@ -114,7 +114,7 @@ def hindsight(begun, problems: Problem, experiments: Experiment, bounds: Array) 
             return jax.tree.map(lambda leaf: jnp.repeat(leaf, count, axis=0), tree)
 
         lanes, x, point = each(problems), each(x), each(point)
-        images = Images.of(lanes)
+        images = ImagePlanes.of(lanes)
         limit = jnp.tile(bounds, len(test_poses))[:, None] * lanes.mask
         bounded = BoundedOffsets.of(limit, images)
         start = Iterate.of(jax.vmap(Parameters.of)(x[:, :3, :3], x[:, :3, 3], point), RIGID)

@@ -18,7 +18,7 @@ from jaxcal.backend import (
     BoundedOffsets,
     Component,
     Further,
-    Images,
+    ImagePlanes,
     Iterate,
     Normal,
     Observation,
@@ -70,7 +70,7 @@ class Eliminated(Observation):
     bounds: BoundedOffsets
     whitened: ClassVar[bool] = False
 
-    def components(self, q: list, further: Further, images: Images) -> list[Component]:
+    def components(self, q: list, further: Further, images: ImagePlanes) -> list[Component]:
         """q_i - p_i(y_i) at the closest point of the arc."""
         offset, _ = self.bounds.local(q, further, images)
         return [Component(on_circle(q, offset, further, images))]
@@ -80,18 +80,18 @@ class Eliminated(Observation):
         return Eliminated(self.sigma, self.bounds.padded())
 
 
-def with_offsets(bound: Array, images: Images) -> Observation:
+def with_offsets(bound: Array, images: ImagePlanes) -> Observation:
     """Every offset an unknown of its own."""
     return BoundedOffsets.of(bound, images)
 
 
-def without_offsets(bound: Array, images: Images) -> Observation:
+def without_offsets(bound: Array, images: ImagePlanes) -> Observation:
     """Variable projection."""
     bounds = BoundedOffsets.of(bound, images)
     return Eliminated(bounds.sigma, bounds)
 
 
-ARMS: dict[str, tuple[Callable[[Array, Images], Observation], bool]] = {
+ARMS: dict[str, tuple[Callable[[Array, ImagePlanes], Observation], bool]] = {
     "joint": (with_offsets, True),
     "joint, Gauss-Newton only": (with_offsets, False),
     "variable projection": (without_offsets, False),
@@ -226,10 +226,10 @@ class Walk:
         return self.bench.judge(self.here, self.rounds, self.stopped(tolerance))
 
 
-def _arm(make: Callable[[Array, Images], Observation], exact: bool) -> Callable:
+def _arm(make: Callable[[Array, ImagePlanes], Observation], exact: bool) -> Callable:
     def solve(problems: Problem, starts: Parameters, bound: Array, tolerance: Any) -> Outcome:
         """As :func:`jaxcal.backend.minimise`, which always is exact near the optimum."""
-        images = Images.of(problems)
+        images = ImagePlanes.of(problems)
         observation, place = make(bound, images), Iterate.of(starts, RIGID)
         images, observation = images.padded(), observation.padded()
         rounding = Rounding.of(place, observation, images)
@@ -255,7 +255,7 @@ def _arm(make: Callable[[Array, Images], Observation], exact: bool) -> Callable:
 
 
 def _three_starts(problems: Problem, starts: Parameters, bound: Array) -> Outcome:
-    images = Images.of(problems)
+    images = ImagePlanes.of(problems)
     return Outcome.of(bounded(Iterate.of(starts, RIGID), BoundedOffsets.of(bound, images), images))
 
 
@@ -277,7 +277,7 @@ def _normal(
     problems: Problem, parameters: Parameters, bound: Array
 ) -> tuple[Normal, Float[Array, " lanes"]]:
     """Normal equations of the bounded problem, offsets eliminated; the cost that is rounding."""
-    images = Images.of(problems)
+    images = ImagePlanes.of(problems)
     place, observation = Iterate.of(parameters, RIGID), BoundedOffsets.of(bound, images)
     rounding = Rounding.of(place, observation, images)
     return accumulate(place, observation, images, None), rounding.vanished

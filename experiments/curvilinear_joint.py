@@ -25,7 +25,7 @@ from common import arguments, machine, results_folder, write_table
 from jaxtyping import Array, Float
 
 from jaxcal import Protocol, calibrate_batch, reconstruction_precision, simulate
-from jaxcal.backend import RIGID, Images, Iterate, Parameters, minimise, target_in_image
+from jaxcal.backend import RIGID, ImagePlanes, Iterate, Parameters, minimise, target_in_image
 from jaxcal.data.probe import C5_2
 from jaxcal.data.problem import Problem
 from jaxcal.data.segmentation.time_of_flight import fit_out_of_plane
@@ -73,7 +73,7 @@ def _with_signs(
     """Eq. 7 with offsets of the given sizes, whose signs are those that X and the target say."""
     first = jax.vmap(Parameters.of)(x[:, :3, :3], x[:, :3, 3], point)
     y = jax.vmap(target_in_image)(first, known)[..., 1]
-    images = Images.of(known)
+    images = ImagePlanes.of(known)
     held = HeldOffsets.of(jnp.where(y < 0, -size, size), images)
     found = minimise(Iterate.of(first, RIGID), held, images).place.parameters()
     return jax.vmap(Parameters.matrix)(found)

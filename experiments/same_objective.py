@@ -23,7 +23,7 @@ from jaxcal import Calibration, Problem, calibrate_batch
 from jaxcal.backend import (
     RIGID,
     BoundedOffsets,
-    Images,
+    ImagePlanes,
     Iterate,
     Parameters,
     circle_residual,
@@ -107,7 +107,7 @@ def spectra(information: np.ndarray, problems: Problem) -> tuple[np.ndarray, np.
 
 def closest_offsets(parameters: Parameters, problems: Problem, bound: Array) -> Array:
     """The best offsets within their bounds for given X and targets, mm (problems first)."""
-    images = Images.of(problems)
+    images = ImagePlanes.of(problems)
     place = Iterate.of(parameters, RIGID)
     return local_unknowns(place, BoundedOffsets.of(bound, images), images)
 
@@ -121,7 +121,7 @@ def advance(
     rounds: Array,
 ) -> Alternation:
     """The alternation from where X and the targets are, for at most so many rounds each."""
-    images = Images.of(problems)
+    images = ImagePlanes.of(problems)
     return alternate(
         Iterate.of(starts, RIGID),
         BoundedOffsets.of(bound, images),

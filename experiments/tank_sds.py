@@ -12,7 +12,7 @@ from tank_placements import part
 from hw.bench.world import Beam, Noise
 from hw.midplane.search import Settings
 from jaxcal import Problem
-from jaxcal.backend import RIGID, Component, Further, Images, Observation, minimise
+from jaxcal.backend import RIGID, Component, Further, ImagePlanes, Observation, minimise
 from jaxcal.model.batch import whole
 from jaxcal.solvers.start import conventional
 
@@ -36,7 +36,7 @@ class PlacedOffsets(Observation):
     sigma: Float[Array, "3 lanes"]
     offset_sd: Float[Array, "lanes n"]
 
-    def components(self, q: list, further: Further, images: Images) -> list[Component]:
+    def components(self, q: list, further: Further, images: ImagePlanes) -> list[Component]:
         """Errors in the plane, and offsets in their SDs."""
         lateral, distance = further.points(images)
         return [
@@ -52,7 +52,7 @@ class PlacedOffsets(Observation):
 
 @jax.jit
 def _minimised(problem: Problem, offset_sd: Array, sigma: Array) -> tuple[Array, Array]:
-    images = Images.of(problem)
+    images = ImagePlanes.of(problem)
     begin = conventional(images, RIGID).fit.place
     given = jnp.concatenate([sigma.T, jnp.ones((1, sigma.shape[0]))])
     found = minimise(begin, PlacedOffsets(given, offset_sd), images).place.parameters()

@@ -37,7 +37,7 @@ from hw.poses import PosePlan, plan_poses
 from hw.recorder import Recorder
 from hw.recording_check import Progress, read_progress
 from hw.recording_file import RecordingWriter
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from hw.resuming import compare, described
 from hw.robot.motion import Motion
 from hw.robot.safety import Confirmation, MotionPlan, check_plan
@@ -90,7 +90,7 @@ class Oracle(Protocol):
 
 
 @dataclass(frozen=True)
-class Request:
+class AcquisitionRequest:
     """What to acquire.
 
     Attributes:
@@ -193,7 +193,7 @@ class Outcome:
 @dataclass(frozen=True)
 class _Job:
     setup: Setup
-    request: Request
+    request: AcquisitionRequest
     targets: np.ndarray
     progress: Progress | None
     changes: tuple[str, ...] = ()
@@ -220,7 +220,7 @@ Confirm = Callable[[MotionPlan], Confirmation]
 def acquire(
     setup: Setup,
     path: str | os.PathLike[str],
-    request: Request | None,
+    request: AcquisitionRequest | None,
     confirm: Confirm,
     *,
     say: Callable[[str], None] = lambda line: None,
@@ -264,9 +264,17 @@ def acquire(
     with _closing(recorder):
         try:
             return _run(
-                job, recorder, estimator, confirm, say, oracle, operator, pause, watch,
+                job,
+                recorder,
+                estimator,
+                confirm,
+                say,
+                oracle,
+                operator,
+                pause,
+                watch,
                 Nobody() if view is None else view,
-            )  # fmt: skip
+            )
         except KeyboardInterrupt:
             reason, interrupted = "interrupted", True
         except (DeviceError, CalibrationError) as error:
@@ -295,7 +303,7 @@ def _closing(recorder: Recorder) -> Iterator[None]:
             recorder.close()
 
 
-def planned(setup: Setup, request: Request) -> PosePlan:
+def planned(setup: Setup, request: AcquisitionRequest) -> PosePlan:
     """The poses of a request: a plan in the order of travel, or the pool of an optimal one.
 
     Raises:
@@ -307,7 +315,9 @@ def planned(setup: Setup, request: Request) -> PosePlan:
     return plan_pool(request.images, setup.scene, setup.extent, request.seed, allowed)
 
 
-def _prepare(setup: Setup, path: str | os.PathLike[str], request: Request | None) -> _Job:
+def _prepare(
+    setup: Setup, path: str | os.PathLike[str], request: AcquisitionRequest | None
+) -> _Job:
     if request is not None:
         return _Job(setup, request, planned(setup, request).poses, None)
     # Cut back to whole rows first, so that what is read is what is there.
@@ -317,7 +327,7 @@ def _prepare(setup: Setup, path: str | os.PathLike[str], request: Request | None
     try:
         if not isinstance(asked, dict):
             raise TypeError
-        request = Request(**asked)
+        request = AcquisitionRequest(**asked)
     except TypeError:
         raise InputError(f"{path}: has no settings of an acquisition to resume") from None
     try:
@@ -332,27 +342,37 @@ def _open_recorder(path: str | os.PathLike[str], job: _Job) -> Recorder:
         gap = job.progress.last_s + 1.0 - job.setup.clock.now()
         return Recorder(path, time_offset_s=max(gap, 0.0))
     probe = job.setup.probe
-    header = Header(
+    header = RecordingHeader(
         kind=job.request.kind,
         probe={
-            "kind": probe.kind, "elements": probe.elements, "pitch_mm": probe.pitch_mm,
-            "sound_speed_m_s": probe.sound_speed_m_s, "delay_s": probe.delay_s,
+            "kind": probe.kind,
+            "elements": probe.elements,
+            "pitch_mm": probe.pitch_mm,
+            "sound_speed_m_s": probe.sound_speed_m_s,
+            "delay_s": probe.delay_s,
         },
         lines=probe.elements,
         settings=json.dumps(
             {"request": asdict(job.request), "bench": described(job.setup, job.targets)}
         ),
-    )  # fmt: skip
+    )
     recorder = Recorder(path, header)
     recorder.put("plan", "targets", job.targets, "mm")
     return recorder
 
 
 def _run(
-    job: _Job, recorder: Recorder, estimator: Estimator, confirm: Confirm,
-    say: Callable[[str], None], oracle: Oracle | None, operator: Callable[[], Operator],
-    pause: Pause | None, watch: Watch | None, view: Audience,
-) -> Outcome:  # fmt: skip
+    job: _Job,
+    recorder: Recorder,
+    estimator: Estimator,
+    confirm: Confirm,
+    say: Callable[[str], None],
+    oracle: Oracle | None,
+    operator: Callable[[], Operator],
+    pause: Pause | None,
+    watch: Watch | None,
+    view: Audience,
+) -> Outcome:
     setup, clock = job.setup, job.setup.clock
     started = clock.now()
 
@@ -381,9 +401,15 @@ def _run(
                 recorder.add_event("command", f"{command} {json.dumps(numbers)}", t)
 
         motion = Motion(
-            setup.robot_host, plan, confirmation, clock=clock, dry_run=False, log=log,
-            guard=session.trouble, caller_s=setup.caller_s,
-        )  # fmt: skip
+            setup.robot_host,
+            plan,
+            confirmation,
+            clock=clock,
+            dry_run=False,
+            log=log,
+            guard=session.trouble,
+            caller_s=setup.caller_s,
+        )
         with motion:
             stage = ProbeStage(session, motion, job.targets, note)
             failures = 0
@@ -478,9 +504,13 @@ def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
 
 
 def _place(
-    job: _Job, row: int, stage: ProbeStage, estimator: Estimator,
-    operator: Callable[[], Operator], view: Audience,
-) -> Placement:  # fmt: skip
+    job: _Job,
+    row: int,
+    stage: ProbeStage,
+    estimator: Estimator,
+    operator: Callable[[], Operator],
+    view: Audience,
+) -> Placement:
     pose, settings = job.targets[row], job.setup.search
     start = estimator.expected_offset_mm(pose) if estimator.count >= _IMAGES_FOR_PREDICTION else 0.0
     start = float(np.clip(start, -_FURTHEST_START_MM, _FURTHEST_START_MM))
@@ -498,9 +528,15 @@ def _place(
         case "pattern-injection":
             title = f"pose {row + 1} of {len(job.targets)}"
             return pattern_injection(
-                stage, stage, operator(), settings, start, frame=stage.frame, title=title,
+                stage,
+                stage,
+                operator(),
+                settings,
+                start,
+                frame=stage.frame,
+                title=title,
                 watch=view.stop,
-            )  # fmt: skip
+            )
     return first_seen(stage, settings, 0.0, watch=view.stop)
 
 
@@ -532,20 +568,31 @@ def _shoot(job: _Job, row: int, stage: ProbeStage, session: Session) -> _Shot:
 
 
 def _take(
-    job: _Job, row: int, session: Session, recorder: Recorder, estimator: Estimator,
-    placement: Placement, shot: _Shot, oracle: Oracle | None, began: float,
-) -> None:  # fmt: skip
+    job: _Job,
+    row: int,
+    session: Session,
+    recorder: Recorder,
+    estimator: Estimator,
+    placement: Placement,
+    shot: _Shot,
+    oracle: Oracle | None,
+    began: float,
+) -> None:
     """Select the image, and solve again."""
     clock, bracket = job.setup.clock, placement.bracket
     recorder.add_selected(
-        shot.pose, shot.measurement, kind=job.request.kind,
-        max_elevation=bracket.max_elevation_mm, amplitude=shot.amplitude, t_host=clock.now(),
+        shot.pose,
+        shot.measurement,
+        kind=job.request.kind,
+        max_elevation=bracket.max_elevation_mm,
+        amplitude=shot.amplitude,
+        t_host=clock.now(),
         target=row,
         bracket=(bracket.centre_mm, bracket.low_mm, bracket.high_mm, bracket.sd_mm),
         offset=placement.offset_mm,
         true_elevation=float("nan") if oracle is None else oracle.elevation_mm(),
         seconds=clock.now() - began,
-    )  # fmt: skip
+    )
     estimate = estimator.add(shot.pose, shot.measurement, bracket.max_elevation_mm)
     if estimate is not None:
         recorder.add_estimate({"t_host": np.array([clock.now()]), **estimate})

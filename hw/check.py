@@ -112,8 +112,9 @@ def _active_echo(setup: Setup, seconds: float) -> Finding:
         error = echo.device_error()
         if error is not None:
             wrong.append(f"it keeps an error: {error}")
-    return Finding("active echo", f"{name}, clock {hz / 1e6:g} MHz, {rate:.0f} frames/s",
-                   tuple(wrong))  # fmt: skip
+    return Finding(
+        "active echo", f"{name}, clock {hz / 1e6:g} MHz, {rate:.0f} frames/s", tuple(wrong)
+    )
 
 
 def _ultrasound(setup: Setup, seconds: float) -> Finding:

@@ -17,7 +17,7 @@ from jaxcal.cli.common import POSITIVE, ExitCode, exit_code
 from jaxcal.cli.run import run
 
 if TYPE_CHECKING:
-    from hw.acquire import Confirm, Outcome, Request
+    from hw.acquire import AcquisitionRequest, Confirm, Outcome
     from hw.bench.run import Bench
     from hw.keys import Keyboard
     from hw.midplane.pattern_injection import Operator
@@ -145,12 +145,21 @@ def acquire(
         raise InputError("give either --bench or --setup TOML")
     if not bench and (speed, controller, bench_seed) != (None, None, None):
         raise InputError("--speed, --controller and --bench-seed need --bench")
-    given = [name for name, value in (
-        ("--images", images), ("--plan", plan), ("--until-tre", until_tre),
-        ("--placement", placement), ("--phantom", phantom), ("--operator", operator),
-        ("--seed", seed),
-        ("--every-frame", every_frame or None), ("--bench-seed", bench_seed),
-    ) if value is not None]  # fmt: skip
+    given = [
+        name
+        for name, value in (
+            ("--images", images),
+            ("--plan", plan),
+            ("--until-tre", until_tre),
+            ("--placement", placement),
+            ("--phantom", phantom),
+            ("--operator", operator),
+            ("--seed", seed),
+            ("--every-frame", every_frame or None),
+            ("--bench-seed", bench_seed),
+        )
+        if value is not None
+    ]
     if resume and given:
         raise InputError(f"{given[0]} does not go with --resume: the recording knows")
     if resume and recording is None:
@@ -174,7 +183,7 @@ def acquire(
     from jaxcal.cli.cache import enable_compilation_cache
 
     enable_compilation_cache()
-    from hw.acquire import Request
+    from hw.acquire import AcquisitionRequest
 
     request = None
     if operator is None:
@@ -182,11 +191,17 @@ def acquire(
         operator = "person" if asks else "simulated"
     if not resume:
         phantom = phantom or PHANTOMS[0]
-        request = Request(
-            images or 60, placement or PLACEMENTS_OF[phantom][0], seed or 0, every_frame,
+        request = AcquisitionRequest(
+            images or 60,
+            placement or PLACEMENTS_OF[phantom][0],
+            seed or 0,
+            every_frame,
             (bench_seed or 0) if bench else None,
-            operator, plan or PLANS[0], until_tre, phantom,
-        )  # fmt: skip
+            operator,
+            plan or PLANS[0],
+            until_tre,
+            phantom,
+        )
     with ExitStack() as stack:
         emulated = _started(stack, bench, bench_seed, speed, controller, phantom)
         setup = _setup_of(setup_path, emulated)
@@ -221,9 +236,13 @@ def acquire(
     help="Part of the frames to look in, px.",
 )
 @click.option(
-    "--spacing", "spacing_mm", type=POSITIVE, nargs=2, metavar="LATERAL AXIAL",
+    "--spacing",
+    "spacing_mm",
+    type=POSITIVE,
+    nargs=2,
+    metavar="LATERAL AXIAL",
     help="Size of a pixel, mm.",
-)  # fmt: skip
+)
 @click.option(
     "--lag",
     "lag_s",
@@ -339,10 +358,10 @@ def _calibrated(path: str) -> int:
 )
 def bench(speed: float | None, controller: str | None, seed: int) -> int:
     """Serve an emulated bench until Ctrl-C; prints one JSON line with its addresses."""
-    from hw.bench.run import Options, serve
+    from hw.bench.run import BenchOptions, serve
 
     pose_hz = _POSE_HZ[controller or "cb"]
-    serve(Options(speed=1.0 if speed is None else speed, seed=seed, pose_hz=pose_hz))
+    serve(BenchOptions(speed=1.0 if speed is None else speed, seed=seed, pose_hz=pose_hz))
     return ExitCode.CONVERGED
 
 
@@ -444,7 +463,7 @@ def _setup_of(path: str | None, emulated: Bench | None) -> Setup:
 def _acquire(
     setup: Setup,
     path: str,
-    request: Request | None,
+    request: AcquisitionRequest | None,
     emulated: Bench | None,
     unattended: str | None,
     operator: str,
@@ -464,19 +483,22 @@ def _acquire(
         if view is not None:
             view.say(line)
 
-    def attempt(request: Request | None) -> Outcome:
+    def attempt(request: AcquisitionRequest | None) -> Outcome:
         def confirm(plan: MotionPlan) -> Confirmation:
             with keyboard.lines():
                 return confirming(plan)
 
         return run_acquisition(
-            setup, path, request, confirm,
+            setup,
+            path,
+            request,
+            confirm,
             say=say,
             oracle=None if emulated is None else BenchOracle(emulated),
             operator=_operators(operator, keyboard, screen),
             pause=pause,
             view=view,
-        )  # fmt: skip
+        )
 
     # A person's Enter accepts a place.
     pause_keys = ("p",) if operator == "person" else ("enter", "p")
@@ -569,7 +591,9 @@ def _plan_page(plan: MotionPlan) -> list[str]:
     return lines
 
 
-def _dry_run(setup: Setup, path: str, request: Request | None, preview: str | None) -> int:
+def _dry_run(
+    setup: Setup, path: str, request: AcquisitionRequest | None, preview: str | None
+) -> int:
     """Everything but the motion: the plan, and the way from pose to pose, against the limits."""
     from hw.outcome import dry_run
 
@@ -578,7 +602,7 @@ def _dry_run(setup: Setup, path: str, request: Request | None, preview: str | No
     return ExitCode.CONVERGED
 
 
-def _preview(setup: Setup, request: Request | None, preview: str) -> None:
+def _preview(setup: Setup, request: AcquisitionRequest | None, preview: str) -> None:
     from hw.outcome import draw
 
     if request is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.bench.run import Bench, Options, start_bench
+from hw.bench.run import Bench, BenchOptions, start_bench
 from hw.setup import Setup
 
 SPEED = 5.0
@@ -14,7 +14,10 @@ _IMAGES_WALL_HZ = 10.0
 
 
 def start(
-    seed: int, speed: float, pose_hz: int = Options.pose_hz, phantom: str = Options.phantom
+    seed: int,
+    speed: float,
+    pose_hz: int = BenchOptions.pose_hz,
+    phantom: str = BenchOptions.phantom,
 ) -> Bench:
     """Start a bench for an acquisition.
 
@@ -28,9 +31,13 @@ def start(
         InputError: a speed that cannot be.
     """
     return start_bench(
-        seed=seed, speed=speed, pose_hz=pose_hz, most_images_wall_hz=_IMAGES_WALL_HZ,
-        most_poses_wall_hz=min(max(62.5 * speed, 125.0), 1000.0), phantom=phantom,
-    )  # fmt: skip
+        seed=seed,
+        speed=speed,
+        pose_hz=pose_hz,
+        most_images_wall_hz=_IMAGES_WALL_HZ,
+        most_poses_wall_hz=min(max(62.5 * speed, 125.0), 1000.0),
+        phantom=phantom,
+    )
 
 
 def setup_of(bench: Bench) -> Setup:

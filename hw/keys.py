@@ -23,10 +23,16 @@ if TYPE_CHECKING:
 
 _PERIOD_S = 0.05
 _NAMES = {
-    b"\r": "enter", b"\n": "enter", b"\x1b": "escape",
-    b"\x1b[A": "up", b"\x1b[B": "down", b"\x1bOA": "up", b"\x1bOB": "down",
-    b"\x1b[5~": "pageup", b"\x1b[6~": "pagedown",
-}  # fmt: skip
+    b"\r": "enter",
+    b"\n": "enter",
+    b"\x1b": "escape",
+    b"\x1b[A": "up",
+    b"\x1b[B": "down",
+    b"\x1bOA": "up",
+    b"\x1bOB": "down",
+    b"\x1b[5~": "pageup",
+    b"\x1b[6~": "pagedown",
+}
 
 
 def names_of(typed: bytes) -> list[str]:

@@ -146,9 +146,13 @@ class LiveCalibration:
         """
         bound = self._bound if np.isfinite(self._bound[self._mask]).all() else None
         images = make_images(
-            self._poses, self._measurements, self._kind, mask=self._mask,
-            max_elevation=bound, spacing_mm=self._spacing,
-        )  # fmt: skip
+            self._poses,
+            self._measurements,
+            self._kind,
+            mask=self._mask,
+            max_elevation=bound,
+            spacing_mm=self._spacing,
+        )
         return Problem.from_recording(Recording(images, probe=self._probe))
 
     def solve(self) -> Calibration:

@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hw.acquire import Outcome, Request, planned
+from hw.acquire import AcquisitionRequest, Outcome, planned
 from hw.poses import preview
 from hw.robot.limits import Limits
 from hw.robot.safety import MotionPlan, check_plan, plan_lines
@@ -17,7 +17,9 @@ from hw.setup import Setup
 from jaxcal import InputError
 
 
-def dry_run(setup: Setup, path: str, request: Request | None, figure: str | None) -> list[str]:
+def dry_run(
+    setup: Setup, path: str, request: AcquisitionRequest | None, figure: str | None
+) -> list[str]:
     """What an acquisition would do, checked against the limits; nothing is opened.
 
     Raises:
@@ -51,7 +53,7 @@ def dry_run(setup: Setup, path: str, request: Request | None, figure: str | None
     ]
 
 
-def _poses(request: Request, count: int) -> str:
+def _poses(request: AcquisitionRequest, count: int) -> str:
     if request.plan == "sobol":
         return f"{count} poses"
     return f"at most {request.images} images; all {count} poses of the pool were checked"
@@ -63,7 +65,7 @@ def _dry_limits(setup: Setup) -> Limits:
     return limits if setup.tcp_offset is not None else replace(limits, arm_model="")
 
 
-def draw(setup: Setup, request: Request, figure: str) -> None:
+def draw(setup: Setup, request: AcquisitionRequest, figure: str) -> None:
     """Write the plan's figure."""
     preview(planned(setup, request), Path(figure))
 

@@ -51,9 +51,7 @@ def plan_pool(
     nominal = check_poses(np.asarray(scene.image_to_probe)[None], what="nominal image_to_probe")[0]
     bounds = constraints_of(scene, extent, allowed)
     model = Model(nominal, np.asarray(scene.point_mm, float), Noise.constant(BENCH_SDS_MM))
-    candidates = make_candidates(
-        count=_CANDIDATES, constraints=bounds, model=model, seed=seed + 1
-    )  # fmt: skip
+    candidates = make_candidates(count=_CANDIDATES, constraints=bounds, model=model, seed=seed + 1)
     best = plan(candidates, 2 * count, rules=BENCH_RULES).poses
     between = spread.poses[bounds.keeps(spread.poses, nominal, model.point)]
     return in_order(np.concatenate([best, between]), scene, extent, spread.passed_over)

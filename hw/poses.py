@@ -56,9 +56,10 @@ class Extent:
 
     def __post_init__(self) -> None:
         for name, least, largest, unit in (
-            ("cone_deg", 0, 85, "degrees"), ("turn_deg", 0, 180, "degrees"),
+            ("cone_deg", 0, 85, "degrees"),
+            ("turn_deg", 0, 180, "degrees"),
             ("lateral_mm", 0, 500, "mm"),
-        ):  # fmt: skip
+        ):
             value = getattr(self, name)
             if not (np.isfinite(value) and least <= value <= largest):
                 raise InputError(f"{name} must be {least} to {largest} {unit}, not {value}")
@@ -199,8 +200,12 @@ def preview(plan: PosePlan, path: Path) -> None:
     room.plot(*tips.T, "-", color="0.7", linewidth=0.8)
     room.quiver(*tips.T, *(12.0 * axial.T), color="tab:blue", linewidth=0.8)
     room.plot(*np.asarray(plan.scene.point_mm)[:, None], "r*", markersize=12)
-    room.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)",
-             title=f"{len(plan)} poses, tip travels {plan.travel_mm:.0f} mm")  # fmt: skip
+    room.set(
+        xlabel="x (mm)",
+        ylabel="y (mm)",
+        zlabel="z (mm)",
+        title=f"{len(plan)} poses, tip travels {plan.travel_mm:.0f} mm",
+    )
 
     cone = figure.add_subplot(1, 3, 2, projection="polar")
     first, second, along = (axial @ looking_rotation(plan.scene.looking)).T
@@ -210,8 +215,9 @@ def preview(plan: PosePlan, path: Path) -> None:
 
     image = figure.add_subplot(1, 3, 3)
     image.scatter(*plan.expected.T, c=np.arange(len(plan)), s=16)
-    image.set(xlabel="lateral (mm)", ylabel="range (mm)", title="target in the image",
-              aspect="equal")  # fmt: skip
+    image.set(
+        xlabel="lateral (mm)", ylabel="range (mm)", title="target in the image", aspect="equal"
+    )
     image.invert_yaxis()
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=130, format=path.suffix.lstrip(".") or "png")

@@ -26,7 +26,7 @@ import numpy as np
 
 from hw.recording_check import check_resumable
 from hw.recording_file import utc_now
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from hw.robot.pose import ur_to_pose
 from jaxcal import CalibrationError, FormatError, OutputError
 from jaxcal.runtime.isolated import python_command
@@ -62,7 +62,7 @@ class Recorder:
     def __init__(
         self,
         path: str | os.PathLike[str],
-        header: Header | None = None,
+        header: RecordingHeader | None = None,
         *,
         time_offset_s: float = 0.0,
         queue_bytes: int = QUEUE_BYTES,
@@ -88,8 +88,10 @@ class Recorder:
         # In a session of its own: Ctrl-C, or a signal to the whole group, must not stop the writer.
         self._process = subprocess.Popen(
             python_command("hw.recorder_process", self.path),
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._listener = threading.Thread(
@@ -128,57 +130,77 @@ class Recorder:
         if not samples:
             return
         raw = _column(samples, "raw")
-        self._stream("tracker", {
-            "t_host": _column(samples, "t_host"),
-            "t_device": _column(samples, "t_device"),
-            "pose": ur_to_pose(raw),
-            "raw_pose": raw,
-            "safety_bits": _column(samples, "safety_bits", int),
-            "status": _column(samples, "robot_mode", int),
-            "runtime_state": _column(samples, "runtime_state", int),
-        })  # fmt: skip
+        self._stream(
+            "tracker",
+            {
+                "t_host": _column(samples, "t_host"),
+                "t_device": _column(samples, "t_device"),
+                "pose": ur_to_pose(raw),
+                "raw_pose": raw,
+                "safety_bits": _column(samples, "safety_bits", int),
+                "status": _column(samples, "robot_mode", int),
+                "runtime_state": _column(samples, "runtime_state", int),
+            },
+        )
 
     def add_images(self, images: Sequence[Image]) -> None:
         """Append ultrasound frames; all frames of a recording have one size and type."""
         for image in images:
-            self._stream("us", {
-                "t_host": _column([image], "t_host"),
-                "t_device": _column([image], "t_device"),
-                "frame_id": _column([image], "frame_id", int),
-                "frames": np.asarray(image.array)[None],
-            })  # fmt: skip
+            self._stream(
+                "us",
+                {
+                    "t_host": _column([image], "t_host"),
+                    "t_device": _column([image], "t_device"),
+                    "frame_id": _column([image], "frame_id", int),
+                    "frames": np.asarray(image.array)[None],
+                },
+            )
 
     def add_echo(self, frames: Sequence[EchoFrame]) -> None:
         """Append frames of the active echo element: ticks as they came, 65535 = no response."""
         if not frames:
             return
-        self._stream("ae", {
-            "t_host": _column(frames, "t_host"),
-            "frame_id": _column(frames, "frame", int),
-            "clock_ticks": np.array([frame.ticks for frame in frames], np.uint64),
-            "tof_ticks": np.array([frame.tof_ticks for frame in frames], np.uint16),
-            "amplitude": np.array([frame.amplitude for frame in frames], np.uint16),
-            "threshold": _column(frames, "threshold", int),
-        })  # fmt: skip
+        self._stream(
+            "ae",
+            {
+                "t_host": _column(frames, "t_host"),
+                "frame_id": _column(frames, "frame", int),
+                "clock_ticks": np.array([frame.ticks for frame in frames], np.uint64),
+                "tof_ticks": np.array([frame.tof_ticks for frame in frames], np.uint16),
+                "amplitude": np.array([frame.amplitude for frame in frames], np.uint16),
+                "threshold": _column(frames, "threshold", int),
+            },
+        )
 
     def add_event(self, kind: str, text: str, t_host: float) -> None:
         """Append a line of the acquisition's diary; text beyond 480 bytes is cut."""
-        self._rows("events", {
-            "t_host": np.array([t_host]),
-            "utc": np.array([utc_now().encode()]),
-            "kind": np.array([kind.encode()[:32]]),
-            "text": np.array([text.encode()[:480].decode(errors="ignore").encode()]),
-        })  # fmt: skip
+        self._rows(
+            "events",
+            {
+                "t_host": np.array([t_host]),
+                "utc": np.array([utc_now().encode()]),
+                "kind": np.array([kind.encode()[:32]]),
+                "text": np.array([text.encode()[:480].decode(errors="ignore").encode()]),
+            },
+        )
 
     def add_clock(
-        self, device: str, offset: float, drift: float, reference: float, residual: float,
+        self,
+        device: str,
+        offset: float,
+        drift: float,
+        reference: float,
+        residual: float,
         t_host: float,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Append the fit of a device's clock (see the layout for its meaning)."""
         values = {
-            "t_host": t_host, "offset": offset, "drift": drift, "reference": reference,
+            "t_host": t_host,
+            "offset": offset,
+            "drift": drift,
+            "reference": reference,
             "residual": residual,
-        }  # fmt: skip
+        }
         columns = {name: np.array([value]) for name, value in values.items()}
         self._rows("clock", {**columns, "device": np.array([device.encode()[:32]])})
 
@@ -215,16 +237,28 @@ class Recorder:
         Raises:
             OutputError: the writer failed, or did not answer in time.
         """
-        self._rows("calibration", {
-            "pose": pose[None], kind: measurement[None],
-            "max_elevation": np.array([max_elevation]), "amplitude": np.array([amplitude]),
-            "mask": np.array([True]), "time": np.array([t_host]), "target": np.array([target]),
-        })  # fmt: skip
+        self._rows(
+            "calibration",
+            {
+                "pose": pose[None],
+                kind: measurement[None],
+                "max_elevation": np.array([max_elevation]),
+                "amplitude": np.array([amplitude]),
+                "mask": np.array([True]),
+                "time": np.array([t_host]),
+                "target": np.array([target]),
+            },
+        )
         centre, low, high, sd = bracket
         values = {
-            "centre": centre, "low": low, "high": high, "sd": sd, "offset": offset,
-            "true_elevation": true_elevation, "seconds": seconds,
-        }  # fmt: skip
+            "centre": centre,
+            "low": low,
+            "high": high,
+            "sd": sd,
+            "offset": offset,
+            "true_elevation": true_elevation,
+            "seconds": seconds,
+        }
         self._rows("placement", {name: np.array([value]) for name, value in values.items()})
         self.sync()
 
@@ -242,10 +276,16 @@ class Recorder:
         Raises:
             OutputError: the writer failed, or did not answer in time.
         """
-        self._rows("calibration", {
-            "pose": pose[None], "pixel": pixel[None], "covariance": covariance[None],
-            "mask": np.array([True]), "time": np.array([time_s]),
-        })  # fmt: skip
+        self._rows(
+            "calibration",
+            {
+                "pose": pose[None],
+                "pixel": pixel[None],
+                "covariance": covariance[None],
+                "mask": np.array([True]),
+                "time": np.array([time_s]),
+            },
+        )
         self.sync()
 
     def leave_out(self, row: int) -> None:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from hw.recording_file import RecordingWriter
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from jaxcal import CalibrationError
 from jaxcal.io.readable import one_line
 
@@ -54,7 +54,7 @@ def main(path: str) -> int:
             if given is None:
                 writer = RecordingWriter.resume(path)
             else:
-                writer = RecordingWriter.create(path, Header(**given))
+                writer = RecordingWriter.create(path, RecordingHeader(**given))
             answer(mark="open", rows=writer.rows)
             _serve(writer, source, answer)
         writer.close()

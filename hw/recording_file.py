@@ -37,7 +37,7 @@ from hw.recording_layout import (
     STATIC,
     VERSION,
     Column,
-    Header,
+    RecordingHeader,
 )
 from jaxcal import FormatError, OutputError, __version__
 from jaxcal.io.atomic import write_text
@@ -81,7 +81,7 @@ class RecordingWriter:
         }
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], header: Header) -> RecordingWriter:
+    def create(cls, path: str | os.PathLike[str], header: RecordingHeader) -> RecordingWriter:
         """A new recording; the file appears with its skeleton whole, so that it always opens.
 
         Args:
@@ -379,7 +379,7 @@ def utc_now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-def _write_skeleton(file: h5py.File, header: Header) -> None:
+def _write_skeleton(file: h5py.File, header: RecordingHeader) -> None:
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
     file.attrs["complete"] = False
     file.attrs["created_utc"] = utc_now()
@@ -418,9 +418,13 @@ def _make_columns(
         tail = tuple(int(sizes[n]) if isinstance(n, str) else n for n in column.tail)
         dtype = np.dtype(str(sizes["frame"])) if column.dtype == "frame" else np.dtype(column.dtype)
         dataset = target.create_dataset(
-            key, shape=(0, *tail), maxshape=(None, *tail), dtype=dtype,
-            chunks=(column.chunk, *tail), fletcher32=True,
-        )  # fmt: skip
+            key,
+            shape=(0, *tail),
+            maxshape=(None, *tail),
+            dtype=dtype,
+            chunks=(column.chunk, *tail),
+            fletcher32=True,
+        )
         dataset.attrs["units"] = column.unit
 
 

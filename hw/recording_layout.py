@@ -131,11 +131,18 @@ LAYOUT: dict[str, dict[str, Column]] = {
 """What may be appended to; a row is appended to all columns of its group, or to none."""
 
 SELECTED = {
-    "time_of_flight": ("pose", "time_of_flight", "max_elevation", "amplitude", "mask", "time",
-                       "target"),
+    "time_of_flight": (
+        "pose",
+        "time_of_flight",
+        "max_elevation",
+        "amplitude",
+        "mask",
+        "time",
+        "target",
+    ),
     "point": ("pose", "point", "max_elevation", "amplitude", "mask", "time", "target"),
     "pixel": ("pose", "pixel", "covariance", "mask", "time"),
-}  # fmt: skip
+}
 """Columns of /calibration by what the selected images hold."""
 
 STATIC = ("plan", "test", "truth")
@@ -146,7 +153,7 @@ LARGEST_ROW = 2**24
 
 
 @dataclass(frozen=True)
-class Header:
+class RecordingHeader:
     """What a recording is told when it is made.
 
     Attributes:

@@ -27,16 +27,19 @@ def described(setup: Setup, targets: np.ndarray) -> dict[str, Any]:
     probe, scene = setup.probe, setup.scene
     content = {
         "probe": {
-            "elements": probe.elements, "pitch_mm": probe.pitch_mm,
-            "sound_speed_m_s": probe.sound_speed_m_s, "delay_s": probe.delay_s,
+            "elements": probe.elements,
+            "pitch_mm": probe.pitch_mm,
+            "sound_speed_m_s": probe.sound_speed_m_s,
+            "delay_s": probe.delay_s,
         },
         "scene": {
-            "image_to_probe": scene.image_to_probe.tolist(), "point_mm": scene.point_mm.tolist(),
+            "image_to_probe": scene.image_to_probe.tolist(),
+            "point_mm": scene.point_mm.tolist(),
             "looking": scene.looking.tolist(),
         },
         "limits": dict(setup.limits),
         "plan_sha256": hashlib.sha256(np.ascontiguousarray(targets, float).tobytes()).hexdigest(),
-    }  # fmt: skip
+    }
     return json.loads(json.dumps(content))
 
 

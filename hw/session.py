@@ -102,9 +102,11 @@ class Session:
         opened = []
         try:
             self.poses = PoseStream(
-                setup.robot_host, clock=self.clock, frequency_hz=setup.frequency_hz,
+                setup.robot_host,
+                clock=self.clock,
+                frequency_hz=setup.frequency_hz,
                 max_age_s=self.clock.patience(self.watch.pose_age_s),
-            )  # fmt: skip
+            )
             self.poses.start()
             opened.append(self.poses)
             self.echo = ActiveEcho(

@@ -196,19 +196,32 @@ def load_setup(path: str | os.PathLike[str]) -> Setup:
 
 
 _TABLES = {
-    "robot": {"host": str, "frequency_hz": float, "settle_s": float,
-              "tcp_offset": list, "model": str},
+    "robot": {
+        "host": str,
+        "frequency_hz": float,
+        "settle_s": float,
+        "tcp_offset": list,
+        "model": str,
+    },
     "active_echo": {"url": str, "frames": int},
     "ultrasound": {"host": str, "port": int},
-    "probe": {"elements": int, "pitch_mm": float, "sound_speed_m_s": float, "delay_s": float,
-              "housing_mm": list},
+    "probe": {
+        "elements": int,
+        "pitch_mm": float,
+        "sound_speed_m_s": float,
+        "delay_s": float,
+        "housing_mm": list,
+    },
     "scene": {"image_to_probe": list, "point_mm": list, "looking": list, "tip_at_tcp": bool},
     "limits": None,
-    "plan": {f.name: list if f.name.endswith("_mm") and f.name != "lateral_mm" else float
-             for f in dataclasses.fields(Extent)},
-    "search": {f.name: int if isinstance(f.default, int) else float
-               for f in dataclasses.fields(Settings)},
-}  # fmt: skip
+    "plan": {
+        f.name: list if f.name.endswith("_mm") and f.name != "lateral_mm" else float
+        for f in dataclasses.fields(Extent)
+    },
+    "search": {
+        f.name: int if isinstance(f.default, int) else float for f in dataclasses.fields(Settings)
+    },
+}
 
 
 def _setup(tables: dict[str, Any]) -> Setup:
@@ -328,9 +341,12 @@ def _table(tables: dict[str, Any], name: str) -> dict[str, Any]:
             value = float(value)
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             wanted = {
-                str: "text", int: "a whole number", float: "a number", list: "a list",
+                str: "text",
+                int: "a whole number",
+                float: "a number",
+                list: "a list",
                 bool: "true or false",
-            }[kind]  # fmt: skip
+            }[kind]
             raise InputError(f"[{name}] {key} must be {wanted}")
         checked[key] = value
     return checked

@@ -5,13 +5,13 @@ A calibration of jaxcal is least squares: unknowns that step on a manifold (:cla
 :func:`channel_residual`), a minimiser of them, and the derivative of the minimum by the implicit
 function theorem. :func:`initial_fit` is where every method begins.
 
-In batches, laid out as planes with the problems last, the same are :class:`Images` (the data),
+In batches, laid out as planes with the problems last, the same are :class:`ImagePlanes` (the data),
 :class:`Iterate` (the unknowns), an :class:`Observation` (:class:`Points`, :class:`OwnCovariances`,
-:class:`TrackedPoints`, :class:`InPlane`, :class:`BoundedOffsets`, :class:`Channels`, or one of your
-own), :func:`accumulate` (the normal equations in one pass over the images), :func:`minimise` and
-:func:`implicit_tangent`. :class:`LevenbergMarquardt` is the same loop behind optimistix's interface
-for residuals of any shape, :func:`arrow_least_squares` that for problems with shared unknowns and
-one local unknown a row.
+:class:`TrackedPoints`, :class:`InPlane`, :class:`BoundedOffsets`, :class:`ChannelDistances`, or one
+of your own), :func:`accumulate` (the normal equations in one pass over the images),
+:func:`minimise` and :func:`implicit_tangent`. :class:`LevenbergMarquardt` is the same loop behind
+optimistix's interface for residuals of any shape, :func:`arrow_least_squares` that for problems
+with shared unknowns and one local unknown a row.
 
 Unlike :func:`jaxcal.calibrate`, these functions compute in the caller's modes: switch 64 bits on
 (``jax.enable_x64``) before making a problem's arrays. ``docs/how-to/own-solver.md`` has worked
@@ -24,10 +24,10 @@ from __future__ import annotations
 import jax
 
 from jaxcal.data.problem import Problem
-from jaxcal.model.batch import Images, Iterate
+from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import (
     BoundedOffsets,
-    Channels,
+    ChannelDistances,
     Component,
     Further,
     InPlane,
@@ -55,10 +55,10 @@ __all__ = [
     "RIGID",
     "Blocks",
     "BoundedOffsets",
-    "Channels",
+    "ChannelDistances",
     "Component",
     "Further",
-    "Images",
+    "ImagePlanes",
     "InPlane",
     "Iterate",
     "LevenbergMarquardt",
@@ -92,6 +92,6 @@ def initial_fit(problem: Problem, blocks: Blocks = RIGID) -> Parameters:
         problem: one problem (vmap for a batch).
         blocks: the free unknowns.
     """
-    images = Images.of(jax.tree.map(lambda leaf: leaf[None], problem))
+    images = ImagePlanes.of(jax.tree.map(lambda leaf: leaf[None], problem))
     found = conventional(images, blocks).fit.place.parameters()
     return jax.tree.map(lambda leaf: leaf[0], found)

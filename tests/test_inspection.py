@@ -21,7 +21,7 @@ from jaxcal.diagnostics.residual_checks import (
     skewness_score,
 )
 from jaxcal.diagnostics.uncertainty import inverses, quadratic
-from jaxcal.model.batch import Images, Iterate
+from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import Points
 from jaxcal.model.parameters import RIGID, Parameters
 from jaxcal.model.residuals import target_in_image
@@ -67,7 +67,7 @@ def scores():
     @jax.jit
     def fit(errors):
         start, data = jax.vmap(drawn)(errors)
-        images, sigma = Images.of(data), jnp.tile(SIGMA[:, None], len(errors))
+        images, sigma = ImagePlanes.of(data), jnp.tile(SIGMA[:, None], len(errors))
         return minimise(Iterate.of(start, RIGID), Points(sigma), images).place.parameters(), data
 
     def run(errors):

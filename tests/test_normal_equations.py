@@ -13,18 +13,18 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from jaxcal.data.problem import Channels as Heard
+from jaxcal.data.problem import ChannelDistances as Heard
 from jaxcal.data.problem import Problem
 from jaxcal.model import derivatives, unrolled
-from jaxcal.model.batch import Images, Iterate, targets, total
+from jaxcal.model.batch import ImagePlanes, Iterate, targets, total
 from jaxcal.model.observations import (
     BoundedOffsets,
-    Channels,
+    ChannelDistances,
     Further,
     HeldOffsets,
     InPlane,
     LocalUnknown,
-    Medium,
+    MediumPrior,
     OwnCovariances,
     Points,
     TrackedPoints,
@@ -129,22 +129,22 @@ CASES = {
         lambda images: BoundedOffsets.of(jnp.full((LANES, IMAGES), 1.2), images),
         RIGID + EXTRA,
     ),
-    "channels": (lambda images: Channels(SIGMA[1:]), (*RIGID, "sound-speed", "delay")),
+    "channels": (lambda images: ChannelDistances(SIGMA[1:]), (*RIGID, "sound-speed", "delay")),
 }
 """Every observation, and the unknowns it is looked at with."""
 
 
-def case(drawn, name: str) -> tuple[Iterate, Any, Images, Medium | None]:
+def case(drawn, name: str) -> tuple[Iterate, Any, ImagePlanes, MediumPrior | None]:
     make, blocks = CASES[name]
     problems, near = drawn
-    images = Images.of(problems, channels=name == "channels")
+    images = ImagePlanes.of(problems, channels=name == "channels")
     medium = None
     if "delay" in blocks and name != "bounded offsets":
-        medium = Medium(jnp.asarray([[0.01] * LANES, [0.4] * LANES]), blocks)
+        medium = MediumPrior(jnp.asarray([[0.01] * LANES, [0.4] * LANES]), blocks)
     return Iterate.of(near, blocks), make(images), images, medium
 
 
-def whitened(step, local, place: Iterate, observation, images: Images, medium):
+def whitened(step, local, place: Iterate, observation, images: ImagePlanes, medium):
     """All whitened residuals of every lane after a step, (lanes, n, residuals of an image)."""
     moved = place.moved(list(step))
     q, _ = targets(moved, images)
@@ -167,7 +167,7 @@ def whitened(step, local, place: Iterate, observation, images: Images, medium):
     return jnp.concatenate(found, axis=-1)
 
 
-def dense(place: Iterate, observation, images: Images, medium):
+def dense(place: Iterate, observation, images: ImagePlanes, medium):
     """Cost, gradient, exact and Gauss-Newton's curvature, squares of the columns."""
     zero, units = jnp.zeros((place.unknowns, LANES)), jnp.eye(place.unknowns)
 
@@ -261,7 +261,7 @@ def test_images_left_out_and_padding_count_for_nothing(drawn, name):
         distances=problems.channels.distances[:, keep],
         heard=problems.channels.heard[:, keep],
     )
-    few = Images.of(
+    few = ImagePlanes.of(
         replace(
             problems,
             poses=problems.poses[:, keep],

@@ -12,7 +12,7 @@ from conftest import problem
 from test_geometry import random_poses
 
 import jaxcal
-from jaxcal.model.batch import Images, Iterate
+from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import InPlane
 from jaxcal.model.parameters import RIGID, Parameters
 from jaxcal.model.residuals import target_in_image
@@ -102,7 +102,7 @@ def test_a_start_drowned_in_noise_is_searched_for():
     matrix = jnp.asarray(truth.image_to_probe)
     start = Parameters.of(matrix[:3, :3], matrix[:3, 3], jnp.asarray(truth.point))
     alone, start = jax.tree.map(lambda leaf: leaf[None], (data, start))
-    images = Images.of(alone)
+    images = ImagePlanes.of(alone)
     fit = minimise(Iterate.of(start, RIGID), InPlane.of(images), images)
     assert float(result.cost) <= float(fit.cost[0]) * (1 + 1e-9)
 

@@ -50,7 +50,7 @@ from common import machine, results_folder, write_table  # noqa: E402
 from peer_solvers import Batch, Solved  # noqa: E402
 
 import jaxcal  # noqa: E402
-from jaxcal.backend import RIGID, Images, Iterate, Parameters, Points, minimise  # noqa: E402
+from jaxcal.backend import RIGID, ImagePlanes, Iterate, Parameters, Points, minimise  # noqa: E402
 from jaxcal.io.atomic import atomic_path  # noqa: E402
 from jaxcal.runtime.compiler import fast_to_run  # noqa: E402
 
@@ -142,7 +142,7 @@ class Minimiser:
             problems, matrix, point = part
             start = jax.vmap(Parameters.of)(matrix[:, :3, :3], matrix[:, :3, 3], point)
             points = Points(jnp.tile(jnp.asarray(SIGMA_MM)[:, None], lanes))
-            fit = minimise(Iterate.of(start, RIGID), points, Images.of(problems))
+            fit = minimise(Iterate.of(start, RIGID), points, ImagePlanes.of(problems))
             found = fit.place.parameters()
             return jax.vmap(Parameters.matrix)(found), found.point, fit.iterations
 

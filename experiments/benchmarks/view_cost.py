@@ -30,7 +30,7 @@ from hw.errors import RefusedError, StaleError, StoppedError
 from hw.midplane.bracket import Bracket, Placement
 from hw.poses import plan_poses
 from hw.recorder import Recorder
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from hw.robot.motion import Motion
 from hw.robot.safety import MotionPlan, confirm_unattended
 from hw.session import Session
@@ -70,7 +70,9 @@ def measure(pages: int, seconds: float) -> list[object]:
         setup = setup_of(stack.enter_context(start(SEED, 1.0)))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         probe = {"kind": "linear", "elements": 128, "pitch_mm": 0.457, "sound_speed_m_s": 1490.0}
-        recorder = Recorder(folder / "rec.h5", Header("time_of_flight", probe, 128, None, "{}"))
+        recorder = Recorder(
+            folder / "rec.h5", RecordingHeader("time_of_flight", probe, 128, None, "{}")
+        )
         stack.enter_context(recorder)
         view = stack.enter_context(LiveView(print, port=8300))
         session = stack.enter_context(Session(setup, recorder))

@@ -163,9 +163,7 @@ def encode_echo(packet: EchoPacket) -> bytes:
     lines = len(packet.tof_ticks)
     values = np.empty((lines, 2), "<u2")
     values[:, 0], values[:, 1] = packet.tof_ticks, packet.amplitude
-    header = _HEADER.pack(
-        _ECHO, _VERSION, packet.frame, packet.ticks, lines, packet.threshold
-    )  # fmt: skip
+    header = _HEADER.pack(_ECHO, _VERSION, packet.frame, packet.ticks, lines, packet.threshold)
     return _frame(header + values.tobytes())
 
 

@@ -238,9 +238,10 @@ class AuspisEmulator:
             ticks=int(t * self._clock_hz) % 2**64,
             threshold=self._threshold,
             tof_ticks=to_ticks(seconds, self._clock_hz)[:lines],
-            amplitude=np.clip(np.nan_to_num(np.rint(amplitude)), 0, 0xFFFF)
-            .astype(np.uint16)[:lines],
-        )  # fmt: skip
+            amplitude=np.clip(np.nan_to_num(np.rint(amplitude)), 0, 0xFFFF).astype(np.uint16)[
+                :lines
+            ],
+        )
         data = bytearray(encode_echo(packet))
         if self._random.random() < faults.crc_errors:
             place = int(self._random.integers(1, len(data) - 1))

@@ -121,10 +121,16 @@ class Arm:
         model: str | None = None,
     ) -> None:
         self.settings = {
-            "raw": _six(raw), "tcp_offset": _six(tcp_offset), "repeatability_mm": repeatability_mm,
-            "repeatability_deg": repeatability_deg, "correlation_mm": correlation_mm, "seed": seed,
-            "halt_acceleration": halt_acceleration, "reach_m": tuple(reach_m), "model": model,
-        }  # fmt: skip
+            "raw": _six(raw),
+            "tcp_offset": _six(tcp_offset),
+            "repeatability_mm": repeatability_mm,
+            "repeatability_deg": repeatability_deg,
+            "correlation_mm": correlation_mm,
+            "seed": seed,
+            "halt_acceleration": halt_acceleration,
+            "reach_m": tuple(reach_m),
+            "model": model,
+        }
         """What it was made of: another process can make the same arm."""
         self.watcher: Callable[[Motion], None] | None = None
         """Told of every new motion, in the thread that commands it."""
@@ -139,9 +145,18 @@ class Arm:
         first = tuple(self._random.gauss(0.0, sd) for sd in self._sd)
         start = _six(raw)
         self._motion = Motion(
-            -math.inf, start[:3], _quaternion(start[3:]), (0.0,) * 3, (0.0,) * 3, 0.0, 1.0, 1.0,
-            error=(first, first), planned_tcp=self._tool, tcp=self._tool,
-        )  # fmt: skip
+            -math.inf,
+            start[:3],
+            _quaternion(start[3:]),
+            (0.0,) * 3,
+            (0.0,) * 3,
+            0.0,
+            1.0,
+            1.0,
+            error=(first, first),
+            planned_tcp=self._tool,
+            tcp=self._tool,
+        )
         self.model = None if model is None else model_named(model)
         self._track: JointTrack | None = None
         if self.model is not None:
@@ -193,9 +208,18 @@ class Arm:
             for e, sd in zip(error, self._sd, strict=True)
         )
         return Motion(
-            t, position, quaternion, travel, turn, length, speed, acceleration,
-            error=(error, drawn), planned_tcp=tcp, tcp=tcp,
-        )  # fmt: skip
+            t,
+            position,
+            quaternion,
+            travel,
+            turn,
+            length,
+            speed,
+            acceleration,
+            error=(error, drawn),
+            planned_tcp=tcp,
+            tcp=tcp,
+        )
 
     def servo(self, t: float, target: Sequence[float], duration: float) -> None:
         """Be at a pose after ``duration`` s, at a constant speed."""
@@ -210,9 +234,13 @@ class Arm:
         if rate == 0.0 and t >= moving.start + moving.duration():
             return t
         brake = replace(
-            moving, start=t, first=first, speed=rate, brake=True,
+            moving,
+            start=t,
+            first=first,
+            speed=rate,
+            brake=True,
             acceleration=acceleration or self.halt_acceleration,
-        )  # fmt: skip
+        )
         self.follow(brake)
         return t + brake.duration()
 

@@ -34,7 +34,7 @@ _HOVER_MM = 70.0
 
 
 @dataclass(frozen=True)
-class Options:
+class BenchOptions:
     """How to run a bench.
 
     Attributes:
@@ -67,10 +67,13 @@ class Options:
 
     def __post_init__(self) -> None:
         for name, least, largest in (
-            ("speed", 0.01, 100.0), ("echo_hz", 0.1, 1000.0), ("image_hz", 0.1, 200.0),
-            ("most_images_wall_hz", 0.1, 1000.0), ("most_poses_wall_hz", 50.0, 1000.0),
+            ("speed", 0.01, 100.0),
+            ("echo_hz", 0.1, 1000.0),
+            ("image_hz", 0.1, 200.0),
+            ("most_images_wall_hz", 0.1, 1000.0),
+            ("most_poses_wall_hz", 50.0, 1000.0),
             ("repeatability_mm", 0.0, 10.0),
-        ):  # fmt: skip
+        ):
             value = getattr(self, name)
             if not (math.isfinite(value) and least <= value <= largest):
                 raise InputError(f"bench: {name} must be {least:g} to {largest:g}, not {value}")
@@ -92,7 +95,7 @@ class Assembly:
         arm: where the robot's arm is; it follows the one in the robot's own process.
     """
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: BenchOptions) -> None:
         self.options = options
         self.world: World = make_world(
             options.seed, phantom=phantom_named(options.phantom), **options.world
@@ -129,14 +132,20 @@ class Assembly:
         self._faults = self._table()
         self._unplugged = False
         self._done: queue.SimpleQueue[None] = queue.SimpleQueue()
-        self.control = ControlServer({
-            "fault": self._fault, "recover": self._recover, "truth": self._truth,
-            "true_pose": lambda _: self.true_pose(self.clock.now()).tolist(),
-            "rest_since": lambda _: self._rest_since(),
-            "world": lambda _: self._world(), "test_set": self._test_set,
-            "statistics": lambda _: self._statistics(), "robot": lambda _: self._robot(),
-            "close": lambda _: self._done.put(None),
-        })  # fmt: skip
+        self.control = ControlServer(
+            {
+                "fault": self._fault,
+                "recover": self._recover,
+                "truth": self._truth,
+                "true_pose": lambda _: self.true_pose(self.clock.now()).tolist(),
+                "rest_since": lambda _: self._rest_since(),
+                "world": lambda _: self._world(),
+                "test_set": self._test_set,
+                "statistics": lambda _: self._statistics(),
+                "robot": lambda _: self._robot(),
+                "close": lambda _: self._done.put(None),
+            }
+        )
 
     # What the devices notice
 
@@ -170,22 +179,33 @@ class Assembly:
         self.control.start()
         world = self.world
         return {
-            "speed": self.clock.speed, "origin_s": self.clock.origin_s,
-            "robot_host": self.robot.host, "robot_serial": self.robot.serial,
-            "pose_hz": self.robot.frequency_hz, "tcp_offset": list(self.arm.tcp_offset),
+            "speed": self.clock.speed,
+            "origin_s": self.clock.origin_s,
+            "robot_host": self.robot.host,
+            "robot_serial": self.robot.serial,
+            "pose_hz": self.robot.frequency_hz,
+            "tcp_offset": list(self.arm.tcp_offset),
             "active_echo_url": self.echo.path,
-            "ultrasound": [self.images.host, self.images.port], "control": self.control.port,
-            "spacing_mm": list(self.camera.spacing_mm), "clock_hz": world.clock_hz,
+            "ultrasound": [self.images.host, self.images.port],
+            "control": self.control.port,
+            "spacing_mm": list(self.camera.spacing_mm),
+            "clock_hz": world.clock_hz,
             "scene": {name: np.asarray(part).tolist() for name, part in vars(world.scene).items()},
-            "probe": asdict(world.probe), "seed": self.options.seed,
-        }  # fmt: skip
+            "probe": asdict(world.probe),
+            "seed": self.options.seed,
+        }
 
     def _start_robot(self) -> RobotProcess:
         chance = random.Random(os.getpid())
-        hosts = [self.options.robot_host] if self.options.robot_host else [
-            f"127.0.{chance.randrange(256)}.{chance.randrange(2, 255)}"
-            for _ in range(_ADDRESS_TRIES)
-        ] + ["127.0.0.1"]  # fmt: skip
+        hosts = (
+            [self.options.robot_host]
+            if self.options.robot_host
+            else [
+                f"127.0.{chance.randrange(256)}.{chance.randrange(2, 255)}"
+                for _ in range(_ADDRESS_TRIES)
+            ]
+            + ["127.0.0.1"]
+        )
         trouble: OSError | None = None
         for host in hosts:
             server = RobotProcess(
@@ -275,10 +295,12 @@ class Assembly:
         return None if since is None else max(since, 0.0)
 
     def _world(self) -> dict:
-        return {"image_to_probe": self.world.image_to_probe.tolist(),
-                "point_mm": self.world.point_mm.tolist(),
-                "sound_speed_m_s": self.world.sound_speed_m_s,
-                "latency_s": self.world.noise.latency_s}  # fmt: skip
+        return {
+            "image_to_probe": self.world.image_to_probe.tolist(),
+            "point_mm": self.world.point_mm.tolist(),
+            "sound_speed_m_s": self.world.sound_speed_m_s,
+            "latency_s": self.world.noise.latency_s,
+        }
 
     def _test_set(self, request: dict) -> list:
         poses, points = self.world.test_set(**request)
@@ -292,9 +314,13 @@ class Assembly:
 
     def _statistics(self) -> dict:
         assert self.robot is not None
-        return {"packets": self.robot.packets, "packets_skipped": self.robot.skipped,
-                "echo_frames": self.echo.sent, "images": self.images.sent,
-                "images_refused": self.images.refused}  # fmt: skip
+        return {
+            "packets": self.robot.packets,
+            "packets_skipped": self.robot.skipped,
+            "echo_frames": self.echo.sent,
+            "images": self.images.sent,
+            "images_refused": self.images.refused,
+        }
 
 
 def hovering(scene: Scene) -> Float[np.ndarray, "4 4"]:

@@ -24,12 +24,26 @@ _REAL_TIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70
 _START_S = 0.05
 """From the end of the script's upload to its first line."""
 _NAMES = {
-    1: "moveJ", 2: "moveJ_IK", 4: "moveL_FK", 6: "forceMode", 7: "forceModeStop", 9: "speedJ",
-    10: "speedL", 11: "servoJ", 12: "servoC", 18: "teachMode", 19: "endTeachMode",
-    25: "toolContact", 30: "getInverseKinematics", 37: "isJointsWithinSafetyLimits",
-    41: "jogStart", 43: "getForwardKinematics", 44: "getForwardKinematics", 45: "movePath",
+    1: "moveJ",
+    2: "moveJ_IK",
+    4: "moveL_FK",
+    6: "forceMode",
+    7: "forceModeStop",
+    9: "speedJ",
+    10: "speedL",
+    11: "servoJ",
+    12: "servoC",
+    18: "teachMode",
+    19: "endTeachMode",
+    25: "toolContact",
+    30: "getInverseKinematics",
+    37: "isJointsWithinSafetyLimits",
+    41: "jogStart",
+    43: "getForwardKinematics",
+    44: "getForwardKinematics",
+    45: "movePath",
     46: "getInverseKinematics",
-}  # fmt: skip
+}
 """ur_rtde's names of commands that end the program, as an unknown function ends a real script."""
 STEADY_S = 0.5
 """How long the arm must have rested to count as steady (URScript manual, is_steady)."""

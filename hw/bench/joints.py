@@ -95,8 +95,11 @@ class JointTrack:
         """Whether another motion (a brake) runs along the same path."""
         mine = self.motion
         return (mine.position, mine.quaternion, mine.travel, mine.turn) == (
-            motion.position, motion.quaternion, motion.travel, motion.turn,
-        )  # fmt: skip
+            motion.position,
+            motion.quaternion,
+            motion.travel,
+            motion.turn,
+        )
 
 
 def track(

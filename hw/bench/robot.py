@@ -63,9 +63,12 @@ class RobotProcess:
         self.serial = ""
         self.frequency_hz = 0.0
         self._setup = {
-            "host": host, "version": version, "arm": arm.settings,
-            "clock": [clock.speed, clock.origin_s], "server": settings,
-        }  # fmt: skip
+            "host": host,
+            "version": version,
+            "arm": arm.settings,
+            "clock": [clock.speed, clock.origin_s],
+            "server": settings,
+        }
         self._asking = threading.Lock()
         self._answers: queue.SimpleQueue[dict] = queue.SimpleQueue()
         self.process: subprocess.Popen[str] | None = None
@@ -79,8 +82,10 @@ class RobotProcess:
         """
         self.process = subprocess.Popen(
             python_command("hw.bench.robot", json.dumps(self._setup)),
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         self._thread = threading.Thread(target=self._receive, name="robot's process", daemon=True)
         self._thread.start()
         told = self._answer()
@@ -225,12 +230,19 @@ def _motion(told: dict) -> Motion:
 def _state(robot: RtdeServer) -> dict:
     arm, program, t = robot.arm, robot.controller, robot.clock.now()
     return {
-        "t": t, "raw": arm.raw(t), "joints": arm.joints(t),
-        "velocity": arm.velocity(t), "rest_since": arm.rest_since(t),
-        "running": program.running, "reason": program.reason, "log": program.log,
-        "packets": robot.packets, "late": robot.late, "skipped": robot.skipped,
+        "t": t,
+        "raw": arm.raw(t),
+        "joints": arm.joints(t),
+        "velocity": arm.velocity(t),
+        "rest_since": arm.rest_since(t),
+        "running": program.running,
+        "reason": program.reason,
+        "log": program.log,
+        "packets": robot.packets,
+        "late": robot.late,
+        "skipped": robot.skipped,
         "unlocks": robot.unlock_requests,
-    }  # fmt: skip
+    }
 
 
 def _do(robot: RtdeServer, name: str, values: list) -> dict:
@@ -242,9 +254,14 @@ def _do(robot: RtdeServer, name: str, values: list) -> dict:
         case "drop control":
             robot.drop(control_only=True)
         case (
-            "mute" | "drop" | "protective_stop" | "unlock" | "set_tcp_offset" | "set_payload"
+            "mute"
+            | "drop"
+            | "protective_stop"
+            | "unlock"
+            | "set_tcp_offset"
+            | "set_payload"
             | "set_speed_slider"
-        ):  # fmt: skip
+        ):
             getattr(robot, name)(*values)
         case _:
             return {"trouble": f"unknown request {name}"}

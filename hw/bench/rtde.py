@@ -437,12 +437,13 @@ class RtdeServer:
     def _set_inputs(self, connection: _Connection, payload: bytes) -> bytes:
         names = _names(payload)
         taken = {
-            name for other in self._connections if other is not connection
-            for recipe in other.inputs for name in recipe
-        }  # fmt: skip
-        types = [
-            "IN_USE" if name in taken else INPUTS.get(name, "NOT_FOUND") for name in names
-        ]  # fmt: skip
+            name
+            for other in self._connections
+            if other is not connection
+            for recipe in other.inputs
+            for name in recipe
+        }
+        types = ["IN_USE" if name in taken else INPUTS.get(name, "NOT_FOUND") for name in names]
         if "IN_USE" in types or "NOT_FOUND" in types:
             return b"\x00" + ",".join(types).encode()
         connection.inputs.append(names)

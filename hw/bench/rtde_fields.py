@@ -6,9 +6,14 @@ VECTOR6D, VECTOR3D, VECTOR6INT32 = "VECTOR6D", "VECTOR3D", "VECTOR6INT32"
 DOUBLE, UINT64, UINT32, INT32 = "DOUBLE", "UINT64", "UINT32", "INT32"
 
 STRUCT = {
-    VECTOR6D: "6d", VECTOR3D: "3d", VECTOR6INT32: "6i", DOUBLE: "d", UINT64: "Q", UINT32: "I",
+    VECTOR6D: "6d",
+    VECTOR3D: "3d",
+    VECTOR6INT32: "6i",
+    DOUBLE: "d",
+    UINT64: "Q",
+    UINT32: "I",
     INT32: "i",
-}  # fmt: skip
+}
 """struct's code of each type; all of it is big-endian."""
 
 _SIX = [

@@ -19,7 +19,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from hw.bench.assembly import Assembly, Options
+from hw.bench.assembly import Assembly, BenchOptions
 from hw.bench.control import ControlClient
 from hw.clock import Clock
 from hw.scene import Scene
@@ -28,7 +28,7 @@ from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
 from jaxcal.runtime.isolated import python_command
 
-__all__ = ["Bench", "Options", "main", "serve", "start_bench"]
+__all__ = ["Bench", "BenchOptions", "main", "serve", "start_bench"]
 
 _START_WALL_S = 60.0
 
@@ -153,23 +153,25 @@ class Bench:
             self._process.stdout.close()
 
 
-def start_bench(options: Options | None = None, **changes) -> Bench:
+def start_bench(options: BenchOptions | None = None, **changes) -> Bench:
     """Start a bench in a process of its own.
 
     Args:
         options: how.
-        changes: fields of :class:`Options`, instead of them.
+        changes: fields of :class:`BenchOptions`, instead of them.
 
     Raises:
         InputError: options that cannot be, or a bench that does not start; one line.
     """
-    options = Options(**{**(asdict(options) if options is not None else {}), **changes})
+    options = BenchOptions(**{**(asdict(options) if options is not None else {}), **changes})
     with tempfile.TemporaryFile() as complaints:
         process = subprocess.Popen(
             python_command("hw.bench.run", "--json", json.dumps(asdict(options))),
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=complaints,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=complaints,
             start_new_session=True,
-        )  # fmt: skip
+        )
         assert process.stdout is not None
         line = _first_line(process)
         if not line:
@@ -193,7 +195,7 @@ def _first_line(process: subprocess.Popen) -> bytes:
         return b""
 
 
-def serve(options: Options) -> None:
+def serve(options: BenchOptions) -> None:
     """Run a bench here: print its addresses, serve until standard input ends or it is told to."""
     # A person's Ctrl-C and a parent's death both end standard input's reader.
     assembly = Assembly(options)
@@ -223,9 +225,9 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     try:
         if given.json:
-            options = Options(**json.loads(given.json))
+            options = BenchOptions(**json.loads(given.json))
         else:
-            options = Options(speed=given.speed, seed=given.seed)
+            options = BenchOptions(speed=given.speed, seed=given.seed)
         serve(options)
     except (InputError, TypeError, json.JSONDecodeError) as error:
         print(" ".join(str(error).split()), file=sys.stderr)

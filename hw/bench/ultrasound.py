@@ -23,7 +23,7 @@ from jaxcal.io.openigtlink import (
     Content,
     Message,
     Picture,
-    Status,
+    StatusMessage,
     Tracked,
     encode,
 )
@@ -233,7 +233,9 @@ class ImageServer:
         client = _Client(connection)
         self._clients[connection.fileno()] = client
         self._selector.register(connection, selectors.EVENT_READ)
-        hello = self._message("STATUS", self._device, self._clock.now(), Status(1, 0, "", "ready"))
+        hello = self._message(
+            "STATUS", self._device, self._clock.now(), StatusMessage(1, 0, "", "ready")
+        )
         client.pending.append(memoryview(encode(hello)))
         client.size += len(client.pending[-1])
         self._serve(client)

@@ -19,7 +19,7 @@ from hw.freehand.guide import Guide, Rules, Taken
 from hw.freehand.posed import PosedImages
 from hw.recorder import Recorder
 from hw.recording_check import check_resumable, settings_of, stored_length
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal import CalibrationError, FormatError, InputError
 from jaxcal.cli.common import ExitCode
@@ -122,7 +122,7 @@ def acquire_free_hand(
         else:
             known = {**asdict(asked), "source": posed.pair[0], "target_frame": posed.pair[1]}
             recorder = Recorder(
-                path, Header("pixel", {}, 0, None, json.dumps({"free-hand": known}))
+                path, RecordingHeader("pixel", {}, 0, None, json.dumps({"free-hand": known}))
             )
         try:
             with recorder:
@@ -144,9 +144,15 @@ class _Run:
     """One run over an open stream and an open recording."""
 
     def __init__(
-        self, asked: FreeHand, guide: Guide, person: Person, posed: PosedImages,
-        recorder: Recorder, used: list[int], rows: int,
-    ) -> None:  # fmt: skip
+        self,
+        asked: FreeHand,
+        guide: Guide,
+        person: Person,
+        posed: PosedImages,
+        recorder: Recorder,
+        used: list[int],
+        rows: int,
+    ) -> None:
         self._asked, self._guide, self._person = asked, guide, person
         self._posed, self._recorder = posed, recorder
         # Row of /calibration of each image that counts; those taken back keep theirs, masked.
@@ -206,9 +212,11 @@ class _Run:
         from jaxcal.calibration.calibrate import calibrate
 
         images = make_images(
-            np.array([each.pose for each in taken]), np.array([each.pixel for each in taken]),
-            "pixel", spacing_mm=self._asked.spacing_mm,
-        )  # fmt: skip
+            np.array([each.pose for each in taken]),
+            np.array([each.pixel for each in taken]),
+            "pixel",
+            spacing_mm=self._asked.spacing_mm,
+        )
         scale = () if self._asked.spacing_mm is not None else ("scale",)
         try:
             answer = calibrate(Recording(images), "conventional", estimate=scale)
@@ -255,10 +263,16 @@ def _resumed(
         rules = Rules(**{**told["rules"], "region": _four(told["rules"]["region"])})
         spacing = told["spacing_mm"]
         asked = FreeHand(
-            asked.host, asked.port, int(told["images"]), told["source"], told["target_frame"],
-            told["device"], float(told["lag_s"]),
-            None if spacing is None else (float(spacing[0]), float(spacing[1])), rules,
-        )  # fmt: skip
+            asked.host,
+            asked.port,
+            int(told["images"]),
+            told["source"],
+            told["target_frame"],
+            told["device"],
+            float(told["lag_s"]),
+            None if spacing is None else (float(spacing[0]), float(spacing[1])),
+            rules,
+        )
     except (TypeError, KeyError, ValueError, IndexError):
         raise InputError(f"{path}: has no settings of a free-hand acquisition to resume") from None
     count = UpTo(100_000, "images")
@@ -267,10 +281,12 @@ def _resumed(
             node = group(root, "calibration")
             columns = {}
             for name, shape, kinds in (
-                ("pose", (count, 4, 4), "f"), ("pixel", (count, 2), "f"),
-                ("covariance", (count, 2, 2), "f"), ("mask", (count,), "b"),
+                ("pose", (count, 4, 4), "f"),
+                ("pixel", (count, 2), "f"),
+                ("covariance", (count, 2, 2), "f"),
+                ("mask", (count,), "b"),
                 ("time", (count,), "f"),
-            ):  # fmt: skip
+            ):
                 dataset = None if node is None else child(node, name)
                 if dataset is None:
                     raise FormatError(f"has no /calibration/{name}")
@@ -280,10 +296,14 @@ def _resumed(
     rows = min(len(values) for values in columns.values())
     used = [row for row in range(rows) if columns["mask"][row]]
     taken = [
-        Taken(columns["pose"][row], columns["pixel"][row], columns["covariance"][row],
-              float(columns["time"][row]))
+        Taken(
+            columns["pose"][row],
+            columns["pixel"][row],
+            columns["covariance"][row],
+            float(columns["time"][row]),
+        )
         for row in used
-    ]  # fmt: skip
+    ]
     return Guide(rules, taken), asked, used, rows
 
 

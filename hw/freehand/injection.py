@@ -34,7 +34,7 @@ from hw.midplane.pattern_injection import View, bar, bar_length, sides_seen
 from hw.midplane.search import Echoes, PlacementError, Settings
 from hw.recorder import Recorder
 from hw.recording_check import settings_of
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from hw.session import median_times
 from hw.setup import HandHeldSetup
 from hw.shapes import Float
@@ -131,23 +131,30 @@ def acquire_by_injection(
 
 
 def _recorder(
-    path: str | os.PathLike[str], asked: FreeHand, setup: HandHeldSetup, posed: PosedImages,
-    echo: ActiveEcho, resume: bool,
-) -> Recorder:  # fmt: skip
+    path: str | os.PathLike[str],
+    asked: FreeHand,
+    setup: HandHeldSetup,
+    posed: PosedImages,
+    echo: ActiveEcho,
+    resume: bool,
+) -> Recorder:
     if resume:
         return Recorder(path)
     probe = setup.probe
     known = {"pair": posed.pair, "images": asked.images, "scene": setup.image_to_probe.tolist()}
-    header = Header(
+    header = RecordingHeader(
         kind="time_of_flight",
         probe={
-            "kind": probe.kind, "elements": probe.elements, "pitch_mm": probe.pitch_mm,
-            "sound_speed_m_s": probe.sound_speed_m_s, "delay_s": probe.delay_s,
+            "kind": probe.kind,
+            "elements": probe.elements,
+            "pitch_mm": probe.pitch_mm,
+            "sound_speed_m_s": probe.sound_speed_m_s,
+            "delay_s": probe.delay_s,
         },
         lines=probe.elements,
         attributes={"ae": {"clock_hz": echo.clock_hz()}},
         settings=json.dumps({"injection": {**known, "search": asdict(setup.search)}}),
-    )  # fmt: skip
+    )
     return Recorder(path, header)
 
 
@@ -161,9 +168,14 @@ class _Run:
     """One run over open devices and an open recording."""
 
     def __init__(
-        self, asked: FreeHand, setup: HandHeldSetup, person: Person, posed: PosedImages,
-        echo: ActiveEcho, recorder: Recorder,
-    ) -> None:  # fmt: skip
+        self,
+        asked: FreeHand,
+        setup: HandHeldSetup,
+        person: Person,
+        posed: PosedImages,
+        echo: ActiveEcho,
+        recorder: Recorder,
+    ) -> None:
         self._asked, self._setup, self._person = asked, setup, person
         self._posed, self._echo, self._recorder = posed, echo, recorder
         self._next_row = recorder.rows.get("calibration", 0)
@@ -401,12 +413,16 @@ class _Run:
         times, amplitude = median_times(frames)
         self._recorder.add_images([self._images[-1].image])
         self._recorder.add_selected(
-            mean_pose(poses), times, kind="time_of_flight",
-            max_elevation=bracket.max_elevation_mm, amplitude=amplitude,
-            t_host=frames[-1].t_host, target=self._next_row,
+            mean_pose(poses),
+            times,
+            kind="time_of_flight",
+            max_elevation=bracket.max_elevation_mm,
+            amplitude=amplitude,
+            t_host=frames[-1].t_host,
+            target=self._next_row,
             bracket=(bracket.centre_mm, bracket.low_mm, bracket.high_mm, bracket.sd_mm),
             offset=where,
-        )  # fmt: skip
+        )
         self._rows.append(self._next_row)
         self._next_row += 1
         self._person.say(

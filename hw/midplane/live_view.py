@@ -52,8 +52,16 @@ class Keys:
     def decide(self, key: str, view: View) -> Decision | None:
         """What a key asks for; None where it asks for no move (an unknown key, another step)."""
         step = self.step(view)
-        way = {"up": 1, "k": 1, "pageup": 4, "K": 4,
-               "down": -1, "j": -1, "pagedown": -4, "J": -4}.get(key)  # fmt: skip
+        way = {
+            "up": 1,
+            "k": 1,
+            "pageup": 4,
+            "K": 4,
+            "down": -1,
+            "j": -1,
+            "pagedown": -4,
+            "J": -4,
+        }.get(key)
         if way is not None:
             return Decision("go", view.offset_mm + way * step)
         if key in ("+", "-"):

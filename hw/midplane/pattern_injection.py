@@ -266,10 +266,19 @@ def pattern_injection(
             lines = echoes.amplitude.shape[1]
             injector.load_pattern(bar(seen[-1][1], echoes.loudest_line, lines))
             injector.inject(True, delay_ticks)
-            decision = operator(View(
-                seen[-1][1], max(length for _, length in seen), where, settings.fine_mm,
-                echoes.peak, tuple(seen), frame, message, title,
-            ))  # fmt: skip
+            decision = operator(
+                View(
+                    seen[-1][1],
+                    max(length for _, length in seen),
+                    where,
+                    settings.fine_mm,
+                    echoes.peak,
+                    tuple(seen),
+                    frame,
+                    message,
+                    title,
+                )
+            )
             message = ""
             if decision.what == "give-up":
                 raise SkippedError("the operator gave up the pose")

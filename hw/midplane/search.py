@@ -254,9 +254,13 @@ class Walker:
                 self.go(self.good)
 
     def placement(
-        self, procedure: str, offset: float, edges: tuple[float, float], sd_mm: float,
+        self,
+        procedure: str,
+        offset: float,
+        edges: tuple[float, float],
+        sd_mm: float,
         amplitude: float,
-    ) -> Placement:  # fmt: skip
+    ) -> Placement:
         """The result, the probe standing at ``offset``: edges are of the mid-plane's offset, mm."""
         # The target's offset in the image is the mid-plane's place less the probe's.
         low, high = edges[0] - offset, edges[1] - offset
@@ -264,9 +268,17 @@ class Walker:
             0.5 * (low + high), low, high, sd_mm, self.settings.hidden_sd_mm, self.settings.factor
         )
         return Placement(
-            procedure, bracket, self.where, amplitude, self.threshold, self.moves, self.travel_mm,
-            self.frames, np.array(self.samples, float).reshape(-1, 3), tuple(self.notes),
-        )  # fmt: skip
+            procedure,
+            bracket,
+            self.where,
+            amplitude,
+            self.threshold,
+            self.moves,
+            self.travel_mm,
+            self.frames,
+            np.array(self.samples, float).reshape(-1, 3),
+            tuple(self.notes),
+        )
 
 
 def guarded(walker: Walker, run: Callable[[Walker], Placement]) -> Placement:
@@ -313,9 +325,11 @@ def coarse(walker: Walker, start_mm: float = 0.0) -> float:
 
 
 def first_seen(
-    bench: Bench, settings: Settings | None = None, start_mm: float = 0.0,
+    bench: Bench,
+    settings: Settings | None = None,
+    start_mm: float = 0.0,
     watch: Callable[[float, float, int], None] | None = None,
-) -> Placement:  # fmt: skip
+) -> Placement:
     """No placement: stop as soon as the element is heard, as conventional practice would.
 
     Returns:
@@ -330,8 +344,11 @@ def first_seen(
         offset = coarse(walker, start_mm)
         half = settings.beam_half_mm
         return walker.placement(
-            "first-seen", offset, (offset - half, offset + half), half / np.sqrt(3.0),
+            "first-seen",
+            offset,
+            (offset - half, offset + half),
+            half / np.sqrt(3.0),
             walker.samples[-1][1],
-        )  # fmt: skip
+        )
 
     return guarded(Walker(bench, settings, watch), run)

@@ -120,12 +120,16 @@ class Mover:
         pendant = plan["pendant"]
         cog = pendant["payload_cog_m"]
         self._plan = MotionPlan.from_poses(
-            plan["targets"], limits, plan["tcp_offset"], plan["serial"],
+            plan["targets"],
+            limits,
+            plan["tcp_offset"],
+            plan["serial"],
             PendantSettings(
-                pendant["payload_kg"], None if cog is None else tuple(cog),
+                pendant["payload_kg"],
+                None if cog is None else tuple(cog),
                 pendant["speed_fraction"],
             ),
-        )  # fmt: skip
+        )
         given = setup["confirmation"]
         confirmation = None if given is None else Confirmation(**given)
         self._gate = Gate(self._plan, confirmation, self._clock)
@@ -255,9 +259,15 @@ class Mover:
                 t_host = self._clock.at(packet.monotonic_s)
                 lag = self._lag.of(t_host, packet.timestamp_s)
                 self._sample = PoseSample(
-                    t_host, packet.timestamp_s, packet.tcp_pose, packet.safety_bits,
-                    packet.robot_mode, packet.runtime_state, lag, packet.joints,
-                )  # fmt: skip
+                    t_host,
+                    packet.timestamp_s,
+                    packet.tcp_pose,
+                    packet.safety_bits,
+                    packet.robot_mode,
+                    packet.runtime_state,
+                    lag,
+                    packet.joints,
+                )
                 self._compare(packet.tcp_offset, packet.pendant)
         if self._library in ready and self._library is not None:
             text = os.read(self._library, 65536).decode("utf-8", "replace")
@@ -383,9 +393,14 @@ class Mover:
         assert self._sample is not None
         assert self._packet is not None
         return self._gate.check_move(
-            pose, self._sample, speed_mm_s, serial=self._serial, tcp_offset=self._offset,
-            pendant=self._pendant, force_n=math.hypot(*self._packet.tcp_force[:3]),
-        )  # fmt: skip
+            pose,
+            self._sample,
+            speed_mm_s,
+            serial=self._serial,
+            tcp_offset=self._offset,
+            pendant=self._pendant,
+            force_n=math.hypot(*self._packet.tcp_force[:3]),
+        )
 
     def _pretend(self, pose: object, speed_mm_s: object) -> None:
         """A dry run: as if the robot stood where the last motion would have taken it."""
@@ -586,9 +601,14 @@ class Mover:
 
 def _plain(sample: PoseSample) -> list:
     return [
-        sample.t_host, sample.t_device, sample.raw, sample.safety_bits, sample.robot_mode,
-        sample.runtime_state, sample.lag_s,
-    ]  # fmt: skip
+        sample.t_host,
+        sample.t_device,
+        sample.raw,
+        sample.safety_bits,
+        sample.robot_mode,
+        sample.runtime_state,
+        sample.lag_s,
+    ]
 
 
 def _write(output: int, message: dict) -> None:

@@ -40,12 +40,18 @@ def _packets(output: int, host: str, frequency_hz: float | None, timeout_s: floa
 def _pack(packet: Packet) -> bytes:
     pendant = packet.pendant
     return RECORD.pack(
-        packet.monotonic_s, packet.timestamp_s, *packet.tcp_pose, packet.safety_bits,
-        packet.robot_mode, packet.runtime_state, *(packet.tcp_offset or _NOT_TOLD * 6),
+        packet.monotonic_s,
+        packet.timestamp_s,
+        *packet.tcp_pose,
+        packet.safety_bits,
+        packet.robot_mode,
+        packet.runtime_state,
+        *(packet.tcp_offset or _NOT_TOLD * 6),
         math.nan if pendant.payload_kg is None else pendant.payload_kg,
-        *(pendant.payload_cog_m or _NOT_TOLD * 3), pendant.speed_fraction,
+        *(pendant.payload_cog_m or _NOT_TOLD * 3),
+        pendant.speed_fraction,
         *(packet.joints or _NOT_TOLD * 6),
-    )  # fmt: skip
+    )
 
 
 def _ur_rtde(output: int, host: str, frequency_hz: float | None) -> None:
@@ -60,9 +66,12 @@ def _ur_rtde(output: int, host: str, frequency_hz: float | None) -> None:
             time.sleep(0.0002)
             continue
         record = (
-            *robot.getActualTCPPose(), robot.getSafetyStatusBits(), robot.getRobotMode(),
-            robot.getRuntimeState(), *_NOT_TOLD * 17,
-        )  # fmt: skip
+            *robot.getActualTCPPose(),
+            robot.getSafetyStatusBits(),
+            robot.getRobotMode(),
+            robot.getRuntimeState(),
+            *_NOT_TOLD * 17,
+        )
         if robot.getTimestamp() != before:
             continue
         last = before

@@ -26,9 +26,15 @@ from jaxcal import FormatError
 from jaxcal.io.toml import load_toml
 
 _VECTORS = {
-    "box_min_mm": 3, "box_max_mm": 3, "tip_mm": 3, "cone_axis": 3, "arm_box_min_mm": 3,
-    "arm_box_max_mm": 3, "joint_min_deg": 6, "joint_max_deg": 6,
-}  # fmt: skip
+    "box_min_mm": 3,
+    "box_max_mm": 3,
+    "tip_mm": 3,
+    "cone_axis": 3,
+    "arm_box_min_mm": 3,
+    "arm_box_max_mm": 3,
+    "joint_min_deg": 6,
+    "joint_max_deg": 6,
+}
 _TEXTS = ("arm_model", "force_reason")
 _MOST_TEXT = 200
 

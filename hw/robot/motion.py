@@ -278,9 +278,9 @@ class Motion:
             self._send({"request": "heard"})
             silent = time.monotonic() - self._heard
             if silent > _HANGS_WALL_S + self.clock.wall(0.5):
-                error = self._stop or stopping or LostError(
-                    "the motion process hangs", device="robot"
-                )  # fmt: skip
+                error = (
+                    self._stop or stopping or LostError("the motion process hangs", device="robot")
+                )
                 self._in_motion = False
                 self._kill(error)
                 raise type(error)(

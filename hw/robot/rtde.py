@@ -49,10 +49,18 @@ RUNNING_MODE = 7
 NORMAL_BITS = 0b11
 """safety_status_bits of a robot that may move: normal, or reduced mode."""
 _SAFETY_NAMES = (
-    "normal", "reduced mode", "protective stop", "recovery mode", "safeguard stop",
-    "system emergency stop", "robot emergency stop", "emergency stop", "safety violation",
-    "safety fault", "stopped by safety",
-)  # fmt: skip
+    "normal",
+    "reduced mode",
+    "protective stop",
+    "recovery mode",
+    "safeguard stop",
+    "system emergency stop",
+    "robot emergency stop",
+    "emergency stop",
+    "safety violation",
+    "safety fault",
+    "stopped by safety",
+)
 
 
 def safety_text(bits: int) -> str:
@@ -240,9 +248,19 @@ class PacketReader:
         if pendant != self._pendant:
             self._pendant = pendant
         return Packet(
-            now, v[0], v[1:7], v[7:13], v[13:19], v[19], v[20], v[21], v[22],
-            told.get("tcp_offset"), self._pendant, told.get("actual_q"),
-        )  # fmt: skip
+            now,
+            v[0],
+            v[1:7],
+            v[7:13],
+            v[13:19],
+            v[19],
+            v[20],
+            v[21],
+            v[22],
+            told.get("tcp_offset"),
+            self._pendant,
+            told.get("actual_q"),
+        )
 
     def _messages(self) -> Generator[tuple[bytes, bytes]]:
         """Kind and payload of each complete message, which is then forgotten."""
@@ -272,9 +290,10 @@ class PacketReader:
         names = list(FIELDS)
         types = self._recipe(names, deadline)
         lacking = [
-            name for name, kind in zip(names, types, strict=False)
+            name
+            for name, kind in zip(names, types, strict=False)
             if kind == "NOT_FOUND" and name in _OPTIONAL
-        ]  # fmt: skip
+        ]
         if lacking:
             names = [name for name in names if name not in lacking]
             types = self._recipe(names, deadline)

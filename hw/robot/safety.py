@@ -399,9 +399,13 @@ class Gate:
         self._check_arm(start, goal, sample, length / velocity)
         acceleration = limits.max_acceleration_mm_s2 / 1000.0
         return Command(
-            near[0], tuple(float(v) for v in pose_to_ur(goal)), goal, velocity, acceleration,
+            near[0],
+            tuple(float(v) for v in pose_to_ur(goal)),
+            goal,
+            velocity,
+            acceleration,
             length / velocity + velocity / acceleration,
-        )  # fmt: skip
+        )
 
     def _check_arm(
         self, start: np.ndarray, goal: np.ndarray, sample: PoseSample, duration_s: float
@@ -598,9 +602,15 @@ def _check_path(
     _check_box(way, spread, probe, names, limits.box_min_mm, limits.box_max_mm, f"{what} takes", "")
     flange = inverse(tool_of(plan.tcp_offset))[:3, 3]
     _check_box(
-        way, spread, np.array([np.zeros(3), flange]), ["the TCP", "the flange"],
-        limits.arm_box_min_mm, limits.arm_box_max_mm, f"{what} takes", "arm's ",
-    )  # fmt: skip
+        way,
+        spread,
+        np.array([np.zeros(3), flange]),
+        ["the TCP", "the flange"],
+        limits.arm_box_min_mm,
+        limits.arm_box_max_mm,
+        f"{what} takes",
+        "arm's ",
+    )
     cosine = way[:, :3, 2] @ np.asarray(limits.cone_axis) / math.hypot(*limits.cone_axis)
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)).max()))
     if not angle <= limits.cone_deg + _TURN_TOLERANCE_DEG:
@@ -608,9 +618,15 @@ def _check_path(
 
 
 def _check_box(
-    way: np.ndarray, spread: float, points: np.ndarray, names: list[str], low: object,
-    high: object, what: str, whose: str,
-) -> None:  # fmt: skip
+    way: np.ndarray,
+    spread: float,
+    points: np.ndarray,
+    names: list[str],
+    low: object,
+    high: object,
+    what: str,
+    whose: str,
+) -> None:
     """Points of the tool in a box along a way, whose samples are ``spread`` rad apart.
 
     A point a mm from the TCP runs along a line plus an arc about the TCP. Linear interpolation of

@@ -168,9 +168,12 @@ class PoseStream:
         if self._process is not None:
             raise LostError("the stream was already started", device="robot")
         self._process = spawn(
-            "hw.robot._reader", self.host, self._client, str(self._frequency or 0.0),
+            "hw.robot._reader",
+            self.host,
+            self._client,
+            str(self._frequency or 0.0),
             str(self._timeout),
-        )  # fmt: skip
+        )
         self._thread = threading.Thread(target=self._receive, name="robot poses", daemon=True)
         self._thread.start()
         # A fresh interpreter on a busy machine takes seconds; that is no fault of the robot's.
@@ -366,9 +369,14 @@ def average(samples: Sequence[PoseSample]) -> SteadyPose:
     last = samples[-1]
     raw = (*(position / 1000.0), *rotation_vector(rotation))
     mean = PoseSample(
-        last.t_host, last.t_device, tuple(float(v) for v in raw), last.safety_bits,
-        last.robot_mode, last.runtime_state, last.lag_s,
-    )  # fmt: skip
+        last.t_host,
+        last.t_device,
+        tuple(float(v) for v in raw),
+        last.safety_bits,
+        last.robot_mode,
+        last.runtime_state,
+        last.lag_s,
+    )
     distances = np.sum((poses[:, :3, 3] - position) ** 2, axis=1)
     return SteadyPose(
         sample=mean,

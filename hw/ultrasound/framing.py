@@ -74,9 +74,12 @@ class MessageDecoder:
     def counts(self) -> FramingCounts:
         """What was seen so far."""
         return FramingCounts(
-            self.messages, self.crc_errors, self.broken_headers, self.unsupported,
+            self.messages,
+            self.crc_errors,
+            self.broken_headers,
+            self.unsupported,
             self.resynchronised,
-        )  # fmt: skip
+        )
 
     @property
     def held(self) -> int:

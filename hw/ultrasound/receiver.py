@@ -25,7 +25,7 @@ from jaxcal.io.openigtlink import (
     Message,
     Picture,
     Pixels,
-    Status,
+    StatusMessage,
     Tracked,
     TrackedFrame,
 )
@@ -153,7 +153,7 @@ class UltrasoundStream:
         self._images: deque[Image] = deque()
         self._bytes = 0
         self._transforms: deque[Transform] = deque(maxlen=4096)
-        self._status: Status | None = None
+        self._status: StatusMessage | None = None
         self._counts = dict.fromkeys(
             ("received", "lost", "dropped", "repeated", "other", "transforms"), 0
         )
@@ -248,7 +248,7 @@ class UltrasoundStream:
             self._transforms.clear()
         return transforms
 
-    def status(self) -> Status | None:
+    def status(self) -> StatusMessage | None:
         """The last status that the server sent."""
         return self._status
 
@@ -304,7 +304,7 @@ class UltrasoundStream:
                 for tracked in message.content.transforms:
                     self._take_transform(message, tracked)
                 self._take_image(message, message.content.picture)
-            case Status():
+            case StatusMessage():
                 self._status = message.content
             case _:
                 self._counts["other"] += 1
@@ -348,10 +348,13 @@ class UltrasoundStream:
         self._counts["transforms"] += 1
         self._transforms.append(
             Transform(
-                message.t_host, message.t_device, tracked.name, tracked.matrix,
+                message.t_host,
+                message.t_device,
+                tracked.name,
+                tracked.matrix,
                 _is_rigid(tracked.matrix) and tracked.status in ("", "OK"),
             )
-        )  # fmt: skip
+        )
 
 
 def _is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:

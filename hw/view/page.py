@@ -39,8 +39,12 @@ _PANEL_EVERY = 3
 """Every third frame goes into the panel as well; compressing pictures is what the page costs."""
 _PANEL_ROWS, _PANEL_COLUMNS = 240, 320
 _GREY, _ARM, _DONE, _NOW, _MISSED = (
-    (150, 150, 150), (120, 140, 165), (0, 120, 40), (240, 110, 0), (200, 0, 0),
-)  # fmt: skip
+    (150, 150, 150),
+    (120, 140, 165),
+    (0, 120, 40),
+    (240, 110, 0),
+    (200, 0, 0),
+)
 _TARGET = (200, 0, 120)
 _LINK_RADIUS_MM = (45.0, 38.0, 30.0, 26.0, 26.0, 24.0, 12.0, 8.0)
 _LEGEND = (
@@ -187,9 +191,12 @@ class Page:
                 f"/arm/link{number}", radius=radius / UNIT_MM, height=1.0, color=_ARM, visible=False
             )
             self._parts[f"joint {number}"] = scene.add_icosphere(
-                f"/arm/joint{number}", radius=1.15 * radius / UNIT_MM, color=_GREY,
-                subdivisions=2, visible=False,
-            )  # fmt: skip
+                f"/arm/joint{number}",
+                radius=1.15 * radius / UNIT_MM,
+                color=_GREY,
+                subdivisions=2,
+                visible=False,
+            )
         self._arm = arm
 
     def _draw_poses(self) -> None:
@@ -205,9 +212,12 @@ class Page:
         if told.get("row") is not None:
             colours[told["row"]] = _NOW
         self._parts["poses"] = self._scene.add_line_segments(
-            "/poses", np.stack([tips, ends], axis=1) / UNIT_MM, np.stack([colours] * 2, axis=1),
-            thickness=4.0, thickness_units="screen",
-        )  # fmt: skip
+            "/poses",
+            np.stack([tips, ends], axis=1) / UNIT_MM,
+            np.stack([colours] * 2, axis=1),
+            thickness=4.0,
+            thickness_units="screen",
+        )
 
     def _draw_target(self) -> None:
         scene, told, estimate = self._scene, self._told, self._told.get("estimate")
@@ -223,9 +233,15 @@ class Page:
                 if half.max() / magnified > _UNKNOWN_MM:
                     half, text = np.full(3, 3.0), "target, not determined yet"
         self._parts["target"] = scene.add_icosphere(
-            "/target", radius=1.0, color=_TARGET, opacity=0.55, scale=tuple(half / UNIT_MM),
-            wxyz=quaternion(axes), position=point / UNIT_MM, cast_shadow=False,
-        )  # fmt: skip
+            "/target",
+            radius=1.0,
+            color=_TARGET,
+            opacity=0.55,
+            scale=tuple(half / UNIT_MM),
+            wxyz=quaternion(axes),
+            position=point / UNIT_MM,
+            cast_shadow=False,
+        )
         self._parts["target label"] = scene.add_label(
             "/target_label",
             text,
@@ -292,14 +308,23 @@ class Page:
         if "image" not in self._parts:
             rgb = np.repeat(self._frame[:, :, None], 3, axis=2)
             self._parts["image"] = self._scene.add_image(
-                "/image", rgb, columns * across / UNIT_MM, rows * down / UNIT_MM,
-                format="jpeg", jpeg_quality=70, cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
+                "/image",
+                rgb,
+                columns * across / UNIT_MM,
+                rows * down / UNIT_MM,
+                format="jpeg",
+                jpeg_quality=70,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
             if self._picture is None:
                 self._picture = self._server.gui.add_image(
-                    to_scale(self._frame, self._spacing), label="B-mode, newest frame",
-                    format="jpeg", jpeg_quality=70, order=1,
-                )  # fmt: skip
+                    to_scale(self._frame, self._spacing),
+                    label="B-mode, newest frame",
+                    format="jpeg",
+                    jpeg_quality=70,
+                    order=1,
+                )
         elif fresh:
             rgb = np.repeat(self._frame[:, :, None], 3, axis=2)
             self._parts["image"].image = rgb

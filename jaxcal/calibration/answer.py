@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.calibration.options import Given, Plan
+from jaxcal.calibration.options import Given, SolvePlan
 from jaxcal.calibration.result import Calibration, Convergence, Linearisation, Medium, Status
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
@@ -88,7 +88,7 @@ class Average(Protocol):
 
 
 def assemble(
-    solved: Solved, averaged: Average | None, problem: Problem, given: Given, plan: Plan
+    solved: Solved, averaged: Average | None, problem: Problem, given: Given, plan: SolvePlan
 ) -> Calibration:
     """A calibration but for its problem, which the front door adds (``with_problem``).
 
@@ -365,7 +365,7 @@ def _is_differentiable(
     bounds: ActiveBounds | None,
     observed: Observability,
     status: Int[Array, "*batch"],
-    plan: Plan,
+    plan: SolvePlan,
 ) -> Bool[Array, "*batch"]:
     """Whether the implicit function theorem's conditions hold at the solution."""
     convergence = solved.convergence
@@ -401,7 +401,7 @@ def _three_sigmas(
     errors: Errors,
     elevation: Float[Array, "*batch n"],
     problem: Problem,
-    plan: Plan,
+    plan: SolvePlan,
 ) -> Float[Array, "*batch 3"]:
     """SDs of lateral position, range and offset, mm: those that whiten, or of the residuals."""
     if solved.sigma is not None and not plan.channels:
@@ -446,7 +446,7 @@ def _medium(
     covariance: Float[Array, "*batch p p"],
     problem: Problem,
     given: Given,
-    plan: Plan,
+    plan: SolvePlan,
 ) -> Medium | None:
     """Sound speed and delay in their units, with SDs; None where neither was estimated."""
     blocks, speed = plan.blocks, nominal_sound_speed(problem)

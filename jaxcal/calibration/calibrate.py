@@ -26,9 +26,9 @@ from jaxcal.calibration.options import (
     Given,
     Method,
     Options,
-    Plan,
     PriorName,
     Request,
+    SolvePlan,
     check_values,
     prepare,
     with_bound,
@@ -146,7 +146,7 @@ def calibrate(
     return widened(result)
 
 
-def _solve_alone(problem: Problem, given: Given, plan: Plan) -> Calibration:
+def _solve_alone(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """One problem, without it in the result (traceable): in closed form, or by the engine."""
     found = None
     if not inside_transformation(problem, given):

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxcal.calibration.options import Plan
+from jaxcal.calibration.options import SolvePlan
 from jaxcal.calibration.result import Calibration, Convergence, Linearisation, Medium, Status
 from jaxcal.data.problem import Problem
 from jaxcal.data.sound import WATER_M_S
@@ -55,7 +55,7 @@ STATIONARY = 1e-6
 """Largest gradient cosine of an answer through which derivatives are valid."""
 
 
-def closed_form_answer(problem: Problem, plan: Plan) -> Calibration | None:
+def closed_form_answer(problem: Problem, plan: SolvePlan) -> Calibration | None:
     """The conventional calibration where the closed form is proved to be the answer, else None.
 
     None is for other methods and solvers, a robust search, float32, further unknowns that have no
@@ -98,7 +98,7 @@ def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
     return assembled(Start, parts)
 
 
-def _with_uncertainty(found: ClosedForm, problem: Problem, plan: Plan) -> Calibration | None:
+def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> Calibration | None:
     """The closed form as a calibration, but for its problem; None where poses are degenerate."""
     blocks, eps = plan.blocks, float(np.finfo(float).eps)
     unknowns = _unknowns(found, problem)
@@ -197,7 +197,7 @@ def _sigmas(seen: ImageErrors, used: float, blocks: tuple[str, ...]) -> Float[np
 
 
 def _medium(
-    found: ClosedForm, covariance: Float[np.ndarray, "p p"], problem: Problem, plan: Plan
+    found: ClosedForm, covariance: Float[np.ndarray, "p p"], problem: Problem, plan: SolvePlan
 ) -> Medium | None:
     """The sound speed, where it was estimated."""
     if "sound-speed" not in plan.blocks:

@@ -1,7 +1,7 @@
 """What a caller may ask of a solve, and the checks that a request has to pass.
 
-Everything static about a solve is a :class:`Plan`, so that each combination is compiled once; the
-numbers that came with the request are a :class:`Given`, which is traced.
+Everything static about a solve is a :class:`SolvePlan`, so that each combination is compiled once;
+the numbers that came with the request are a :class:`Given`, which is traced.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def _check_static(solver: optx.AbstractLeastSquaresSolver) -> None:
 
 
 @dataclass(frozen=True)
-class Plan:
+class SolvePlan:
     """Everything static about a solve: method, belief about the offsets, data, unknowns.
 
     ``laws`` are those to weigh after the self-tuned Gaussian solve; none: that is the answer.
@@ -183,7 +183,7 @@ class Request:
     robust: bool = False
 
 
-def prepare(problem: Problem, request: Request) -> tuple[Plan, Given]:
+def prepare(problem: Problem, request: Request) -> tuple[SolvePlan, Given]:
     """Check a request against its problem and sort it into what is static and what is traced.
 
     Raises:
@@ -226,7 +226,9 @@ def prepare(problem: Problem, request: Request) -> tuple[Plan, Given]:
     laws: tuple[Shape, ...] = ()
     if tuning and request.prior in LAWS:
         laws = LAWS[request.prior]
-    plan = Plan(request.method, kind, tuning, laws, channels, blocks, options, bool(request.robust))
+    plan = SolvePlan(
+        request.method, kind, tuning, laws, channels, blocks, options, bool(request.robust)
+    )
     return plan, given
 
 

@@ -15,14 +15,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.calibration.answer import Solved, assemble
-from jaxcal.calibration.options import Given, Plan
+from jaxcal.calibration.options import Given, SolvePlan
 from jaxcal.calibration.result import Calibration, Convergence
 from jaxcal.data.problem import Problem
-from jaxcal.model.batch import Images
+from jaxcal.model.batch import ImagePlanes
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.observations import (
     BoundedOffsets,
-    Channels,
+    ChannelDistances,
     InPlane,
     LocalUnknown,
     Points,
@@ -40,7 +40,7 @@ from jaxcal.solvers.start import ConventionalStart, GivenStart
 def solve_problems(
     problems: Problem,
     given: Given,
-    plan: Plan,
+    plan: SolvePlan,
     agreed: Float[Array, "lanes n"] | None = None,
     begun: ConventionalStart | GivenStart | None = None,
 ) -> Calibration:
@@ -86,7 +86,7 @@ def agreed_images(problem: Problem, blocks: Blocks) -> Float[Array, " n"]:
     return find_consensus(jax.lax.stop_gradient(problem), rigid_model(blocks)).keep
 
 
-class Averaged(eqx.Module):
+class AveragedAnswer(eqx.Module):
     """The average over the offsets' laws, problems first.
 
     Attributes:
@@ -101,11 +101,14 @@ class Averaged(eqx.Module):
 
 
 def _solved(
-    problems: Problem, given: Given, plan: Plan, begun: ConventionalStart | GivenStart | None = None
-) -> tuple[Solved, Averaged | None]:
+    problems: Problem,
+    given: Given,
+    plan: SolvePlan,
+    begun: ConventionalStart | GivenStart | None = None,
+) -> tuple[Solved, AveragedAnswer | None]:
     """The method's solution with its normal matrices, problems first."""
     found = methods.solve(problems, given, plan, begun)
-    images = Images.of(problems, channels=plan.channels)
+    images = ImagePlanes.of(problems, channels=plan.channels)
     observation = found.observation
     information, design = _normal_matrices(found, images)
     offset = jnp.zeros((images.lanes, 0), images.mask.dtype)
@@ -124,15 +127,15 @@ def _solved(
     if found.covariance is None or found.elevation_sd is None or found.law is None:
         return solved, None
     covariance = jnp.moveaxis(found.covariance, -1, 0)
-    return solved, Averaged(covariance, found.elevation_sd, found.law)
+    return solved, AveragedAnswer(covariance, found.elevation_sd, found.law)
 
 
 def _normal_matrices(
-    found: Solution, images: Images
+    found: Solution, images: ImagePlanes
 ) -> tuple[Float[Array, "p p lanes"], Float[Array, "p p lanes"]]:
     """The weighted normal matrix at a solution, and that of the unweighted components."""
     observation, place = found.observation, found.place
-    if isinstance(observation, (Points, Channels)):
+    if isinstance(observation, (Points, ChannelDistances)):
         # One pass for both.
         sums = component_sums(place, observation, images, None, found.medium)
         weighted = sums.weighed(1 / observation.sigma**2).stacked()
@@ -143,7 +146,7 @@ def _normal_matrices(
     return weighted, accumulate(place, InPlane.of(images), images, None).stacked()
 
 
-def _convergence(found: Solution, plan: Plan) -> Convergence:
+def _convergence(found: Solution, plan: SolvePlan) -> Convergence:
     floored = found.sigma_floored
     if floored.shape[0] == 1:
         floored = jnp.tile(floored, (3, 1))

@@ -31,7 +31,13 @@ from jaxcal.model.residuals import target_in_image
 from jaxcal.runtime import buckets, compiler, executables
 from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.solvers import dense
-from jaxcal.solvers.consensus import FEWEST_IMAGES, Model, departures, find_consensus, stands_out
+from jaxcal.solvers.consensus import (
+    FEWEST_IMAGES,
+    ConsensusModel,
+    departures,
+    find_consensus,
+    stands_out,
+)
 
 BLOCKS = ("translation", "point")
 AXES = ("x", "y", "z")
@@ -193,7 +199,7 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
         spacing=jnp.ones(2, poses.dtype),
         face_offset=jnp.zeros((), poses.dtype),
     )
-    model = Model(BLOCKS, _errors, _proposals, isotropic=True, subset=_SUBSET)
+    model = ConsensusModel(BLOCKS, _errors, _proposals, isotropic=True, subset=_SUBSET)
     keep = find_consensus(everything, model).keep if robust else mask
     problem = eqx.tree_at(lambda p: p.mask, everything, keep)
     parameters = jax.tree.map(lambda leaf: leaf[0], _proposals(problem, keep[None]))

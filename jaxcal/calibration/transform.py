@@ -307,9 +307,17 @@ def _cross(vector: np.ndarray) -> Float[np.ndarray, "3 3"]:
 def _format_of(name: str) -> SaveFormat:
     lower = name.lower()
     formats: dict[str, SaveFormat] = {
-        ".json": "json", ".xml": "plus", ".tfm": "slicer", ".txt": "slicer", ".h5": "itk",
-        ".yaml": "ros", ".yml": "ros", ".csv": "tusrec", ".npy": "numpy", ".npz": "numpy",
-    }  # fmt: skip
+        ".json": "json",
+        ".xml": "plus",
+        ".tfm": "slicer",
+        ".txt": "slicer",
+        ".h5": "itk",
+        ".yaml": "ros",
+        ".yml": "ros",
+        ".csv": "tusrec",
+        ".npy": "numpy",
+        ".npz": "numpy",
+    }
     for extension, chosen in formats.items():
         if lower.endswith(extension):
             return chosen

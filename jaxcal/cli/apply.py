@@ -10,8 +10,17 @@ import click
 from jaxcal import InputError
 from jaxcal.cli.common import NOT_NEGATIVE, ExitCode
 
-_COLUMNS = ("x_mm", "y_mm", "z_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm", "cov_xy_mm2", "cov_xz_mm2",
-            "cov_yz_mm2")  # fmt: skip
+_COLUMNS = (
+    "x_mm",
+    "y_mm",
+    "z_mm",
+    "sd_x_mm",
+    "sd_y_mm",
+    "sd_z_mm",
+    "cov_xy_mm2",
+    "cov_xz_mm2",
+    "cov_yz_mm2",
+)
 
 
 @click.command()

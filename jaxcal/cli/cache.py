@@ -57,8 +57,9 @@ def show(as_json: bool) -> int:
     ]
     total = sum(entry.size for entry in found)
     if as_json:
-        print_json({"folder": str(folder), "bytes": total, "on": program_cache.is_on(),
-                    "programs": rows})  # fmt: skip
+        print_json(
+            {"folder": str(folder), "bytes": total, "on": program_cache.is_on(), "programs": rows}
+        )
         return ExitCode.CONVERGED
     off = [] if program_cache.is_on() else [f"It is off: {program_cache.SWITCH} is set."]
     said = f"{len(rows)} programs, {total / 2**20:.1f} of {program_cache.LIMIT_BYTES >> 20} MiB"
@@ -150,8 +151,13 @@ def _table(rows: list[dict[str, Any]]) -> Any:
         if row["refused"]:
             words[0] = "refused"
         seconds = "-" if row["compile_s"] is None else f"{row['compile_s']:.1f}"
-        table.add_row(*words, str(row.get("images", "-")), f"{row['bytes'] / 1e6:.1f}", seconds,
-                      _ago(row["used_s_ago"]))  # fmt: skip
+        table.add_row(
+            *words,
+            str(row.get("images", "-")),
+            f"{row['bytes'] / 1e6:.1f}",
+            seconds,
+            _ago(row["used_s_ago"]),
+        )
     return table
 
 

@@ -195,8 +195,10 @@ def calibrate(
 ) -> int:
     """Calibrate from the recording REC; nobody has to supply a starting guess."""
     alternation = {
-        "tolerance_mm": tolerance_mm, "tolerance_rad": tolerance_rad, "max_rounds": max_rounds
-    }  # fmt: skip
+        "tolerance_mm": tolerance_mm,
+        "tolerance_rad": tolerance_rad,
+        "max_rounds": max_rounds,
+    }
     request = _request(method, prior, max_elevation, sigma, estimate, data, solver, alternation)
     request = replace(request, robust=robust)
     targets = [_export_target(export) for export in exports]
@@ -310,8 +312,9 @@ def _request(
 ) -> _Request:
     """Refuse options that would be without effect: whoever gives one counts on it."""
     fitting = {
-        "joint": ("auto", "gaussian", "uniform", "bounded"), "alternating": ("auto", "bounded")
-    }  # fmt: skip
+        "joint": ("auto", "gaussian", "uniform", "bounded"),
+        "alternating": ("auto", "bounded"),
+    }
     if prior not in fitting.get(method, ("auto",)):
         raise InputError(f"--prior {prior} does not go with --method {method}")
     bounding = method == "alternating" or (method == "joint" and prior != "gaussian")

@@ -125,9 +125,13 @@ def patched(
     from jaxcal.io.plus import patch_configuration
 
     notes = patch_configuration(
-        config, frames, transform.plus_matrix(),
-        out=out, error_mm=transform.error_mm, date=datetime.datetime.now(),
-    )  # fmt: skip
+        config,
+        frames,
+        transform.plus_matrix(),
+        out=out,
+        error_mm=transform.error_mm,
+        date=datetime.datetime.now(),
+    )
     written = f"{config if out is None else out}: {frames[0]} to {frames[1]} written"
     return [written, *(f"- {note}" for note in notes)]
 
@@ -140,7 +144,10 @@ def sent(transform: ImageTransform, server: str, frames: tuple[str, str]) -> str
     if colon and not (text.isdigit() and 0 < int(text) < 65536):
         raise click.BadParameter(f"{server!r} is not HOST or HOST:PORT", param_hint="--plus-server")
     said = update_transform(
-        frames, transform.plus_matrix(), host, int(text) if colon else PORT,
+        frames,
+        transform.plus_matrix(),
+        host,
+        int(text) if colon else PORT,
         error_mm=transform.error_mm,
-    )  # fmt: skip
+    )
     return f"{server}: {frames[0]} to {frames[1]} set; {said}"

@@ -76,7 +76,14 @@ def _tell(placed: Any, source: str, out: str, options: dict[str, Any]) -> None:
         + (f", {left} still to do (the same command goes on)" if left else "")
     )
     if count:
-        given = [f"--{name} {options[key]}" for name, key in
-                 (("poses", "poses"), ("from", "source"), ("to", "target"),
-                  ("orientation", "orientation")) if options[key]]  # fmt: skip
+        given = [
+            f"--{name} {options[key]}"
+            for name, key in (
+                ("poses", "poses"),
+                ("from", "source"),
+                ("to", "target"),
+                ("orientation", "orientation"),
+            )
+            if options[key]
+        ]
         click.echo(" ".join(["next: jaxcal import", source, out, "OUT.h5", *given]))

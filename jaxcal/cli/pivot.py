@@ -46,21 +46,23 @@ def _record(result: Pivot) -> dict[str, Any]:
     from jaxcal.report.record import plain
 
     mask, covariance = np.asarray(result.mask), np.asarray(result.covariance)
-    return plain({
-        "converged": bool(result.converged),
-        "status": result.status,
-        "poses": len(mask),
-        "poses_used": int((mask > 0).sum()),
-        "tip_mm": np.asarray(result.tip),
-        "point_mm": np.asarray(result.point),
-        "covariance": covariance if np.isfinite(covariance).all() else None,
-        "sigma_mm": float(result.sigma),
-        "rms_mm": float(result.rms),
-        "robust": result.robust,
-        "outliers": messages.images_that_stand_out(result),
-        "outlier_reasons": messages.outlier_reasons(result, AXES),
-        "warnings": result.warnings,
-    })  # fmt: skip
+    return plain(
+        {
+            "converged": bool(result.converged),
+            "status": result.status,
+            "poses": len(mask),
+            "poses_used": int((mask > 0).sum()),
+            "tip_mm": np.asarray(result.tip),
+            "point_mm": np.asarray(result.point),
+            "covariance": covariance if np.isfinite(covariance).all() else None,
+            "sigma_mm": float(result.sigma),
+            "rms_mm": float(result.rms),
+            "robust": result.robust,
+            "outliers": messages.images_that_stand_out(result),
+            "outlier_reasons": messages.outlier_reasons(result, AXES),
+            "warnings": result.warnings,
+        }
+    )
 
 
 def _print(record: dict[str, Any]) -> None:

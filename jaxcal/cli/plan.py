@@ -29,10 +29,15 @@ _COUNTED = (0.5, 0.3, 0.2, 0.1)
 
 @click.command()
 @click.argument("recording", type=click.Path(), metavar="[REC]", required=False)
-@click.option("--images", type=click.IntRange(1, 2000), metavar="N", help="Poses.  [default: 30; "
-              "with REC 10]")  # fmt: skip
-@click.option("--until-tre", type=POSITIVE, metavar="MM", help="As many poses as this predicted "
-              "error over the image takes.")  # fmt: skip
+@click.option(
+    "--images", type=click.IntRange(1, 2000), metavar="N", help="Poses.  [default: 30; with REC 10]"
+)
+@click.option(
+    "--until-tre",
+    type=POSITIVE,
+    metavar="MM",
+    help="As many poses as this predicted error over the image takes.",
+)
 @click.option(
     "--criterion",
     type=click.Choice(["tre", "rp", "d"]),
@@ -48,13 +53,26 @@ _COUNTED = (0.5, 0.3, 0.2, 0.1)
     show_default=True,
     help="Transducer where the recording names none: L14-5 or C5-2.",
 )
-@click.option("--depth", type=POSITIVE, nargs=2, metavar="NEAR FAR", help="Range of the target, "
-              "mm.  [default: 15 82; with REC where it was]")  # fmt: skip
-@click.option("--lateral", type=POSITIVE, metavar="MM", help="Lateral position of the target, up "
-              "to this either way.")  # fmt: skip
+@click.option(
+    "--depth",
+    type=POSITIVE,
+    nargs=2,
+    metavar="NEAR FAR",
+    help="Range of the target, mm.  [default: 15 82; with REC where it was]",
+)
+@click.option(
+    "--lateral",
+    type=POSITIVE,
+    metavar="MM",
+    help="Lateral position of the target, up to this either way.",
+)
 @click.option("--cone", type=NOT_NEGATIVE, metavar="DEG", help="Largest tilt.  [default: 40]")
-@click.option("--turn", type=NOT_NEGATIVE, metavar="DEG", help="Largest turn about the beam's "
-              "direction.  [default: 90]")  # fmt: skip
+@click.option(
+    "--turn",
+    type=NOT_NEGATIVE,
+    metavar="DEG",
+    help="Largest turn about the beam's direction.  [default: 90]",
+)
 @click.option(
     "--sigma",
     type=POSITIVE,
@@ -62,10 +80,17 @@ _COUNTED = (0.5, 0.3, 0.2, 0.1)
     metavar="LATERAL RANGE ELEVATIONAL",
     help="SDs of the errors, mm, without REC. They may be wrong by a factor of three.",
 )
-@click.option("--estimate", metavar="LIST", help="With REC: further unknowns (scale), as for "
-              "calibrate.")  # fmt: skip
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
-              help="Seed of the candidate poses.")  # fmt: skip
+@click.option(
+    "--estimate", metavar="LIST", help="With REC: further unknowns (scale), as for calibrate."
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    metavar="N",
+    help="Seed of the candidate poses.",
+)
 @click.option("--figure", type=click.Path(), metavar="PNG", help="Draw the plan.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def plan(
@@ -148,9 +173,10 @@ def _from_nothing(
     transducer = PRESETS[probe]
     region = design.Region.of_probe(transducer) if region is None else region
     bounds = design.Constraints(
-        region=region, cone_deg=40.0 if cone is None else cone,
+        region=region,
+        cone_deg=40.0 if cone is None else cone,
         turn_deg=90.0 if turn is None else turn,
-    )  # fmt: skip
+    )
     noise = design.Noise.of_probe(transducer) if sigma is None else design.Noise.constant(sigma)
     return design.make_candidates(
         transducer, constraints=bounds, model=design.Model(noise=noise), seed=seed
@@ -224,9 +250,11 @@ def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
         lateral, depth = pose["target_mm"]
         sign = " (fills space)" if pose["fills_space"] else ""
         table.add_row(
-            str(found.known.images + k + 1), pose["words"] + sign, f"{lateral:.0f}, {depth:.0f}",
+            str(found.known.images + k + 1),
+            pose["words"] + sign,
+            f"{lateral:.0f}, {depth:.0f}",
             f"{pose['tre_mm']:.3g}",
-        )  # fmt: skip
+        )
     counts = [
         f"{wanted} mm: {'over 1000' if count is None else count}"
         for wanted, count in record["images_to_tre_mm"].items()

@@ -173,26 +173,30 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     save(recording, target, found)
     images = recording.calibration
     if as_json:
-        print_json({
-            "out": target, "method": found.target, "frames": len(found), **{
-                name.replace(" ", "_"): count for name, count in found.counts.items()
-            },
-            "reasons": found.reasons,
-            "images": len(images), "spacing_mm":
-                None if images.spacing_mm is None else images.spacing_mm.tolist(),
-            "per_frame": [
-                {"frame": k, "fate": FATES[fate], "reason": found.reason[k] or None}
-                for k, fate in enumerate(found.fate)
-            ],
-            "notes": notes,
-        })  # fmt: skip
+        print_json(
+            {
+                "out": target,
+                "method": found.target,
+                "frames": len(found),
+                **{name.replace(" ", "_"): count for name, count in found.counts.items()},
+                "reasons": found.reasons,
+                "images": len(images),
+                "spacing_mm": None if images.spacing_mm is None else images.spacing_mm.tolist(),
+                "per_frame": [
+                    {"frame": k, "fate": FATES[fate], "reason": found.reason[k] or None}
+                    for k, fate in enumerate(found.fate)
+                ],
+                "notes": notes,
+            }
+        )
         return ExitCode.CONVERGED
     unscaled = images.spacing_mm is None
     hint = "; a pixel's size is not known: calibrate with --estimate scale" if unscaled else ""
     counts = found.counts
     first = f"{target}: {counts['found']} of {len(found)} frames segmented ({found.target}){hint}"
-    others = ", ".join(f"{count} {name}" for name, count in counts.items()
-                       if count and name != "found")  # fmt: skip
+    others = ", ".join(
+        f"{count} {name}" for name, count in counts.items() if count and name != "found"
+    )
     lines = [first, *([f"- other frames: {others}"] if others else [])]
     lines += [f"- not credible: {count} x {why}" for why, count in found.reasons.items()]
     if counts["not credible"] > counts["found"]:

@@ -151,9 +151,12 @@ def _watching() -> Iterator[Watcher]:
 
     console = Console(stderr=True, markup=False, highlight=False)
     columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"), TimeRemainingColumn(),
-    )  # fmt: skip
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
     # An hour's average: a chunk may take minutes.
     with Progress(*columns, console=console, speed_estimate_period=3600) as progress:
         yield _Bar(progress)

@@ -141,17 +141,37 @@ def make_images(
     prefix = f"{where}: " if where else ""
     try:
         return _make_images(
-            poses, measurements, kind, mask, covariance, max_elevation, amplitude, time,
-            spacing_mm, face_offset_mm, time_of_flight, minimum,
-        )  # fmt: skip
+            poses,
+            measurements,
+            kind,
+            mask,
+            covariance,
+            max_elevation,
+            amplitude,
+            time,
+            spacing_mm,
+            face_offset_mm,
+            time_of_flight,
+            minimum,
+        )
     except InputError as error:
         raise type(error)(f"{prefix}{error}") from None
 
 
 def _make_images(
-    poses, measurements, kind, mask, covariance, max_elevation, amplitude, time,
-    spacing_mm, face_offset_mm, time_of_flight, minimum,
-) -> Images:  # fmt: skip
+    poses,
+    measurements,
+    kind,
+    mask,
+    covariance,
+    max_elevation,
+    amplitude,
+    time,
+    spacing_mm,
+    face_offset_mm,
+    time_of_flight,
+    minimum,
+) -> Images:
     poses = np.asarray(poses, dtype=np.float64)
     values = np.array(measurements, dtype=np.float64)
     count = len(poses) if poses.ndim else 0

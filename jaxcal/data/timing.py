@@ -73,9 +73,7 @@ def can_interpolate(
     on_next = asked == times[before + 1]
     near = times[before + 1] - times[before] <= max_gap_s
     between = usable[before] & usable[before + 1] & near
-    return inside & (
-        between | (on_sample & usable[before]) | (on_next & usable[before + 1])
-    )  # fmt: skip
+    return inside & (between | (on_sample & usable[before]) | (on_next & usable[before + 1]))
 
 
 def _interval(times: np.ndarray, asked: np.ndarray) -> np.ndarray:
@@ -279,8 +277,9 @@ def estimate_latency(
             of the search, or several that fit alike (a periodic motion).
     """
     t_video, t_tracker = (
-        _increasing(t_video, "time of image", 8), _increasing(t_tracker, "time of pose", 8),
-    )  # fmt: skip
+        _increasing(t_video, "time of image", 8),
+        _increasing(t_tracker, "time of pose", 8),
+    )
     video, tracker = np.asarray(video, float), np.asarray(tracker_mm, float)
     if video.shape != t_video.shape or tracker.shape != t_tracker.shape:
         raise InputError("each motion must have one value for each of its times")

@@ -28,8 +28,12 @@ COUNT = 5000
 """Candidates of a plan; twice as many change the predicted error by less than 1 %."""
 MOST_CANDIDATES = 200_000
 SOBOL: tuple[tuple[int, tuple[int, ...]], ...] = (
-    (0, (1,) * 30), (0, (1,)), (1, (1, 3)), (1, (1, 3, 1)), (2, (1, 1, 1)),
-)  # fmt: skip
+    (0, (1,) * 30),
+    (0, (1,)),
+    (1, (1, 3)),
+    (1, (1, 3, 1)),
+    (2, (1, 1, 1)),
+)
 """Primitive polynomials (their inner coefficients) and first direction numbers of each axis.
 
 Source: Joe and Kuo, SIAM J. Sci. Comput. 30, 2008 (new-joe-kuo-6); the first axis is van der
@@ -117,11 +121,15 @@ def numbers_of(
     """Five numbers of points of the unit cube: tilt and azimuth, turn, lateral, depth."""
     tilt = np.arccos(1 - fraction[:, 0] * (1 - np.cos(np.radians(constraints.cone_deg))))
     azimuth = 2 * np.pi * fraction[:, 1]
-    return np.column_stack([
-        2 * fraction[:, 3] - 1, 2 * fraction[:, 4] - 1,
-        tilt * np.cos(azimuth), tilt * np.sin(azimuth),
-        np.radians(constraints.turn_deg) * (2 * fraction[:, 2] - 1),
-    ])  # fmt: skip
+    return np.column_stack(
+        [
+            2 * fraction[:, 3] - 1,
+            2 * fraction[:, 4] - 1,
+            tilt * np.cos(azimuth),
+            tilt * np.sin(azimuth),
+            np.radians(constraints.turn_deg) * (2 * fraction[:, 2] - 1),
+        ]
+    )
 
 
 def sobol_poses(

@@ -39,8 +39,9 @@ CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
 def check_criterion(criterion: str) -> None:
     """Raise InputError for a name that is no criterion."""
     if criterion not in CRITERIA:
-        raise InputError(f"criterion must be {', '.join(CRITERIA[:-1])} or {CRITERIA[-1]}, "
-                         f"not {criterion!r}")  # fmt: skip
+        raise InputError(
+            f"criterion must be {', '.join(CRITERIA[:-1])} or {CRITERIA[-1]}, not {criterion!r}"
+        )
 
 
 def tre_weight(points: Float[np.ndarray, "m 3"], size: int = 9) -> Float[np.ndarray, "p p"]:
@@ -163,8 +164,14 @@ def _adjugate(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "6 m"]]:
     """Determinant and adjugate of symmetric 3x3 matrices, entries as in :func:`_symmetric`."""
     a11, a22, a33, a23, a13, a12 = a
-    adjugate = np.stack([
-        a22 * a33 - a23**2, a11 * a33 - a13**2, a11 * a22 - a12**2,
-        a12 * a13 - a11 * a23, a12 * a23 - a13 * a22, a13 * a23 - a12 * a33,
-    ])  # fmt: skip
+    adjugate = np.stack(
+        [
+            a22 * a33 - a23**2,
+            a11 * a33 - a13**2,
+            a11 * a22 - a12**2,
+            a12 * a13 - a11 * a23,
+            a12 * a23 - a13 * a22,
+            a13 * a23 - a12 * a33,
+        ]
+    )
     return a11 * adjugate[0] + a12 * adjugate[5] + a13 * adjugate[4], adjugate

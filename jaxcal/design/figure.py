@@ -26,9 +26,10 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
 
     figure = Figure(figsize=(12.5, 4.2), dpi=130, layout="constrained")
     image, cone, errors = (
-        figure.add_subplot(1, 3, 1), figure.add_subplot(1, 3, 2, projection="polar"),
+        figure.add_subplot(1, 3, 1),
+        figure.add_subplot(1, 3, 2, projection="polar"),
         figure.add_subplot(1, 3, 3),
-    )  # fmt: skip
+    )
     bounds, model = plan.candidates.constraints, plan.candidates.model
     numbers = bounds.coordinates(plan.poses, model.image_to_probe, model.point)
     filling = plan.filling
@@ -43,8 +44,9 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
         azimuth = np.arctan2(numbers[which, 3], numbers[which, 2])
         tilt = np.degrees(np.hypot(numbers[which, 2], numbers[which, 3]))
         cone.plot(azimuth, tilt, "o", color=colour, markersize=4)
-    image.set(xlabel="lateral (mm)", ylabel="depth (mm)", title="target in the image",
-              aspect="equal")  # fmt: skip
+    image.set(
+        xlabel="lateral (mm)", ylabel="depth (mm)", title="target in the image", aspect="equal"
+    )
     image.invert_yaxis()
     image.legend(fontsize="small")
     cone.set_title("tilt (degrees)")
@@ -54,8 +56,9 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
     errors.plot(count[seen], plan.rp_mm[seen], color=_ORANGE, label="reconstruction precision")
     if wanted_mm is not None:
         errors.axhline(wanted_mm, color=_GREY, linewidth=0.8, linestyle="--")
-    errors.set(xlabel="images", ylabel="predicted error (mm)", yscale="log",
-               title="how many images?")  # fmt: skip
+    errors.set(
+        xlabel="images", ylabel="predicted error (mm)", yscale="log", title="how many images?"
+    )
     errors.grid(alpha=0.3, which="both")
     errors.legend(fontsize="small")
     return figure

@@ -97,9 +97,13 @@ class Noise:
         # A beam of 0.8 mm at its focus that spreads by 0.03 mm a mm.
         width = np.hypot(1.0, 0.03 / 0.8 * (place[:, 2] - focus_mm))
         sigma = np.stack(
-            [channel_mm * np.sqrt(inverse[:, 0, 0]), channel_mm * np.sqrt(inverse[:, 1, 1]),
-             elevational_mm * width], axis=1,
-        )  # fmt: skip
+            [
+                channel_mm * np.sqrt(inverse[:, 0, 0]),
+                channel_mm * np.sqrt(inverse[:, 1, 1]),
+                elevational_mm * width,
+            ],
+            axis=1,
+        )
         basis = _basis(place)
         found, *_ = np.linalg.lstsq(basis, np.log(sigma))
         return cls(found.T, doubt)

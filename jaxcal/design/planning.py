@@ -281,9 +281,17 @@ def _finished(
 
     tre, rp = curve(candidates, known, poses)
     return Plan(
-        poses, candidates.model.targets(poses), np.array(chosen.filling, bool),
-        np.array(chosen.rows), criterion, candidates, known, tre, rp, rules,
-    )  # fmt: skip
+        poses,
+        candidates.model.targets(poses),
+        np.array(chosen.filling, bool),
+        np.array(chosen.rows),
+        criterion,
+        candidates,
+        known,
+        tre,
+        rp,
+        rules,
+    )
 
 
 def check_candidates(candidates: Candidates) -> None:

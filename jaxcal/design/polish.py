@@ -111,9 +111,17 @@ def polish(
 
     def evaluate(at: np.ndarray, known: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = _scored(
-            at, known, search.weight, search.factors, bounds.reference, x, point,
-            np.asarray(model.noise.coefficients), region=bounds.region, scale=model.scale,
-        )  # fmt: skip
+            at,
+            known,
+            search.weight,
+            search.factors,
+            bounds.reference,
+            x,
+            point,
+            np.asarray(model.noise.coefficients),
+            region=bounds.region,
+            scale=model.scale,
+        )
         return float(value), np.asarray(slope)
 
     def among_too_many(k: int, pose: np.ndarray) -> bool:

@@ -184,8 +184,10 @@ def _slips(
     yield (
         "the poses' rotations are transposed (columns for rows, or conjugate quaternions): "
         "transpose the 3x3 blocks",
-        turned, shifts, points,
-    )  # fmt: skip
+        turned,
+        shifts,
+        points,
+    )
     for words, order in (
         ("first but is read as last", [1, 2, 3, 0]),
         ("last but is read as first", [3, 0, 1, 2]),
@@ -202,27 +204,38 @@ def _slips(
         yield (
             f"the poses' translations have the wrong sign along {name} (a left-handed frame, "
             "converted by half?): reverse it",
-            rotations, shifts * signs, points,
-        )  # fmt: skip
+            rotations,
+            shifts * signs,
+            points,
+        )
     for order, name in (
-        ([1, 0, 2], "x and y"), ([2, 1, 0], "x and z"), ([0, 2, 1], "y and z"),
-        ([1, 2, 0], "x, y and z"), ([2, 0, 1], "x, y and z"),
-    ):  # fmt: skip
+        ([1, 0, 2], "x and y"),
+        ([2, 1, 0], "x and z"),
+        ([0, 2, 1], "y and z"),
+        ([1, 2, 0], "x, y and z"),
+        ([2, 0, 1], "x, y and z"),
+    ):
         yield (
             f"the columns {name} of the poses' translations are exchanged: put them in order",
-            rotations, shifts[:, order], points,
-        )  # fmt: skip
+            rotations,
+            shifts[:, order],
+            points,
+        )
     if len(points) > 5:
         yield (
             "each point belongs to the pose of the row before: the two lists are one row out of "
             "step",
-            rotations[:-1], shifts[:-1], points[1:],
-        )  # fmt: skip
+            rotations[:-1],
+            shifts[:-1],
+            points[1:],
+        )
         yield (
             "each point belongs to the pose of the row after: the two lists are one row out of "
             "step",
-            rotations[1:], shifts[1:], points[:-1],
-        )  # fmt: skip
+            rotations[1:],
+            shifts[1:],
+            points[:-1],
+        )
 
 
 def _with_quaternions_reordered(
@@ -243,9 +256,13 @@ def _wrong_scale(
     if (np.abs(np.log(scales)) < np.log(1.01)).all():
         return None
     chosen = ImageData(
-        images.rotations[rows], images.translations[rows], images.points[rows], 0.0,
-        np.ones(2), True,
-    )  # fmt: skip
+        images.rotations[rows],
+        images.translations[rows],
+        images.points[rows],
+        0.0,
+        np.ones(2),
+        True,
+    )
     reduced = reduce(chosen, CONSTRAINTS[()])
     start = scalar_root(reduce(chosen, CONSTRAINTS[("scale",)]))
     assert start is not None

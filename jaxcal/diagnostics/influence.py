@@ -140,10 +140,12 @@ def _influence(
     pull = np.einsum("mkp,mk->mp", rows, errors)
     without = inverses(information - each, np.finfo(float).eps)
     moved = np.einsum("mpq,mq->mp", without, pull)
-    by_kind = np.stack([
-        np.einsum("mkp,mkq->pq", rows[:, found.kind == kind], rows[:, found.kind == kind])
-        for kind in range(len(KINDS))
-    ])  # fmt: skip
+    by_kind = np.stack(
+        [
+            np.einsum("mkp,mkq->pq", rows[:, found.kind == kind], rows[:, found.kind == kind])
+            for kind in range(len(KINDS))
+        ]
+    )
 
     leverage = rows @ inverse @ np.swapaxes(rows, 1, 2)
     values, vectors = np.linalg.eigh(np.eye(components) - 0.5 * (leverage + leverage.mT))
@@ -196,9 +198,13 @@ def _on_points(
     if answer.offset_law is not None:
         mean = float(np.asarray(answer.offset_law.mean)[0])
     centred = seen.errors - mean * seen.mask[..., None] * [0.0, 0.0, 1.0]
-    whitened = Whitened.of(answer, ImageErrors(
-        seen.q, seen.turned, seen.lateral, seen.distance, centred, seen.rows, seen.mask
-    ), problem)  # fmt: skip
+    whitened = Whitened.of(
+        answer,
+        ImageErrors(
+            seen.q, seen.turned, seen.lateral, seen.distance, centred, seen.rows, seen.mask
+        ),
+        problem,
+    )
     errors, rows = whitened.errors[0][used], whitened.rows[0][used]
     log_sd, shape = np.zeros(len(rows)), own_covariance(answer, problem)
     if shape is not None:

@@ -301,10 +301,14 @@ def suspects(result: Calibration) -> list[OutlierReason]:
     departure[images_that_stand_out(result)] = 0.0
     found: list[OutlierReason] = []
     for image in np.flatnonzero((np.abs(departure) > limit).any(axis=1)):
-        found.append({
-            "image": int(image), "component": COMPONENTS[1],
-            "sds": _finite(departure[image, 1]), "left_out": False,
-        })  # fmt: skip
+        found.append(
+            {
+                "image": int(image),
+                "component": COMPONENTS[1],
+                "sds": _finite(departure[image, 1]),
+                "left_out": False,
+            }
+        )
     return found
 
 

@@ -40,8 +40,11 @@ def law_distances(offsets: Float[np.ndarray, " n"]) -> dict[str, float]:
     below, above = np.arange(count) / count, np.arange(1, count + 1) / count
     found = {}
     for family, size in (
-        ("uniform", spread), ("bell", spread), ("gaussian", spread), ("student", middle)
-    ):  # fmt: skip
+        ("uniform", spread),
+        ("bell", spread),
+        ("gaussian", spread),
+        ("student", middle),
+    ):
         expected = distribution(family, centred / size)
         apart = np.maximum(expected - below, above - expected).max()
         found[family] = float(np.sqrt(count) * apart)

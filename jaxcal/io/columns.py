@@ -33,17 +33,33 @@ _NAMES = {
     "qy": ("qy", "quaterniony", "rotationy"),
     "qz": ("qz", "quaternionz", "rotationz"),
     "qw": ("qw", "qs", "quaternionw", "rotationw", "w"),
-}  # fmt: skip
+}
 _ROLE = {name: role for role, names in _NAMES.items() for name in names}
 _UNIT = re.compile(r"^(.*?)(?:\s*[\[(]\s*([^\])]*?)\s*[\])]|[_\s](mm|cm|m|px|pixels?|s|ms|us))?$")
 _CELL = re.compile(r"([a-z]*?)_?([0-4])[_,]?([0-4])")
 _NUMBERED = re.compile(r"([a-z]*?)_?(\d{1,2})")
 _UNITS = {
-    "mm": "mm", "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm",
-    "cm": "cm", "m": "m", "meter": "m", "meters": "m", "metre": "m", "metres": "m",
-    "px": "px", "pixel": "px", "pixels": "px",
-    "s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us",
-}  # fmt: skip
+    "mm": "mm",
+    "millimeter": "mm",
+    "millimeters": "mm",
+    "millimetre": "mm",
+    "millimetres": "mm",
+    "cm": "cm",
+    "m": "m",
+    "meter": "m",
+    "meters": "m",
+    "metre": "m",
+    "metres": "m",
+    "px": "px",
+    "pixel": "px",
+    "pixels": "px",
+    "s": "s",
+    "sec": "s",
+    "seconds": "s",
+    "ms": "ms",
+    "us": "us",
+    "µs": "us",
+}
 
 
 @dataclass(frozen=True)
@@ -129,14 +145,19 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
     if time_unit not in (None, *TIMES_S):
         raise FormatError(f"time in {quoted(str(time_unit))} is not known: s, ms or us")
     return Columns(
-        width=len(names), matrix=matrix,
+        width=len(names),
+        matrix=matrix,
         translation=None if matrix is not None else translation,
-        quaternion=quaternion_columns, point=point,
-        time=roles.get("time"), frame=roles.get("frame"), file=roles.get("file"),
+        quaternion=quaternion_columns,
+        point=point,
+        time=roles.get("time"),
+        frame=roles.get("frame"),
+        file=roles.get("file"),
         valid=roles.get("valid"),
         length_mm=_length(lengths, names, list(units)),
-        point_unit=point_unit, time_s=TIMES_S[time_unit or "s"],
-    )  # fmt: skip
+        point_unit=point_unit,
+        time_s=TIMES_S[time_unit or "s"],
+    )
 
 
 def _unknown(names: list[str], column: int) -> FormatError:

@@ -122,9 +122,11 @@ def _region(name: str, region: Dataset, data: Dataset) -> PixelSize:
         raise FormatError(f"{name}: a region has no location")
     left, top, right, bottom = (int(edge or 0) for edge in edges)
     return PixelSize(
-        (spacing[0], spacing[1]), _whole(data, "Columns"), _whole(data, "Rows"),
+        (spacing[0], spacing[1]),
+        _whole(data, "Columns"),
+        _whole(data, "Rows"),
         (left, top, right - left + 1, bottom - top + 1),
-    )  # fmt: skip
+    )
 
 
 def _text(spacing: tuple[float, float]) -> str:

@@ -51,9 +51,13 @@ def read_folder(path: str | os.PathLike[str]) -> TrackedSequence:
             )
     count = len(paths)
     return TrackedSequence(
-        {}, {}, np.full(count, np.nan), np.ones(count, bool),
-        FolderPixels(tuple(paths), *size), name,
-    )  # fmt: skip
+        {},
+        {},
+        np.full(count, np.nan),
+        np.ones(count, bool),
+        FolderPixels(tuple(paths), *size),
+        name,
+    )
 
 
 def with_pose_table(images: TrackedSequence, table: PoseTable) -> tuple[TrackedSequence, list[str]]:
@@ -94,9 +98,13 @@ def with_pose_table(images: TrackedSequence, table: PoseTable) -> tuple[TrackedS
     if missing:
         notes.append(f"{missing} of {count} images have no pose in {table.name}")
     return TrackedSequence(
-        {PROBE_TO_TRACKER: poses}, {PROBE_TO_TRACKER: valid}, time, images.image_valid,
-        images.pixels, images.source,
-    ), notes  # fmt: skip
+        {PROBE_TO_TRACKER: poses},
+        {PROBE_TO_TRACKER: valid},
+        time,
+        images.image_valid,
+        images.pixels,
+        images.source,
+    ), notes
 
 
 def _rows(images: TrackedSequence, paths: tuple[Path, ...], table: PoseTable) -> np.ndarray:

@@ -108,9 +108,7 @@ def import_files(
     """
     options = options or ImportOptions()
     kinds = [_kind(source) for source in sources]
-    tracked = [
-        source for source, kind in zip(sources, kinds, strict=True) if kind in _SEQUENCES
-    ]  # fmt: skip
+    tracked = [source for source, kind in zip(sources, kinds, strict=True) if kind in _SEQUENCES]
     if tracked:
         return _from_sequence(sources, tracked, options)
     if options.poses is not None:
@@ -159,9 +157,12 @@ def _kind(source: str | os.PathLike[str]) -> str:
 
 def _table(source: str | os.PathLike[str], options: ImportOptions) -> PoseTable:
     return read_pose_table(
-        source, quaternion=options.quaternion, pose_units=options.pose_units,
-        units=options.units, skip_invalid=options.skip_invalid,
-    )  # fmt: skip
+        source,
+        quaternion=options.quaternion,
+        pose_units=options.pose_units,
+        units=options.units,
+        skip_invalid=options.skip_invalid,
+    )
 
 
 def _skipped(table: PoseTable) -> list[str]:
@@ -218,9 +219,13 @@ def _from_sequence(
     rows = placed.rows[used]
     time, said = _time(sequence, rows, options)
     images = make_images(
-        poses[rows], placed.points[used], placed.kind, time=time,
-        spacing_mm=spacing, where=sequence.source,
-    )  # fmt: skip
+        poses[rows],
+        placed.points[used],
+        placed.kind,
+        time=time,
+        spacing_mm=spacing,
+        where=sequence.source,
+    )
     return Imported(Recording(images, source=sequence.source), notes + said)
 
 
@@ -422,7 +427,12 @@ def _segmented(
         )
     time, said = _time(sequence, used, options)
     images = make_images(
-        poses[used], results.position[used], "pixel", covariance=results.covariance[used],
-        time=time, spacing_mm=spacing, where=sequence.source,
-    )  # fmt: skip
+        poses[used],
+        results.position[used],
+        "pixel",
+        covariance=results.covariance[used],
+        time=time,
+        spacing_mm=spacing,
+        where=sequence.source,
+    )
     return Imported(Recording(images, source=sequence.source), notes + said, results)

@@ -93,11 +93,13 @@ def _versor(vector: np.ndarray) -> Float[np.ndarray, "3 3"]:
     if squared > 1 + 1e-9:
         raise FormatError("a versor longer than 1")
     w = np.sqrt(max(0.0, 1 - squared))
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def itk_text(matrix: Float[np.ndarray, "4 4"]) -> str:
@@ -128,9 +130,12 @@ def write_itk(path: str | os.PathLike[str], matrix: Float[np.ndarray, "4 4"]) ->
     ascii_text = h5py.string_dtype("ascii")
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         for key, value in (
-            ("ITKVersion", "5.4.0"), ("HDFVersion", h5py.version.hdf5_version),
-            ("OSName", "any"), ("OSVersion", "any"), ("TransformGroup/0/TransformType", _KIND),
-        ):  # fmt: skip
+            ("ITKVersion", "5.4.0"),
+            ("HDFVersion", h5py.version.hdf5_version),
+            ("OSName", "any"),
+            ("OSVersion", "any"),
+            ("TransformGroup/0/TransformType", _KIND),
+        ):
             file.create_dataset(key, data=[value], dtype=ascii_text)
         file["TransformGroup/0/TransformParameters"] = parameters
         file["TransformGroup/0/TransformFixedParameters"] = np.zeros(3)

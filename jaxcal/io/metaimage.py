@@ -23,10 +23,13 @@ from jaxcal.io.sequence_header import (
 )
 
 _META_TYPES = {
-    "MET_UCHAR": np.dtype("u1"), "MET_CHAR": np.dtype("i1"),
-    "MET_SHORT": np.dtype("i2"), "MET_USHORT": np.dtype("u2"),
-    "MET_FLOAT": np.dtype("f4"), "MET_DOUBLE": np.dtype("f8"),
-}  # fmt: skip
+    "MET_UCHAR": np.dtype("u1"),
+    "MET_CHAR": np.dtype("i1"),
+    "MET_SHORT": np.dtype("i2"),
+    "MET_USHORT": np.dtype("u2"),
+    "MET_FLOAT": np.dtype("f4"),
+    "MET_DOUBLE": np.dtype("f8"),
+}
 
 
 def read_metaimage(path: Path, name: str) -> TrackedSequence:
@@ -84,12 +87,20 @@ def _metaimage_pixels(
     packed = fields.get("CompressedData", "False").lower() == "true"
     data = fields["ElementDataFile"]
     start, where = (header.end, path) if data == "LOCAL" else (0, _beside(path, data))
-    return checked_pixels(Pixels(
-        where, start, "zlib" if packed else "raw", columns, rows,
-        whole_numbers(fields.get("ElementNumberOfChannels", "1"), "ElementNumberOfChannels")[0],
-        dtype, orientation_of(fields.get("UltrasoundImageOrientation", "")),
-        image_type_of(fields.get("UltrasoundImageType", "")),
-    ), count)  # fmt: skip
+    return checked_pixels(
+        Pixels(
+            where,
+            start,
+            "zlib" if packed else "raw",
+            columns,
+            rows,
+            whole_numbers(fields.get("ElementNumberOfChannels", "1"), "ElementNumberOfChannels")[0],
+            dtype,
+            orientation_of(fields.get("UltrasoundImageOrientation", "")),
+            image_type_of(fields.get("UltrasoundImageType", "")),
+        ),
+        count,
+    )
 
 
 def _check_data_name(data: str) -> None:
@@ -117,17 +128,27 @@ def metaimage_header(
 ) -> list[str]:
     """The lines of a header before the fields of frames."""
     channels = stack.shape[3] if stack.ndim == 4 else 1
-    head = ["ObjectType = Image", "NDims = 3", "AnatomicalOrientation = RAI", "BinaryData = True",
-            "BinaryDataByteOrderMSB = False", "CenterOfRotation = 0 0 0",
-            f"CompressedData = {compressed}"]  # fmt: skip
+    head = [
+        "ObjectType = Image",
+        "NDims = 3",
+        "AnatomicalOrientation = RAI",
+        "BinaryData = True",
+        "BinaryDataByteOrderMSB = False",
+        "CenterOfRotation = 0 0 0",
+        f"CompressedData = {compressed}",
+    ]
     if compressed:
         head.append(f"CompressedDataSize = {size}")
-    head += [f"DimSize = {stack.shape[2]} {stack.shape[1]} {stack.shape[0]}",
-             "Kinds = domain domain list", "ElementSpacing = 1 1 1",
-             f"ElementType = {'MET_UCHAR' if stack.dtype == np.uint8 else 'MET_SHORT'}",
-             "Offset = 0 0 0", "TransformMatrix = 1 0 0 0 1 0 0 0 1",
-             f"UltrasoundImageOrientation = {written_orientation(orientation)}",
-             "UltrasoundImageType = BRIGHTNESS"]  # fmt: skip
+    head += [
+        f"DimSize = {stack.shape[2]} {stack.shape[1]} {stack.shape[0]}",
+        "Kinds = domain domain list",
+        "ElementSpacing = 1 1 1",
+        f"ElementType = {'MET_UCHAR' if stack.dtype == np.uint8 else 'MET_SHORT'}",
+        "Offset = 0 0 0",
+        "TransformMatrix = 1 0 0 0 1 0 0 0 1",
+        f"UltrasoundImageOrientation = {written_orientation(orientation)}",
+        "UltrasoundImageType = BRIGHTNESS",
+    ]
     if pixels:
         head.append(f"ElementNumberOfChannels = {channels}")
     return head

@@ -23,12 +23,26 @@ from jaxcal.io.sequence_header import (
 )
 
 _NRRD_TYPES = {
-    "uchar": "u1", "unsigned char": "u1", "uint8": "u1", "uint8_t": "u1",
-    "char": "i1", "signed char": "i1", "int8": "i1", "int8_t": "i1",
-    "short": "i2", "short int": "i2", "signed short": "i2", "int16": "i2", "int16_t": "i2",
-    "ushort": "u2", "unsigned short": "u2", "uint16": "u2", "uint16_t": "u2",
-    "float": "f4", "double": "f8",
-}  # fmt: skip
+    "uchar": "u1",
+    "unsigned char": "u1",
+    "uint8": "u1",
+    "uint8_t": "u1",
+    "char": "i1",
+    "signed char": "i1",
+    "int8": "i1",
+    "int8_t": "i1",
+    "short": "i2",
+    "short int": "i2",
+    "signed short": "i2",
+    "int16": "i2",
+    "int16_t": "i2",
+    "ushort": "u2",
+    "unsigned short": "u2",
+    "uint16": "u2",
+    "uint16_t": "u2",
+    "float": "f4",
+    "double": "f8",
+}
 
 
 def read_nrrd(path: Path, name: str) -> TrackedSequence:
@@ -111,12 +125,20 @@ def _nrrd_pixels(
         raise FormatError(f"encoding {quoted(encoding)} is not read: write raw or gzip")
     order = ">" if fields.get("endian", "little").lower() == "big" else "<"
     columns, rows, channels = size
-    return checked_pixels(Pixels(
-        path, header.end, packings[encoding], columns, rows, channels,
-        np.dtype(_NRRD_TYPES[kind]).newbyteorder(order),
-        orientation_of(fields.get("ultrasound image orientation", "")),
-        image_type_of(fields.get("ultrasound image type", "")),
-    ), count)  # fmt: skip
+    return checked_pixels(
+        Pixels(
+            path,
+            header.end,
+            packings[encoding],
+            columns,
+            rows,
+            channels,
+            np.dtype(_NRRD_TYPES[kind]).newbyteorder(order),
+            orientation_of(fields.get("ultrasound image orientation", "")),
+            image_type_of(fields.get("ultrasound image type", "")),
+        ),
+        count,
+    )
 
 
 def nrrd_header(stack: np.ndarray, orientation: str, pixels: bool, compressed: bool) -> list[str]:

@@ -91,7 +91,7 @@ class Tracked:
 
 
 @dataclass(frozen=True)
-class Status:
+class StatusMessage:
     """Content of a STATUS: code 1 is well, the rest are listed in the protocol."""
 
     code: int
@@ -113,7 +113,7 @@ class TrackedFrame:
     transforms: tuple[Tracked, ...]
 
 
-Content = Picture | tuple[Tracked, ...] | TrackedFrame | Status | None
+Content = Picture | tuple[Tracked, ...] | TrackedFrame | StatusMessage | None
 
 
 @dataclass(frozen=True)
@@ -175,9 +175,7 @@ def parse_header(data: bytes | bytearray | memoryview) -> Header | None:
     if size > _LARGEST.get(text, MAXIMUM_BODY):
         return None
     stamp = seconds + fraction * 2.0**-32
-    return Header(
-        version, text, device.decode("utf-8", "replace"), stamp or math.nan, size, crc
-    )  # fmt: skip
+    return Header(version, text, device.decode("utf-8", "replace"), stamp or math.nan, size, crc)
 
 
 BEGINNING = _EXTENDED.size + _IMAGE.size
@@ -337,11 +335,11 @@ def _tdata(content: memoryview) -> tuple[Tracked, ...]:
     )
 
 
-def _status(content: memoryview) -> Status:
+def _status(content: memoryview) -> StatusMessage:
     if len(content) < _STATUS.size:
         raise ContentError("a status that is cut off")
     code, subcode, name = _STATUS.unpack_from(content)
-    return Status(code, subcode, _text(name), _text(bytes(content[_STATUS.size :])))
+    return StatusMessage(code, subcode, _text(name), _text(bytes(content[_STATUS.size :])))
 
 
 def _text(data: bytes) -> str:
@@ -365,7 +363,7 @@ def encode(message: Message) -> bytes:
                 metadata = {_TRANSFORM_STATUS: message.content[0].status}
         case tuple() if message.kind == "TDATA":
             content = b"".join(_encode_tracked(each) for each in message.content)
-        case Status(code, subcode, name, text) if message.kind == "STATUS":
+        case StatusMessage(code, subcode, name, text) if message.kind == "STATUS":
             content = _STATUS.pack(code, subcode, name.encode()) + text.encode() + b"\0"
         case None:
             content = b""
@@ -412,10 +410,31 @@ def _encode_image(picture: Picture) -> bytes:
     # Position is that of the image's centre; the first pixel is put at the origin.
     centre = ((width - 1) / 2 * lateral, (height - 1) / 2 * axial, 0.0)
     head = _IMAGE.pack(
-        1, 1, scalar, _LITTLE_ENDIAN, _LPS, width, height, 1,
-        lateral, 0.0, 0.0, 0.0, axial, 0.0, 0.0, 0.0, 1.0, *centre,
-        0, 0, 0, width, height, 1,
-    )  # fmt: skip
+        1,
+        1,
+        scalar,
+        _LITTLE_ENDIAN,
+        _LPS,
+        width,
+        height,
+        1,
+        lateral,
+        0.0,
+        0.0,
+        0.0,
+        axial,
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+        *centre,
+        0,
+        0,
+        0,
+        width,
+        height,
+        1,
+    )
     return head + picture.array.astype(picture.array.dtype.newbyteorder("<"), copy=False).tobytes()
 
 

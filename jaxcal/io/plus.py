@@ -216,9 +216,12 @@ def _transform(element: Element) -> PlusTransform:
     if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
         raise FormatError(f"line {element.line}: the matrix's last row is not 0 0 0 1")
     return PlusTransform(
-        _frames(element), matrix, _optional_number(element, "Error"),
-        element.attributes.get("Date"), element.line,
-    )  # fmt: skip
+        _frames(element),
+        matrix,
+        _optional_number(element, "Error"),
+        element.attributes.get("Date"),
+        element.line,
+    )
 
 
 def _frames(element: Element) -> FramePair:
@@ -364,9 +367,10 @@ def patched_configuration(
     if between:
         old = between[0]
         others = {
-            key: value for key, value in old.attributes.items()
+            key: value
+            for key, value in old.attributes.items()
             if key not in ("From", "To", "Matrix", "Error", "Date", "Valid", "Status")
-        }  # fmt: skip
+        }
         indent = _indent(content, old.start)
         text = transform_element(wanted, matrix, others=others, indent=indent, **stated)
         new = content[: old.start] + text.encode() + content[old.end :]

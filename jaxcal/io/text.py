@@ -24,10 +24,25 @@ from jaxcal.runtime.array_types import Float, Int
 LengthUnit = Literal["mm", "cm", "m"]
 
 _TRUE = frozenset(("1", "1.0", "true", "yes", "ok", "valid", "good", "tracked"))
-_FALSE = frozenset((
-    "0", "0.0", "false", "no", "invalid", "missing", "bad", "lost", "out_of_view", "out of view",
-    "out_of_volume", "partially out of volume", "too few markers", "req_timeout", "",
-))  # fmt: skip
+_FALSE = frozenset(
+    (
+        "0",
+        "0.0",
+        "false",
+        "no",
+        "invalid",
+        "missing",
+        "bad",
+        "lost",
+        "out_of_view",
+        "out of view",
+        "out_of_volume",
+        "partially out of volume",
+        "too few markers",
+        "req_timeout",
+        "",
+    )
+)
 
 
 @dataclass(frozen=True)
@@ -160,9 +175,13 @@ def recording_of(
         missing = "poses" if table.poses is None else "points (u and v, or lateral and range)"
         raise InputError(f"{table.name}: holds no {missing}")
     images = make_images(
-        table.poses, table.points, table.kind,
-        time=table.time, spacing_mm=spacing_mm, where=table.name,
-    )  # fmt: skip
+        table.poses,
+        table.points,
+        table.kind,
+        time=table.time,
+        spacing_mm=spacing_mm,
+        where=table.name,
+    )
     return Recording(images, source=table.name)
 
 
@@ -253,9 +272,9 @@ def _fixed(
         )
     if finite:
         return table.numbers(tuple(range(width)))
-    return np.array([
-        [table.number(row, column) for column in range(width)] for row in range(len(table.rows))
-    ])  # fmt: skip
+    return np.array(
+        [[table.number(row, column) for column in range(width)] for row in range(len(table.rows))]
+    )
 
 
 def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
@@ -282,9 +301,12 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
 def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list[int], int]:
     """Rows to use, and how many are left out as invalid."""
     needed = [
-        *(columns.matrix or ()), *(columns.translation or ()), *(columns.quaternion or ()),
-        *(columns.point or ()), *(() if columns.time is None else (columns.time,)),
-    ]  # fmt: skip
+        *(columns.matrix or ()),
+        *(columns.translation or ()),
+        *(columns.quaternion or ()),
+        *(columns.point or ()),
+        *(() if columns.time is None else (columns.time,)),
+    ]
     kept: list[int] = []
     for row, cells in enumerate(table.rows):
         valid = columns.valid is None or _is_valid(table, row, columns.valid)

@@ -76,8 +76,10 @@ def encode_tracked_frame(frame: TrackedFrame, t: float, orientation: int = 5) ->
     fields = []
     for tracked in frame.transforms:
         values = " ".join(repr(float(value)) for value in tracked.matrix.ravel())
-        fields += [(tracked.name + _STATUS, tracked.status or "OK"),
-                   (tracked.name + _TRANSFORM, values)]  # fmt: skip
+        fields += [
+            (tracked.name + _STATUS, tracked.status or "OK"),
+            (tracked.name + _TRANSFORM, values),
+        ]
     lines = [
         f'<TrackedFrame Timestamp="{t!r}" ImageDataValid="true" NumberOfBits="8" '
         f'NumberOfScalarComponents="1" FrameSize="{columns} {rows} 1">',
@@ -86,9 +88,17 @@ def encode_tracked_frame(frame: TrackedFrame, t: float, orientation: int = 5) ->
     ]
     xml = "\n".join(lines).encode()
     head = _HEAD.pack(
-        _UINT8, 1, _BRIGHTNESS, columns, rows, 1, columns * rows, len(xml), orientation,
+        _UINT8,
+        1,
+        _BRIGHTNESS,
+        columns,
+        rows,
+        1,
+        columns * rows,
+        len(xml),
+        orientation,
         np.eye(4, dtype="<f4").tobytes(),
-    )  # fmt: skip
+    )
     return head + xml + np.ascontiguousarray(frame.picture.array, np.uint8).tobytes()
 
 

@@ -58,9 +58,13 @@ def read_scan(path: str | os.PathLike[str]) -> TrackedSequence:
         count = len(poses)
         valid = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
         return TrackedSequence(
-            {FRAMES: poses}, {FRAMES: valid}, np.full(count, np.nan),
-            np.full(count, pixels is not None), pixels, os.fspath(path),
-        )  # fmt: skip
+            {FRAMES: poses},
+            {FRAMES: valid},
+            np.full(count, np.nan),
+            np.full(count, pixels is not None),
+            pixels,
+            os.fspath(path),
+        )
 
 
 def calib_matrix(

@@ -44,7 +44,7 @@ class ElementPlanes(eqx.Module):
     elements: Float[Array, "3 lanes elements"]
 
 
-class Images(eqx.Module):
+class ImagePlanes(eqx.Module):
     """What was measured, one plane (lanes, images) for every number.
 
     Attributes:
@@ -66,7 +66,7 @@ class Images(eqx.Module):
     channels: ElementPlanes | None = None
 
     @classmethod
-    def of(cls, problems: Problem, *, channels: bool = False) -> Images:
+    def of(cls, problems: Problem, *, channels: bool = False) -> ImagePlanes:
         """The planes of a batch of problems (one leading axis).
 
         Args:
@@ -108,12 +108,12 @@ class Images(eqx.Module):
         """Number of used images."""
         return jnp.sum(self.mask, axis=1)
 
-    def padded(self) -> Images:
+    def padded(self) -> ImagePlanes:
         """With unused images up to whole vectors: a loop over them leaves no rest."""
         if self.channels is not None:
             return self
         added = whole(self.mask).shape[1] - self.mask.shape[1]
-        return Images(
+        return ImagePlanes(
             whole(self.rotation),
             whole(self.origin),
             whole(self.lateral),
@@ -122,9 +122,9 @@ class Images(eqx.Module):
             jnp.pad(self.mask, [(0, 0), (0, added)]),
         )
 
-    def repeated(self, times: int) -> Images:
+    def repeated(self, times: int) -> ImagePlanes:
         """The same points (no times of flight) in so many times the lanes."""
-        return Images(
+        return ImagePlanes(
             jnp.tile(self.rotation, (1, times, 1)),
             jnp.tile(self.origin, (1, times, 1)),
             jnp.tile(self.lateral, (times, 1)),
@@ -246,7 +246,7 @@ def _extra_names(blocks: Blocks) -> list[str]:
     return [name for name in EXTRA if name in blocks for _ in range(size((name,)))]
 
 
-def targets(iterate: Iterate, images: Images) -> tuple[Vector, Matrix]:
+def targets(iterate: Iterate, images: ImagePlanes) -> tuple[Vector, Matrix]:
     """q_i, and M_i = R' R_i' by which a step of the target moves it, as planes."""
     inverse = [[iterate.rotation[k, a][:, None] for k in range(3)] for a in range(3)]
     back = [[images.rotation[3 * j + i] for j in range(3)] for i in range(3)]

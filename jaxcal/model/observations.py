@@ -14,7 +14,7 @@ observation is one class here and a line where :mod:`jaxcal.solvers.methods` cho
 
 - :class:`Points`: errors of lateral position and range, and the offset itself (y_i = q_y), each
   with its SD; :class:`OwnCovariances`: the same with a covariance for every image.
-- :class:`Channels`: what each element should have heard less what it heard (Eqs. 5 and 6).
+- :class:`ChannelDistances`: what each element should have heard less what it heard (Eqs. 5 and 6).
 - :class:`InPlane`: q - p(0), equally weighted: the conventional Eq. 7.
 - :class:`HeldOffsets`: q - p(y) with given y: a half-round of the alternation.
 - :class:`BoundedOffsets`: q - p(y) with |y| <= bound unknown: what the alternation descends.
@@ -33,7 +33,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxcal.model.batch import RIGID_UNKNOWNS, Images, Iterate, targets, whole
+from jaxcal.model.batch import RIGID_UNKNOWNS, ImagePlanes, Iterate, targets, whole
 from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import (
     EXTRA,
@@ -76,7 +76,7 @@ class Further(eqx.Module):
                 ]
         return cls(values)
 
-    def points(self, images: Images) -> tuple[Array, Array]:
+    def points(self, images: ImagePlanes) -> tuple[Array, Array]:
         """Lateral position and range of every image, mm."""
         return measured(images.lateral, images.axial, images.face[:, None], self.values)
 
@@ -110,10 +110,10 @@ class Observation(eqx.Module):
     """Whether residuals are in SDs; otherwise their variance is estimated from them."""
 
     @abc.abstractmethod
-    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         """Residuals of every image; one entry for each SD."""
 
-    def count(self, images: Images) -> Float[Array, "components lanes"]:
+    def count(self, images: ImagePlanes) -> Float[Array, "components lanes"]:
         """How many residuals each component has."""
         return jnp.broadcast_to(images.used, self.sigma.shape)
 
@@ -144,12 +144,12 @@ class Points(Observation):
 
     sigma: Float[Array, "3 lanes"]
 
-    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         lateral, distance = errors(q, further, images)
         return [Component([lateral]), Component([distance]), Component([q[1]])]
 
 
-def errors(q: Vector, further: Further, images: Images) -> tuple[Array, Array]:
+def errors(q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Array]:
     """Error of lateral position and of range, mm, of every image."""
     lateral, distance = further.points(images)
     square = q[1] * q[1] + q[2] * q[2]
@@ -173,7 +173,7 @@ class OwnCovariances(Observation):
     ratio: Float[Array, " lanes"]
     tied: bool = eqx.field(static=True, default=False)
 
-    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         lateral, distance = errors(q, further, images)
         # The 2x2 Cholesky factor written out; a mm of lateral error is ratio mm of range error.
         first = jnp.sqrt(self.shape[0])
@@ -185,7 +185,7 @@ class OwnCovariances(Observation):
             return [Component([one, other]), Component([q[1]])]
         return [Component([one]), Component([other]), Component([q[1]])]
 
-    def count(self, images: Images) -> Float[Array, "components lanes"]:
+    def count(self, images: ImagePlanes) -> Float[Array, "components lanes"]:
         used = images.used
         return jnp.stack([2 * used, used] if self.tied else [used] * 3)
 
@@ -210,7 +210,7 @@ def variance_planes(covariance: Float[Array, "lanes n 2 2"]) -> Float[Array, "3 
 
 
 def unit_shape(
-    variances: Float[Array, "3 lanes n"], images: Images
+    variances: Float[Array, "3 lanes n"], images: ImagePlanes
 ) -> tuple[Float[Array, "3 lanes n"], Float[Array, "2 lanes"]]:
     """Covariances scaled so that the used images' mean variances are 1, and those means, mm^2.
 
@@ -226,7 +226,7 @@ def unit_shape(
     return jnp.where(shaped, variances * by[..., None], unit), mean
 
 
-class Channels(Observation):
+class ChannelDistances(Observation):
     """Distance of the target from every element that heard it, and the elevational offset.
 
     With the sound speed s times the nominal one, and a delay worth d mm, an element at distance
@@ -239,7 +239,7 @@ class Channels(Observation):
 
     sigma: Float[Array, "2 lanes"]
 
-    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         channels = images.channels
         assert channels is not None
         square = 0.0
@@ -248,17 +248,17 @@ class Channels(Observation):
         exact = further.heard(jnp.sqrt(square))
         return [Component([exact - channels.distances], channels.heard), Component([q[1]])]
 
-    def count(self, images: Images) -> Float[Array, "2 lanes"]:
+    def count(self, images: ImagePlanes) -> Float[Array, "2 lanes"]:
         assert images.channels is not None
         heard = jnp.sum(images.mask[..., None] * images.channels.heard, axis=(1, 2))
         return jnp.stack([heard, images.used])
 
 
-def _unit(images: Images) -> Float[Array, "1 lanes"]:
+def _unit(images: ImagePlanes) -> Float[Array, "1 lanes"]:
     return jnp.ones((1, images.lanes), images.mask.dtype)
 
 
-def on_circle(q: Vector, y: Array, further: Further, images: Images) -> Vector:
+def on_circle(q: Vector, y: Array, further: Further, images: ImagePlanes) -> Vector:
     """Q - p(y), mm: the residuals of Eq. 7 at a given offset."""
     lateral, distance = further.points(images)
     return [q[0] - lateral, q[1] - y, q[2] - jnp.sqrt(distance * distance - y * y)]
@@ -275,11 +275,11 @@ class InPlane(Observation):
     whitened: ClassVar[bool] = False
 
     @classmethod
-    def of(cls, images: Images) -> InPlane:
+    def of(cls, images: ImagePlanes) -> InPlane:
         """For these images."""
         return cls(_unit(images))
 
-    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         lateral, distance = further.points(images)
         return [Component([q[0] - lateral, q[1], q[2] - distance])]
 
@@ -297,11 +297,11 @@ class HeldOffsets(Observation):
     whitened: ClassVar[bool] = False
 
     @classmethod
-    def of(cls, offset: Float[Array, "lanes n"], images: Images) -> HeldOffsets:
+    def of(cls, offset: Float[Array, "lanes n"], images: ImagePlanes) -> HeldOffsets:
         """For these images."""
         return cls(_unit(images), offset)
 
-    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         return [Component(on_circle(q, self.offset, further, images))]
 
     def padded(self) -> HeldOffsets:
@@ -313,21 +313,21 @@ class LocalUnknown(Observation):
     """An observation with one more unknown in every image, which is eliminated there."""
 
     @abc.abstractmethod
-    def local(self, q: Vector, further: Further, images: Images) -> tuple[Array, Array]:
+    def local(self, q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Array]:
         """The best value for given q, and 1 where it may move (0 where it rests on a bound)."""
 
     @abc.abstractmethod
     def components_at(
-        self, q: Vector, local: Array, further: Further, images: Images
+        self, q: Vector, local: Array, further: Further, images: ImagePlanes
     ) -> list[Component]:
         """:meth:`components` at a value of that unknown."""
 
-    def components(self, q: Vector, further: Further, images: Images) -> list[Component]:
+    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         return self.components_at(q, self.local(q, further, images)[0], further, images)
 
 
 def local_unknowns(
-    iterate: Iterate, observation: LocalUnknown, images: Images
+    iterate: Iterate, observation: LocalUnknown, images: ImagePlanes
 ) -> Float[Array, "lanes n"]:
     """Every image's own unknown at its best; 0 for images left out."""
     q, _ = targets(iterate, images)
@@ -348,15 +348,15 @@ class BoundedOffsets(LocalUnknown):
     whitened: ClassVar[bool] = False
 
     @classmethod
-    def of(cls, bound: Float[Array, "lanes n"], images: Images) -> BoundedOffsets:
+    def of(cls, bound: Float[Array, "lanes n"], images: ImagePlanes) -> BoundedOffsets:
         """For these images."""
         return cls(_unit(images), bound)
 
-    def limit(self, further: Further, images: Images) -> Array:
+    def limit(self, further: Further, images: ImagePlanes) -> Array:
         """The largest |y_i|, mm."""
         return jnp.minimum(self.bound, LARGEST_ELEVATION * jnp.abs(further.points(images)[1]))
 
-    def local(self, q: Vector, further: Further, images: Images) -> tuple[Array, Array]:
+    def local(self, q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Array]:
         """The y_i of the point closest to q_i on the arc |y| <= bound (section 2.4), mm.
 
         On the circle the distance grows with the angle away from q_i, so the closest point of the
@@ -371,7 +371,7 @@ class BoundedOffsets(LocalUnknown):
         return jnp.clip(free, -limit, limit), jnp.where(jnp.abs(free) < limit, 1.0, 0.0)
 
     def components_at(
-        self, q: Vector, local: Array, further: Further, images: Images
+        self, q: Vector, local: Array, further: Further, images: ImagePlanes
     ) -> list[Component]:
         return [Component(on_circle(q, local, further, images))]
 
@@ -397,7 +397,7 @@ class TrackedPoints(LocalUnknown):
     shape: Float[Array, "3 lanes n"] | None = None
 
     def components_at(
-        self, q: Vector, local: Array, further: Further, images: Images
+        self, q: Vector, local: Array, further: Further, images: ImagePlanes
     ) -> list[Component]:
         # Each residual in units of its component's SD, which do not hold the tracker's share.
         tau = self.tracker_sd[:, None]
@@ -417,7 +417,7 @@ class TrackedPoints(LocalUnknown):
             Component([offset, local * sigma[2]]),
         ]
 
-    def local(self, q: Vector, further: Further, images: Images) -> tuple[Array, Array]:
+    def local(self, q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Array]:
         def halved(local: Array) -> Array:
             parts = self.components_at(q, local, further, images)
             weighed = [
@@ -444,7 +444,7 @@ class TrackedPoints(LocalUnknown):
         return eqx.tree_at(lambda o: o.shape, self, whole(self.shape))
 
 
-class Medium(eqx.Module):
+class MediumPrior(eqx.Module):
     """What is known of sound speed and delay before the data are seen.
 
     Attributes:
@@ -455,9 +455,9 @@ class Medium(eqx.Module):
     sd: Float[Array, "2 lanes"]
     blocks: Blocks = eqx.field(static=True)
 
-    def repeated(self, times: int) -> Medium:
+    def repeated(self, times: int) -> MediumPrior:
         """The same in so many times the lanes."""
-        return Medium(jnp.tile(self.sd, (1, times)), self.blocks)
+        return MediumPrior(jnp.tile(self.sd, (1, times)), self.blocks)
 
     def deviations(self, iterate: Iterate) -> list[tuple[int, Array, Array]]:
         """Place, deviation from nominal and its precision, of every further unknown there is."""

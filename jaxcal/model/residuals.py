@@ -12,17 +12,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.data.problem import Problem
-from jaxcal.model.batch import Images, Iterate, targets
-from jaxcal.model.observations import Channels, Further, Points, on_circle
+from jaxcal.model.batch import ImagePlanes, Iterate, targets
+from jaxcal.model.observations import ChannelDistances, Further, Points, on_circle
 from jaxcal.model.parameters import EXTRA, RIGID, Parameters
 
 
 def _one_lane(
     parameters: Parameters, problem: Problem, *, channels: bool = False
-) -> tuple[Images, Further, list[Array]]:
+) -> tuple[ImagePlanes, Further, list[Array]]:
     """The images, the further unknowns and q of one problem as planes of one lane."""
     alone = jax.tree.map(lambda leaf: leaf[None], (parameters, problem))
-    images = Images.of(alone[1], channels=channels)
+    images = ImagePlanes.of(alone[1], channels=channels)
     iterate = Iterate.of(alone[0], RIGID + EXTRA)
     still = [jnp.zeros((1, 1), problem.mask.dtype)] * iterate.extras.shape[0]
     return images, Further.of(iterate, still), targets(iterate, images)[0]
@@ -86,7 +86,7 @@ def channel_residual(parameters: Parameters, problem: Problem) -> Float[Array, "
         problem: the data, with channels.
     """
     images, further, q = _one_lane(parameters, problem, channels=True)
-    unit = Channels(jnp.ones((2, 1), problem.mask.dtype))
+    unit = ChannelDistances(jnp.ones((2, 1), problem.mask.dtype))
     distances = unit.components(q, further, images)[0]
     present = 1.0 if distances.present is None else distances.present[0]
     return problem.mask[:, None] * present * distances.errors[0][0]

@@ -69,38 +69,58 @@ TABLE = {
     row.name: row
     for row in (
         Unknown(
-            "translation", ("v_lateral_mm", "v_elevational_mm", "v_axial_mm"), "frame",
-            lever=False, in_image=True,
-            words="translation along the {} axis", axes=_IMAGE_AXES,
+            "translation",
+            ("v_lateral_mm", "v_elevational_mm", "v_axial_mm"),
+            "frame",
+            lever=False,
+            in_image=True,
+            words="translation along the {} axis",
+            axes=_IMAGE_AXES,
             oblique="translation along an oblique axis (lateral {:.2f}, elevational {:.2f}, "
             "axial {:.2f})",
         ),
         Unknown(
-            "rotation", ("omega_lateral_rad", "omega_elevational_rad", "omega_axial_rad"), "frame",
-            lever=True, in_image=True,
-            words="rotation about the {} axis", axes=_IMAGE_AXES,
+            "rotation",
+            ("omega_lateral_rad", "omega_elevational_rad", "omega_axial_rad"),
+            "frame",
+            lever=True,
+            in_image=True,
+            words="rotation about the {} axis",
+            axes=_IMAGE_AXES,
             oblique="rotation about an oblique axis (lateral {:.2f}, elevational {:.2f}, "
             "axial {:.2f})",
         ),
         Unknown(
-            "point", ("point_x_mm", "point_y_mm", "point_z_mm"), "add",
-            lever=False, in_image=False,
-            words="target position along the tracker's {}", axes=("x", "y", "z"),
+            "point",
+            ("point_x_mm", "point_y_mm", "point_z_mm"),
+            "add",
+            lever=False,
+            in_image=False,
+            words="target position along the tracker's {}",
+            axes=("x", "y", "z"),
             oblique="target position along the tracker's ({:.2f}, {:.2f}, {:.2f})",
         ),
         Unknown(
-            "scale", ("log_scale_lateral", "log_scale_axial"), "factor",
-            lever=True, in_image=True,
-            words="{} pixel scale", axes=("lateral", "axial"),
+            "scale",
+            ("log_scale_lateral", "log_scale_axial"),
+            "factor",
+            lever=True,
+            in_image=True,
+            words="{} pixel scale",
+            axes=("lateral", "axial"),
             oblique="both pixel scales ({:.2f}, {:.2f})",
         ),
         Unknown(
-            "sound-speed", ("log_sound_speed",), "factor",
-            lever=True, in_image=True, words="sound speed{}",
+            "sound-speed",
+            ("log_sound_speed",),
+            "factor",
+            lever=True,
+            in_image=True,
+            words="sound speed{}",
         ),
         Unknown("delay", ("delay_mm",), "add", lever=False, in_image=True, words="delay{}"),
     )
-}  # fmt: skip
+}
 """In the order of a step's components."""
 
 RIGID: Blocks = ("translation", "rotation", "point")

@@ -348,21 +348,25 @@ def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
         each = len(moved) / folds
         scatter = math.sqrt((folds - 1) / folds * sum(by**2 for by in moved) / each)
         if stated and scatter > SCATTER_TIMES * stated:
-            found.append((
-                scatter / stated,
-                f"calibrations without some of the images scatter by {scatter:.2f} mm, "
-                f"{scatter / stated:.1f} times what is stated",
-            ))  # fmt: skip
+            found.append(
+                (
+                    scatter / stated,
+                    f"calibrations without some of the images scatter by {scatter:.2f} mm, "
+                    f"{scatter / stated:.1f} times what is stated",
+                )
+            )
     if drawn is not None and drawn["stated_mm"]:
         known = [value for value in drawn["reproducibility_mm"] if value is not None]
         scatter = math.sqrt(sum(value**2 for value in known) / max(len(known), 1))
         if scatter > SCATTER_TIMES * drawn["stated_mm"]:
             times = scatter / drawn["stated_mm"]
-            found.append((
-                times,
-                f"calibrations from images drawn anew scatter by {scatter:.2f} mm, {times:.1f} "
-                "times what is stated",
-            ))  # fmt: skip
+            found.append(
+                (
+                    times,
+                    f"calibrations from images drawn anew scatter by {scatter:.2f} mm, {times:.1f} "
+                    "times what is stated",
+                )
+            )
     return found
 
 

@@ -62,9 +62,13 @@ def bounded_curves(
     from jaxcal.solvers.alternating import WARM_UP_ROUNDS
 
     joint = calibrate(
-        problem, "joint", "bounded", max_elevation=max_elevation, estimate=estimate,
+        problem,
+        "joint",
+        "bounded",
+        max_elevation=max_elevation,
+        estimate=estimate,
         options=Options(trace=KEPT),
-    )  # fmt: skip
+    )
     # A tolerance of nothing: every round is taken.
     patient = Options(trace=KEPT, max_rounds=KEPT, tolerance_mm=1e-300, tolerance_rad=1e-300)
     slow = calibrate(

@@ -30,17 +30,32 @@ def convergence_figure(curves: list[Curve]) -> Figure:
             excess = np.maximum(curve.objective - best, floor)
             # Down there the values only jitter.
             excess = excess[: int(np.nanargmin(excess)) + 1]
-            panel.plot(np.arange(len(excess)), excess, marker=marker, color=colour, markersize=4,
-                       linewidth=1.0, label=curve.label)  # fmt: skip
+            panel.plot(
+                np.arange(len(excess)),
+                excess,
+                marker=marker,
+                color=colour,
+                markersize=4,
+                linewidth=1.0,
+                label=curve.label,
+            )
             if curve.stopped is not None and curve.stopped < len(excess):
-                panel.plot(curve.stopped, excess[curve.stopped], "o", color=colour, markersize=11,
-                           fillstyle="none", label=f"{curve.label}: stops here")  # fmt: skip
+                panel.plot(
+                    curve.stopped,
+                    excess[curve.stopped],
+                    "o",
+                    color=colour,
+                    markersize=11,
+                    fillstyle="none",
+                    label=f"{curve.label}: stops here",
+                )
         panel.set_yscale("log")
         panel.axhline(floor, color=GREY, linewidth=0.8, linestyle=":", label="rounding")
         _legend(panel)
     else:
-        panel.text(0.5, 0.5, "no objective values were kept", ha="center",
-                   transform=panel.transAxes)  # fmt: skip
+        panel.text(
+            0.5, 0.5, "no objective values were kept", ha="center", transform=panel.transAxes
+        )
     panel.set_title("Convergence on the same objective")
     panel.set_xlabel("iteration")
     panel.set_ylabel("objective above the best (mm²)")

@@ -209,9 +209,12 @@ def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording)
     used = np.asarray(answer.mask) > 0
     seen = _targets(answer, recording)[used][:, [0, 2]]
     drawn = svg.error_map(
-        mapped["lateral_mm"], mapped["axial_mm"], error, seen,
+        mapped["lateral_mm"],
+        mapped["axial_mm"],
+        error,
+        seen,
         "Target registration error to expect over the image, mm",
-    )  # fmt: skip
+    )
     rows = []
     for k, point in enumerate(tre["points"]):
         path = f"tre.points.{k}"
@@ -237,13 +240,15 @@ def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording)
         )
     return _section(
         "How accurate",
-        '<div class="grid"><figure>', drawn,
+        '<div class="grid"><figure>',
+        drawn,
         "<figcaption>Distance to expect between the true and the calibrated place of what is seen "
         "at a point of the image. Dots: where the target was.</figcaption></figure><div>",
-        table, why,
+        table,
+        why,
         '<p class="soft">Half of the intervals\' remaining 5 % lies below, half above. Errors of '
         "the tracker at the time of use, and of reading a point, come on top.</p></div></div>",
-    )  # fmt: skip
+    )
 
 
 def _matrix(record: dict[str, Any]) -> str:
@@ -266,12 +271,14 @@ def _matrix(record: dict[str, Any]) -> str:
             f'</button></div><pre id="{name}">{escape(text)}</pre></details>'
         )
     rows = "".join(
-        "<tr>" + "".join(
+        "<tr>"
+        + "".join(
             f'<td class="n">{_number(record, f"image_plane_to_probe.{i}.{j}", ".6f")}</td>'
             for j in range(4)
-        ) + "</tr>"
+        )
+        + "</tr>"
         for i in range(4)
-    )  # fmt: skip
+    )
     parts.append(f'<h3>image_plane_to_probe (mm)</h3><div class="wide"><table>{rows}</table></div>')
     return _section("The matrix", *parts)
 
@@ -297,9 +304,14 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     deep = float(seen[:, 2].max())
     middle = float(0.5 * (seen[:, 0].min() + seen[:, 0].max()))
     corners = np.array(
-        [[middle - wide, 0, 0], [middle + wide, 0, 0], [middle + wide, 0, deep],
-         [middle - wide, 0, deep], [middle - wide, 0, 0]]
-    )  # fmt: skip
+        [
+            [middle - wide, 0, 0],
+            [middle + wide, 0, 0],
+            [middle + wide, 0, deep],
+            [middle - wide, 0, deep],
+            [middle - wide, 0, 0],
+        ]
+    )
     frames = images[:, None, :3, :3] @ corners[None, :, :, None]
     frames = frames[..., 0] + images[:, None, :3, 3]
     far = np.concatenate([frames.reshape(-1, 3), point[None]])
@@ -316,15 +328,24 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     whole = {
         "centre": _rounded(centre),
         "radius": float(np.linalg.norm(far - centre, axis=1).max()),
-        "lines": lines, "dots": dots, "bar": _bar(float(np.linalg.norm(np.ptp(far, axis=0)))),
-    }  # fmt: skip
+        "lines": lines,
+        "dots": dots,
+        "bar": _bar(float(np.linalg.norm(np.ptp(far, axis=0)))),
+    }
     close = _close_up(answer, cloud, shown)
     views = (
-        ("scene-all", whole, "Planes of the images (blue) and the target (orange), in the "
-         "tracker's frame."),
-        ("scene-target", close, "The target as each image puts it (green; does not fit the rest: "
-         "orange), and the estimate with its 95 % ellipsoid (lines)."),
-    )  # fmt: skip
+        (
+            "scene-all",
+            whole,
+            "Planes of the images (blue) and the target (orange), in the tracker's frame.",
+        ),
+        (
+            "scene-target",
+            close,
+            "The target as each image puts it (green; does not fit the rest: "
+            "orange), and the estimate with its 95 % ellipsoid (lines).",
+        ),
+    )
     parts = [
         f'<figure>{_embedded(name, data)}<svg class="scene" viewBox="0 0 380 300" role="img" '
         f'tabindex="0" aria-label="{escape(words)}" data-scene="{name}"></svg>'
@@ -334,9 +355,10 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     ]
     place = ", ".join(_number(record, f"point_mm.{k}", ".3f") for k in range(3))
     return _section(
-        "In space", f'<div class="grid">{"".join(parts)}</div>',
+        "In space",
+        f'<div class="grid">{"".join(parts)}</div>',
         f"<p>Target in the tracker's frame: {place}&nbsp;mm.</p>",
-    )  # fmt: skip
+    )
 
 
 def _close_up(
@@ -353,24 +375,31 @@ def _close_up(
         reach = float(np.linalg.norm(axes, axis=0).max())
         round_ = np.linspace(0, 2 * np.pi, 49)
         for i, j in ((0, 1), (1, 2), (2, 0)):
-            ring = point + np.outer(np.cos(round_), axes[:, i]) + np.outer(
-                np.sin(round_), axes[:, j]
-            )  # fmt: skip
+            ring = (
+                point + np.outer(np.cos(round_), axes[:, i]) + np.outer(np.sin(round_), axes[:, j])
+            )
             lines.append({"points": _rounded(ring), "colour": "var(--text)", "width": 0.8})
     away = np.linalg.norm(cloud - point, axis=1)
     # A few that are far off must not make the rest a single dot.
     radius = max(1.15 * float(np.quantile(away, 0.97)) if len(away) else 1.0, 1.2 * reach, 1e-3)
     dots = [
-        {"at": _rounded(place), "r": 2.2, "title": f"image {image}, {apart:.2f} mm",
-         "colour": svg.ORANGE if image in named else svg.GREEN}
+        {
+            "at": _rounded(place),
+            "r": 2.2,
+            "title": f"image {image}, {apart:.2f} mm",
+            "colour": svg.ORANGE if image in named else svg.GREEN,
+        }
         for place, image, apart in zip(cloud, shown.tolist(), away, strict=True)
         if apart <= 1.2 * radius
-    ]  # fmt: skip
+    ]
     dots.append({"at": _rounded(point), "r": 3, "colour": "var(--text)", "title": "target"})
     return {
-        "centre": _rounded(point), "radius": radius, "lines": lines, "dots": dots,
+        "centre": _rounded(point),
+        "radius": radius,
+        "lines": lines,
+        "dots": dots,
         "bar": _bar(2 * radius),
-    }  # fmt: skip
+    }
 
 
 def _rounded(values: Any) -> Any:
@@ -394,13 +423,15 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
         [
             (f"{name} (mm)", images, residual[:, axis].tolist(), colour)
             for name, axis, colour in (
-                ("lateral", 0, svg.BLUE), ("axial", 2, svg.GREEN), ("elevational", 1, svg.ORANGE),
+                ("lateral", 0, svg.BLUE),
+                ("axial", 2, svg.GREEN),
+                ("elevational", 1, svg.ORANGE),
             )
         ],
         named,
         "Residual of every image: the target less the point that was measured, mm",
         height=78.0,
-    )  # fmt: skip
+    )
     offset = np.asarray(answer.elevation)[used]
     second = svg.series(
         [("offset (mm)", images, offset.tolist(), svg.ORANGE)],
@@ -512,9 +543,10 @@ def _observability(record: dict[str, Any]) -> str:
             )
         )
         drawn = svg.matrix_map(
-            [_plain(name) for name in names], covariance / np.outer(sd, sd),
+            [_plain(name) for name in names],
+            covariance / np.outer(sd, sd),
             "Correlations of the unknowns",
-        )  # fmt: skip
+        )
         parts.append(
             '<div class="grid"><div class="wide"><table><tr><th></th><th>unknown</th>'
             f'<th class="n">standard deviation</th></tr>{rows}</table></div><figure>{drawn}'
@@ -553,7 +585,8 @@ def _facts(record: dict[str, Any]) -> str:
         f"<tr><td>{escape(name)}</td><td>{escape(str(value))}</td></tr>" for name, value in rows
     )
     return _section(
-        "Facts", f'<div class="wide"><table>{cells}</table></div>',
+        "Facts",
+        f'<div class="wide"><table>{cells}</table></div>',
         '<p class="soft">The whole record of the calibration is inside this page '
         "(the element with the id record).</p>",
-    )  # fmt: skip
+    )

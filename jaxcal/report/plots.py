@@ -103,9 +103,15 @@ def plot_residuals(calibration: Calibration) -> Figure:
         panel.plot(used, residual[used, axis], "o", color=COLOURS[name], ms=2.2)
         if len(named):
             panel.plot(
-                named, residual[named, axis], "o", ms=6, mfc="none", mec="black", mew=0.7,
+                named,
+                residual[named, axis],
+                "o",
+                ms=6,
+                mfc="none",
+                mec="black",
+                mew=0.7,
                 label="does not fit the rest",
-            )  # fmt: skip
+            )
         panel.set_ylabel(f"{name} (mm)")
     if len(named):
         panels[0].legend(fontsize=7, frameon=False, loc="best")
@@ -129,13 +135,28 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
     spread = np.nan_to_num(np.asarray(answer.elevation_sd)[used], nan=0.0)
     offset = np.asarray(answer.elevation)[used]
     panel.errorbar(
-        used, offset, yerr=spread, fmt="o", color=ORANGE, ecolor=GREY, ms=2.2, linewidth=0.7,
+        used,
+        offset,
+        yerr=spread,
+        fmt="o",
+        color=ORANGE,
+        ecolor=GREY,
+        ms=2.2,
+        linewidth=0.7,
         label="estimated, with one SD",
-    )  # fmt: skip
+    )
     resting = used[np.asarray(answer.at_bound)[used] > 0]
     if len(resting):
-        panel.plot(resting, np.asarray(answer.elevation)[resting], "s", ms=5, mfc="none",
-                   mec=GREEN, mew=0.8, label="at its bound")  # fmt: skip
+        panel.plot(
+            resting,
+            np.asarray(answer.elevation)[resting],
+            "s",
+            ms=5,
+            mfc="none",
+            mec=GREEN,
+            mew=0.8,
+            label="at its bound",
+        )
     if truth is not None:
         panel.plot(used, np.asarray(truth)[used], "x", color="black", ms=3, mew=0.7, label="true")
     panel.legend(fontsize=7, frameon=False, loc="best")
@@ -157,11 +178,24 @@ def plot_influence(calibration: Calibration) -> Figure:
     panel = styled(figure.subplots())
     panel.vlines(used, 0.0, moved[used], color=BLUE, linewidth=0.8)
     panel.plot(used, moved[used], "o", color=BLUE, ms=2.4, label="by leaving it out")
-    panel.plot(used, expected[used], "_", color="black", ms=4, mew=0.8,
-               label="if the noise model holds (SD)")  # fmt: skip
+    panel.plot(
+        used,
+        expected[used],
+        "_",
+        color="black",
+        ms=4,
+        mew=0.8,
+        label="if the noise model holds (SD)",
+    )
     for image in used[np.argsort(-moved[used])[:3]]:
-        panel.annotate(str(image), (image, moved[image]), (0, 3), textcoords="offset points",
-                       ha="center", fontsize=7)  # fmt: skip
+        panel.annotate(
+            str(image),
+            (image, moved[image]),
+            (0, 3),
+            textcoords="offset points",
+            ha="center",
+            fontsize=7,
+        )
     panel.set(xlabel="image", ylabel="moves the image by (mm)", ylim=(0.0, None))
     panel.margins(y=0.12)
     panel.legend(fontsize=7, frameon=False, loc="best")
@@ -181,11 +215,19 @@ def plot_limits(calibration: Calibration) -> Figure:
     for row, values in enumerate((squares / squares.sum(), part / part.sum())):
         left = 0.0
         for kind, share in zip(KINDS, values, strict=True):
-            panel.barh(row, share, left=left, color=COLOURS[kind], height=0.6,
-                       label=kind if row else None)  # fmt: skip
+            panel.barh(
+                row, share, left=left, color=COLOURS[kind], height=0.6, label=kind if row else None
+            )
             if share > 0.05:
-                panel.text(left + share / 2, row, f"{100 * share:.0f} %", ha="center",
-                           va="center", color="white", fontsize=7)  # fmt: skip
+                panel.text(
+                    left + share / 2,
+                    row,
+                    f"{100 * share:.0f} %",
+                    ha="center",
+                    va="center",
+                    color="white",
+                    fontsize=7,
+                )
             left += share
     panel.set_yticks([0, 1], rows)
     panel.set(xlim=(0, 1), xlabel="share of the mean square")
@@ -215,9 +257,18 @@ def _scale_bar(axes: Axes, length: float) -> None:
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     x = right - 0.05 * (right - left)
     y = bottom + 0.04 * (top - bottom)
-    axes.plot([x - length, x], [y, y], color="white", linewidth=2.0, solid_capstyle="butt",
-              zorder=6)  # fmt: skip
+    axes.plot(
+        [x - length, x], [y, y], color="white", linewidth=2.0, solid_capstyle="butt", zorder=6
+    )
     # Above the contours' labels, and readable on whatever lies below.
-    axes.text(x - length / 2, y + 0.025 * (top - bottom), f"{length:g} mm", color="white",
-              ha="center", va="bottom", fontsize=7, zorder=6,
-              bbox={"facecolor": "black", "alpha": 0.55, "linewidth": 0, "pad": 1.5})  # fmt: skip
+    axes.text(
+        x - length / 2,
+        y + 0.025 * (top - bottom),
+        f"{length:g} mm",
+        color="white",
+        ha="center",
+        va="bottom",
+        fontsize=7,
+        zorder=6,
+        bbox={"facecolor": "black", "alpha": 0.55, "linewidth": 0, "pad": 1.5},
+    )

@@ -28,18 +28,20 @@ def cross_validation_record(found: CrossValidation, result: Calibration) -> dict
     influence = np.asarray(found.influence, dtype=float)
     used = np.asarray(found.mask) > 0
     strongest = np.argsort(np.where(used & np.isfinite(influence), -influence, np.inf))[:5]
-    return plain({
-        "folds": len(np.asarray(found.converged)),
-        "folds_converged": int(np.asarray(found.converged).sum()),
-        "precision_mm": float(found.precision),
-        "rms_mm": float(found.rms),
-        "log_density": float(np.sum(np.asarray(found.log_density))),
-        "influence": np.where(used, influence, np.nan),
-        "image_moved_mm": np.where(used, np.asarray(found.image_moved), np.nan),
-        "image_points_mm": np.asarray(found.image_points),
-        "stated_mm": stated_at(result, np.asarray(found.image_points)),
-        "most_influential": [int(image) for image in strongest if used[image]],
-    })  # fmt: skip
+    return plain(
+        {
+            "folds": len(np.asarray(found.converged)),
+            "folds_converged": int(np.asarray(found.converged).sum()),
+            "precision_mm": float(found.precision),
+            "rms_mm": float(found.rms),
+            "log_density": float(np.sum(np.asarray(found.log_density))),
+            "influence": np.where(used, influence, np.nan),
+            "image_moved_mm": np.where(used, np.asarray(found.image_moved), np.nan),
+            "image_points_mm": np.asarray(found.image_points),
+            "stated_mm": stated_at(result, np.asarray(found.image_points)),
+            "most_influential": [int(image) for image in strongest if used[image]],
+        }
+    )
 
 
 def bootstrap_record(found: Bootstrap, result: Calibration) -> dict[str, Any]:
@@ -50,15 +52,17 @@ def bootstrap_record(found: Bootstrap, result: Calibration) -> dict[str, Any]:
         result: the calibration of all images.
     """
     spread = np.asarray(found.spread, dtype=float)
-    return plain({
-        "resamples": len(np.asarray(found.converged)),
-        "resamples_converged": int(np.asarray(found.converged).sum()),
-        "translation_sd_mm": spread[:3],
-        "rotation_sd_deg": np.degrees(spread[3:]),
-        "image_points_mm": np.asarray(found.image_points),
-        "reproducibility_mm": np.asarray(found.reproducibility),
-        "stated_mm": stated_at(result, np.asarray(found.image_points)),
-    })  # fmt: skip
+    return plain(
+        {
+            "resamples": len(np.asarray(found.converged)),
+            "resamples_converged": int(np.asarray(found.converged).sum()),
+            "translation_sd_mm": spread[:3],
+            "rotation_sd_deg": np.degrees(spread[3:]),
+            "image_points_mm": np.asarray(found.image_points),
+            "reproducibility_mm": np.asarray(found.reproducibility),
+            "stated_mm": stated_at(result, np.asarray(found.image_points)),
+        }
+    )
 
 
 def resampled_sentences(record: dict[str, Any]) -> list[str]:
@@ -71,9 +75,10 @@ def resampled_sentences(record: dict[str, Any]) -> list[str]:
             f"{held['precision_mm']:.2f} mm ({held['folds']}-fold cross-validation)."
         )
         strong = [
-            image for image in held["most_influential"]
+            image
+            for image in held["most_influential"]
             if (held["influence"][image] or 0.0) > INFLUENTIAL
-        ]  # fmt: skip
+        ]
         if strong:
             first = strong[0]
             lines.append(

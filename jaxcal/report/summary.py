@@ -117,10 +117,12 @@ def html_of(calibration: Calibration) -> str:
         )
         seen = ((in_probe - x[:3, 3]) @ x[:3, :3])[:, [0, 2]]
         drawn = svg.error_map(
-            np.array(mapped["lateral_mm"]), np.array(mapped["axial_mm"]),
-            tre["factor"] * np.array(mapped["stated_mm"]), seen,
+            np.array(mapped["lateral_mm"]),
+            np.array(mapped["axial_mm"]),
+            tre["factor"] * np.array(mapped["stated_mm"]),
+            seen,
             "Target registration error to expect over the image, mm",
-        )  # fmt: skip
+        )
     matrix = "".join(
         "<tr>" + "".join(f"<td style='text-align:right'>{_cell(v)}</td>" for v in row) + "</tr>"
         for row in record["image_plane_to_probe"]

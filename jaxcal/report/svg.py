@@ -22,9 +22,16 @@ WIDTH = 380.0
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8a8a8a"
 
 _VIRIDIS = (
-    (68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141), (39, 173, 129),
-    (92, 200, 99), (170, 220, 50), (253, 231, 37),
-)  # fmt: skip
+    (68, 1, 84),
+    (71, 44, 122),
+    (59, 81, 139),
+    (44, 113, 142),
+    (33, 144, 141),
+    (39, 173, 129),
+    (92, 200, 99),
+    (170, 220, 50),
+    (253, 231, 37),
+)
 """Nine colours of matplotlib's viridis (public domain, CC0), evenly lighter."""
 
 
@@ -263,8 +270,10 @@ def error_map(
             outline = " ".join(f"{_at(a)},{_at(b)}" for a, b in places)
             colour = viridis((mean - low) / span)
             # The same stroke closes the seams between cells.
-            cells.append(f'<polygon points="{outline}" fill="{colour}" stroke="{colour}" '
-                         f'stroke-width="0.6"><title>{mean:.3f} mm</title></polygon>')  # fmt: skip
+            cells.append(
+                f'<polygon points="{outline}" fill="{colour}" stroke="{colour}" '
+                f'stroke-width="0.6"><title>{mean:.3f} mm</title></polygon>'
+            )
     parts = [*panel.axes("lateral (mm)", "depth (mm)"), *cells]
     for a, b in seen[:400]:
         if x[0] <= a <= x[1] and y[0] <= b <= y[1]:
@@ -280,8 +289,10 @@ def error_map(
         parts.append(line(left, under, left + bar, under, "var(--text)", 2.0))
         parts.append(text(left, under - 6, "10 mm", "start", "tick"))
         dot = under - 30
-        parts.append(f'<circle cx="{_at(left + 2)}" cy="{_at(dot)}" r="1.7" fill="#fff" '
-                     'stroke="var(--text)" stroke-width="0.6"/>')  # fmt: skip
+        parts.append(
+            f'<circle cx="{_at(left + 2)}" cy="{_at(dot)}" r="1.7" fill="#fff" '
+            'stroke="var(--text)" stroke-width="0.6"/>'
+        )
         parts.append(text(left + 8, dot + 3, "target", "start", "tick"))
     return figure(10.0 + down + 34.0, parts, label)
 

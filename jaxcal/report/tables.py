@@ -99,17 +99,21 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
     if record["scale_mm_per_px"] is not None:
         facts.append(("pixel scale (mm/px)", _numbers(record["scale_mm_per_px"], ".6f")))
     if record["sound_speed_m_s"] is not None:
-        facts.append((
-            "sound speed (m/s)",
-            f"{_number(record['sound_speed_m_s'], '.1f')} +- "
-            f"{_number(record['sound_speed_sd_m_s'], '.1f')}",
-        ))  # fmt: skip
+        facts.append(
+            (
+                "sound speed (m/s)",
+                f"{_number(record['sound_speed_m_s'], '.1f')} +- "
+                f"{_number(record['sound_speed_sd_m_s'], '.1f')}",
+            )
+        )
     if record["delay_s"] is not None:
         sd = record["delay_sd_s"]
-        facts.append((
-            "delay (us)",
-            f"{1e6 * record['delay_s']:.3f} +- " + ("-" if sd is None else f"{1e6 * sd:.3f}"),
-        ))  # fmt: skip
+        facts.append(
+            (
+                "delay (us)",
+                f"{1e6 * record['delay_s']:.3f} +- " + ("-" if sd is None else f"{1e6 * sd:.3f}"),
+            )
+        )
     sight = record["observability"]
     # Where it is not determined at all, the SD says only where rounding begins.
     sd = sight["weakest_sd_mm"] if record["status"] != "unobservable" else None

@@ -164,9 +164,13 @@ def _scatter(record: dict[str, Any]) -> str:
     """Why the target scatters as it does, which is not how far off the calibration is."""
     found = record["limits"]
     precision = record["reconstruction_precision_mm"]
-    shown = "" if precision is None else (
-        f", {_mm(precision)} by Eq. 8 over the {record['reconstruction_precision_set']} images"
-    )  # fmt: skip
+    shown = (
+        ""
+        if precision is None
+        else (
+            f", {_mm(precision)} by Eq. 8 over the {record['reconstruction_precision_set']} images"
+        )
+    )
     ranked = sorted(found["scatter_share"].items(), key=lambda item: -(item[1] or 0.0))
     told = [f"{_KINDS[kind]} {100 * share:.0f} %" for kind, share in ranked if share is not None]
     return (

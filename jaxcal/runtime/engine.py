@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.calibration.conventional import closed_form_start
-from jaxcal.calibration.options import Given, Plan, with_bound
+from jaxcal.calibration.options import Given, SolvePlan, with_bound
 from jaxcal.calibration.result import Calibration
 from jaxcal.data.problem import Problem
 from jaxcal.runtime import buckets, compiler, executables
@@ -33,7 +33,7 @@ FEW_PROBLEMS = 1024
 """Up to so many problems of a batch are padded to a bucket of images."""
 
 
-def solve_problem(problem: Problem, given: Given, plan: Plan) -> Calibration:
+def solve_problem(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """One problem, but for the problem itself in the result (traceable).
 
     Args:
@@ -47,7 +47,7 @@ def solve_problem(problem: Problem, given: Given, plan: Plan) -> Calibration:
 
 
 @in_own_modes
-def _solve_compiled(problem: Problem, given: Given, plan: Plan) -> Calibration:
+def _solve_compiled(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """One problem by a program of JAX's own, which serves every method and prior."""
     from jaxcal.runtime import programs
 
@@ -61,7 +61,7 @@ def _solve_compiled(problem: Problem, given: Given, plan: Plan) -> Calibration:
 
 
 @in_own_modes
-def _solve_kept(problem: Problem, given: Given, plan: Plan) -> Calibration:
+def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """One problem by programs that are kept, which serve every number of images of a bucket."""
     padded = buckets.padded(problem)
     given = replace(given, max_elevation=None)  # the problem has it
@@ -82,7 +82,7 @@ def _solve_kept(problem: Problem, given: Given, plan: Plan) -> Calibration:
 
 
 @in_own_modes
-def solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None) -> Calibration:
+def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | None) -> Calibration:
     """A batch with its problems in the result (traceable).
 
     Args:
@@ -104,7 +104,9 @@ def solve_batch(problems: Problem, given: Given, plan: Plan, chunk: int | None) 
     return result.with_problem(problems)
 
 
-def _solve_chunks_kept(problems: Problem, given: Given, plan: Plan, largest: int) -> Calibration:
+def _solve_chunks_kept(
+    problems: Problem, given: Given, plan: SolvePlan, largest: int
+) -> Calibration:
     """A batch (one leading axis) by a program that serves all batches of nearly its size."""
     count, images = problems.mask.shape
     given = replace(given, max_elevation=None)  # the problems have it
@@ -129,7 +131,7 @@ def _solve_chunks_kept(problems: Problem, given: Given, plan: Plan, largest: int
 
 
 def _solve_chunks_compiled(
-    problems: Problem, given: Given, plan: Plan, largest: int
+    problems: Problem, given: Given, plan: SolvePlan, largest: int
 ) -> Calibration:
     """A batch (one leading axis) by JAX's own program, on all devices where it may go anywhere."""
     import jax
@@ -153,7 +155,7 @@ def _solve_chunks_compiled(
     return programs.chunks(devices, alone)(problems, given, plan, lanes)
 
 
-def _label(plan: Plan, images: int) -> dict[str, Any]:
+def _label(plan: SolvePlan, images: int) -> dict[str, Any]:
     """What a kept program is, for ``jaxcal cache show``."""
     return {
         "method": plan.method,
@@ -164,7 +166,7 @@ def _label(plan: Plan, images: int) -> dict[str, Any]:
     }
 
 
-def _is_kept(problems: Problem, given: Given, plan: Plan) -> bool:
+def _is_kept(problems: Problem, given: Given, plan: SolvePlan) -> bool:
     """Whether the program for it is one that is kept: whole, on one CPU, and of our own solvers."""
     if inside_transformation(problems, given) or not executables.is_describable(plan):
         return False

@@ -52,15 +52,27 @@ NOT_TRACED = ("cli", "report", "io")
 """Folders of jaxcal that no compiled program comes from."""
 
 CPU_FACTS = (
-    "vendor_id", "cpu family", "model", "model name", "stepping", "flags", "Features",
-    "CPU implementer", "CPU architecture", "CPU variant", "CPU part", "isa",
-)  # fmt: skip
+    "vendor_id",
+    "cpu family",
+    "model",
+    "model name",
+    "stepping",
+    "flags",
+    "Features",
+    "CPU implementer",
+    "CPU architecture",
+    "CPU variant",
+    "CPU part",
+    "isa",
+)
 """Lines of /proc/cpuinfo that say what a processor can do."""
 
 JAX_SETTINGS = (
-    "jax_enable_x64", "jax_default_matmul_precision", "jax_default_prng_impl",
+    "jax_enable_x64",
+    "jax_default_matmul_precision",
+    "jax_default_prng_impl",
     "jax_threefry_partitionable",
-)  # fmt: skip
+)
 """Settings of the caller that change what is traced."""
 
 Description = Any
@@ -127,16 +139,19 @@ def run(
     leaves: list[Any] = []
     described = describe(arguments, leaves)
     device = _device(leaves)
-    key = json.dumps({
-        "function": _name_of(function),
-        "plan": describe(plan, []),
-        "arguments": described,
-        "leaves": [[leaf.dtype.name, list(leaf.shape)] for leaf in leaves],
-        "device": [device.platform, device.id],
-        "flags": flags,
-        "settings": [str(getattr(jax.config, name, None)) for name in JAX_SETTINGS],
-        "installation": installation(),
-    }, sort_keys=True)  # fmt: skip
+    key = json.dumps(
+        {
+            "function": _name_of(function),
+            "plan": describe(plan, []),
+            "arguments": described,
+            "leaves": [[leaf.dtype.name, list(leaf.shape)] for leaf in leaves],
+            "device": [device.platform, device.id],
+            "flags": flags,
+            "settings": [str(getattr(jax.config, name, None)) for name in JAX_SETTINGS],
+            "installation": installation(),
+        },
+        sort_keys=True,
+    )
     with _lock:
         turn = _being_made.setdefault(key, Lock())
 

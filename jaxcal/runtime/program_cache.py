@@ -48,7 +48,7 @@ _LENGTH = struct.Struct(">I")
 _log = logging.getLogger(__name__)
 
 
-class RefusedError(Exception):
+class UntrustedProgramError(Exception):
     """An entry that must not be used; the message says why."""
 
 
@@ -122,11 +122,11 @@ def read(key: str) -> tuple[dict[str, Any], bytes] | None:
         content = _content(path)
         header, body = _parsed(content)
         if header.get("key") != key:
-            raise RefusedError("it is the program of another key")
+            raise UntrustedProgramError("it is the program of another key")
         program = zlib.decompress(body)
     except FileNotFoundError:
         return None
-    except (RefusedError, OSError, RuntimeError, zlib.error) as error:
+    except (UntrustedProgramError, OSError, RuntimeError, zlib.error) as error:
         _log.debug("a compiled program in the cache is not used: %s", error)
         return None
     with suppress(OSError):  # the least recently used are removed first
@@ -179,7 +179,7 @@ def entries() -> list[Entry]:
             status = path.lstat()
             try:
                 header = _parsed(_content(path))[0]
-            except (RefusedError, OSError):
+            except (UntrustedProgramError, OSError):
                 header = {}
             found.append(Entry(path, status.st_size, status.st_mtime, header))
     return sorted(found, key=lambda entry: -entry.used)
@@ -218,9 +218,9 @@ def _content(path: Path) -> bytes:
     with open(os.open(path, flags | getattr(os, "O_NONBLOCK", 0)), "rb") as file:
         found = os.fstat(file.fileno())
         if not stat.S_ISREG(found.st_mode):
-            raise RefusedError(f"{path} is not a regular file")
+            raise UntrustedProgramError(f"{path} is not a regular file")
         if os.name == "posix" and (found.st_uid != os.geteuid() or found.st_mode & 0o077):
-            raise RefusedError(f"{path} is not private to this user")
+            raise UntrustedProgramError(f"{path} is not private to this user")
         return file.read()
 
 
@@ -233,14 +233,14 @@ def _parsed(content: bytes) -> tuple[dict[str, Any], bytes]:
     start = len(MAGIC) + _DIGEST_BYTES
     digest, rest = content[len(MAGIC) : start], content[start:]
     if not content.startswith(MAGIC) or hashlib.sha256(rest).digest() != digest:
-        raise RefusedError("an entry is damaged")
+        raise UntrustedProgramError("an entry is damaged")
     try:
         (length,) = _LENGTH.unpack(rest[: _LENGTH.size])
         header = json.loads(rest[_LENGTH.size : _LENGTH.size + length])
     except (ValueError, struct.error) as error:
-        raise RefusedError("an entry has no header") from error
+        raise UntrustedProgramError("an entry has no header") from error
     if not isinstance(header, dict):
-        raise RefusedError("an entry has no header")
+        raise UntrustedProgramError("an entry has no header")
     return header, rest[_LENGTH.size + length :]
 
 

@@ -16,7 +16,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from jaxcal.calibration.conventional import Start
-from jaxcal.calibration.options import Given, Plan
+from jaxcal.calibration.options import Given, SolvePlan
 from jaxcal.calibration.pipeline import agreed_images, solve_problems
 from jaxcal.calibration.result import Calibration
 from jaxcal.data.problem import Problem
@@ -29,7 +29,7 @@ def solve_one(
     given: Given,
     agreed: Float[Array, " n"] | None,
     start: Start | None,
-    plan: Plan,
+    plan: SolvePlan,
 ) -> Calibration:
     """One problem is a batch of one (traceable).
 
@@ -60,7 +60,7 @@ def agreement(platform: str | None):
     return jax.jit(agreed_images, static_argnums=1, compiler_options=flags)
 
 
-def solve_chunks(problems: Problem, given: Given, plan: Plan, chunk: int) -> Calibration:
+def solve_chunks(problems: Problem, given: Given, plan: SolvePlan, chunk: int) -> Calibration:
     """Solve a batch whose size is a multiple of the chunk's (traceable)."""
     count = problems.mask.shape[0]
     if count == chunk:
@@ -71,7 +71,7 @@ def solve_chunks(problems: Problem, given: Given, plan: Plan, chunk: int) -> Cal
 
 
 def solve_some_chunks(
-    problems: Problem, given: Given, used: Int[Array, ""], how: tuple[Plan, int]
+    problems: Problem, given: Given, used: Int[Array, ""], how: tuple[SolvePlan, int]
 ) -> Calibration:
     """Solve the first chunks of a batch, of which the others hold anything; theirs are zeros.
 
@@ -108,7 +108,7 @@ def chunks(devices: tuple[Any, ...], alone: bool):
         return jax.jit(solve_chunks, static_argnums=(2, 3), compiler_options=options)
     mesh, cut = Mesh(np.asarray(devices), ("problems",)), PartitionSpec("problems")
 
-    def spread(problems: Problem, given: Given, plan: Plan, chunk: int) -> Calibration:
+    def spread(problems: Problem, given: Given, plan: SolvePlan, chunk: int) -> Calibration:
         def share(problems: Problem, given: Given) -> Calibration:
             return solve_chunks(problems, given, plan, chunk)
 

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.data.geometry import chord_angle
 from jaxcal.model import unrolled
-from jaxcal.model.batch import Images, Iterate, barrier, choose
+from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import BoundedOffsets, Further, HeldOffsets, local_unknowns
 from jaxcal.solvers.levenberg_marquardt import Descent, Rounding, gradient_cosine, minimise
 from jaxcal.solvers.normal_equations import accumulate
@@ -70,7 +70,7 @@ class _State(eqx.Module):
 def alternate(
     start: Iterate,
     observation: BoundedOffsets,
-    images: Images,
+    images: ImagePlanes,
     *,
     tolerance_rad: float,
     tolerance_mm: float,
@@ -151,7 +151,7 @@ def alternate(
 def bounded(
     start: Iterate,
     observation: BoundedOffsets,
-    images: Images,
+    images: ImagePlanes,
     *,
     max_steps: int = 100,
     trace: int = 0,

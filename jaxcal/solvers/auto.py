@@ -43,9 +43,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.model import unrolled
-from jaxcal.model.batch import Images, Iterate, barrier, choose, targets
+from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose, targets
 from jaxcal.model.distributions import FAMILIES, Family, OffsetLaw, Shape
-from jaxcal.model.observations import Medium, Observation, OwnCovariances, Points, unit_shape
+from jaxcal.model.observations import MediumPrior, Observation, OwnCovariances, Points, unit_shape
 from jaxcal.model.parameters import retract
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.solvers.evidence import V_Y, NoiseModel, row_of, tune
@@ -86,12 +86,12 @@ class Averaged(eqx.Module):
 def average_over_laws(
     place: Iterate,
     observation: Observation,
-    images: Images,
+    images: ImagePlanes,
     shapes: tuple[Shape, ...],
     *,
     variances: Float[Array, "3 lanes n"] | None,
     bound: Float[Array, "lanes n"] | None,
-    medium: Medium | None,
+    medium: MediumPrior | None,
 ) -> Averaged:
     """Weigh noise models, offset means and laws of the offsets, and average the answers.
 
@@ -255,7 +255,9 @@ class Answers(eqx.Module):
         )
 
 
-def sites_at(model: Linearised, images: Images, bound: Float[Array, "lanes n"] | None) -> Sites:
+def sites_at(
+    model: Linearised, images: ImagePlanes, bound: Float[Array, "lanes n"] | None
+) -> Sites:
     """The offsets of a linearised problem, as the laws see them."""
     q, turned = targets(model.place, images)
     return barrier(Sites.of(q, turned, images.mask, model.mean, bound))
@@ -292,9 +294,9 @@ def answers_under(model: Linearised, sites: Sites, shapes: tuple[Shape, ...]) ->
 def with_own_covariances(
     common: NoiseModel,
     observation: Points,
-    images: Images,
+    images: ImagePlanes,
     variances: Float[Array, "3 lanes n"],
-    medium: Medium | None,
+    medium: MediumPrior | None,
 ) -> tuple[Linearised, Float[Array, " lanes"]]:
     """The noise model of the images' own covariances, and by how much more probable it is (ln)."""
     used, sigma = images.used, common.sigma

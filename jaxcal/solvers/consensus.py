@@ -63,7 +63,7 @@ Propose = Callable[[Problem, Float[Array, "k n"]], Parameters]
 
 
 @dataclass(frozen=True)
-class Model:
+class ConsensusModel:
     """What agreeing means; static.
 
     Attributes:
@@ -97,10 +97,10 @@ class Consensus(eqx.Module):
     departure: Float[Array, "n 3"]
 
 
-def rigid_model(blocks: Blocks) -> Model:
+def rigid_model(blocks: Blocks) -> ConsensusModel:
     """The calibration's own: X and the target (and pixel scales where they are free)."""
     kept = tuple(name for name in blocks if name in ("translation", "rotation", "point", "scale"))
-    return Model(kept, steadied_errors, partial(linear_proposals, scaled="scale" in kept))
+    return ConsensusModel(kept, steadied_errors, partial(linear_proposals, scaled="scale" in kept))
 
 
 def steadied_errors(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:
@@ -116,7 +116,7 @@ def steadied_errors(parameters: Parameters, problem: Problem) -> Float[Array, "n
     return errors.at[:, 0].divide(jnp.where(problem.mask > 0, beyond, 1.0))
 
 
-def find_consensus(problem: Problem, model: Model) -> Consensus:
+def find_consensus(problem: Problem, model: ConsensusModel) -> Consensus:
     """Find the images that agree, and how far every image departs from them.
 
     Args:
@@ -160,7 +160,7 @@ def _finish(
     subset: Float[Array, " n"],
     all_good: Bool[Array, ""],
     problem: Problem,
-    model: Model,
+    model: ConsensusModel,
 ) -> tuple[Consensus, Float[Array, ""]]:
     """Fit the subset, concentrate, reject; and weigh what came of it (the less, the better)."""
     used = problem.mask
@@ -206,7 +206,7 @@ def _finish(
 
 
 def departures(
-    parameters: Parameters, problem: Problem, keep: Float[Array, " n"], model: Model
+    parameters: Parameters, problem: Problem, keep: Float[Array, " n"], model: ConsensusModel
 ) -> tuple[Float[Array, 3], Float[Array, "n 3"]]:
     """How far every image is from what the kept ones say.
 
@@ -238,7 +238,7 @@ def stands_out(departure: Float[Array, "n 3"], keep: Float[Array, " n"]) -> Floa
 
 
 def _robust(
-    errors: Float[Array, "n 3"], weight: Float[Array, " n"], model: Model
+    errors: Float[Array, "n 3"], weight: Float[Array, " n"], model: ConsensusModel
 ) -> Float[Array, 3]:
     """SDs of the components from the median magnitudes of the weighted images, mm."""
     # The unknowns' degrees of freedom are shared equally by the three components.
@@ -250,7 +250,7 @@ def _efficient(
     errors: Float[Array, "n 3"],
     leverage: Float[Array, "n 3"],
     weight: Float[Array, " n"],
-    model: Model,
+    model: ConsensusModel,
 ) -> tuple[Float[Array, 3], Float[Array, 3]]:
     """SDs of the components from the mean squares of the weighted images, mm, and their freedom.
 
@@ -278,7 +278,7 @@ def _studentised(
 
 
 def _linearise(
-    parameters: Parameters, problem: Problem, model: Model
+    parameters: Parameters, problem: Problem, model: ConsensusModel
 ) -> tuple[Float[Array, "n 3"], Float[Array, "p n 3"]]:
     def errors(tangent: Float[Array, " p"]) -> Float[Array, "n 3"]:
         return model.errors(retract(parameters, tangent, model.blocks), problem)
@@ -301,7 +301,7 @@ def _step(
     jacobian: Float[Array, "p n 3"],
     sigma: Float[Array, 3],
     weight: Float[Array, " n"],
-    model: Model,
+    model: ConsensusModel,
 ) -> Parameters:
     """A lightly damped Gauss-Newton step on the weighted images."""
     matrix = _information(jacobian, sigma, weight)
@@ -323,7 +323,7 @@ def _leverage(
 
 
 def _medians(
-    errors: Float[Array, "n 3"], weight: Float[Array, " n"], model: Model
+    errors: Float[Array, "n 3"], weight: Float[Array, " n"], model: ConsensusModel
 ) -> Float[Array, 3]:
     """Median magnitude of each component over the weighted images, mm."""
     if model.isotropic:

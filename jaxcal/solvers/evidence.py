@@ -29,8 +29,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxcal.model.batch import Images, Iterate, barrier, picked
-from jaxcal.model.observations import Medium, Observation
+from jaxcal.model.batch import ImagePlanes, Iterate, barrier, picked
+from jaxcal.model.observations import MediumPrior, Observation
 from jaxcal.solvers import dense
 from jaxcal.solvers.normal_equations import (
     ComponentSums,
@@ -151,8 +151,8 @@ def row_of(flat: Float[Array, "triangle lanes"], k: int) -> Float[Array, "p lane
 def tune(
     place: Iterate,
     observation: Observation,
-    images: Images,
-    medium: Medium | None,
+    images: ImagePlanes,
+    medium: MediumPrior | None,
     rounds: int = ROUNDS,
 ) -> NoiseModel:
     """Tune the SDs, the unknowns and the mean from a nearby solution.

@@ -18,7 +18,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from jaxcal.calibration.options import Options
-from jaxcal.model.batch import Images, Iterate
+from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import Further, InPlane
 from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate
@@ -36,7 +36,7 @@ class SteepestDescent(optx.AbstractGradientDescent):
     verbose: Callable[..., None] = eqx.field(static=True, default=lambda **_: None)
 
 
-def reconstructed(place: Iterate, images: Images) -> Float[Array, "3 lanes n"]:
+def reconstructed(place: Iterate, images: ImagePlanes) -> Float[Array, "3 lanes n"]:
     """B_i X p_i, the target as reconstructed from every image, in the tracker's frame, mm."""
     still = [jnp.zeros_like(images.mask[:, :1])] * place.extras.shape[0]
     lateral, distance = Further.of(place, still).points(images)
@@ -46,7 +46,7 @@ def reconstructed(place: Iterate, images: Images) -> Float[Array, "3 lanes n"]:
     return jnp.sum(poses * in_probe, axis=1) + images.origin
 
 
-def pairwise_gradient(start: Iterate, images: Images, options: Options) -> Fit:
+def pairwise_gradient(start: Iterate, images: ImagePlanes, options: Options) -> Fit:
     """The historical gradient descent of one problem, from a start.
 
     Args:

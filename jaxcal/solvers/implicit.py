@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxcal.model.batch import Images, Iterate
-from jaxcal.model.observations import Medium, Observation
+from jaxcal.model.batch import ImagePlanes, Iterate
+from jaxcal.model.observations import MediumPrior, Observation
 from jaxcal.runtime.precision import in_standard_promotion
 from jaxcal.solvers import dense, reml
 from jaxcal.solvers.normal_equations import accumulate
@@ -28,7 +28,7 @@ from jaxcal.solvers.normal_equations import accumulate
 
 @jax.custom_jvp
 def optimum(
-    place: Iterate, observation: Observation, images: Images, medium: Medium | None
+    place: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
 ) -> Float[Array, "p lanes"]:
     """How the minimiser of an objective moves with the data and with given numbers.
 
@@ -50,7 +50,9 @@ def optimum(
 def _optimum_jvp(primals: tuple, tangents: tuple) -> tuple:
     place, observation, images, medium = primals
 
-    def gradient(observation: Observation, images: Images, medium: Medium | None) -> Array:
+    def gradient(
+        observation: Observation, images: ImagePlanes, medium: MediumPrior | None
+    ) -> Array:
         return accumulate(place, observation, images, None, medium).gradient
 
     _, moved = jax.jvp(gradient, primals[1:], tangents[1:])
@@ -65,8 +67,8 @@ def self_tuned_optimum(
     place: Iterate,
     sigma: Float[Array, "k lanes"],
     observation: Observation,
-    images: Images,
-    medium: Medium | None,
+    images: ImagePlanes,
+    medium: MediumPrior | None,
 ) -> tuple[Float[Array, "p lanes"], Float[Array, "k lanes"]]:
     """How a self-tuned solution and its SDs move with the data.
 

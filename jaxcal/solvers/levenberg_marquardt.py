@@ -34,8 +34,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.model.batch import Images, Iterate, barrier, choose
-from jaxcal.model.observations import LocalUnknown, Medium, Observation
+from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
+from jaxcal.model.observations import LocalUnknown, MediumPrior, Observation
 from jaxcal.solvers import dense
 from jaxcal.solvers.normal_equations import Normal, accumulate
 
@@ -201,18 +201,18 @@ class Rounding(eqx.Module):
     vanished: Float[Array, " lanes"]
 
     @classmethod
-    def of(cls, iterate: Iterate, observation: Observation, images: Images) -> Rounding:
+    def of(cls, iterate: Iterate, observation: Observation, images: ImagePlanes) -> Rounding:
         """From the size of the coordinates."""
         return cls.at(reach(iterate, images), observation.largest_weight(), images)
 
     @classmethod
-    def at(cls, reach: Array, weight: Array, images: Images) -> Rounding:
+    def at(cls, reach: Array, weight: Array, images: ImagePlanes) -> Rounding:
         """From that size and the largest weight of a mm."""
         one = jnp.finfo(reach.dtype).eps * reach * weight
         return cls(one, 3 * images.mask.shape[1] * (2 * one) ** 2)
 
 
-def reach(iterate: Iterate, images: Images) -> Float[Array, " lanes"]:
+def reach(iterate: Iterate, images: ImagePlanes) -> Float[Array, " lanes"]:
     """The largest coordinate of a lane's poses and target, mm."""
     away = jnp.max(images.mask * jnp.max(jnp.abs(images.origin), axis=0), axis=1)
     return jnp.maximum(away, jnp.max(jnp.abs(iterate.point), axis=0))
@@ -357,9 +357,9 @@ def descend(
 def minimise(
     start: Iterate,
     observation: Observation,
-    images: Images,
+    images: ImagePlanes,
     *,
-    medium: Medium | None = None,
+    medium: MediumPrior | None = None,
     damping: float = 1e-3,
     tolerance: float | None = None,
     max_steps: int = 100,

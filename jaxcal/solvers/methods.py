@@ -15,16 +15,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.calibration.options import DEFAULT_MAX_ELEVATION_MM, Given, Plan
+from jaxcal.calibration.options import DEFAULT_MAX_ELEVATION_MM, Given, SolvePlan
 from jaxcal.data.problem import Problem
 from jaxcal.data.sound import WATER_M_S
-from jaxcal.model.batch import Images, Iterate
+from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.observations import (
     BoundedOffsets,
-    Channels,
+    ChannelDistances,
     InPlane,
-    Medium,
+    MediumPrior,
     Observation,
     OwnCovariances,
     Points,
@@ -75,7 +75,7 @@ class Solution(eqx.Module):
 
     place: Iterate
     observation: Observation
-    medium: Medium | None
+    medium: MediumPrior | None
     offset: Float[Array, "lanes n"] | None
     cost: Float[Array, " lanes"]
     cosine: Float[Array, " lanes"]
@@ -93,7 +93,10 @@ class Solution(eqx.Module):
 
 
 def solve(
-    problems: Problem, given: Given, plan: Plan, begun: ConventionalStart | GivenStart | None = None
+    problems: Problem,
+    given: Given,
+    plan: SolvePlan,
+    begun: ConventionalStart | GivenStart | None = None,
 ) -> Solution:
     """Solve a batch (one leading axis) whose images left out hold harmless values.
 
@@ -107,7 +110,7 @@ def solve(
     frozen, numbers = jax.lax.stop_gradient((problems, given))
     begun = begin(frozen, plan) if begun is None else begun
     found = run(begun, frozen, numbers, plan)
-    images = Images.of(problems, channels=plan.channels)
+    images = ImagePlanes.of(problems, channels=plan.channels)
     if plan.options.differentiate:
         found = _attached(found, images, problems, given, plan)
     if not plan.laws:
@@ -115,11 +118,11 @@ def solve(
     return _averaged(found, images, problems, plan)
 
 
-def begin(problems: Problem, plan: Plan) -> ConventionalStart:
+def begin(problems: Problem, plan: SolvePlan) -> ConventionalStart:
     """The conventional fits from which every method starts."""
     alone = plan.method == "conventional"
     return conventional(
-        Images.of(problems),
+        ImagePlanes.of(problems),
         plan.blocks,
         max_steps=plan.options.max_iterations,
         undamped=alone and plan.options.solver == "gauss-newton",
@@ -128,8 +131,8 @@ def begin(problems: Problem, plan: Plan) -> ConventionalStart:
 
 
 def observe(
-    problems: Problem, images: Images, given: Given, plan: Plan
-) -> tuple[Observation, Medium | None]:
+    problems: Problem, images: ImagePlanes, given: Given, plan: SolvePlan
+) -> tuple[Observation, MediumPrior | None]:
     """The plan's objective; where SDs are tuned, with those to hold instead."""
     if plan.prior == "none":
         return InPlane.of(images), None
@@ -147,9 +150,9 @@ def observe(
         speed = nominal_sound_speed(problems)
         # A delay in s is a distance in mm at the nominal speed.
         sd = jnp.stack([given.medium_sd[0] / speed, given.medium_sd[1] * speed * 1e3])
-        medium = Medium(sd, plan.blocks)
+        medium = MediumPrior(sd, plan.blocks)
     if plan.channels:
-        return Channels(sigma), medium
+        return ChannelDistances(sigma), medium
     shape = None
     # Where laws are weighed, so are the covariances, and the first fit does without.
     if problems.covariance is not None and not plan.laws:
@@ -170,11 +173,11 @@ def nominal_sound_speed(problem: Problem) -> Float[Array, "*batch"]:
 
 
 def run(
-    begun: ConventionalStart | GivenStart, problems: Problem, given: Given, plan: Plan
+    begun: ConventionalStart | GivenStart, problems: Problem, given: Given, plan: SolvePlan
 ) -> Solution:
     """The plan's method from conventional fits."""
     options, other = plan.options, plan.other_solver
-    images = Images.of(problems, channels=plan.channels)
+    images = ImagePlanes.of(problems, channels=plan.channels)
     observation, medium = observe(problems, images, given, plan)
     zero = jnp.zeros_like(images.mask[:, 0])
     components = observation.sigma.shape[0]
@@ -265,7 +268,7 @@ def run(
 
 
 def _attached(
-    found: Solution, images: Images, problems: Problem, given: Given, plan: Plan
+    found: Solution, images: ImagePlanes, problems: Problem, given: Given, plan: SolvePlan
 ) -> Solution:
     """The solution as a differentiable function of the problems (and of given numbers)."""
     observation, medium = observe(problems, images, given, plan)
@@ -283,7 +286,7 @@ def _attached(
     return replace(found, place=place, observation=observation, medium=medium, offset=offset)
 
 
-def _averaged(found: Solution, images: Images, problems: Problem, plan: Plan) -> Solution:
+def _averaged(found: Solution, images: ImagePlanes, problems: Problem, plan: SolvePlan) -> Solution:
     """The average over the laws that the plan has."""
     variances = None
     if problems.covariance is not None and not plan.channels:

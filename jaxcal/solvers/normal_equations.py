@@ -35,8 +35,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.model import derivatives, unrolled
-from jaxcal.model.batch import RIGID_UNKNOWNS, Images, Iterate, picked, targets, total
-from jaxcal.model.observations import Component, Further, LocalUnknown, Medium, Observation
+from jaxcal.model.batch import RIGID_UNKNOWNS, ImagePlanes, Iterate, picked, targets, total
+from jaxcal.model.observations import Component, Further, LocalUnknown, MediumPrior, Observation
 from jaxcal.model.unrolled import Entry, Matrix, Vector
 
 IN_IMAGE = 3
@@ -89,7 +89,7 @@ class _Derived(eqx.Module):
 
 
 def _derive(
-    observation: Observation, q: Vector, iterate: Iterate, images: Images, *, exact: bool
+    observation: Observation, q: Vector, iterate: Iterate, images: ImagePlanes, *, exact: bool
 ) -> _Derived:
     """Look at an observation at the places q."""
     still = jnp.zeros((images.lanes, 1), images.mask.dtype)
@@ -122,7 +122,7 @@ def _over_elements(plane: Entry) -> Entry:
     return plane if unrolled.is_zero(plane) or plane.ndim < 3 else jnp.sum(plane, axis=2)
 
 
-def _weight(component: Component, images: Images) -> Array:
+def _weight(component: Component, images: ImagePlanes) -> Array:
     """1 for every residual that is there."""
     if component.errors[0].ndim < 3:
         return images.mask if component.present is None else images.mask * component.present
@@ -130,7 +130,7 @@ def _weight(component: Component, images: Images) -> Array:
     return mask if component.present is None else mask * component.present
 
 
-def _plain(derived: _Derived, k: int, images: Images) -> Term:
+def _plain(derived: _Derived, k: int, images: ImagePlanes) -> Term:
     """Component k alone, unweighted, with Gauss-Newton's curvature."""
     component, slopes = derived.components[k], derived.slopes[k]
     width, weight = len(slopes[0]), _weight(component, images)
@@ -151,7 +151,7 @@ def _plain(derived: _Derived, k: int, images: Images) -> Term:
     return Term(cost, gradient, curvature)
 
 
-def _bent(derived: _Derived, k: int, images: Images) -> Matrix:
+def _bent(derived: _Derived, k: int, images: ImagePlanes) -> Matrix:
     """What second derivatives of component k's residuals add to its curvature."""
     component, width = derived.components[k], len(derived.slopes[k][0])
     weight = _weight(component, images)
@@ -339,9 +339,9 @@ def diagonal_places(unknowns: int) -> tuple[int, ...]:
 def accumulate(
     iterate: Iterate,
     observation: Observation,
-    images: Images,
+    images: ImagePlanes,
     gate: Float[Array, " lanes"] | None,
-    medium: Medium | None = None,
+    medium: MediumPrior | None = None,
 ) -> Normal:
     """One pass: the normal equations at an iterate.
 
@@ -419,9 +419,9 @@ class ComponentSums(eqx.Module):
 def component_sums(
     iterate: Iterate,
     observation: Observation,
-    images: Images,
+    images: ImagePlanes,
     sigma: Float[Array, "k lanes"] | None,
-    medium: Medium | None = None,
+    medium: MediumPrior | None = None,
 ) -> ComponentSums:
     """One pass that keeps the components apart.
 

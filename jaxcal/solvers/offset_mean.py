@@ -38,7 +38,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.model import unrolled
-from jaxcal.model.batch import RIGID_UNKNOWNS, Images, Iterate, targets
+from jaxcal.model.batch import RIGID_UNKNOWNS, ImagePlanes, Iterate, targets
 from jaxcal.model.observations import Component, Further, Observation
 from jaxcal.model.unrolled import Vector
 
@@ -106,7 +106,7 @@ def gained(belief: MeanBelief) -> Array:
 def influences(
     place: Iterate,
     observation: Observation,
-    images: Images,
+    images: ImagePlanes,
     weight: Float[Array, "k lanes"],
     mean: Float[Array, " lanes"],
     *,

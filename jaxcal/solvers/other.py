@@ -14,8 +14,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.calibration.options import Options
-from jaxcal.model.batch import Images, Iterate, choose, targets
-from jaxcal.model.observations import Further, Medium, Observation
+from jaxcal.model.batch import ImagePlanes, Iterate, choose, targets
+from jaxcal.model.observations import Further, MediumPrior, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate, component_sums
@@ -45,7 +45,7 @@ class Fit(eqx.Module):
 
 
 def whitened_residuals(
-    place: Iterate, observation: Observation, images: Images, medium: Medium | None
+    place: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
 ) -> Float[Array, "residuals lanes"]:
     """All residuals of every lane in SDs, zeros where an image is left out; lanes last."""
     q, _ = targets(place, images)
@@ -70,8 +70,8 @@ def minimise_with(
     solver: optx.AbstractLeastSquaresSolver,
     start: Iterate,
     observation: Observation,
-    images: Images,
-    medium: Medium | None,
+    images: ImagePlanes,
+    medium: MediumPrior | None,
     options: Options,
 ) -> Fit:
     """Minimise the objective of one problem.
@@ -114,8 +114,8 @@ def self_tuned_with(
     solver: optx.AbstractLeastSquaresSolver,
     start: Iterate,
     observation: Observation,
-    images: Images,
-    medium: Medium | None,
+    images: ImagePlanes,
+    medium: MediumPrior | None,
     options: Options,
     *,
     tolerance: float = 1e-9,

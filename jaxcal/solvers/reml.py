@@ -35,8 +35,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.model.batch import Images, Iterate, barrier, choose
-from jaxcal.model.observations import Medium, Observation
+from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
+from jaxcal.model.observations import MediumPrior, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.solvers import dense
 from jaxcal.solvers.levenberg_marquardt import (
@@ -232,9 +232,9 @@ def updated(
 def self_tuned(
     start: Iterate,
     observation: Observation,
-    images: Images,
+    images: ImagePlanes,
     *,
-    medium: Medium | None = None,
+    medium: MediumPrior | None = None,
     tolerance: float | None = None,
     max_rounds: int = 100,
     trace: int = 0,
@@ -369,8 +369,8 @@ def update_at(
     place: Iterate,
     sigma: Float[Array, "k lanes"],
     observation: Observation,
-    images: Images,
-    medium: Medium | None,
+    images: ImagePlanes,
+    medium: MediumPrior | None,
 ) -> tuple[Normal, Float[Array, "k lanes"]]:
     """The normal equations with SDs, and the SDs after one update, at a place.
 

@@ -34,7 +34,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxcal.calibration.conventional import Start
 from jaxcal.model import unrolled
-from jaxcal.model.batch import Images, Iterate, barrier, choose, total
+from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose, total
 from jaxcal.model.observations import InPlane
 from jaxcal.model.parameters import EXTRA, Blocks, Parameters
 from jaxcal.model.unknowns import TABLE
@@ -118,7 +118,7 @@ class Reduced(eqx.Module):
     least: Float[Array, " lanes"]
 
     @classmethod
-    def of(cls, images: Images) -> Reduced:
+    def of(cls, images: ImagePlanes) -> Reduced:
         """Two passes over the images: the means, and the rest."""
         count = images.used
         points = [images.lateral, images.distance]
@@ -206,8 +206,10 @@ class Reduced(eqx.Module):
 
     def _scales(self, lateral: Array, axial: Array) -> Float[Array, "2 lanes"]:
         """The best factors of two columns of a rotation."""
-        forces = [dense.product_lanes_last(self.matrix[:, :3], lateral),
-                  dense.product_lanes_last(self.matrix[:, 3:], axial)]  # fmt: skip
+        forces = [
+            dense.product_lanes_last(self.matrix[:, :3], lateral),
+            dense.product_lanes_last(self.matrix[:, 3:], axial),
+        ]
         first, mixed, second = (
             jnp.sum(lateral * forces[0][:3], axis=0),
             jnp.sum(axial * forces[0][3:], axis=0),
@@ -226,7 +228,9 @@ class Reduced(eqx.Module):
         )
 
 
-def closed_form(images: Images, blocks: Blocks) -> tuple[Iterate, Bool[Array, " lanes"], Reduced]:
+def closed_form(
+    images: ImagePlanes, blocks: Blocks
+) -> tuple[Iterate, Bool[Array, " lanes"], Reduced]:
     """The start, whether it is sound, and the sums that it is made of."""
     sums = Reduced.of(images)
     inverse, _ = dense.inverse_lanes_last(sums.matrix)
@@ -254,7 +258,7 @@ def closed_form(images: Images, blocks: Blocks) -> tuple[Iterate, Bool[Array, " 
 
 
 def conventional(
-    images: Images,
+    images: ImagePlanes,
     blocks: Blocks,
     *,
     max_steps: int = 100,

@@ -27,7 +27,7 @@ from jaxcal.data.geometry import chord_angle
 from jaxcal.data.problem import Problem
 from jaxcal.data.segmentation.deviations import fit_deviations
 from jaxcal.model import unrolled
-from jaxcal.model.batch import Images, Iterate, targets, total
+from jaxcal.model.batch import ImagePlanes, Iterate, targets, total
 from jaxcal.model.parameters import RIGID
 from jaxcal.solvers.start import ConventionalStart, conventional
 from jaxcal.study.simulation import Protocol, arrange, draw, draw_noise
@@ -69,8 +69,8 @@ class Experiments(eqx.Module):
         test: poses and exact points of the test images.
     """
 
-    images: Images
-    test: Images
+    images: ImagePlanes
+    test: ImagePlanes
 
 
 def experiments(
@@ -112,8 +112,8 @@ def _grouped(values: Array) -> Array:
     return values.reshape(-1, group, *values.shape[1:])
 
 
-def _images(rotation: Array, origin: Array, lateral: Array, distance: Array) -> Images:
-    return Images(
+def _images(rotation: Array, origin: Array, lateral: Array, distance: Array) -> ImagePlanes:
+    return ImagePlanes(
         rotation=jnp.moveaxis(rotation, 1, 0),
         origin=jnp.moveaxis(origin, 1, 0),
         lateral=lateral,
@@ -123,7 +123,7 @@ def _images(rotation: Array, origin: Array, lateral: Array, distance: Array) -> 
     )
 
 
-def problems_of(images: Images) -> Problem:
+def problems_of(images: ImagePlanes) -> Problem:
     """The same as problems with a leading axis; what nobody reads is not computed."""
     lanes, count = images.mask.shape
     rotation = jnp.moveaxis(images.rotation, 0, -1).reshape(lanes, count, 3, 3)
@@ -188,7 +188,7 @@ def solve(
     )
 
 
-def _mean_squares(place: Iterate, images: Images) -> Float[Array, "3 lanes"]:
+def _mean_squares(place: Iterate, images: ImagePlanes) -> Float[Array, "3 lanes"]:
     """Of lateral error, range error and elevational offset at a place, mm^2."""
     q, _ = targets(place, images)
     far = jnp.sqrt(q[1] * q[1] + q[2] * q[2])
@@ -196,7 +196,7 @@ def _mean_squares(place: Iterate, images: Images) -> Float[Array, "3 lanes"]:
     return jnp.stack(total([images.mask * error * error for error in errors])) / images.used
 
 
-def _precision(place: Iterate, truth: Iterate, test: Images) -> Float[Array, " lanes"]:
+def _precision(place: Iterate, truth: Iterate, test: ImagePlanes) -> Float[Array, " lanes"]:
     """Eq. 8, as :func:`jaxcal.diagnostics.metrics.reconstruction_precision`, mm.
 
     Reconstructed points are taken from the true target, near which they are: their mean and spread

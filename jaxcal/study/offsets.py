@@ -37,8 +37,10 @@ _SIZED_BY_SD = ("normal", "heavy-tailed")
 def check_law(law: str) -> None:
     """Raise InputError for a name that is no law."""
     if law not in OFFSET_LAWS:
-        raise InputError(f"elevation_distribution must be {', '.join(OFFSET_LAWS[:-1])} or "
-                         f"{OFFSET_LAWS[-1]}, not {law!r}")  # fmt: skip
+        raise InputError(
+            f"elevation_distribution must be {', '.join(OFFSET_LAWS[:-1])} or "
+            f"{OFFSET_LAWS[-1]}, not {law!r}"
+        )
 
 
 def standard_offsets(key: Key[Array, ""], law: OffsetLaw, count: int) -> Float[Array, " count"]:

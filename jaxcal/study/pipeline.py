@@ -56,7 +56,7 @@ COMPONENTS = ("lateral", "range", "elevation")
 
 
 @dataclasses.dataclass(frozen=True)
-class Shape:
+class ProblemShape:
     """All that is static about a draw."""
 
     law: OffsetLaw
@@ -174,11 +174,11 @@ def protocol(condition: Condition, probe: LinearProbe) -> Protocol:
     return shape_of(condition, probe).protocol(numbers_of(condition))
 
 
-def shape_of(condition: Condition, probe: LinearProbe) -> Shape:
+def shape_of(condition: Condition, probe: LinearProbe) -> ProblemShape:
     """What is static about a condition's draws."""
     law: OffsetLaw = condition.elevation_distribution  # type: ignore[assignment]
     tracked = condition.tracker_mm > 0 or condition.tracker_deg > 0
-    return Shape(law, condition.images, condition.test_images, probe, tracked)
+    return ProblemShape(law, condition.images, condition.test_images, probe, tracked)
 
 
 def numbers_of(condition: Condition) -> dict[str, Any]:
@@ -246,7 +246,7 @@ def compile_pieces(function: Any, devices: Devices, *, pieces: int, fast: bool =
 
 
 @cache
-def draw_program(shape: Shape, devices: Devices) -> Any:
+def draw_program(shape: ProblemShape, devices: Devices) -> Any:
     """From (trial indices, seed, numbers) to :func:`jaxcal.study.lean.experiments`, compiled."""
 
     def program(indices: Array, seed: Array, numbers: dict[str, Any]) -> Any:

@@ -49,8 +49,9 @@ def open_results(folder: str | os.PathLike[str], *, incomplete: bool = False) ->
     lengths = [len(spec.axis(name)) for name in spec.listed]
     dimensions: dict[str, tuple[str, ...]] = dict.fromkeys(UNITS, ("method", "trial"))
     dimensions |= {
-        "sigma": ("method", "trial", "component"), "realised": ("trial", "component"),
-    }  # fmt: skip
+        "sigma": ("method", "trial", "component"),
+        "realised": ("trial", "component"),
+    }
     variables: dict[str, Any] = {}
     for name, array in values.items():
         shaped = array.reshape(*lengths, *array.shape[1:])
@@ -95,8 +96,10 @@ def read_all(store: Store[Spec], *, incomplete: bool = False) -> dict[str, np.nd
         chunk = spec.chunk(index)
         part = slice(chunk.start, chunk.stop)
         for name, array in store.read(chunk).items():
-            place = (chunk.condition, part) if name == "realised" else (
-                chunk.condition, slice(None), part
-            )  # fmt: skip
+            place = (
+                (chunk.condition, part)
+                if name == "realised"
+                else (chunk.condition, slice(None), part)
+            )
             values[name][place] = array
     return values

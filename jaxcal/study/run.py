@@ -54,7 +54,7 @@ class Silence:
 
 
 @dataclass(frozen=True)
-class Summary:
+class RunSummary:
     """How a run ended.
 
     Attributes:
@@ -78,7 +78,7 @@ def run_study(
     workers: int = 0,
     scheduler: Any = None,
     watcher: Watcher | None = None,
-) -> Summary:
+) -> RunSummary:
     """Compute the missing chunks of a study and write each when it is done.
 
     Killed or interrupted at any moment, it is continued by the same call with ``resume``; the
@@ -115,7 +115,7 @@ def run_study(
                 store.write(chunk, arrays, device)
                 trials += chunk.stop - chunk.start
                 watcher.advance(chunk.stop - chunk.start)
-    return Summary(spec.chunk_count, len(missing), trials, time.monotonic() - begun)
+    return RunSummary(spec.chunk_count, len(missing), trials, time.monotonic() - begun)
 
 
 def _missing(store: Store, watcher: Watcher) -> tuple[list[Chunk], int]:
@@ -133,8 +133,10 @@ def _missing(store: Store, watcher: Watcher) -> tuple[list[Chunk], int]:
         done += chunk.stop - chunk.start
     missing = [store.spec.chunk(k) for k in range(store.spec.chunk_count) if k not in sound]
     if len(makers) > 1:
-        watcher.note(f"the chunks were computed by {len(makers)} different set-ups: "
-                     f"{'; '.join(sorted(makers))}")  # fmt: skip
+        watcher.note(
+            f"the chunks were computed by {len(makers)} different set-ups: "
+            f"{'; '.join(sorted(makers))}"
+        )
     return missing, done
 
 

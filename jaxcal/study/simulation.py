@@ -85,9 +85,11 @@ class Protocol:
         if not MINIMUM_IMAGES <= self.images <= 100_000:
             raise InputError(f"images must be between {MINIMUM_IMAGES} and 100000")
         for name, largest, unit in (
-            ("elevation_mm", 1000, "mm"), ("noise_mm", 1000, "mm"),
-            ("tracker_mm", 1000, "mm"), ("tracker_rad", 1, "rad"),
-        ):  # fmt: skip
+            ("elevation_mm", 1000, "mm"),
+            ("noise_mm", 1000, "mm"),
+            ("tracker_mm", 1000, "mm"),
+            ("tracker_rad", 1, "rad"),
+        ):
             value = getattr(self, name)
             if not (is_traced(value) or (np.isfinite(value) and 0 <= value <= largest)):
                 raise InputError(f"{name} must be between 0 and {largest} {unit}, not {value}")
@@ -300,12 +302,17 @@ def arrange(numbers: Numbers, protocol: Protocol) -> Planes:
         ]
     exact = jnp.stack([lateral, depth if curved else jnp.hypot(elevation, depth)])
     return Planes(
-        rotation=jnp.stack(tracked), origin=jnp.stack(origins), exact=exact,
-        elevation=elevation, true_rotation=truth, true_translation=translation, target=target,
+        rotation=jnp.stack(tracked),
+        origin=jnp.stack(origins),
+        exact=exact,
+        elevation=elevation,
+        true_rotation=truth,
+        true_translation=translation,
+        target=target,
         test_rotation=jnp.stack(test_rotation),
         test_origin=jnp.stack(origin(test_rotation, [across, 0, far])),
         test_point=jnp.stack([across, far]),
-    )  # fmt: skip
+    )
 
 
 def _distances(

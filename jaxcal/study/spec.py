@@ -348,9 +348,15 @@ def spec_from_canonical(text: str) -> Spec:
         axes = tuple((name, tuple(given[name])) for name in AXES)
         methods = tuple(MethodSpec(**method) for method in content["methods"])
         spec = Spec(
-            content["name"], content["seed"], content["trials"], content["chunk_trials"], axes,
-            tuple(content["listed"]), LinearProbe(**content["probe"]), methods,
-        )  # fmt: skip
+            content["name"],
+            content["seed"],
+            content["trials"],
+            content["chunk_trials"],
+            axes,
+            tuple(content["listed"]),
+            LinearProbe(**content["probe"]),
+            methods,
+        )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"is not a study's canonical spec: {error}") from None
     if spec.canonical() != text:
@@ -394,8 +400,9 @@ def _integer(name: str, value: object, least: int, most: int) -> int:
 
 def _number(name: str, value: object, least: float, most: float, *, above: bool = False) -> float:
     if isinstance(value, str):
-        raise InputError(f"{name} must be a plain number (its unit is in its name), not "
-                         f"{_shown(value)}")  # fmt: skip
+        raise InputError(
+            f"{name} must be a plain number (its unit is in its name), not {_shown(value)}"
+        )
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{name} must be a number, not {_shown(value)}")
     number = float(value) if abs(value) < 2**1000 else math.inf
@@ -473,12 +480,14 @@ def _method(table: dict[str, Any], where: str) -> MethodSpec:
     if not (isinstance(name, str) and 1 <= len(name) <= 100 and name.isprintable()):
         raise InputError(f"{where}name must be 1 to 100 printable characters")
     if method not in ("conventional", "alternating", "joint"):
-        raise InputError(f"{where}method must be conventional, alternating or joint, not "
-                         f"{_shown(method)}")  # fmt: skip
+        raise InputError(
+            f"{where}method must be conventional, alternating or joint, not {_shown(method)}"
+        )
     prior = table.get("prior", "auto")
     if prior not in ("auto", "gaussian", "uniform", "bounded"):
-        raise InputError(f"{where}prior must be auto, gaussian, uniform or bounded, not "
-                         f"{_shown(prior)}")  # fmt: skip
+        raise InputError(
+            f"{where}prior must be auto, gaussian, uniform or bounded, not {_shown(prior)}"
+        )
     if method != "joint" and "prior" in table:
         raise InputError(f"{where}prior belongs to the joint method")
     bounded = method == "alternating" or prior == "bounded"
@@ -486,8 +495,9 @@ def _method(table: dict[str, Any], where: str) -> MethodSpec:
     if len(given) == 2:
         raise InputError(f"{where}{given[0]} and {where}{given[1]} contradict each other")
     if given and not bounded:
-        raise InputError(f"{where}{given[0]} belongs to alternating and to joint with prior "
-                         '"bounded"')  # fmt: skip
+        raise InputError(
+            f'{where}{given[0]} belongs to alternating and to joint with prior "bounded"'
+        )
     for key in ("tolerance_rad", "tolerance_mm", "max_rounds", "inner_steps"):
         if key in table and method != "alternating":
             raise InputError(f"{where}{key} belongs to the alternating method")
@@ -507,18 +517,28 @@ def _method(table: dict[str, Any], where: str) -> MethodSpec:
 
 def _check_size(spec: Spec) -> None:
     if spec.condition_count > MAXIMUM_CONDITIONS:
-        raise InputError(f"the grid has {spec.condition_count} conditions, at most "
-                         f"{MAXIMUM_CONDITIONS} are computed")  # fmt: skip
+        raise InputError(
+            f"the grid has {spec.condition_count} conditions, at most "
+            f"{MAXIMUM_CONDITIONS} are computed"
+        )
     if spec.condition_count * spec.trials > MAXIMUM_EXPERIMENTS:
-        raise InputError(f"conditions times trials are {spec.condition_count * spec.trials}, at "
-                         f"most {MAXIMUM_EXPERIMENTS} have draws of their own")  # fmt: skip
+        raise InputError(
+            f"conditions times trials are {spec.condition_count * spec.trials}, at "
+            f"most {MAXIMUM_EXPERIMENTS} have draws of their own"
+        )
     if spec.chunk_count > MAXIMUM_CHUNKS:
-        raise InputError(f"chunk_trials = {spec.chunk_trials} makes {spec.chunk_count} files, at "
-                         f"most {MAXIMUM_CHUNKS}: enlarge it")  # fmt: skip
+        raise InputError(
+            f"chunk_trials = {spec.chunk_trials} makes {spec.chunk_count} files, at "
+            f"most {MAXIMUM_CHUNKS}: enlarge it"
+        )
     if spec.chunk_trials * len(spec.methods) > MAXIMUM_CHUNK:
-        raise InputError(f"chunk_trials = {spec.chunk_trials} is too large for {len(spec.methods)} "
-                         "methods: reduce it")  # fmt: skip
+        raise InputError(
+            f"chunk_trials = {spec.chunk_trials} is too large for {len(spec.methods)} "
+            "methods: reduce it"
+        )
     images = max(int(count) for name in _COUNTS for count in spec.axis(name))
     if images * spec.probe.elements > MAXIMUM_DISTANCES:
-        raise InputError(f"{images} images times {spec.probe.elements} elements are too many: at "
-                         f"most {MAXIMUM_DISTANCES} distances are drawn")  # fmt: skip
+        raise InputError(
+            f"{images} images times {spec.probe.elements} elements are too many: at "
+            f"most {MAXIMUM_DISTANCES} distances are drawn"
+        )

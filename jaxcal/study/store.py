@@ -185,9 +185,11 @@ class Store(Generic[S]):
             if text(root, "spec_sha256") != self.spec.sha256:
                 raise FormatError("belongs to another spec")
             agreed = {
-                "chunk": chunk.index, "condition": chunk.condition,
-                "trial_start": chunk.start, "trial_stop": chunk.stop,
-            }  # fmt: skip
+                "chunk": chunk.index,
+                "condition": chunk.condition,
+                "trial_start": chunk.start,
+                "trial_stop": chunk.stop,
+            }
             for name, value in agreed.items():
                 if number(root, name) != value:
                     raise FormatError(f"its {name} is not {value}")

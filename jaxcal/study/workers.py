@@ -52,15 +52,22 @@ class Worker:
         # In a session of its own: Ctrl-C reaches the parent, which ends its workers.
         self.process = subprocess.Popen(
             python_command("jaxcal.study.workers"),
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=environment,
+            start_new_session=True,
+        )
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self._to, self._from = self.process.stdin, self.process.stdout
         with contextlib.suppress(OSError):
-            self._say({
-                "spec": spec.canonical(), "where": where_defined(spec), "cores": sorted(cores),
-            })  # fmt: skip
+            self._say(
+                {
+                    "spec": spec.canonical(),
+                    "where": where_defined(spec),
+                    "cores": sorted(cores),
+                }
+            )
 
     def compute(self, chunk: Chunk) -> tuple[dict[str, np.ndarray], str] | None:
         """A chunk's arrays and the device that computed them; None where the worker died.

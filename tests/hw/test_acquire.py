@@ -23,7 +23,7 @@ pytest.importorskip("serial", reason="pyserial is not installed (jaxcal[serial])
 from test_recorder import wait_until_closed
 
 import jaxcal
-from hw.acquire import AcquisitionStopped, Outcome, Pause, Request, acquire
+from hw.acquire import AcquisitionRequest, AcquisitionStopped, Outcome, Pause, acquire
 from hw.bench.run import Bench
 from hw.emulated import BenchOracle, setup_of, start
 from hw.outcome import share_inside
@@ -42,7 +42,7 @@ def a_bench(speed: float = 5.0) -> Bench:
 def run(
     bench: Bench,
     path: Path,
-    request: Request | None,
+    request: AcquisitionRequest | None,
     say: Callable[[str], None] = lambda line: None,
     pause: Pause | None = None,
 ) -> Outcome:
@@ -83,7 +83,7 @@ def test_a_short_run_ends_in_a_recording_that_calibrate_takes(tmp_path, capsys):
 
     with a_bench() as bench:
         try:
-            run(bench, path, Request(IMAGES, "none", 1, bench=3), say, pause)
+            run(bench, path, AcquisitionRequest(IMAGES, "none", 1, bench=3), say, pause)
         except AcquisitionStopped as error:
             print(error)
             finish(bench, path)
@@ -117,8 +117,9 @@ def test_a_short_run_ends_in_a_recording_that_calibrate_takes(tmp_path, capsys):
 def test_an_optimal_run_plans_on_and_stops_by_itself(tmp_path):
     path, lines = tmp_path / "rec.h5", []
     wanted = 0.4
-    request: Request | None = Request(30, "amplitude-scan", 2, bench=3, plan="optimal",
-                                      until_tre_mm=wanted)  # fmt: skip
+    request: AcquisitionRequest | None = AcquisitionRequest(
+        30, "amplitude-scan", 2, bench=3, plan="optimal", until_tre_mm=wanted
+    )
     with a_bench() as bench:
         outcome = None
         for _ in range(ATTEMPTS):
@@ -148,7 +149,7 @@ def test_every_placement_brackets_the_truth(tmp_path, placement):
     path = tmp_path / "rec.h5"
     with a_bench() as bench:
         try:
-            run(bench, path, Request(12, placement, 2, bench=3))
+            run(bench, path, AcquisitionRequest(12, placement, 2, bench=3))
         except AcquisitionStopped as error:
             print(error)
             finish(bench, path)
@@ -187,7 +188,7 @@ def fault_in_the_middle(tmp_path, name: str, speed: float, rest_s: float | None)
             if line.startswith("image 2/"):
                 threading.Thread(target=strike, daemon=True).start()
 
-        request: Request | None = Request(IMAGES, "none", 1, bench=3)
+        request: AcquisitionRequest | None = AcquisitionRequest(IMAGES, "none", 1, bench=3)
         for _ in range(ATTEMPTS):
             with pytest.raises(AcquisitionStopped) as caught:
                 run(bench, path, request, say)

@@ -15,7 +15,7 @@ pytest.importorskip("serial", reason="pyserial is not installed")
 pytest.importorskip("cobs", reason="cobs is not installed")
 
 from hw.active_echo.device import ActiveEcho
-from hw.bench.run import Bench, Options, start_bench
+from hw.bench.run import Bench, BenchOptions, start_bench
 from hw.bench.world import make_world
 from hw.midplane.pattern_injection import bar
 from hw.ultrasound.receiver import UltrasoundStream
@@ -126,9 +126,9 @@ def test_two_benches_side_by_side(bench):
 
 def test_options_that_cannot_be_are_one_line():
     with pytest.raises(InputError, match="speed"):
-        Options(speed=0.0)
+        BenchOptions(speed=0.0)
     with pytest.raises(InputError, match="125 or 500"):
-        Options(pose_hz=60)
+        BenchOptions(pose_hz=60)
     with pytest.raises(InputError, match="did not start: the simulated world has no 'colour'"):
         start_bench(world={"colour": 1.0})
 

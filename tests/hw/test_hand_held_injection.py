@@ -26,7 +26,7 @@ from hw.freehand.injection import acquire_by_injection, hand_advice
 from hw.midplane.pattern_injection import View
 from hw.poses import Extent, plan_poses
 from hw.recorder import Recorder
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from hw.setup import HandHeldSetup, load_hand_held
 from jaxcal import InputError
 
@@ -212,7 +212,7 @@ def test_enter_is_refused_until_both_sides_were_seen(tmp_path, bench):
     person = Hasty(bench.hand)
     with pytest.raises(FreeHandStopped, match="0 images are too few"):
         acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, person)
-    Recorder(tmp_path / "o.h5", Header("pixel", {}, 0, None, "{}")).close()
+    Recorder(tmp_path / "o.h5", RecordingHeader("pixel", {}, 0, None, "{}")).close()
     with pytest.raises(InputError, match="was not begun with pattern injection"):
         acquire_by_injection(tmp_path / "o.h5", bench.asked, bench.setup, person, resume=True)
 

@@ -13,7 +13,7 @@ from test_setup import GOOD
 
 from hw.cli import _plan_page, main
 from hw.recording_file import RecordingWriter
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from hw.robot.limits import Limits
 from hw.robot.safety import MotionPlan
 
@@ -104,7 +104,9 @@ def test_a_recording_of_the_bench_is_resumed_on_the_bench(tmp_path, capsys):
     path = tmp_path / "rec.h5"
     probe = {"kind": "linear", "elements": 8, "pitch_mm": 1.0, "sound_speed_m_s": 1490.0}
     settings = json.dumps({"request": {"images": 5, "bench": 0}})
-    RecordingWriter.create(path, Header("time_of_flight", probe, 8, None, settings)).close()
+    RecordingWriter.create(
+        path, RecordingHeader("time_of_flight", probe, 8, None, settings)
+    ).close()
     assert main(["acquire", str(path), "--setup", "x.toml", "--resume", "--move"]) == 2
     assert "begun on the emulated bench" in capsys.readouterr().err
     RecordingWriter.resume(path).finish()

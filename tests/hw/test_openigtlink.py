@@ -19,7 +19,7 @@ from jaxcal.io.openigtlink import (
     MAXIMUM_BODY,
     Message,
     Picture,
-    Status,
+    StatusMessage,
     Tracked,
     encode,
     parse_header,
@@ -155,7 +155,7 @@ def test_what_pyigtl_does_not_know() -> None:
     body = struct.pack(">Hq20s", 13, -4, b"NotReady") + b"probe unplugged\0"
     header = struct.pack(">H12s20sIIQQ", 1, b"STATUS", b"US", 0, 0, len(body), crc64(body))
     (message,) = decode(header + body)
-    assert message.content == Status(13, -4, "NotReady", "probe unplugged")
+    assert message.content == StatusMessage(13, -4, "NotReady", "probe unplugged")
     assert math.isnan(message.t_device)
     assert decode(encode(message))[0].content == message.content
 
@@ -288,7 +288,7 @@ def stream(count: int, rng: np.random.Generator) -> tuple[list[bytes], list[Mess
             message = Message("TDATA", "Tracker", 1.0, content, number)
         else:
             message = Message(
-                "STATUS", "US", 1.0, Status(1, number, "", "x" * int(rng.integers(40)))
+                "STATUS", "US", 1.0, StatusMessage(1, number, "", "x" * int(rng.integers(40)))
             )
         messages.append(message)
     return [encode(message) for message in messages], messages

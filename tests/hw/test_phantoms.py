@@ -14,7 +14,7 @@ import pytest
 from test_world import placed
 
 import jaxcal
-from hw.acquire import Request
+from hw.acquire import AcquisitionRequest
 from hw.bench.frames import COLUMNS, DECIBELS, Camera, Look
 from hw.bench.phantoms import ActiveEcho, Hydrophone, phantom_named
 from hw.bench.stage import WorldStage
@@ -25,7 +25,7 @@ from hw.midplane.image_scan import ImageBench, image_scan, pixel_of, place_of
 from hw.poses import plan_poses
 from hw.recorder import Recorder
 from hw.recording_check import check_resumable, read_progress, settings_of
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from jaxcal import InputError
 from jaxcal.data.segmentation.image import localise
 
@@ -188,18 +188,18 @@ def test_pixels_and_places_are_each_others_inverse():
 
 
 def test_requests_name_what_goes_with_a_phantom():
-    kinds = {name: Request(phantom=name, placement="none").kind for name in PHANTOMS}
+    kinds = {name: AcquisitionRequest(phantom=name, placement="none").kind for name in PHANTOMS}
     assert kinds == {
         "active-echo": "time_of_flight",
         "cross-wire": "point",
         "hydrophone": "time_of_flight",
     }
     with pytest.raises(InputError, match="with the cross-wire placement is image-scan or none"):
-        Request(phantom="cross-wire", placement="amplitude-scan")
+        AcquisitionRequest(phantom="cross-wire", placement="amplitude-scan")
     with pytest.raises(InputError, match="with the hydrophone placement is"):
-        Request(phantom="hydrophone", placement="pattern-injection")
+        AcquisitionRequest(phantom="hydrophone", placement="pattern-injection")
     with pytest.raises(InputError, match="phantom must be one of"):
-        Request(phantom="wall")
+        AcquisitionRequest(phantom="wall")
     with pytest.raises(InputError, match="there are: active-echo"):
         phantom_named("wall")
     assert [phantom_named(name).name for name in PHANTOMS] == list(PHANTOMS)
@@ -209,10 +209,12 @@ def test_an_interrupted_recording_of_points_is_resumed_with_them(tmp_path):
     path = tmp_path / "rec.h5"
     world = make_world(2, phantom="cross-wire")
     poses, points = world.test_set(6)
-    request = Request(6, "image-scan", 0, bench=2, phantom="cross-wire")
+    request = AcquisitionRequest(6, "image-scan", 0, bench=2, phantom="cross-wire")
     settings = json.dumps({"request": asdict(request)})
     probe = {"kind": "linear", "elements": 128, "pitch_mm": 58.5 / 128, "sound_speed_m_s": 1490.0}
-    with Recorder(path, Header(kind=request.kind, probe=probe, settings=settings)) as recorder:
+    with Recorder(
+        path, RecordingHeader(kind=request.kind, probe=probe, settings=settings)
+    ) as recorder:
         recorder.put("plan", "targets", poses, "mm")
         for row in range(4):
             recorder.add_selected(
@@ -231,7 +233,7 @@ def test_an_interrupted_recording_of_points_is_resumed_with_them(tmp_path):
     assert progress.taken.tolist() == [0, 1, 2, 3]
     asked = settings_of(path)["request"]
     assert isinstance(asked, dict)
-    assert Request(**asked) == request
+    assert AcquisitionRequest(**asked) == request
 
 
 @pytest.mark.slow

@@ -20,11 +20,11 @@ import jaxcal
 from hw.recorder import Recorder
 from hw.recording_check import check_resumable, settings_of
 from hw.recording_file import RecordingWriter
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from jaxcal.cli.main import main
 
 PROBE = {"kind": "linear", "elements": 128, "pitch_mm": 58.5 / 128, "sound_speed_m_s": 1490.0}
-HEADER = Header(kind="time_of_flight", probe=PROBE, settings='{"placement": "none"}')
+HEADER = RecordingHeader(kind="time_of_flight", probe=PROBE, settings='{"placement": "none"}')
 
 
 def simulated(images: int = 12) -> SimpleNamespace:

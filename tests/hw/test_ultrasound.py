@@ -19,7 +19,7 @@ from hw.bench.ultrasound import ImageServer
 from hw.clock import Clock
 from hw.errors import DeviceError, LostError, StaleError
 from hw.ultrasound import Image, UltrasoundStream
-from jaxcal.io.openigtlink import HEADER_SIZE, Message, Picture, Status, encode
+from jaxcal.io.openigtlink import HEADER_SIZE, Message, Picture, StatusMessage, encode
 
 RNG = np.random.default_rng(11)
 PICTURES = [RNG.integers(0, 256, (48, 64), dtype=np.uint8) for _ in range(16)]
@@ -67,7 +67,7 @@ def test_images_of_our_server(server: ImageServer) -> None:
         assert (image.spacing_mm, image.device, image.is_rf) == ((0.1, 0.2), "Image", False)
         # The machine's clock is a million seconds ahead; nothing comes before it is sent.
         assert image.t_host >= image.t_device - 1_000_000.0 - 1e-6
-    assert status == Status(1, 0, "", "ready")
+    assert status == StatusMessage(1, 0, "", "ready")
 
 
 @contextlib.contextmanager

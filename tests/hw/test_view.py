@@ -26,7 +26,7 @@ from hw.extras import missing
 from hw.midplane.bracket import Bracket, Placement
 from hw.poses import plan_poses
 from hw.recorder import Recorder
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from hw.robot.motion import Motion
 from hw.robot.safety import MotionPlan, confirm_unattended
 from hw.robot.stream import PoseSample
@@ -80,7 +80,7 @@ def a_plan(setup: Setup, serial: str = "none") -> MotionPlan:
 @contextmanager
 def a_session(setup: Setup, folder: Path) -> Iterator[Session]:
     probe = {"kind": "linear", "elements": 128, "pitch_mm": 0.457, "sound_speed_m_s": 1490.0}
-    header = Header("time_of_flight", probe, 128, None, "{}")
+    header = RecordingHeader("time_of_flight", probe, 128, None, "{}")
     with Recorder(folder / "rec.h5", header) as recorder, Session(setup, recorder) as session:
         yield session
 

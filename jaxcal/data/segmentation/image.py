@@ -146,9 +146,17 @@ def localise(
         centre = None if expected is None else expected[index] - corner
         try:
             results.append(
-                _localise_one(part, target, centre, radius, compression, decibels_per_level,
-                              false_alarm, minimum_margin_db)
-            )  # fmt: skip
+                _localise_one(
+                    part,
+                    target,
+                    centre,
+                    radius,
+                    compression,
+                    decibels_per_level,
+                    false_alarm,
+                    minimum_margin_db,
+                )
+            )
         except NotFoundError as reason:
             results.append(reason)
     return _collect(results, corner, np.diag(np.broadcast_to(scatter**2, (2,))))
@@ -197,9 +205,16 @@ def images_from_frames(
             f"needed (most often: {most})"
         )
     images = make_images(
-        poses, located.position, "pixel", mask=located.found, covariance=located.covariance,
-        time=time, spacing_mm=spacing_mm, face_offset_mm=face_offset_mm, minimum=minimum,
-    )  # fmt: skip
+        poses,
+        located.position,
+        "pixel",
+        mask=located.found,
+        covariance=located.covariance,
+        time=time,
+        spacing_mm=spacing_mm,
+        face_offset_mm=face_offset_mm,
+        minimum=minimum,
+    )
     return images, located
 
 
@@ -324,8 +339,10 @@ def _localise_one(
     if contrast < needed:
         raise NotFoundError(
             f"nothing stands out: the brightest spot is {contrast:.1f} dB over the background, "
-            f"speckle alone reaches {needed:.1f} dB", contrast, margin,
-        )  # fmt: skip
+            f"speckle alone reaches {needed:.1f} dB",
+            contrast,
+            margin,
+        )
     if margin < minimum_margin_db:
         raise NotFoundError(
             f"ambiguous: the next bright spot is only {margin:.1f} dB below", contrast, margin

@@ -19,7 +19,12 @@ from jaxcal import InputError
 from jaxcal.data.geometry import AnyArray
 from jaxcal.data.probe import CurvilinearProbe, Probe
 from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording, make_images
-from jaxcal.data.segmentation.time_of_flight import Fit, fit_in_plane, fit_out_of_plane, shortest
+from jaxcal.data.segmentation.time_of_flight import (
+    DistanceFit,
+    fit_in_plane,
+    fit_out_of_plane,
+    shortest,
+)
 from jaxcal.runtime.compiler import fast_to_run
 from jaxcal.runtime.precision import in_own_modes
 
@@ -336,7 +341,9 @@ def compiled_fit(curved: bool, robust: bool):
     before any arithmetic.
     """
 
-    def fit(distances: AnyArray, positions: AnyArray) -> Fit | tuple[Fit, Fit]:
+    def fit(
+        distances: AnyArray, positions: AnyArray
+    ) -> DistanceFit | tuple[DistanceFit, DistanceFit]:
         if curved:
             return fit_out_of_plane(distances, positions, robust=robust)
         # What the compiler knows to be zero it does not compute with.

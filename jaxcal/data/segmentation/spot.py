@@ -164,8 +164,9 @@ def fit_spot(
         first = [*start, np.log(speckle.sigma), *one, lean, *one, -lean]
     first = np.array(first)
     if np.sum(window[use] > 0.1 * top) < len(first):
-        raise NotFoundError("the display is saturated: only the spot's outline is left", contrast,
-                            margin)  # fmt: skip
+        raise NotFoundError(
+            "the display is saturated: only the spot's outline is left", contrast, margin
+        )
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def model(unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -200,9 +201,16 @@ def fit_spot(
     with np.errstate(over="ignore", invalid="ignore"):
         try:
             fit = least_squares(
-                residual, first, jac=derivative, method="trf", x_scale=steps, ftol=1e-8, xtol=1e-6,
-                gtol=1e-8, max_nfev=40,
-            )  # fmt: skip
+                residual,
+                first,
+                jac=derivative,
+                method="trf",
+                x_scale=steps,
+                ftol=1e-8,
+                xtol=1e-6,
+                gtol=1e-8,
+                max_nfev=40,
+            )
         except (ValueError, np.linalg.LinAlgError):
             raise NotFoundError("no spot could be fitted", contrast, margin) from None
     unknowns = fit.x

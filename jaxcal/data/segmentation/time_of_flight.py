@@ -44,7 +44,7 @@ ABSOLUTE_STEPS, SCALE_STEPS, LAST_STEPS = 5, 3, 3
 _Stage = Literal["absolute", "scale", "efficient"]
 
 
-class Fit(eqx.Module):
+class DistanceFit(eqx.Module):
     """A least-squares fit of one position to each frame's distances.
 
     Attributes:
@@ -161,7 +161,7 @@ def fit_in_plane(
     *,
     robust: bool = False,
     steps: int = 4,
-) -> Fit:
+) -> DistanceFit:
     """Least squares for [lateral, axial], every target taken for in-plane (Eq. 5, or 6 with y = 0).
 
     For a linear array "axial" is the range, and nothing is neglected.
@@ -187,7 +187,7 @@ def fit_out_of_plane(
     *,
     robust: bool = False,
     steps: int = 4,
-) -> tuple[Fit, Fit]:
+) -> tuple[DistanceFit, DistanceFit]:
     """Least squares on Eq. 6 for [lateral, axial, elevation squared]; curved arrays only.
 
     The sign of the elevation cannot be known: the array is symmetric about the image plane.
@@ -259,9 +259,17 @@ def _closed_form(d: Array, m: Array, ex: Array, ez: Array) -> tuple[Array, Array
 
 
 def _iterate(
-    state: _State, d: Array, m: Array, ex: Array, ez: Array, lines: Array,
-    *, robust: bool, steps: int, out_of_plane: bool,
-) -> Fit:  # fmt: skip
+    state: _State,
+    d: Array,
+    m: Array,
+    ex: Array,
+    ez: Array,
+    lines: Array,
+    *,
+    robust: bool,
+    steps: int,
+    out_of_plane: bool,
+) -> DistanceFit:
     """Gauss-Newton from a start; the last pass also gives the covariance."""
     unknowns = 3 if out_of_plane else 2
 
@@ -336,7 +344,7 @@ def _iterate(
     matrix = jnp.stack(
         [jnp.stack([inverse[k] for k in row], axis=-1) for row in _ROWS[unknowns]], -2
     )
-    return Fit(
+    return DistanceFit(
         position=position,
         covariance=matrix * (noise**2)[..., None, None],
         inverse_normal=matrix,

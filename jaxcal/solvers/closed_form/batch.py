@@ -39,7 +39,7 @@ from jaxcal.solvers.closed_form.reduced_objective import (
     CONSTRAINTS,
     FEWEST_IMAGES,
     ROUNDING,
-    Constraints,
+    QuadraticConstraints,
     check_estimate,
 )
 from jaxcal.solvers.closed_form.single import ClosedForm, calibrate_closed_form
@@ -88,8 +88,9 @@ def solve_batch(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
             without JAX's 64 bits.
     """
     check_estimate(estimate, problems.pixels, problems.spacing_known)
-    problems = replace(problems, covariance=None, max_elevation=None, channels=None,
-                       sound_speed=None, delay=None)  # fmt: skip
+    problems = replace(
+        problems, covariance=None, max_elevation=None, channels=None, sound_speed=None, delay=None
+    )
     shape = problems.batch_shape
     flat = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
     if any(is_traced(leaf) for leaf in jax.tree.leaves(problems)):
@@ -185,10 +186,11 @@ def solve_lanes(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     # Plane by plane: batched products of such small matrices are slow.
     of_points = shift + used.face_offset * r3 if scaled else shift
     seen = [
-        points[:, :, 0] * x[i, :, None] + points[:, :, 1] * x[3 + i, :, None]
+        points[:, :, 0] * x[i, :, None]
+        + points[:, :, 1] * x[3 + i, :, None]
         + of_points[i, :, None]
         for i in range(3)
-    ]  # fmt: skip
+    ]
     target, objective = [], jnp.zeros_like(count)
     for i in range(3):
         cloud = sum((rotations[:, :, i, j] * seen[j] for j in range(3)), translations[:, :, i])
@@ -261,7 +263,7 @@ def _rows(stacked: Array) -> Matrix:
     return [[stacked[i, j] for j in range(6)] for i in range(6)]
 
 
-def _with_multipliers(constraints: Constraints, matrix: Array, values: Array) -> Matrix:
+def _with_multipliers(constraints: QuadraticConstraints, matrix: Array, values: Array) -> Matrix:
     """M as rows over the lanes."""
     rows = _rows(matrix)
     for each, value in zip(constraints.matrices, values, strict=True):
@@ -270,18 +272,15 @@ def _with_multipliers(constraints: Constraints, matrix: Array, values: Array) ->
     return rows
 
 
-def _products(constraints: Constraints, x: Vector) -> list[Vector]:
+def _products(constraints: QuadraticConstraints, x: Vector) -> list[Vector]:
     """A_j x."""
     return [
-        [
-            unrolled.add(*(each[i, j] * x[j] for j in np.flatnonzero(each[i])))
-            for i in range(6)
-        ]
+        [unrolled.add(*(each[i, j] * x[j] for j in np.flatnonzero(each[i]))) for i in range(6)]
         for each in constraints.matrices
-    ]  # fmt: skip
+    ]
 
 
-def _off(constraints: Constraints, x: Vector) -> Vector:
+def _off(constraints: QuadraticConstraints, x: Vector) -> Vector:
     """How far x is from the constraints, x' A_j x - e_j."""
     return [
         unrolled.dot(x, product) - value
@@ -367,7 +366,9 @@ def _optimum_jvp(estimate: tuple[str, ...], primals: tuple, tangents: tuple) -> 
     return (x, values), (slope, jnp.stack(change))
 
 
-def _multipliers(constraints: Constraints, matrix: Array, vector: Array, x: Array) -> Array:
+def _multipliers(
+    constraints: QuadraticConstraints, matrix: Array, vector: Array, x: Array
+) -> Array:
     """Least squares for the multipliers that make x stationary."""
     products = _products(constraints, list(x))
     rest = vector - jnp.einsum("ijl,jl->il", matrix, x)
@@ -375,7 +376,9 @@ def _multipliers(constraints: Constraints, matrix: Array, vector: Array, x: Arra
     return jnp.stack(unrolled.solve(gram, [unrolled.dot(p, list(rest)) for p in products]))
 
 
-def _feasible(x: Float[Array, "6 lanes"], constraints: Constraints) -> Float[Array, "6 lanes"]:
+def _feasible(
+    x: Float[Array, "6 lanes"], constraints: QuadraticConstraints
+) -> Float[Array, "6 lanes"]:
     """The nearest orthonormal pair, with the scales that are free."""
     pair = x.reshape(2, 3, -1)
     lengths = jnp.sqrt(jnp.sum(pair**2, axis=1))
@@ -395,7 +398,7 @@ def _feasible(x: Float[Array, "6 lanes"], constraints: Constraints) -> Float[Arr
 
 
 def _gap(
-    constraints: Constraints, matrix: Array, vector: Array, x: Array, values: Array
+    constraints: QuadraticConstraints, matrix: Array, vector: Array, x: Array, values: Array
 ) -> tuple[Float[Array, " lanes"], Float[Array, " lanes"], Bool[Array, " lanes"]]:
     """f(x) less the bound that the multipliers prove, M's least pivot, whether it is definite."""
     rows = _with_multipliers(constraints, matrix, values)

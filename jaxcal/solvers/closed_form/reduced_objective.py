@@ -42,7 +42,7 @@ ROUNDING = 64
 
 
 @dataclass(frozen=True)
-class Constraints:
+class QuadraticConstraints:
     """What is known of the scales: x' A_j x = e_j for every j.
 
     Attributes:
@@ -57,7 +57,7 @@ class Constraints:
     free: tuple[str, ...]
 
 
-def _constraints() -> dict[tuple[str, ...], Constraints]:
+def _constraints() -> dict[tuple[str, ...], QuadraticConstraints]:
     one, two = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
     both = np.array([[0.0, 1.0], [1.0, 0.0]])
     table = {
@@ -67,7 +67,7 @@ def _constraints() -> dict[tuple[str, ...], Constraints]:
         ("sound-speed",): ([one, both], [1.0, 0.0], ("axial",)),
     }
     return {
-        estimate: Constraints(
+        estimate: QuadraticConstraints(
             np.stack([np.kron(each, np.eye(3)) for each in small]), np.array(values), free
         )
         for estimate, (small, values, free) in table.items()
@@ -125,7 +125,7 @@ class ReducedObjective:
     origin_map: Float[np.ndarray, "3 7"]
     target_map: Float[np.ndarray, "3 10"]
     mean: Float[np.ndarray, 2]
-    constraints: Constraints
+    constraints: QuadraticConstraints
 
     def __call__(self, x: Float[np.ndarray, "*starts 6"]) -> Any:
         """f(x), mm^2: a number, or one for every start."""
@@ -142,7 +142,7 @@ class ReducedObjective:
 
 def image_data(
     problem: Problem | Recording | Images, estimate: tuple[str, ...]
-) -> tuple[ImageData, Constraints]:
+) -> tuple[ImageData, QuadraticConstraints]:
     """The images in use and the constraints, from whatever a caller holds.
 
     Raises:
@@ -214,7 +214,7 @@ def used_images(
     return ImageData(used[:, :3, :3], used[:, :3, 3], points, face_offset, spacing, pixels)
 
 
-def reduce(data: ImageData, constraints: Constraints) -> ReducedObjective:
+def reduce(data: ImageData, constraints: QuadraticConstraints) -> ReducedObjective:
     """Eliminate c, then t, by orthogonal transformations.
 
     Squares of the factor are never formed, so that f and the distance of f(x) from its minimum keep

@@ -39,8 +39,8 @@ from jaxcal.diagnostics.arrays import is_traced
 from jaxcal.runtime.array_types import Float
 from jaxcal.solvers.closed_form.certificate import Certificate, certify_point, tolerance
 from jaxcal.solvers.closed_form.reduced_objective import (
-    Constraints,
     ImageData,
+    QuadraticConstraints,
     ReducedObjective,
     image_data,
     reduce,
@@ -256,7 +256,7 @@ def _sphere_multiplier(squared: Float[np.ndarray, "6 6"], rhs: Float[np.ndarray,
     return max(edge, at)
 
 
-def feasible(x: Float[np.ndarray, 6], constraints: Constraints) -> Float[np.ndarray, 6]:
+def feasible(x: Float[np.ndarray, 6], constraints: QuadraticConstraints) -> Float[np.ndarray, 6]:
     """A point near x that satisfies the constraints: the nearest orthonormal pair, scaled."""
     pair = x.reshape(2, 3).T
     lengths = np.linalg.norm(pair, axis=0)

@@ -23,7 +23,7 @@ from hw.errors import RefusedError
 from hw.recorder import Recorder
 from hw.recording_check import check_resumable, read_progress
 from hw.recording_file import RecordingWriter
-from hw.recording_layout import LAYOUT, Header
+from hw.recording_layout import LAYOUT, RecordingHeader
 from hw.resuming import compare, described
 from hw.robot.limits import Limits
 from hw.setup import Setup, load_setup
@@ -31,7 +31,7 @@ from jaxcal.cli.main import main as study
 from jaxcal.io.toml import parse_toml
 
 PROBE = {"kind": "linear", "elements": 8, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
-HEADER = Header(kind="time_of_flight", probe=PROBE)
+HEADER = RecordingHeader(kind="time_of_flight", probe=PROBE)
 
 EVIL = "open({mark!r}, 'a').write(__name__ + chr(10))\nraise SystemExit('a stranger ran')\n"
 SHADOWED = (
@@ -410,7 +410,7 @@ def interrupted(path: Path, setup: Setup, *, old: bool = False) -> None:
     settings = {"request": {"images": 4}}
     if not old:
         settings["bench"] = described(setup, targets)
-    header = Header(kind="time_of_flight", probe=attributes, settings=json.dumps(settings))
+    header = RecordingHeader(kind="time_of_flight", probe=attributes, settings=json.dumps(settings))
     writer = RecordingWriter.create(path, header)
     writer.put("plan", "targets", targets, "mm")
     select(writer, 0, probe.elements)
