@@ -77,6 +77,9 @@ from jaxcal.runtime import executables
 # who have 32. Not by the environment: processes that the tests start are users'.
 jax.config.update("jax_enable_x64", True)
 
+# Tracing makes millions of objects that die young; looking through all others takes a tenth of it.
+gc.set_threshold(50_000, 20, 50)
+
 REAL_DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
