@@ -125,11 +125,34 @@ def angle(first: np.ndarray, second: np.ndarray) -> float:
 
 
 LONGEST = (
-    "test_cli", "test_channels", "test_study", "test_solvers", "test_robust", "test_crosswire",
-    "test_resampling", "test_acquire", "test_observability_sets", "test_auto", "test_batches",
-    "test_live", "test_observability", "test_recorder", "test_pivot", "test_report",
+    "test_solvers",
+    "test_study",
     "test_normal_equations",
-)  # fmt: skip
+    "test_cli",
+    "test_motion",
+    "test_operator",
+    "test_acquire",
+    "test_guest",
+    "test_view",
+    "test_stream",
+    "test_files",
+    "test_stops",
+    "test_buckets",
+    "test_robust",
+    "test_report",
+    "test_accuracy",
+    "test_observability",
+    "test_recorder",
+    "test_observability_sets",
+    "test_crosswire",
+    "test_auto",
+    "test_pivot",
+    "test_midplane",
+    "test_live",
+    "test_channels",
+    "test_batches",
+    "test_resampling",
+)
 """Modules that take longest, which start first: no worker is left alone with one at the end."""
 
 
