@@ -238,7 +238,9 @@ def _cayley(vector: Float[Array, "3 lanes"]) -> Float[Array, "3 3 lanes"]:
 
 def picked(array: Float[Array, "k ..."], places: np.ndarray) -> Float[Array, "*places ..."]:
     """The entries at known places of the first axis, in one operation."""
-    return array.at[places].get(mode="promise_in_bounds")
+    # Without a sign: JAX would add the size to negative ones, in the integers of whoever traced
+    # that first, whose bits may be others than ours.
+    return array.at[places.astype(np.uint32)].get(mode="promise_in_bounds")
 
 
 def _extra_names(blocks: Blocks) -> list[str]:
