@@ -13,7 +13,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from jaxcal.data.problem import ChannelDistances as Heard
+from jaxcal.data.problem import Channels as Heard
 from jaxcal.data.problem import Problem
 from jaxcal.model import derivatives, unrolled
 from jaxcal.model.batch import ImagePlanes, Iterate, targets, total

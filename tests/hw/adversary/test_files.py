@@ -57,11 +57,11 @@ from hw.bench.arm import Arm
 from hw.bench.robot import START, RobotProcess
 from hw.bench.run import start_bench
 from hw.recorder import Recorder
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from hw.robot._process import spawn
 
 probe = {"kind": "linear", "elements": 8, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
-with Recorder("rec.h5", Header(kind="time_of_flight", probe=probe)) as recorder:
+with Recorder("rec.h5", RecordingHeader(kind="time_of_flight", probe=probe)) as recorder:
     recorder.finish()
 mover = spawn("hw.robot._mover", stdin=True)
 mover.communicate()
@@ -270,10 +270,10 @@ import sys
 from types import SimpleNamespace
 import numpy as np
 from hw.recorder import Recorder
-from hw.recording_layout import Header
+from hw.recording_layout import RecordingHeader
 from jaxcal import CalibrationError
 probe = {"kind": "linear", "elements": 8, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
-recorder = Recorder(sys.argv[1], Header(kind="time_of_flight", probe=probe))
+recorder = Recorder(sys.argv[1], RecordingHeader(kind="time_of_flight", probe=probe))
 frame = np.full((128, 128), 7, np.uint8)
 try:
     for k in range(4000):
