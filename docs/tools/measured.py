@@ -379,11 +379,11 @@ claim(
 claim(
     ACCURACY,
     "with exact data, {} cells of {} are above 1.20. On 1000 draws of their own they are at "
-    "{:.2f}, {:.2f} and {:.2f}:",
+    "{:.2f} to {:.2f}:",
     lambda: (
         sum(v > 1.2 for v in bayes("50")),
         len(bayes("50")),
-        *column("bayes_limit_again", BAYES),
+        *span(column("bayes_limit_again", BAYES)),
     ),
 )
 claim(
