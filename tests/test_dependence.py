@@ -11,6 +11,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal.data.problem import Channels
@@ -202,3 +203,17 @@ def test_correlated_errors_widen_the_covariance(frames, monkeypatch):
         lines = wide[k].linearisation
         inverse = np.linalg.inv(np.asarray(lines.information))
         np.testing.assert_allclose(np.sqrt(np.diag(inverse)[:6] * lines.variance), wider, rtol=1e-6)
+
+
+def test_negligible_errors_cost_no_images_however_slowly_they_change():
+    """A planned target in the plane leaves offsets of hundredths of a mm: the fit's own error."""
+    rng = np.random.default_rng(3)
+    count = 60
+    t = np.linspace(0, 6, count)
+    turns = 0.4 * np.column_stack([np.sin(t), np.cos(1.3 * t), np.sin(0.7 * t)])
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+    q = np.column_stack([15 * np.sin(2 * t), np.zeros(count), 50 + 25 * np.cos(t)])
+    poses[:, :3, 3] = [10.0, 20.0, 30.0] - np.einsum("nij,nj->ni", poses[:, :3, :3], q)
+    points = q[:, [0, 2]] + rng.normal(0, 0.2, (count, 2))
+    assert independent(make_images(poses, points))[1].images == count

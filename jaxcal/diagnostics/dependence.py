@@ -322,13 +322,21 @@ def _middle(values: np.ndarray, name: str) -> Any:
     return values.mean(axis=0)
 
 
+NEGLIGIBLE = 0.01
+"""Share of the mean square error below which a kind of error is not looked at: a tenth in size."""
+
+
 def _stride(data: Images | Problem, estimate: tuple[str, ...]) -> int:
     """Every which image of a stream is worth keeping; 1 for other recordings."""
     errors = conventional_errors(data, estimate)
     if errors is None:
         return 1
     time = 1.0
-    for values in clipped(errors).T:
+    cut = clipped(errors)
+    for values in cut.T:
+        # Errors that are nothing beside the others cost no images, however slowly they change.
+        if np.var(values) < NEGLIGIBLE * np.sum(np.var(cut, axis=0)):
+            continue
         correlation = autocorrelation(values)
         if correlation[1] * np.sqrt(len(values)) > SURE:
             time = max(time, correlation_time(correlation))
