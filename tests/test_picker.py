@@ -19,11 +19,11 @@ import pytest
 import jaxcal
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.cli.main import main
+from jaxcal.io.picker.frames import Frames
+from jaxcal.io.picker.picks import Picks
+from jaxcal.io.picker.server import Picker
 from jaxcal.io.png import encode_png, read_png
 from jaxcal.io.sequence_files import read_sequence, write_sequence
-from jaxcal.picker.frames import Frames
-from jaxcal.picker.picks import Picks
-from jaxcal.picker.server import Picker
 
 sys.path.insert(0, str(Path(__file__).parent / "hw"))
 from browser import addresses, browsing, screenshot

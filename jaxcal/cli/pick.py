@@ -39,9 +39,9 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
     PICKS.csv is beside SOURCE and has its name.
     """
     from jaxcal.io.importing import ImportOptions, frames_to_show, open_sequence
-    from jaxcal.picker.frames import Frames
-    from jaxcal.picker.picks import Picks
-    from jaxcal.picker.server import Picker
+    from jaxcal.io.picker.frames import Frames
+    from jaxcal.io.picker.picks import Picks
+    from jaxcal.io.picker.server import Picker
 
     asked = ImportOptions(**options)
     sequence, _ = open_sequence(frames, asked)

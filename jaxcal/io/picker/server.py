@@ -19,8 +19,8 @@ from socketserver import TCPServer
 from typing import Any
 
 from jaxcal import CalibrationError, InputError
-from jaxcal.picker.frames import Frames
-from jaxcal.picker.picks import Picks
+from jaxcal.io.picker.frames import Frames
+from jaxcal.io.picker.picks import Picks
 
 HOST = "127.0.0.1"
 _LARGEST_BODY = 4096
@@ -161,7 +161,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         if rest in _PAGE:
             name, kind = _PAGE[rest]
-            self._answer(files("jaxcal.picker").joinpath(name).read_bytes(), kind)
+            self._answer(files("jaxcal.io.picker").joinpath(name).read_bytes(), kind)
         elif rest == "state":
             with self.page.lock:
                 self._json(self.page.state())
