@@ -29,10 +29,10 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import special
 
 from jaxcal import InputError
 from jaxcal.data.sound import WATER_M_S
-from jaxcal.diagnostics import probability
 from jaxcal.diagnostics.arrays import array_module, traceable
 from jaxcal.diagnostics.image_points import point_jacobian
 from jaxcal.diagnostics.uncertainty import TUNED
@@ -101,7 +101,11 @@ def transform_intervals(
     """
     _check_level(level)
     left = np.asarray(degrees_of_freedom(calibration), float)
-    factor = probability.student_quantile(left, 0.5 + 0.5 * level)
+    factor = np.where(
+        np.isfinite(left),
+        special.stdtrit(np.where(np.isfinite(left), left, 1.0), 0.5 + 0.5 * level),
+        special.ndtri(0.5 + 0.5 * level),
+    )
     variance = np.diagonal(calibration.numpy().covariance, axis1=-2, axis2=-1)
     return factor[..., None] * np.sqrt(variance)
 
@@ -339,7 +343,7 @@ def _directions(dimensions: int) -> Float[np.ndarray, "d k"]:
         golden = (1 + golden) ** (1 / (dimensions + 1))
     steps = golden ** -np.arange(1, dimensions + 1)
     uniform = (0.5 + np.arange(1, DIRECTIONS + 1)[:, None] * steps) % 1.0
-    normal = probability.normal_quantile(np.clip(uniform, 1e-9, 1 - 1e-9))
+    normal = special.ndtri(np.clip(uniform, 1e-9, 1 - 1e-9))
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
@@ -389,9 +393,9 @@ def _radial(dimensions: int, freedom: float) -> _Radial:
     first, last = np.log(1e-9), np.log(1e9)
     square = np.exp(np.linspace(first, last, _RADII))
     if np.isfinite(freedom):
-        below = probability.f_below(dimensions, freedom, square / dimensions)
+        below = special.fdtr(dimensions, freedom, square / dimensions)
     else:
-        below = probability.chi_squared_below(dimensions, square)
+        below = special.chdtr(dimensions, square)
     return _Radial(float(first), float(last), below, np.diff(below, append=below[-1]))
 
 

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal.calibration.result import Status
-from jaxcal.diagnostics.probability import student_quantile
 from jaxcal.study.pipeline import bound_mm
 from jaxcal.study.spec import Condition, Spec
 from jaxcal.study.store import Store
@@ -106,7 +105,9 @@ def mean_interval(values: np.ndarray) -> tuple[float, float, float] | None:
     if len(values) < 2:
         return None
     mean, error = values.mean(), values.std(ddof=1) / np.sqrt(len(values))
-    half = float(student_quantile(len(values) - 1, 0.5 + CONFIDENCE / 2)) * error
+    from scipy.special import stdtrit
+
+    half = stdtrit(len(values) - 1, 0.5 + CONFIDENCE / 2) * error
     return float(mean), float(mean - half), float(mean + half)
 
 
