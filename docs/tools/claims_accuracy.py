@@ -1,0 +1,432 @@
+"""Claims of the README, the overview and the page on accuracy."""
+
+from __future__ import annotations
+
+import statistics
+
+from claims import (
+    ACCURACY,
+    AUTO,
+    BAYES,
+    FITTED,
+    INDEX,
+    LAWS,
+    ONE_SIDED,
+    README,
+    auto,
+    bayes,
+    cells,
+    claim,
+    column,
+    compared,
+    covered,
+    crosswire_halves,
+    number,
+    only,
+    percent,
+    placed,
+    poses,
+    quantity,
+    span,
+    spoilt,
+    table,
+    tre_span,
+    trials,
+    worst_spoilt,
+)
+
+claim(
+    README,
+    "| error against conventional calibration, on average, in {} conditions | {:.2f} to {:.2f} of "
+    "it |",
+    lambda: (len(auto()), *span(auto())),
+)
+claim(
+    README,
+    "| error against the best possible (the Bayes limit), median of {} conditions | "
+    "{:.2f} times it |",
+    lambda: (len(bayes("50")), statistics.median(bayes("50"))),
+)
+claim(
+    README,
+    "| 95 % intervals that cover the truth, each of 6 parameters in {} conditions | "
+    "{:.1f} to {:.1f} % |",
+    lambda: (len(table("coverage")), *covered()),
+)
+claim(
+    INDEX,
+    "| {:.2f} to {:.2f} of its mean error, in {} simulated conditions |",
+    lambda: (*span(auto()), len(auto())),
+)
+claim(
+    INDEX,
+    "| {:.2f} times the Bayes limit's error (median of {} conditions), {:.2f} at worst |",
+    lambda: (statistics.median(bayes("50")), len(bayes("50")), max(bayes("50"))),
+)
+claim(INDEX, "95 % intervals cover in {:.1f} to {:.1f} % |", covered)
+claim(
+    INDEX,
+    "95 % intervals of TRE hold in {:.1f} to {:.1f} % for offsets of mean zero; the predicted TRE "
+    "is {:.2f} to {:.2f} times the actual one |",
+    lambda: (*percent(tre_span("held_at_points")), *tre_span("predicted_over_actual")),
+)
+claim(
+    INDEX,
+    "| {:.2f} times the error without the spoilt images, at worst |",
+    lambda: [number(worst_spoilt(), "robust_over_oracle")],
+)
+claim(
+    INDEX,
+    "| {} of {} cells within the paper's mean +- 1 SD, with two choices fitted |",
+    lambda: (sum(cells(FITTED)[::2]), sum(cells(FITTED)[1::2])),  # type: ignore[arg-type]
+)
+claim(
+    INDEX,
+    "| never above in {:.0f} problems; {:.0f} steps against {:.0f} rounds |",
+    lambda: (
+        quantity("same_objective_summary", "problems"),
+        only("same_objective_convergence", "iterations_to_best_median", arm="joint"),
+        only("same_objective_convergence", "iterations_to_best_median", arm="alternation"),
+    ),
+)
+claim(
+    INDEX,
+    "| {:.2f} to {:.2f} of conventional's error |",
+    lambda: span(column("curvilinear_joint", "joint_over_conventional")),
+)
+claim(
+    INDEX,
+    "| precision within {:.0f} % of knowing both |",
+    lambda: [100 * max(abs(v - 1) for v in column("sound_speed_delay", "rp_estimated_over_known"))],
+)
+claim(
+    INDEX,
+    "| {:.3f} mm against {:.3f} mm by a steady hand |",
+    lambda: (placed("amplitude scan"), placed("free hand")),
+)
+claim(
+    INDEX,
+    "| {:,.0f} on two cores |",
+    lambda: [round(trials("jaxcal study: trials a second, two cores"), -2)],
+)
+
+# Accuracy.
+claim(
+    ACCURACY,
+    "Over conventional's, at worst {:.2f} for uniform offsets, {:.2f} for normal, {:.2f} for "
+    "one-sided, {:.2f} for heavy-tailed and {:.2f} for triangular ones.",
+    lambda: [
+        max(column("auto_grid", AUTO, elevation_distribution=law, images="50")) for law in LAWS
+    ],
+)
+claim(
+    ACCURACY,
+    "With 12, 20 and 200 images at worst {:.2f}, {:.2f} and {:.2f}. So it is above 1 in none of "
+    "{} cells. From points without covariances: at worst {:.2f}.",
+    lambda: (
+        *(max(column("auto_grid", AUTO, images=images)) for images in ("12", "20", "200")),
+        len(auto()),
+        max(column("auto_grid", "auto_points_over_conventional")),
+    ),
+)
+
+
+def _points_over_alternating() -> list[float]:
+    rows = [row for row in table("auto_grid") if row["auto_points_over_alternating"] != "nan"]
+    worst = max(rows, key=lambda row: number(row, "auto_points_over_alternating"))
+    (again,) = table("auto_grid_again")
+    return [
+        number(row, f"auto_points_over_alternating{end}")
+        for row, ends in ((worst, ("", "_ci95_half")), (again, ("", "_ci95_half")))
+        for end in ends
+    ]
+
+
+claim(
+    ACCURACY,
+    "is better in none: over it, at worst {:.2f}.",
+    lambda: [max(column("auto_grid", "auto_over_alternating"))],
+)
+claim(
+    ACCURACY,
+    "From points without covariances {:.2f} +- {:.2f} in one cell; on 4000 draws of its own that "
+    "cell is at {:.2f} +- {:.2f}.",
+    _points_over_alternating,
+)
+
+
+def _hindsight() -> list[object]:
+    ratio = column("auto_grid", "hindsight_over_auto")
+    return [sum(v < 1 for v in ratio), len(ratio), min(ratio)]
+
+
+claim(
+    ACCURACY,
+    "is ahead in {} of {} cells, at best by a factor of {:.2f}:",
+    _hindsight,
+)
+
+
+def _loses() -> list[float]:
+    # Without offsets there is nothing to be better at.
+    rows = [row for row in table("auto_grid") if float(row["elevation_mm"]) > 0]
+    return [100 * max(number(row, "auto_loses") for row in rows)]
+
+
+claim(ACCURACY, "in {:.0f} % of the trials of the worst cell.", _loses)
+claim(
+    ACCURACY,
+    "Over conventional's {:.2f} to {:.2f}; the three estimated SDs are {:.3f} to {:.3f} of what "
+    "was realised.",
+    lambda: (
+        *span(column("self_tuned_grid", "joint_over_conventional")),
+        *span(
+            value
+            for name in ("lateral", "range", "elevation")
+            for value in column("self_tuned_grid", f"sigma_{name}_over_realised")
+        ),
+    ),
+)
+SELF_TUNED = "joint, self-tuned"
+claim(
+    ACCURACY,
+    "{} conditions, 448 trials each: significantly better than conventional in {}, and "
+    "significantly worse in {}: one-sided offsets of 5 mm at 0.5 mm noise ({:.2f} times).",
+    lambda: (
+        compared(SELF_TUNED, "cells"),
+        compared(SELF_TUNED, "cells_better"),
+        compared(SELF_TUNED, "cells_worse"),
+        max(column("alternating_vs_joint_summary", "worst_ratio", method=SELF_TUNED)),
+    ),
+)
+claim(
+    ACCURACY,
+    "auto's mean error is {:.2f} times the limit's in the median, {:.2f} at worst. With 12 images "
+    "{:.2f} to {:.2f}, with 20 images {:.2f} to {:.2f}.",
+    lambda: (
+        statistics.median(bayes("50")),
+        max(bayes("50")),
+        *span(bayes("12")),
+        *span(bayes("20")),
+    ),
+)
+claim(
+    ACCURACY,
+    "with exact data, {} cells of {} are above 1.20. On 1000 draws of their own they are at "
+    "{:.2f} to {:.2f}:",
+    lambda: (
+        sum(v > 1.2 for v in bayes("50")),
+        len(bayes("50")),
+        *span(column("bayes_limit_again", BAYES)),
+    ),
+)
+claim(
+    ACCURACY,
+    "1000 trials a condition, in {} conditions:",
+    lambda: [len(table("coverage"))],
+)
+claim(
+    ACCURACY,
+    "in {:.1f} to {:.1f} % of the trials with 50 images, and in {:.1f} to {:.1f} % with 12. The "
+    "predicted target registration error is {:.2f} to {:.2f} times the actual one, on average.",
+    lambda: (
+        *covered(images="50"),
+        *covered(images="12"),
+        *span(column("coverage", "predicted_over_actual")),
+    ),
+)
+claim(
+    ACCURACY,
+    "with the present `auto`: {:.0f} recordings of {:.0f} images a condition, offsets of {:g} and "
+    "{:g} mm, {:g} mm of noise.",
+    lambda: (
+        only("tre_calibration", "trials", **ONE_SIDED, elevation_mm="5"),
+        only("tre_calibration", "images", **ONE_SIDED, elevation_mm="5"),
+        *span(column("tre_calibration", "elevation_mm")),
+        only("tre_calibration", "noise_mm", **ONE_SIDED, elevation_mm="5"),
+    ),
+)
+claim(
+    ACCURACY,
+    "the 95 % interval of TRE at an image point holds the actual one in {:.1f} to {:.1f} %. The "
+    "predicted TRE is {:.2f} to {:.2f} times the actual one:",
+    lambda: (*percent(tre_span("held_at_points")), *tre_span("predicted_over_actual")),
+)
+claim(
+    ACCURACY,
+    "One-sided offsets of 5 mm: {:.1f} %; of 1.5 mm: {:.1f} %,",
+    lambda: percent(
+        [
+            only("tre_calibration", "held_at_points", **ONE_SIDED, elevation_mm=size)
+            for size in ("5", "1.5")
+        ]
+    ),
+)
+claim(
+    ACCURACY,
+    "The error is at worst {:.2f} +- {:.2f} times that of the same images without the spoilt "
+    "ones. At least {:.1f} % of these are named, and at most {:.1f} % of the clean images. Of "
+    "clean data it is {:.2f} to {:.2f} times.",
+    lambda: (
+        number(worst_spoilt(), "robust_over_oracle"),
+        number(worst_spoilt(), "ci95_half_of_ratio"),
+        100 * min(number(row, "named") for row in spoilt()),
+        100 * max(column("outliers", "false_alarms")),
+        *span(column("outliers", "robust_over_oracle", fraction="0")),
+    ),
+)
+claim(
+    ACCURACY,
+    "pass for noise in {} of {} trials ({:.2f} +- {:.2f})",
+    lambda: (
+        worst_spoilt("slip")["trials_with_one_left_in"],
+        worst_spoilt("slip")["trials"],
+        number(worst_spoilt("slip"), "robust_over_oracle"),
+        number(worst_spoilt("slip"), "ci95_half_of_ratio"),
+    ),
+)
+
+
+def _crosswire(*names: str) -> list[float]:
+    return [quantity("crosswire_real", name) for name in names]
+
+
+claim(
+    ACCURACY,
+    "reaches an RMS of {:.3f} mm. The default (prior auto) finds errors of {:.2f} mm "
+    "lateral, {:.2f} mm axial and {:.2f} mm elevational (SD)",
+    lambda: _crosswire(
+        "conventional_rms_mm", "sigma_lateral_mm", "sigma_range_mm", "sigma_elevation_mm"
+    ),
+)
+claim(
+    ACCURACY,
+    "the two methods are alike: {:.2f} mm (conventional) and {:.2f} mm.",
+    lambda: _crosswire("held_out_rms_conventional_mm", "held_out_rms_joint_mm"),
+)
+claim(
+    ACCURACY,
+    "beat one by {:.1f} +- {:.1f} in leave-one-out log-likelihood. Elevational errors have "
+    "kurtosis {:.1f}, range errors {:.1f};",
+    lambda: _crosswire(
+        "log_density_gained",
+        "log_density_gained_standard_error",
+        "kurtosis_elevation",
+        "kurtosis_range",
+    ),
+)
+claim(
+    ACCURACY,
+    "moves X by at most {:.2f} of its stated SD, 200 bootstrap samples scatter by {:.2f} of it and "
+    "none by more than {:.1f}; precision on images not used is {:.3f} times conventional's.",
+    lambda: _crosswire(
+        "joint_left_out_largest_shift_sds",
+        "joint_bootstrap_scatter_sds",
+        "joint_bootstrap_largest_sds",
+        "precision_not_used_over_conventional",
+    ),
+)
+claim(
+    ACCURACY,
+    "mean of the offsets (probability {:.2f}), since the residuals are heavy-tailed and alike in "
+    "successive images: {:.2f} of what they say",
+    lambda: _crosswire("mean_probability", "mean_trust"),
+)
+claim(
+    ACCURACY,
+    "({:.0f} of {:.0f}) and fits to {:.3f} mm; its clean twin to {:.3f} mm. The two tips differ by "
+    "{:.2f} mm.",
+    lambda: _crosswire(
+        "pivot_outliers_named",
+        "pivot_outliers_poses",
+        "pivot_outliers_robust_rms_mm",
+        "pivot_clean_rms_mm",
+        "pivot_tips_apart_mm",
+    ),
+)
+claim(
+    ACCURACY,
+    "Joint calibration, {:.3f} mm with the amplitude scan, {:.3f} mm with pattern injection, "
+    "{:.3f} mm with the threshold climb, {:.3f} mm with a steady free hand. Without placement "
+    "{:.2f} mm (by hand) and {:.2f} mm (by robot,",
+    lambda: [
+        placed(name)
+        for name in (
+            "amplitude scan", "pattern injection", "threshold climb", "free hand", "none, by hand",
+            "none, by robot",
+        )
+    ],
+)  # fmt: skip
+claim(
+    ACCURACY,
+    "has {:.2f} to {:.2f} of conventional's mean error, and the sign of {:.1f} to {:.1f} %",
+    lambda: (
+        *span(column("curvilinear_joint", "joint_over_conventional")),
+        *percent(span(column("curvilinear_joint", "right_signs"))),
+    ),
+)
+claim(
+    ACCURACY,
+    "is harmful: {:.2f} to {:.0f} times conventional's.",
+    lambda: span(column("curvilinear_joint", "paper_way_over_conventional")),
+)
+claim(
+    ACCURACY,
+    "within 2 reported SDs in {:.0f} to {:.0f} % of the trials, with a precision within {:.0f} % "
+    "of that with both known. Left at their nominal values, the error is {:.0f} to {:.0f} times as "
+    "large.",
+    lambda: (
+        *percent(
+            span(
+                v
+                for name in ("speed", "delay")
+                for v in column("sound_speed_delay", f"{name}_within_2sd")
+            )
+        ),
+        100 * max(abs(v - 1) for v in column("sound_speed_delay", "rp_estimated_over_known")),
+        *span(
+            number(row, "rp_wrong_mm") / number(row, "rp_known_mm")
+            for row in table("sound_speed_delay")
+        ),
+    ),
+)
+claim(
+    ACCURACY,
+    "Normalised squared errors are {:.2f} to {:.2f} (2 is exact), also with a fifth of the lines "
+    "missing.",
+    lambda: span(
+        column(
+            "segmentation_accuracy",
+            "mean_normalised_squared_error",
+            method=("least squares", "least squares, robust"),
+            data=("complete", "missing"),
+        )
+    ),
+)
+for cone, words in (
+    ("wide", "| 40 degrees (turn 90), {} "),
+    ("narrow", "| 10 degrees (turn 10), {} "),
+):
+    for images in ("12", "30", "60"):
+        claim(
+            ACCURACY,
+            words.format(images) + 5 * "| {:.2f} / {:.2f} " + "|",
+            lambda cone=cone, images=images: poses(cone, images),
+        )
+claim(
+    ACCURACY,
+    "with a precision of {:.2f} mm (TRE), {:.2f} (RP) and {:.2f} (D), joint with estimated scales.",
+    lambda: crosswire_halves("chosen_rp_mm"),
+)
+claim(
+    ACCURACY,
+    "The median of {:.0f} random halves is {:.2f} mm (5 to 95 %: {:.2f} to {:.2f}), and "
+    "{:.0f}, {:.0f} and {:.0f} % of them are better.",
+    lambda: (
+        *(crosswire_halves(name)[0] for name in (
+            "random_halves", "random_median_mm", "random_5_mm", "random_95_mm")),
+        *percent(crosswire_halves("share_better")),
+    ),
+)  # fmt: skip
+
+# The paper.
