@@ -64,6 +64,8 @@ def home(tmp_path, monkeypatch):
     """A cache of the test's own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("JAXCAL_NO_CACHE", raising=False)
+    # Of JAX's own cache, which the tests share, JAX says itself where it cannot be written.
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     executables.forget()
     traced.clear()
     yield tmp_path
