@@ -160,11 +160,13 @@ def replanned(cone: str, law: str, trials: int, rng: np.random.Generator) -> dic
     images = [taken(start, law, rng) for _ in range(trials)]
     found = {}
     for count in COUNTS[1:]:
-        results = solve(problems(*map(list, zip(*images, strict=True))), "auto")
+        batch = problems(*map(list, zip(*images, strict=True)))
+        results = solve(batch, "auto").numpy()
         for k, (poses, points) in enumerate(images):
             have = len(poses)
-            one = jaxcal.Recording(jaxcal.make_images(poses, points))
-            result = lane(results, k, have)
+            padded = (np.asarray(all_[k]) for all_ in (batch.poses, batch.measurements))
+            one = jaxcal.Recording(jaxcal.make_images(*padded, mask=np.arange(MOST) < have))
+            result = results[k]
             bounds = pool(cone).constraints
             candidates = design.candidates_around(one, result, count=1500, constraints=bounds)
             rules = Rules()
@@ -182,15 +184,6 @@ def taken_at(poses: np.ndarray, law: str, rng: np.random.Generator):
     centred = poses.copy()
     centred[:, :3, 3] += off[:, None] * (poses[:, :3, :3] @ MOUNT[:3, 1])
     return taken(centred, law, rng)
-
-
-def lane(results: jaxcal.Calibration, k: int, have: int) -> jaxcal.Calibration:
-    """One calibration of a batch, cut to its images."""
-    import jax
-
-    one = jax.tree.map(lambda leaf: np.asarray(leaf)[k], results)
-    names = ("elevation", "elevation_sd", "residual", "mask", "at_bound")
-    return replace(one, **{name: getattr(one, name)[:have] for name in names})
 
 
 def errors(found: np.ndarray, tests: np.ndarray, points: np.ndarray) -> tuple:

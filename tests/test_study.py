@@ -182,15 +182,29 @@ def test_the_grid_is_counted_in_order():
 def test_offsets_have_their_size(law):
     drawn = np.asarray(standard_offsets(jax.random.key(3), law, 200_000))
     assert np.std(drawn) == pytest.approx(standard_deviation(law), rel=0.03)
-    mean = 0.5 if law == "one-sided" else 0.0
-    assert np.mean(drawn) == pytest.approx(mean, abs=0.01)
+    mean = {"one-sided": 0.5, "exponential": 1.0, "off-centre": 3.0}.get(law, 0.0)
+    if law != "sometimes off-centre":
+        assert np.mean(drawn) == pytest.approx(mean, abs=0.03 if law == "drifting" else 0.01)
+    alike = np.corrcoef(drawn[1:], drawn[:-1])[0, 1]
+    assert alike == pytest.approx(0.9 if law == "drifting" else 0.0, abs=0.01)
+    if law == "two-humped":
+        assert np.mean(np.abs(drawn) < 0.25) < 0.01
+        return
     if law in ("uniform", "triangular", "one-sided"):
         assert np.abs(drawn).max() <= nominal_bound(law, 1.0) == 1.0
         assert np.abs(drawn).max() > 0.99
     else:
         assert nominal_bound(law, 2.0) == pytest.approx(2 * np.sqrt(3))
     kurtosis = np.mean((drawn - drawn.mean()) ** 4) / np.var(drawn) ** 2
-    assert (kurtosis > 4) == (law == "heavy-tailed")
+    assert (kurtosis > 4) == (law in ("heavy-tailed", "exponential", "outlying"))
+
+
+def test_one_recording_in_ten_is_off_centre():
+    keys = jax.random.split(jax.random.key(5), 4000)
+    drawn = jax.vmap(lambda key: standard_offsets(key, "sometimes off-centre", 100))(keys)
+    means = np.asarray(drawn).mean(axis=1)
+    # Of means N(0, 4), 80.3 % are more than half an SD away; of those of centred recordings none.
+    assert np.mean(np.abs(means) > 0.5) == pytest.approx(0.1 * 0.803, abs=0.013)
 
 
 def test_tracker_noise_has_its_size_and_moves_nothing_else():

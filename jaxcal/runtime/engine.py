@@ -29,6 +29,10 @@ BATCH_CHUNK = 64
 CHANNELS_CHUNK = 8
 """The same for solves on channels, whose problems are a hundred times larger."""
 
+ACCELERATOR_ROWS = 2**20
+"""On an accelerator, images (times elements, on channels) side by side: it needs all of its lanes
+filled, and half a million rows take some 2 GB of its memory."""
+
 FEW_PROBLEMS = 1024
 """Up to so many problems of a batch are padded to a bucket of images."""
 
@@ -94,7 +98,7 @@ def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | N
     shape = problems.batch_shape
     problems = with_bound(problems, given)
     flat = map_arrays(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
-    largest = chunk or (CHANNELS_CHUNK if plan.channels else BATCH_CHUNK)
+    largest = chunk or _side_by_side(problems, given, plan)
     count = flat.mask.shape[0]
     if count and _is_kept(problems, given, plan):
         result = _solve_chunks_kept(flat, given, plan, largest)
@@ -102,6 +106,22 @@ def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | N
         result = _solve_chunks_compiled(flat, given, plan, largest)
     result = map_arrays(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
     return result.with_problem(problems)
+
+
+def _side_by_side(problems: Problem, given: Given, plan: SolvePlan) -> int:
+    """How many problems are solved at once, unless the caller says."""
+    import jax
+
+    if inside_transformation(problems, given):
+        platform = jax.default_backend()
+    else:
+        platform = _devices(problems)[0].platform
+    if platform == "cpu":
+        return CHANNELS_CHUNK if plan.channels else BATCH_CHUNK
+    rows = problems.images
+    if plan.channels and problems.channels is not None:
+        rows *= problems.channels.distances.shape[-1]
+    return max(ACCELERATOR_ROWS // max(rows, 1), 1)
 
 
 def _solve_chunks_kept(

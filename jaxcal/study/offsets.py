@@ -8,6 +8,15 @@ Every law has one size in mm, a bound m or a standard deviation s:
     normal        of SD s
     heavy-tailed  Student's t with four degrees of freedom, scaled to SD s
 
+Those do not favour an estimator's laws, but no estimator of ours was made for these either:
+
+    exponential   of SD s, and so of mean s: mostly near the plane, always on the same side
+    two-humped    half of them near -m, half near m, each hump of SD m / 4
+    drifting      normal, of SD s, alike in successive images: correlation 0.9 from one to the next
+    outlying      normal, of SD s, one in ten drawn from a normal five times as wide
+    off-centre    normal, of SD s, with a mean of 3 s
+    sometimes off-centre  normal, of SD s, one time in ten with a mean that is normal, of SD 2 s
+
 One draw is a pure function of a key, so a law is the only thing that differs between two studies of
 the same seed.
 """
@@ -24,14 +33,36 @@ from jaxtyping import Array, Float, Key
 from jaxcal import InputError
 from jaxcal.study import draws
 
-OffsetLaw = Literal["uniform", "normal", "one-sided", "heavy-tailed", "triangular"]
+OffsetLaw = Literal[
+    "uniform",
+    "normal",
+    "one-sided",
+    "heavy-tailed",
+    "triangular",
+    "exponential",
+    "two-humped",
+    "drifting",
+    "outlying",
+    "off-centre",
+    "sometimes off-centre",
+]
 
 OFFSET_LAWS: tuple[OffsetLaw, ...] = get_args(OffsetLaw)
 
 DEGREES_OF_FREEDOM = 4.0
 """Of the heavy-tailed law: the fewest whole ones with a variance that settles in a sample."""
 
-_SIZED_BY_SD = ("normal", "heavy-tailed")
+_BOUNDED = ("uniform", "one-sided", "triangular", "two-humped")
+_HUMP = 0.25
+"""SD of a hump over its distance from the plane."""
+_ALIKE = 0.9
+"""Correlation of the drifting law between successive images."""
+_OUTLYING, _WIDER = 0.1, 5.0
+"""Share of the outlying offsets, and how much wider their law is."""
+_FAR = 3.0
+"""Mean of the off-centre law."""
+_SOMETIMES, _MEAN_SD = 0.1, 2.0
+"""How often the sometimes off-centre law has a mean, and its SD: what prior ``auto`` believes."""
 
 
 def check_law(law: str) -> None:
@@ -66,6 +97,30 @@ def standard_offsets(key: Key[Array, ""], law: OffsetLaw, count: int) -> Float[A
         return unit * draws.normals(key, 0, count) * jax.lax.rsqrt(chi_square)
     if law == "one-sided":
         return draws.uniforms(key, 0, count)
+    if law == "exponential":
+        return -jnp.log(draws.uniforms(key, 0, count))
+    if law == "two-humped":
+        side = jnp.sign(draws.uniforms(key, 1, count) - 0.5)
+        return side + _HUMP * draws.normals(key, 0, count)
+    if law == "drifting":
+        steps = draws.normals(key, 0, count)
+        fresh = np.sqrt(1 - _ALIKE**2)
+
+        def move(last: Array, step: Array) -> tuple[Array, Array]:
+            now = _ALIKE * last + fresh * step
+            return now, now
+
+        return jnp.append(steps[:1], jax.lax.scan(move, steps[0], steps[1:])[1])
+    if law == "outlying":
+        wide = draws.uniforms(key, 1, count) < _OUTLYING
+        unit = (1 + _OUTLYING * (_WIDER**2 - 1)) ** -0.5
+        return unit * jnp.where(wide, _WIDER, 1.0) * draws.normals(key, 0, count)
+    if law == "off-centre":
+        return _FAR + draws.normals(key, 0, count)
+    if law == "sometimes off-centre":
+        there = draws.uniforms(key, 1, 1) < _SOMETIMES
+        mean = jnp.where(there, _MEAN_SD * draws.normals(key, 2, 1), 0.0)
+        return mean + draws.normals(key, 0, count)
     if law == "triangular":
         pair = draws.uniforms(key, 0, 2 * count).reshape(2, count)
         return pair[0] - pair[1]
@@ -75,15 +130,20 @@ def standard_offsets(key: Key[Array, ""], law: OffsetLaw, count: int) -> Float[A
 def nominal_bound(law: OffsetLaw, size: float) -> float:
     """The bound that a method is told when it is told "the true one", mm.
 
-    It is m itself where the law has one. Normal and heavy-tailed offsets have none: sqrt(3) s is
-    the bound of the uniform law with the same SD.
+    It is m itself where the law has one. Laws of an SD have none: sqrt(3) s is the bound of the
+    uniform law with the same SD.
     """
     check_law(law)
-    return float(np.sqrt(3.0)) * size if law in _SIZED_BY_SD else size
+    return size if law in _BOUNDED else float(np.sqrt(3.0)) * size
 
 
 def standard_deviation(law: OffsetLaw) -> float:
-    """SD about the mean of a law of size 1."""
+    """SD about the mean of one recording's offsets, for a law of size 1."""
     check_law(law)
-    squares = {"uniform": 1 / 3, "one-sided": 1 / 12, "triangular": 1 / 6}
+    squares = {
+        "uniform": 1 / 3,
+        "one-sided": 1 / 12,
+        "triangular": 1 / 6,
+        "two-humped": 1 + _HUMP**2,
+    }
     return float(jnp.sqrt(squares.get(law, 1.0)))

@@ -9,7 +9,7 @@
     images = 50               # calibration images
     test_images = 50          # noise-free in-plane test images
     elevation_mm = [0.5, 1]   # size of the elevational offsets: bound or SD (jaxcal.study.offsets)
-    elevation_distribution = "uniform"  # or normal, one-sided, heavy-tailed, triangular; or a list
+    elevation_distribution = "uniform"  # or another of jaxcal.study.offsets; or a list
     noise_mm = [0, 2]         # SD of the noise on every element's distance
     lateral_mm = 29.25        # the target's lateral position is uniform within +- this
     depth_min_mm = 10         # its depth is uniform between this
