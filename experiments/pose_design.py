@@ -164,8 +164,9 @@ def replanned(cone: str, law: str, trials: int, rng: np.random.Generator) -> dic
         results = solve(batch, "auto").numpy()
         for k, (poses, points) in enumerate(images):
             have = len(poses)
-            padded = (np.asarray(all_[k]) for all_ in (batch.poses, batch.measurements))
-            one = jaxcal.Recording(jaxcal.make_images(*padded, mask=np.arange(MOST) < have))
+            all_poses, all_points = np.asarray(batch.poses[k]), np.asarray(batch.measurements[k])
+            used = np.arange(MOST) < have
+            one = jaxcal.Recording(jaxcal.make_images(all_poses, all_points, mask=used))
             result = results[k]
             bounds = pool(cone).constraints
             candidates = design.candidates_around(one, result, count=1500, constraints=bounds)

@@ -106,8 +106,8 @@ ONE_SIDED = {"elevation_distribution": "one-sided"}
 
 def tre_span(name: str) -> tuple[float, float]:
     """Least and largest of a column of tre_calibration, for the laws of mean zero."""
-    rows = table("tre_calibration")
-    return span(float(row[name]) for row in rows if row["elevation_distribution"] != "one-sided")
+    centred = tuple(law for law in LAWS if law != "one-sided")
+    return span(column("tre_calibration", name, elevation_distribution=centred))
 
 
 def covered(**where: str) -> tuple[float, ...]:

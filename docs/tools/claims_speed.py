@@ -67,6 +67,78 @@ claim(
         _segmentation("robust", "median_ratio"),
     ),
 )
+
+
+def _accelerator(method: str, prior: str) -> float:
+    found = only("accelerator", "problems_per_s", method=method, prior=prior, images="20")
+    return round(found, -3)
+
+
+claim(
+    SPEED,
+    "batches of {:,.0f} problems of {:.0f} images in float64 on an NVIDIA H100: {:,.0f} "
+    "conventional calibrations a second, {:,.0f} self-tuned Gaussian ones, {:,.0f} with prior "
+    "auto. That is {:.1f} to {:.1f} times what all {:.0f} cores",
+    lambda: (
+        max(column("accelerator", "problems")),
+        min(column("accelerator", "images")),
+        _accelerator("conventional", "auto"),
+        _accelerator("joint", "gaussian"),
+        _accelerator("joint", "auto"),
+        *span(column("accelerator", "ratio")),
+        max(column("accelerator", "cores")),
+    ),
+)
+OURS, FAR, FITTED = "calibrate_batch", "20 degrees, 20 mm off", "conventional fit"
+
+
+def _over(peer: str, start: str = FAR) -> float:
+    """How many times as long as ours a peer takes."""
+    over = "calibrate_batch_over_it_median"
+    return only("solver_peers", over, solver=peer, start=start, images="50")
+
+
+claim(
+    SPEED,
+    "solves {:,.0f} problems a second. That is {:.1f} times as many as Ceres (DENSE_SCHUR), "
+    "{:.1f} times its TinySolver, {:.0f} times scipy with exact Jacobians and {:.0f} times "
+    "optimistix;",
+    lambda: (
+        round(
+            only("solver_peers", "solves_per_s_median", solver=f"{OURS}, given SDs", images="50"),
+            -2,
+        ),
+        _over("Ceres DENSE_SCHUR, 1e-9"),
+        _over("Ceres TinySolver, 1e-9"),
+        _over("scipy lm"),
+        _over("optimistix LM, vmapped"),
+    ),
+)
+claim(
+    SPEED,
+    "Ceres takes {:.1f} times as long as all of ours (TinySolver: {:.1f}).",
+    lambda: (
+        _over("Ceres DENSE_SCHUR, 1e-9, from the conventional fit", FITTED),
+        _over("Ceres TinySolver, 1e-9, from the conventional fit", FITTED),
+    ),
+)
+claim(
+    SPEED,
+    "A problem takes {:.0f} us with self-tuned SDs, {:.0f} us with prior auto, {:.0f} us by the "
+    "alternation, {:.0f} us with bounded offsets, {:.0f} us with pixels of unknown size, and "
+    "{:.0f} us on the times of flight",
+    lambda: [
+        only("solver_peers", "us_per_problem", solver=f"{OURS}, {method}", images="50")
+        for method in (
+            "REML", "auto", "alternation", "bounded", "pixels, unknown scale", "channels"
+        )
+    ],
+)  # fmt: skip
+claim(
+    SPEED,
+    "The answers are the same but for {:.0e} mm.",
+    lambda: [max(column("accelerator", "largest_apart_mm"))],
+)
 claim(
     SPEED,
     "prior auto costs {:.1f} times the self-tuned Gaussian solve.",

@@ -54,7 +54,8 @@ def drawn(images: int) -> Problem:
 def timed(problems: Problem, method: str, prior: str) -> tuple[float, float, np.ndarray, int]:
     """Seconds of the first call and of the best of the next ones; X; how many did not converge."""
     bound = {"max_elevation": 1.0} if method == "alternating" else {}
-    seconds = []
+    seconds: list[float] = []
+    x = status = np.zeros(0)
     for _ in range(CALLS + 1):
         began = time.perf_counter()
         result = calibrate_batch(problems, method, prior, **bound)  # pyright: ignore[reportArgumentType]
