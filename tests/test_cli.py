@@ -297,15 +297,18 @@ def degenerate(shared, simulated):
     return shared
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "files"), [("parallel", set()), ("duplicates", REPORT - DETERMINED)]
-)
-def test_degenerate_sets_are_solved_but_not_observable(
-    name, files, degenerate, calibrated, jaxcal_process, tmp_path
-):
-    report = ["--out", tmp_path] if files else []
-    done = jaxcal_process("calibrate", degenerate / f"{name}.h5", "--json", *report)
+def test_equal_poses_are_counted_and_refused(degenerate, jaxcal_process, tmp_path):
+    done = jaxcal_process("calibrate", degenerate / "duplicates.h5", "--out", tmp_path)
+    assert done.returncode == 2
+    assert "count once" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_degenerate_set_is_solved_but_not_observable(degenerate, jaxcal_process, tmp_path):
+    files = REPORT - DETERMINED
+    report = ["--out", tmp_path]
+    done = jaxcal_process("calibrate", degenerate / "parallel.h5", "--json", *report)
     assert (done.returncode, done.stderr) == (3, "")
     record = json.loads(done.stdout)
     assert (record["status"], record["converged"]) == ("unobservable", False)

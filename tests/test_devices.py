@@ -7,7 +7,6 @@ import subprocess
 import sys
 
 import numpy as np
-import pytest
 
 PROGRAM = """
 import sys
@@ -16,6 +15,7 @@ import numpy as np
 import jaxcal
 from jaxcal.study.simulation import Protocol, simulate
 
+jax.config.update("jax_enable_x64", True)
 root, protocol = jax.random.key(1), Protocol(images=12, noise_mm=0.5)
 draw = jax.jit(jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol).problem()))
 problems = draw(np.arange(70))
@@ -24,7 +24,6 @@ np.save(sys.argv[1], np.concatenate([[len(jax.devices())], found.image_to_probe.
 """
 
 
-@pytest.mark.slow
 def test_results_do_not_depend_on_the_number_of_devices(tmp_path):
     for count in (1, 2):
         environment = os.environ | {"JAX_NUM_CPU_DEVICES": str(count), "JAX_PLATFORMS": "cpu"}
@@ -33,4 +32,5 @@ def test_results_do_not_depend_on_the_number_of_devices(tmp_path):
         subprocess.run(command, env=environment, check=True)
     one, two = (np.load(tmp_path / f"{count}.npy") for count in (1, 2))
     assert (one[0], two[0]) == (1, 2)
-    assert np.array_equal(one[1:], two[1:])
+    # One device runs a program that is kept, for whole chunks: other sums, the same but rounding.
+    np.testing.assert_allclose(one[1:], two[1:], rtol=0, atol=1e-11)

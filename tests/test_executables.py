@@ -42,6 +42,7 @@ def function(x, more, plan):
     traced.append(1)
     return plan[0] * x + more[0], (x > 0, None), plan[1]
 if "full" in sys.argv:
+    sys.dont_write_bytecode = True  # it would be truncated, and stay
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
 if "wait" in sys.argv:
     while not os.path.exists(sys.argv[-1]):

@@ -16,9 +16,6 @@ from jaxcal import Options
 from jaxcal.model.parameters import RIGID, Parameters, retract
 from jaxcal.model.residuals import circle_residual, measurement_residual
 
-# Minutes of compilation and of alternation; the solvers' own suite is in test_solvers.
-pytestmark = pytest.mark.slow
-
 SETTINGS = [(0.5, 0.05, 0.25), (1.0, 0.5, 1.0), (2.0, 2.0, 1.0), (3.0, 0.5, 2.0), (5.0, 4.0, 4.0),
             (2.0, 10.0, 2.0), (5.0, 0.05, 0.5), (1.0, 2.0, 4.0)]  # fmt: skip
 
@@ -126,6 +123,21 @@ def test_self_tuned_beats_conventional_and_recovers_the_sds():
     realised = np.mean([np.sqrt(np.mean(t.truth.elevation**2)) for t in truth])
     assert precision["joint"] < 0.9 * precision["conventional"]
     assert float(result.sigma[:, 2].mean()) == pytest.approx(realised, rel=0.05)
+
+
+def test_sds_beside_own_covariances_are_found():
+    """They are the units of the residuals as well, which must not stop the descent."""
+    protocol = jaxcal.Protocol(images=30, test_images=2, elevation_mm=2.0, noise_mm=2.0)
+
+    @jax.jit
+    @jax.vmap
+    def drawn(seed):
+        experiment = jaxcal.simulate(jax.random.key(seed), protocol)
+        return replace(experiment.problem(), covariance=experiment.covariance)
+
+    result = jaxcal.calibrate_batch(drawn(jnp.arange(200)), prior="gaussian")
+    assert np.mean(np.asarray(result.converged)) >= 0.99
+    assert np.median(result.variance_rounds) < 20
 
 
 def test_given_covariances_set_the_weights():

@@ -91,13 +91,13 @@ def test_points_on_a_line_leave_a_rotation_open():
 
 @pytest.mark.slow
 def test_a_start_drowned_in_noise_is_searched_for():
-    data = problem(6, images=4, elevation_mm=5.0, noise_mm=10.0)
+    data = problem(17, images=4, elevation_mm=5.0, noise_mm=10.0)
     result = jaxcal.calibrate(data, method="conventional")
     assert result.searched_start
     assert any("start was searched for" in warning for warning in result.warnings)
     # Noise of this size may well have moved the minimum; none better is near the truth, though.
     truth = jaxcal.simulate_recording(
-        jaxcal.Protocol(images=4, elevation_mm=5.0, noise_mm=10.0), 6
+        jaxcal.Protocol(images=4, elevation_mm=5.0, noise_mm=10.0), 17
     ).truth
     matrix = jnp.asarray(truth.image_to_probe)
     start = Parameters.of(matrix[:3, :3], matrix[:3, 3], jnp.asarray(truth.point))

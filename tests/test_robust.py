@@ -110,7 +110,7 @@ def test_a_wrong_echo_is_told_by_its_range():
 def test_command_line(tmp_path, capsys):
     recording = jaxcal.simulate_recording(jaxcal.Protocol(images=20), 3)
     points = recording.calibration.measurements.copy()
-    points[4] += [30.0, -25.0]
+    points[4] += [30.0, 25.0]
     images = replace(recording.calibration, measurements=points)
     path = tmp_path / "spoilt.h5"
     jaxcal.save(replace(recording, calibration=images), path)
@@ -160,7 +160,7 @@ def test_one_problem_leaves_out_what_a_batch_does():
     np.testing.assert_array_equal(traced.mask, good)
     np.testing.assert_allclose(traced.image_to_probe, found.image_to_probe, atol=1e-9)
     robust, plain = (jaxcal.calibrate(clean, "conventional", robust=r) for r in (True, False))
-    np.testing.assert_array_equal(robust.image_to_probe, plain.image_to_probe)
+    np.testing.assert_allclose(robust.image_to_probe, plain.image_to_probe, atol=1e-9)
 
 
 def test_consensus_calls_no_lapack(consensus):

@@ -30,6 +30,7 @@ from jaxcal.calibration.result import Calibration, Convergence, Linearisation, M
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.diagnostics.uncertainty import AT_BOUND, LARGEST_SD, mm_at_target, threshold
+from jaxcal.model.batch import ImagePlanes, Iterate, barrier, targets
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.parameters import Parameters, block_slice, size
 from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
@@ -88,7 +89,12 @@ class Average(Protocol):
 
 
 def assemble(
-    solved: Solved, averaged: Average | None, problem: Problem, given: Given, plan: SolvePlan
+    solved: Solved,
+    averaged: Average | None,
+    problem: Problem,
+    images: ImagePlanes,
+    given: Given,
+    plan: SolvePlan,
 ) -> Calibration:
     """A calibration but for its problem, which the front door adds (``with_problem``).
 
@@ -96,14 +102,17 @@ def assemble(
         solved: where the method stopped.
         averaged: the average over the offsets' distributions, where they were weighed; the
             parameters and SDs of ``solved`` are then the average's.
-        problem: the images in use, with leading axes as in ``solved``.
+        problem: the images in use, with one leading axis as in ``solved``.
+        images: the same as planes.
         given: numbers that came with the request, without leading axes.
         plan: what is static about the request.
     """
     problem = problem.cleared(problem.mask)
+    # Or the compiler would repeat the end of the solve for every image.
+    solved = barrier(solved)
     parameters, blocks, mask = solved.parameters, plan.blocks, problem.mask
     used = jnp.sum(mask, axis=-1)
-    errors = Errors.of(parameters, problem)
+    errors = Errors.of(parameters, images, blocks)
     elevation = _elevation(solved, errors, given, problem)
     in_plane = errors.squares(errors.q[1])
 
@@ -175,7 +184,7 @@ def _further(parameters: Parameters, blocks: Blocks) -> Float[Array, "*batch k"]
 
 
 class Errors(eqx.Module):
-    """The target in every image, beside what was measured; arrays are (*batch, n).
+    """The target in every image, beside what was measured; arrays are (lanes, n).
 
     Attributes:
         q: lateral, elevational and axial coordinate of the target, mm; (0, 0, 1) where left out.
@@ -190,26 +199,15 @@ class Errors(eqx.Module):
     mask: Array
 
     @classmethod
-    def of(cls, parameters: Parameters, problem: Problem) -> Errors:
-        """At some unknowns; the problem must be cleared of rubbish."""
-        mask, poses = problem.mask, problem.poses
-        # Written out in planes: products of 3x3 matrices, one an image, would be calls.
-        away = [parameters.point[..., j, None] - poses[..., j, 3] for j in range(3)]
-        probe = [
-            sum(poses[..., j, i] * away[j] for j in range(3)) - parameters.translation[..., i, None]
-            for i in range(3)
-        ]
-        q = [
-            sum(parameters.rotation[..., j, i, None] * probe[j] for j in range(3)) for i in range(3)
-        ]
-        points = problem.measurements * problem.spacing[..., None, :]
+    def of(cls, parameters: Parameters, images: ImagePlanes, blocks: Blocks) -> Errors:
+        """At some unknowns."""
+        mask = images.mask
+        q, _ = targets(Iterate.of(parameters, blocks), images)
         further = {
             name: [values[..., k, None] for k in range(TABLE[name].size)]
             for name, values in ((name, parameters.further(name)) for name in EXTRA)
         }
-        lateral, distance = measured(
-            points[..., 0], points[..., 1], problem.face_offset[..., None], further
-        )
+        lateral, distance = measured(images.lateral, images.axial, images.face[:, None], further)
         # The range has no derivative at 0, where an image left out may well put the target.
         x, y, z = (
             jnp.where(mask > 0, value, unused) for value, unused in zip(q, (0, 0, 1), strict=True)
@@ -320,17 +318,23 @@ def covariance_and_observability(
     # A ridge at the level of rounding: an unobservable direction stays finite.
     diagonal = jnp.diagonal(design if bounded else information, axis1=-2, axis2=-1)
     ridge = jax.lax.stop_gradient(16 * eps * diagonal)
-    matrices = [
-        information + ridge[..., None] * eye,
-        weighted - least[..., None, None] * eye,
-        unweighted - floor[..., None, None] * eye,
-    ]
+    # The logarithm of a pivot that is not positive is not finite.
+    matrices = [information + ridge[..., None] * eye, unweighted - floor[..., None, None] * eye]
     lanes_last = jnp.moveaxis(jnp.stack(matrices).reshape(-1, count, count), 0, -1)
     inverse, log_determinant = inverse_lanes_last(lanes_last)
-    inverse = jnp.moveaxis(inverse.reshape(count, count, 3, -1)[:, :, 0], -1, 0)
+    inverse = jnp.moveaxis(inverse.reshape(count, count, 2, -1)[:, :, 0], -1, 0)
     inverse = inverse.reshape(*batch, count, count)
-    # The logarithm of a pivot that is not positive is not finite.
-    _, exceeds, observable = jnp.isfinite(log_determinant).reshape(3, *batch)
+    observable = jnp.isfinite(log_determinant).reshape(2, *batch)[1]
+
+    def exceeding() -> Bool[Array, "*batch"]:
+        reduced = weighted - least[..., None, None] * eye
+        lanes_last = jnp.moveaxis(reduced.reshape(-1, count, count), 0, -1)
+        return jnp.isfinite(inverse_lanes_last(lanes_last)[1]).reshape(batch)
+
+    # No eigenvalue of an inverse is above its trace, which nearly always settles it.
+    largest = jnp.sum(jnp.diagonal(inverse, axis1=-2, axis2=-1) * scale**2, axis=-1)
+    clearly = jax.lax.stop_gradient(2 * least * largest < 1) & (largest > 0) & (not bounded)
+    exceeds = jax.lax.cond(jnp.all(clearly), lambda: clearly, exceeding)
 
     degenerate = jnp.logical_not(observable)
     # Of nearly exact data, what rounding leaves of the smallest eigenvalue may be enough.

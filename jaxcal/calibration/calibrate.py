@@ -186,7 +186,7 @@ def calibrate_batch(
 
     Plain problems are shared out among all of JAX's local devices: a processor is one device unless
     ``jax.config.update("jax_num_cpu_devices", n)`` (or JAX_NUM_CPU_DEVICES=n) says before JAX's
-    first use that it is n, one a core. Results do not depend on it.
+    first use that it is n, one a core. Results do not depend on it, but for rounding.
 
     Args:
         problems: leading axes of any shape; see :func:`jaxcal.stack`. A list of problems or

@@ -83,6 +83,9 @@ def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
     Args:
         problem: one problem with concrete, finite values and at least 4 used images.
         blocks: the free unknowns; those without a closed form begin at their nominal values.
+
+    Returns:
+        The start in the problem's own precision.
     """
     known = replace(problem, spacing_known=True, channels=None)
     found = calibrate_closed_form(known, estimate=("scale",) if "scale" in blocks else ())
@@ -93,8 +96,10 @@ def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
         "point": unknowns.point[0],
         "scale": np.ravel(unknowns.further.get("scale", np.ones(2))),
         "sound_speed": np.asarray(found.sound_speed_factor),
-        "searched": np.asarray(not (found.certified and found.unique)),
     }
+    dtype = np.asarray(problem.mask).dtype
+    parts = {name: np.asarray(value, dtype) for name, value in parts.items()}
+    parts["searched"] = np.asarray(not (found.certified and found.unique))
     return assembled(Start, parts)
 
 

@@ -64,14 +64,14 @@ def solve_problems(
         problems = replace(problems, mask=agreed)
     if plan.one_by_one:
         solution = jax.lax.map(
-            lambda problem: _solved(jax.tree.map(lambda leaf: leaf[None], problem), given, plan),
-            problems,
+            lambda problem: _solved(*_alone(problem, plan), given, plan), problems
         )
-        solution = jax.tree.map(lambda leaf: leaf[:, 0], solution)
+        solved, averaged = jax.tree.map(lambda leaf: leaf[:, 0], solution)
+        images = ImagePlanes.of(problems)
     else:
-        solution = _solved(problems, given, plan, begun)
-    solved, averaged = solution
-    return assemble(solved, averaged, problems, given, plan)
+        images = ImagePlanes.of(problems, channels=plan.channels)
+        solved, averaged = _solved(problems, images, given, plan, begun)
+    return assemble(solved, averaged, problems, images, given, plan)
 
 
 def _one_at_a_time(blocks: Blocks):
@@ -100,15 +100,21 @@ class AveragedAnswer(eqx.Module):
     law: OffsetLaw
 
 
+def _alone(problem: Problem, plan: SolvePlan) -> tuple[Problem, ImagePlanes]:
+    """A batch of one."""
+    batch = jax.tree.map(lambda leaf: leaf[None], problem)
+    return batch, ImagePlanes.of(batch, channels=plan.channels)
+
+
 def _solved(
     problems: Problem,
+    images: ImagePlanes,
     given: Given,
     plan: SolvePlan,
     begun: ConventionalStart | GivenStart | None = None,
 ) -> tuple[Solved, AveragedAnswer | None]:
     """The method's solution with its normal matrices, problems first."""
-    found = methods.solve(problems, given, plan, begun)
-    images = ImagePlanes.of(problems, channels=plan.channels)
+    found = methods.solve(problems, images, given, plan, begun)
     observation = found.observation
     information, design = _normal_matrices(found, images)
     offset = jnp.zeros((images.lanes, 0), images.mask.dtype)

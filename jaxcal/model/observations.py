@@ -134,6 +134,22 @@ class Observation(eqx.Module):
         del sigma
         return self
 
+    def growth(
+        self,
+        before: Float[Array, "components lanes"],
+        now: Float[Array, "components lanes"],
+        squares: Float[Array, "components lanes"],
+    ) -> Float[Array, " lanes"] | float:
+        """How much half the cost can have grown because residuals are in the units of other SDs.
+
+        Args:
+            before: the SDs in whose units they were.
+            now: those in whose units they are.
+            squares: of the whitened residuals, summed.
+        """
+        del before, now, squares
+        return 0.0
+
 
 class Points(Observation):
     """Lateral position, range and elevational offset, each with its SD; y_i is q_y itself.
@@ -196,6 +212,24 @@ class OwnCovariances(Observation):
         # Before the first pass SDs are infinite, and say nothing of their ratio.
         ratio = jnp.where(jnp.isfinite(ratio), ratio, self.ratio)
         return eqx.tree_at(lambda o: o.ratio, self, ratio)
+
+    def growth(
+        self,
+        before: Float[Array, "components lanes"],
+        now: Float[Array, "components lanes"],
+        squares: Float[Array, "components lanes"],
+    ) -> Float[Array, " lanes"] | float:
+        if self.tied:
+            return 0.0
+        # The second residual has a part of the first, at most so much of it; then Cauchy-Schwarz.
+        first = jnp.sqrt(self.shape[0])
+        mixed = self.shape[1] / first
+        part = jnp.max(jnp.abs(mixed) / jnp.sqrt(self.shape[2] - mixed * mixed), axis=1)
+        change = jnp.abs(jnp.log(now[1] / now[0]) - jnp.log(before[1] / before[0]))
+        # Before the first pass SDs are infinite: nothing can be compared.
+        change = jnp.where(jnp.isfinite(change), change, jnp.inf)
+        growth = change * part * jnp.sqrt(squares[0] * squares[1])
+        return jnp.where(part > 0, growth, 0.0)
 
     def with_sigma(self, sigma: Float[Array, "components lanes"]) -> Observation:
         return super().with_sigma(sigma).in_units(sigma)

@@ -137,8 +137,10 @@ def _solve_chunks_kept(
         # Here a person waits for the compiler; of thousands, masked images would cost run time.
         padded = buckets.padded(problems)
     size = buckets.size(pieces) if pieces > 1 else 1
-    rows = np.arange(size * chunk) % count
-    padded = map_arrays(lambda leaf: np.asarray(leaf)[rows], padded)
+    if size * chunk != count:
+        # A copy of everything, which costs as much as the cheapest solves.
+        rows = np.arange(size * chunk) % count
+        padded = map_arrays(lambda leaf: np.asarray(leaf)[rows], padded)
     label = _label(plan, padded.images) | {"problems": size * chunk}
     result = executables.run(
         "jaxcal.runtime.programs:solve_some_chunks",

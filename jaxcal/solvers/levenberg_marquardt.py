@@ -94,6 +94,7 @@ def judge_step(
     exact: Bool[Array, " lanes"],
     retry: Bool[Array, " lanes"],
     less_exact: float = LESS_EXACT,
+    allowance: Float[Array, " lanes"] | float = 0.0,
 ) -> Judged:
     """The acceptance rule.
 
@@ -107,11 +108,13 @@ def judge_step(
         exact: it came from exact second derivatives.
         retry: it was no step, but the same place once more.
         less_exact: factor of the damping after a good exact step.
+        allowance: half the cost may have grown by this much for another reason than the step.
     """
     # Each residual is off by its rounding, so half their sum of squares by this much.
     noise = 8 * jnp.finfo(half_cost.dtype).eps * half_cost + 2 * rounding * jnp.sqrt(half_cost)
-    accept = (decrease >= ENOUGH * predicted - noise) | retry
-    good = (decrease >= GOOD * predicted - noise) & jnp.logical_not(retry)
+    least = -noise - allowance
+    accept = (decrease >= ENOUGH * predicted + least) | retry
+    good = (decrease >= GOOD * predicted + least) & jnp.logical_not(retry)
     # The exact matrix needs no damping; a Gauss-Newton one is wanted less and less.
     factor = jnp.where(good, jnp.where(exact, less_exact, LESS), 1.0)
     raised = jnp.maximum(MORE * damping, LEAST_DAMPING)

@@ -94,6 +94,7 @@ class Solution(eqx.Module):
 
 def solve(
     problems: Problem,
+    images: ImagePlanes,
     given: Given,
     plan: SolvePlan,
     begun: ConventionalStart | GivenStart | None = None,
@@ -102,15 +103,15 @@ def solve(
 
     Args:
         problems: the batch.
+        images: its planes.
         given: numbers that came with the request.
         plan: what is static about it.
         begun: their conventional fits, where they have been made before.
     """
     # The solvers see constants; their answers become functions of the data again afterwards.
-    frozen, numbers = jax.lax.stop_gradient((problems, given))
-    begun = begin(frozen, plan) if begun is None else begun
-    found = run(begun, frozen, numbers, plan)
-    images = ImagePlanes.of(problems, channels=plan.channels)
+    frozen, planes, numbers = jax.lax.stop_gradient((problems, images, given))
+    begun = begin(planes, plan) if begun is None else begun
+    found = run(begun, frozen, planes, numbers, plan)
     if plan.options.differentiate:
         found = _attached(found, images, problems, given, plan)
     if not plan.laws:
@@ -118,15 +119,16 @@ def solve(
     return _averaged(found, images, problems, plan)
 
 
-def begin(problems: Problem, plan: SolvePlan) -> ConventionalStart:
+def begin(images: ImagePlanes, plan: SolvePlan) -> ConventionalStart:
     """The conventional fits from which every method starts."""
     alone = plan.method == "conventional"
     return conventional(
-        ImagePlanes.of(problems),
+        replace(images, channels=None),
         plan.blocks,
         max_steps=plan.options.max_iterations,
         undamped=alone and plan.options.solver == "gauss-newton",
         trace=plan.options.trace if alone else 0,
+        fitted=alone or plan.method == "alternating" or plan.self_tuning or plan.prior == "bounded",
     )
 
 
@@ -173,11 +175,14 @@ def nominal_sound_speed(problem: Problem) -> Float[Array, "*batch"]:
 
 
 def run(
-    begun: ConventionalStart | GivenStart, problems: Problem, given: Given, plan: SolvePlan
+    begun: ConventionalStart | GivenStart,
+    problems: Problem,
+    images: ImagePlanes,
+    given: Given,
+    plan: SolvePlan,
 ) -> Solution:
     """The plan's method from conventional fits."""
     options, other = plan.options, plan.other_solver
-    images = ImagePlanes.of(problems, channels=plan.channels)
     observation, medium = observe(problems, images, given, plan)
     zero = jnp.zeros_like(images.mask[:, 0])
     components = observation.sigma.shape[0]

@@ -113,6 +113,7 @@ class SelfTuned(eqx.Module):
         cosine: gradient cosine.
         candidate: the place to look at next.
         proposed: the SDs there.
+        units: the SDs in whose units residuals were at the last look.
         retry: that is the place once more, with more damping.
         weighed: the SDs that belong to the step to the candidate.
         half: half the cost before it, with these.
@@ -134,6 +135,7 @@ class SelfTuned(eqx.Module):
     cosine: Float[Array, " lanes"]
     candidate: Iterate
     proposed: Float[Array, "k lanes"]
+    units: Float[Array, "k lanes"]
     retry: Bool[Array, " lanes"]
     weighed: Float[Array, "k lanes"]
     half: Float[Array, " lanes"]
@@ -161,6 +163,7 @@ class SelfTuned(eqx.Module):
             cosine=number,
             candidate=start,
             proposed=sigma,
+            units=sigma,
             retry=~no,
             weighed=sigma,
             half=number,
@@ -189,7 +192,7 @@ def damped_step(
     diagonal = normal.diagonal()
     held = damping * jnp.where(diagonal > 0, diagonal, 1.0)
     matrix = stacked(normal.curvature + exact * rest)
-    places = jnp.eye(len(diagonal))[..., None]
+    places = jnp.eye(len(diagonal), dtype=diagonal.dtype)[..., None]
     matrix, gradient = barrier((matrix + places * held, normal.gradient))
     return -dense.product_lanes_last(dense.inverse_lanes_last(matrix)[0], gradient)
 
@@ -214,10 +217,10 @@ def updated(
     scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1.0))
     unit = stacked(normal.curvature) * scale[:, None] * scale
     eps = jnp.finfo(count.dtype).eps
-    unit = barrier(unit + 16 * eps * jnp.eye(len(diagonal))[..., None])
+    unit = barrier(unit + 16 * eps * jnp.eye(len(diagonal), dtype=diagonal.dtype)[..., None])
     inverse = dense.inverse_lanes_last(unit)[0] * scale[:, None] * scale
     places = pairs(len(diagonal))
-    twice = np.array([1.0 if i == j else 2.0 for i, j in places])[:, None]
+    twice = np.array([1 if i == j else 2 for i, j in places], diagonal.dtype)[:, None]
 
     def flat(matrix: Float[Array, "p p lanes"]) -> Float[Array, "triangle lanes"]:
         rows, columns = (np.array(each) for each in zip(*places, strict=True))
@@ -301,6 +304,9 @@ def self_tuned(
         rounding = Rounding.at(coordinates, 1 / jnp.min(proposed, axis=0), images)
         cosine = gradient_cosine(normal, rounding.vanished)
 
+        # Other SDs may mean other units of the residuals, and so another cost without any step.
+        whitened = sums.squares / state.weighed**2
+        growth = observation.growth(state.units, state.proposed, whitened)
         judged = judge_step(
             state.half - 0.5 * sums.weighed(1 / state.weighed**2).cost,
             state.predicted,
@@ -310,6 +316,7 @@ def self_tuned(
             state.idle,
             exact=state.exact_used > 0,
             retry=state.retry,
+            allowance=growth,
         )
         accept, damping, idle = judged.accept, judged.damping, judged.idle
         place, sigma, cost, cosine = barrier(
@@ -347,6 +354,7 @@ def self_tuned(
             cosine=cosine,
             candidate=choose(retry, place, place.moved(barrier(move))),
             proposed=jnp.where(retry, sigma, after),
+            units=state.proposed,
             retry=retry,
             weighed=weighed,
             half=half,

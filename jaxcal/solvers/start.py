@@ -264,6 +264,7 @@ def conventional(
     max_steps: int = 100,
     undamped: bool = False,
     trace: int = 0,
+    fitted: bool = True,
 ) -> ConventionalStart:
     """Conventional fits from the closed-form start, or the best of many where it is unsound.
 
@@ -273,6 +274,7 @@ def conventional(
         max_steps: most passes of each fit.
         undamped: Gauss-Newton instead of Levenberg-Marquardt.
         trace: how many values of the objective to keep.
+        fitted: refine sound starts too; else they are handed on as they are.
     """
     start, sound, sums = closed_form(images, blocks)
     cubes = jnp.asarray(cube_rotations(), images.mask.dtype)
@@ -294,11 +296,15 @@ def conventional(
         return index + 1, choose(better, fit, best)
 
     def unfinished(state: tuple) -> Bool[Array, ""]:
-        return (state[0] == 0) | (jnp.any(~sound) & (state[0] <= len(cubes)))
+        once = fitted & (state[0] == 0)
+        return once | (jnp.any(~sound) & (state[0] <= len(cubes)))
 
     shapes = jax.eval_shape(fit_from, start, observation, images)
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     _, fit = jax.lax.while_loop(unfinished, one_round, (jnp.zeros((), jnp.int32), empty))
+    if not fitted:
+        # Whatever happened to a lane's neighbours.
+        fit = replace(fit, place=choose(sound, start, fit.place))
     return ConventionalStart(fit, choose(sound, start, fit.place), jnp.logical_not(sound))
 
 

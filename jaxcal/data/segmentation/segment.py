@@ -25,7 +25,8 @@ from jaxcal.data.segmentation.time_of_flight import (
     fit_out_of_plane,
     shortest,
 )
-from jaxcal.runtime.compiler import fast_to_run
+from jaxcal.runtime import buckets, executables
+from jaxcal.runtime.compiler import ONE_PROBLEM, batch_wishes, fast_to_run
 from jaxcal.runtime.precision import in_own_modes
 
 Method = Literal["least-squares", "shortest"]
@@ -42,6 +43,12 @@ _NOISIEST = 5.0
 _MANY = 0.1
 # An answer this many SDs from the fit is not the target's.
 _FAR = 6.0
+# Up to so many frames a person waits longer for the compiler than for the fit.
+_FEW_FRAMES = 4096
+
+
+Fits = DistanceFit | tuple[DistanceFit, DistanceFit]
+"""Of a linear array; of a curved one in the plane and out of it."""
 
 
 @dataclass(frozen=True)
@@ -291,9 +298,9 @@ def _shortest(
 def _fit(distances: np.ndarray, probe: Probe, robust: bool, scale: Scale, failed: np.ndarray):
     """Points, covariances, noise, rejected lines and, curved arrays, [x, z, y^2] and covariance."""
     curved = isinstance(probe, CurvilinearProbe)
-    fits = compiled_fit(curved, robust)(distances, probe.element_positions())
+    fits = _fitted(np.asarray(distances, float), probe.element_positions(), (curved, robust))
     # Far out of the plane the in-plane fit has more than noise in its residuals; the other has not.
-    plane, whole = fits if curved else (fits, fits)
+    plane, whole = fits if isinstance(fits, tuple) else (fits, fits)
     noise, rejected = np.asarray(whole.noise), np.asarray(whole.rejected).astype(int)
 
     def scaled(fit) -> tuple[np.ndarray, np.ndarray]:
@@ -341,17 +348,46 @@ def compiled_fit(curved: bool, robust: bool):
     before any arithmetic.
     """
 
-    def fit(
-        distances: AnyArray, positions: AnyArray
-    ) -> DistanceFit | tuple[DistanceFit, DistanceFit]:
-        if curved:
-            return fit_out_of_plane(distances, positions, robust=robust)
-        # What the compiler knows to be zero it does not compute with.
-        zero = jnp.zeros_like(positions[:, 0])
-        line = jnp.stack([jnp.asarray(positions)[:, 0], zero, zero], axis=-1)
-        return fit_in_plane(distances, line, robust=robust)
+    def fit(distances: AnyArray, positions: AnyArray) -> Fits:
+        return fit_frames(distances, positions, (curved, robust))
 
     return jax.jit(fit, compiler_options=fast_to_run(jax.default_backend()))
+
+
+def fit_frames(distances: AnyArray, positions: AnyArray, how: tuple[bool, bool]) -> Fits:
+    """The fit of every frame (traceable).
+
+    Args:
+        distances: (..., n, elements), mm; NaN: no answer.
+        positions: (elements, 3) of the elements, mm.
+        how: whether the array is curved, and whether outliers are rejected.
+    """
+    curved, robust = how
+    if curved:
+        return fit_out_of_plane(distances, positions, robust=robust)
+    # What the compiler knows to be zero it does not compute with.
+    zero = jnp.zeros_like(positions[:, 0])
+    line = jnp.stack([jnp.asarray(positions)[:, 0], zero, zero], axis=-1)
+    return fit_in_plane(distances, line, robust=robust)
+
+
+def _fitted(
+    distances: Float[np.ndarray, "n elements"], positions: np.ndarray, how: tuple[bool, bool]
+) -> Fits:
+    """The fit by a program that is kept, where programs are; it serves a bucket of frames."""
+    if jax.default_backend() != "cpu":
+        return compiled_fit(*how)(distances, positions)
+    count, elements = distances.shape
+    padded = np.full((buckets.size(count), elements), np.nan)
+    padded[:count] = distances
+    found = executables.run(
+        "jaxcal.data.segmentation.segment:fit_frames",
+        (padded, np.asarray(positions, float)),
+        how,
+        flags=ONE_PROBLEM if count <= _FEW_FRAMES else batch_wishes(),
+        label={"method": "segmentation", "data": "channels", "images": len(padded)},
+    )
+    return jax.tree.map(lambda leaf: leaf[:count], found)
 
 
 def _warnings(used, failed, missing, rejected, elements: int) -> tuple[str, ...]:

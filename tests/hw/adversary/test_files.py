@@ -301,8 +301,8 @@ class Writing:
     def __init__(self, path: Path, file_bytes: int = resource.RLIM_INFINITY) -> None:
         self.path, self.images = path, 0
         self._process = subprocess.Popen(
-            [sys.executable, "-c", WRITE, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, text=True,
+            [sys.executable, "-B", "-c", WRITE, path], stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes,) * 2),
         )  # fmt: skip
 
