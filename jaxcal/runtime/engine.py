@@ -31,7 +31,7 @@ CHANNELS_CHUNK = 8
 
 ACCELERATOR_ROWS = 2**20
 """On an accelerator, images (times elements, on channels) side by side: it needs all of its lanes
-filled, and half a million rows take some 2 GB of its memory."""
+filled, and a million of these took 3.8 GB of its memory."""
 
 FEW_PROBLEMS = 1024
 """Up to so many problems of a batch are padded to a bucket of images."""
