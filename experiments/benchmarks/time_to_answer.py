@@ -180,7 +180,8 @@ def measure(words: list[str], environment: dict[str, str], until: str = "") -> t
             process.communicate()
             return taken, cpu
     process.wait()
-    if process.returncode not in (0, 3) or not seen:
+    # An answer is an answer, however good it is.
+    if process.returncode not in (0, 3, 5) or not seen:
         raise SystemExit(f"{' '.join(words)} ended with {process.returncode}:\n{''.join(said)}")
     after = os.times()
     spent = after.children_user + after.children_system
@@ -222,22 +223,31 @@ def one_round(every: list[Case], folder: Path) -> list[tuple[str, str, float, fl
 def main() -> None:
     """Measure and write the table."""
     sys.path.insert(0, str(Path(__file__).parents[1]))
-    from common import arguments, machine, results_folder, write_table
+    from common import arguments, results_folder, write_table
 
     quick = arguments(__doc__ or "").quick
     with tempfile.TemporaryDirectory() as name:
         every = cases(Path(name), quick)
         load = os.getloadavg()[0]
         rounds = QUICK_ROUNDS if quick else ROUNDS
-        found = [row for _ in range(rounds) for row in one_round(every, Path(name))]
+        found: list[tuple] = []
+        for _ in range(rounds):
+            found += one_round(every, Path(name))
+            write_table(results_folder(quick) / "time_to_answer.csv", HEADER, medians(found, load))
+
+
+def medians(found: list[tuple], load: float) -> list[list[object]]:
+    """The table of all rounds so far."""
+    from common import machine
+
     rows: list[list[object]] = []
     for key in dict.fromkeys(row[:2] for row in found):
         numbers = np.array([row[2:] for row in found if row[:2] == key])
         ratios = numbers[:, :2] / numbers[:, 2:]
-        medians = [*np.median(numbers[:, :2], axis=0), *np.median(ratios, axis=0)]
-        rows.append([*key, len(numbers), *map(float, medians), load])
+        middle = [*np.median(numbers[:, :2], axis=0), *np.median(ratios, axis=0)]
+        rows.append([*key, len(numbers), *map(float, middle), load])
     rows.append(["", machine(), "", "", "", "", "", ""])
-    write_table(results_folder(quick) / "time_to_answer.csv", HEADER, rows)
+    return rows
 
 
 if __name__ == "__main__":
