@@ -25,7 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import ELEVATIONS_MM, NOISES_MM, arguments, machine, results_folder, write_table
+from common import ELEVATIONS_MM, LAWS, NOISES_MM, arguments, machine, results_folder, write_table
 from jaxtyping import Array
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision
@@ -49,7 +49,6 @@ SIDE_BY_SIDE = 10
 """Trials whose bounds are alternated together: 100 lanes."""
 SUBSET = ((0.5, 6.0), (1.0, 0.5), (3.0, 2.0), (5.0, 0.5), (5.0, 6.0))
 SIZES = (12, 20, 200)
-LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "one-sided", "heavy-tailed", "triangular")
 COMPARED = (
     "auto_over_conventional", "auto_points_over_conventional", "auto_over_alternating",
     "auto_points_over_alternating",

@@ -14,6 +14,7 @@ from pathlib import Path
 import jax
 
 from jaxcal.io.atomic import atomic_path
+from jaxcal.study.offsets import OffsetLaw
 
 # The scripts' own arrays; jaxcal computes in 64 bits anyway.
 jax.config.update("jax_enable_x64", True)
@@ -23,6 +24,9 @@ RESULTS = Path(__file__).parent / "results"
 ELEVATIONS_MM = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 NOISES_MM = (0.0, 0.5, 2.0, 4.0, 6.0, 8.0, 10.0)
 """The grid of the paper's Tables 1 and 2."""
+
+LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "one-sided", "heavy-tailed", "triangular")
+"""Of the offsets, in most experiments."""
 
 
 def arguments(description: str) -> argparse.Namespace:

@@ -31,7 +31,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import LAWS, arguments, machine, results_folder, write_table
 from jaxtyping import Array
 
 from jaxcal import Calibration, Problem, Protocol, calibrate_batch, predicted_tre, simulate
@@ -55,7 +55,6 @@ FIELDS = {
 }
 """Where the target is: points to look at, bounds of its place and of its offsets, mm."""
 SIZES_MM = (1.5, 5.0)
-LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "one-sided", "heavy-tailed", "triangular")
 MIXTURE: OffsetLaw = "sometimes off-centre"
 SPACING_MM = np.array([0.15, 0.12])
 LEFT_MM = 32.0

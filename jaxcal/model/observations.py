@@ -145,7 +145,7 @@ class Observation(eqx.Module):
         Args:
             before: the SDs in whose units they were.
             now: those in whose units they are.
-            squares: of the whitened residuals, summed.
+            squares: of the whitened residuals, summed over the images.
         """
         del before, now, squares
         return 0.0
@@ -189,13 +189,17 @@ class OwnCovariances(Observation):
     ratio: Float[Array, " lanes"]
     tied: bool = eqx.field(static=True, default=False)
 
-    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
-        lateral, distance = errors(q, further, images)
-        # The 2x2 Cholesky factor written out; a mm of lateral error is ratio mm of range error.
+    def _factor(self) -> tuple[Array, Array, Array]:
+        """The Cholesky factor of every image's 2x2 shape: first, off-diagonal and last entry."""
         first = jnp.sqrt(self.shape[0])
         mixed = self.shape[1] / first
-        second = jnp.sqrt(self.shape[2] - mixed * mixed)
+        return first, mixed, jnp.sqrt(self.shape[2] - mixed * mixed)
+
+    def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
+        lateral, distance = errors(q, further, images)
+        first, mixed, second = self._factor()
         one = lateral / first
+        # A mm of lateral error is ratio mm of range error.
         other = (distance - self.ratio[:, None] * mixed * one) / second
         if self.tied:
             return [Component([one, other]), Component([q[1]])]
@@ -222,9 +226,8 @@ class OwnCovariances(Observation):
         if self.tied:
             return 0.0
         # The second residual has a part of the first, at most so much of it; then Cauchy-Schwarz.
-        first = jnp.sqrt(self.shape[0])
-        mixed = self.shape[1] / first
-        part = jnp.max(jnp.abs(mixed) / jnp.sqrt(self.shape[2] - mixed * mixed), axis=1)
+        _, mixed, second = self._factor()
+        part = jnp.max(jnp.abs(mixed) / second, axis=1)
         change = jnp.abs(jnp.log(now[1] / now[0]) - jnp.log(before[1] / before[0]))
         # Before the first pass SDs are infinite: nothing can be compared.
         change = jnp.where(jnp.isfinite(change), change, jnp.inf)

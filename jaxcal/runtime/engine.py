@@ -30,8 +30,8 @@ CHANNELS_CHUNK = 8
 """The same for solves on channels, whose problems are a hundred times larger."""
 
 ACCELERATOR_ROWS = 2**20
-"""On an accelerator, images (times elements, on channels) side by side: it needs all of its lanes
-filled, and a million of these took 3.8 GB of its memory."""
+"""On an accelerator, images (times elements, on channels) side by side: enough to fill it, few
+enough for its memory."""
 
 FEW_PROBLEMS = 1024
 """Up to so many problems of a batch are padded to a bucket of images."""

@@ -128,6 +128,8 @@ def begin(images: ImagePlanes, plan: SolvePlan) -> ConventionalStart:
         max_steps=plan.options.max_iterations,
         undamped=alone and plan.options.solver == "gauss-newton",
         trace=plan.options.trace if alone else 0,
+        # With given SDs the descent arrives from the closed form as well; other answers may hang on
+        # the start.
         fitted=alone or plan.method == "alternating" or plan.self_tuning or plan.prior == "bounded",
     )
 

@@ -8,7 +8,7 @@ Every law has one size in mm, a bound m or a standard deviation s:
     normal        of SD s
     heavy-tailed  Student's t with four degrees of freedom, scaled to SD s
 
-Those do not favour an estimator's laws, but no estimator of ours was made for these either:
+Laws that differ from those which prior ``auto`` weighs, and, last, what it believes of the mean:
 
     exponential   of SD s, and so of mean s: mostly near the plane, always on the same side
     two-humped    half of them near -m, half near m, each hump of SD m / 4

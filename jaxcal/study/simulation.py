@@ -51,8 +51,7 @@ class Protocol:
     Attributes:
         images: calibration images.
         test_images: noise-free in-plane test images.
-        elevation_mm: bound (uniform, one-sided, triangular) or SD (normal, heavy-tailed) of the
-            elevational offsets.
+        elevation_mm: bound or SD of the elevational offsets, as their law has it.
         elevation_distribution: their law, see :mod:`jaxcal.study.offsets`.
         noise_mm: SD of the noise on each element's distance.
         lateral_mm: the target's lateral position is uniform within +- this (linear probes).
