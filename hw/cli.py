@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from hw.choices import HAND_PLACEMENTS, OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
+from hw.interrupts import as_interrupts
 from jaxcal import InputError, __version__
 from jaxcal.cli.common import POSITIVE, ExitCode, exit_code
 from jaxcal.cli.run import run
@@ -408,7 +409,8 @@ def check(bench: bool, setup_path: str | None, speed: float | None, controller: 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``jaxcal-hw``; see :func:`jaxcal.cli.run.run`."""
-    return run(commands, "jaxcal-hw", arguments)
+    with as_interrupts():
+        return run(commands, "jaxcal-hw", arguments)
 
 
 def _recorded_bench(settings: dict[str, object], bench: bool) -> int | None:

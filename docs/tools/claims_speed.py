@@ -144,3 +144,34 @@ claim(
     "prior auto costs {:.1f} times the self-tuned Gaussian solve.",
     lambda: [only("auto_cost", "over_gaussian", images="50", contestant="auto")],
 )
+
+
+def _waits(command: str, of: str = "wall_ratio") -> list[float]:
+    """The first run ever, the second, and one of another number of images where there is one."""
+    rows = [row for row in table("time_to_answer") if row["command"] == command]
+    return [number(row, of) for row in rows]
+
+
+claim(
+    SPEED,
+    "takes {:.1f} such processes the first time ever, {:.1f} the second time, and {:.1f} for a "
+    "recording of another length that no run has seen before.",
+    lambda: _waits("joint, auto"),
+)
+claim(SPEED, "it takes {:.2f}, {:.2f} and {:.2f}.", lambda: _waits("conventional"))
+claim(
+    SPEED,
+    "a curvilinear probe (60 images) take {:.1f}, {:.1f} and {:.1f}.",
+    lambda: _waits("channels"),
+)
+claim(
+    SPEED,
+    "A small study takes {:.0f} the first time and {:.1f} the second;",
+    lambda: _waits("study"),
+)
+claim(
+    SPEED,
+    "The emulated bench takes {:.0f} s from the command to its first estimate, {:.0f} s the "
+    "second time:",
+    lambda: _waits("bench, first estimate", "wall_s"),
+)

@@ -259,6 +259,32 @@ def test_killed_and_resumed(tmp_path, capfd):
     np.testing.assert_array_equal(taken(path)[: len(before)], before)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["INT", "TERM"])
+def test_a_signal_to_a_background_job_ends_it_in_order(tmp_path, number):
+    """A shell's background job is started with Ctrl-C ignored."""
+    path = tmp_path / "rec.h5"
+    code = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
+    arguments = ["acquire", str(path), "--bench", "--images", str(IMAGES), "--placement", "none",
+                 "--speed", "3", "--bench-seed", "3"]  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
+    )  # fmt: skip
+    assert process.stderr is not None
+    with process.stderr:
+        for line in process.stderr:
+            if line.startswith("image 2/"):
+                process.send_signal(number)
+                break
+        rest = process.stderr.read()
+    assert process.wait() == 130, rest
+    assert f"interrupted; 2 of {IMAGES} images are in {path}" in rest
+    assert "Traceback" not in rest
+    with h5py.File(path) as file:
+        assert not file.attrs["complete"]
+        assert len(file["calibration/target"]) >= 2
+
+
 def viewers(parent: int) -> list[int]:
     """Processes of the live view that a command started."""
     found = []

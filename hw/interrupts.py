@@ -1,0 +1,41 @@
+"""Ctrl-C and the signals that end a process: each of them stops the robot in an orderly way."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+ENDING = tuple(
+    getattr(signal, name)
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+    if hasattr(signal, name)
+)
+"""The signals by which a person, a shell or a system asks a program to end; SIGBREAK on Windows."""
+
+
+@contextmanager
+def as_interrupts() -> Iterator[None]:
+    """Meanwhile each of ``ENDING`` raises KeyboardInterrupt in the main thread, as Ctrl-C does.
+
+    A shell starts background jobs with SIGINT ignored, and so would be a stop sent to one: it
+    is heard again. SIGHUP stays ignored where it is, since that is what ``nohup`` is for.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    before = {number: signal.getsignal(number) for number in ENDING}
+    heard = [
+        number
+        for number, handler in before.items()
+        if not (number == getattr(signal, "SIGHUP", None) and handler is signal.SIG_IGN)
+    ]
+    for number in heard:
+        signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number in heard:
+            signal.signal(number, before[number] or signal.SIG_DFL)
