@@ -72,6 +72,9 @@ VARIANTS = {
     "empty": configuration(),
     "no definitions": configuration(OLD).replace(b"CoordinateDefinitions", b"Else"),
     "entities of XML": configuration(OTHER.replace("StylusTip", "A&amp;B"), OLD),
+    "characters by number": configuration(OLD.replace("/>", " Comment='Ger&#228;t'/>"),
+                                          head="<?xml version='1.0' encoding='US-ASCII'?>"),
+    "another case": configuration(OLD.replace("Transform", "transform")),
     "error and date": configuration(OLD.replace("/>", ' Error="0.9" Date="021513_103745"/>')),
 }  # fmt: skip
 
@@ -87,7 +90,8 @@ def test_only_the_element_changes(name, tmp_path):
     assert found.error_mm == 0.5
     assert found.date == "2026.11.21 21:00:00"
     put = found_element(parse_xml(new))
-    replaced = [element for element in transforms(old) if is_between(element)]
+    there = b"<CoordinateDefinitions>" in old
+    replaced = [element for element in transforms(old) if is_between(element)] if there else []
     if replaced:
         # By expat's own offsets: every byte before and after the element is as it was.
         assert new[: put.start] == old[: replaced[0].start]
@@ -103,7 +107,8 @@ def test_only_the_element_changes(name, tmp_path):
 
 
 def transforms(content):
-    return list(parse_xml(content).all("CoordinateDefinitions/Transform"))
+    (place,) = parse_xml(content).all("CoordinateDefinitions")
+    return [each for each in place.children if each.tag in ("Transform", "transform")]
 
 
 def is_between(element):
@@ -123,6 +128,27 @@ def test_other_attributes_are_kept():
     attributes = found_element(parse_xml(new)).attributes
     assert attributes["Persistent"] == "FALSE"
     assert "Error" not in attributes
+
+
+@pytest.mark.parametrize("encoding", ["UTF-8", "ISO-8859-1", "windows-1252"])
+def test_other_attributes_are_kept_in_every_encoding(encoding):
+    element = OLD.replace("/>", " Comment='Ger\xe4t'/>")
+    old = configuration(element, head=f'<?xml version="1.0" encoding="{encoding}"?>')
+    new, _ = patched_configuration(old.decode().encode(encoding), IMAGE, MATRIX)
+    assert found_element(parse_xml(new)).attributes["Comment"] == "Ger\xe4t"
+
+
+def test_definitions_without_an_end_tag_get_one():
+    old = configuration().replace(
+        b"<CoordinateDefinitions>\r\n\t</CoordinateDefinitions>", b"<CoordinateDefinitions />"
+    )
+    new, _ = patched_configuration(old, IMAGE, MATRIX)
+    before, after = old.split(b" />\r\n</Plus")
+    assert new.startswith(before + b">\r\n")
+    assert new.endswith(b"</CoordinateDefinitions>\r\n</Plus" + after)
+    np.testing.assert_array_equal(
+        np.array(found_element(parse_xml(new)).attributes["Matrix"].split(), float), MATRIX.ravel()
+    )
 
 
 @pytest.mark.parametrize(
@@ -195,6 +221,40 @@ def test_stale_pixel_size_is_told():
     )
     _, notes = patched_configuration(configuration(OLD, scaled), IMAGE, MATRIX)
     assert "still has pixels of 1 x 1 mm" in notes[0]
+
+
+def test_pixel_sizes_that_fcal_itself_wrote_are_not_stale():
+    size = np.linalg.norm(MATRIX[:3, :2], axis=0) * (1 + np.array([3.8e-4, -6.6e-4]))
+    scaled = OTHER.replace("StylusTip", "TransducerOriginPixel").replace(
+        '"Stylus" Matrix="1 0 0 0 0 1 ', f'"TransducerOrigin" Matrix="{size[0]} 0 0 0 0 {size[1]} '
+    )
+    assert patched_configuration(configuration(OLD, scaled), IMAGE, MATRIX)[1] == []
+
+
+@pytest.mark.parametrize(
+    ("sent", "inside", "message"),
+    [
+        ("ImageToProbe", [OLD], "sends ImageToProbe by itself, which overwrites this Image to"),
+        (
+            "ImageToTransducer",
+            [OTHER.replace("StylusTip", "Transducer").replace('"Stylus"', '"Probe"')],
+            "is a second path from Image, which PLUS refuses with every frame",
+        ),
+        ("ImageToTransducer", [OLD], ""),
+        ("TransducerOriginPixelToTransducerOrigin", [OLD], ""),
+        (
+            "",
+            [OTHER.replace("StylusTip", "Image").replace('"Stylus"', '"Reference"')],
+            "line 7: Image to Reference is a second path from Image as soon as",
+        ),
+    ],
+)
+def test_what_plus_hears_of_the_image_while_it_runs_is_told(sent, inside, message):
+    old = configuration(*inside).replace(
+        b"<Device Id='V'", f"<Device Id='V' ImageToTransducerTransformName='{sent}'".encode()
+    )
+    _, notes = patched_configuration(old, IMAGE, MATRIX)
+    assert [message in note for note in notes] == ([True] if message else [])
 
 
 def test_paste_and_command():

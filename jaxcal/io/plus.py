@@ -27,6 +27,9 @@ from jaxcal.runtime.array_types import Float
 _ROOT = "PlusConfiguration"
 _COORDINATES = "CoordinateDefinitions"
 
+PIXELS_AGREE = 2e-3
+"""Relative: fCal's own two statements of the pixel size differ by up to 7e-4."""
+
 
 @dataclass(frozen=True)
 class PlusTransform:
@@ -138,7 +141,11 @@ def read_configuration(path: str | os.PathLike[str]) -> PlusConfiguration:
         if root.tag != _ROOT:
             raise FormatError(f"is not a configuration of PLUS: its root is {quoted(root.tag)}")
         return PlusConfiguration(
-            tuple(_transform(element) for element in root.all(f"{_COORDINATES}/Transform")),
+            tuple(
+                _transform(element)
+                for place in root.all(_COORDINATES)
+                for element in _transforms(place)
+            ),
             tuple(
                 tuple(_wire(wire) for wire in pattern.all("Wire"))
                 for pattern in root.all("PhantomDefinition/Geometry/Pattern")
@@ -209,6 +216,11 @@ def _result_frame(frame: Element) -> ResultFrame:
             for error in frame.all("ReprojectionError3DList/ReprojectionError3D")
         },
     )
+
+
+def _transforms(coordinates: Element) -> list[Element]:
+    """Its transforms; PLUS compares their tag without regard to case."""
+    return [element for element in coordinates.children if element.tag.lower() == "transform"]
 
 
 def _transform(element: Element) -> PlusTransform:
@@ -351,9 +363,12 @@ def patched_configuration(
         raise FormatError(f"is not a configuration of PLUS: its root is {quoted(root.tag)}")
     places = list(root.all(_COORDINATES))
     if len(places) > 1:
-        raise FormatError(f"line {places[1].line}: a second {_COORDINATES}")
+        raise FormatError(
+            f"lines {places[0].line} and {places[1].line}: two {_COORDINATES}; PLUS reads one: put "
+            "the transforms together"
+        )
     wanted = capitalised(frames[0]), capitalised(frames[1])
-    elements = [] if not places else list(places[0].all("Transform"))
+    elements = [] if not places else _transforms(places[0])
     between = [element for element in elements if set(_frames(element)) == set(wanted)]
     if len(between) > 1:
         lines = " and ".join(str(element.line) for element in between)
@@ -364,6 +379,7 @@ def patched_configuration(
     _check_other_paths([element for element in elements if element not in between], wanted)
     newline = "\r\n" if b"\r\n" in content else "\n"
     stated = {"error_mm": error_mm, "date": date, "newline": newline}
+    notes = _stale_scale(elements, wanted, matrix) + _other_sources(root, elements, wanted)
     if between:
         old = between[0]
         others = {
@@ -373,11 +389,18 @@ def patched_configuration(
         }
         indent = _indent(content, old.start)
         text = transform_element(wanted, matrix, others=others, indent=indent, **stated)
-        new = content[: old.start] + text.encode() + content[old.end :]
-        return new, _stale_scale(elements, wanted, matrix)
+        return content[: old.start] + _ascii(text) + content[old.end :], notes
     parent = places[0] if places else root
+    if parent.content_end == parent.end and not places:
+        raise FormatError(f"line {parent.line}: <{parent.tag}/> is empty: there is no device in it")
     if parent.content_end == parent.end:
-        raise FormatError(f"line {parent.line}: <{parent.tag}/> is empty; write a start and an end")
+        # <CoordinateDefinitions/>: it gets an end tag.
+        outer = _indent(content, parent.start)
+        inner = outer + "  "
+        text = transform_element(wanted, matrix, indent=inner, **stated)
+        opened = content[parent.start : parent.end].removesuffix(b"/>").rstrip() + b">"
+        text = f"{newline}{inner}{text}{newline}{outer}</{_COORDINATES}>"
+        return content[: parent.start] + opened + _ascii(text) + content[parent.end :], notes
     outer = _indent(content, parent.content_end)
     inner = outer + "  "
     if places:
@@ -389,7 +412,7 @@ def patched_configuration(
         parts = (f"  <{_COORDINATES}>", f"{deeper}{text}", f"{inner}</{_COORDINATES}>", outer)
         text = newline.join(parts)
     at = parent.content_end
-    return content[:at] + text.encode() + content[at:], _stale_scale(elements, wanted, matrix)
+    return content[:at] + _ascii(text) + content[at:], notes
 
 
 def patch_configuration(
@@ -428,6 +451,11 @@ def patch_configuration(
     return notes
 
 
+def _ascii(text: str) -> bytes:
+    """An element for a file of whatever encoding: beyond ASCII, characters by their number."""
+    return text.encode("ascii", "xmlcharrefreplace")
+
+
 def _check_other_paths(others: list[Element], wanted: FramePair) -> None:
     pairs = [_frames(element) for element in others]
     way = path_between(pairs, *wanted)
@@ -457,13 +485,44 @@ def _stale_scale(
     for element in elements:
         if _frames(element) == ("TransducerOriginPixel", "TransducerOrigin"):
             kept = np.linalg.norm(_transform(element).matrix[:3, :2], axis=0)
-            if np.abs(kept / scale - 1).max() > 1e-4:
+            if np.abs(kept / scale - 1).max() > PIXELS_AGREE:
                 return [
                     f"line {element.line}: TransducerOriginPixel to TransducerOrigin still has "
                     f"pixels of {kept[0]:.6g} x {kept[1]:.6g} mm, the new transform "
-                    f"{scale[0]:.6g} x {scale[1]:.6g} mm"
+                    f"{scale[0]:.6g} x {scale[1]:.6g} mm: change it as well"
                 ]
     return []
+
+
+def _other_sources(root: Element, elements: list[Element], wanted: FramePair) -> list[str]:
+    """What PLUS learns of the first frame only while it runs, and what then goes wrong.
+
+    Source: PlusLib, vtkPlusUsDevice; IGSIO, vtkIGSIOTransformRepository::SetTransform.
+    """
+    notes = []
+    pairs = [_frames(element) for element in elements if set(_frames(element)) != set(wanted)]
+    for device in root.all("DataCollection/Device"):
+        name = device.attributes.get("ImageToTransducerTransformName", "")
+        sent = split_name(name)
+        if sent is None or sent[0] != wanted[0]:
+            continue
+        if sent == wanted:
+            what = f"overwrites this {wanted[0]} to {wanted[1]}"
+        elif path_between(pairs, sent[1], wanted[1]) is not None:
+            what = f"is a second path from {wanted[0]}, which PLUS refuses with every frame"
+        else:
+            continue
+        notes.append(
+            f"line {device.line}: while it runs, the device sends {name} by itself, which {what}: "
+            "take ImageToTransducerTransformName out, or give it another name"
+        )
+    for element in elements:
+        if _frames(element) in ((wanted[0], "Reference"), (wanted[0], "Tracker")):
+            notes.append(
+                f"line {element.line}: {wanted[0]} to {_frames(element)[1]} is a second path from "
+                f"{wanted[0]} as soon as the tracker sends {wanted[1]}: take it out then"
+            )
+    return notes
 
 
 def update_transform_command(
