@@ -245,7 +245,7 @@ def test_a_phantom_is_swapped_on_the_command_line_and_ends_in_a_calibration(tmp_
     command = [sys.executable, "-m", "hw", "acquire", str(path), "--bench", "--phantom", phantom]
     command += ["--images", "8", "--bench-seed", "3", "--speed", "5"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=540)
-    assert done.returncode in (0, 3), done.stderr
+    assert done.returncode in (0, 3, 5), done.stderr
     assert re.search(r"error against truth +[0-9.]+ mm", done.stdout)
     recording = jaxcal.load(path)
     assert recording.calibration.kind == ("point" if phantom == "cross-wire" else "time_of_flight")
