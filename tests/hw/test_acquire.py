@@ -116,7 +116,7 @@ def test_a_short_run_ends_in_a_recording_that_calibrate_takes(tmp_path, capsys):
 @pytest.mark.slow
 def test_an_optimal_run_plans_on_and_stops_by_itself(tmp_path):
     path, lines = tmp_path / "rec.h5", []
-    wanted = 0.4
+    wanted = 0.2
     request: AcquisitionRequest | None = AcquisitionRequest(
         30, "amplitude-scan", 2, bench=3, plan="optimal", until_tre_mm=wanted
     )

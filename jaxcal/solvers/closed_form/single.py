@@ -328,6 +328,8 @@ def _starts(reduced: ReducedObjective) -> Float[np.ndarray, "60 6"]:
     return fixed + (columns @ scales)[:, :, 0]
 
 
+# A step on a degenerate problem may be without bound: it makes no number, and is not taken.
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def descend(reduced: ReducedObjective, x: Float[np.ndarray, "s 6"]) -> Float[np.ndarray, 6]:
     """The best of Newton's descents on rotation and free scales from several feasible points.
 
