@@ -154,9 +154,9 @@ def _waits(command: str, of: str = "wall_ratio") -> list[float]:
 
 claim(
     SPEED,
-    "takes {:.1f} such processes the first time ever, {:.1f} the second time, and {:.1f} for a "
-    "recording of another length that no run has seen before.",
-    lambda: _waits("joint, auto"),
+    "takes {:.1f} s the first time, {:.1f} s the second, and {:.1f} s for a recording of another "
+    "length that no run has seen before: {:.1f}, {:.1f} and {:.1f} such processes.",
+    lambda: [*_waits("joint, auto", "wall_s"), *_waits("joint, auto")],
 )
 claim(SPEED, "it takes {:.2f}, {:.2f} and {:.2f}.", lambda: _waits("conventional"))
 claim(

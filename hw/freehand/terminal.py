@@ -9,7 +9,7 @@ import numpy as np
 from hw.keys import Keyboard
 from hw.midplane.terminal_image import COLUMNS, ROWS, Screen, picture
 
-KEYS = "u: take the last image back, q: finish, Ctrl-C: stop (it can be resumed)"
+KEYS = "u: take the last image back, q or Enter: finish, Ctrl-C: stop (it can be resumed)"
 INJECTION_KEYS = (
     "Enter: accept, s: begin the sweep anew, u: take the last image back, q: finish, Ctrl-C: stop"
 )

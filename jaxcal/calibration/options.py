@@ -52,7 +52,7 @@ class Options:
             one; it begins where ours would, stops by its own rule, and takes longer in a batch.
         gradient_tolerance: where ``gradient`` stops, relative.
         tolerance_rad: the alternation stops when a round turns X by less than this (rad) and
-        tolerance_mm: moves its origin by less than this (mm). The defaults reproduce the paper.
+        tolerance_mm: moves its origin by less than this (mm). The paper does not state it.
         max_rounds: most rounds of the alternation.
         inner_steps: Gauss-Newton steps on X and c in each of its rounds.
         max_iterations: most linearisations of the other solvers.

@@ -59,7 +59,7 @@ def apply(
 
     SOURCE is a table with columns u and v, and a pose (probe to tracker) if points in the tracker's
     frame are wanted; or a recording (.h5). Standard deviations and covariances are those of the
-    calibration and of --pixel-sd; neither of the pixel size nor of the pose.
+    calibration (estimated pixel sizes included) and of --pixel-sd; not of the pose.
     """
     import numpy as np
 

@@ -69,8 +69,8 @@ class _Request:
     "--max-elevation",
     type=POSITIVE,
     metavar="MM",
-    help="Bound on the offsets, for --method alternating and --prior bounded; without it the "
-    "recording's own, or 1 mm.",
+    help="Bound on the offsets, with --method alternating and --prior bounded (without it the "
+    "recording's own, or 1 mm), auto and uniform (without it the recording's own, if any).",
 )
 @click.option(
     "--sigma",
