@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import jax
@@ -240,6 +241,29 @@ def test_with_sds_wrong_by_three_a_plan_is_nearly_as_good():
         candidates = replace(pool, model=replace(MODEL, noise=wrong))
         assert error(design.plan(candidates, 20, polish=False).poses) < 1.1 * right
     assert right < 0.8 * random
+
+
+@pytest.mark.parametrize("criterion", ["tre", "rp"])
+def test_no_set_of_poses_goes_below_the_bound(criterion):
+    few = some(9)
+    which = 0 if criterion == "tre" else 1
+    every = [
+        curve(few, Known(MODEL.beliefs()), few.poses[list(rows)])[which][-1]
+        for rows in itertools.combinations_with_replacement(range(9), 5)
+    ]
+    least = design.least_error(few, 5, criterion)
+    assert 0.85 * min(every) < least < min(every)
+    # Of many candidates a plan takes nearly the best.
+    pool = some(2000)
+    chosen = design.plan(pool, 20, criterion, polish=False, rules=Rules(0.0, 20))
+    least = design.least_error(pool, 20, criterion)
+    assert least < (chosen.tre_mm, chosen.rp_mm)[which][-1] < 1.04 * least
+    # After a plan, what is known counts.
+    assert design.least_error(pool, 20, criterion, chosen) < 0.8 * least
+    with pytest.raises(InputError, match="choose the criterion tre or rp"):
+        design.least_error(pool, 20, "d")
+    with pytest.raises(InputError, match="at least one pose"):
+        design.least_error(pool, 0)
 
 
 def test_sds_that_grow_with_depth_are_learned_and_moved_away_from():

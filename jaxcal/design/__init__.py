@@ -12,6 +12,7 @@ candidates.py   poses to choose from: of a probe and a region, or around a recor
 greedy.py       one pose after the other; exchange.py: each of them against all others
 polish.py       off the grid, along the gradient on SE(3), inside the constraints
 planning.py     plan, next_poses
+bound.py        what no choice among the candidates goes below
 predict.py      what a plan promises; images_to
 words.py        a pose for a person who holds the probe
 figure.py       the plan, and how many images are needed
@@ -23,6 +24,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from jaxcal.design.bound import least_error as least_error
     from jaxcal.design.candidates import Candidates as Candidates
     from jaxcal.design.candidates import candidates_around as candidates_around
     from jaxcal.design.candidates import make_candidates as make_candidates
@@ -52,6 +54,7 @@ _HOME = {
     "gain": "criteria",
     "images_to": "predict",
     "known_information": "information",
+    "least_error": "bound",
     "make_candidates": "candidates",
     "next_poses": "planning",
     "plan": "planning",

@@ -1,0 +1,91 @@
+"""How good the best set of poses can be: a bound that no choice among the candidates beats.
+
+A set of n poses has the information B + sum_i k_i I_i, with whole numbers k_i that sum to n. Let
+them be any shares n w_i instead: tr(W (B + n sum w_i I_i)^-1) is convex in w, and with
+d_i = n tr(M^-1 W M^-1 I_i) its gradient is -d. So from any w
+
+    tr(W M^-1) - (max_i d_i - sum_i w_i d_i)
+
+is below what every set of n poses leaves (the equivalence theorem turned into a bound), and
+w_i <- w_i sqrt(d_i), normalised, brings both together.
+
+References: Kiefer and Wolfowitz 1960; Silvey, Titterington and Torsney 1978; Yu 2010.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.calibration.result import Calibration
+from jaxcal.design.candidates import Candidates
+from jaxcal.design.criteria import Criterion, check_criterion
+from jaxcal.design.information import covariance_of
+from jaxcal.design.planning import (
+    Known,
+    Plan,
+    check_candidates,
+    known_before,
+    weight_of,
+    with_effective_noise,
+)
+from jaxcal.design.predict import student_factor
+
+NEAR = 1e-3
+"""Of the squared error: how near to the best shares is near enough."""
+
+MOST_STEPS = 4000
+
+
+def least_error(
+    candidates: Candidates,
+    n: int,
+    criterion: Criterion = "tre",
+    prior: Known | Plan | Calibration | np.ndarray | None = None,
+) -> float:
+    """The predicted error that no n of the candidates go below, mm.
+
+    It compares with ``tre_mm[-1]`` and ``rp_mm[-1]`` of a plan without polish, which moves poses
+    off the candidates. The same pose may be taken several times; space filling and the cap on
+    replicates (:class:`jaxcal.design.Rules`) are left out, so a plan that keeps them is above.
+
+    Args:
+        candidates: to choose from.
+        n: how many.
+        criterion: ``tre`` or ``rp``.
+        prior: what is known already, as for :func:`jaxcal.design.plan`.
+
+    Raises:
+        InputError: criterion ``d``, no number of poses, or candidates from which nothing can be
+            calibrated.
+    """
+    check_criterion(criterion)
+    if criterion == "d":
+        raise InputError("the bound is on an error in mm: choose the criterion tre or rp")
+    if n < 1:
+        raise InputError(f"a plan has at least one pose, not {n}")
+    known = known_before(prior, candidates)
+    check_candidates(candidates)
+    candidates = with_effective_noise(prior, candidates)
+    weight = weight_of(criterion, candidates)
+    assert weight is not None
+    rows = candidates.model.jacobian(candidates.poses)
+    count, _, size = rows.shape
+    flat = rows.reshape(-1, size)
+    share = np.full(count, 1.0 / count)
+    best = 0.0
+    for _ in range(MOST_STEPS):
+        heavy = np.repeat(share, rows.shape[1])[:, None] * flat
+        covariance = covariance_of(known.information + n * flat.T @ heavy)
+        turned = covariance @ weight @ covariance
+        gains = n * np.einsum("ni,ni->n", flat @ turned, flat).reshape(count, -1).sum(axis=1)
+        mean = float(share @ gains)
+        left = float(np.sum(weight * covariance))
+        best = max(best, left - (float(gains.max()) - mean))
+        if gains.max() - mean <= NEAR * left:
+            break
+        share = share * np.sqrt(gains)
+        share = share / share.sum()
+    return math.sqrt(student_factor(known.images + n, size) * best)
