@@ -323,7 +323,7 @@ def test_a_degenerate_set_is_solved_but_not_observable(degenerate, jaxcal_proces
     [
         ([], "Missing command"),
         (["nonsense"], "No such command 'nonsense'"),
-        (["--nonsense"], "No such option '--nonsense'"),
+        (["--nonsense"], "--nonsense"),
         (["calibrate"], "Missing argument 'REC'"),
         (["demo", "--seed", "-1"], "--seed"),
         (["demo", "--seed", "x"], "'x' is not a valid integer"),

@@ -168,8 +168,12 @@ def test_conventional_is_scipys_least_squares():
         return circle_residual(retract(start, tangent, RIGID), jnp.zeros(15), data).ravel()
 
     away = 0.1 * np.random.default_rng(0).normal(size=9)
-    fit = least_squares(lambda u: np.asarray(residual(jnp.asarray(u))), away, method="lm",
-                        xtol=1e-15, ftol=1e-15, gtol=1e-15)  # fmt: skip
+    slope = jax.jit(jax.jacfwd(residual))
+    fit = least_squares(
+        lambda u: np.asarray(residual(jnp.asarray(u))), away,
+        jac=lambda u: np.asarray(slope(jnp.asarray(u))),  # pyright: ignore[reportArgumentType]
+        method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15,
+    )  # fmt: skip
     assert float(result.cost) == pytest.approx(2 * fit.cost, rel=1e-12)
     np.testing.assert_allclose(fit.x, 0, atol=1e-5)
 
