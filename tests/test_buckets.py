@@ -154,3 +154,26 @@ def test_every_number_of_images_in_a_bucket_is_one_program(tmp_path, monkeypatch
         jaxcal.calibrate(select(problems[0], slice(0, count)), "alternating")
     (entry,) = program_cache.entries()
     assert entry.header["label"]["images"] == 12
+
+
+@pytest.mark.parametrize("method", ["joint", "alternating"])
+def test_a_recording_of_another_length_compiles_nothing(problems, method):
+    def answer(count: int) -> None:
+        recording = select(problems[1], slice(0, count))
+        found = jaxcal.calibrate(recording, method).numpy()
+        assert found.images_used == count
+        assert np.isfinite(found.covariance).all()
+
+    answer(12)
+    compiled = []
+
+    def listen(name: str, *_: object, **__: object) -> None:
+        if "backend_compile" in name:
+            compiled.append(name)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        answer(11)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert compiled == []

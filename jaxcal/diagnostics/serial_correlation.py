@@ -55,7 +55,9 @@ def widened(result: Calibration) -> Calibration:
     if result.data != "points" or result.prior == "bounded" or result.problem is None:
         return result
     covariance = np.asarray(result.unknowns_covariance)
-    if not np.isfinite(covariance).all() or int(result.images_used) < FEWEST_IMAGES:
+    # Counted by numpy: JAX would compile the count for every number of images.
+    used = int(np.sum(np.asarray(result.mask) > 0))
+    if not np.isfinite(covariance).all() or used < FEWEST_IMAGES:
         return result
     errors, rows = _in_sds(result)
     found = _ratio(errors, rows)
