@@ -15,11 +15,12 @@ RESULTS = ROOT / "experiments" / "results"
 
 Row = dict[str, str]
 
-README, INDEX, ACCURACY, PAPER, SPEED = PAGES = (
+README, INDEX, ACCURACY, PAPER, EXPERIMENT, SPEED = PAGES = (
     "README.md",
     "docs/results/index.md",
     "docs/results/accuracy.md",
     "docs/results/paper.md",
+    "docs/results/paper-experiment.md",
     "docs/results/speed.md",
 )
 
