@@ -63,7 +63,7 @@ def test_every_number_of_readme_and_results_is_in_a_table():
 def test_a_number_that_no_table_has_is_found(tmp_path, monkeypatch):
     import measured
 
-    for name in measured.PAGES:
+    for name in measured.pages():
         copy = tmp_path / name
         copy.parent.mkdir(parents=True, exist_ok=True)
         copy.write_text((ROOT / name).read_text(encoding="utf-8"), encoding="utf-8")

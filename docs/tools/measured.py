@@ -1,7 +1,7 @@
-"""Where each number of the README and of the results pages comes from.
+"""Where each number of the README and of the results pages comes from, and some of other pages.
 
-The claims stand in ``claims_accuracy.py``, ``claims_trust.py``,
-``claims_paper.py`` and ``claims_speed.py``.
+The claims stand in ``claims_*.py``. On the pages of :data:`claims.PAGES` no other number may stand
+beside them but settings; on other pages the claims alone are compared.
 ``python docs/tools/measured.py`` lists what is not as the tables in ``experiments/results`` say;
 ``--write`` puts the tables' present values into the sentences (read them afterwards: what a number
 means may have changed with it).
@@ -14,6 +14,7 @@ import sys
 
 # These register their claims.
 import claims_accuracy  # noqa: F401
+import claims_guides  # noqa: F401
 import claims_paper  # noqa: F401
 import claims_speed  # noqa: F401
 import claims_trust  # noqa: F401
@@ -125,10 +126,15 @@ def plain(text: str) -> str:
     return text
 
 
+def pages() -> tuple[str, ...]:
+    """Every page with a claim."""
+    return tuple(dict.fromkeys((*PAGES, *(piece.page for piece in CLAIMS))))
+
+
 def problems() -> list[str]:
     """What is not as the tables say, one line each."""
     found = []
-    for page in PAGES:
+    for page in pages():
         text = (ROOT / page).read_text(encoding="utf-8")
         known = [False] * len(text)
         for piece in (c for c in CLAIMS if c.page == page):
@@ -140,14 +146,14 @@ def problems() -> list[str]:
                 if re.sub(r"\s+", " ", match[0]) != re.sub(r"\s+", " ", wanted):
                     found.append(f"{page}: the tables say: {wanted}")
                 known[match.start() : match.end()] = [True] * (match.end() - match.start())
-        for words in SETTINGS[page]:
+        for words in SETTINGS.get(page, ()):
             pattern = r"\s+".join(re.escape(word) for word in words.split())
             matches = list(re.finditer(pattern, text))
             if not matches:
                 found.append(f"{page}: nowhere: {words}")
             for match in matches:
                 known[match.start() : match.end()] = [True] * (match.end() - match.start())
-        for match in _NUMBER.finditer(plain(text)):
+        for match in _NUMBER.finditer(plain(text)) if page in PAGES else ():
             if not known[match.start()]:
                 line = text.count("\n", 0, match.start()) + 1
                 around = " ".join(text[max(match.start() - 30, 0) : match.end() + 20].split())
