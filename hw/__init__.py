@@ -1,7 +1,7 @@
 """Hardware side of jaxcal: what a bench measures becomes arrays for the engine, live or in files.
 
 ``hw`` imports ``jaxcal``, never the other way round. The small processes that talk to devices
-import parts of ``hw`` too; so the engine is loaded only when something of it is asked for.
+import parts of ``hw`` too, so the engine is loaded only when ``LiveCalibration`` is asked for.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The experiment: for each pose of the plan move, place, record, and say what is known so far.
 
-What was taken stays taken: every image is on the disk before the next move, whatever happens then.
-A device that fails ends the run with the robot at rest and one line; the recording is resumed with
-the images that are still missing, after a new confirmation.
+Every image is on the disk before the next move, so it is kept whatever happens. When a device
+fails, the robot is stopped and the run ends with one line. The recording can be resumed, after a
+new confirmation, to take the images that are still missing.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class AcquisitionStopped(CalibrationError):
 
     Attributes:
         exit_code: of the command line.
-        by_itself: whether it may be resumed without a person who puts something right.
+        by_itself: whether it may be resumed without a person's help.
     """
 
     def __init__(self, message: str, *, interrupted: bool = False, by_itself: bool = False) -> None:
@@ -101,10 +101,10 @@ class AcquisitionRequest:
         bench: seed of the emulated bench; None for a real one.
         operator: one of :data:`OPERATORS`: who follows the injected pattern, a person at the
             terminal or before a window, or a rule.
-        plan: one of :data:`PLANS`; ``optimal`` chooses from a pool as the images tell.
+        plan: one of :data:`PLANS`; ``optimal`` chooses from a pool by the images taken so far.
         until_tre_mm: with ``optimal``: stop once the predicted TRE is no larger than this.
-        phantom: one of :data:`PHANTOMS`: what is in the tank. Images of a cross-wire are placed and
-            segmented by what they show, those of the others by the electronics.
+        phantom: one of :data:`PHANTOMS`: what is in the tank. A cross-wire is placed and measured
+            by what the images show, the other phantoms by the electronics.
     """
 
     images: int = 60
@@ -139,7 +139,7 @@ class AcquisitionRequest:
 
     @property
     def by_image(self) -> bool:
-        """Whether frames are placed and segmented, not the electronics' times of flight."""
+        """Whether images serve for placement and measurement, instead of the electronics."""
         return self.phantom == "cross-wire"
 
     @property
@@ -175,11 +175,11 @@ class Pause:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended that came to its end.
+    """Result of a completed run.
 
     Attributes:
         images: selected.
-        given_up: rows of the plan for which no mid-plane was found.
+        given_up: rows of the plan for which no mid-plane was found, or that were skipped.
         sha256: of the finished file.
         seconds: bench seconds that this run took.
     """
@@ -239,10 +239,10 @@ def acquire(
         confirm: asked once before anything moves, with the plan of motion; resuming asks again.
         say: told one line after every image, and of everything that a person should know.
         oracle: of an emulated bench; its truth goes into the recording.
-        operator: makes who follows the injected pattern, afresh for every pose.
+        operator: called for every pose; makes the operator that follows the injected pattern.
         pause: to hold the run between images.
         watch: limits of the devices' silence.
-        view: told how it goes; nothing comes back from there.
+        view: told of the progress; it gives nothing back.
 
     Returns:
         The outcome; the file is complete then.
@@ -279,11 +279,11 @@ def acquire(
             reason, interrupted = "interrupted", True
         except (DeviceError, CalibrationError) as error:
             reason, interrupted = str(error), False
-        # The robot rests by now.
+        # Motion has ended by now: no process of ours moves the robot any more.
         with suppress(CalibrationError):
             recorder.add_event("stopped", reason, setup.clock.now())
     if recorder.error is not None and not interrupted:
-        # Everything else that went wrong came of it.
+        # The recorder's failure is the cause of what went wrong.
         reason = str(recorder.error)
     raise AcquisitionStopped(
         f"{reason}; {estimator.count} of {job.images} images are in {recorder.kept}; put it "
@@ -295,7 +295,7 @@ def acquire(
 
 @contextmanager
 def _closing(recorder: Recorder) -> Iterator[None]:
-    """Close a recorder; what it failed of is in its ``error``."""
+    """Close a recorder at the end; its failure, if any, is in its ``error``."""
     try:
         yield
     finally:
@@ -320,7 +320,7 @@ def _prepare(
 ) -> _Job:
     if request is not None:
         return _Job(setup, request, planned(setup, request).poses, None)
-    # Cut back to whole rows first, so that what is read is what is there.
+    # Cut the file back to whole rows first, so that only these are read.
     RecordingWriter.resume(path).close()
     progress = read_progress(path)
     asked = progress.settings.get("request")
@@ -396,7 +396,7 @@ def _run(
         note("confirmed", f"{by}; plan {plan.digest[:16]} for robot {plan.serial}, {plan.pendant}")
 
         def log(t: float, command: str, numbers: dict[str, object]) -> None:
-            # Called where the controller is heard: what the recorder fails of is seen elsewhere.
+            # Runs in the thread that hears the motion process; the recorder keeps its own error.
             with suppress(CalibrationError):
                 recorder.add_event("command", f"{command} {json.dumps(numbers)}", t)
 
@@ -453,7 +453,7 @@ def _run(
 def _rows(
     job: _Job, estimator: Estimator, session: Session, note: Callable[[str, str], None]
 ) -> Iterator[int]:
-    """The poses to visit, one after the other; those that were given up are not asked for again."""
+    """The poses to visit, one after the other; a pose given up does not come again in this run."""
     if job.request.plan == "sobol":
         yield from job.missing
         return
@@ -542,7 +542,7 @@ def _place(
 
 @dataclass(frozen=True)
 class _Shot:
-    """What was measured where the probe was left."""
+    """What was measured at the place where the probe stands."""
 
     pose: np.ndarray
     measurement: np.ndarray

@@ -19,7 +19,7 @@ class Estimator:
     Args:
         capacity: images of the plan.
         setup: probe and scene.
-        progress: of a recording that is resumed; its images are taken over.
+        progress: of a recording that is resumed; its images are used.
         kind: what an image holds, ``time_of_flight`` or ``point``.
 
     Raises:
@@ -65,10 +65,10 @@ class Estimator:
         return self._result
 
     def warm_up(self, targets: np.ndarray) -> None:
-        """Compile before anything moves, on what the drawing says that the plan will measure."""
+        """Compile before anything moves, on measurements simulated from drawing and plan."""
         live, probe, scene = self._empty(), self._setup.probe, self._setup.scene
         seen = np.linalg.inv(targets @ scene.image_to_probe) @ np.append(scene.point_mm, 1.0)
-        # Somewhat off the plane, as real images are: an exact fit is a degenerate problem.
+        # Slightly off the plane, like real images: an exact fit would be a degenerate problem.
         rng = np.random.default_rng(0)
         seen = seen[:, :3] + rng.normal(0, 0.2, (len(targets), 3))
         if self._kind == "point":
@@ -116,7 +116,7 @@ class Estimator:
         return float(seen[1])
 
     def line(self, total: int, placement: Placement) -> str:
-        """The state of things after an image, for a person."""
+        """The state of the acquisition after an image, for a person."""
         bracket = placement.bracket
         head = (
             f"image {self.count}/{total}: offset {bracket.centre_mm:+.2f} mm in "
@@ -137,7 +137,7 @@ class Estimator:
         try:
             self._live.put(pose, measurement, bound)
         except InputError:
-            # In the file it is all the same; calibrate will say what is wrong with it.
+            # The file keeps the image; calibrate will say what is wrong with it.
             self._left_out += 1
             return
         if last:

@@ -11,14 +11,14 @@ PLACEMENTS_OF = {
     "cross-wire": ("image-scan", "none"),
     "hydrophone": ("amplitude-scan", "none"),
 }
-"""What goes with which phantom, the default first: nothing is wired to a cross-wire, and a
-hydrophone never answers."""
+"""Placements possible with each phantom, the default first: a cross-wire is not connected to the
+electronics, and a hydrophone never answers."""
 
 HAND_PLACEMENTS = ("none", "pattern-injection")
-"""Of a probe that a person holds; the first is the default."""
+"""Placements of a hand-held probe; the first is the default."""
 
 OPERATORS = ("person", "window", "simulated")
 """Who follows the injected pattern."""
 
 PLANS = ("sobol", "optimal")
-"""How poses are planned: spread evenly beforehand, or chosen as the images tell."""
+"""How poses are planned: spread evenly beforehand, or chosen by the images taken so far."""

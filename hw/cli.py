@@ -35,8 +35,9 @@ _POSE_HZ = {"cb": 125, "e": 500}
     no_args_is_help=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog="Exit status: 0 done; 2 bad usage or input, with one line that says what; 3 done, but "
-    "the calibration did not converge; 4 a device failed: the robot rests, the recording can be "
-    "resumed; 130 interrupted, likewise.",
+    "the calibration did not converge; 4 a device failed: motion has ended, and the recording can "
+    "be resumed; 5 done, but the calibration is less than fair; 130 interrupted, with motion ended "
+    "as by 4.",
 )
 @click.version_option(__version__, prog_name="jaxcal-hw")
 def commands() -> None:
@@ -324,7 +325,7 @@ def free_hand(
 
 
 def _calibrated(path: str) -> int:
-    """Calibrate from a finished free-hand recording and print what came of it."""
+    """Calibrate from a finished free-hand recording and print the result."""
     from jaxcal.calibration.calibrate import calibrate
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.cli.common import print_page
@@ -517,7 +518,7 @@ def _acquire(
             except AcquisitionStopped as error:
                 if error.exit_code == ExitCode.INTERRUPTED or not error.by_itself:
                     raise
-                # A busy machine trips the emulated controller's watchdog; nobody has to look.
+                # A busy machine trips the emulated controller's watchdog: resume without a person.
                 say(f"stopped: {error}")
                 request = None
         return _finished(path, attempt(request), setup)
@@ -553,7 +554,7 @@ def _finished(path: str, outcome: Outcome, setup: Setup) -> int:
 
 
 def _confirming(setup: Setup, emulated: bool, unattended: str | None) -> Confirm:
-    """Who confirms the plan: the emulated bench's needs nobody's word, a robot's a person's."""
+    """Who confirms a plan: a person, or ``--unattended``; nobody on the emulated bench."""
 
     def ask(plan: MotionPlan) -> Confirmation:
         from hw.robot.safety import Challenge, confirm, confirm_unattended
@@ -576,7 +577,7 @@ def _confirming(setup: Setup, emulated: bool, unattended: str | None) -> Confirm
 
 
 def _plan_page(plan: MotionPlan) -> list[str]:
-    """What somebody who confirms a plan must know of it."""
+    """Everything that a person must know of a plan to confirm it."""
     from hw.robot.safety import plan_lines
 
     lines = [

@@ -40,14 +40,14 @@ class Clock:
         return (monotonic_s - self.origin_s) * self.speed
 
     def wall(self, seconds: float) -> float:
-        """Wall seconds that so many bench seconds take."""
+        """Wall seconds that a number of bench seconds takes."""
         return seconds / self.speed
 
     def patience(self, seconds: float) -> float:
         """A limit on silence in bench seconds, at least as long on the wall as in real time.
 
-        A busy machine holds a process up for as long on the wall however fast the bench runs: on an
-        emulated bench at ten times real time 100 ms would be 10 ms, and every hiccup a fault.
+        A busy machine delays a process by the same wall time however fast the bench runs. At ten
+        times real time 100 ms would be 10 ms on the wall, and every short delay would be a fault.
         """
         return seconds * max(self.speed, 1.0)
 

@@ -1,4 +1,4 @@
-"""The emulated bench as a setup and an oracle: what a lab's TOML file says of a real one."""
+"""The emulated bench as a setup, in place of a lab's TOML file, and as an oracle of the truth."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def start(
     Args:
         seed: of the world.
         speed: bench seconds per second on the wall.
-        pose_hz: of the robot, which says what series it is (:class:`hw.bench.run.Options`).
+        pose_hz: of the robot; it decides the series (:class:`hw.bench.run.BenchOptions`).
         phantom: in the tank (:mod:`hw.bench.phantoms`).
 
     Raises:
-        InputError: a speed that cannot be.
+        InputError: an impossible speed.
     """
     return start_bench(
         seed=seed,

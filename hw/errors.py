@@ -1,4 +1,4 @@
-"""What a device of the bench does wrong, as one clear line and the device it came from.
+"""Errors of the bench's devices: one clear line each, and the device that it came from.
 
 These errors stay apart from :class:`jaxcal.CalibrationError` so that the small processes that talk
 to devices start without importing JAX.
@@ -42,7 +42,10 @@ class LostError(DeviceError):
 
 
 class RefusedError(DeviceError):
-    """The safety gate, or the device, refused what was asked; nothing moved."""
+    """The safety gate, or the device, refused what was asked, or a robot's setting was changed.
+
+    Nothing moved, unless the change came during a motion: then the robot was stopped.
+    """
 
 
 class StoppedError(DeviceError):

@@ -17,10 +17,10 @@ ENDING = tuple(
 
 @contextmanager
 def as_interrupts() -> Iterator[None]:
-    """Meanwhile each of ``ENDING`` raises KeyboardInterrupt in the main thread, as Ctrl-C does.
+    """Within it each signal of ``ENDING`` raises KeyboardInterrupt in the main thread, like Ctrl-C.
 
-    A shell starts background jobs with SIGINT ignored, and so would be a stop sent to one: it
-    is heard again. SIGHUP stays ignored where it is, since that is what ``nohup`` is for.
+    A shell starts background jobs with SIGINT ignored, so a stop by SIGINT would have no effect:
+    here it has. SIGHUP stays ignored where it is ignored, since that is what ``nohup`` is for.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,7 +1,7 @@
 """Keys of the person at the terminal, one at a time, without Enter.
 
 Nothing is read where standard input is no terminal, or where this process is in the background.
-Ctrl-C stays a signal, and the terminal is as it was afterwards.
+Ctrl-C stays a signal, and the terminal is restored afterwards.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ def names_of(typed: bytes) -> list[str]:
 
 
 class Keyboard:
-    """Hands every key to whoever asks for one, and otherwise lets the pause keys hold the run.
+    """Gives every key to :meth:`read` within :meth:`asking`; otherwise the pause keys hold the run.
 
     Args:
-        pause: held and released by ``pause_keys`` while nobody asks.
+        pause: held and released by ``pause_keys`` outside of :meth:`asking`.
         pause_keys: names of keys.
         say: told what the pause keys did.
     """
@@ -99,7 +99,7 @@ class Keyboard:
 
     @contextmanager
     def asking(self) -> Iterator[None]:
-        """Keys go to :meth:`read` meanwhile; those pressed before are forgotten."""
+        """Within it keys go to :meth:`read`; those pressed before are forgotten."""
         with contextlib.suppress(queue.Empty):
             while True:
                 self._keys.get_nowait()
@@ -118,7 +118,7 @@ class Keyboard:
 
     @contextmanager
     def lines(self) -> Iterator[None]:
-        """The terminal reads whole lines meanwhile, for a question that is answered with Enter."""
+        """Within it the terminal reads whole lines, for a question that is answered with Enter."""
         if self._terminal is None:
             yield
             return
@@ -157,7 +157,7 @@ class Keyboard:
 
 
 class _Terminal:
-    """Standard input, a POSIX terminal: by lines as it was, or key by key."""
+    """Standard input, a POSIX terminal: read by lines as before, or key by key."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()

@@ -23,7 +23,7 @@ class LiveCalibration:
     """Images come in one by one; the calibration so far is there after each.
 
     Args:
-        capacity: most images; twice as much room costs twice the time of a solve.
+        capacity: most images; twice the capacity takes twice the time of a solve.
         kind: ``point`` (mm), ``pixel`` or ``time_of_flight`` (s) measurements.
         spacing_mm: [lateral, axial] mm/px for pixels.
         probe: the transducer, for times of flight.

@@ -1,4 +1,4 @@
-"""Before and after an acquisition: the plan as it would be run, and what came of it."""
+"""Before and after an acquisition: the dry run of its plan, and its result."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def dry_run(
 
     Raises:
         InputError: a plan that cannot be made.
-        RefusedError: a plan that the limits do not allow; the first pose that is not.
+        RefusedError: a plan that the limits do not allow; it names the first pose or way.
     """
     if request is None:
         raise InputError("--resume needs --move: a dry run has nothing to resume")
@@ -60,7 +60,7 @@ def _poses(request: AcquisitionRequest, count: int) -> str:
 
 
 def _dry_limits(setup: Setup) -> Limits:
-    """The limits, without the arm where its TCP offset is not known: only the controller tells."""
+    """The limits, without the arm's model where the setup lacks the controller's TCP offset."""
     limits = setup.motion_limits()
     return limits if setup.tcp_offset is not None else replace(limits, arm_model="")
 
@@ -71,7 +71,7 @@ def draw(setup: Setup, request: AcquisitionRequest, figure: str) -> None:
 
 
 def calibrate_and_print(path: str, outcome: Outcome, speed: float) -> dict[str, Any]:
-    """Calibrate from the finished file as ``jaxcal calibrate`` would, and print what came of it.
+    """Calibrate from the finished file as ``jaxcal calibrate`` would, and print the result.
 
     Returns:
         The calibration's record (:func:`jaxcal.report.record.calibration_record`).
@@ -95,7 +95,7 @@ def calibrate_and_print(path: str, outcome: Outcome, speed: float) -> dict[str, 
     ]
     if outcome.given_up:
         rows = ", ".join(str(row + 1) for row in outcome.given_up)
-        lines.append(f"no mid-plane was found at poses {rows}")
+        lines.append(f"without an image: poses {rows} (no mid-plane found, or skipped)")
     share = share_inside(path)
     if share is not None:
         lines.append(f"true offsets inside their brackets: {share[0]} of {share[1]}")

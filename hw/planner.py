@@ -1,9 +1,9 @@
 """Which pose of a confirmed pool comes next, and whether another image is worth it.
 
-Up to the eighth image, and as long as the running calibration has not converged, poses are chosen
-for the SDs that a bench begins with; from then on for what the calibration so far knows and with
-the SDs that were tuned. Gains are compared a second: the way there and what a placement takes both
-count. Every fifth image fills space.
+With fewer than eight images, or while the running calibration has not converged, poses are chosen
+with the drawing and the SDs of a new bench; after that with the calibration so far and the SDs
+tuned from its images. Gains are compared per second of bench time, for the way to a pose and the
+placement there. Every fifth image instead fills a gap between the poses.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from jaxcal.design.greedy import Cover, space_features
 from jaxcal.design.planning import Known
 
 FEWEST_TO_TRUST = 8
-"""Images from which on a calibration's own covariance says what is known."""
+"""With at least so many images a calibration's own covariance is used."""
 _PLACEMENT_S = 8.0
-"""Bench seconds that an image takes beside the way there."""
+"""Bench seconds that an image takes, without the way to its pose."""
 _TURN_DEG_S = 30.0
 _FILL = 5
 _MOST_IMAGES = 1000
@@ -37,9 +37,9 @@ class Choice:
 
     Attributes:
         row: of the pool; None: the wanted error is reached.
-        tre_now_mm: predicted with the images so far; None where nothing is known yet.
-        tre_then_mm: with one more at this pose.
-        more: images that the wanted error still takes; None: not asked for, not known, or more
+        tre_now_mm: TRE predicted with the images so far; None where nothing is known yet.
+        tre_then_mm: TRE predicted with one more image, at this pose.
+        more: images still needed for the wanted error; None: not asked for, not known, or more
             than 1000.
     """
 
@@ -61,7 +61,7 @@ class Choice:
 
 
 class Planner:
-    """Chooses from a pool.
+    """Chooses poses from a pool.
 
     Args:
         targets: (n, 4, 4) the pool, mm.
@@ -130,7 +130,7 @@ class Planner:
         return Known(model.beliefs() + model.information(taken), max(len(taken), 1)), left
 
     def _filling(self, open_rows: list[int], left: Candidates, count: int) -> int | None:
-        """The pose that fills space, where this image is one of those."""
+        """The row of the pose that fills space; None where this image is not one of those."""
         if (count + 1) % _FILL or count == 0:
             return None
         assert left.taken is not None
@@ -143,7 +143,7 @@ class Planner:
     def _seconds(
         self, here: Float[np.ndarray, "4 4"], poses: Float[np.ndarray, "n 4 4"]
     ) -> Float[np.ndarray, " n"]:
-        """From here to each pose, and the placement there."""
+        """Bench seconds for the way from here to each pose and the placement there."""
         tip = here[:3, :3] @ self._tip + here[:3, 3]
         tips = poses[:, :3, :3] @ self._tip + poses[:, :3, 3]
         way = np.linalg.norm(tips - tip, axis=1) / self._speed

@@ -1,7 +1,7 @@
 """Poses to choose from while an experiment runs: the pool of ``--plan optimal``.
 
-Optimal poses for SDs as a bench has them, and Sobol poses between them, all of them inside the
-plan's extent and the limits of motion.
+The pool holds poses that are optimal for the SDs of a typical bench, and Sobol poses between them,
+all inside the plan's extent and the limits of motion.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from jaxcal.design import Constraints, Model, Noise, Region, Rules, make_candida
 from jaxcal.design.constraints import Allowed
 
 BENCH_SDS_MM = (0.15, 0.12, 0.35)
-"""Lateral, range and elevational SDs of a bench before its images tell: placed by an arm that is
-good to 0.1 mm and an element that is heard 0.3 mm off the plane. They may be off by three."""
+"""Lateral, range and elevational SDs assumed before there are images: for an arm that is good to
+0.1 mm and an element that is heard 0.3 mm off the plane. They may be wrong by a factor of three."""
 BENCH_RULES = Rules(replicates=1, apart_deg=4.0, apart_mm=1e6)
-"""On a bench two images of one orientation share the shift of the element's response."""
+"""One image for each orientation: two images of one orientation would share the shift of the
+element's response."""
 _CANDIDATES = 1000
 _SEARCH_ROOM_MM = 5.0
 
@@ -34,7 +35,7 @@ def plan_pool(
     seed: int = 0,
     allowed: Allowed | None = None,
 ) -> PosePlan:
-    """Poses to choose ``count`` images from: twice as many optimal ones, and Sobol ones.
+    """Poses to choose ``count`` images from: up to 2 ``count`` optimal and ``count`` Sobol poses.
 
     Args:
         count: 4 to 1000.
@@ -78,11 +79,11 @@ def allowed_by(limits: Limits, tcp_offset: tuple[float, ...] | None) -> Allowed:
 
     Args:
         limits: of motion.
-        tcp_offset: m and rad; None: the arm is not looked at.
+        tcp_offset: m and rad; None: the arm's joints are not checked.
     """
     axis = np.asarray(limits.cone_axis) / np.linalg.norm(limits.cone_axis)
     corners = np.array([limits.tip_mm, *limits.hull_mm])
-    # Room for the search along the elevational axis, of which a few mm are mostly enough.
+    # Room for the search along the elevational axis; mostly a few mm are enough.
     margin = min(limits.search_mm, _SEARCH_ROOM_MM)
     low, high = np.radians(limits.joint_min_deg), np.radians(limits.joint_max_deg)
 

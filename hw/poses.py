@@ -1,17 +1,17 @@
 """Plan of poses: where the probe looks at the target from (section 3.3 of the paper).
 
 Orientations cover a cone about the direction in which the probe looks, with turns about it; the
-target is spread over the image. All five numbers of a pose run through one Sobol sequence, turned
-round by the seed (:mod:`jaxcal.design.candidates`). A pose whose tip leaves the box, or whose tool
-centre point is out of the arm's reach, is passed over for the next of the sequence.
+target is spread over the image. All five numbers of a pose come from one Sobol sequence, shifted
+modulo 1 by the seed (:mod:`jaxcal.design.candidates`). A pose whose tip leaves the box, or whose
+tool centre point is out of the arm's reach, is passed over for the next one of the sequence.
 
 A plan may also be a pool to choose from while the experiment runs (:mod:`hw.pool`). The whole pool
 is checked and confirmed before anything moves; which of its poses are visited, and in which order,
 follows from the images (:mod:`hw.planner`).
 
-The planner knows a drawing of the probe's mount and roughly where the target is, not the truth: the
-target will stand off the mid-plane by some millimetres, which the search of :mod:`hw.midplane`
-takes up.
+The planner knows a drawing of the probe's mount and roughly where the target is, not the truth. So
+the target will be off the mid-plane by some millimetres; the search of :mod:`hw.midplane` corrects
+this.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MM_PER_DEGREE = 1.0
 
 @dataclass(frozen=True)
 class Extent:
-    """What the plan shall cover, and what it must not leave.
+    """What the plan covers, and the bounds that it keeps.
 
     Attributes:
         cone_deg: half angle of the cone of axial directions.
@@ -80,8 +80,8 @@ class PosePlan:
     Attributes:
         poses: (n, 4, 4) tool centre point -> base, mm.
         expected: (n, 2) where the target should then be in the image: [lateral, range], mm.
-        scene: what it was made from.
-        extent: likewise.
+        scene: the scene that it was made for.
+        extent: the extent that it was made for.
         passed_over: poses of the sequence that left the box or the reach.
     """
 
@@ -115,7 +115,7 @@ def plan_poses(count: int, scene: Scene, extent: Extent | None = None, seed: int
         seed: another one gives another plan of the same quality.
 
     Raises:
-        InputError: a scene that is no scene, or a box or reach that leaves too few poses.
+        InputError: an invalid scene, or a box or reach that leaves too few poses.
     """
     extent = Extent() if extent is None else extent
     if not 1 <= count <= MOST_POSES:
@@ -167,7 +167,7 @@ def _short_tour(poses: np.ndarray, tip: np.ndarray) -> np.ndarray:
 
 
 def _two_opt(tour: np.ndarray, cost: np.ndarray, rounds: int = 20) -> np.ndarray:
-    """Turn pieces of an open tour round as long as that shortens it."""
+    """Reverse pieces of an open tour as long as that shortens it."""
     if len(tour) > 500:
         return tour
     for _ in range(rounds):

@@ -1,11 +1,11 @@
-"""The recorder: rows go into a bounded queue, a process of its own writes them to the file.
+"""The recorder: rows go into a bounded queue, and a separate process writes them to the file.
 
-Acquisition hands over what it measured and goes on; a slow disk, an interpreter lock held by a
-client library or a solve in between cost nothing but room in the queue. Continuous data (poses,
-frames, echo) that find the queue full are dropped and counted; selected images, events and
-estimates never are: they wait, and an image has been taken only once the writer says that it is on
-the disk. When the acquisition dies, however it dies, its writer notices the closed pipe, closes the
-file in order, and leaves it incomplete, to be resumed.
+The acquisition hands over its data and goes on; a slow disk, an interpreter lock held by a client
+library or a solve only fill the queue. Continuous data (poses, frames, echo) are dropped and
+counted when the queue is full. Selected images, events and estimates are never dropped: they wait
+for room, and an image counts as taken only once the writer says that it is on the disk. When the
+acquisition dies, in whatever way, its writer notices the closed pipe, closes the file in order, and
+leaves it incomplete, to be resumed.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ class Recorder:
 
     Args:
         path: the file to make, or with ``header`` None the incomplete one to go on with.
-        header: what a new file is told (see :class:`hw.recording_layout.Header`).
+        header: of a new file (see :class:`hw.recording_layout.RecordingHeader`).
         time_offset_s: added to host times, so that they go on where a resumed recording ended.
-        queue_bytes: most that may wait; continuous data beyond are dropped and counted.
+        queue_bytes: most bytes that may wait; continuous data beyond are dropped and counted.
         patience_s: how long a selected image or the end may take, in wall-clock seconds, before
             the disk is given up.
 
@@ -80,9 +80,9 @@ class Recorder:
         self._changed = threading.Condition()
         self._answers: dict[str, Any] = {}
         self.error: CalibrationError | None = None
-        """What the writer failed of, first; None as long as it writes."""
+        """The first error of the writer; None as long as it writes."""
         self.kept = self.path
-        """Where the rows are: another file where this one was moved or removed."""
+        """Where the rows are: maybe another path, if the file was moved, removed or replaced."""
         self._ending = self._ended = False
         self._marks = 0
         # In a session of its own: Ctrl-C, or a signal to the whole group, must not stop the writer.
@@ -105,7 +105,7 @@ class Recorder:
         self._put({"do": "open", "header": None if header is None else asdict(header)})
         try:
             self.rows: dict[str, int] = self._answer("open", _ENDING_S)["rows"]
-            """Rows of every group when the file was opened: what a resumed one holds already."""
+            """Rows of every group when the file was opened; a resumed file holds some already."""
         except BaseException:
             self._stop()
             raise
@@ -289,7 +289,7 @@ class Recorder:
         self.sync()
 
     def leave_out(self, row: int) -> None:
-        """Mask a selected image: it was taken back.
+        """Mask a selected image that was taken back.
 
         Raises:
             OutputError: the writer failed, or did not answer in time.
@@ -326,7 +326,7 @@ class Recorder:
         self._answer(mark)
 
     def finish(self) -> str:
-        """Mark the recording complete, as the last thing; the SHA-256 digest of the file.
+        """Mark the recording complete and end; returns the SHA-256 digest of the file.
 
         Raises:
             OutputError: the writer failed; the file is incomplete then.
@@ -468,7 +468,7 @@ class Recorder:
 
     def _fail(self, error: CalibrationError) -> None:
         with self._changed:
-            # What went wrong first is what matters.
+            # Keep the first error: the later ones follow from it.
             self.error = self.error or error
             self._changed.notify_all()
 

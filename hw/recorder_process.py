@@ -1,8 +1,7 @@
 """The process that writes a recording: messages on standard input, answers on standard output.
 
-Started by :class:`hw.recorder.Recorder` and by nobody else. It flushes the file at least once a
-second, and closes it in order when its standard input ends: that is how it learns that the
-acquisition is gone.
+Started by :class:`hw.recorder.Recorder` only. It flushes new data to the file within about a
+second. When its standard input ends, the acquisition is gone, and it closes the file in order.
 """
 
 from __future__ import annotations
@@ -32,17 +31,17 @@ def main(path: str) -> int:
     """Write until standard input ends; 0 if all went well."""
     for name in (signal.SIGINT, signal.SIGHUP):
         signal.signal(name, signal.SIG_IGN)
-    # h5py or a library may print; only answers may go where the acquisition listens.
+    # h5py or a library may print; only answers may go to the pipe that the acquisition reads.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
 
     def answer(**content: Any) -> None:
-        # Where nobody listens any more the file is closed in order all the same.
+        # If nobody listens any more, the file must still be closed in order.
         with suppress(OSError):
             answers.write(json.dumps(content).encode() + b"\n")
             answers.flush()
 
-    # Objects of a file that cannot be written complain on the person's screen when they end.
+    # Objects of a file that cannot be written would print errors on the screen when they end.
     sys.unraisablehook = lambda _: None
     writer = None
     try:
@@ -62,19 +61,19 @@ def main(path: str) -> int:
         known = isinstance(error, CalibrationError)
         # A vanished disk: h5py has many exceptions for it.
         line = str(error) if known else f"{path}: cannot be written: {one_line(error)}"
-        # First of all, so that the robot stops.
+        # Tell it first, so that the robot is stopped; the file is rescued after that.
         answer(error=line, kind=type(error).__name__ if known else "OutputError")
         if writer is not None:
             with suppress(CalibrationError, OSError):
                 answer(kept=os.fspath(writer.rescue()))
-        # HDF5 would try again while Python clears up.
+        # Exit without clean-up, in which HDF5 would try to write again.
         os._exit(1)
     return 0
 
 
 def _serve(writer: RecordingWriter, source: RawIOBase, answer) -> None:
     """Handle messages until the pipe ends or the recording is finished."""
-    # When the file on the disk has to be brought up to date; None while it is.
+    # Time by which the file on the disk must be flushed; None while it is up to date.
     due: float | None = None
     while True:
         left = None if due is None else max(due - time.monotonic(), 0.0)
@@ -123,7 +122,7 @@ def _exactly(source: RawIOBase, size: int) -> bytes:
 
 
 def _read(source: RawIOBase) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
-    """The next message; None at the end, also in the middle of a message cut off by a death."""
+    """The next message; None at the end of the pipe, also if a message is cut off there."""
     start = _exactly(source, 4)
     if len(start) < 4:
         return None

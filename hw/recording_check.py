@@ -1,4 +1,4 @@
-"""Looking at the file of an acquisition before it is resumed; it is not trusted."""
+"""Checking the file of an acquisition before it is resumed; the file is not trusted."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ _MOST_MEMBERS = 100
 
 
 def check_resumable(path: str | os.PathLike[str]) -> None:
-    """Look at a file before it is opened for writing; it is not trusted, and not changed.
+    """Check a file before it is opened for writing; it is not trusted, and not changed.
 
-    A file that is shorter than it says of itself (:func:`stored_length`) is looked at as if zeros
-    were at its end. Text that the writer may touch is read, so that its heaps have been checked.
+    A file that is shorter than its own superblock says (:func:`stored_length`) is read as if zeros
+    were at its end. Text that the writer may touch is read, so that its heaps are checked too.
 
     Raises:
         FormatError: missing, not a recording, complete, of another layout, with links or data
@@ -82,7 +82,7 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
 
 @dataclass(frozen=True)
 class Progress:
-    """What an interrupted acquisition has, checked.
+    """What the recording of an interrupted acquisition holds, checked.
 
     Attributes:
         settings: how it was asked for.
@@ -123,7 +123,7 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
                 times = _read(root, name, "t_host", (UpTo(2**27, "rows"),))
                 last.append(float(np.nanmax(times, initial=0.0)))
             targets = _read(root, "plan", "targets", (images, 4, 4))
-            # Checked, but kept to the last digit: the plan's digest must be the same again.
+            # Checked but not changed in any digit: the plan's digest must be the same again.
             check_poses(targets)
             progress = Progress(
                 settings=_settings(root),
@@ -144,7 +144,7 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
 
 
 def settings_of(path: str | os.PathLike[str]) -> dict[str, object]:
-    """How the acquisition of a recording was asked for; of a file that is not trusted.
+    """How the acquisition of a recording was asked for; the file is not trusted.
 
     Raises:
         FormatError: not an acquisition's recording, or settings that are not a JSON object.
@@ -196,7 +196,7 @@ def _read(
 
 
 def stored_length(path: str | os.PathLike[str]) -> int | None:
-    """The length that a file says it has, where it is a little shorter; None otherwise.
+    """The length in a file's superblock if the file is a little shorter; None otherwise.
 
     HDF5 refuses a file that is shorter than its superblock (version 0) says.
     """

@@ -2,13 +2,13 @@
 
 How it stays readable: default file format (no SWMR, which plain readers refuse), one frame a chunk,
 poses in chunks of 256, a checksum on every chunk, and a flush at least once a second. Between
-flushes HDF5 is kept from writing its own structures (evictions are off), so what is on the disk is
-what the last flush left. ``complete`` is set last, then a SHA-256 sidecar is written.
+flushes HDF5 does not write its own structures (evictions are off), so the structures on the disk
+are those of the last flush. ``complete`` is set last, then a SHA-256 sidecar is written.
 
 A flush must not fail half-way: HDF5 would leave new structures beside old ones. So the bytes that
 the next flush may need are allocated in the file before any row is taken (:meth:`_make_room`). When
-the disk refuses them (full, quota, limit of a file's size), what was taken is flushed into what is
-there, and the file is closed in order.
+the disk refuses them (full, quota, limit of a file's size), the rows taken before are flushed into
+the space allocated so far, and the file is closed in order.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ from jaxcal.io.atomic import write_text
 from jaxcal.io.readable import one_line
 
 RESERVE_BYTES = 2**27
-"""The writer ends in order while this much of the disk is free: 128 MiB, many seconds of data."""
+"""The writer ends in order when the disk has less free than this: 128 MiB, many seconds of data."""
 
 _STRUCTURES_BYTES = 2**21
-"""More than HDF5's own structures, and chunks that are not yet full, take in one flush."""
+"""More than one flush takes for HDF5's own structures and for chunks that are not yet full."""
 
 _STEP_BYTES = 2**23
-"""Allocated ahead, so that not every row asks the file system."""
+"""Bytes allocated ahead, so that not every row asks the file system."""
 
 _END_OF_FILE = slice(40, 48)
 """Where a superblock of version 0 keeps the file's length, little endian."""
@@ -63,15 +63,15 @@ class RecordingWriter:
 
     Attributes:
         path: of the file.
-        reserve_bytes: of the disk that stay free.
-        rows: how many every group has (those without datasets yet are left out).
+        reserve_bytes: bytes of the disk that stay free.
+        rows: how many rows each group has (groups without datasets yet are left out).
     """
 
     def __init__(self, path: Path, file: h5py.File) -> None:
         self.path = path
         self.reserve_bytes = RESERVE_BYTES
         self._file = file
-        # Ours, not HDF5's: it stays the same file whatever becomes of the path.
+        # A duplicate of HDF5's descriptor: it leads to the same file whatever becomes of the path.
         self._descriptor = os.dup(file.id.get_vfd_handle())
         self._allocated = self._pending = 0
         self._make_room(0)
@@ -82,7 +82,7 @@ class RecordingWriter:
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], header: RecordingHeader) -> RecordingWriter:
-        """A new recording; the file appears with its skeleton whole, so that it always opens.
+        """A new recording; the file appears with its whole skeleton, so that it always opens.
 
         Args:
             path: the file to make.
@@ -202,7 +202,7 @@ class RecordingWriter:
         if disk.f_bavail * disk.f_frsize < self.reserve_bytes:
             self.close()
             raise OutputError(f"{self.path}: the disk is nearly full: make room")
-        # HDF5 cuts the file to its length, and with it what was allocated ahead.
+        # HDF5 has cut the file to its own length, so the bytes allocated ahead are gone.
         self._allocated, self._pending = os.fstat(self._descriptor).st_size, 0
         self._check_place()
         self._make_room(0)
@@ -211,7 +211,7 @@ class RecordingWriter:
         """Flush and close; the recording stays marked incomplete and can be resumed.
 
         Raises:
-            OutputError: the disk refused it; the file was mended so that it opens.
+            OutputError: the disk refused it; the file was mended as far as possible, to open again.
         """
         try:
             self._close_file()
@@ -238,10 +238,10 @@ class RecordingWriter:
             self._descriptor = -1
 
     def _make_room(self, size: int) -> None:
-        """Allocate what the next flush needs once ``size`` bytes more are to be written.
+        """Allocate what the next flush needs when ``size`` more bytes are to be written.
 
         Raises:
-            OutputError: the disk has no room; what was taken before is in the closed file.
+            OutputError: the disk has no room; the rows taken before are in the closed file.
         """
         # Chunks with a checksum get their place in the file only when they are flushed.
         self._pending += size
@@ -270,7 +270,7 @@ class RecordingWriter:
         self._allocated = end
 
     def _mend(self) -> None:
-        """Make a file whose last flush failed open again: its length as its superblock says it."""
+        """Make a file whose last flush failed open again: match its length and its superblock's."""
         with suppress(OSError):
             size = os.fstat(self._descriptor).st_size
             start = os.pread(self._descriptor, _END_OF_FILE.stop, 0)
@@ -285,7 +285,7 @@ class RecordingWriter:
         """Check that the path still leads to the file that is being written.
 
         Raises:
-            OutputError: it does not; the file has been closed in order, wherever it is.
+            OutputError: it does not; the file has been closed in order, wherever it is now.
         """
         if not self._in_place():
             what = "replaced by another file" if self.path.exists() else "removed"
@@ -299,10 +299,10 @@ class RecordingWriter:
             return False
 
     def rescue(self) -> Path:
-        """Close the file whatever has failed, and say where it is.
+        """Close the file whatever has failed, and return where it is.
 
-        A file that was moved is where it was moved to. One that has no name any more is copied:
-        back to its path, or beside it where another file has taken that.
+        A file that was moved stays where it is now. A file that was removed is copied back to its
+        path, or to a new name beside it if another file is there.
         """
         if self._descriptor < 0:
             return self.path
@@ -344,8 +344,8 @@ class RecordingWriter:
         """Mark the recording complete, close it, and write its SHA-256 beside it.
 
         Returns:
-            The digest, hexadecimal, of the file that was written, wherever its path leads; the
-            sidecar ``<file>.sha256`` is what ``sha256sum -c`` reads.
+            The hexadecimal digest of the file that was written; ``sha256sum -c`` reads the sidecar
+            ``<file>.sha256``.
 
         Raises:
             OutputError: the disk is full, or the path leads to another file.
@@ -397,7 +397,7 @@ def _write_skeleton(file: h5py.File, header: RecordingHeader) -> None:
         target = file.create_group(name)
         kept = SELECTED[header.kind] if name == "calibration" else columns
         wanted = {key: column for key, column in columns.items() if key in kept}
-        # Frames tell their size when they come; a bench without active echo has no lines.
+        # The size of the frames is known when the first one comes; without active echo: no lines.
         if name != "us" and (name != "ae" or header.lines):
             _make_columns(target, wanted, sizes)
     file["us"].attrs["orientation"] = "MF"
@@ -431,7 +431,7 @@ def _make_columns(
 def _open_for_writing(path: Path) -> h5py.File:
     try:
         file = h5py.File(path, "r+")
-        # Without this HDF5 writes its own structures when it likes, half of a change at a time.
+        # Without this HDF5 may write its own structures at any time, in the middle of a change.
         cache = file.id.get_mdc_config()
         cache.set_initial_size, cache.initial_size = True, 2**23
         cache.incr_mode, cache.flash_incr_mode, cache.decr_mode = 0, 0, 0
@@ -445,14 +445,14 @@ def _open_for_writing(path: Path) -> h5py.File:
 
 
 def _columns(file: h5py.File, name: str) -> dict[str, h5py.Dataset]:
-    """The datasets of a group that grow, in the layout's order; none where it has none yet."""
+    """The growing datasets of a group, in the layout's order; empty where it has none yet."""
     target = file.require_group(name)
     found = {key: target[key] for key in LAYOUT[name] if key in target}
     return {key: member for key, member in found.items() if isinstance(member, h5py.Dataset)}
 
 
 def _cut_back(datasets: list[h5py.Dataset]) -> None:
-    """Drop rows that not every column has, or that cannot be read: those of the last moment."""
+    """Drop the last rows if not every column has them, or if they cannot be read."""
     if not datasets:
         return
     rows = whole = min(len(dataset) for dataset in datasets)

@@ -40,7 +40,7 @@ _POSES_A_CHUNK = 256
 
 @dataclass(frozen=True)
 class Column:
-    """One dataset that grows: ``tail`` is a row's shape, with names for what a file fixes."""
+    """One dataset that grows: ``tail`` is a row's shape; names stand for sizes fixed per file."""
 
     tail: tuple[int | str, ...]
     dtype: str
@@ -54,7 +54,7 @@ def _text(size: int) -> Column:
 
 _TIME = Column((), "f8", "s")
 _COUNT = Column((), "i8", "1")
-# One row a chunk for what is few and dear: a torn write then costs no earlier row.
+# One row a chunk for data that are few but precious: a torn write then damages no earlier row.
 _MM = Column((), "f8", "mm", 1)
 _POSE = Column((4, 4), "f8", "mm", 1)
 
@@ -128,7 +128,7 @@ LAYOUT: dict[str, dict[str, Column]] = {
         "status": Column((), "i8", "1", 1),
     },
 }
-"""What may be appended to; a row is appended to all columns of its group, or to none."""
+"""Groups that may be appended to; a row is appended to all columns of its group, or to none."""
 
 SELECTED = {
     "time_of_flight": (
@@ -154,7 +154,7 @@ LARGEST_ROW = 2**24
 
 @dataclass(frozen=True)
 class RecordingHeader:
-    """What a recording is told when it is made.
+    """What a recording holds from the start.
 
     Attributes:
         kind: what the selected images hold, one of :data:`SELECTED`.
@@ -163,7 +163,7 @@ class RecordingHeader:
         lines: transmitted lines of the active echo element (times of flight in a frame); 0: there
             is none.
         attributes: of other groups, by name: {"ae": {"clock_hz": 1e8}}.
-        settings: JSON text of how the acquisition was asked for; what ``--resume`` goes by.
+        settings: JSON text of how the acquisition was asked for; ``--resume`` uses it.
     """
 
     kind: str

@@ -1,8 +1,8 @@
 """Whether a recording that is resumed fits the bench as it is now.
 
-Images taken with another probe or another mounting do not fit together with those that are there:
+Images taken with another probe or another mounting do not fit together with those in the recording:
 such a difference is refused by name. Other limits, or an edited plan, change what the robot does
-but not what the images mean: they are said, and the person confirms the plan with them.
+but not what the images mean: they are reported, and the plan is confirmed with them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SAME = 1e-9
 
 
 def described(setup: Setup, targets: np.ndarray) -> dict[str, Any]:
-    """What a recording keeps of its bench, as JSON takes it: probe, scene, limits, plan."""
+    """What a recording keeps of its bench, ready for JSON: probe, scene, limits, plan."""
     probe, scene = setup.probe, setup.scene
     content = {
         "probe": {
@@ -44,7 +44,7 @@ def described(setup: Setup, targets: np.ndarray) -> dict[str, Any]:
 
 
 def compare(progress: Progress, setup: Setup) -> list[str]:
-    """What differs between a recording and the bench and does not matter to its images.
+    """Differences between a recording and the bench that do not change what its images mean.
 
     Args:
         progress: what the recording holds.
@@ -59,7 +59,7 @@ def compare(progress: Progress, setup: Setup) -> list[str]:
     now = described(setup, progress.targets)
     before = progress.settings.get("bench")
     before = before if isinstance(before, dict) else {}
-    # The file's own /probe is what calibrates; recordings of before this comparison have it too.
+    # The calibration uses the file's own /probe; recordings older than this check have it too.
     for table, kept in (
         ("probe", progress.probe),
         *((t, before.get(t)) for t in ("probe", "scene")),

@@ -129,7 +129,7 @@ def turn_deg(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) 
 
 
 def looking_rotation(looking: Float[np.ndarray, 3]) -> Float[np.ndarray, "3 3"]:
-    """Image axes [lateral, elevational, axial] in the base frame when the probe looks that way."""
+    """Image axes [lateral, elevational, axial] in the base frame of a probe with this direction."""
     axial = np.asarray(looking, float) / np.linalg.norm(looking)
     guess = np.eye(3)[np.argmin(np.abs(axial))]
     lateral = guess - axial * (guess @ axial)
@@ -166,7 +166,7 @@ def straight_way(
     Args:
         start: at part 0.
         goal: at part 1.
-        parts: of the way.
+        parts: parts of the way, 0 to 1.
     """
     parts = np.asarray(parts, dtype=np.float64)[:, None]
     turn = rotation_vector(goal[:3, :3] @ start[:3, :3].T)

@@ -15,7 +15,7 @@ class Scene:
 
     Attributes:
         image_to_probe: (4, 4) X as drawn, mm; off by some mm and degrees.
-        point_mm: (3,) the target in the robot's base frame, likewise.
+        point_mm: (3,) the target in the robot's base frame; off by some mm.
         looking: (3,) mean direction of the image's axial axis in the base frame.
     """
 
@@ -34,9 +34,9 @@ class Scene:
         return self.image_to_probe[:3, 1]
 
     def expected(self, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, 3]:
-        """Where the target should be in the image of a probe at ``pose``, as far as is known, mm.
+        """Where the target should be in the image of a probe at ``pose``, by this scene, mm.
 
-        The elevational one, with its sign turned, is the probe's place along a free-hand sweep.
+        The negative of the elevational coordinate is the probe's place along a free-hand sweep.
         """
         in_tool = (self.point_mm - pose[:3, 3]) @ pose[:3, :3]
         return (in_tool - self.tip_mm) @ self.image_to_probe[:3, :3]

@@ -1,10 +1,10 @@
-"""The open devices of an acquisition: what they send goes to the file, and is watched meanwhile.
+"""The open devices of an acquisition: their data go to the file, and are watched for trouble.
 
-One thread empties every device's queue into the recorder and keeps the newest echo frames at hand
-for whoever listens. :meth:`Session.trouble` is asked at every tick of a motion, and stops it: a
-reason is a line for a person. A short hesitation of a device stops the robot and is noted; the
-acquisition goes on when the device does (:meth:`Session.wait_until_clear`), and ends when it does
-not.
+One thread empties every device's queue into the recorder and keeps the newest echo frames for
+:meth:`Session.listen`. :meth:`Session.trouble` is called at every tick of a motion; the robot is
+stopped if it returns anything but None. After a hesitation (StaleError: a device was silent, late
+or sent damaged frames) the acquisition goes on once the device is well again
+(:meth:`Session.wait_until_clear`). It ends if that takes too long, or on any other trouble.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _PERIOD_WALL_S = 0.005
 _BATCH_WALL_S = 0.25
 _KEPT_FRAMES = 256
 _DELAY_S = 10.0
-"""How often, in bench seconds, the delay of the echo frames is measured anew."""
+"""After so many bench seconds the delay of the echo frames is measured again."""
 
 _LEAST_STAMPS, _MOST_STAMPS = 20, 20_000
 
@@ -43,14 +43,14 @@ class Watch:
     """When a device counts as in trouble; times in bench seconds.
 
     Attributes:
-        echo_age_s: no active-echo frame for so long.
-        echo_late_s: active-echo frames arrive so long after their triggers.
-        image_age_s: no ultrasound frame for so long.
+        echo_age_s: no active-echo frame for longer than this.
+        echo_late_s: active-echo frames arrive later than this after their triggers.
+        image_age_s: no ultrasound frame for longer than this.
         pose_age_s: poses older than this are not used.
-        burst: damaged or missing frames within ``burst_s`` that are more than bad luck.
-        burst_s: see there.
-        grace_s: how long trouble may last before the acquisition gives up.
-        clear_s: how long it must have been gone before anything moves.
+        burst: more damaged or missing active-echo frames of one kind than this within ``burst_s``.
+        burst_s: see ``burst``.
+        grace_s: how long a hesitation may last before the acquisition gives up.
+        clear_s: how long the trouble must have been gone before the robot moves again.
     """
 
     echo_age_s: float = 0.12
@@ -70,10 +70,10 @@ class Session:
         setup: where the devices are.
         recorder: where everything goes.
         watch: what counts as trouble.
-        frames: whether every ultrasound frame is recorded, or only those that are asked for.
+        every_frame: whether every ultrasound frame is recorded, or only those asked for.
 
     Raises:
-        DeviceError: a device that is not there; those already open are closed again.
+        DeviceError: a device is not there; those already open are closed again.
     """
 
     def __init__(
@@ -159,22 +159,22 @@ class Session:
         """What is wrong with a device now (:data:`hw.robot.motion.Guard`); None if nothing is.
 
         Returns:
-            A StaleError where the device was only silent for a moment, or a line with the reason
-            for which motion must end.
+            A StaleError for a hesitation (a device is silent, late or sends damaged frames), or a
+            line with the reason why motion must end.
         """
         error = self._trouble()
         if error is None or isinstance(error, StaleError):
             return error
         if isinstance(error, DeviceError) and error.device == "robot":
-            return str(error.args[0])  # whoever stops the robot for it names the robot
+            return str(error.args[0])  # the error that stops the robot names it
         return str(error)
 
     def check(self) -> None:
-        """Raise what is wrong.
+        """Raise the error if something is wrong.
 
         Raises:
             DeviceError: trouble of a device.
-            OutputError: the recorder's.
+            OutputError: an error of the recorder.
         """
         error = self._trouble()
         if error is not None:
@@ -250,8 +250,9 @@ class Session:
 
         Args:
             frames: how many.
-            since: bench time; a frame is taken to have begun a frame's period before it arrived,
-                by the stream's own period (:func:`frame_period`).
+            since: bench time. A frame is assumed to have begun before its arrival by its delay, or
+                by the stream's period (:func:`frame_period`) if that is longer; a frame whose delay
+                is not known is not taken.
 
         Raises:
             DeviceError: trouble while waiting.
@@ -308,7 +309,7 @@ class Session:
         raise StaleError("no B-mode frame came in time", device="ultrasound")
 
     def record_image(self) -> None:
-        """Put the newest ultrasound frame into the recording, where not all of them go there."""
+        """Put the newest ultrasound frame into the recording, unless every frame goes there."""
         image = self.latest_image()
         if image is not None and not self._every_frame:
             self._recorder.add_images([image])
@@ -325,7 +326,7 @@ class Session:
             with self._changed:
                 self._failure = error
                 self._changed.notify_all()
-        # What came before a device was lost belongs into the file all the same.
+        # Data from before a device was lost belong into the file too.
         with suppress(CalibrationError):
             self._hand_over()
 
@@ -409,7 +410,7 @@ def frame_period(frames: Sequence[EchoFrame], clock_hz: float) -> float | None:
 
 
 def median_times(frames: list[EchoFrame]) -> tuple[np.ndarray, float]:
-    """One frame from several of the same place.
+    """One frame from several frames at the same place.
 
     Returns:
         (lines,) median time of flight, s, NaN where fewer than half of the frames have one; and

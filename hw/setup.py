@@ -30,11 +30,11 @@ from jaxcal.io.toml import load_toml
 _LARGEST_BYTES = 2**18
 _LEAST_TIP_MM = 5.0
 _TARGET_MM = (50.0, 2000.0)
-"""Distance of a target from the base: not within it, and no arm reaches further."""
+"""Distance of a target from the base: not inside the base, and not beyond the reach of any arm."""
 _WIDTH_MM = (2.0, 300.0)
-"""Of an array."""
+"""Width of an array."""
 _HOUSING_MM = (25.0, 60.0)
-"""Thickness and length of a housing that the setup does not tell: a common linear probe's."""
+"""Thickness and length of a housing where the setup gives none: those of a common linear probe."""
 _LONGEST_OFFSET_M = 1.0
 _TIP_TOLERANCE_MM = 0.1
 
@@ -56,7 +56,7 @@ class Setup:
         clock: of the bench.
         frequency_hz: of the poses; None: the controller's own.
         tcp_offset: (6,) m and rad, of a controller that does not tell it.
-        settle_s: poses are averaged for so long.
+        settle_s: how long poses are averaged, s.
         caller_s: bench seconds that this process may be silent while the robot moves.
         frames: active-echo frames of an image.
         model: of the arm, by name; None: what the controller says.
@@ -88,8 +88,8 @@ class Setup:
             controller_model: of the arm, as the controller tells it (:func:`controller_arm`).
 
         Raises:
-            RefusedError: limits that are none, that contradict the scene, or another arm than the
-                setup's.
+            RefusedError: invalid limits, limits that contradict the scene, or a controller of
+                another arm than the setup's.
         """
         tip = self.scene.tip_mm
         given = self.limits.get("tip_mm")
@@ -138,9 +138,8 @@ def load_hand_held(path: str | os.PathLike[str]) -> HandHeldSetup:
     Of [scene] only ``image_to_probe`` is needed, to the tracked frame on the probe.
 
     Raises:
-        FormatError: no such file, or not TOML.
-        InputError: unknown or missing keys, numbers that are none; like the other one line that
-            starts with the path.
+        FormatError: no such file, or not TOML; one line that starts with the path.
+        InputError: unknown or missing keys, or invalid numbers; one line that starts with the path.
     """
     tables = load_toml(path, maximum_bytes=_LARGEST_BYTES)
     names = ("active_echo", "probe", "scene", "search")
@@ -164,7 +163,7 @@ def load_hand_held(path: str | os.PathLike[str]) -> HandHeldSetup:
 
 
 def controller_arm(model: str, version: str) -> str | None:
-    """The arm that a controller says it moves; None where that is none that is known.
+    """The arm that a controller says it moves; None where that arm is not known.
 
     Args:
         model: the dashboard's answer to ``get robot model``, which has no "e" for e-Series arms.
@@ -184,9 +183,8 @@ def load_setup(path: str | os.PathLike[str]) -> Setup:
     """Read a bench's description.
 
     Raises:
-        FormatError: no such file, or not TOML.
-        InputError: unknown or missing keys, numbers that are none; like the other one line that
-            starts with the path.
+        FormatError: no such file, or not TOML; one line that starts with the path.
+        InputError: unknown or missing keys, or invalid numbers; one line that starts with the path.
     """
     tables = load_toml(path, maximum_bytes=_LARGEST_BYTES)
     try:
@@ -287,7 +285,7 @@ def _setup(tables: dict[str, Any]) -> Setup:
 
 
 def _check_lengths(setup: Setup, tip_at_tcp: bool) -> None:
-    """Lengths that are not plausible in mm: the box bounds nothing where the tip is elsewhere."""
+    """Refuse lengths that are not plausible in mm: with a wrong tip the box would bound nothing."""
     tip = float(np.linalg.norm(setup.scene.tip_mm))
     if tip < _LEAST_TIP_MM and not tip_at_tcp:
         raise InputError(

@@ -1,7 +1,7 @@
 """The probe at one pose of the plan: the procedures' view of the real clients.
 
-Moves go through the motion process and its gate; a hesitation of a device (StaleError) stops the
-robot, and the move is asked for again when the device is back, a few times at most. Everything else
+Moves go through the motion process and its gate. A hesitation (StaleError) stops the robot, and the
+move is asked for again when the device is back, at most ten times. Every other stop of a motion
 ends the acquisition (:mod:`hw.robot.motion` says which is which).
 """
 
@@ -23,11 +23,11 @@ from hw.ultrasound.receiver import Image
 
 _MOST_HESITATIONS = 10
 IMAGE_AGE_S = 0.2
-"""An image is at most so old when it arrives: a frame's time, the machine's and the network's
+"""Largest age of an image at its arrival: a frame's time, plus the machine's and the network's
 (assumption; the emulated machine takes 0.05 s)."""
 _NEAR_MM = 12.0
-"""The drawing knows the target's place in the image better than this: mount and target are off by
-some millimetres and degrees."""
+"""The drawing gives the target's place in the image to better than this: mount and target are off
+by some millimetres and degrees."""
 _LOOKS = 5
 """Frames to look at before a place without a credible target is given up."""
 
@@ -39,7 +39,7 @@ class ProbeStage:
         session: devices.
         motion: of the robot.
         targets: (n, 4, 4) poses of the plan, mm.
-        note: told of what belongs into the diary: kind, text.
+        note: called with events for the recording: kind, text.
     """
 
     def __init__(
@@ -58,9 +58,9 @@ class ProbeStage:
     def go_to(self, row: int) -> None:
         """Travel to a pose of the plan; offsets count from there.
 
-        The plan was checked from each pose to the next. Where a run begins elsewhere (a resumed
-        one, or after poses that were given up) and the straight way is refused, it goes from the
-        nearest pose of the plan through those in between.
+        The plan was checked from each pose to the next. If the robot starts elsewhere (in a resumed
+        run, or after poses that were given up) and the straight way is refused, it goes to the
+        nearest pose of the plan and from there through the poses in between.
 
         Raises:
             DeviceError: stopped, refused, lost, or a device in lasting trouble.
@@ -70,6 +70,8 @@ class ProbeStage:
             self._move(self.plan_pose, None)
             return
         except RefusedError as error:
+            if self._motion.ended:  # refused while it moved, for good: no other way helps
+                raise
             here = self._session.poses.latest().pose
             near = int(np.argmin([_apart(here, pose) for pose in self._targets]))
             if near == row:
@@ -95,23 +97,23 @@ class ProbeStage:
         return Echoes(np.where(answered, amplitude, 0.0), answered)
 
     def set_threshold(self, threshold: int) -> None:
-        """Counts; frames that began under another threshold are not read any more."""
+        """Set the threshold, counts; frames that began under another one are not read any more."""
         self._session.echo.set_threshold(threshold)
         self._arrived = self._session.clock.now()
 
     def load_pattern(self, pattern: bytes) -> None:
-        """A level (0 to 255) for each line."""
+        """Load a pattern: a level (0 to 255) for each line."""
         self._session.echo.load_pattern(pattern)
 
     def inject(self, on: bool, delay_ticks: int = 0) -> None:
-        """Switch injection."""
+        """Switch injection on or off."""
         self._session.echo.inject(on, delay_ticks)
 
     def frame(self) -> np.ndarray | None:
-        """The newest B-mode frame for whoever looks on; None where no images come.
+        """The newest B-mode frame for the operator; None where no images come.
 
         Raises:
-            DeviceError: a device is lost, so that looking on leads nowhere.
+            DeviceError: a device is lost, or in lasting trouble.
         """
         self._session.wait_until_clear()
         image = self._session.latest_image()
@@ -126,10 +128,10 @@ class ProbeStage:
         return self._session.image_after(self._arrived + IMAGE_AGE_S)
 
     def image_bench(self, row: int, *, credible: bool = False) -> ImageBench:
-        """What the procedures see of a phantom that only shows in the image.
+        """The bench of the procedures for a phantom that only shows in the image.
 
         Args:
-            row: of the plan: where the target should be.
+            row: of the plan; it says where the target should be.
             credible: respond only where the segmentation finds the target.
         """
         image = self.whole_frame()
@@ -159,7 +161,7 @@ class ProbeStage:
 
     @property
     def arrived_s(self) -> float:
-        """Bench time since which nothing has moved and the threshold is what it is."""
+        """Bench time since which neither the probe nor the threshold has changed."""
         return self._arrived
 
     def _move(self, pose: np.ndarray, speed_mm_s: float | None) -> PoseSample:
@@ -178,5 +180,5 @@ class ProbeStage:
 
 
 def _apart(first: np.ndarray, second: np.ndarray) -> float:
-    """How far two poses are apart, a degree counted as a mm."""
+    """Distance of two poses, mm; a degree counts as a mm."""
     return float(np.linalg.norm(first[:3, 3] - second[:3, 3])) + turn_deg(first, second)

@@ -19,9 +19,9 @@ Every command prints its options with `--help`. `jaxcal` calibrates, `jaxcal-hw`
 | 1 | an internal error, in one line; `JAXCAL_TRACEBACK=1` shows where | the same |
 | 2 | bad usage or input, in one line; nothing was written | the same |
 | 3 | solved, but not converged, not determined by the images, or from data in wrong frames or units | done, but the calibration did not converge |
-| 4 | | a device failed: the robot rests, `--resume` goes on; of `check`: a device is wrong |
-| 5 | converged, and less accurate than `--require` (fair, if not told otherwise) | |
-| 130 | Ctrl-C | Ctrl-C: the robot rests, `--resume` goes on |
+| 4 | | a device failed: motion has ended, `--resume` goes on; of `check`: a device is wrong |
+| 5 | converged, and less accurate than `--require` (fair, if not told otherwise) | done, and the calibration is less than fair |
+| 130 | Ctrl-C | Ctrl-C: motion has ended, `--resume` goes on |
 
 `eval "$(_JAXCAL_COMPLETE=bash_source jaxcal)"` in `~/.bashrc` completes commands and options (`zsh_source` and
 `fish_source` for these shells; `_JAXCAL_HW_COMPLETE` for `jaxcal-hw`).

@@ -6,8 +6,8 @@ another codec; transport and driver know nothing of what is described here but :
 and the ``encode`` functions.
 
 Commands, host to device: one line of printable ASCII, ``<command>*<crc>`` and a line feed, where
-crc is the CRC-32 (zlib) of the command in eight hexadecimal digits. Whoever types may leave out
-``*<crc>``; the device then takes the line unchecked.
+crc is the CRC-32 (zlib) of the command in eight hexadecimal digits. A person who types commands may
+leave out ``*<crc>``; the device then takes the line unchecked.
 
 ==================  ===============================================================================
 ``*IDN?``           maker, model, serial number, firmware, separated by commas
@@ -23,16 +23,16 @@ crc is the CRC-32 (zlib) of the command in eight hexadecimal digits. Whoever typ
 ``STRM ON``         send a frame after each frame trigger (``OFF``, as at power-up: be silent)
 ==================  ===============================================================================
 
-Replies begin with the word of the command that they answer, so that one that comes late is not
-taken for another's: ``THR? 512``. A command that sets something is answered by what is now in
-force (``THR 512``), a refused one by ``ERR <code>,<text>`` after its word. While the device is
-silent replies are lines like commands, always with their CRC. After the line ``STRM ON`` they
-travel as binary frames, up to and including the reply ``STRM OFF``.
+A reply begins with the word of its command, so that a late reply is not taken for that of another
+command: ``THR? 512``. A command that sets a value is answered by the value now in force
+(``THR 512``), a refused command by ``ERR <code>,<text>`` after its word. While the device does not
+stream, replies are lines like commands, always with their CRC. After the line ``STRM ON`` they are
+sent as binary frames, up to and including the reply ``STRM OFF``.
 
 Binary frames, device to host: a zero byte, the payload in COBS (Cheshire and Baker 1999: no zero
-byte within), a zero byte. Bytes lost, added or changed spoil the frames that they touch and none
-after the next zero. All numbers are little-endian; the last four bytes are the CRC-32 of all
-before.
+byte within), a zero byte. Bytes that are lost, added or changed damage only the frames that they
+touch, and none after the next zero byte. All numbers are little-endian; the last four bytes are the
+CRC-32 of all bytes before.
 
 =======  =======================================================================================
 echo     type u8 = 1, version u8 = 1, frame u32, clock u64 [ticks], lines u16, threshold u16,
@@ -65,7 +65,7 @@ NO_RESPONSE = 0xFFFF
 
 MAXIMUM_THRESHOLD = 4095
 MAXIMUM_LINES = 1024
-"""More lines than any probe fires: a longer frame is no frame."""
+"""More lines than any probe fires: a longer frame is malformed."""
 
 _HEADER = struct.Struct("<BBIQHH")
 _VERSION = 1
@@ -108,12 +108,12 @@ class Reply:
 
 
 class Mode(Enum):
-    """What the bytes to come are taken for."""
+    """How the bytes to come are read."""
 
     TEXT = "text"
     BINARY = "binary"
     UNKNOWN = "unknown"
-    """The device may be streaming or not; the first thing that passes its CRC tells."""
+    """Whether the device streams is not known; the first line or frame with a right CRC tells."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,8 @@ class DecoderCounts:
         frames: echo frames accepted.
         replies: replies accepted.
         crc_errors: frames or lines whose CRC was wrong.
-        malformed: chunks that were no COBS, of no possible length, or of an unknown kind.
-        resynchronised: how often something was accepted after something that was not.
+        malformed: chunks that were not COBS, of impossible length, or of an unknown kind.
+        resynchronised: how often something was accepted after something damaged.
     """
 
     frames: int = 0
@@ -183,7 +183,7 @@ class Decoder:
     It never waits, never raises on what it is fed, and keeps at most one chunk of bounded length.
 
     Args:
-        mode: what the first bytes are taken for.
+        mode: how the first bytes are read.
     """
 
     def __init__(self, mode: Mode = Mode.BINARY) -> None:
@@ -204,7 +204,7 @@ class Decoder:
         )
 
     def reset(self, mode: Mode) -> None:
-        """Forget what is half read and take what comes for ``mode``; the counts go on."""
+        """Forget what is half read and read what comes in ``mode``; the counts go on."""
         self._buffer.clear()
         self._scanned = 0
         self._skipping = self._damaged = False
@@ -257,7 +257,7 @@ class Decoder:
         return take(chunk), True
 
     def _skip(self) -> None:
-        """Throw away what is too long to be anything, up to the next delimiter."""
+        """Drop a chunk that is too long, up to the next delimiter."""
         if not self._skipping:
             self.malformed += 1
         self._buffer.clear()
@@ -273,7 +273,7 @@ class Decoder:
                 self._scanned = 0
             return None, False
         if feed >= 0 and (zero < 0 or feed < zero):
-            # A frame may hold a line feed, so a line that is none stays for the frame's sake.
+            # A binary frame may hold a line feed, so a chunk that is no valid line stays.
             start = self._buffer.rfind(b"\n", 0, feed) + 1
             text, checked = decode_line(bytes(self._buffer[start:feed]))
             self._scanned = feed + 1

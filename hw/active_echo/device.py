@@ -1,14 +1,15 @@
-"""Driver of the active-echo electronics: commands, and a stream of frames that never lies.
+"""Driver of the active-echo electronics: commands, and a stream of checked frames.
 
 A thread reads the line and decodes; frames wait in a bounded queue. Nothing is made up: a gap in
 the device's frame counter is counted as lost, a damaged frame is dropped and counted, a frame
-with fewer lines than the probe fires (a missed line trigger: nothing tells which) is counted and
-not handed on, a frame that comes again is counted and dropped, and when the queue is full the
-oldest frame goes and is counted.
+with another number of lines than the probe fires (after a missed line trigger it is not known which
+line is missing) is counted and not handed on, a frame that comes again is counted and dropped, and
+when the queue is full the oldest frame is dropped and counted.
 
-How late frames are (:attr:`EchoFrame.late_s`): the device is asked for its count of frame triggers;
-the frame with that number was triggered after the question, so its way here took at most the time
-since then. From there the device's ticks tell by how much later, or earlier, the others came.
+How late frames are (:attr:`EchoFrame.late_s`): the device is asked for its count of frame triggers.
+The frame with that number was triggered after the question, so its way here took at most the time
+since the question. For the other frames the device's ticks tell how much later, or earlier, they
+came.
 """
 
 from __future__ import annotations
@@ -38,15 +39,15 @@ from hw.errors import DeviceError, LostError, RefusedError, StaleError
 from hw.shapes import Float, UInt16
 
 COMMAND_TIMEOUT_S = 1.0
-"""A command that is not answered for so long (bench time) has failed."""
+"""A command that is not answered within this bench time has failed."""
 
-# A bench that runs faster than real time has no faster operating system.
+# Where a bench runs faster than real time, the operating system does not become faster.
 _SHORTEST_WAIT_S = 0.25
 
 _LARGEST_GAP = 2**31
 _REMEMBERED = 256
 _ANCHOR_S = 60.0
-"""A measured delay is used for so long: two quartz clocks drift apart by 6 ms meanwhile."""
+"""A measured delay is used for this long, in which two quartz clocks drift apart by 6 ms."""
 
 _MAXIMUM_DELAY_TICKS = 0xFFFF
 
@@ -63,7 +64,7 @@ class EchoFrame:
         tof_s: (lines,) one-way time of flight, s; NaN where nothing was heard.
         tof_ticks: (lines,) the same as it came, 0xFFFF where nothing was heard.
         amplitude: (lines,) peak amplitude, counts.
-        late_s: at most so long after its trigger it arrived, s; NaN where that is not known.
+        late_s: upper bound of the time from its trigger to its arrival, s; NaN where not known.
     """
 
     t_host: float
@@ -137,8 +138,8 @@ class ActiveEcho:
         self._repeated = 0
         self._last_frame: int | None = None
         self._recent: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
-        # The question: when, and the number of the next frame then. The answer: a frame's arrival,
-        # its ticks, and how late it was at most.
+        # _asked: time of the question, and the number of the next frame then. _anchor: a frame's
+        # arrival, its ticks, and the bound of its delay.
         self._asked: tuple[float, int] | None = None
         self._anchor: tuple[float, int, float] | None = None
         self._tick_s = 0.0
@@ -154,7 +155,7 @@ class ActiveEcho:
             raise
 
     def _greet(self) -> None:
-        """Whatever state the device was left in: silent, and its clock known."""
+        """Silence the device, whatever state it was left in, and ask for its clock frequency."""
         self._ask("STRM", "OFF", expected="OFF")
         self._tick_s = 1.0 / self.clock_hz()
         with self._changed:
@@ -175,7 +176,7 @@ class ActiveEcho:
         """Frequency of the device's counter, Hz.
 
         Raises:
-            DeviceError: an answer that cannot be one.
+            DeviceError: an answer that cannot be a frequency.
         """
         text = self._query("CLK?")
         value = float(text) if text.replace(".", "", 1).isdigit() else 0.0
@@ -238,19 +239,19 @@ class ActiveEcho:
         return self._integer("TRIG:COUN?", lines), self._integer("TRIG:COUN?", frames)
 
     def measure_delay(self) -> None:
-        """Ask the device for its count, so that the next frames know how late they are."""
+        """Ask for the device's frame count, so that the delay of the next frames is known."""
         sent = self._clock.now()
         _, frames = self.trigger_count()
         with self._changed:
             self._asked = sent, frames
 
     def device_error(self) -> str | None:
-        """The oldest error that the device has kept and nobody has asked for; None without one."""
+        """The oldest error of the device that was not asked for yet; None without one."""
         text = self._ask("SYST:ERR?", attempts=1)
         return None if text.startswith("0,") else text
 
     def stream(self, on: bool) -> None:
-        """Have frames sent, or not."""
+        """Have the device send frames, or not."""
         state = "ON" if on else "OFF"
         with self._changed:
             self._last_frame = None
@@ -342,15 +343,15 @@ class ActiveEcho:
     ) -> str:
         """Send a command and wait for its own reply.
 
-        Settings are absolute, so that repeating one changes nothing; what does change something
-        (reading an error takes it from the device's list) must come with ``attempts=1``.
+        Settings are absolute, so repeating one changes nothing. A command that changes something
+        when repeated (reading an error takes it from the device's list) needs ``attempts=1``.
         """
         with self._asking:
             for attempt in range(attempts):
                 with self._changed:
                     self._replies.clear()
                     if attempt:
-                        # The reply that was missed may have been the one that changes the mode.
+                        # The reply that was missed may have been one that changes the mode.
                         self._decoder.reset(Mode.UNKNOWN)
                 self._transport.write(encode_line(f"{word} {argument}" if argument else word))
                 answer = self._await_reply(word, expected)
@@ -371,7 +372,7 @@ class ActiveEcho:
         return answer
 
     def _await_reply(self, word: str, expected: str | None) -> str | None:
-        """The reply's value; another than ``expected`` only when the right one does not come."""
+        """The reply's value; one other than ``expected`` only if that does not come in time."""
         other: str | None = None
         wait = max(self._clock.wall(COMMAND_TIMEOUT_S), _SHORTEST_WAIT_S)
         deadline = time.monotonic() + wait
@@ -449,7 +450,7 @@ class ActiveEcho:
         )
 
     def _late(self, packet: EchoPacket, now: float) -> float:
-        """By how much a frame is late at most, s; NaN where nobody has asked of late."""
+        """Upper bound of a frame's delay, s; NaN where it was not measured lately."""
         late = float("nan")
         if self._anchor is not None:
             arrived, ticks, before = self._anchor
@@ -460,7 +461,7 @@ class ActiveEcho:
             sent, frame = self._asked
             if (packet.frame - frame) % 2**32 < _LARGEST_GAP:
                 self._asked = None
-                # Both are bounds: the smaller one holds.
+                # Both are upper bounds: take the smaller one.
                 if not late <= now - sent:
                     late = now - sent
                 self._anchor = now, packet.ticks, late

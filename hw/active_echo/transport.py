@@ -1,8 +1,7 @@
 """Bytes to and from the active-echo electronics: a serial port, a pty or a TCP bridge.
 
-What pyserial raises, in which way ever, becomes :class:`~hw.errors.LostError` or
-:class:`~hw.errors.DeviceError` with one line for a person. A pty (the bench's emulator) takes any
-baud rate and says nothing of a wrong one.
+Every error of pyserial becomes a :class:`~hw.errors.DeviceError` or a subclass of it, with one line
+for a person. A pty (the bench's emulator) takes any baud rate, also a wrong one.
 """
 
 from __future__ import annotations
@@ -50,8 +49,8 @@ class Transport:
             raise self._lost() from error
 
     def _read_socket(self) -> bytes:
-        # Over socket:// pyserial knows only that there is something, and waits for all it was
-        # asked for: wait for one byte, then take what there is.
+        # Over socket:// pyserial does not know how much has come, and waits for as many bytes as
+        # were asked for: so wait for one byte, then take what there is.
         self._port.timeout = _POLL_S
         first = self._port.read(1)
         if not first:
@@ -84,7 +83,7 @@ class Transport:
     def close(self) -> None:
         """Close the port; safe to repeat, and on a port that is gone."""
         self._closed = True
-        # Where the peer went first, pyserial's socket:// leaves its socket open.
+        # If the peer closed first, pyserial's socket:// leaves its socket open.
         inner = getattr(self._port, "_socket", None)
         with contextlib.suppress(OSError, TypeError, AttributeError, ValueError):
             self._port.close()

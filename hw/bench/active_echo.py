@@ -1,8 +1,8 @@
-"""The active-echo electronics that are not there: our line protocol on a pty (or a TCP port).
+"""Emulated active-echo electronics: our line protocol on a pty (or a TCP port).
 
-What the element hears is asked of a function of time and threshold, once a frame; the rest is the
-device: command interpreter, counters, frames at the ultrasound machine's rate, and on request the
-faults that benches have.
+A function of time and threshold, called once a frame, says what the element hears. The rest is the
+emulated device: command interpreter, counters, frames at the ultrasound machine's rate, and on
+request the faults that benches have.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ _LONGEST_COMMAND = 2 * MAXIMUM_LINES + 64
 
 @dataclass(frozen=True)
 class Injection:
-    """What the element answers a received pulse with.
+    """How the element answers a received pulse.
 
     Attributes:
-        on: whether it does.
+        on: whether it answers.
         delay_ticks: between the pulse and the answer.
         pattern: a level (0 to 255) for each line.
     """
@@ -80,7 +80,7 @@ class AuspisEmulator:
         path: what to open, a path or ``socket://host:port``.
         injection: what the element answers with; replaced as a whole.
         sent: frames put on the line.
-        refused: frames that the line had no room for.
+        refused: frames dropped because the line's buffer was full.
     """
 
     def __init__(
@@ -178,7 +178,7 @@ class AuspisEmulator:
         self._thread.join()
 
     def replug(self) -> None:
-        """Come back at the same path, as after power-up: no fault, and the counters at zero."""
+        """Come back at the same path, as after power-up: no faults, counters as at the start."""
         self.unplug()
         if self._folder is not None:
             self._link = PtyLink(Path(self.path))
@@ -194,7 +194,7 @@ class AuspisEmulator:
         self._thread.start()
 
     def recover(self) -> None:
-        """No fault any more, an unplugged port aside."""
+        """End all faults, except that an unplugged port stays unplugged."""
         self._faults = _Faults()
 
     # The device
@@ -205,7 +205,7 @@ class AuspisEmulator:
     def _run(self) -> None:
         due = self._clock.now()
         while not self._unplug:
-            # Wakes often enough to notice that it is to stop.
+            # The thread wakes often enough to notice a request to stop.
             wait = self._clock.wall(due - self._clock.now())
             ready, _, _ = select.select([self._link], [], [], min(max(wait, 0.0), 0.05))
             if ready:
@@ -213,8 +213,8 @@ class AuspisEmulator:
             now = self._clock.now()
             if now < due:
                 continue
-            # The ultrasound machine triggers on, whether frames are sent or not. A bench that is
-            # too slow for its own clock slips rather than pretend that triggers were missed.
+            # The ultrasound machine goes on to trigger, whether frames are sent or not. A bench
+            # that is too slow for its clock is delayed; it does not count triggers as missed.
             if now - due > _LARGEST_SLIP_S:
                 due = now
             self._trigger(due)

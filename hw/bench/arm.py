@@ -7,9 +7,9 @@ follows from the last motion alone, so reading it has no side effects and any th
 Another TCP offset (:meth:`Arm.set_tcp_offset`) changes what is reported and commanded, not where
 the tool is: the path of a motion is that of the TCP at its start.
 
-The tool is where the commands put it only to within the arm's repeatability: :meth:`Arm.raw` is
-what the joint encoders say, :meth:`Arm.true_raw` is where the tool is. The difference is redrawn
-with travel (its correlation falls as exp(-travel / ``correlation_mm``)), as a fine step hardly
+The tool reaches a commanded pose only to within the arm's repeatability: :meth:`Arm.raw` is the
+pose by the joint encoders, :meth:`Arm.true_raw` is where the tool is. The difference is redrawn
+with travel (its correlation falls as exp(-travel / ``correlation_mm``)), because a fine step hardly
 changes the gears' error while a long move changes all of it.
 
 With a model the arm has joints (:mod:`hw.bench.joints`), and places where it cannot follow.
@@ -31,7 +31,7 @@ from hw.robot.pose import ur_to_pose
 Vector = tuple[float, ...]
 
 _AHEAD_S = 0.01
-"""A controller looks at its arm no less often than that; a CB-series one every 8 ms."""
+"""Longest time between two checks of the arm by a controller; a CB-series one checks every 8 ms."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Arm:
 
     Args:
         raw: where the tool starts, [x, y, z] m and rotation vector rad, in the base frame.
-        tcp_offset: the tool centre point in the flange's frame, as ``raw``: that of the real tool.
+        tcp_offset: the real tool's centre point in the flange's frame, m and rotation vector rad.
         repeatability_mm: SD of the tool's position error per axis.
         repeatability_deg: SD of its orientation error per axis.
         correlation_mm: travel over which the error is forgotten.
@@ -131,14 +131,14 @@ class Arm:
             "reach_m": tuple(reach_m),
             "model": model,
         }
-        """What it was made of: another process can make the same arm."""
+        """The arguments, so that another process can make the same arm."""
         self.watcher: Callable[[Motion], None] | None = None
         """Told of every new motion, in the thread that commands it."""
         self._tool: Vector = _six(tcp_offset)
         self.halt_acceleration = halt_acceleration
         self.reach_m = reach_m
         self.force: Vector = (0.0,) * 6
-        """What the tool meets: N and N m."""
+        """Force and torque on the tool: N and N m."""
         self._sd = (repeatability_mm / 1000.0,) * 3 + (math.radians(repeatability_deg),) * 3
         self._correlation = correlation_mm / 1000.0
         self._random = random.Random(seed)
@@ -165,7 +165,7 @@ class Arm:
 
     @property
     def tcp_offset(self) -> Vector:
-        """Of the tool centre point in the flange's frame (m, rad), as the controller believes."""
+        """The tool centre point in the flange's frame (m, rad), as set at the controller."""
         return self._motion.tcp
 
     def set_tcp_offset(self, offset: Sequence[float]) -> None:
@@ -181,14 +181,14 @@ class Arm:
             t: bench time now, s.
             target: [x, y, z] m and rotation vector rad.
             speed: m/s of the tool; where the turn in rad is more than the travel in m, rad/s.
-            acceleration: m/s^2, likewise.
+            acceleration: m/s^2, or rad/s^2 in the same case.
         """
         motion = self._plan(t, target, speed, acceleration)
         self.follow(motion)
         return t + motion.duration()
 
     def follow(self, motion: Motion) -> None:
-        """Do this from now on; an arm in another process may be made to follow this one."""
+        """Take over a motion from now on; so an arm can mirror one in another process."""
         self._motion = motion
         if self.watcher is not None:
             self.watcher(motion)
@@ -285,7 +285,7 @@ class Arm:
         return tuple((rate * found.slope(place)).tolist())
 
     def at_its_end(self, t: float) -> bool:
-        """Whether the arm must be stopped now to rest before a place where it cannot follow."""
+        """Whether the arm must brake now to rest before a place where it cannot follow the path."""
         found, moving = self._tracked(), self._motion
         if found is None or math.isinf(found.end) or moving.brake:
             return False
@@ -296,7 +296,7 @@ class Arm:
         return place + ahead >= found.end - 1e-6
 
     def _tracked(self) -> JointTrack | None:
-        """The joints along the motion that runs, worked out when they are first asked for."""
+        """The joints along the present motion, computed when they are first needed."""
         before, moving = self._track, self._motion
         if before is None or self.model is None or before.motion is moving:
             return before
@@ -356,8 +356,8 @@ def _six(values: Sequence[float]) -> Vector:
     return result
 
 
-# As in hw.rigid, in plain numbers: the controller asks a thousand times a second, and what takes
-# 6 us here takes 76 us by numpy's calls on arrays of four numbers.
+# As in hw.rigid, but in plain Python: the controller calls these a thousand times a second, and
+# what takes 6 us here takes 76 us with numpy on arrays of four numbers.
 
 
 def _quaternion(vector: Sequence[float]) -> Vector:

@@ -43,8 +43,8 @@ class BenchOptions:
         pose_hz: of the robot's stream in bench time, 125 or 500: which controller it is.
         echo_hz: active-echo frames per bench second.
         image_hz: ultrasound frames per bench second.
-        most_images_wall_hz: and no more of them than this per wall second.
-        most_poses_wall_hz: likewise of the robot's stream.
+        most_images_wall_hz: cap on ultrasound frames per wall second.
+        most_poses_wall_hz: cap on poses of the robot's stream per wall second.
         repeatability_mm: SD of the arm's hidden error on each axis.
         robot_host: loopback address; empty: any free one.
         link: of the active echo: ``pty`` or ``tcp``.
@@ -87,12 +87,12 @@ class Assembly:
     """World and devices of one bench, in this process; :meth:`start` them.
 
     Args:
-        options: see there.
+        options: how to run the bench.
 
     Attributes:
-        world: what there is.
+        world: the simulated world.
         clock: bench time.
-        arm: where the robot's arm is; it follows the one in the robot's own process.
+        arm: a mirror of the arm in the robot's own process.
     """
 
     def __init__(self, options: BenchOptions) -> None:
@@ -155,7 +155,7 @@ class Assembly:
 
     def _hear(self, t: float, threshold: int) -> tuple[np.ndarray, np.ndarray]:
         times, amplitude = self.world.echo(self.true_pose(t), threshold, self._echo_rng)
-        # The world's times are whole ticks already; the counter that cuts off must not take one.
+        # The world's times are whole ticks; the counter rounds down and must not lose one.
         return times + 0.25 / self.world.clock_hz, amplitude
 
     def _see(self, t: float) -> np.ndarray:
@@ -172,7 +172,7 @@ class Assembly:
     # Life
 
     def start(self) -> dict:
-        """Start every device; what a client must know, as JSON."""
+        """Start every device; returns what a client must know, to be sent as JSON."""
         self.robot = self._start_robot()
         self.echo.start()
         self.images.start()
@@ -230,7 +230,7 @@ class Assembly:
             self.robot.stop()
 
     def wait(self) -> None:
-        """Until somebody asks for the end."""
+        """Wait until somebody asks for the end."""
         self._done.get()
 
     def end(self) -> None:
@@ -276,7 +276,7 @@ class Assembly:
         return self.clock.now()
 
     def _recover(self, _: dict) -> None:
-        """All devices as new; a protective stop is a person's, and stays."""
+        """End the devices' faults. A protective stop and changes at the pendant stay."""
         if self.robot is not None:
             self.robot.mute(False)
         if self._unplugged:

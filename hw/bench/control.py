@@ -1,6 +1,6 @@
-"""The control socket of an emulated bench: faults on request, and the truth for those who check.
+"""The control socket of an emulated bench: faults on request, and the truth for tests.
 
-One JSON object a line, either way, on a loopback TCP port:
+One JSON object a line, in both directions, on a loopback TCP port:
 
     {"do": "fault", "name": "protective_stop"}        -> {"ok": null}
     {"do": "true_pose"}                                -> {"ok": [[...], ...]}
@@ -25,8 +25,8 @@ class ControlServer:
     """Answers requests; each connection has a thread.
 
     Args:
-        handlers: by the name under ``do``; what they return must be JSON, what they raise becomes
-            the error.
+        handlers: by the name under ``do``. A handler's result must fit into JSON; an exception of
+            it becomes the error.
     """
 
     def __init__(self, handlers: Mapping[str, Handler]) -> None:
@@ -83,14 +83,14 @@ class ControlServer:
 
 
 class ControlClient:
-    """Asks a bench.
+    """Sends requests to a bench.
 
     Args:
         port: of its control socket on loopback.
         timeout_s: wall seconds for connecting and for an answer.
 
     Raises:
-        OSError: there is none.
+        OSError: no bench listens there.
     """
 
     def __init__(self, port: int, timeout_s: float = 30.0) -> None:

@@ -2,8 +2,8 @@
 
 The client writes a command into input_int_register_0 and its numbers into the double registers. The
 program answers in output_int_register_0: 1 ready, 2 done; it goes back to 1 when the client has
-written 0. Commands of real time are taken as they come and leave the register at 1. While a
-synchronous motion runs, the program reads nothing, as on the real controller.
+written 0. Real-time commands are executed at every step and leave the register at 1. While a
+synchronous motion runs, the program reads no commands, as on the real controller.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NORMAL_BIT, PROTECTIVE_BIT = 1 << 0, 1 << 2
 
 _REAL_TIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71})
 _START_S = 0.05
-"""From the end of the script's upload to its first line."""
+"""Time from the end of the script's upload to its first line."""
 _NAMES = {
     1: "moveJ",
     2: "moveJ_IK",
@@ -44,7 +44,8 @@ _NAMES = {
     45: "movePath",
     46: "getInverseKinematics",
 }
-"""ur_rtde's names of commands that end the program, as an unknown function ends a real script."""
+"""ur_rtde's names of commands that are not emulated: they end the program, as an unknown function
+ends a real script."""
 STEADY_S = 0.5
 """How long the arm must have rested to count as steady (URScript manual, is_steady)."""
 
@@ -67,7 +68,7 @@ class Controller:
     payload_kg: float = 0.0
     payload_cog_m: tuple[float, ...] = (0.0, 0.0, 0.0)
     speed_fraction: float = 1.0
-    """Of the speed slider."""
+    """Position of the speed slider, 0 to 1."""
     told: Callable[[str, bool], None] = field(default=lambda reason, fault: None, repr=False)
     """Called when a program stops: the reason, and whether it is a fault of the program."""
 
@@ -126,7 +127,7 @@ class Controller:
         if self._starts is not None and t >= self._starts and not self.protective:
             self._start(t)
         if not self.protective and self.arm.at_its_end(t):
-            # As a real one does: a joint too fast, a singularity, the end of the reach.
+            # A real controller stops too: for a fast joint, a singularity, the end of the reach.
             self.protect(t, "protective stop: the arm cannot follow the path")
             return
         if not self.running:

@@ -1,14 +1,14 @@
 """B-mode frames of the simulated world: speckle, what the phantom shows, its injected pattern.
 
-Speckle is drawn once, as a field larger than a frame, and cut out at a new place for every frame; a
-spot is added to the envelope in its own small patch before log compression. So a 640 x 480 frame
+Speckle is drawn once, as a field larger than a frame; each frame is cut out of it at a new place.
+A spot is added to the envelope in its own small patch, before log compression. So a 640 x 480 frame
 costs a fraction of a millisecond, whatever is in it.
 
 The phantom of the world says which marks it leaves (:mod:`hw.bench.phantoms`); an injected pattern
 is a bar of lines beneath the mark. Beside the active echo element, at the same height (section 3.2
 of the paper), the tank holds cross-wires; they are passive and show where the beam crosses them.
 
-What the paper calls image quality is three things here (section 4.2): the transmit focus, at the
+Of the paper's image quality (section 4.2) three things are modelled: the transmit focus, at the
 target's depth or fixed; multiple reflections, as ghosts of loud echoes; and too short a delay
 between lines, which raises the background by late echoes of the line before.
 """
@@ -42,8 +42,8 @@ class Look:
     Attributes:
         echo: the active echo of a line at full amplitude.
         wire: a wire in the mid-plane; 0: there are no cross-wires beside the element.
-        ghost: the active echo's reflection over the echo, later by ``ghost_mm``; 0: none.
-        ghost_mm: its detour.
+        ghost: strength of the active echo's reflection relative to the echo; 0: none.
+        ghost_mm: by how much deeper than the echo the reflection shows.
         ghost_share: share of the frames that show it.
         axial_mm: SD of a spot along the axial direction.
         lateral_mm: SD of a point's two-way spot along the lateral direction, in focus.
@@ -51,7 +51,7 @@ class Look:
         defocus: growth of the transmit beam's lateral SD per mm off its focus.
         speckle_db: level of the background, dB below white.
         face: envelope of the ringing at the probe's face; 0: none.
-        beside_mm: where the wires beside the element cross, from it, in the base frame.
+        beside_mm: place where the wires cross, relative to the element, in the base frame.
     """
 
     echo: float = 0.9
@@ -214,7 +214,7 @@ def _speckle(rng: np.random.Generator, size_px: tuple[float, float]) -> Float[np
 
 
 def _ringing(range_mm: np.ndarray) -> Float[np.ndarray, " rows"]:
-    """Bands under the probe's face: the pulse to and fro in the lens, a millimetre apart.
+    """Bands under the probe's face, a millimetre apart: the pulse goes to and fro in the lens.
 
     Assumption: their distance and decay (1.5 mm) are those of common linear probes.
     """

@@ -1,9 +1,9 @@
 """Joints of the emulated arm along its motions, and where a real controller would stop them.
 
-The path of a motion is put through the inverse kinematics once, when it begins, in the branch of
-the joints at which it begins; in between its samples the joints are interpolated. A controller
-stops protectively where a joint would turn faster than it can, where its range ends, and near a
-singularity; the emulated one does so early enough to rest before that place.
+The inverse kinematics of a motion's path is computed once, when the motion begins, in the branch of
+its first joints; between the samples the joints are interpolated. A controller makes a protective
+stop where a joint would turn faster than it can, where its range ends, and near a singularity; the
+emulated controller does so early enough to rest before that place.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 LEAST_DEXTERITY_MM = 1.0
 """Smallest singular value (mm per rad, :func:`hw.robot.kinematics.dexterity_mm`) at which the
-emulated controller moves the tool along a line: a wrist singularity's last degree."""
+emulated controller moves the tool along a line: about a degree from a wrist singularity."""
 _RANGE = 2 * math.pi
 _SPACING_MM = 4.0
 _MOST_SAMPLES = 500
@@ -42,7 +42,7 @@ _MOST_SAMPLES = 500
 def first_joints(
     model: ArmModel, raw: tuple[float, ...], tcp_offset: tuple[float, ...]
 ) -> Float[np.ndarray, 6]:
-    """Joints of an arm that was put somewhere: elbow up, as far as can be from singularities.
+    """Joints of an arm at its first pose: elbow up where possible, far from singularities.
 
     Raises:
         ValueError: out of reach.
@@ -63,7 +63,7 @@ class JointTrack:
     Attributes:
         motion: whose path it is.
         places: (n,) path parameter of each sample, m or rad as the motion counts.
-        joints: (n, 6) there, rad.
+        joints: (n, 6) at each sample, rad.
         end: path parameter beyond which the arm cannot follow; infinite where it can to the end.
     """
 
@@ -84,7 +84,7 @@ class JointTrack:
         return (1 - part) * self.joints[k - 1] + part * self.joints[k]
 
     def slope(self, place: float) -> Float[np.ndarray, 6]:
-        """Change of the joints per path parameter there."""
+        """Derivative of the joints by the path parameter at a place."""
         if len(self.places) < 2:
             return np.zeros(6)
         k = min(max(int(np.searchsorted(self.places, place)), 1), len(self.places) - 1)
@@ -105,7 +105,7 @@ class JointTrack:
 def track(
     model: ArmModel, motion: Motion, tcp_offset: tuple[float, ...], start: Float[np.ndarray, 6]
 ) -> JointTrack:
-    """Joints along a motion that begins at some joints."""
+    """Joints along a motion that begins at given joints."""
     travel, turn = np.array(motion.travel), np.array(motion.turn)
     length = math.hypot(
         1000 * float(np.linalg.norm(travel)), ANGLE_MM * float(np.linalg.norm(turn))
@@ -118,7 +118,7 @@ def track(
     found = inverse(model, flange_of(way, tcp_offset), joint_6=float(start[5]))
     branch = int(branch_of(model, start))
     good, joints = found.reached[:, branch], found.joints[:, branch]
-    # Beyond the reach the joints stay where they were.
+    # Samples from the first one out of reach on are left out.
     count = len(parts) if good.all() else int(np.argmin(good))
     joints = joints[: max(count, 1)]
     if count == 0:
@@ -126,10 +126,10 @@ def track(
     joints = np.unwrap(joints, axis=0)
     joints += nearest_turn(joints[0], start) - joints[0]
     places = parts[:count] * motion.length
-    # What a real arm does not do: near a singularity, out of a joint's range, faster than it can.
+    # A real arm stops near a singularity, at a joint's limit, and where a joint would be too fast.
     dexterity = dexterity_mm(model, joints)
     wrong = (np.abs(joints) > _RANGE).any(axis=1)
-    # Out of a singularity it may go.
+    # It may move away from a singularity.
     wrong |= (dexterity < LEAST_DEXTERITY_MM) & (np.gradient(dexterity) <= 0 if count > 1 else True)
     steps = np.abs(np.diff(joints, axis=0)).max(axis=1) / np.diff(places)
     peak = min(motion.speed, math.sqrt(motion.length * motion.acceleration))

@@ -1,7 +1,7 @@
 """The emulated device's end of a line: the master of a pty, or a TCP port for ``socket://``.
 
-Both read and write without ever waiting; what the other end does not take is kept up to a bound, as
-a bridge's buffer would, and refused beyond it.
+Both read and write without ever waiting. Data that the other end does not take are kept up to a
+bound, as in the buffer of a bridge, and refused beyond it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Link(Protocol):
     url: str
 
     def fileno(self) -> int:
-        """What to wait on for reading."""
+        """File descriptor to wait on for reading."""
         ...
 
     def read(self) -> bytes:
@@ -29,7 +29,7 @@ class Link(Protocol):
         ...
 
     def write(self, data: bytes) -> bool:
-        """Send; False when there is no room, and then nothing of it is sent."""
+        """Send; False when there is no room: then none of the data are sent."""
         ...
 
     def close(self) -> None:
@@ -38,17 +38,17 @@ class Link(Protocol):
 
 
 class PtyLink:
-    """The master of a pty; its slave is reached by a link in the file system that stays the same.
+    """The master of a pty; a symbolic link with a fixed path leads to its slave.
 
     Args:
-        path: of that link, such as a rule of udev would make.
+        path: of the link, like one made by a udev rule.
     """
 
     def __init__(self, path: Path) -> None:
         import tty
 
         self._path = path
-        # The slave stays open here too: reading a master whose slave nobody has open is an error.
+        # The slave stays open here too: reading the master fails while nobody has the slave open.
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -97,7 +97,7 @@ class PtyLink:
 
 
 class TcpLink:
-    """A TCP port that one peer at a time is connected to, like a serial-to-TCP bridge."""
+    """A TCP port that takes one peer at a time, like a serial-to-TCP bridge."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
         self._listener = socket.create_server((host, port))

@@ -1,9 +1,10 @@
-"""An emulated robot in a process of its own, so that nothing else holds its controller up.
+"""An emulated robot in a process of its own, so that nothing else delays its controller.
 
-A controller works in real time; one that shares its interpreter with, say, the rendering of images
-answers whenever it gets the lock. So the server runs alone, and tells each new motion of its arm to
-the process that started it, where a mirror of the arm follows: the state at any bench time follows
-from the last motion alone. :class:`RobotProcess` stands for an :class:`hw.bench.rtde.RtdeServer`.
+A controller works in real time; if it shared an interpreter with, say, the rendering of images, it
+would answer only when it gets the lock. So the server runs alone, and sends each new motion of its
+arm to the process that started it. There a mirror of the arm takes over the motion: the state at
+any bench time follows from the last motion alone. :class:`RobotProcess` is the caller's side of an
+:class:`hw.bench.rtde.RtdeServer` in such a process.
 
 ``python -m hw.bench.robot '{"host": "127.0.0.2"}'`` serves until its input ends.
 """
@@ -43,7 +44,7 @@ class RobotProcess:
     """An arm and its controller in a child process.
 
     Args:
-        arm: made here; it follows the child's arm and must not be commanded.
+        arm: a mirror of the child's arm; it must not be commanded.
         host: loopback address.
         version: of the controller.
         clock: bench time, shared with the child.
@@ -158,7 +159,7 @@ class RobotProcess:
         return self.state()["skipped"]
 
     def ask(self, name: str, *values: object) -> object:
-        """One request: a fault (answered by the bench time at which it came), ``force``, ``state``.
+        """One request: ``state``, ``force`` or a fault (the last two answer with the bench time).
 
         Raises:
             RuntimeError: the child is gone, or does not know the request.
@@ -272,12 +273,12 @@ def main() -> None:
     """Serve until the input ends."""
     setup = json.loads(sys.argv[1])
     lines: queue.SimpleQueue[dict | None] = queue.SimpleQueue()
-    # Every thread: one that holds the interpreter's lock must not wait behind other programs while
-    # the controller's own thread waits for that lock.
+    # For every thread: a thread that holds the interpreter's lock must not wait for other programs
+    # while the controller's own thread waits for that lock.
     be_prompt(ANSWERS)
 
     def write() -> None:
-        # Whoever does not read must not hold the controller up.
+        # A parent that does not read must not delay the controller.
         with contextlib.suppress(BrokenPipeError):
             while (message := lines.get()) is not None:
                 print(json.dumps(message), flush=True)

@@ -1,15 +1,15 @@
 """A Universal Robots controller on loopback that the real ur_rtde accepts.
 
 Ports are fixed: 29999 dashboard, 30001 primary interface, 30003 scripts, 30004 real-time data
-(RTDE); several robots live at several loopback addresses. Run it in another process than its
-client, whose constructors hold the interpreter's lock. Two versions are known to be taken: 5.11.0
-(500 Hz) and 3.15.8 (125 Hz).
+(RTDE); several robots need several loopback addresses. Run it in another process than its client,
+because ur_rtde's constructors hold the interpreter's lock. ur_rtde is known to accept two versions:
+5.11.0 (500 Hz) and 3.15.8 (125 Hz).
 
-What it does not do, it says: a command of ur_rtde's script that is not emulated ends the program,
-as an unknown function ends a script, and the reason goes to the primary interface as a text
+It reports what it does not emulate: a command of ur_rtde's script that is not emulated ends the
+program, as an unknown function ends a script. The reason goes to the primary interface as a text
 message, to the process's standard error, and into the ``state`` of :mod:`hw.bench.robot`
 (``robot`` of a bench's control socket). The primary interface sends the arm's kinematic calibration
-when a client connects (3.6 or newer), and those texts; not the ten states a second of a real
+when a client connects (3.6 or newer), and these texts, but not the ten states a second of a real
 controller. Only one client may write an input register (IN_USE); a recipe with an unknown variable
 cannot be started; a packet of an unknown type ends the connection.
 
@@ -48,7 +48,7 @@ __all__ = ["Arm", "RtdeServer"]
 
 DASHBOARD, PRIMARY, SCRIPT, RTDE = DASHBOARD_PORT, PRIMARY_PORT, 30003, 30004
 _MAX_WAITING = 1 << 16
-"""Bytes that may wait for a client that does not read; further packets are left out for it."""
+"""Bytes that may wait for a client that does not read; further packets for it are dropped."""
 _ROBOT_MESSAGE = 20
 _LATE_S = 1.0
 _MAX_INPUT = 1 << 20
@@ -149,7 +149,7 @@ class RtdeServer:
         if self._thread is None:
             return
         self._running = False
-        # It may have seen that already, and be gone.
+        # The thread may have ended already.
         with contextlib.suppress(OSError):
             self._wake.send(b"x")
         self._thread.join()
@@ -164,7 +164,7 @@ class RtdeServer:
     # Faults
 
     def mute(self, on: bool = True) -> None:
-        """Neither read nor write; connections stay, and new ones are taken but not answered."""
+        """Neither read nor write; connections stay, and new ones are accepted but not answered."""
 
         def act() -> None:
             self._muted = on
@@ -179,7 +179,7 @@ class RtdeServer:
         self._call(act)
 
     def drop(self, *, reset: bool = True, control_only: bool = False) -> None:
-        """Close the clients' connections, or only those that command, by a reset or in order."""
+        """Close all clients' connections, or only those that command: reset, or closed in order."""
 
         def act() -> None:
             for connection in [c for c in self._connections if c.inputs or not control_only]:
@@ -236,7 +236,7 @@ class RtdeServer:
     # The loop
 
     def _serve(self) -> None:
-        # A controller is never late; other threads of this process must hand over soon.
+        # A controller is never late, so other threads here must release the lock soon.
         be_prompt(ANSWERS)
         sys.setswitchinterval(min(sys.getswitchinterval(), 0.0005))
         period = 1.0 / self.frequency_hz
@@ -307,7 +307,7 @@ class RtdeServer:
         elif connection.port == SCRIPT:
             self._script(connection)
         elif connection.port == PRIMARY:
-            # It would run what is sent; nobody here sends anything.
+            # A real controller would run scripts sent here; this one closes the connection.
             self._forget(connection)
         else:
             self._dashboard(connection)
@@ -571,7 +571,7 @@ class RtdeServer:
                 return f"could not understand: '{line}'"
 
     def _since(self, cb: tuple[int, int] | None, e: tuple[int, int]) -> bool:
-        """Whether this version has what came with these: CB (None: never) and e-Series."""
+        """Whether this version is at least ``e`` on e-Series, else ``cb`` (None: never)."""
         least = e if self.version[0] >= 5 else cb
         return least is not None and self.version[:2] >= least
 

@@ -3,7 +3,7 @@
     python -m hw.bench.run --speed 5 --seed 1
 
 prints one JSON line with the addresses and serves until its standard input ends, so that a bench
-never outlives whoever started it. :func:`start_bench` is that for programs.
+never outlives the process that started it. Programs call :func:`start_bench`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Bench:
     """A running bench in a process of its own; a context manager.
 
     Args:
-        process: whose standard input ends it.
+        process: the bench's; it ends when its standard input ends.
         told: the JSON line that it printed.
 
     Attributes:
@@ -75,11 +75,11 @@ class Bench:
 
     @property
     def pid(self) -> int:
-        """Of the bench's process."""
+        """Id of the bench's process."""
         return self._process.pid
 
     def fault(self, name: str, **arguments: object) -> float:
-        """Have a fault; returns the bench time at which it was in force.
+        """Cause a fault; returns the bench time at which it was in force.
 
         Args:
             name: mute, drop, protective_stop, unlock, tcp_offset (offset), payload
@@ -94,7 +94,10 @@ class Bench:
         return float(str(self._control.ask("fault", name=name, **arguments)))
 
     def recover(self) -> None:
-        """No faults any more; a protective stop needs ``fault("unlock")``."""
+        """End the devices' faults; changes at the pendant stay.
+
+        A protective stop needs ``fault("unlock")``.
+        """
         self._control.ask("recover")
 
     def true_pose(self) -> Float[np.ndarray, "4 4"]:
@@ -157,11 +160,11 @@ def start_bench(options: BenchOptions | None = None, **changes) -> Bench:
     """Start a bench in a process of its own.
 
     Args:
-        options: how.
-        changes: fields of :class:`BenchOptions`, instead of them.
+        options: how to run it.
+        changes: fields of :class:`BenchOptions` that replace those of ``options``.
 
     Raises:
-        InputError: options that cannot be, or a bench that does not start; one line.
+        InputError: invalid options, or a bench that does not start; one line.
     """
     options = BenchOptions(**{**(asdict(options) if options is not None else {}), **changes})
     with tempfile.TemporaryFile() as complaints:
@@ -184,7 +187,7 @@ def start_bench(options: BenchOptions | None = None, **changes) -> Bench:
 
 
 def _first_line(process: subprocess.Popen) -> bytes:
-    """What it prints first; nothing where that takes too long."""
+    """The first line that it prints; empty if that takes too long."""
     lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     stdout = process.stdout
     assert stdout is not None
@@ -196,8 +199,8 @@ def _first_line(process: subprocess.Popen) -> bytes:
 
 
 def serve(options: BenchOptions) -> None:
-    """Run a bench here: print its addresses, serve until standard input ends or it is told to."""
-    # A person's Ctrl-C and a parent's death both end standard input's reader.
+    """Run a bench here: print its addresses, serve until standard input ends or a client asks."""
+    # Ctrl-C interrupts the wait below; the end of the parent ends standard input, and so the wait.
     assembly = Assembly(options)
     try:
         print(json.dumps(assembly.start()), flush=True)

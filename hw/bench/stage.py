@@ -1,7 +1,7 @@
 """The simulated world as a bench for the placement procedures: no sockets, no waiting.
 
-What the real clients and the emulators do between a procedure and the world is left out, so that
-procedures and experiments with thousands of placements run in seconds. Bench time is accounted for.
+The real clients and the emulators between a procedure and the world are left out, so that
+procedures and experiments with thousands of placements run in seconds. Bench time is added up.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hw.shapes import Float
 
 @dataclass(frozen=True)
 class Pace:
-    """What takes how long on a bench, for accounts of bench time.
+    """How long each action takes on a bench, to add up bench time.
 
     Attributes:
         search_mm_s: speed of elevational moves.
@@ -45,8 +45,8 @@ class WorldStage:
         rng: of noise and repeatability.
         position_sd_mm: every stop misses by a normal error of this SD on each axis, which the robot
             does not see.
-        backlash_mm: lost motion when the direction of elevational motion turns round.
-        pace: accounts.
+        backlash_mm: lost motion when the elevational motion changes its direction.
+        pace: how long each action takes.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class WorldStage:
         self.move(0.0)
 
     def move(self, offset_mm: float) -> float:
-        """Stop at an offset; what the robot reports is where it was sent."""
+        """Stop at an offset; the robot reports the place where it was sent."""
         step = offset_mm - self._asked
         # Lost motion: the tool follows only when the drive has run through its play.
         self._slack = float(np.clip(self._slack - step, -self._backlash / 2, self._backlash / 2))

@@ -1,8 +1,8 @@
-"""The ultrasound machine that is not there: an OpenIGTLink server with images of its own making.
+"""An emulated ultrasound machine: an OpenIGTLink server that renders its own images.
 
-``pyigtl`` is the independent server in the tests; this one sends what that cannot: message ids, RF
-channel data, TDATA and STATUS, and on request the faults that streams have. A client that does not
-keep up loses whole images, never parts of them.
+The tests use ``pyigtl`` as an independent server; this one also sends what pyigtl cannot: message
+ids, RF channel data, TDATA and STATUS, and on request the faults that streams have. A client that
+is too slow loses whole images, never parts of them.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class ImageServer:
 
     Attributes:
         port: to connect to.
-        sent: images sent to the client that has got most of them.
-        refused: images that a slow client had no room for.
+        sent: images made for the clients.
+        refused: images dropped for clients that were too slow.
     """
 
     def __init__(
@@ -154,7 +154,7 @@ class ImageServer:
         due = self._clock.now()
         while not self._stopping:
             wait = self._clock.wall(due - self._clock.now())
-            # Wakes often enough to notice that it is to stop.
+            # The thread wakes often enough to notice a request to stop.
             for key, _ in self._selector.select(min(max(wait, 0.0), 0.05)):
                 if key.fileobj is self._listener:
                     self._welcome()
@@ -167,7 +167,7 @@ class ImageServer:
             now = self._clock.now()
             if now < due:
                 continue
-            # A bench that is too slow for its own clock slips: fewer images, none missing.
+            # A bench that is too slow for its clock sends fewer images, and none is missing.
             if now - due > _LARGEST_SLIP_S:
                 due = now
             if self._clients and not self._faults.stale:
@@ -202,7 +202,7 @@ class ImageServer:
 
     def _spoil(self, data: bytes) -> bytes:
         spoilt = bytearray(data)
-        # Every other one in the header, which would be hit once in 5000 images otherwise.
+        # Half of the errors go to the header, which chance would hit once in 5000 images.
         end = HEADER_SIZE if self._random.random() < 0.5 else len(data)
         spoilt[int(self._random.integers(end))] ^= 1 << int(self._random.integers(8))
         return bytes(spoilt)
@@ -241,7 +241,7 @@ class ImageServer:
         self._serve(client)
 
     def _serve(self, client: _Client) -> None:
-        """Send what goes, and throw away what the client says: nothing of it matters here."""
+        """Send as much as the client takes; what the client sends is ignored."""
         try:
             while client.pending:
                 sent = client.connection.send(client.pending[0])

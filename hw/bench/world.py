@@ -1,4 +1,4 @@
-"""The simulated world: one probe, one phantom in water, and what each of them notices.
+"""The simulated world: one probe, one phantom in water, and what each of them measures.
 
 Everything is a function of the *true* pose of the tool centre point (mm, tool -> base), and cheap
 enough for every frame. The phantom (:mod:`hw.bench.phantoms`) is the active echo element unless
@@ -8,16 +8,17 @@ another one is put into the tank. The element hears every transmitted line:
 
 with y the target's elevational offset, w(r) the beam's elevational SD, which is least at the focus,
 theta_k the angle off element k's normal, and s the response's own shift. The element answers a line
-whose amplitude reaches the threshold, and then its time of flight is that of the straight way,
-except for a few lines on which a reflection is taken for it, later by some millimetres.
+whose amplitude reaches the threshold. Its time of flight is then that of the straight way, except
+for a few lines on which a reflection, some millimetres longer, is taken for the echo.
 
-The shift s is the mid-plane accuracy of the published electronics (+-0.3 mm): the place of an
-element of finite size that hears the most is not its middle, and depends on where the sound comes
-from. So it is fixed for a pose and differs from pose to pose: reading again, or searching longer,
-does *not* average it away, which is the harder of the two readings. It is a smooth random field
-over the orientation (correlation length three degrees) with a normal law of SD 0.3 mm, again the
-harder reading of "+-". It is the paper's explanation of a mid-plane accuracy that is limited by the
-2 mm of the element (section 4.2), and is taken to be in proportion to a sensor's size.
+The shift s is the mid-plane accuracy of the published electronics (+-0.3 mm): an element of finite
+size does not hear the most at its middle, but at a place that depends on where the sound comes
+from. So the shift is fixed for a pose and differs from pose to pose: reading again, or searching
+longer, does *not* average it away. Of the two ways to read the published number this is the harder
+case. The shift is a smooth random field over the orientation (correlation length three degrees),
+normally distributed with SD 0.3 mm, again the harder way to read "+-". This follows the paper,
+which explains the limited mid-plane accuracy by the 2 mm of the element (section 4.2); the shift is
+taken to be in proportion to a sensor's size.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ class Beam:
 
 @dataclass(frozen=True)
 class Noise:
-    """How far what is noticed is from what is.
+    """Errors of what is measured.
 
     Attributes:
         response_mm: SD of the mid-plane shift of the element's response, fixed for a pose.
@@ -112,11 +113,11 @@ class World:
         point_mm: (3,) the target in the robot's base frame.
         scene: what a person knows of them beforehand, off by some mm and degrees.
         probe: the transducer.
-        sound_speed_m_s: the true one; the probe's own is what everyone assumes.
+        sound_speed_m_s: the true one; that of ``probe`` is the assumed one.
         delay_s: the electronics' fixed delay, true.
         clock_hz: the counter behind the times of flight.
         beam: elevational profile.
-        noise: see there.
+        noise: errors of what is measured.
         seed: of the response's shift.
         phantom: what is in the tank.
     """
@@ -248,15 +249,15 @@ TANK_MM = np.array([350.0, -250.0, 80.0])
 
 
 def make_world(seed: int = 0, **changes) -> World:
-    """A bench whose mount and target are off what is known by up to 2 mm and 1.5 degrees an axis.
+    """A bench whose mount and target are off the scene by up to 2 mm and 1.5 degrees an axis.
 
     Args:
-        seed: of these, and of the response's shift.
-        changes: any attribute of :class:`World`; those of ``noise`` and ``beam`` too, by their
-            names. A phantom may be given by its name.
+        seed: of these differences, and of the response's shift.
+        changes: attributes of :class:`World`, or of its ``noise`` and ``beam``, by their names. A
+            phantom may be given by its name.
 
     Raises:
-        InputError: an unknown name, a sound speed or clock that is none, a beam thinner than the
+        InputError: an unknown name, an impossible sound speed or clock, or a beam thinner than the
             paper's element.
     """
     rng = np.random.default_rng([seed, 0x0B])

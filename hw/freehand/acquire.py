@@ -1,7 +1,7 @@
 """A free-hand run: from the connection to a recording that is complete.
 
-Every image that is taken is on the disk before the next one is looked for, with its frame. A run
-that ends early, however it ends, leaves a recording that is gone on with.
+Every image that is taken is on the disk, with its frame, before the next one is looked for. A run
+that ends early, however it ends, leaves a recording that can be resumed.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
 _SILENCE_S = 3.0
 _LEAST_FOR_ESTIMATE = 6
 _STANDS_OUT = 4.0
-"""An image whose residual is so many times the median one is named."""
+"""An image whose residual is more than so many times the median residual is named."""
 _LEAST_MM = 1.0
 _ENOUGH = 30
-"""Images that are asked for, where nothing else is."""
+"""Default number of images to take."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class FreeHand:
         host: of the OpenIGTLink server.
         port: of it.
         images: to take.
-        source: tracked frame on the probe; None: found.
-        target_frame: frame that the target rests in; None: found.
-        device: of the images; None: of any.
+        source: tracked frame on the probe; None: found from the stream.
+        target_frame: frame that the target rests in; None: found from the stream.
+        device: that sends the images; None: any.
         lag_s: an image stamped t shows what was at t - lag.
         spacing_mm: [lateral, axial] mm per px, when known.
         rules: when an image is taken.
@@ -75,7 +75,7 @@ class FreeHandStopped(CalibrationError):
 
 @runtime_checkable
 class Person(Protocol):
-    """Who holds the probe: what they are shown, and the keys that they press."""
+    """The person who holds the probe: what they are shown, and the keys that they press."""
 
     def show(self, frame: np.ndarray, words: str, advice: str) -> None:
         """The newest frame, what is said of it, and what is missing."""
@@ -155,12 +155,12 @@ class _Run:
     ) -> None:
         self._asked, self._guide, self._person = asked, guide, person
         self._posed, self._recorder = posed, recorder
-        # Row of /calibration of each image that counts; those taken back keep theirs, masked.
+        # Row of /calibration of each image that counts; an image taken back keeps its row, masked.
         self._rows, self._next_row = used, rows
         self._size = (0, 0)
 
     def go(self) -> int:
-        """Until enough is taken, or the person ends it."""
+        """Run until enough images are taken, or the person ends it."""
         asked, guide = self._asked, self._guide
         self._note("started", f"{asked.images - len(guide.taken)} images to take")
         if asked.spacing_mm is not None:

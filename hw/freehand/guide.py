@@ -1,9 +1,9 @@
-"""When an image is taken, and what the person who holds the probe is told meanwhile.
+"""When an image is taken, and what the person who holds the probe is told.
 
-An image is taken by itself once the probe has been held still for a moment, a credible target is in
-it, and it differs from those before: another orientation, or the target elsewhere in the image.
-The pose is the mean over the moment. What is still missing is said in words: parts of the image
-where the target has not been, and orientations that all lie about one axis.
+An image is taken automatically once the probe has been held still for a moment, if it shows a
+credible target and differs from the images before: another orientation, or the target elsewhere in
+the image. Its pose is the mean over that moment. The person is told what is still missing: parts of
+the image where the target has not been, and turns of the probe, also about a second axis.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class Rules:
 
     Attributes:
         hold_s: the probe must be still for so long, s.
-        still_mm: and move by no more than this meanwhile.
-        still_deg: nor turn by more than this.
-        different_deg: an image differs from another by so large a turn,
-        different_part: or by so large a part of the frame between the targets' places.
+        still_mm: largest motion of a probe that is still.
+        still_deg: largest turn of a probe that is still.
+        different_deg: an image differs from another if the probe has turned by this,
+        different_part: or if the target has moved by this part of the frame.
         target: what to look for.
         region: (first column, first row, columns, rows) to look in, px.
     """
@@ -63,7 +63,7 @@ class Taken:
         pixel: [u, v] of the target, px.
         covariance: (2, 2), px^2.
         time: s.
-        posed: the frame in the middle of the moment.
+        posed: the frame in the middle of that moment.
     """
 
     pose: Float[np.ndarray, "4 4"]
@@ -75,7 +75,7 @@ class Taken:
 
 @dataclass(frozen=True)
 class Look:
-    """What one image led to.
+    """Result of looking at one image.
 
     Attributes:
         words: what the person is told.
@@ -93,7 +93,7 @@ class Guide:
     """Looks at one image after the other.
 
     Attributes:
-        rules: see there.
+        rules: when an image is taken.
         taken: images that count, those of a resumed recording first.
     """
 
@@ -104,7 +104,7 @@ class Guide:
     _words: str = ""
 
     def look(self, posed: PosedImage) -> Look:
-        """What to say of an image; it is taken where all holds."""
+        """Judge an image, and take it if it keeps all rules."""
         rules, moment = self.rules, self._moment
         if posed.pose is None:
             moment.clear()
@@ -117,7 +117,7 @@ class Guide:
         poses = np.array([each.pose for each in moment])
         shift, turn = spread_of(poses)
         if shift > rules.still_mm or turn > rules.still_deg:
-            # The newest alone may be still.
+            # Keep only the newest poses: the probe may be still from now on.
             while len(moment) > 1 and moment[-1].time - moment[0].time > 0.3 * rules.hold_s:
                 moment.popleft()
             return Look("moving: bring the target into the image and hold still")
@@ -196,7 +196,7 @@ class Guide:
         empty = np.argwhere(counts < _LEAST_IN_CELL)
         if not len(empty):
             return None
-        # Farthest from where it has been.
+        # The empty cell farthest from the cells where the target has been.
         seen = np.argwhere(counts >= _LEAST_IN_CELL)
         away = np.linalg.norm(empty[:, None] - seen[None], axis=2).min(axis=1)
         row, column = empty[int(np.argmax(away))]

@@ -2,12 +2,13 @@
 
 The active echo element draws what it hears into the ultrasound image, as a bar that is longest in
 the mid-plane of the beam (:mod:`hw.midplane.pattern_injection`). A person moves the probe across
-the plane by hand, back to where the bar is longest, holds it still and accepts. The tracker tells
-where the probe was at every frame of the element, so that the sweep itself is the scan: its maximum
-(:func:`hw.midplane.amplitude_scan.fit_peak`) says how far beside the mid-plane the image was taken.
+the plane by hand, then back to where the bar is longest, holds it still and accepts. The tracker
+tells where the probe was at every frame of the element, so the sweep itself is the scan: the
+maximum (:func:`hw.midplane.amplitude_scan.fit_peak`) says how far beside the mid-plane the image
+was taken.
 
-Places are the probe's along the image's elevational axis *at the target*, from the drawing of probe
-and image: a hand that tilts the probe moves the plane at the target as well.
+Places of the probe are measured along the image's elevational axis *at the target*, by the drawing
+of probe and image, because a hand that tilts the probe also moves the plane at the target.
 """
 
 from __future__ import annotations
@@ -48,18 +49,18 @@ _SILENCE_S = 3.0
 _DELAY_TICKS = 400
 _PATTERN_PERIOD_S = 0.1
 _LONGEST_GAP_S = 0.3
-"""Between two images with poses, in which the place of the hand is interpolated."""
+"""Longest time between two images with poses over which the pose is interpolated."""
 _ANOTHER_DEG = 5.0
-"""A hand that has turned the probe by more than this is at another pose: a new sweep."""
+"""When the hand has turned the probe by more than this, a new sweep begins."""
 _FASTEST_MM_S = 6.0
-"""Of a hand: image, pose and echo are known to belong together to some 50 ms, which at this speed
-is 0.3 mm, as much as the element's own accuracy. Faster frames are not used."""
+"""Fastest motion of a hand whose frames are used: image, pose and echo are known to belong together
+to some 50 ms, which at this speed is 0.3 mm, as much as the element's own accuracy."""
 _RECENT = 32
 _SHOW_PERIOD_S = 0.1
 _KEPT_S = 60.0
-"""Of a sweep: what is older is forgotten, or the hand's drift would blur the maximum."""
+"""Older samples of a sweep are dropped, because the hand's drift would blur the maximum."""
 _BESIDE_MM = 1.0
-"""Farther from the maximum nobody means to accept."""
+"""A place farther from the maximum than this is not accepted."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class Sample:
 
     Attributes:
         t: arrival, s.
-        offset_mm: of the probe along the elevational axis at the target.
+        offset_mm: the probe's offset along the elevational axis at the target.
         peak: amplitude, counts; 0 where the element was not heard.
     """
 
@@ -90,7 +91,7 @@ def acquire_by_injection(
     Args:
         path: the recording: to make, or with ``resume`` to go on with.
         asked: server, frames and number of images.
-        setup: element, probe and the drawing of both.
+        setup: element, probe, and X as drawn.
         person: shown what goes on; ``enter`` accepts, ``s`` begins the sweep anew, ``u`` takes the
             last image back, ``q`` ends.
         resume: go on with ``path``.
@@ -159,7 +160,7 @@ def _recorder(
 
 
 def _switch_off(echo: ActiveEcho) -> None:
-    """Injection off again, whatever happened."""
+    """Switch injection off, whatever happened before."""
     with contextlib.suppress(DeviceError):
         echo.inject(False)
 
@@ -194,7 +195,7 @@ class _Run:
         return len(self._rows)
 
     def go(self) -> int:
-        """Until enough is accepted, or the person ends it."""
+        """Run until enough images are accepted, or the person ends it."""
         self._note("started", f"{self._asked.images - self.count} images to take")
         while self.count < self._asked.images:
             key = self._person.key()
@@ -217,14 +218,14 @@ class _Run:
     # The sweep
 
     def _begin(self) -> None:
-        """A new sweep; places count from where the element is heard first."""
+        """Begin a new sweep; places count from where the element is heard first."""
         self._samples: deque[Sample] = deque()
         self._origin: tuple[np.ndarray, np.ndarray] | None = None
         self._held.clear()
         self._message, self._hurried = "", False
 
     def _look(self) -> None:
-        # Whoever looks at a bar must see where the probe is now, however busy the machine is.
+        # Read all images that wait: the bar must show where the probe is now, however busy the PC.
         self._images.append(self._posed.read(_SILENCE_S))
         for _ in range(self._posed.behind - 1):
             self._images.append(self._posed.read(_SILENCE_S))
@@ -250,7 +251,7 @@ class _Run:
         self._inject(now)
 
     def _pose_at(self, t: float) -> np.ndarray | bool:
-        """The pose at a time of arrival; True where it may still come, False where none is."""
+        """The pose at a time of arrival; True if it may still come, False if there is none."""
         images = list(self._images)
         if not images or t > images[-1].image.t_host:
             return True
@@ -267,7 +268,7 @@ class _Run:
         return False
 
     def _too_fast(self) -> bool:
-        """Whether the hand moves so fast that times do not say where it was."""
+        """Whether the hand is so fast that the times do not say well enough where it was."""
         first, last = self._images[max(len(self._images) - 4, 0)], self._images[-1]
         passed = last.image.t_host - first.image.t_host
         if self._origin is None or first.pose is None or last.pose is None or passed <= 0:
@@ -306,7 +307,7 @@ class _Run:
         return np.array([lateral, 0.0, distance, 1.0])
 
     def _offset(self, pose: Float[np.ndarray, "4 4"]) -> float:
-        """Of the probe along the elevational axis, where the target is, mm."""
+        """The probe's offset along the elevational axis at the target, mm."""
         assert self._origin is not None
         origin, target = self._origin
         x = self._setup.image_to_probe
@@ -314,7 +315,7 @@ class _Run:
         return -float(there[1])
 
     def _inject(self, now: float) -> None:
-        """Draw the bar anew where it changes, but not more often than an eye follows."""
+        """Draw the bar again if it has changed, but not more often than the eye can follow."""
         if not self._samples or now - self._patterned < _PATTERN_PERIOD_S:
             return
         length = bar_length(self._samples[-1].peak, self._loudest)
@@ -360,7 +361,7 @@ class _Run:
         self._person.show(frame, "\n".join(rows), hand_advice(view, self._peak()))
 
     def _accept(self) -> str:
-        """Take the image if it can be; else what is missing."""
+        """Take the image if possible; returns what is missing otherwise, else an empty string."""
         view = self._view()
         if view is None or not view.length:
             return "the element is not heard here"
@@ -396,7 +397,7 @@ class _Run:
         return offsets, np.array([sample.peak for sample in self._samples])
 
     def _bracket(self, times: list[float]) -> tuple[Bracket, float]:
-        """Where the target's offset lies in what was just held, and the probe's place."""
+        """The bracket of the target's offset while the probe was held, and the probe's place."""
         settings: Settings = self._setup.search
         offsets, peaks = self._sweep()
         peak = fit_peak(offsets, peaks, settings.full_scale)

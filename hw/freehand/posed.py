@@ -1,9 +1,10 @@
 """Images of an OpenIGTLink stream with the poses that belong to them.
 
 Transforms come under their names (``ProbeToTracker``), with the image (PlusServer's TRACKEDFRAME)
-or by themselves (TRANSFORM, TDATA), before it or after it. The pose of an image is that of the
-same time stamp, or between the two around it. Stamps are the sender's, which PlusServer gives to
-images and transforms alike; where either has none, times of arrival are used and said.
+or by themselves (TRANSFORM, TDATA), before the image or after it. The pose of an image is the one
+with the same time stamp, or is interpolated between the two around it. Time stamps are the
+sender's; PlusServer gives them to images and transforms alike. Where stamps are missing, or of
+images and transforms over 60 s apart, times of arrival are used, and the person is told.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ from jaxcal.data.timing import interpolate_poses
 from jaxcal.io.frame_names import FramePair, capitalised, path_between, split_name
 
 LISTEN_S = 5.0
-"""So long the first image and the first transform are waited for."""
+"""How long to wait for the first image and the first transform."""
 _MORE_S = 0.5
-"""Of listening after the first of both, so that all names are known."""
+"""How long to listen after both have come, so that all names are known."""
 _LONGEST_GAP_S = 0.2
 _LATEST_S = 0.4
-"""So long an image waits for the pose after it."""
+"""How long an image waits for the pose after it."""
 _SAME_S = 1e-6
 _KEPT = 1024
 _ONE_CLOCK_S = 60.0
@@ -40,8 +41,8 @@ class PosedImage:
     Attributes:
         image: as it came.
         time: s, of the clock that images and poses share.
-        pose: (4, 4) probe -> tracker or reference, mm; None where there is none.
-        why: why there is none, in words.
+        pose: (4, 4) probe -> tracker or reference, mm; None where the image has no pose.
+        why: why it has no pose, in words.
     """
 
     image: Image
@@ -67,7 +68,7 @@ class PosedImages:
         by_arrival: whether times of arrival are used.
 
     Raises:
-        DeviceError: no images, no transforms, or none that lead from the one frame to the other.
+        DeviceError: no images, no transforms, or none that lead from ``source`` to ``target``.
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class PosedImages:
 
     @property
     def behind(self) -> int:
-        """Images that have come and were not read."""
+        """Number of images that have come and were not read yet."""
         self._take()
         return len(self._waiting)
 
@@ -127,7 +128,7 @@ class PosedImages:
             time.sleep(0.005)
 
     def _listen(self) -> None:
-        """Until images and transforms have come, and a moment longer."""
+        """Listen until images and transforms have come, and a moment longer."""
         started = time.monotonic()
         both: float | None = None
         while both is None or time.monotonic() - both < _MORE_S:
@@ -152,7 +153,7 @@ class PosedImages:
                 kept = self._samples.setdefault(transform.name, deque(maxlen=_KEPT))
                 kept.append(transform)
         now = time.monotonic()
-        # With the transforms above; what comes between waits for the next time.
+        # Leave the images in the stream's own queue while too many wait here.
         if self._waiting and len(self._waiting) > 64:
             return
         self._waiting.extend((image, now) for image in self._stream.drain() if not image.is_rf)
@@ -194,7 +195,7 @@ class PosedImages:
 
 
 def _chosen(pairs: dict[str, FramePair], source: str | None, target: str | None) -> FramePair:
-    """From which frame to which poses are taken."""
+    """The frames from which and to which the poses lead."""
     frames = {frame for pair in pairs.values() for frame in pair}
     tools = list(dict.fromkeys(start for start, _ in pairs.values() if start != "Reference"))
     start = None if source is None else capitalised(source)

@@ -1,4 +1,4 @@
-"""The person at a terminal: the newest frame in half blocks, what is said of it, and keys."""
+"""The person at a terminal: the newest frame in half blocks, words about it, and keys."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class TerminalPerson:
     Args:
         screen: where to show it.
         keyboard: what the person types; asked within its ``asking``.
-        keys: what they do, in words.
+        keys: what the keys do, in words.
     """
 
     def __init__(self, screen: Screen, keyboard: Keyboard | None, keys: str = KEYS) -> None:

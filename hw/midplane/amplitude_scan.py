@@ -1,10 +1,10 @@
 """Procedure 1: scan across the beam and go where the response is loudest.
 
 Across the beam the amplitude is nearly Gaussian, so its logarithm is a parabola near the maximum.
-A weighted straight-forward fit gives the maximum between the steps, and from its residuals the
-SD; stops err, too (the robot's repeatability), and that is in the residuals as well.
+A weighted linear fit gives the maximum between the steps, and its residuals give the SD. The
+residuals also hold the errors of the stops (the robot's repeatability).
 
-The same fit serves a free-hand sweep, whose places are the tracker's.
+The same fit serves a free-hand sweep, whose places come from the tracker.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, 
 from hw.shapes import Float
 
 LEAST_FRACTION = 0.4
-"""Samples below this part of the loudest say more of the beam's skirts than of its middle."""
+"""Samples below this part of the loudest are not used: they show the beam's skirts."""
 _LEAST_SAMPLES = 5
 
 
@@ -55,7 +55,7 @@ def fit_peak(
         full_scale: of the converter, counts.
 
     Raises:
-        PlacementError: too few samples, none on one of the sides, or no maximum among them.
+        PlacementError: too few samples, or no maximum among them.
     """
     where, loud = np.asarray(offsets_mm, float), np.asarray(amplitudes, float)
     clipped = loud >= 0.98 * full_scale
@@ -66,7 +66,7 @@ def fit_peak(
         raise PlacementError(f"only {len(where)} usable samples near the maximum: {why}")
     middle = float(np.average(where, weights=loud))
     x, y = where - middle, np.log(loud)
-    # Errors of the amplitude are nearly equal in counts, so that those of its logarithm go as 1/A.
+    # The amplitude's errors are nearly equal in counts, so those of its logarithm go as 1/A.
     design = np.stack([np.ones_like(x), x, x**2], axis=1) * loud[:, None]
     coefficients, *_ = np.linalg.lstsq(design, y * loud, rcond=None)
     top, slope, curvature = coefficients
@@ -93,8 +93,8 @@ def fit_peak(
 def scan_up(walker: Walker, start_mm: float, step_mm: float) -> Peak:
     """Cross the beam upwards, from skirt to skirt, and fit the maximum.
 
-    Coarse steps say first where the beam is and how thick, so that the fine ones cover no more than
-    its middle; a thin beam is scanned in finer steps.
+    First coarse steps find where the beam is and how thick, so that the fine steps cover only its
+    middle; a thin beam is scanned in finer steps.
 
     Args:
         walker: at the low threshold.
@@ -102,14 +102,14 @@ def scan_up(walker: Walker, start_mm: float, step_mm: float) -> Peak:
         step_mm: largest step of the scan.
 
     Raises:
-        PlacementError: caps, saturation, or no maximum.
+        PlacementError: a cap was reached, the amplitude saturates, or there is no maximum.
     """
     settings = walker.settings
     middle, width = _overview(walker, start_mm)
     step = float(np.clip(0.35 * width, settings.finest_mm, step_mm))
     offset = middle - 1.4 * width
     where, echoes = walker.stop_at(offset)
-    # Coarse steps may have misjudged: the scan begins on the lower skirt.
+    # The coarse steps may be wrong: go down until the scan begins on the lower skirt.
     loudest = max(echoes.peak, max(amplitude for _, amplitude, _ in walker.samples))
     while echoes.peak > LEAST_FRACTION * loudest:
         offset -= width
@@ -120,7 +120,7 @@ def scan_up(walker: Walker, start_mm: float, step_mm: float) -> Peak:
     while True:
         clipped = echoes.saturated(settings.full_scale)
         offsets.append(where)
-        # A clipped sample tells its place only; the fit leaves it out.
+        # Of a clipped sample only the place is known; the fit leaves it out.
         loud.append(settings.full_scale if clipped else echoes.peak)
         best = max(loud)
         if loud[-1] < LEAST_FRACTION * best and best >= 0.7 * loudest:
@@ -163,7 +163,7 @@ def _overview(walker: Walker, start_mm: float) -> tuple[float, float]:
 
 
 def go_to_peak(walker: Walker, peak: Peak) -> tuple[float, float]:
-    """Go to a fitted maximum from below and find it there again, or give up.
+    """Go to a fitted maximum from below, and check by the amplitude that it is there.
 
     Returns:
         Where the probe stands (mm, tracked) and the amplitude there.
@@ -198,7 +198,7 @@ def amplitude_scan(
 
     Args:
         bench: what to move and listen to.
-        settings: see there.
+        settings: how to search.
         start_mm: where the mid-plane is expected, as an offset from the plan's pose.
         watch: told of every stop.
 
@@ -250,7 +250,7 @@ def free_hand(
     loud = np.asarray(amplitudes, float)
     peak = fit_peak(offsets_mm, loud, settings.full_scale)
     usable = np.where(loud >= 0.98 * settings.full_scale, 0.0, loud)
-    # Saturated frames tell nothing apart; the one nearest the fitted maximum is as good as any.
+    # If the loudest frame is saturated, take the frame nearest to the fitted maximum.
     best = int(np.argmax(loud))
     if usable[best] == 0.0:
         best = int(np.argmin(np.abs(np.asarray(offsets_mm) - peak.place_mm)))

@@ -1,4 +1,4 @@
-"""What a placement ends in: where the target's elevational offset lies, and how it was found."""
+"""Result of a placement: where the target's elevational offset lies, and how it was found."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ class Bracket:
 
     Attributes:
         centre_mm: the best guess.
-        low_mm: the offset is not below this,
-        high_mm: nor above this, in 99 of 100 images if the stated accuracies hold.
+        low_mm: lower end.
+        high_mm: upper end; the offset lies between the ends in 99 of 100 images, if the stated
+            accuracies hold.
         sd_mm: standard deviation of the guess.
     """
 
@@ -51,14 +52,14 @@ class Bracket:
         return bool(self.low_mm <= elevation_mm <= self.high_mm)
 
     def agrees(self, other: Bracket) -> bool:
-        """Whether both may be true: the intervals overlap."""
+        """Whether both may be true, that is, whether the intervals overlap."""
         return bool(self.low_mm <= other.high_mm and other.low_mm <= self.high_mm)
 
 
 def widened(
     centre_mm: float, low_mm: float, high_mm: float, sd_mm: float, other_sd_mm: float, factor: float
 ) -> Bracket:
-    """A bracket from seen edges and independent errors that no search sees.
+    """A bracket from the edges that a search found and independent errors that it cannot see.
 
     Args:
         centre_mm: best guess of the offset.
@@ -66,10 +67,11 @@ def widened(
         high_mm: upper edge as seen.
         sd_mm: SD of the guess itself.
         other_sd_mm: SD of what the search cannot see (the response's own shift, the last move).
-        factor: SDs that the bracket reaches.
+        factor: half width of the bracket in SDs.
 
     Returns:
-        Edges as far away as seen distance and ``factor`` SDs together (root of squares).
+        Its ends: their distance from the centre is the root of the summed squares of the seen
+        distance and of ``factor`` times ``other_sd_mm``.
     """
     hidden = factor * other_sd_mm
     return Bracket(
@@ -85,7 +87,7 @@ class Placement:
     """One finished placement; the probe stands at ``offset_mm``.
 
     Attributes:
-        procedure: ``amplitude-scan``, ``pattern-injection``, ``threshold-climb``, ``free-hand`` or
+        procedure: ``amplitude-scan``, ``pattern-injection``, ``threshold-climb``, ``image-scan`` or
             ``first-seen``.
         bracket: where the target's offset lies.
         offset_mm: how far the probe was moved along its elevational axis from the plan's pose.

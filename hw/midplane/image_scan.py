@@ -1,12 +1,12 @@
-"""Procedure 4: the same scan by what the image shows, for a phantom that nothing is wired to.
+"""Procedure 4: an amplitude scan by the image, for a phantom without electronics (a cross-wire).
 
-Two wires show at one place only in the mid-plane, and twice as bright there as one of them; beside
-it they part. So the intensity of the brightest place near the expected one (its squared envelope)
-has its maximum in the mid-plane and falls to a quarter beside it, where
-:func:`hw.midplane.amplitude_scan.amplitude_scan` stops to look.
+Only in the mid-plane do the two wires show at one place, twice as bright as one wire; beside it
+they part. So the intensity (squared envelope) of the brightest place near the expected one has its
+maximum in the mid-plane, and beside it falls to a quarter, low enough for
+:func:`hw.midplane.amplitude_scan.amplitude_scan` to end there.
 
-The procedures hear :class:`ImageBench` as if it were the electronics: the intensity stands for the
-amplitude of every line.
+:class:`ImageBench` takes the place of the electronics: the intensity stands for the amplitude of
+every line.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from jaxcal.data.segmentation.spot import brightest
 Target = Literal["echo", "cross"]
 
 LINES = 16
-"""Lines that the intensity stands for; as many as the procedures ask to be answered, and more."""
+"""Number of lines that are given this intensity; more than the procedures need to be answered."""
 FULL_SCALE = 4000.0
-"""Intensity of a white pixel: below the converter's full scale, for nothing saturates here."""
+"""Intensity of a white pixel: below the converter's full scale, as nothing saturates here."""
 DISPLAY_DECIBELS = 60.0
 """Dynamic range of the display over its levels (assumption: usual, and only a scale)."""
 COARSE_MM, FINE_MM = 1.0, 0.15
-"""Largest steps; half a coarse one is the least that crosses the maximum."""
+"""Largest steps; the scan finds the beam's middle roughly by half coarse steps."""
 SEEN_DB = 14.0
-"""A place this far over the background's root mean square is no speckle: in a frame's region
+"""A place this far above the background's root mean square is not speckle: within a frame's region
 speckle alone reaches about 12 dB (jaxcal.data.segmentation.image)."""
 
 
@@ -85,7 +85,7 @@ class ImageBench:
         """An image has no threshold."""
 
     def read(self, frames: int) -> Echoes:
-        """Intensity of the brightest place in whole frames; one frame for three of the echo's."""
+        """Intensity of the brightest place in whole frames; one image for three echo frames."""
         told = [self._intensity(self._see()) for _ in range(-(-frames // 3))]
         amplitude = np.repeat(np.array(told)[:, None], LINES, axis=1)
         return Echoes(amplitude, amplitude > 0)
@@ -146,7 +146,7 @@ def image_scan(
         PlacementError: given up; the probe is at the last good place.
     """
     settings = Settings() if settings is None else settings
-    # Wires part within half a millimetre: coarse steps of two would pass over the crossing.
+    # The wires part within half a millimetre: coarse steps of 2 mm would step over the crossing.
     settings = replace(
         settings,
         response_sd_mm=0.0,

@@ -1,4 +1,4 @@
-"""What a person looks at during pattern injection: B-mode frame, bar, and how the bar went.
+"""What a person sees during pattern injection: B-mode frame, bar, and the bar's length by place.
 
 Two operators for :func:`hw.midplane.pattern_injection.pattern_injection`: a terminal, and a window
 (matplotlib with a display). Both say in words what to do next. Keys are the same in both:
@@ -36,21 +36,21 @@ KEYS = (
 
 
 class Keys:
-    """Turns key presses into decisions; the step is the person's.
+    """Turns key presses into decisions, and keeps the step that the person has set.
 
     Attributes:
-        step_mm: of the next move; None: the procedure's own.
+        step_mm: step of the next move; None: the procedure's own.
     """
 
     def __init__(self) -> None:
         self.step_mm: float | None = None
 
     def step(self, view: View) -> float:
-        """Of the next move, mm."""
+        """Step of the next move, mm."""
         return view.step_mm if self.step_mm is None else self.step_mm
 
     def decide(self, key: str, view: View) -> Decision | None:
-        """What a key asks for; None where it asks for no move (an unknown key, another step)."""
+        """What a key asks for; None if it decides nothing (an unknown key, a new step size)."""
         step = self.step(view)
         way = {
             "up": 1,
@@ -118,7 +118,7 @@ class KeySource(Protocol):
     """Where keys come from (see :class:`hw.keys.Keyboard`)."""
 
     def asking(self) -> AbstractContextManager[None]:
-        """Keys go to :meth:`read` meanwhile; those pressed before are forgotten."""
+        """Within it keys go to :meth:`read`; those pressed before are forgotten."""
         ...
 
     def read(self, timeout_s: float) -> str | None:
@@ -130,8 +130,8 @@ class TerminalOperator:
     """A person at a terminal.
 
     Args:
-        keys: what the person types; keys pressed while the robot moves do not count, because they
-            were pressed before its result was seen.
+        keys: what the person types; keys pressed while the robot moves do not count, because the
+            person had not seen the result of the move.
         screen: where to show it.
     """
 

@@ -1,13 +1,13 @@
 """Procedure 2: the element draws what it hears into the image, and a person follows it.
 
 The injected pattern is a bar beside the echo. Its length and brightness follow the received
-amplitude, so that in the image itself the operator sees how near the mid-plane is: the bar is
-longest there. The operator moves the probe in steps, looks at both sides, goes back to the middle
-and accepts. Whoever accepts without having seen the bar shrink on *both* sides is asked to look
-again, because only then is there a bracket.
+amplitude, so the image itself shows the operator how near the mid-plane is: the bar is longest
+there. The operator moves the probe in steps, looks at both sides, goes back to the middle and
+accepts. An operator who accepts before the bar was seen to shrink on *both* sides is asked to look
+again, because a bracket needs both sides.
 
 The operator is a callable: a person before a live view (:mod:`hw.midplane.live_view`) or
-:class:`SteadyOperator`, who does by rule what the instructions tell a person to do.
+:class:`SteadyOperator`, which follows by rule the instructions given to a person.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ _MOST_LOOKS = 150
 _VISIBLE_DROP = 4
 _LEAST_SHORT = 2
 _SAME_PLACE_MM = 0.05
-# Shown on a scale that begins here, so that a few per cent near the maximum can be seen.
+# The bar's scale begins at this part of the maximum, so that a few per cent near it can be seen.
 _SCALE_FROM = 0.4
 
 
 @runtime_checkable
 class Injector(Protocol):
-    """The electronics' part that answers with a pattern (see the active echo's driver)."""
+    """The part of the electronics that answers with a pattern (see the active echo's driver)."""
 
     def load_pattern(self, pattern: bytes) -> object:
         """A level (0 to 255) for each line."""
@@ -50,7 +50,7 @@ class Injector(Protocol):
 
 
 def bar_length(amplitude: float, loudest: float) -> int:
-    """How many lines the bar covers, 0 to 31, when ``loudest`` is what the longest bar means."""
+    """How many lines the bar covers, 0 to 31; ``loudest`` is the amplitude of the longest bar."""
     if loudest <= 0 or amplitude <= 0:
         return 0
     level = (amplitude / loudest - _SCALE_FROM) / (1 - _SCALE_FROM)
@@ -62,11 +62,11 @@ def bar(length: int, line: int, lines: int) -> bytes:
 
     Args:
         length: lines that are bright, 0 to 31.
-        line: in whose middle it lies; a bar beyond the first or last line is cut off.
+        line: middle of the bar; what reaches beyond the first or last line is cut off.
         lines: of the probe.
 
     Raises:
-        InputError: a length or a line that cannot be.
+        InputError: an impossible length or line.
     """
     if not (0 <= length <= LONGEST and 0 <= line < lines):
         raise InputError(f"a bar has 0 to {LONGEST} lines about one of {lines}: {length}, {line}")
@@ -90,7 +90,7 @@ def _no_frame() -> None:
 
 @dataclass(frozen=True)
 class View:
-    """What the operator has before the eyes.
+    """What the operator sees.
 
     Attributes:
         length: of the bar, lines.
@@ -165,7 +165,7 @@ def middle_of(seen: tuple[tuple[float, int], ...]) -> float:
     """Half way between the places on both flanks where the bar becomes visibly shorter, mm.
 
     Args:
-        seen: (offset, length) of every look; in the order of offsets or not.
+        seen: (offset, length) of every look, in any order.
     """
     ordered = sorted(seen)
     places = np.array([place for place, _ in ordered])
@@ -186,7 +186,7 @@ def middle_of(seen: tuple[tuple[float, int], ...]) -> float:
 def sides_seen(seen: Sequence[tuple[float, int]]) -> tuple[bool, bool]:
     """Whether the bar was seen to shrink below, and above, the place where it was longest.
 
-    It must be clearly shorter at two places on a side: one may be a stop that fell short.
+    It must be clearly shorter at two places on a side: a single one may be a stop that fell short.
     """
     longest = max(length for _, length in seen)
     place = next(at for at, length in seen if length == longest)
@@ -201,7 +201,7 @@ def sides_seen(seen: Sequence[tuple[float, int]]) -> tuple[bool, bool]:
 def flanks(
     seen: Sequence[tuple[float, int]], place: float
 ) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
-    """On either side of a place, the nearest stop with a visibly shorter bar and the one before."""
+    """On each side of a place: the last stop with a long bar and the first with a shorter one."""
     longest = max(length for _, length in seen)
     short = sorted(at for at, length in seen if length <= longest - _VISIBLE_DROP)
     long = sorted(at for at, length in seen if length > longest - _VISIBLE_DROP)
@@ -235,7 +235,8 @@ def pattern_injection(
         bench: what to move and listen to.
         injector: what draws the bar.
         operator: looks and decides.
-        settings: see there; every move, the operator's too, is within its caps and from below.
+        settings: how to search; every move, also the operator's, keeps its caps and approaches
+            from below.
         start_mm: where the mid-plane is expected, as an offset from the plan's pose.
         frame: gives the newest B-mode frame for the view.
         title: which pose this is, for the view.
@@ -244,7 +245,7 @@ def pattern_injection(
 
     Returns:
         A placement whose bracket lies between the places on both sides where the bar was visibly
-        shorter, widened by what nobody sees. Injection is off again.
+        shorter, widened by the errors that nobody can see. Injection is off again.
 
     Raises:
         SkippedError: by the operator.
@@ -298,7 +299,7 @@ def pattern_injection(
     try:
         placement = guarded(Walker(bench, settings, watch), run)
     except BaseException:
-        # What went wrong first is what a person must read.
+        # A person must read the first error, not one of switching off.
         with contextlib.suppress(DeviceError):
             injector.inject(False)
         raise

@@ -3,10 +3,10 @@
 Offsets are mm along the probe's elevational axis from the plan's pose; moving the probe by +1 mm
 moves the target by -1 mm in the image.
 
-Guards: every stop is approached from the same side, so that lost motion of the arm does not enter;
-moves, travel and reach are capped; amplitudes at the converter's full scale are not used; when the
-response is lost the probe goes back to the last place where it was heard, and if it is not heard
-there either the placement is given up.
+Guards: every stop is approached from the same side, so that lost motion of the arm has no effect.
+Moves, travel and reach are capped. Amplitudes at the converter's full scale are not used. When the
+response is lost, the probe goes back to the last good place; if nothing is heard there either, the
+placement is given up.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _LISTEN_AGAIN = 3
 
 
 class PlacementError(DeviceError):
-    """A placement was given up: one line that says why. The probe is at the last good place."""
+    """A placement was given up; one line says why. The probe is at the last good place, if any."""
 
     def __init__(self, message: str, *, device: Device = "active echo") -> None:
         super().__init__(message, device=device)
@@ -41,7 +41,7 @@ class Echoes:
 
     Attributes:
         amplitude: (frames, lines) counts, 0 where a line was not answered.
-        answered: (frames, lines) whether it was.
+        answered: (frames, lines) whether the line was answered.
     """
 
     amplitude: Float[np.ndarray, "frames lines"]
@@ -74,7 +74,7 @@ class Echoes:
 
 @runtime_checkable
 class Bench(Protocol):
-    """What a procedure needs; :mod:`hw.midplane.devices` makes it of the real clients."""
+    """What a procedure needs; :class:`hw.stage.ProbeStage` provides it by the real devices."""
 
     def move(self, offset_mm: float) -> float:
         """Go there, arrive, settle; returns the offset as tracked, mm."""
@@ -95,15 +95,15 @@ class Settings:
 
     Attributes:
         low_threshold: counts; the element then answers far from the mid-plane.
-        span_mm: the coarse raster reaches this far either side of where it starts.
+        span_mm: the coarse raster reaches this far to either side of its start.
         coarse_mm: its step.
-        fine_mm: step of the fine scan.
-        finest_mm: least step of the threshold climb.
+        fine_mm: largest step of the fine scan.
+        finest_mm: least step of the fine scan and of the threshold climb.
         frames: active-echo frames to listen to at every stop.
         backlash_mm: every stop is approached from this far below.
         hysteresis_mm: coming back to the maximum must find it within this.
-        epsilon_mm: the climb is done when this far either way the response is lost.
-        top_fraction: the climb's highest threshold, of the amplitude at the maximum.
+        epsilon_mm: the climb is done when a move this far either way loses the response.
+        top_fraction: the climb's highest threshold, as a part of the amplitude at the maximum.
         most_moves: cap on single moves.
         most_travel_mm: cap on the way.
         reach_mm: cap on the offset either way.
@@ -111,7 +111,7 @@ class Settings:
         response_sd_mm: stated accuracy of the response's mid-plane; no search sees this error.
         position_sd_mm: stated repeatability of a stop.
         beam_half_mm: how far off the mid-plane the target may be and still be heard at all.
-        factor: SDs that a bracket reaches: 2.58 holds 99 of 100.
+        factor: half width of a bracket in SDs: 2.58 holds 99 of 100.
     """
 
     low_threshold: int = 100
@@ -146,7 +146,7 @@ class Settings:
 
     @property
     def hidden_sd_mm(self) -> float:
-        """SD of what no search sees: the response's shift and the last stop's repeatability, mm."""
+        """SD of the errors that no search sees: response's shift, last stop's repeatability; mm."""
         return float(np.hypot(self.response_sd_mm, self.position_sd_mm))
 
 
@@ -212,7 +212,7 @@ class Walker:
         """Listen where the probe stands; remembers the place if it is heard."""
         echoes = self._bench.read(self.settings.frames)
         self.frames += len(echoes.amplitude)
-        # A place where it is only just heard is no place to come back to.
+        # A place where the response is much weaker is not kept as a good place.
         if echoes.heard and (self.good is None or echoes.peak >= 0.5 * self._good_amplitude):
             self.good, self._good_amplitude = self._at, echoes.peak
         self.samples.append((self.where, echoes.peak, self.threshold))
@@ -226,10 +226,10 @@ class Walker:
         return where, self.listen()
 
     def recover(self) -> None:
-        """Back to the last good place after the response was lost.
+        """Go back to the last good place after the response was lost.
 
         Raises:
-            PlacementError: when it is not heard there either, or was never heard.
+            PlacementError: the element is not heard there either, or was never heard.
         """
         self.set_threshold(self.settings.low_threshold)
         if self.good is None:
@@ -249,7 +249,7 @@ class Walker:
         self.set_threshold(self.settings.low_threshold)
         if self.good is not None and self._at is not None and self._at != self.good:
             self.moves, self.travel_mm = 0, 0.0
-            # It was there before; only a reach that the approach from below would leave can object.
+            # The probe was there before; only the approach from below may exceed the reach.
             with contextlib.suppress(PlacementError):
                 self.go(self.good)
 
@@ -261,8 +261,8 @@ class Walker:
         sd_mm: float,
         amplitude: float,
     ) -> Placement:
-        """The result, the probe standing at ``offset``: edges are of the mid-plane's offset, mm."""
-        # The target's offset in the image is the mid-plane's place less the probe's.
+        """The result with the probe at ``offset``; ``edges`` bound the mid-plane's offset, mm."""
+        # The target's offset in the image is the mid-plane's place minus the probe's.
         low, high = edges[0] - offset, edges[1] - offset
         bracket = widened(
             0.5 * (low + high), low, high, sd_mm, self.settings.hidden_sd_mm, self.settings.factor
@@ -285,8 +285,7 @@ def guarded(walker: Walker, run: Callable[[Walker], Placement]) -> Placement:
     """Run a procedure; if it gives up, leave the probe at the last good place.
 
     Raises:
-        PlacementError: the procedure's own. Errors of a device pass through untouched: then
-            nothing may move any more.
+        PlacementError: the procedure's own. After any other error nothing is moved here.
     """
     try:
         return run(walker)
@@ -298,13 +297,13 @@ def guarded(walker: Walker, run: Callable[[Walker], Placement]) -> Placement:
 def coarse(walker: Walker, start_mm: float = 0.0) -> float:
     """Step 1: an elevational raster at the low threshold until the element is heard.
 
-    A narrow raster about ``start_mm`` comes first: plans are mostly nearly right.
+    A narrow raster about ``start_mm`` comes first: most plans are nearly right.
 
     Returns:
-        An offset at which it is heard, mm.
+        An offset at which the element is heard, mm.
 
     Raises:
-        PlacementError: nowhere.
+        PlacementError: it is heard nowhere, or a cap was reached.
     """
     settings = walker.settings
     walker.set_threshold(settings.low_threshold)
@@ -333,7 +332,7 @@ def first_seen(
     """No placement: stop as soon as the element is heard, as conventional practice would.
 
     Returns:
-        A placement whose bracket is the beam's own reach.
+        A placement whose bracket reaches as far as the element may be heard.
 
     Raises:
         PlacementError: it is heard nowhere.

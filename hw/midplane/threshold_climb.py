@@ -1,10 +1,10 @@
 """Procedure 3: coarse, fine, and then raise the response threshold until any small move loses it.
 
 At a threshold T the element answers within w sqrt(2 ln(A / T)) of the mid-plane. Both edges of that
-stretch are looked for from below, the middle between them becomes the new place, and T rises until
+stretch are searched from below, the middle between them becomes the new place, and T rises until
 the stretch is so short that a move of epsilon either way loses the response. Because the two edges
 lie on equal flanks, the middle does not depend on the beam's thickness or on the amplitude's scale.
-The fine scan's maximum (procedure 1) must agree with it.
+The middle must agree with the fine scan's maximum (procedure 1).
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Edges:
     """Where the response begins and ends at one threshold, mm.
 
     Attributes:
-        low_mm: begins.
-        high_mm: ends.
+        low_mm: where it begins.
+        high_mm: where it ends.
         sd_mm: standard deviation of the middle.
     """
 
@@ -53,14 +53,14 @@ def find_edges(walker: Walker, middle_mm: float, half_mm: float) -> Edges | None
 
     Args:
         walker: with the threshold set.
-        middle_mm: where the stretch is expected,
-        half_mm: and half of its length.
+        middle_mm: where the middle of the stretch is expected.
+        half_mm: expected half length of the stretch.
 
     Returns:
         The edges, or None where nothing was heard: the threshold is too high.
 
     Raises:
-        PlacementError: caps.
+        PlacementError: a cap was reached.
     """
     settings = walker.settings
     step = float(np.clip(half_mm / _STEPS_PER_HALF, settings.finest_mm, settings.fine_mm))
@@ -68,7 +68,7 @@ def find_edges(walker: Walker, middle_mm: float, half_mm: float) -> Edges | None
     blur = 3 * settings.position_sd_mm
     offset = middle_mm - half_mm - blur
     where, echoes = walker.stop_at(offset)
-    # It must be silent at the start, otherwise there is no lower edge in sight.
+    # Begin where nothing is heard: otherwise the lower edge would be missed.
     while echoes.heard:
         offset -= max(2 * step, blur)
         where, echoes = walker.stop_at(offset)
@@ -82,7 +82,7 @@ def find_edges(walker: Walker, middle_mm: float, half_mm: float) -> Edges | None
             break
         elif not heard and where > middle_mm + 2 * half_mm + blur:
             return None
-    # Mean and number of the heard stops: stops that miss by chance cancel in both.
+    # From mean and number of the heard stops: random errors of the stops cancel in both.
     middle, half = float(np.mean(heard)), 0.5 * step * len(heard)
     spread = np.hypot(step / np.sqrt(24.0), settings.position_sd_mm / np.sqrt(2.0))
     return Edges(middle - half, middle + half, float(spread))
@@ -92,7 +92,7 @@ def climb(walker: Walker, peak: Peak) -> Edges:
     """Raise the threshold until the stretch is within epsilon.
 
     Raises:
-        PlacementError: caps, or the response is lost for good.
+        PlacementError: a cap was reached, or the response is lost for good.
     """
     settings = walker.settings
     middle, top = peak.place_mm, peak.amplitude
@@ -134,12 +134,12 @@ def threshold_climb(
 
     Args:
         bench: what to move and listen to.
-        settings: see there.
+        settings: how to search.
         start_mm: where the mid-plane is expected, as an offset from the plan's pose.
         watch: told of every stop.
 
     Returns:
-        A placement whose bracket holds the last stretch, widened by what no search sees.
+        A placement whose bracket holds the last stretch, widened by the errors that no search sees.
 
     Raises:
         PlacementError: given up, or the climb and the fine scan contradict each other; the probe is
@@ -174,14 +174,14 @@ def threshold_climb(
 
 
 def _apart(edges: Edges, peak: Peak, settings: Settings) -> float:
-    """How far the middle is beside the loudest place, mm; 0 where the two may be the same."""
+    """Distance of the middle from the loudest place, mm; 0 where the two may be the same."""
     apart = edges.middle_mm - peak.place_mm
     allowed = edges.half_mm + settings.factor * float(np.hypot(peak.sd_mm, edges.sd_mm))
     return apart if abs(apart) > allowed else 0.0
 
 
 def _lost_beside(walker: Walker, edges: Edges) -> bool:
-    """Whether a move of epsilon either way loses the response: where the climb may end."""
+    """Whether a move of epsilon either way loses the response, so that the climb may end."""
     epsilon = walker.settings.epsilon_mm
     sides = (edges.middle_mm - epsilon, edges.middle_mm + epsilon)
     return not any(walker.stop_at(side)[1].heard for side in sides)

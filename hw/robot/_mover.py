@@ -1,32 +1,37 @@
 """The process that moves the robot, for :class:`hw.robot.motion.Motion`.
 
-It holds the only control connection and the gate; one loop reads poses, looks for trouble, keeps
-the controller's watchdog quiet and takes requests, line by line as JSON, from its standard input.
-Nothing in it waits for a motion: motions are asynchronous, so that every pose is looked at while
+It holds the only control connection and the gate. One loop reads the poses, checks for trouble,
+kicks the controller's watchdog and reads requests, one JSON object a line, from its standard input.
+The loop never waits for a motion: motions are asynchronous, so that every pose is checked while
 the robot moves. When the input ends (the caller is gone), the robot is stopped.
 
-A stop cannot be lost. Every line of input is looked at when it is read, whatever the loop is doing:
-a request to stop is latched there (:attr:`Mover._stop`), a request to move waits in a queue, and
-nothing that was read is dropped. The states (:class:`State`) and what leads from one to another:
+A stop cannot be lost. Each line of input is handled as soon as it is read, whatever the loop is
+doing: a request to stop is latched at once (:attr:`Mover._stop`), a request to move waits in a
+queue. Only a hesitation whose move was already answered is ignored; any other hesitation also
+cancels the moves that wait. The states (:class:`State`) and what leads from one to another:
 
     REST -> SENDING      a request to move was taken from the queue
     SENDING -> REST      the gate or the controller refused it
     SENDING -> MOVING    moveL was taken by the controller
     MOVING -> REST       arrived: at the target, steady, and no stop latched
-    any -> STOPPING      a stop is latched; stopL is sent, and again until the robot rests
+    any -> STOPPING      a stop is latched; stopL is sent again and again until the robot rests
     STOPPING -> REST     the stop was a hesitation (StaleError): the move may be asked for again
     STOPPING -> the end  any other stop: this process ends, and with it the confirmation
 
-The last line is what "latched until a new confirmation" means: a process that was stopped never
-moves again. The latch is looked at before each command of SENDING and right after moveL, so that
-a stop that comes while ur_rtde waits for the controller acts on the next command.
+The last line of the table is what "latched until a new confirmation" means: after such a stop this
+process never moves the robot again. While a motion is being sent, the latch is checked after the
+controller's safety limits were asked, right before moveL and right after it. A stop that comes
+while ur_rtde waits for the controller therefore acts at the next of these checks.
 
-What ur_rtde does and this must live with (each measured): a getter of a lost connection goes on
-with the last values, so freshness comes from :class:`hw.robot.rtde.PacketReader`; calls to a mute
-controller hang, so the caller kills this process after a while, and the controller's own watchdog
-stops the robot 0.1 s after the last sign of life; a reset connection is made again behind our back,
-script and all, so what ur_rtde prints is watched and ends the motion for good; motion goes on after
-a disconnect, so the robot is stopped first.
+How ur_rtde behaves, and what is done about it (each measured):
+
+- A getter of a lost connection returns the last values, so freshness comes from
+  :class:`hw.robot.rtde.PacketReader`.
+- Calls to a silent controller hang, so the caller kills this process after a while, and the
+  controller's own watchdog stops the robot 0.1 s after the last sign of life.
+- A connection that was reset is opened again, and the script sent again, without asking; so the
+  text that ur_rtde prints is watched, and a reset ends the motion for good.
+- A motion goes on after a disconnect, so the robot is stopped first.
 """
 
 from __future__ import annotations
@@ -69,9 +74,9 @@ _REPORT_S = 0.05
 _STEADY_S, _STEADY_POLL_S = 0.5, 0.05
 _STOP_M_S2 = 2.0
 _STOPPED_MM_S, _STOPPED_RAD_S = 1.0, 0.01
-"""Slower than this the TCP rests; a real arm's reading is never quite zero."""
+"""Below these speeds the TCP counts as at rest; a real arm's reading is never quite zero."""
 _REST_SEEN_S = 0.03
-"""How long the poses must show rest after stopL before a stop is done (4 poses at 125 Hz)."""
+"""A stop is done when the poses have shown rest for so long after stopL (4 poses at 125 Hz)."""
 _STOP_PATIENCE_S = 2.0
 _ARRIVED_MM, _ARRIVED_DEG = 0.2, 0.1
 _REST_MM_S = 0.2
@@ -92,7 +97,7 @@ class State(enum.Enum):
 
 @dataclass(frozen=True)
 class _Stop:
-    """Why the robot must stop, and whether motion is over then."""
+    """Why the robot must stop, and whether the stop ends motion for good."""
 
     error: DeviceError
     for_good: bool
@@ -146,9 +151,9 @@ class Mover:
         self._closing = False
         self._requests: deque[dict] = deque()
         self._count = 0
-        """Of the newest request to move that was taken."""
+        """Number of the newest request to move that was taken."""
         self._answered = 0
-        """Of the newest request to move that was answered."""
+        """Number of the newest request to move that was answered."""
         self._moving: Command | None = None
         self._deadline = self._steady_due = 0.0
         self._heard = self._kicked = self._reported = -math.inf
@@ -180,7 +185,7 @@ class Mover:
         module = require("rtde_control", extra="robot")
         self._log("connect", host=self._host, serial=self._serial)
         try:
-            # The thread that it starts inherits this.
+            # The thread that ur_rtde starts inherits this priority.
             be_prompt(RECEIVES)
             self._control = module.RTDEControlInterface(self._host)
         except RuntimeError as error:
@@ -244,7 +249,7 @@ class Mover:
                 self._tell("alive")
 
     def _read(self, timeout_s: float) -> None:
-        """Wait for input or a packet, and take in all that is there."""
+        """Wait for input or a packet, and handle everything that has come."""
         sources = [self._reader, *([] if self._library is None else [self._library])]
         if not self._closing:
             sources.append(0)
@@ -289,7 +294,7 @@ class Mover:
             case "stop":
                 kind = StaleError if request["kind"] == StaleError.__name__ else StoppedError
                 hesitation = kind is StaleError
-                # A hesitation is about one move; one that was answered meanwhile needs no stop.
+                # A hesitation is about one move: once that is answered, there is nothing to stop.
                 if not hesitation or request["move"] > self._answered:
                     self._latch(kind(request["reason"], device="robot"), not hesitation)
             case "heard":
@@ -298,7 +303,7 @@ class Mover:
                 self._closing = True
 
     def _latch(self, error: DeviceError, for_good: bool) -> None:
-        """Keep a stop until the robot rests; one for good outweighs a hesitation."""
+        """Keep a stop until the robot rests; a stop for good replaces a hesitation."""
         if self._stop is None or (for_good and not self._stop.for_good):
             self._stop = _Stop(error, for_good)
 
@@ -308,10 +313,10 @@ class Mover:
             self._latch(*trouble)
 
     def _heed(self) -> None:
-        """Look at all that came while a command was being sent.
+        """Handle everything that came while a command was being sent.
 
         Raises:
-            _Interrupted: there is a stop among it; nothing more may be sent but stopL.
+            _Interrupted: a stop is latched, or the caller has left; the motion must not go on.
         """
         self._read(0.0)
         self._watch()
@@ -337,7 +342,7 @@ class Mover:
         try:
             self._move(request["pose"], request["speed_mm_s"])
         except _Interrupted:
-            # The loop stops the robot, and answers.
+            # The loop stops the robot, and answers the request.
             return
         except (RefusedError, StaleError) as error:
             self._state = State.REST
@@ -358,15 +363,15 @@ class Mover:
         """Ask the gate and the controller, and send the motion.
 
         Raises:
-            RefusedError: one of them says no.
+            RefusedError: the gate or the controller refuses the motion.
             StaleError: the newest pose is too old.
-            _Interrupted: a stop came before the motion was sent.
+            _Interrupted: a stop came, or the caller left, before or while the motion was sent.
         """
         if self._dry_run:
             self._pretend(pose, speed_mm_s)
             return
         if self._packet is not None and self._packet.tcp_offset is None:
-            # It is not among this controller's real-time data.
+            # This controller's real-time data lacks the TCP offset, so ask for it.
             self._offset = numbers(self._command("getTCPOffset"), 6, "TCP offset")
         raw = list(self._allow(pose, speed_mm_s).raw)
         if not self._command("isPoseWithinSafetyLimits", raw):
@@ -374,7 +379,7 @@ class Mover:
             raise RefusedError(text, device="robot")
         self._heed()
         self._command("setWatchdog", WATCHDOG_HZ / self._clock.patience(1.0))
-        # What was asked took time: look again, at the newest pose, and for a stop.
+        # The questions took time: check again for a stop, and check the move from the newest pose.
         self._heed()
         command = self._allow(pose, speed_mm_s)
         sent = self._command(
@@ -403,7 +408,7 @@ class Mover:
         )
 
     def _pretend(self, pose: object, speed_mm_s: object) -> None:
-        """A dry run: as if the robot stood where the last motion would have taken it."""
+        """Check a motion of a dry run, as if the robot stood at the target of the last one."""
         assert self._sample is not None
         here = self._sample
         if self._virtual is not None:
@@ -415,7 +420,7 @@ class Mover:
         self._arrive(self._virtual)
 
     def _follow(self, command: Command) -> None:
-        """Whether the motion has arrived, and rests."""
+        """Answer when the motion has arrived and rests; latch a stop for good when it is late."""
         assert self._sample is not None
         assert self._packet is not None
         assert self._control is not None
@@ -425,7 +430,7 @@ class Mover:
         off = float(np.linalg.norm(pose[:3, 3] - command.pose[:3, 3]))
         there = off < _ARRIVED_MM and turn_deg(pose, command.pose) < _ARRIVED_DEG
         if not (there and speed < _REST_MM_S):
-            # The controller calls an arm steady that has rested for half a second.
+            # The controller calls an arm steady once it has rested for half a second.
             self._steady_due = now + _STEADY_S
         elif now >= self._steady_due:
             self._steady_due = now + _STEADY_POLL_S
@@ -433,7 +438,7 @@ class Mover:
                 self._command("setWatchdog", IDLE_WATCHDOG_HZ)
                 self._read(0.0)
                 self._watch()
-                # "Arrived" is never the answer to a motion that was asked to stop.
+                # A motion that was asked to stop is never answered with "arrived".
                 if self._stop is None:
                     self._arrive(self._sample)
                 return
@@ -447,7 +452,7 @@ class Mover:
         self._tell("arrived", move=self._count, sample=_plain(sample))
 
     def _trouble(self) -> tuple[DeviceError, bool] | None:
-        """What speaks against going on, and whether it ends motion for good."""
+        """Why the robot must stop, and whether that ends motion for good; None: it may go on."""
         packet, sample = self._packet, self._sample
         if packet is None or sample is None or self._control is None:
             return None
@@ -475,21 +480,21 @@ class Mover:
             text = f"the probe is {out:.1f} mm out of the box"
             return StoppedError(text, device="robot"), True
         if now - self._heard > self._clock.patience(self._caller_s):
-            # Our own fault, as a silent stream is: nothing says that motion is dangerous.
+            # A fault of this software, like a silent stream: nothing says that motion is dangerous.
             text = f"the caller was silent for {now - self._heard:.2f} s"
             return StaleError(text, device="robot"), False
         return None
 
     def _halt(self) -> None:
-        """Do what the latched stop asks for; returns only after a hesitation.
+        """Stop the robot as latched; returns only after a hesitation.
 
         Raises:
-            _Ended: any other stop.
+            _Ended: after any other stop, or if the robot does not stop or is lost.
         """
         told: _Stop | None = None
         self._state = State.STOPPING
         while self._stop is not None and self._stop is not told:
-            # Braking takes in what comes meanwhile: a hesitation may turn into a stop for good.
+            # Input is read while braking, so a stop for good may replace a hesitation.
             told = self._stop
             self._tell("stopping", kind=type(told.error).__name__, text=told.error.args[0])
             try:
@@ -512,14 +517,14 @@ class Mover:
             self._answer(told.error)
 
     def _brake(self) -> None:
-        """Send stopL until the poses show rest, as far as the controller takes commands.
+        """Send stopL until the poses show rest, as long as the controller takes commands.
 
         Raises:
             _Ended: the robot does not stop, or is lost.
         """
         give_up = self._clock.now() + self._clock.patience(_STOP_PATIENCE_S)
         while self._usable():
-            # It answers nothing; whether it was taken is seen in the poses.
+            # stopL has no answer; the poses show whether the controller took it.
             self._command("stopL", _STOP_M_S2, False)
             if self._rests():
                 return
@@ -528,7 +533,7 @@ class Mover:
                 raise _Ended(LostError(text, device="robot"))
 
     def _rests(self) -> bool:
-        """Whether every pose of the next few shows rest."""
+        """Whether every pose of the next :data:`_REST_SEEN_S` shows rest."""
         assert self._packet is not None
         since = self._packet.timestamp_s
         give_up = self._clock.now() + self._clock.patience(10 * _REST_SEEN_S)
@@ -546,7 +551,7 @@ class Mover:
         return False
 
     def _usable(self) -> bool:
-        """Whether the controller takes commands; else ur_rtde would hang or reconnect."""
+        """Whether the controller takes commands; if not, calls of ur_rtde hang or reconnect."""
         packet = self._packet
         return bool(
             self._control is not None
@@ -571,7 +576,7 @@ class Mover:
         assert self._sample is not None
         age = self._sample.age_s(self._clock.now())
         if age > self._plan.limits.max_pose_age_s:
-            # A mute controller: ur_rtde would spin for seconds, and keep a core from everybody.
+            # The controller is silent: ur_rtde would spin for seconds at real-time priority.
             be_prompt(0)
         try:
             return getattr(self._control, name)(*values)
@@ -587,7 +592,7 @@ class Mover:
         self._tell("error", move=self._count, kind=kind, text=error.args[0], ended=False)
 
     def end(self, error: DeviceError) -> NoReturn:
-        """Say why, and leave at once: ur_rtde must not reconnect, or wait, behind our back."""
+        """Report why, and exit at once, so that ur_rtde can neither reconnect nor wait."""
         self._tell("error", kind=type(error).__name__, text=error.args[0], ended=True)
         os._exit(1)
 

@@ -29,10 +29,10 @@ def spawn(module: str, *arguments: str, stdin: bool = False) -> subprocess.Popen
 def be_prompt(priority: int) -> None:
     """Ask for real-time scheduling of the calling thread and those that it starts; 0 gives it up.
 
-    On a busy machine a process waits for milliseconds before it may run; these here need little
-    time but need it at once. Only a privileged user gets it (on Linux: CAP_SYS_NICE, or an rtprio
-    limit); for others all stays as it is. ur_rtde's commands spin while they wait for an answer, so
-    whoever helps with that answer needs a higher priority than the one who asks.
+    On a busy machine a process waits for milliseconds before it may run. The processes that talk to
+    the robot need little time, but at once. Only a privileged user gets it (on Linux: CAP_SYS_NICE,
+    or an rtprio limit); for others nothing changes. ur_rtde's commands spin while they wait for an
+    answer, so a thread that delivers the answer needs a higher priority than the one that asks.
     """
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
@@ -41,4 +41,4 @@ def be_prompt(priority: int) -> None:
 
 
 ASKS, RECEIVES, ANSWERS = 1, 2, 3
-"""Priorities: who commands, who reads the controller, and the controller's emulator."""
+"""Priorities: of commanding, of reading the controller, and of the controller's emulator."""

@@ -1,7 +1,7 @@
 """The process that reads poses for :class:`hw.robot.stream.PoseStream`, and writes them out.
 
-Started as ``python -m hw.robot._reader HOST CLIENT FREQUENCY TIMEOUT``. One record per pose, or a
-last one that says why there are no more. It ends when nobody reads its output.
+Started as ``python -m hw.robot._reader HOST CLIENT FREQUENCY TIMEOUT``. It writes one record per
+pose, and a last one that says why no more come. It ends when nobody reads its output.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from hw.robot._process import RECEIVES, be_prompt
 from hw.robot.rtde import Packet, PacketReader
 
 RECORD = struct.Struct("<8dIiI6d5d6d")
-"""Host and device s, pose (6), safety bits, mode, runtime state, TCP offset (6), payload, its
-centre of gravity (3), speed slider, joints (6); NaN where the controller does not tell."""
+"""Host and device time (s), pose (6), safety bits, mode, runtime state, TCP offset (6), payload and
+its centre of gravity (3), speed slider, joints (6); NaN where the controller sends no value."""
 POSE, ERROR, BOUND = b"P", b"E", b"B"
-"""What a record is; ``BOUND`` comes first: :attr:`PacketReader.bound` and ``latency_s``."""
+"""Kinds of records; ``BOUND`` comes first: :attr:`PacketReader.bound` and ``latency_s``."""
 _NOT_TOLD = (math.nan,)
 
 
@@ -55,7 +55,10 @@ def _pack(packet: Packet) -> bytes:
 
 
 def _ur_rtde(output: int, host: str, frequency_hz: float | None) -> None:
-    """The same through ur_rtde: the newest pose only, and getters that may tear."""
+    """As :func:`_packets`, through ur_rtde, which keeps only the newest pose.
+
+    Its getters may return values of two packets; such a mixture is dropped.
+    """
     names = ["timestamp", "actual_TCP_pose", "safety_status_bits", "robot_mode", "runtime_state"]
     module = require("rtde_receive", extra="robot")
     robot = module.RTDEReceiveInterface(host, frequency_hz or -1.0, names)
@@ -88,7 +91,7 @@ def _write(output: int, data: bytes) -> None:
 def main(arguments: list[str]) -> int:
     """Read until the connection or the reader of the records is gone."""
     host, client, frequency, timeout = arguments
-    # What a library prints must not get between the records.
+    # Text that a library prints must not get between the records.
     output = os.dup(1)
     os.dup2(2, 1)
     be_prompt(RECEIVES)

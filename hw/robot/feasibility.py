@@ -5,12 +5,12 @@ sigma be the smallest singular value of the scaled Jacobian J at a sample and u 
 joints' speed there, V the flange's twist along the way. J changes by at most K per rad
 (:attr:`hw.robot.kinematics.ArmModel.jacobian_lipschitz_mm`), so within a distance r of the sample,
 in joint space, sigma is at least sigma - K r and the joints' speed at most u / (1 - K r / sigma).
-Integrated over half the distance h between two samples, this gives
+Integrated over h, half the distance between two samples, this gives
 
     sigma between the samples >= sigma sqrt(1 - 2 K u h / sigma).
 
-Samples are added until the right side is at least half of the least value that is allowed. In
-between nothing singular lies then, the branch is the same, and the joints run continuously.
+Samples are added until the right side is at least half of the least value that is allowed. Then no
+singularity lies between the samples, the branch stays the same, and the joints run continuously.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ _COARSE_MM = 20.0
 """First distance between samples, of the flange and ANGLE_MM per rad."""
 _MOST_SAMPLES = 20_000
 _PROVEN = 0.5
-"""Between the samples, sigma is shown to be at least this part of what is asked at the samples."""
+"""Between the samples, sigma is shown to be at least this share of what is required at them."""
 _MODEL_DEG = 3.0
-"""Joints that differ by more from those that the pose asks for are those of another arm. The
-factory calibration makes tenths of a degree."""
+"""If the controller's joints differ by more than this from those that the model gives for its pose,
+the arm is another one. The factory calibration accounts for tenths of a degree."""
 
 
 def _refuse(text: str) -> RefusedError:
@@ -88,7 +88,7 @@ class Course:
         branch: of the inverse kinematics, the same all along.
         joints: (n, 6) at each pose, rad.
         dexterity_mm: least along the plan, at the samples.
-        joint_speed: largest of any joint on any way, rad/s; 0 where none was asked for.
+        joint_speed: largest of any joint on any way, rad/s; 0 where no duration was given.
     """
 
     branch: int
@@ -134,26 +134,26 @@ def follow(
     what: str,
     duration_s: float | None = None,
 ) -> Course:
-    """The arm along a straight motion of its TCP, from some joints on.
+    """The arm along a straight motion of its TCP, from given joints.
 
     Args:
-        arm: see there.
-        start: pose of the TCP, mm.
-        goal: likewise.
+        arm: the arm and its bounds.
+        start: pose of the TCP at the start, mm.
+        goal: pose of the TCP at the end, mm.
         joints: at the start, rad; they decide the branch.
         what: the motion, for the error.
         duration_s: seconds at full speed, for the joints' speed; None: not checked.
 
     Raises:
         RefusedError: a pose out of reach, a joint limit, a singularity, a joint too fast, or a link
-            out of its box; where on the way.
+            out of its box; the text says where on the way.
     """
     branch = int(branch_of(arm.model, joints))
     turn = rotation_vector(goal[:3, :3] @ start[:3, :3].T)
     travel = goal[:3, 3] - start[:3, 3]
     lever = tool_of(arm.tcp_offset)[:3, 3]
     angle = float(np.linalg.norm(turn))
-    # The flange runs along the TCP's line, and about it.
+    # A bound of the flange's path: the TCP's line plus the arc about the TCP.
     length = math.hypot(
         float(np.linalg.norm(travel)) + angle * float(np.linalg.norm(lever)), angle * ANGLE_MM
     )
@@ -174,7 +174,7 @@ def follow(
         twist = np.concatenate([velocity, np.tile(turn * ANGLE_MM, (count, 1))], axis=1)
         rates = np.linalg.solve(matrix, twist[..., None])[..., 0]
         half = 0.5 / max(count - 1, 1)
-        # The twist turns with the lever: between the samples it differs by so much at most.
+        # The twist changes as the lever turns: between the samples by at most this much.
         bend = angle**2 * float(np.linalg.norm(lever)) * half
         speed = np.linalg.norm(rates, axis=1) + bend / dexterity
         proven = 1 - (_PROVEN * arm.least_dexterity_mm / dexterity) ** 2
@@ -203,15 +203,15 @@ def follow_all(
     """The arm along a plan, from pose to pose.
 
     Args:
-        arm: see there.
+        arm: the arm and its bounds.
         poses: of the TCP, mm.
         durations_s: (n - 1,) seconds of each way at full speed.
-        joints: the arm's, rad, which decide the branch; None: the branch that keeps furthest from
-            singularities, of those in which all of the plan can be followed.
+        joints: the arm's, rad, which decide the branch; None: of the branches that can follow the
+            whole plan, the one whose poses keep furthest from singularities.
 
     Raises:
         RefusedError: the first pose or way that the arm cannot take, and why; without ``joints``,
-            that of the branch that comes furthest.
+            for the branch that gets furthest.
     """
     if joints is not None:
         check = [int(branch_of(arm.model, joints))]
@@ -244,7 +244,7 @@ def _follow_branch(
     first: Float[np.ndarray, 6],
     reference: Float[np.ndarray, 6],
 ) -> tuple[int, Course | RefusedError]:
-    """How far a branch comes, and the course or what was in its way."""
+    """Index of the last pose tried in a branch, and the course or why it ends there."""
     stage = 0
     try:
         if np.isnan(first).any():
@@ -279,7 +279,7 @@ def _joints_along(
     what: str,
     parts: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n 6"]:
-    """Joints along a way, without jumps of a turn, within their limits."""
+    """Joints along a way, unwrapped and within their limits."""
     found = inverse(arm.model, flange_of(way, arm.tcp_offset))
     path, reached = found.joints[:, branch], found.reached[:, branch]
     if not reached.all():
@@ -340,10 +340,11 @@ def _check_speed(
 def _check_links(
     arm: Arm, path: Float[np.ndarray, "n 6"], what: str, parts: Float[np.ndarray, " n"]
 ) -> None:
-    """Elbow, wrists and flange with their housings in the arm's box.
+    """Whether elbow, wrists and flange with their housings stay in the arm's box.
 
-    Links run straight between them, so a convex box that holds the joints holds the links. Between
-    two samples a point is taken to be off by as much as it moves from one to the next.
+    Links run straight between these points, so the box, which is convex, holds those links too (the
+    upper arm only where it holds the shoulder, which is not checked). Between two samples a point
+    may be off by its largest motion from one sample to the next.
     """
     points = joint_points(arm.model, path)
     margin = np.full(points.shape[:2], arm.model.radius_mm)

@@ -1,15 +1,15 @@
-"""Which arm it is that answers at an address.
+"""Which arm answers at an address.
 
 Two things tell arms apart. The dashboard gives the serial number (PolyScope 3.12 or newer on CB
 series, 5.6 or newer on e-Series). The primary interface gives, on every connection, the factory's
 calibration of the arm's kinematics with its checksum (3.6 or newer): it belongs to the arm, not to
 the controller's box, and stays the same wherever box and arm are on the network. Where a controller
-tells neither, nothing here identifies the arm, and :attr:`Identity.name` is its address, with an
-``@`` in it; whoever shows it must say so.
+tells neither, the arm is not identified: :attr:`Identity.name` is then ``<model>@<address>``, and a
+program that shows it must say that nothing identifies the arm.
 
 Sources: Universal Robots' articles on the dashboard server and the client interfaces, and their
-ur_client_library (``dashboard_client_implementation_g5.cpp``: since which version;
-``kinematics_info``: the calibration's layout).
+ur_client_library (``dashboard_client_implementation_g5.cpp`` for the versions, ``kinematics_info``
+for the calibration's layout).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from hw.errors import LostError
 DASHBOARD_PORT, PRIMARY_PORT = 29999, 30001
 
 ROBOT_STATE, KINEMATICS_INFO = 16, 5
-"""Type of the message of the primary interface, and of the part of it, that hold the kinematics."""
+"""Types of the primary interface's message and of its part that holds the kinematics."""
 KINEMATICS = struct.Struct(">6I24dI")
 """Checksums of the joints; DH theta, a, d, alpha (rad, m), six each; state of the calibration."""
 _MOST_MESSAGE = 1 << 16
@@ -96,7 +96,7 @@ def read_identity(host: str, *, timeout_s: float = 3.0) -> Identity:
 
 
 def _read_calibration(host: str, timeout_s: float) -> str | None:
-    """From the primary interface's first messages; None where there is no such thing."""
+    """The calibration from the primary interface's first messages; None where there is none."""
     deadline = time.monotonic() + timeout_s
     data = b""
     with (
@@ -130,7 +130,7 @@ def _calibration_in(parts: bytes) -> str | None:
         if not 5 <= size <= len(parts):
             return None
         if parts[4] == KINEMATICS_INFO and size >= 5 + KINEMATICS.size:
-            # All but the last word, which tells a state, not a number of the arm.
+            # All but the last word, which is a state, not a property of the arm.
             return hashlib.sha256(parts[5 : 5 + KINEMATICS.size - 4]).hexdigest()[:12]
         parts = parts[size:]
     return None

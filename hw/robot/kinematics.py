@@ -10,8 +10,8 @@ them by its factory calibration, by some tenths of a mm to a few mm at the flang
 
 The inverse is in closed form, with eight branches: the wrist centre (origin of frame 5) left or
 right of the plane of axis 1, joint 5 positive or negative, joint 3 positive or negative. A
-continuous motion that meets no singularity keeps its branch, so a path is followed by one column
-of :func:`inverse`, unwrapped. The singularities are where two branches meet:
+continuous motion that meets no singularity keeps its branch, so the joints along a path are one
+column of :func:`inverse`, unwrapped. The singularities are where two branches meet:
 
     shoulder: the wrist centre lies d4 from axis 1;  wrist: sin q5 = 0;  elbow: sin q3 = 0
 
@@ -45,7 +45,7 @@ from the flange to the tip of a probe."""
 BRANCHES = 8
 _COS_ALPHA = np.array([0.0, 1.0, 1.0, 0.0, 0.0, 1.0])
 _SIN_ALPHA = np.array([1.0, 0.0, 0.0, 1.0, -1.0, 0.0])
-# Reach is cut off here, relative to the links' lengths: far below a nanometre.
+# Tolerance of the reach, relative to the links' lengths: far below a nanometre.
 _REACH_TOLERANCE = 1e-12
 # Below this sine of joint 5, joints 4 and 6 count as turning about the same axis.
 _WRIST_TOLERANCE = 1e-12
@@ -63,7 +63,7 @@ class ArmModel:
         d4: offset of the wrist from the plane of axis 1.
         d5: from joint 4 to joint 5 along axis 5.
         d6: from joint 5 to the flange.
-        elbow_mm: by how much the elbow sticks out of the plane of axis 1, along axis 3.
+        elbow_mm: how far the elbow sticks out of the plane of axis 1, along axis 3.
         radius_mm: radius of the largest joint's housing, about.
         joint_speed_deg_s: largest speed of the slowest joint.
     """
@@ -174,8 +174,8 @@ def link_frames(
 ) -> Float[np.ndarray, "*n 7 4 4"]:
     """Frames 0 (base) to 6 (flange) in the base frame.
 
-    Origins: 0 the base; 1 and the start of the upper arm, the shoulder; 2 the elbow; 3 wrist 1; 4
-    and 5 wrists 2 and 3; 6 the flange.
+    Origins: 0 the base; 1 the shoulder, where the upper arm starts; 2 the elbow; 3 wrist 1; 4
+    wrist 2; 5 wrist 3; 6 the flange.
 
     Args:
         model: whose dimensions.
@@ -203,10 +203,11 @@ def forward(model: ArmModel, joints: Float[np.ndarray, "*n 6"]) -> Float[np.ndar
 
 
 def joint_points(model: ArmModel, joints: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 6 3"]:
-    """Centres of what moves: elbow (inner and outer side), wrists 1 to 3, flange; mm.
+    """Centres of the moving joints: elbow (inner and outer side), wrists 1 to 3, flange; mm.
 
-    Every link between the shoulder and the flange runs between two of them (or the shoulder), so
-    that all of the arm lies in a convex region with them, but for the housings' radius.
+    Every link from the shoulder to the flange runs between two of these points, or from the
+    shoulder to one. So a convex region that holds them and the shoulder holds all the links, but
+    for the housings' radius.
     """
     frames = link_frames(model, joints)
     elbow, axis = frames[..., 2, :3, 3], frames[..., 2, :3, 2]
@@ -224,7 +225,7 @@ def joint_points(model: ArmModel, joints: Float[np.ndarray, "*n 6"]) -> Float[np
 
 
 POINT_NAMES = ("elbow", "elbow", "wrist 1", "wrist 2", "wrist 3", "flange")
-"""What :func:`joint_points` gives."""
+"""Names of the points of :func:`joint_points`."""
 
 
 def jacobian(model: ArmModel, joints: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 6 6"]:
@@ -251,7 +252,7 @@ def scaled_jacobian(
 def dexterity_mm(model: ArmModel, joints: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n"]:
     """Smallest singular value of the scaled Jacobian, mm per rad; 0 in a singular pose.
 
-    The reciprocal is by how much the joints must turn, at worst, for a mm of the flange (Klein and
+    Its reciprocal is how far the joints must turn, at worst, to move the flange by a mm (Klein and
     Blaho 1987).
     """
     return np.asarray(np.linalg.svd(scaled_jacobian(model, joints), compute_uv=False)[..., -1])
@@ -262,7 +263,7 @@ def nearest_singularity(model: ArmModel, joints: Float[np.ndarray, 6]) -> str:
     frames = link_frames(model, joints)
     wrist = frames[5, :3, 3]
     away = math.hypot(wrist[0], wrist[1])
-    # Each as the sine of the angle that is missing to the singular pose.
+    # Each is the sine of the angle left to the singular pose.
     shoulder = math.sqrt(max(away**2 - model.d4**2, 0.0)) / abs(model.a2 + model.a3)
     elbow, turn = abs(math.sin(joints[2])), abs(math.sin(joints[4]))
     if shoulder <= min(elbow, turn):
@@ -292,7 +293,7 @@ _SHOULDER, _WRIST, _ELBOW = (
     np.array([1.0 if branch >> shift & 1 == 0 else -1.0 for branch in range(BRANCHES)])
     for shift in (2, 1, 0)
 )
-"""Signs of each branch: it is 4 (shoulder < 0) + 2 (wrist < 0) + (elbow < 0)."""
+"""Signs of each branch; its number is 4 (shoulder < 0) + 2 (wrist < 0) + (elbow < 0)."""
 
 
 def branch_name(branch: int) -> str:
@@ -309,13 +310,13 @@ def inverse(
     Args:
         model: whose dimensions.
         flange: in the base frame, mm.
-        joint_6: its angle in a wrist singularity, where joints 4 and 6 turn about the same axis and
-            any angle will do.
+        joint_6: angle to take for joint 6 in a wrist singularity, where joints 4 and 6 turn about
+            the same axis and any angle will do.
     """
     flange = np.asarray(flange, dtype=np.float64)[..., None, :, :]
     rotation, position = flange[..., :3, :3], flange[..., :3, 3]
 
-    # Joint 1: the wrist centre stands d4 from the plane through axis 1 in which the arm bends.
+    # Joint 1: the wrist centre is d4 away from the plane through axis 1 in which the arm bends.
     centre = position - model.d6 * rotation[..., 2]
     away = np.hypot(centre[..., 0], centre[..., 1])
     inside = away**2 - model.d4**2
@@ -328,7 +329,8 @@ def inverse(
     )
     sine, cosine = np.sin(q1), np.cos(q1)
 
-    # Joint 5: between axes 2 (that of the plane) and 6; joint 6: axis 2 seen from the flange.
+    # Joint 5 is the angle between axis 2 (the plane's normal) and axis 6; joint 6 is the direction
+    # of axis 2 in the flange's frame.
     across = rotation[..., 0, :] * sine[..., None] - rotation[..., 1, :] * cosine[..., None]
     sine5 = np.hypot(across[..., 0], across[..., 1])
     q5 = _WRIST * np.arctan2(sine5, across[..., 2])
@@ -372,10 +374,10 @@ def nearest_turn(joints: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def branch_of(model: ArmModel, joints: Float[np.ndarray, "*n 6"]) -> Int[np.ndarray, "*n"]:
-    """Which branch of :func:`inverse` some joints are of."""
+    """Which branch of :func:`inverse` the joints belong to."""
     joints = np.asarray(joints, dtype=np.float64)
     centre = link_frames(model, joints)[..., 5, :3, 3]
-    # The wrist centre along the arm's plane: joint 1's sine and cosine turn it into that.
+    # Position of the wrist centre along the arm's plane, which joint 1 turns.
     along = centre[..., 0] * np.cos(joints[..., 0]) + centre[..., 1] * np.sin(joints[..., 0])
     negative = [along > 0, np.sin(joints[..., 4]) < 0, np.sin(joints[..., 2]) < 0]
     return np.asarray(np.array([4, 2, 1]) @ np.array(negative, dtype=int).reshape(3, -1)).reshape(
@@ -386,7 +388,7 @@ def branch_of(model: ArmModel, joints: Float[np.ndarray, "*n 6"]) -> Int[np.ndar
 def nearest(
     model: ArmModel, flange: Float[np.ndarray, "4 4"], reference: Float[np.ndarray, 6]
 ) -> Float[np.ndarray, 6] | None:
-    """Of all joints that bring the flange to a pose those nearest to a reference; None: none do.
+    """The joints nearest to a reference that bring the flange to a pose; None where none do.
 
     In a wrist singularity joint 6 keeps its reference.
     """
@@ -401,7 +403,7 @@ def nearest(
 def flange_of(
     pose: Float[np.ndarray, "*n 4 4"], tcp_offset: tuple[float, ...]
 ) -> Float[np.ndarray, "*n 4 4"]:
-    """The flange of a TCP's pose (mm); ``tcp_offset`` as the controller tells it (m, rad)."""
+    """Pose of the flange from that of the TCP (mm); ``tcp_offset`` is the controller's (m, rad)."""
     return pose @ inverse_transform(tool_of(tcp_offset))
 
 

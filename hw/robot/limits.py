@@ -1,13 +1,13 @@
 """Limits of motion, from a TOML file.
 
-A limit that does not limit anything is refused: every value has a bound of its own, and a file with
-an unknown or missing name is not read at all.
+A limit that does not limit anything is refused: every value has a bound of its own. A file with an
+unknown or missing name is refused as a whole.
 
 Two boxes bound what moves. The box (``box_min_mm``, ``box_max_mm``) holds the probe: its tip and
 the convex hull of array face and housing (``hull_mm``). The arm's box (``arm_box_min_mm``,
 ``arm_box_max_mm``) holds the TCP, the flange and, where the arm's model is known, its elbow and
 wrists with their housings; by default it is the half-space above the floor of the probe's box. The
-arm's base stands outside of the first and is not checked against the second.
+arm's base is not checked against either box.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ _TEXTS = ("arm_model", "force_reason")
 _MOST_TEXT = 200
 
 FURTHEST_MM = 2000.0
-"""No corner of a box lies further than this from the base, along any axis: the largest arm that is
-known (UR20) reaches 1.75 m."""
+"""No corner of a box may lie further than this from the base along any axis: the largest known arm
+(UR20) reaches 1.75 m."""
 FURTHEST_TIP_MM = 500.0
-"""No part of a probe is further from the TCP than this."""
+"""No part of a probe may be further from the TCP than this."""
 FORCE_WITHOUT_REASON_N = 140.0
-"""The quasi-static limits of ISO/TS 15066 for contact with people lie at and below this for chest
-and abdomen; a higher cap needs ``force_reason``."""
+"""For contact with a person's chest and abdomen the quasi-static limits of ISO/TS 15066 are no
+higher than this; a higher cap needs ``force_reason``."""
 _MOST_CORNERS = 64
 
 Vector3 = tuple[float, float, float]
@@ -65,7 +65,7 @@ class Limits:
     """
 
     box_min_mm: Vector3
-    """Lowest corner of the box for the probe's tip."""
+    """Lowest corner of the box for the probe (tip and hull)."""
     box_max_mm: Vector3
     """Highest corner of that box."""
     tip_mm: Vector3
@@ -79,7 +79,7 @@ class Limits:
     max_turn_deg: float
     """Largest turn in a single motion."""
     max_speed_mm_s: float
-    """Of the TCP and of the tip."""
+    """Largest speed of the TCP and of the tip."""
     max_acceleration_mm_s2: float = 100.0
     search_mm: float = 0.0
     """How far from a planned pose the search may go."""
@@ -87,11 +87,11 @@ class Limits:
     search_speed_mm_s: float = 10.0
     """Speed cap of motions within the search envelope of one pose; at most 10 mm/s."""
     max_pose_age_s: float = 0.1
-    """Oldest pose on which to move; at most 0.1 s."""
+    """Largest age of the newest pose, before and during a motion; at most 0.1 s."""
     max_force_n: float = 20.0
-    """Force at the TCP at which a motion is stopped."""
+    """Force at the TCP above which no motion starts, and a running one is stopped."""
     force_reason: str = ""
-    """Why a cap above 140 N is needed; such a cap is refused without."""
+    """Why a cap above 140 N is needed; without a reason such a cap is refused."""
     hull_mm: tuple[Vector3, ...] = ()
     """Corners of the probe's array face and housing in the TCP's frame (:func:`hull_of`)."""
     arm_model: str = ""
@@ -103,15 +103,16 @@ class Limits:
     arm_box_max_mm: Vector3 | None = None
     """Highest corner of the arm's box; by default 2 m away along every axis."""
     joint_min_deg: Vector6 = (-360.0, -360.0, -180.0, -360.0, -360.0, -360.0)
-    """Lowest angle of each joint. The elbow's own range is wider, but the upper arm is in its
-    way."""
+    """Lowest angle of each joint. The elbow could turn further, but the forearm would meet the
+    upper arm."""
     joint_max_deg: Vector6 = (360.0, 360.0, 180.0, 360.0, 360.0, 360.0)
     """Highest angle of each joint."""
     max_joint_speed_deg_s: float = 90.0
-    """Of any joint."""
+    """Largest speed of any joint."""
     min_singular_value_mm: float = 10.0
-    """Least singular value of the arm's Jacobian, mm per rad with 100 mm for a rad of the flange;
-    near a wrist singularity it is about joint 5's angle from it in degrees."""
+    """Smallest singular value allowed for the arm's Jacobian, mm per rad, where a rad of the flange
+    counts as 100 mm; near a wrist singularity it is about the angle in degrees that joint 5 has
+    left to the singularity."""
 
     def __post_init__(self) -> None:
         for item in fields(self):

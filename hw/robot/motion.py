@@ -1,12 +1,12 @@
 """Asking the robot to move: one motion at a time, in a process that can always be killed.
 
-:class:`Motion` starts dry: it checks and logs every motion and sends none. To move, it takes the
-operator's confirmation of the plan, which serves for one connection; after anything that ends it
-(a stop, a protective stop, a reset connection, a stopped program) a new one is needed. A protective
-stop is reported and never released from here.
+By default :class:`Motion` makes a dry run: it checks and logs every motion and sends none. To move
+the robot it needs the operator's confirmation of the plan, which is good for one connection. After
+anything that ends motion (a stop, a protective stop, a reset connection, a stopped program) a new
+confirmation is needed. A protective stop is reported; this software never releases it.
 
 A stop is latched on both sides of the pipe: here in :attr:`Motion._stop`, in the other process as
-described in :mod:`hw.robot._mover`. What stops a motion is one of two things.
+described in :mod:`hw.robot._mover`. There are two kinds of stops.
 
 - A *stop* (:meth:`Motion.stop`, a guard that reports danger or fails, an interrupt such as Ctrl-C,
   force, the box, a protective stop, a motion that does not arrive) ends motion:
@@ -14,10 +14,10 @@ described in :mod:`hw.robot._mover`. What stops a motion is one of two things.
   robot move again.
 - A *hesitation* (StaleError: poses, echo frames, images or this process were silent for a moment)
   stops the robot in the same way, but the same move may be asked for again. Nothing said that
-  moving is dangerous; the software could not know for a moment that it is not.
+  moving was dangerous; for a moment the software could not know that it was safe.
 
-Requests to move are counted, and stops and answers carry the count, so that none of them can be
-taken for that of another move.
+Requests to move are counted, and stops and answers carry the count of their move, so that they are
+never applied to another move.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ from hw.robot.stream import PoseSample
 Log = Callable[[float, str, dict[str, object]], None]
 """Takes bench time (s), the command, and its numbers."""
 Guard = Callable[[], str | StaleError | None]
-"""Asked before a motion is requested and at every tick of it. A reason (str) stops it and ends
-motion; a StaleError stops it as a hesitation."""
+"""Called before a motion is requested and at every tick of it. A returned reason (str) stops the
+robot and ends motion; a returned StaleError stops the robot as a hesitation."""
 
 _KINDS = {kind.__name__: kind for kind in (LostError, RefusedError, StaleError, StoppedError)}
 _TICK_S = 0.02
 _START_PATIENCE_S = 30.0
-# The controller has stopped the robot by itself long before; a busy machine gets its chance.
+# The controller's watchdog has stopped the robot long before; a busy machine gets time to answer.
 _HANGS_WALL_S = 2.0
 
 
@@ -62,11 +62,11 @@ class Motion:
         confirmation: of that plan; used up by :meth:`start`. None only for a dry run.
         clock: bench time.
         dry_run: check and log, but send nothing to the robot.
-        log: told every command before it is sent (but for the watchdog's kicks, of which it is told
-            the number), every refusal and every stop.
+        log: called with every command before it is sent (of the watchdog's kicks only with their
+            number), every refusal and every stop.
         guard: see :data:`Guard`; may be set at any time.
         caller_s: bench seconds that this process may be silent during a motion, e.g. held up by
-            another thread, before the motion is stopped: no guard is asked meanwhile.
+            another thread, before the motion is stopped: while it is silent, no guard is called.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Motion:
         self.host, self.plan, self.clock, self.dry_run = host, plan, clock, dry_run
         self.guard = guard
         self.tcp_offset: tuple[float, ...] | None = None
-        """Of the controller (m, rad), once started; None where a dry run cannot know it."""
+        """TCP offset of the controller (m, rad), once started; None where a dry run lacks it."""
         self.serial: str | None = None
         self._confirmation = confirmation
         self._log = log or (lambda t, command, numbers: None)
@@ -96,7 +96,7 @@ class Motion:
         self._one_at_a_time = threading.Lock()
         self._ended: DeviceError | None = None
         self._stop: StoppedError | None = None
-        """The stop that was asked for; it stays, and so nothing is sent or answered as before."""
+        """The stop asked for, never cleared: no move is sent or reported as arrived after it."""
         self._count = 0
         self._heard = 0.0
         self._in_motion = False
@@ -106,7 +106,7 @@ class Motion:
 
         Raises:
             RefusedError: no valid, unused confirmation for this plan and robot, or a plan outside
-                its limits, or another TCP offset.
+                its limits, or another TCP offset, payload or speed slider than the plan's.
             LostError: the controller does not answer.
         """
         if sys.platform == "win32":
@@ -184,14 +184,16 @@ class Motion:
         """Move in a straight line, and wait until the robot has arrived and is steady.
 
         Args:
-            pose: (4, 4) mm, TCP -> robot base: of the plan, or within its search envelope.
+            pose: (4, 4) mm, TCP -> robot base: a pose of the plan, or one in its search envelope.
             speed_mm_s: of TCP and tip; the cap by default.
 
         Returns:
-            The pose at which it rests; in a dry run, the pose at which it would.
+            The pose at which the robot rests; in a dry run, the pose at which it would.
 
         Raises:
-            RefusedError: the gate or the controller does not allow it; nothing moved.
+            RefusedError: the gate or the controller does not allow it; nothing moved. Or the TCP
+                offset, payload or speed slider was changed: then the robot was stopped, and motion
+                needs a new confirmation (:attr:`ended` tells).
             StaleError: a hesitation; the robot rests, and the move may be asked for again.
             StoppedError: stopped before arrival: by :meth:`stop`, the guard, force, the box, a
                 protective stop, or because it took too long. Motion needs a new confirmation.
@@ -224,7 +226,7 @@ class Motion:
                     self._stop_and_wait()
 
     def _stop_and_wait(self) -> None:
-        """After an interrupt, or a guard that failed: the robot must rest before that goes on."""
+        """Stop after an interrupt or a failed guard, before its exception goes on."""
         try:
             self.stop("interrupted")
         finally:
@@ -232,7 +234,7 @@ class Motion:
             self._wait_for_end()
 
     def _wait_for_end(self) -> None:
-        """Until the other process says that the robot rests and that it ends; else it is killed."""
+        """Give the other process a moment to brake and to report its end; then kill it."""
         deadline = time.monotonic() + 0.5 + self.clock.wall(0.5)
         answer: dict = {}
         with contextlib.suppress(queue.Empty):
@@ -241,7 +243,7 @@ class Motion:
         self._kill(_error(answer) or LostError("the motion process hangs", device="robot"))
 
     def _wait(self, count: int) -> PoseSample:
-        """Until a move was answered; a stop is sent again until the other process confirms it."""
+        """Wait for a move's answer; a stop is sent again until the other process confirms it."""
         tick = max(0.001, self.clock.wall(_TICK_S))
         hesitation: StaleError | None = None
         stopping: DeviceError | None = None
@@ -253,7 +255,7 @@ class Motion:
             error = _error(answer)
             match answer.get("what"):
                 case "arrived" if answer["move"] == count and self._stop is None:
-                    # It arrived before it read a stop; asked to stop, it has not arrived.
+                    # The robot arrived. Once a stop was asked for, this answer does not count.
                     self._in_motion = False
                     if hesitation is not None:
                         raise hesitation
@@ -264,7 +266,7 @@ class Motion:
                     self._kill(error)
                     raise error
                 case "error" if error is not None and answer["move"] == count:
-                    # With a stop under way its own answer follows, and ends motion.
+                    # If a stop was asked for, its own answer follows and ends motion.
                     if self._stop is None:
                         self._in_motion = False
                         raise error if hesitation is None else hesitation

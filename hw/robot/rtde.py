@@ -1,12 +1,12 @@
 """Reading a controller's real-time data (RTDE) packet by packet.
 
-ur_rtde keeps only the newest packet, and skips what came in between whenever its thread was late;
-measured on two busy cores, a tenth of 500 packets/s. A tracker must not lose poses, so they are
-read here from the socket, where nothing is lost and a packet cannot tear. Commands go through
-ur_rtde (:mod:`hw.robot.motion`).
+ur_rtde keeps only the newest packet, and skips packets whenever its thread is late: on two busy
+cores it skipped a tenth of 500 packets/s. A tracker must not lose poses, so they are read here
+from the socket, where no packet is lost or mixed with another. Commands go through ur_rtde
+(:mod:`hw.robot.motion`).
 
-What comes from the socket is untrusted: a message is at most 64 KiB by its format, and anything
-that does not fit the recipe ends the connection.
+Data from the socket are untrusted: a message is at most 64 KiB by its format, and anything that
+does not fit the recipe ends the connection.
 
 Source: Universal Robots' RTDE guide, protocol version 2.
 """
@@ -40,10 +40,10 @@ FIELDS: dict[str, tuple[str, str]] = {
     "payload_cog": ("VECTOR3D", "3d"),
     "actual_q": ("VECTOR6D", "6d"),
 }
-"""What is asked for, with the type that must come back."""
+"""The variables that are asked for, with the type that the controller must answer."""
 
 _OPTIONAL = ("tcp_offset", "payload", "payload_cog", "actual_q")
-"""Older controllers lack these; every controller that is known tells the joints, actual_q."""
+"""Older controllers may lack these, but all known controllers send the joints, actual_q."""
 
 RUNNING_MODE = 7
 NORMAL_BITS = 0b11
@@ -71,19 +71,19 @@ def safety_text(bits: int) -> str:
 
 
 _BOUND_TRIES, _LEAST_TRIES, _BOUND_S, _BOUND_WITHIN_S = 5, 3, 0.01, 0.25
-"""Tries to bound the latency, how many of them whatever they take, how tight, beyond two periods,
-is tight enough, and how long the others may take (wall s)."""
+"""Most tries to bound the latency; fewest tries, unless a bound is tight; a bound is tight below
+this plus three periods (s); beyond the fewest, no try begins after this time (wall s)."""
 _PAYLOAD_TOLERANCE_KG, _COG_TOLERANCE_M, _SPEED_TOLERANCE = 1e-3, 1e-4, 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class PendantSettings:
-    """What a person sets at the pendant, besides the TCP offset, and what motion depends on.
+    """Settings at the pendant, besides the TCP offset, on which motion depends.
 
     Attributes:
-        payload_kg: mass that the arm carries; None where the controller does not tell it.
-        payload_cog_m: (3,) its centre of gravity in the flange's frame; None likewise.
-        speed_fraction: of the speed slider, 0 to 1.
+        payload_kg: mass that the arm carries; None where the controller does not send it.
+        payload_cog_m: (3,) its centre of gravity in the flange's frame; None where not sent.
+        speed_fraction: position of the speed slider, 0 to 1.
     """
 
     payload_kg: float | None = 0.0
@@ -91,7 +91,7 @@ class PendantSettings:
     speed_fraction: float = 1.0
 
     def changed(self, now: PendantSettings) -> str:
-        """What is different now, by more than rounding, as a line; empty if nothing is."""
+        """Which settings differ now by more than rounding, as one line; empty if none does."""
         found = []
         if _apart([self.payload_kg], [now.payload_kg], _PAYLOAD_TOLERANCE_KG):
             found.append(f"the payload is {now.payload_kg} kg, not {self.payload_kg}")
@@ -157,11 +157,11 @@ class Packet:
 
 
 def too_late(latency_s: float, limit_s: float) -> LostError | None:
-    """Why poses of this connection will not do, where all of them look older than the limit.
+    """The error if the latency makes all poses look older than the limit; else None.
 
     Args:
-        latency_s: of :attr:`PacketReader.latency_s`, bench s.
-        limit_s: of a pose's age, bench s.
+        latency_s: :attr:`PacketReader.latency_s`, bench s.
+        limit_s: largest age of a pose, bench s.
     """
     if latency_s <= limit_s:
         return None
@@ -178,7 +178,7 @@ class PacketReader:
 
     Args:
         host: its address.
-        frequency_hz: packets per second; by default what the controller can (500, or 125 on CB).
+        frequency_hz: packets per second; by default the controller's own (500, or 125 on CB).
         timeout_s: wall seconds for the connection and each of its answers.
 
     Raises:
@@ -216,7 +216,7 @@ class PacketReader:
         """Every packet that has come since the last call; does not wait.
 
         Raises:
-            LostError: the controller closed the connection, or sent what is no RTDE data.
+            LostError: the controller closed the connection, or sent something other than RTDE.
         """
         try:
             data = self._socket.recv(1 << 18)
@@ -263,7 +263,7 @@ class PacketReader:
         )
 
     def _messages(self) -> Generator[tuple[bytes, bytes]]:
-        """Kind and payload of each complete message, which is then forgotten."""
+        """Kind and payload of each complete message, which is then removed from the buffer."""
         data = self._data
         start = 0
         try:
@@ -311,23 +311,23 @@ class PacketReader:
             self._optional_slots.append((start, end))
             start = end
         self.bound, self.latency_s = self._begin(deadline)
-        """``bound``: ``time.monotonic()`` and the controller's time (s); a packet with this stamp
-        was not made before that moment. ``latency_s``: how long the promptest packet so far was on
-        its way at most (wall s). See :meth:`_begin`."""
+        """``bound``: a moment of ``time.monotonic()`` and a time of the controller (s): the packet
+        with this time stamp was not made before that moment. ``latency_s``: an upper bound of how
+        long the fastest packet was on its way (wall s). See :meth:`_begin`."""
 
     def _begin(self, deadline: float) -> tuple[tuple[float, float], float]:
-        """Start the stream, a few times over, and bound how long a packet is on its way.
+        """Start the stream several times, and bound how long a packet is on its way.
 
-        The first packet after the controller took a request to start was made after that request
-        was sent, but for one period, as a controller stamps a packet at its cycle's start. However
-        constant a latency is, it cannot make that packet older. So each try bounds the offset of
-        the two clocks, host less controller: from below by the moment of the request, from above by
-        the packet's arrival. A busy machine delays any of these, so the tightest of some tries
-        count; a single slow one (the machine was held up while connecting) must not make every
-        pose of this connection look old.
+        The controller makes the first packet after the request to start was sent. As it stamps a
+        packet at the start of its cycle, the stamp may be up to one period older than the request,
+        but not more, whatever the latency. So each try bounds the offset of the two clocks, host
+        minus controller: from below by the moment of the request minus one period, from above by
+        the packet's arrival. A busy machine makes these bounds loose, so the tightest of several
+        tries are taken: one slow try (the machine was held up while connecting) must not make
+        every pose of this connection look old.
 
         Returns:
-            The bound and the latency, see the attributes.
+            The attributes ``bound`` and ``latency_s``.
         """
         period = 1.0 / self.frequency_hz
         best, above = (-math.inf, 0.0), math.inf
@@ -336,14 +336,14 @@ class PacketReader:
             if attempt >= _LEAST_TRIES and time.monotonic() > give_up:
                 break
             if attempt:
-                # What was sent before the answer to this is read, and dropped, with it.
+                # Packets sent before the answer to this request to pause are read and dropped.
                 self._ask(b"P", b"", deadline)
             asked = time.monotonic()
             if self._ask(b"S", b"", deadline)[:1] != b"\x01":
                 raise RefusedError("the controller would not start sending", device="robot")
             packet = self._first(deadline)
             if packet is None:
-                # It accepts and sends nothing: whoever reads finds that out.
+                # The controller accepts but sends nothing: whoever reads will notice.
                 break
             stamp = packet.timestamp_s
             above = min(above, packet.monotonic_s - stamp)
@@ -353,7 +353,7 @@ class PacketReader:
         return best, max(above - (best[0] - best[1]), 0.0) if math.isfinite(above) else 0.0
 
     def _first(self, deadline: float) -> Packet | None:
-        """The first packet after a start; it is read again by :meth:`read`. None: none came."""
+        """The first packet after a start, kept for :meth:`read`; None if none or a bad one came."""
         while True:
             data = bytes(self._data)
             if len(data) >= 3:
@@ -362,7 +362,7 @@ class PacketReader:
                     raise LostError("what came is no RTDE data", device="robot")
                 if len(data) >= size:
                     if data[2:3] == b"U":
-                        # What is wrong with it, reading it again says.
+                        # If it is bad, :meth:`read` will say what is wrong with it.
                         with contextlib.suppress(LostError):
                             return self._packet(time.monotonic(), data[3:size])
                         return None

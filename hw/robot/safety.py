@@ -1,6 +1,6 @@
 """What the robot may be asked to do: limits, a plan, the operator's confirmation, and the gate.
 
-Nothing is commanded that :meth:`Gate.check_move` did not allow, and what is sent is the
+No motion is sent unless :meth:`Gate.check_move` allowed it, and what is sent is the
 :class:`Command` that it returned. This comes on top of the robot's own safety configuration and
 emergency stop, and replaces neither.
 
@@ -11,7 +11,7 @@ known, its joints, singularities and links are checked along the same path
 (:mod:`hw.robot.feasibility`).
 
 A move goes to a pose of the plan, or to one within the declared search envelope of such a pose
-(fine elevational steps are searched for, they cannot be planned).
+(fine elevational steps are found by a search and cannot be planned).
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ class MotionPlan:
     serial: str
     """Which robot: :attr:`hw.robot.identity.Identity.name`."""
     joints: tuple[float, ...] | None = None
-    """(6,) rad of the arm when the plan was made, which decide the branch of its kinematics that
-    the plan is checked in; None: any branch. Not part of the digest: it permits nothing."""
+    """(6,) the arm's joints, rad, when the plan was made. They decide in which branch of the
+    kinematics the plan is checked; None: any branch. Not in the digest: they permit nothing."""
     pendant: PendantSettings = field(default_factory=PendantSettings)
     """Payload and speed slider when the plan was made."""
 
@@ -93,7 +93,7 @@ class MotionPlan:
         serial: object,
         pendant: PendantSettings | None = None,
     ) -> MotionPlan:
-        """A plan from what somebody else made; anything that is no plan is refused.
+        """A plan from another program's data; anything that is not a plan is refused.
 
         Raises:
             RefusedError: not poses, not an offset, or no robot.
@@ -144,15 +144,15 @@ class MotionPlan:
 
 @dataclass(frozen=True)
 class Confirmation:
-    """Somebody's word for one plan, one robot and one connection, which must be made in time.
+    """Permission for one plan on one robot over one connection, which must be made in time.
 
     Attributes:
         digest: of the plan.
         serial: of the robot.
         issued_s: bench time.
-        expires_s: bench time until which motion may be started. It does not end motion that was.
-        unattended: whether nobody was asked.
-        used: set by the motion process that was started with it; a second one needs another.
+        expires_s: bench time by which the connection must be made; later motions are not limited.
+        unattended: whether it was given without asking a person.
+        used: set when motion is started with it; every start needs a new confirmation.
     """
 
     digest: str
@@ -165,12 +165,12 @@ class Confirmation:
 
 @dataclass(frozen=True)
 class Challenge:
-    """A code for a person to type, for one plan and once: the next challenge has another code.
+    """A code for a person to type. It confirms one plan, once; the next challenge has another code.
 
     Attributes:
-        plan: it is checked first.
+        plan: the plan to confirm; it is checked first.
         nonce: random.
-        used: set once it was answered rightly.
+        used: set once it was answered correctly.
 
     Raises:
         RefusedError: the plan is not allowed.
@@ -198,7 +198,7 @@ def confirm(
     """Take the operator's confirmation of a plan.
 
     Args:
-        challenge: that the operator was shown.
+        challenge: the one that the operator was shown.
         answer: what the operator typed; must be ``challenge.code``.
         clock: bench time.
         valid_s: bench seconds within which motion must be started.
@@ -222,17 +222,17 @@ def confirm_unattended(
 ) -> Confirmation:
     """Confirm a plan that somebody has named beforehand; nobody is asked, now or later.
 
-    What this gives up: that a person who sees the robot says, at the moment before it moves, that
-    nobody and nothing is in its way. What it keeps: the plan that moves is the one that was named.
+    What is lost: no person who sees the robot says, just before it moves, that nobody and nothing
+    is in its way. What is kept: only the plan that was named can move the robot.
 
     Args:
-        plan: it is checked first.
+        plan: the plan to confirm; it is checked first.
         digest: the plan's, at least its first :data:`LEAST_DIGEST_DIGITS` digits.
         clock: bench time.
         valid_s: bench seconds within which motion must be started.
 
     Raises:
-        RefusedError: the plan is not allowed, or is another one.
+        RefusedError: the plan is not allowed, or is not the one named.
     """
     check_plan(plan)
     given = digest.strip().lower()
@@ -264,7 +264,7 @@ class Command:
     raw: tuple[float, ...]
     """Target: m and rotation vector (rad)."""
     pose: np.ndarray
-    """(4, 4) mm, the same."""
+    """(4, 4) mm, the same target."""
     speed_m_s: float
     acceleration_m_s2: float
     duration_s: float
@@ -291,10 +291,10 @@ class Gate:
         return self.plan.digest
 
     def check_start(self, serial: str, tcp_offset: object, pendant: PendantSettings | None) -> None:
-        """Whether motion may begin: as :meth:`check_authority`, and in time.
+        """Whether motion may begin: as :meth:`check_authority`, and the confirmation is valid now.
 
         Raises:
-            RefusedError: likewise, or a confirmation that is not yet, or no longer, valid.
+            RefusedError: as there, or a confirmation that is not yet, or no longer, valid.
         """
         self.check_authority(serial, tcp_offset, pendant)
         given, now = self.confirmation, self.clock.now()
@@ -362,7 +362,7 @@ class Gate:
             force_n: at the TCP now.
 
         Raises:
-            RefusedError: it may not be done; the text says why. Nothing was sent.
+            RefusedError: the motion is not allowed; the text says why. Nothing was sent.
             StaleError: the newest pose is too old.
         """
         self.check_authority(serial, tcp_offset, pendant)
@@ -372,7 +372,7 @@ class Gate:
         return self.check_geometry(target, sample, speed_mm_s)
 
     def check_geometry(self, target: object, sample: PoseSample, speed_mm_s: object) -> Command:
-        """As :meth:`check_move` but for the confirmation: all that a dry run can check."""
+        """As :meth:`check_move` without confirmation, robot and force: what a dry run can check."""
         limits = self.plan.limits
         check_sample(sample, limits, self.clock)
         goal = _pose(target, "the target")
@@ -410,12 +410,12 @@ class Gate:
     def _check_arm(
         self, start: np.ndarray, goal: np.ndarray, sample: PoseSample, duration_s: float
     ) -> None:
-        """Whether the arm can follow the motion from the joints at which it is."""
+        """Whether the arm can follow the motion from its present joints."""
         arm = self.plan.arm
         if arm is None:
             return
         if sample.joints is None:
-            # Without joints, any branch will do.
+            # The joints are not known: one branch that can follow is enough.
             follow_all(arm, np.stack([start, goal]), np.array([duration_s]))
             return
         joints = np.asarray(sample.joints)
@@ -496,8 +496,8 @@ def _pace(
 ) -> tuple[float, float]:
     """Length of a motion as the controller counts it, and its speed (m and m/s, or rad and rad/s).
 
-    The controller reads a speed in m/s as rad/s where a motion is mostly a turn; the tip must keep
-    the cap as well as the TCP.
+    Where a motion is mostly a turn, the controller takes the speed as rad/s instead of m/s. The cap
+    holds for the tip as well as for the TCP.
     """
     distance = float(np.linalg.norm(goal[:3, 3] - start[:3, 3])) / 1000.0
     turn = math.radians(turn_deg(start, goal))
@@ -508,7 +508,7 @@ def _pace(
 
 
 def _check_box_in_reach(plan: MotionPlan) -> None:
-    """A box that the arm can never leave bounds nothing."""
+    """Refuse a box that the arm can never leave: it bounds nothing."""
     if plan.arm is None:
         return
     model, limits = plan.arm.model, plan.limits
@@ -524,11 +524,12 @@ def _check_box_in_reach(plan: MotionPlan) -> None:
 
 
 def check_sample(sample: PoseSample, limits: Limits, clock: Clock) -> None:
-    """Whether a pose is new, and the robot fit to move.
+    """Check that a pose is fresh and that the robot is fit to move.
 
     Raises:
-        StaleError: too old; a new pose may come.
-        RefusedError: from the future, or a robot in another mode than running.
+        StaleError: the pose is too old; a new one may come.
+        RefusedError: the pose is from the future, the robot reports a safety stop, or it is not
+            running.
     """
     age, oldest = sample.age_s(clock.now()), clock.patience(limits.max_pose_age_s)
     if not age <= oldest:
@@ -579,9 +580,10 @@ def _within(planned: np.ndarray, pose: np.ndarray, limits: Limits) -> bool:
 def _check_path(
     plan: MotionPlan, start: np.ndarray, goal: np.ndarray, what: str, *, reserve: bool = False
 ) -> None:
-    """Step, turn, boxes and cone along a motion.
+    """Check step, turn, boxes and cone along a motion.
 
-    ``reserve`` keeps room for a motion that starts anywhere in the start's search envelope.
+    ``reserve`` leaves room, in step and turn, for a motion that starts anywhere in the start's
+    search envelope.
     """
     limits = plan.limits
     tip = np.asarray(limits.tip_mm)
@@ -627,11 +629,11 @@ def _check_box(
     what: str,
     whose: str,
 ) -> None:
-    """Points of the tool in a box along a way, whose samples are ``spread`` rad apart.
+    """Check that points of the tool stay in a box along a way with samples ``spread`` rad apart.
 
-    A point a mm from the TCP runs along a line plus an arc about the TCP. Linear interpolation of
-    an arc is off by at most a spread^2 / 8 (the second derivative is a spread^2), and a box is
-    convex: what holds at the samples with that margin holds between them.
+    A point at a distance a (mm) from the TCP runs along a line plus an arc about the TCP. Linear
+    interpolation of the arc is off by at most a spread^2 / 8 (the second derivative is a spread^2).
+    A box is convex, so points that are inside by this margin at the samples are inside in between.
     """
     places = np.einsum("nij,pj->npi", way[:, :3, :3], points) + way[:, None, :3, 3]
     sag = np.linalg.norm(points, axis=1) * spread**2 / 8.0

@@ -1,9 +1,10 @@
-"""The robot as a tracker: every pose with host and device time, and never an old one as new.
+"""The robot as a tracker: every pose with host and device time; an old pose never passes as new.
 
-A process of its own reads the controller, so that neither the parent's interpreter lock nor a mute
-controller delays or freezes anything; the parent can always give it up. :meth:`PoseStream.latest`
-raises rather than hand out a pose older than the limit. Age counts from arrival, plus a bound of
-how long the pose was on its way (:class:`Lag`): a latency that was there from the start counts too.
+A separate process reads the controller. So the parent's interpreter lock does not delay reading, a
+silent controller does not freeze the parent, and the parent can always kill that process.
+:meth:`PoseStream.latest` raises an error rather than return a pose older than the limit. The age
+counts from arrival, plus an upper bound of how long the pose was on its way (:class:`Lag`), so a
+latency that was there from the start counts too.
 """
 
 from __future__ import annotations
@@ -51,9 +52,9 @@ class PoseSample:
     robot_mode: int
     runtime_state: int
     lag_s: float = 0.0
-    """Bench seconds that it was on its way at most (:class:`Lag`)."""
+    """Upper bound of how long it was on its way, bench s (:class:`Lag`)."""
     joints: tuple[float, ...] | None = None
-    """(6,) rad; None where the controller's were not read."""
+    """(6,) rad; None where they were not read from the controller."""
 
     @cached_property
     def pose(self) -> Float[np.ndarray, "4 4"]:
@@ -65,7 +66,7 @@ class PoseSample:
         return now - self.t_host + self.lag_s
 
     def age_text(self, now: float) -> str:
-        """Its age in words, and what of it is silence and what the way's latency."""
+        """Its age in words, split into the time since arrival and the latency before."""
         return (
             f"{1000 * self.age_s(now):.0f} ms old: it came {1000 * (now - self.t_host):.0f} ms ago "
             f"and was on its way for up to {1000 * self.lag_s:.0f} ms"
@@ -88,14 +89,14 @@ class SteadyPose:
 class Lag:
     """An upper bound of how long a pose was on its way (bench s).
 
-    A pose's host time less its device time is its lag plus the offset of the two clocks. The
-    offset is known from below by one pair of times of which the pose was not made before the host
-    time (:attr:`hw.robot.rtde.PacketReader.bound`), and from then on by the smallest difference
-    that was seen. Clocks drift: what is known loses 200 ppm, more than quartz clocks differ by,
-    and a lag that creeps faster than that is seen.
+    A pose's host time minus its device time is its lag plus the offset of the two clocks. A lower
+    bound of the offset comes from one pair of times: the pose with this device time was not made
+    before this host time (:attr:`hw.robot.rtde.PacketReader.bound`). A smaller difference seen
+    later replaces it. As clocks drift, the bound is raised by 200 ppm of the time that passes, more
+    than quartz clocks differ by; a lag that grows faster than that is still seen.
 
     Args:
-        t_host: of the pair, bench s; without one only lags above the least are seen.
+        t_host: of the pair, bench s; without a pair, lags count from the smallest one seen.
         t_device: of the pair, s.
     """
 
@@ -114,14 +115,15 @@ class Lag:
 
 
 class PoseStream:
-    """Poses from a controller at ``host``, through a process of its own.
+    """Poses from a controller at ``host``, read by a separate process.
 
     Args:
         host: the controller's address.
         clock: bench time.
         frequency_hz: poses per second; by default all the controller makes.
         max_age_s: bench seconds after which :meth:`latest` refuses a pose.
-        queue: most poses kept for :meth:`drain`; older ones go and are counted in ``dropped``.
+        queue: most poses kept for :meth:`drain`; beyond it the oldest are dropped, and counted in
+            ``dropped``.
         client: ``packets`` reads every packet; ``ur_rtde`` goes through that library, which keeps
             only the newest and so loses some on a busy machine.
         timeout_s: wall seconds for the connection, and of silence before it counts as lost.
@@ -144,9 +146,9 @@ class PoseStream:
         self.dropped = 0
         """Poses that nobody drained in time."""
         self.tcp_offset: tuple[float, ...] | None = None
-        """[m, rad] of the tool centre point in the flange's frame; None if it is not told."""
+        """[m, rad] of the tool centre point in the flange's frame; None where it is not sent."""
         self.pendant: PendantSettings | None = None
-        """The newest; None if it is not told."""
+        """The newest settings; None until the controller has sent them."""
         self._client, self._frequency, self._timeout = client, frequency_hz, timeout_s
         self._samples: deque[PoseSample] = deque(maxlen=queue)
         self._latest: PoseSample | None = None
@@ -162,7 +164,7 @@ class PoseStream:
         """Connect, and wait for the first pose.
 
         Raises:
-            LostError: nothing came in time, or what comes is on its way for too long; the text says
+            LostError: nothing came in time, or poses are on their way for too long; the text says
             what the controller did.
         """
         if self._process is not None:
@@ -176,7 +178,7 @@ class PoseStream:
         )
         self._thread = threading.Thread(target=self._receive, name="robot poses", daemon=True)
         self._thread.start()
-        # A fresh interpreter on a busy machine takes seconds; that is no fault of the robot's.
+        # Starting an interpreter takes seconds on a busy machine; that is not the robot's fault.
         patience = self._timeout + 20.0
         with self._condition:
             come = self._condition.wait_for(lambda: self._latest or self._error, patience)
@@ -234,7 +236,7 @@ class PoseStream:
         """Average the poses of the next bench seconds; does not touch :meth:`drain`.
 
         Raises:
-            LostError: the connection went.
+            LostError: the connection was lost.
             StaleError: too few poses came.
         """
         start = self.clock.now()

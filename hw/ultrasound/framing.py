@@ -1,9 +1,9 @@
-"""Bytes in any portions to OpenIGTLink messages; what is broken is counted, and the next one found.
+"""Bytes in any portions to OpenIGTLink messages; broken ones are counted, and the next is found.
 
-The protocol has no mark between messages: after a broken header only the next bytes that can be a
-header tell where to go on. A body whose CRC is wrong is left out as a whole where a header
-follows it; otherwise, or where an image says itself that its size was wrong, a header is looked
-for within it, as long as the bytes so looked at more than once are not many times those received.
+The protocol has no mark between messages: after a broken header, decoding goes on at the next bytes
+that can be a header. A body whose CRC is wrong is dropped as a whole if a header follows it. If
+none follows, or if an image's own size contradicts its header, a header is searched within the
+body. A budget in proportion to the bytes received limits how often bytes are checked again.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class FramingCounts:
     Attributes:
         messages: accepted.
         crc_errors: bodies whose CRC was wrong.
-        broken_headers: times that no header stood where one had to.
-        unsupported: messages in order that hold what is not read here.
+        broken_headers: how often there was no header where one had to be.
+        unsupported: intact messages with content that is not read here.
         resynchronised: how often a message was accepted after something broken.
     """
 
@@ -91,7 +91,7 @@ class MessageDecoder:
 
         Args:
             data: any portion of the stream.
-            now: its time of arrival, which messages that begin in it are given.
+            now: its time of arrival, and that of the messages that begin in it.
         """
         if not self._buffer:
             self._began = now
@@ -106,7 +106,7 @@ class MessageDecoder:
         return found
 
     def _step(self, found: list[Message]) -> bool:
-        """Take one message or one piece of rubbish off the buffer; False when more must come."""
+        """Remove one message or one broken piece from the buffer; False when more must come."""
         if self._header is None:
             if len(self._buffer) < HEADER_SIZE:
                 return False
@@ -126,7 +126,7 @@ class MessageDecoder:
                 return True
             self.crc_errors += 1
             self._wrong_crc = self._damaged = True
-        # Whether the size can be trusted is seen from what follows.
+        # The bytes that follow show whether the size can be trusted.
         if len(self._buffer) < end + HEADER_SIZE:
             return False
         follows = parse_header(memoryview(self._buffer)[end : end + HEADER_SIZE])
@@ -146,7 +146,7 @@ class MessageDecoder:
 
     def _hunt_within(self) -> bool:
         """Look for a header in what was taken for a message."""
-        # Of what is found there the time of arrival is not known: late is better than early.
+        # The arrival of a message found there is not known: rather too late than too early.
         self._fresh = 0
         self._began = self._now
         return self._hunt()
@@ -164,11 +164,11 @@ class MessageDecoder:
         self.messages += 1
 
     def _hunt(self) -> bool:
-        """Drop bytes up to the next that may begin a header."""
+        """Drop bytes up to the next place where a header may begin."""
         if not self._hunting:
             self._hunting = self._damaged = True
             self.broken_headers += 1
-        # Where fewer than a header's bytes are left they may begin one.
+        # If fewer bytes than a header are left, they may be the beginning of one.
         last = len(self._buffer) - HEADER_SIZE
         place = 1
         while (match := _BEGIN.search(self._buffer, place)) is not None:
@@ -182,7 +182,7 @@ class MessageDecoder:
                 self._drop(place)
                 return True
             place += 1
-        # The last two bytes may begin what the next portion goes on with.
+        # The last two bytes may be the beginning of a header that the next portion completes.
         self._drop(max(1, len(self._buffer) - 2))
         return False
 

@@ -1,8 +1,8 @@
 """The ultrasound machine's stream: images and transforms from an OpenIGTLink server.
 
-A thread receives, checks and decodes; what is good waits in bounded queues, and what had no room
-is counted. An image that comes again with the same time stamp is no new image (a frozen machine):
-it is counted and not handed on.
+A thread receives, checks and decodes. Good images and transforms wait in bounded queues; those
+dropped for lack of room are counted. An image that comes again with the same time stamp is not a
+new image (the machine is frozen): it is counted and not handed on.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Image:
     Attributes:
         t_host: arrival of its first bytes, s of the bench's clock.
         t_device: the machine's time stamp, s of its own clock; NaN where it sends none.
-        frame_id: the message's id, or a count of images where the sender numbers none.
+        frame_id: the message's id, or a count of images where the sender gives no ids.
         array: (height, width) uint8 B-mode, or int16; rows downwards; not writable.
         spacing_mm: [lateral, axial] mm per pixel.
         device: name of the sender's device.
@@ -78,8 +78,8 @@ class Transform:
         t_device: the sender's time stamp, s; NaN where it sends none.
         name: ``<From>To<To>``, e.g. ``ProbeToTracker``.
         matrix: (4, 4), mm, From -> To, as sent.
-        valid: finite, within 1e-2 of a rigid transform (trackers round), and of a status that is OK
-            where one is sent.
+        valid: whether it is finite, within 1e-2 of a rigid transform (trackers round), and has the
+            status OK where one is sent.
     """
 
     t_host: float
@@ -106,7 +106,7 @@ class UltrasoundStatistics:
         resynchronised: how often a message was accepted after something broken.
         dropped: images and transforms that a full queue had no room for.
         repeated: images that came again with the same time stamp; not handed on.
-        unsupported: messages in order that hold what is not taken (:attr:`reason` of the last).
+        unsupported: intact messages with content that is not taken (``reason`` for the last one).
         other: messages of other types or devices; skipped.
         transforms: accepted.
         reason: why the last unsupported message was not taken.
@@ -300,7 +300,7 @@ class UltrasoundStream:
                 for tracked in message.content:
                     self._take_transform(message, tracked)
             case TrackedFrame() if self._device in (None, message.device):
-                # Before the image, so that they are there when it is read.
+                # Transforms before the image, so that they are there when the image is read.
                 for tracked in message.content.transforms:
                     self._take_transform(message, tracked)
                 self._take_image(message, message.content.picture)
@@ -336,7 +336,10 @@ class UltrasoundStream:
             counts["dropped"] += 1
 
     def _remember(self, message: Message) -> None:
-        """Number and time stamp of a device's last image; a peer may invent devices without end."""
+        """Keep number and time stamp of a device's last image, for at most 64 devices.
+
+        A peer may invent devices without end.
+        """
         self._last.pop(message.device, None)
         self._last[message.device] = (message.message_id, message.t_device)
         if len(self._last) > 64:

@@ -1,9 +1,8 @@
-"""The acquisition's end of the live view: what is known, ten times a second, into a pipe.
+"""The acquisition's end of the live view: its state goes into a pipe, ten times a second.
 
-The pipe holds one message at most. While the viewer has not read it nothing more is put together,
-so a slow, stopped or dead viewer costs the acquisition nothing and holds nothing up; what it missed
-it never sees. What changes seldom is sent when it has changed, the pose and the newest frame every
-time.
+While the pipe has not taken a whole message, no other message is made, so a slow, stopped or dead
+viewer costs the acquisition nothing and delays nothing. It does not get what it missed. State that
+changes seldom is sent when it has changed; the pose, and a new frame, in every message.
 """
 
 from __future__ import annotations
@@ -39,14 +38,14 @@ _LINES = 5
 
 @runtime_checkable
 class Audience(Protocol):
-    """Who is told how an acquisition goes; see :class:`LiveView`."""
+    """Receives the progress of an acquisition; see :class:`LiveView`."""
 
     def plan(self, setup: Setup, plan: MotionPlan, done: list[int]) -> None:
         """What shall be acquired; ``done`` are the rows that a resumed recording has."""
         ...
 
     def watch(self, session: Session | None) -> None:
-        """Whose poses and frames to show; None: no longer."""
+        """Show the poses and frames of this session; None: show them no longer."""
         ...
 
     def going(self, row: int) -> None:
@@ -67,7 +66,7 @@ class Audience(Protocol):
 
 
 class Nobody:
-    """Looks at nothing."""
+    """An audience that ignores everything."""
 
     def plan(self, setup: Setup, plan: MotionPlan, done: list[int]) -> None:
         """Nothing."""
@@ -110,8 +109,8 @@ class LiveView:
         url: of the page.
         pid: of the viewer's process.
         sent: messages.
-        left_out: messages for which the viewer had no room.
-        seconds: CPU time of the thread that feeds.
+        left_out: messages not made because the pipe had not taken the one before.
+        seconds: CPU time of the feeding thread.
 
     Raises:
         InputError: viser is not installed, or the viewer does not start; one line.
@@ -190,7 +189,7 @@ class LiveView:
         )
 
     def watch(self, session: Session | None) -> None:
-        """Whose poses and frames to show; None: no longer."""
+        """Show the poses and frames of this session; None: show them no longer."""
         with self._lock:
             self._session = session
 
@@ -279,7 +278,7 @@ class LiveView:
                 self._frame_id = image.frame_id
                 small, spacing = halved(image.array), [2 * step for step in image.spacing_mm]
                 if 1.5 * spacing[0] < spacing[1]:
-                    # Nothing is seen of lines that lie closer than the rows.
+                    # Columns much narrower than the rows would not be seen: join pairs of them.
                     pairs = small.shape[1] // 2 * 2
                     small = np.maximum(small[:, :pairs:2], small[:, 1:pairs:2])
                     spacing[0] *= 2
@@ -288,7 +287,7 @@ class LiveView:
         return encoded(told, frame)
 
     def _greeting(self) -> str:
-        """The address that the viewer prints when its page can be opened."""
+        """Wait for the viewer; returns the address that it prints once its page can be opened."""
         process = self._process
         assert process.stdout is not None
         line = b""

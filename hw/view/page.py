@@ -1,8 +1,8 @@
 """What the page shows: arm, box, image plane, target, poses, and the running estimate in words.
 
-Places are those of the robot's base frame; one unit of the scene is 100 mm. The arm is drawn
-through the joints that the controller tells with the pose, or, where it tells none, through joints
-that bring the flange to the pose (:mod:`hw.robot.kinematics`).
+Places are in the robot's base frame; one unit of the scene is 100 mm. The arm is drawn with the
+joints that the controller sends with the pose or, where it sends none, with joints that bring the
+flange to the pose (:mod:`hw.robot.kinematics`).
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ UNIT_MM = 100.0
 _CHI_95 = 7.8147
 """95 % point of chi squared with three degrees of freedom."""
 _SHOWN_MM = 4.0
-"""The target's ellipsoid is drawn so many powers of ten larger that it can be seen."""
+"""The target's ellipsoid is enlarged by powers of ten until its largest half axis is this long."""
 _MOST_MAGNIFIED = 1000
 _UNKNOWN_MM = 50.0
 _LABEL_MM = 70.0
 # Poses that differ by less (mm, or in a rotation matrix) look the same.
 _MOVED = 1e-4
 _PANEL_EVERY = 3
-"""Every third frame goes into the panel as well; compressing pictures is what the page costs."""
+"""Every third frame goes into the panel too; compressing pictures is the page's main cost."""
 _PANEL_ROWS, _PANEL_COLUMNS = 240, 320
 _GREY, _ARM, _DONE, _NOW, _MISSED = (
     (150, 150, 150),
@@ -82,7 +82,7 @@ def ellipsoid(
 def to_scale(
     frame: UInt8[np.ndarray, "r c"], spacing_mm: tuple[float, float]
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """A frame in the middle of a panel's picture, a mm as long across as down."""
+    """A frame in the middle of a panel's picture; a mm has the same length across and down."""
     across, down = (size * step for size, step in zip(frame.shape[::-1], spacing_mm, strict=True))
     scale = max(across / _PANEL_COLUMNS, down / _PANEL_ROWS)
     columns, rows = max(round(across / scale), 1), max(round(down / scale), 1)
@@ -112,7 +112,7 @@ class Page:
         server.gui.configure_theme(
             control_layout="fixed", control_width="large", show_logo=False, show_share_button=False
         )
-        # Shadows and reflections are dear where there is no graphics processor.
+        # Shadows and reflections are slow where there is no graphics processor.
         server.scene.configure_default_lights(cast_shadow=False)
         server.scene.configure_environment_map(hdri=None)
         server.scene.add_light_ambient("/light", intensity=2.5)
@@ -125,7 +125,7 @@ class Page:
         self._parts: dict[str, Any] = {}
 
     def show(self, told: dict[str, Any], frame: UInt8[np.ndarray, "r c"] | None) -> None:
-        """Take what the feed tells, and redraw what that changes."""
+        """Take a message of the feed, and redraw what it changes."""
         pose, spacing = told.pop("pose", None), told.pop("frame", None)
         joints = told.pop("joints", None)
         trouble = told.pop("trouble", None)
@@ -179,7 +179,7 @@ class Page:
             anchor="bottom-left",
         )
         camera = self._server.initial_camera
-        # From beyond the target, somewhat aside, so that the arm does not stand before it.
+        # Look from beyond the target and from the side, so that the arm does not hide it.
         away = np.array([*middle[:2], 0.0]) / max(float(np.hypot(*middle[:2])), 1e-9)
         aside = np.cross(away, [0.0, 0.0, 1.0])
         camera.look_at = tuple(middle + np.array([0.0, 0.0, 1.0]) - 0.9 * away)
@@ -200,7 +200,7 @@ class Page:
         self._arm = arm
 
     def _draw_poses(self) -> None:
-        """A short stroke from each tip along the image's axial axis."""
+        """Draw a short stroke from each tip along the image's axial axis."""
         told = self._told
         poses = np.reshape(told["plan"], (-1, 3, 4))
         x = np.reshape(told["image_to_probe"], (4, 4))
@@ -266,7 +266,7 @@ class Page:
         ways = np.diff(points, axis=0)
         lengths = np.linalg.norm(ways, axis=1)
         middles = (points[:-1] + 0.5 * ways) / UNIT_MM
-        # Links shorter than a mm are left out; any direction will do for them.
+        # Links shorter than a mm are not shown; any direction will do for them.
         turns = quaternion(towards(np.where(lengths[:, None] > 1.0, ways, [0.0, 0.0, 1.0])))
         if len(lengths) != len(self._lengths) or np.abs(lengths - self._lengths).max() > 0.1:
             self._lengths = lengths
@@ -296,13 +296,13 @@ class Page:
         return found
 
     def _draw_image(self, fresh: bool) -> None:
-        """The newest frame as a textured plane where the tracked probe and X put it."""
+        """Draw the newest frame as a textured plane, placed by the tracked probe and X."""
         if self._frame is None or self._pose is None:
             return
         rows, columns = self._frame.shape
         across, down = self._spacing
         x = self._pose @ self._image_to_probe()
-        # The plane's first row is where its own y is least.
+        # The plane's first row is at its smallest y.
         rotation = np.stack([x[:3, 0], x[:3, 2], -x[:3, 1]], axis=1)
         middle = x[:3, 3] + 0.5 * rows * down * x[:3, 2]
         if "image" not in self._parts:
@@ -382,7 +382,7 @@ def _estimate_words(estimate: dict[str, Any] | None) -> list[str]:
     rows = ["| running estimate | mm | SD |", "| --- | --- | --- |"]
     spread = ["?"] * 3
     if covariance is not None:
-        # The covariance is along the image's axes, the origin's place along the probe's.
+        # The covariance is in the image's axes, the origin's position in the probe's.
         rotation = transform[:3, :3]
         spread = _sds(rotation @ np.reshape(covariance, (6, 6))[:3, :3] @ rotation.T)
     for axis, value, sd in zip("xyz", transform[:3, 3], spread, strict=True):

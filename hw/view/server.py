@@ -1,8 +1,8 @@
 """The viewer's process: messages on standard input, one page on 127.0.0.1.
 
-Started by :class:`hw.view.feed.LiveView`. It prints one JSON line, its address or why there is
-none, and ends with its standard input. It has no connection to any device, and drops every message
-of a browser: cameras and panels work in the browser alone.
+Started by :class:`hw.view.feed.LiveView`. It prints one JSON line with its address, or with the
+reason why there is none, and ends when its standard input ends. It has no connection to any device,
+and drops every message from a browser: cameras and panels work in the browser alone.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def main(port: int) -> int:
     except ImportError as error:
         answer(error=f"viser cannot be imported ({error})")
         return 2
-    # viser looks for OpenCV at every picture, which takes longer than the picture.
+    # viser looks for OpenCV at every picture, which takes longer than the picture itself.
     sys.modules.setdefault("cv2", None)  # type: ignore[arg-type]
     with redirect_stdout(sys.stderr):
         try:
@@ -62,12 +62,12 @@ def ignore_browsers(server: Any) -> None:
     """Drop what browsers send.
 
     viser acts on some messages by itself: it would open a tunnel through a public server when a
-    page asks for a link to share, and tell all pages what one of them put into a panel.
+    page asks for a link to share, and copy a change in one page's panel to all pages.
 
     Raises:
-        NotImplementedError: a viser whose messages cannot be dropped; it must not be shown.
+        NotImplementedError: a version of viser whose messages cannot be dropped; do not serve it.
     """
-    # viser has no public way; a version that renamed this must not be served with an open ear.
+    # viser has no public way to do this. A version without this method must not be served.
     listener = getattr(server, "_websock_server", None)
     if not callable(getattr(listener, "_handle_incoming_message", None)):
         raise NotImplementedError(
@@ -81,7 +81,7 @@ def ignore_browsers(server: Any) -> None:
 
 
 def messages(source: RawIOBase) -> Iterator[tuple[dict[str, Any], np.ndarray | None]]:
-    """What the feed sends, until its end, also in the middle of a message cut off by a death."""
+    """The feed's messages until the pipe ends; a message that is cut off there is dropped."""
     while True:
         start = _exactly(source, 8)
         sizes = int.from_bytes(start[:4], "big"), int.from_bytes(start[4:], "big")

@@ -1,7 +1,7 @@
 """The active echo element: a PZT tube that hears every line and answers with a pulse.
 
-Its answer crosses the beam once, so that its mark in the image is as thick, across the plane, as
-what its electronics hear. It is loud: its reflections show in the image, and a person may take one
+Its answer crosses the beam once, so across the plane its mark in the image is as thick as what the
+electronics hear. It is loud: its reflections show in the image, and a person may take a reflection
 for the element. It is 2 mm wide: the place on it that hears the most moves with the direction of
 the sound (:meth:`hw.bench.world.World.shift_mm`), and its mark is wider than a point's.
 """

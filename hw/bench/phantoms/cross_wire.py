@@ -1,10 +1,10 @@
 """The cross-wire: two fishing lines of 0.2 mm that cross; nothing is wired to the electronics.
 
 Every piece of a wire that the beam's thickness touches shows in the image, at its own lateral
-position and range. In the mid-plane both wires show at the crossing, twice as bright as one;
-beside it the wires part. They are told apart only when they are further apart than the width of a
-spot: the response spreads over the thickness of the beam, and the image alone says where the
-mid-plane is.
+position and range. In the mid-plane both wires show at the crossing, twice as bright as one wire;
+beside the mid-plane they part. The image shows two wires only where they are further apart than the
+width of a spot. The response spreads over the thickness of the beam, and the image alone says where
+the mid-plane is.
 
 Where on a wire the echo comes from changes with the angle of incidence: spots of real wires scatter
 by 0.6 to 0.8 px, about 0.1 mm (jaxcal.data.segmentation.image, measured on a real recording).
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 WIRE_MM = 0.2
 """Diameter of the fishing lines (section 3.2)."""
 SCATTER_MM = 0.1
-"""SD of where the echo comes from, over directions (real recording, see the head)."""
+"""SD of the place that the echo comes from, over directions (real recording, see above)."""
 DIRECTIONS = ((0.8, 0.6, 0.0), (-0.6, 0.8, 0.0))
 """Of the wires in the base frame: level, at right angles (assumption: the paper does not tell)."""
 _HALF_MM = 30.0
 _MOST_MARKS = 49
 _FIRST_SOURCE = 10
-"""Of the wires; what stands beside them in the tank has smaller numbers."""
+"""First source number of the wires; the other targets in the tank have smaller numbers."""
 _REACH = 3.0
 """Pieces of a wire are drawn this many SDs of the two-way field to either side of the plane."""
 

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 APERTURE_MM = 0.01
 """Receiving aperture (section 3.2)."""
 LEAST_PRESSURE_MPA = 0.01
-"""Lower end of its dynamic range (section 3.2), taken for the SD of its noise (assumption)."""
+"""Lower end of its dynamic range (section 3.2), used as the SD of its noise (assumption)."""
 PRESSURE_MPA = 1.0
 """In the mid-plane at the range where the beam's peak is stated (assumption)."""
 TIP = 0.25
-"""Echo of the fibre's tip over that of a wire (assumption)."""
+"""Echo of the fibre's tip relative to that of a wire (assumption)."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Hydrophone(Sensor):
     target = "echo"
 
     def noise_counts(self, world: World) -> float:
-        """Least pressure over the pressure in the mid-plane, of the amplitude there."""
+        """The amplitude in the mid-plane times least pressure over the pressure there, counts."""
         return world.beam.peak * LEAST_PRESSURE_MPA / PRESSURE_MPA
 
     def marks(

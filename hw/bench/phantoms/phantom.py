@@ -1,6 +1,6 @@
 """What every phantom of the simulated tank has in common.
 
-A phantom is asked two things at a true pose of the probe: how loud each transmitted line is at its
+At a true pose of the probe, a phantom says two things: how loud each transmitted line is at its
 sensor (the electronics), and which marks it leaves in a B-mode frame (the image).
 
 The probe's field across the image plane is Gaussian. :class:`hw.bench.world.Beam` states the
@@ -38,15 +38,16 @@ _RANGE_OF_PEAK_MM = 20.0
 class Mark:
     """One Gaussian spot of the envelope in a B-mode frame.
 
-    Spots of one source are pieces of one thing: the strongest counts. Sources add up.
+    Spots of one source are pieces of one target: where they overlap, the strongest counts. Spots of
+    different sources add up.
 
     Attributes:
-        lateral_mm: its middle.
-        range_mm: its middle, from the element line.
+        lateral_mm: lateral position of its middle.
+        range_mm: range of its middle from the element line.
         strength: envelope at its middle; 1 is white.
-        lateral_sd_mm: SD of the envelope.
-        axial_sd_mm: SD of the envelope.
-        source: what it is a piece of.
+        lateral_sd_mm: SD of the envelope along the lateral direction.
+        axial_sd_mm: SD of the envelope along the axial direction.
+        source: number of the target that it is a piece of.
     """
 
     lateral_mm: float
@@ -75,7 +76,7 @@ class Phantom(ABC):
 
     @property
     def response_scale(self) -> float:
-        """SD of the mid-plane shift of its response over that of the paper's element."""
+        """SD of the mid-plane shift of its response, relative to that of the paper's element."""
         return 0.0
 
     def noise_counts(self, world: World) -> float:
@@ -128,7 +129,7 @@ class Sensor(Phantom):
         return np.hypot(world.beam.field_mm(range_mm), self.size_mm / np.sqrt(12.0))
 
     def loudness(self, world: World, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
-        """Amplitude of every line at it, counts; nothing behind the probe."""
+        """Amplitude of every line at it, counts; 0 behind the probe."""
         lateral, elevation, axial = world.target(pose)
         elements = world.elements
         if axial <= 0:
@@ -143,6 +144,6 @@ class Sensor(Phantom):
 def two_way(
     world: World, elevation_mm: np.ndarray | float, range_mm: np.ndarray | float
 ) -> np.ndarray | float:
-    """Echo of a passive point over that in the mid-plane: the square of the one-way field."""
+    """Echo of a passive point relative to the mid-plane: the square of the one-way field."""
     off = np.asarray(elevation_mm, float) / world.beam.field_mm(range_mm)
     return np.exp(-(off**2))
