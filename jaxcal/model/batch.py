@@ -27,7 +27,7 @@ _CROSS_SIGNS = np.array([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]])[
 """[v]x has the entries of v at these places with these signs."""
 
 RIGID_UNKNOWNS = 9
-"""X and the target; further unknowns follow them."""
+"""Unknowns of X and the target; further unknowns follow them."""
 
 
 class ElementPlanes(eqx.Module):
@@ -109,7 +109,7 @@ class ImagePlanes(eqx.Module):
         return jnp.sum(self.mask, axis=1)
 
     def padded(self) -> ImagePlanes:
-        """With unused images up to whole vectors: a loop over them leaves no rest."""
+        """With unused images added up to whole vectors, so that loops have no remainder."""
         if self.channels is not None:
             return self
         added = whole(self.mask).shape[1] - self.mask.shape[1]
@@ -123,7 +123,7 @@ class ImagePlanes(eqx.Module):
         )
 
     def repeated(self, times: int) -> ImagePlanes:
-        """The same points (no times of flight) in so many times the lanes."""
+        """The same points (no times of flight) in ``times`` times the lanes."""
         return ImagePlanes(
             jnp.tile(self.rotation, (1, times, 1)),
             jnp.tile(self.origin, (1, times, 1)),
@@ -178,7 +178,7 @@ class Iterate(eqx.Module):
         return self.extras[at.start - RIGID_UNKNOWNS : at.stop - RIGID_UNKNOWNS]
 
     def parameters(self) -> Parameters:
-        """With a leading axis; what is not free is nominal."""
+        """The parameters, with a leading axis; what is not free is nominal."""
         rotation = jnp.moveaxis(self.rotation, -1, 0)
         found = jax.vmap(Parameters.of)(rotation, self.translation.T, self.point.T)
         free = {name: self.extra(name) for name in EXTRA}
@@ -187,9 +187,9 @@ class Iterate(eqx.Module):
         )
 
     def moved(self, step: Float[Array, "p lanes"] | Vector) -> Iterate:
-        """The step taken, as :func:`jaxcal.model.parameters.retract` takes it to third order.
+        """The iterate after a step: :func:`jaxcal.model.parameters.retract` to second order.
 
-        The turn is Cayley's, which is a rotation for any step and needs no sine.
+        It turns by Cayley's rotation, which is a rotation for any step and needs no sine.
         """
         if isinstance(step, list):
             step = jnp.stack(step)
@@ -238,8 +238,8 @@ def _cayley(vector: Float[Array, "3 lanes"]) -> Float[Array, "3 3 lanes"]:
 
 def picked(array: Float[Array, "k ..."], places: np.ndarray) -> Float[Array, "*places ..."]:
     """The entries at known places of the first axis, in one operation."""
-    # Without a sign: JAX would add the size to negative ones, in the integers of whoever traced
-    # that first, whose bits may be others than ours.
+    # Unsigned, because JAX adds the size to negative indices, in the integer type of whoever traced
+    # that code first, which may have another number of bits.
     return array.at[places.astype(np.uint32)].get(mode="promise_in_bounds")
 
 
@@ -249,11 +249,11 @@ def _extra_names(blocks: Blocks) -> list[str]:
 
 
 def targets(iterate: Iterate, images: ImagePlanes) -> tuple[Vector, Matrix]:
-    """q_i, and M_i = R' R_i' by which a step of the target moves it, as planes."""
+    """q_i, and its derivative M_i = R' R_i' by the target, as planes."""
     inverse = [[iterate.rotation[k, a][:, None] for k in range(3)] for a in range(3)]
     back = [[images.rotation[3 * j + i] for j in range(3)] for i in range(3)]
     from_probe = [iterate.point[j][:, None] - images.origin[j] for j in range(3)]
-    # Not by M_i: who needs q_i alone shall not have to wait for it in memory.
+    # q_i is not computed from M_i, so that callers of q_i alone need not have M_i in memory.
     in_probe = [
         value - shift[:, None]
         for value, shift in zip(unrolled.apply(back, from_probe), iterate.translation, strict=True)
@@ -262,12 +262,12 @@ def targets(iterate: Iterate, images: ImagePlanes) -> tuple[Vector, Matrix]:
 
 
 def choose(which: Bool[Array, "*lanes"], first, second):
-    """Lane by lane one of two pytrees whose last axis counts the lanes."""
+    """For every lane, one of two pytrees whose last axis counts the lanes."""
     return jax.tree.map(lambda a, b: jnp.where(which, a, b), first, second)
 
 
 def barrier(values):
-    """Keep XLA from fusing across here: it would repeat what belongs to a lane for every image."""
+    """Keep XLA from fusing across here: it would compute a lane's values again for every image."""
     return jax.lax.optimization_barrier(values)
 
 
@@ -289,7 +289,7 @@ def _sums_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 
 def total(planes: Vector) -> Vector:
-    """Sum every plane over its images (last), all in one reduction; structural zeros are zeros.
+    """Sum every plane over its images (last), all in one reduction; structural zeros give zeros.
 
     XLA compiles the variadic reduction to one loop over the images, in which nothing that belongs
     to one image is stored.
@@ -302,6 +302,6 @@ def total(planes: Vector) -> Vector:
 
 
 def whole(planes: Float[Array, "*planes n"]) -> Float[Array, "*planes padded"]:
-    """Planes continued by their last image, up to whole vectors of 64 bytes."""
+    """Planes padded with their last image, up to whole vectors of 64 bytes."""
     extra = -planes.shape[-1] % (64 // planes.dtype.itemsize)
     return jnp.pad(planes, [(0, 0)] * (planes.ndim - 1) + [(0, extra)], mode="edge")

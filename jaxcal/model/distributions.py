@@ -35,7 +35,7 @@ class Shape:
 UNIFORM: tuple[Shape, ...] = tuple(
     Shape("uniform", math.exp(0.14 - 0.055 * k), 0.08) for k in range(5)
 )
-"""Flat between edges that are a little uncertain, in even steps of ln SD, widest first."""
+"""Flat, with several edges since these are uncertain: even steps of ln SD, widest first."""
 
 SHAPES: tuple[Shape, ...] = (
     *UNIFORM,
@@ -43,10 +43,10 @@ SHAPES: tuple[Shape, ...] = (
     Shape("gaussian", 1.0, 1 / 5),
     Shape("student", 1.10, 1 / 5),
 )
-"""The laws that are weighed: a fifth for each family, two for the uniform one.
+"""The laws that are weighed: a prior of a fifth for each family, two fifths for the uniform one.
 
-With equal shares the answer is farthest from the Bayes limit where offsets are uniform; a larger
-one of the uniform laws is paid for where they are triangular, and by few images.
+With equal priors the answer is farthest from the Bayes limit where offsets are uniform. A larger
+prior of the uniform laws costs accuracy where offsets are triangular, and where images are few.
 """
 
 
@@ -56,11 +56,11 @@ class OffsetLaw:
 
     Attributes:
         probability: of each family of ``FAMILIES``.
-        mean: of the offsets, mm, its expectation.
-        mean_sd: its standard deviation, mm.
+        mean: expectation of the offsets' mean, mm.
+        mean_sd: standard deviation of that mean, mm.
         mean_probability: that there is a mean other than zero.
-        trust: share of the data's word on the mean that counts: below 1 where the residuals have
-            heavy tails, or are alike in successive images.
+        trust: share of the data's information about the mean that is used: below 1 where the
+            residuals have heavy tails, or are correlated between successive images.
         own_probability: that the images' own covariances describe the errors better than common
             SDs do; 0 where there are none.
         weighed: the laws were weighed; otherwise the plain Gaussian answer stands.

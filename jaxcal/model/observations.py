@@ -7,14 +7,14 @@ paper's Eq. 5):
     p(y) = (x, y, sqrt(r^2 - y^2)).
 
 An *observation* turns q, and further unknowns such as the pixels' scale, into residual planes, in
-groups (*components*) that share one SD. Nothing else in the package knows residuals: derivatives
-are derived from these functions (:mod:`jaxcal.model.derivatives`), sums over the images are made
-by :mod:`jaxcal.solvers.normal_equations`, and every method is a loop on those. A further
-observation is one class here and a line where :mod:`jaxcal.solvers.methods` chooses.
+groups (*components*) that share one SD. Residuals are defined nowhere else in the package: their
+derivatives follow from these functions (:mod:`jaxcal.model.derivatives`),
+:mod:`jaxcal.solvers.normal_equations` sums over the images, and every method is a loop on those
+sums. A new observation needs one class here and one line in :mod:`jaxcal.solvers.methods`.
 
 - :class:`Points`: errors of lateral position and range, and the offset itself (y_i = q_y), each
   with its SD; :class:`OwnCovariances`: the same with a covariance for every image.
-- :class:`ChannelDistances`: what each element should have heard less what it heard (Eqs. 5 and 6).
+- :class:`ChannelDistances`: predicted less measured distance of each element (Eqs. 5 and 6).
 - :class:`InPlane`: q - p(0), equally weighted: the conventional Eq. 7.
 - :class:`HeldOffsets`: q - p(y) with given y: a half-round of the alternation.
 - :class:`BoundedOffsets`: q - p(y) with |y| <= bound unknown: what the alternation descends.
@@ -49,7 +49,7 @@ from jaxcal.model.unknowns import (
 from jaxcal.model.unrolled import Vector, add
 
 TRACKER_STEPS = 4
-"""Newton steps to a tracker's elevational error: the range bends so little that two suffice."""
+"""Newton steps for a tracker's elevational error; the range curves so little that two would do."""
 
 
 class Further(eqx.Module):
@@ -63,7 +63,7 @@ class Further(eqx.Module):
 
     @classmethod
     def of(cls, iterate: Iterate, tangent: Vector) -> Further:
-        """The iterate's, moved by tangents."""
+        """The iterate's further unknowns, moved by a step."""
         values = {}
         for name in EXTRA:
             components = iterate.extra(name)
@@ -91,7 +91,7 @@ class Component(eqx.Module):
 
     Attributes:
         errors: planes (lanes, n), or (lanes, n, elements), mm.
-        present: 1 where there is a residual, beside the images' mask; None for everywhere.
+        present: 1 where there is a residual, in addition to the images' mask; None: everywhere.
     """
 
     errors: Vector
@@ -99,7 +99,7 @@ class Component(eqx.Module):
 
 
 class Observation(eqx.Module):
-    """The interface.
+    """What every observation provides.
 
     Attributes:
         sigma: SD of each component, mm; ones where residuals are not in SDs.
@@ -122,15 +122,15 @@ class Observation(eqx.Module):
         return eqx.tree_at(lambda observation: observation.sigma, self, sigma)
 
     def largest_weight(self) -> Float[Array, " lanes"]:
-        """How much a mm of error can be in a whitened residual, 1/mm."""
+        """Largest change of a whitened residual for a mm of error, 1/mm."""
         return 1 / jnp.min(self.sigma, axis=0)
 
     def padded(self) -> Observation:
-        """For images that are padded."""
+        """The same for images that are padded."""
         return self
 
     def in_units(self, sigma: Float[Array, "components lanes"]) -> Observation:
-        """The residuals whose SDs are about to be tuned, at their present values."""
+        """The same for tuning, with residuals in the units that the present SDs set."""
         del sigma
         return self
 
@@ -140,11 +140,11 @@ class Observation(eqx.Module):
         now: Float[Array, "components lanes"],
         squares: Float[Array, "components lanes"],
     ) -> Float[Array, " lanes"] | float:
-        """How much half the cost can have grown because residuals are in the units of other SDs.
+        """How much half the cost can have grown only because the residuals' units changed.
 
         Args:
-            before: the SDs in whose units they were.
-            now: those in whose units they are.
+            before: the SDs that gave the residuals their units before.
+            now: the SDs that give them their units now.
             squares: of the whitened residuals, summed over the images.
         """
         del before, now, squares
@@ -176,11 +176,11 @@ class OwnCovariances(Observation):
     """Points whose errors have a covariance of their own in every image.
 
     Attributes:
-        sigma: SDs of lateral position, range and offset, mm; with ``tied``, of the measurements'
-            common factor and of the offset.
+        sigma: SDs of lateral position, range and offset, mm; with ``tied``, the measurements'
+            common factor and the SD of the offset.
         shape: lateral variance, covariance, range variance of every image; without ``tied`` their
             mean variances are 1, with it they are in mm^2 up to one factor.
-        ratio: range SD over lateral SD, as far as whitening needs it.
+        ratio: range SD over lateral SD, for whitening.
         tied: whether one factor is the SD of both measurements (static).
     """
 
@@ -199,7 +199,7 @@ class OwnCovariances(Observation):
         lateral, distance = errors(q, further, images)
         first, mixed, second = self._factor()
         one = lateral / first
-        # A mm of lateral error is ratio mm of range error.
+        # A mm of lateral error counts as ``ratio`` mm of range error.
         other = (distance - self.ratio[:, None] * mixed * one) / second
         if self.tied:
             return [Component([one, other]), Component([q[1]])]
@@ -225,7 +225,7 @@ class OwnCovariances(Observation):
     ) -> Float[Array, " lanes"] | float:
         if self.tied:
             return 0.0
-        # The second residual has a part of the first, at most so much of it; then Cauchy-Schwarz.
+        # The second residual contains at most this share of the first; then Cauchy-Schwarz.
         _, mixed, second = self._factor()
         part = jnp.max(jnp.abs(mixed) / second, axis=1)
         change = jnp.abs(jnp.log(now[1] / now[0]) - jnp.log(before[1] / before[0]))
@@ -267,8 +267,9 @@ class ChannelDistances(Observation):
     """Distance of the target from every element that heard it, and the elevational offset.
 
     With the sound speed s times the nominal one, and a delay worth d mm, an element at distance
-    |q - e| measures |q - e| / s + d. On a curvilinear probe an image's distances say something of
-    |y_i|, through Eq. 6, and nothing of its sign; poses that share one X and one target settle it.
+    |q - e| measures |q - e| / s + d. On a curvilinear probe an image's distances give information
+    about |y_i|, through Eq. 6, but not about the sign of y_i. The poses, which share one X and one
+    target, determine the sign.
 
     Attributes:
         sigma: SDs of an element's distance and of the offset, mm.
@@ -377,7 +378,7 @@ class BoundedOffsets(LocalUnknown):
 
     Attributes:
         sigma: one.
-        bound: m_i, mm; above 0.95 of an image's range it is taken as that.
+        bound: m_i, mm; at most 0.95 of the image's range is used.
     """
 
     sigma: Float[Array, "1 lanes"]
@@ -396,8 +397,8 @@ class BoundedOffsets(LocalUnknown):
     def local(self, q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Array]:
         """The y_i of the point closest to q_i on the arc |y| <= bound (section 2.4), mm.
 
-        On the circle the distance grows with the angle away from q_i, so the closest point of the
-        arc is the closest point of the circle where that lies on the arc, else its nearer end.
+        On the circle the distance grows with the angle away from q_i. So the closest point of the
+        arc is the circle's closest point if that lies on the arc, else the arc's nearer end.
         """
         limit, distance = self.limit(further, images), further.points(images)[1]
         square = q[1] * q[1] + q[2] * q[2]
@@ -420,8 +421,9 @@ class TrackedPoints(LocalUnknown):
     """Points whose tracker has isotropic errors of SD tau beside those of the measurements.
 
     The tracker's error moves the target along all three axes. Along the lateral axis and the range
-    it adds to the SDs; along the elevational axis it tells q_y from the offset y_i = q_y + tau u_i,
-    with u_i ~ N(0, 1) the unknown of the image, which stays well scaled as tau goes to 0.
+    it adds to the SDs. Along the elevational axis it makes the offset differ from q_y:
+    y_i = q_y + tau u_i. The image's own unknown is u_i ~ N(0, 1), which stays well scaled as tau
+    goes to 0.
 
     Attributes:
         sigma: SDs of lateral position, range and offset, mm.
@@ -436,7 +438,7 @@ class TrackedPoints(LocalUnknown):
     def components_at(
         self, q: Vector, local: Array, further: Further, images: ImagePlanes
     ) -> list[Component]:
-        # Each residual in units of its component's SD, which do not hold the tracker's share.
+        # Scaled so that division by the component's SD, which leaves out the tracker, whitens each.
         tau = self.tracker_sd[:, None]
         offset = q[1] + tau * local
         lateral, distance = errors([q[0], offset, q[2]], further, images)
@@ -467,7 +469,7 @@ class TrackedPoints(LocalUnknown):
         def slope(local: Array) -> Array:
             return jax.jvp(halved, (local,), (jnp.ones_like(local),))[1]
 
-        # Where the offset alone would put it: the range moves that by little.
+        # Start where the offset alone would put it; the range changes that only a little.
         tau, across = self.tracker_sd[:, None], self.sigma[2][:, None]
         local = -tau * q[1] / (across * across + tau * tau)
         for _ in range(TRACKER_STEPS):
@@ -493,11 +495,11 @@ class MediumPrior(eqx.Module):
     blocks: Blocks = eqx.field(static=True)
 
     def repeated(self, times: int) -> MediumPrior:
-        """The same in so many times the lanes."""
+        """The same in ``times`` times the lanes."""
         return MediumPrior(jnp.tile(self.sd, (1, times)), self.blocks)
 
     def deviations(self, iterate: Iterate) -> list[tuple[int, Array, Array]]:
-        """Place, deviation from nominal and its precision, of every further unknown there is."""
+        """Index, deviation from nominal and precision of sound speed and delay, where free."""
         found = []
         for name, sd in zip(MEDIUM, self.sd, strict=True):
             value = iterate.extra(name)

@@ -1,9 +1,9 @@
 """The unknowns other than the offsets, in named blocks, and how a step moves them.
 
 X steps on its manifold by the right perturbation X Exp([v, omega]), so v (mm) and omega (rad) are
-along and about the image's own axes (lateral, elevational, axial). How further unknowns step is
-said in :mod:`jaxcal.model.unknowns`, whose names can be had here too. A solver is told which blocks
-are free; the rest stay fixed.
+along and about the image's own axes (lateral, elevational, axial). Steps of further unknowns are
+described in :mod:`jaxcal.model.unknowns`, whose names can be imported from here, too. A solver is
+told which blocks are free; the rest stay fixed.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ class Parameters(eqx.Module):
         return cls(rotation, translation, point, scale, one, jnp.zeros_like(one))
 
     def further(self, name: str) -> Float[Array, "*batch k"]:
-        """A further unknown's components, last."""
+        """A further unknown, its components on the last axis."""
         value = getattr(self, TABLE[name].field)
         return value if value.ndim == self.point.ndim else value[..., None]
 
     def with_further(self, values: dict[str, Float[Array, "*batch k"]]) -> Parameters:
-        """With other values of further unknowns, components last."""
+        """The same with other values of further unknowns, components on the last axis."""
         fields = {
             TABLE[name].field: value
             if getattr(self, TABLE[name].field).ndim == value.ndim
@@ -85,9 +85,9 @@ def retract(parameters: Parameters, tangent: Float[Array, " p"], blocks: Blocks)
             return tangent[block_slice(blocks, name)]
         return jnp.zeros(TABLE[name].size, tangent.dtype)
 
-    # R Exp([v, w]) with Exp's translation taken as v itself: the same first order as SE(3)'s
-    # exponential, defined for any step, and cheaper. Rotations are kept as matrices: the residuals
-    # need nothing else, and a product of quaternions to get there doubles what XLA must compile.
+    # R Exp([v, w]) with v itself as the translation: equal to SE(3)'s exponential to first order,
+    # defined for any step, and cheaper. Rotations are kept as matrices: the residuals need nothing
+    # else, and products of quaternions would double what XLA must compile.
     turn = rotation_from_vector(part("rotation"))
     moved = replace(
         parameters,

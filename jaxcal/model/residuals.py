@@ -1,8 +1,8 @@
 """The residuals of one problem, as arrays with one row an image.
 
-They are those of :mod:`jaxcal.model.observations`, laid out as public arrays are: for those who
-bring a solver of their own, and for the few places that look at one problem at a time. Images left
-out give zeros.
+They are the residuals of :mod:`jaxcal.model.observations` in the layout of public arrays, for
+callers with a solver of their own and for the few places that take one problem at a time. Images
+left out give zeros.
 """
 
 from __future__ import annotations

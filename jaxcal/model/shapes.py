@@ -8,13 +8,14 @@ All are of Pearson's family
 e = 0 is uniform, e = 2 a bell with edges (near the triangular law), e -> infinity Gaussian, and
 type VII with e = 5/2 is Student's t with four degrees of freedom.
 
-What inference needs of a shape is one function, :func:`tilted`: mass, mean and variance of the
-shape times a Gaussian, cut to an interval. It is one quadrature over where both factors are, on
-equidistant nodes, with Gregory's corrections where the product may end abruptly: there the Gaussian
-needs three exponentials, each node's following from the last one's by two products, and 1 -+
-(u/a)^2 two sums. It is the inner loop of the whole estimator, and so it is written that XLA makes a
-single vectorised loop of it: one reduction over the interval's two halves, each summed from its end
-towards the middle, with so few nodes that the compiler unrolls them.
+Inference needs only one function of a shape, :func:`tilted`: mass, mean and variance of the shape
+times a Gaussian, cut to an interval. It is one quadrature over the interval where both factors are
+not negligible, on equidistant nodes, with Gregory's corrections where the product may end abruptly.
+On such nodes the Gaussian needs only three exponentials: two products give its value from that at
+the node before, and two sums give 1 -+ (u/a)^2. This is the inner loop of the whole estimator, so
+it is written for XLA to make a single vectorised loop of it: one reduction over the interval's two
+halves, each summed from its end towards the middle, with so few nodes that the compiler unrolls
+them.
 
 Reference for the corrections: Hildebrand, Introduction to Numerical Analysis, 5.9.
 """
@@ -33,13 +34,13 @@ from jaxcal.model.distributions import Family
 from jaxcal.runtime.precision import in_standard_promotion
 
 NODES = 8
-"""In each half of the interval."""
+"""Nodes in each half of the interval."""
 
 REACH = 4.5
 """The Gaussian factor is taken to end this many SDs from its mean."""
 
 END_WEIGHTS = np.array([475.0, 1902.0, 1104.0, 1586.0, 1413.0]) / 1440.0
-"""Gregory's weights of the first and the last nodes; those between have weight one."""
+"""Gregory's weights of the first and the last nodes; nodes between have weight one."""
 
 EDGE: dict[Family, float] = {"uniform": 3**0.5, "bell": 7**0.5, "gaussian": 1e3, "student": 1e3}
 """Where each family's density of unit SD ends; the last two have no end that matters."""
@@ -95,7 +96,7 @@ def tilted(
     log_height = 0.0
     edge = EDGE[family] * sd
     if family == "gaussian":
-        # A Gaussian times a Gaussian is a Gaussian, and a cut one is flat times a Gaussian.
+        # A Gaussian times a Gaussian is a Gaussian; if it is cut, it is a flat shape times one.
         both = variance + sd**2
         log_height = -0.5 * (jnp.log(2 * np.pi * both) + mean**2 / both)
         mean, variance = mean * sd**2 / both, variance * sd**2 / both
@@ -106,8 +107,8 @@ def tilted(
         log_height = jnp.log(HEIGHT[family] / sd)
     low = -edge if lower is None else jnp.clip(lower, -edge, edge)
     high = edge if upper is None else jnp.clip(upper, -edge, edge)
-    # From the point of the interval nearest to the Gaussian's mean the Gaussian falls by
-    # exp(-REACH^2 / 2) within ``fall``, be the mean inside or far out.
+    # Within ``fall`` of the interval's point nearest to its mean, the Gaussian falls by a factor
+    # exp(-REACH^2 / 2), whether the mean is inside the interval or far out.
     nearest = jnp.clip(mean, low, high)
     out = mean - nearest
     reach = REACH**2 * variance
@@ -127,14 +128,14 @@ def tilted(
 
 
 Window = tuple[Array, Array, Array, Array, Array, Array]
-"""Middle, step, nearest point to the Gaussian's mean, how far out that is, precision, 1 / SD."""
+"""Middle, step, point nearest to the Gaussian's mean, mean less that point, precision, 1 / SD."""
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _sums(family: Family, abrupt: bool, window: Window) -> tuple[Array, Array, Array]:
     """Sums over the nodes of (1, x, x^2) times shape times Gaussian, relative to ``nearest``.
 
-    x is a node's place about the middle, in steps. Weights at the ends only where they are abrupt.
+    x is a node's place about the middle, in steps. The ends have weights only if they are abrupt.
     """
     middle, step, nearest, out, precision, scale = window
     ndim = step.ndim

@@ -6,4 +6,4 @@ LARGEST_ELEVATION = 0.95
 """Offsets are kept below this fraction of the range: at 1 the circle's tangent turns axial."""
 
 MINIMUM_SELF_TUNING = 8
-"""With fewer used images the residuals cannot tell three SDs apart from nine unknowns."""
+"""With fewer used images the residuals cannot determine three SDs besides nine unknowns."""

@@ -1,9 +1,9 @@
 """The unknowns other than the offsets: a table with a row for each. Needs no JAX.
 
-X and the target are those of Eq. 7. *Further* unknowns stand between what was measured and mm:
-:func:`measured` and :func:`heard` say how, in arithmetic that numpy, JAX and complex numbers share.
-Whatever else has to know of an unknown (steps, derivatives, names, words) reads it from here: a
-further unknown is a row, its line in :func:`measured`, and its field in
+X and the target are those of Eq. 7. *Further* unknowns convert what was measured to mm:
+:func:`measured` and :func:`heard` define how, in arithmetic that numpy, JAX and complex numbers
+share. All other code that depends on an unknown (steps, derivatives, names, words) reads this
+table. A new unknown needs a row, a line in :func:`measured`, and a field in
 :class:`jaxcal.model.parameters.Parameters`.
 """
 
@@ -34,7 +34,7 @@ class Unknown:
         lever: whether a step has to be multiplied by the lever arm to be mm at the target.
         in_image: whether the place of an image point depends on it.
         words: one component in words, with a place for the axis.
-        axes: what goes there.
+        axes: the words for that place.
         oblique: several components in words; empty for a single one.
     """
 
@@ -54,7 +54,7 @@ class Unknown:
 
     @property
     def field(self) -> str:
-        """Its name where a name in Python is wanted."""
+        """Its name as a name in Python."""
         return self.name.replace("-", "_")
 
     @property
@@ -121,7 +121,7 @@ TABLE = {
         Unknown("delay", ("delay_mm",), "add", lever=False, in_image=True, words="delay{}"),
     )
 }
-"""In the order of a step's components."""
+"""The rows are in the order of a step's components."""
 
 RIGID: Blocks = ("translation", "rotation", "point")
 """The unknowns of Eq. 7: X and the target."""
@@ -130,17 +130,17 @@ EXTRA: Blocks = tuple(name for name in TABLE if name not in RIGID)
 """Further unknowns: what a caller may ask for beside X and the target."""
 
 TINY = 1e-20
-"""A complex step: its square is nothing beside a number of double precision."""
+"""A complex step: its square is negligible in double precision."""
 
 MEDIUM = ("sound-speed", "delay")
-"""Those between a time of flight and a distance, of which something is known before."""
+"""The unknowns between a time of flight and a distance; both have a prior."""
 
 
 def measured(lateral: Any, axial: Any, face: Any, values: Values) -> tuple[Any, Any]:
     """Lateral position and range of a point, mm, after the further unknowns.
 
-    Pixels are multiplied by their scale. A range is a time of flight in disguise and follows
-    sound speed and delay, while lateral positions come from where the elements are.
+    Pixels are multiplied by their scale. A range is really a time of flight, so it depends on sound
+    speed and delay; lateral positions come from the positions of the elements.
 
     Args:
         lateral: at the nominal scale, mm.
@@ -191,12 +191,12 @@ def further_derivatives(
 ) -> list[tuple[int, list[np.ndarray]]]:
     """Derivatives of real functions by the steps of the free further unknowns, in numpy.
 
-    By a complex step, which has no rounding error worth the name (Squire and Trapp, SIAM Review 40,
-    1998): the function must be analytic, as :func:`measured` and :func:`heard` are.
+    They come from a complex step, which has practically no rounding error (Squire and Trapp, SIAM
+    Review 40, 1998). The function must be analytic, as :func:`measured` and :func:`heard` are.
 
     Args:
         function: of the values; a sequence of arrays.
-        values: where; what is missing is nominal.
+        values: where the derivatives are wanted; what is missing is nominal.
         blocks: the free unknowns.
 
     Returns:

@@ -2,7 +2,7 @@
 
 A matrix is a list of rows of arrays that all have the same shape, one entry for every problem
 ("lane"). Written out, a 9x9 Cholesky solve is one straight stretch of code that XLA turns into a
-few vectorised loops over the lanes: 0.07 us a lane, where the same by loops over rows and columns
+few vectorised loops over the lanes. It takes 0.07 us a lane; with loops over rows and columns it
 takes 2 us. Structural zeros are the number 0 and cost nothing.
 
 A matrix that is not positive definite gives NaN or Inf, in its own lane only.
@@ -127,10 +127,10 @@ def upper(matrix: Matrix) -> Vector:
 
 
 def rotation(vector: Vector) -> Matrix:
-    """Cayley's rotation of a vector w (rad): Exp(w) up to third order, and always a rotation.
+    """Cayley's rotation of a vector w (rad): Exp(w) to second order, and a rotation for any w.
 
-    I + (2 / (1 + |h|^2)) ([h]x + [h]x^2), h = w / 2: the turn is by 2 atan(|w| / 2). One division,
-    where sine and cosine would be scalar calls for every lane and entry.
+    I + (2 / (1 + |h|^2)) ([h]x + [h]x^2), h = w / 2: the turn is by 2 atan(|w| / 2). It takes one
+    division; sine and cosine would be scalar calls for every lane and entry.
     """
     half = [0.5 * value for value in vector]
     factor = 2 / (1 + dot(half, half))

@@ -3,15 +3,15 @@
 From the conventional X and c, each round of the alternation (1) moves every p_i to the point of its
 arc |y| <= m_i that is closest to where X and c put the target, and (2) improves X and c with those
 points held, by a few Gauss-Newton steps of Eq. 7. It stops when a round moves X by less than a
-tolerance. Like every ICP it converges linearly, and where the arcs can slide along themselves
-(rotation about the lateral axis) at a rate near 1.
+tolerance. Like every ICP it converges linearly. Its rate is near 1 where the arcs can slide along
+themselves (rotation about the lateral axis).
 
-The joint solve takes the same objective to full precision, every offset eliminated in its image. It
-can have more than one local minimum along the direction that lateral position and range do not see,
-rotation about the lateral axis: the offsets slide along their arcs together until one set of bounds
-or another stops them. So it begins at three starts, the conventional one and that turned either way
-by what the bounds allow, each after a few rounds of the alternation, which descend gently; the
-lowest of the three is the answer.
+The joint solve minimises the same objective to full precision, with every offset eliminated in its
+image. The objective can have several local minima along the direction that lateral position and
+range do not determine, rotation about the lateral axis: the offsets slide along their arcs together
+until one set of bounds or another stops them. So the joint solve has three starts: the conventional
+fit, and that fit turned either way by as much as the bounds allow. Each start first takes a few
+rounds of the alternation, which descend gently; the lowest of the three minima is the answer.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ def alternate(
         start: the unknowns to start from.
         observation: the bounds.
         images: the data.
-        tolerance_rad: stop when a round turns X by less than this and
-        tolerance_mm: moves its origin by less than this.
+        tolerance_rad: stop when a round turns X by less than this, and
+        tolerance_mm: moves X's origin by less than this.
         max_rounds: most rounds.
         inner_steps: Gauss-Newton steps on X and c in every round.
         trace: how many values of the objective to keep.
@@ -166,7 +166,7 @@ def bounded(
         trace: how many values of the objective to keep (of the joint steps from the best start).
 
     Returns:
-        The fits; their iterations are those from all starts and their warm-up.
+        The fits; their iterations count those from all starts, and the warm-up.
     """
     still = [jnp.zeros_like(images.mask[:, :1])] * start.extras.shape[0]
     further = Further.of(start, still)
@@ -179,7 +179,7 @@ def bounded(
         step[3] = by * turn
         return start.moved(step)
 
-    # All three at once, as so many lanes more.
+    # All three starts at once, as three times as many lanes.
     starts = jax.tree.map(
         lambda *leaves: jnp.concatenate(leaves, axis=-1), *(turned(by) for by in TURNS)
     )
@@ -201,8 +201,8 @@ def bounded(
         for k in range(len(TURNS))
     ]
     costs = jnp.stack([jnp.where(jnp.isfinite(fit.cost), fit.cost, jnp.inf) for fit in parts])
-    # Where minimisers form an interval all starts reach the same cost, and the conventional one's
-    # is the answer to keep: another must be lower by more than rounding.
+    # Where minimisers form an interval, all starts reach the same cost. The conventional start's
+    # answer is kept then: another one must be lower by more than rounding.
     eps = jnp.finfo(costs.dtype).eps
     size = jnp.max(jnp.abs(images.origin), axis=(0, 2))
     floor = images.used * (100 * eps * size) ** 2

@@ -1,37 +1,38 @@
 """The estimator behind ``--method joint``: nothing to choose, and it says what it found.
 
-What the plain self-tuned fit (:mod:`jaxcal.solvers.reml`) takes for granted is asked of the
-data here: that the offsets are Gaussian, that their mean is zero, and that errors are alike in all
-images. All of it matters because lateral position and range leave rotation about the lateral axis
-open, and only the offsets' law closes it: the edges of bounded offsets tell X twice as well as
-their SD does, heavy tails must not pull it, and a mean that is denied bends it. Nothing is switched
-on or off: every alternative has a weight that moves continuously with the data, and what they
-disagree about is in the covariance.
+The plain self-tuned fit (:mod:`jaxcal.solvers.reml`) assumes that the offsets are Gaussian, that
+their mean is zero, and that errors are alike in all images. Here the data are asked whether that is
+so. It matters because lateral position and range do not determine rotation about the lateral axis;
+only the offsets' law does. The edges of bounded offsets determine X twice as well as their SD does,
+heavy tails must not pull it, and a mean that is ignored biases it. Nothing is switched on or off:
+every alternative has a weight that moves continuously with the data, and the covariance includes
+their disagreement.
 
 1. *REML* tunes the SDs of lateral position, range and offset, with Gaussian offsets of mean zero.
-2. *Noise models* (:mod:`jaxcal.solvers.evidence`). The same with a belief about the offsets' mean
-   (:mod:`jaxcal.solvers.offset_mean`); and where the images came with covariances of their own,
-   once more with those, up to one factor.
-3. *Laws* (:mod:`jaxcal.model.shapes`). Linearised there, everything is Gaussian but the offsets'
-   law. Expectation propagation gives X under each law of ``SHAPES`` and how probable the data are
-   under it: uniform, a bell with edges, Gaussian, Student's t4; the uniform one with five SDs
-   about REML's, which knows the edges to a few per cent only, and it is they that matter. Where an
-   image came with a bound on its offset, its law is cut there. Under each law the belief about the
-   mean is formed anew, since edges say of it what a Gaussian does not see.
+2. *Noise models* (:mod:`jaxcal.solvers.evidence`). The same model with a belief about the offsets'
+   mean (:mod:`jaxcal.solvers.offset_mean`). Where the images have covariances of their own, a
+   second model uses these, up to one common factor.
+3. *Laws* (:mod:`jaxcal.model.shapes`). Linearised at a noise model's answer, everything is Gaussian
+   except the offsets' law. Expectation propagation gives X under each law of ``SHAPES``, and how
+   probable the data are under it. The laws are uniform, a bell with edges, Gaussian, and Student's
+   t4. The uniform law has five SDs about REML's, because its edges are what matters, and REML's SD
+   gives them only to a few per cent. Where an image has a bound on its offset, the law is cut at
+   the bound. The belief about the mean is formed anew under each law, since edges give information
+   about the mean that a Gaussian does not.
 4. *Median*. X, target and mean are the geometric median of the answers under all laws and noise
-   models, weighted by their probability; the covariance is their average, with their spread about
-   that answer added. A law under which the propagation does not settle (its edges exclude some
-   image) loses its weight.
+   models, weighted by their probability. The covariance is the average of theirs, plus the spread
+   of the answers about the median. A law under which the propagation does not settle (its edges
+   exclude some image) loses its weight.
 
-Each step is a fixed number of array operations, so gradients go through (REML's by the implicit
-function theorem). With fewer than eight used images, with given SDs, or where no law settles, the
-plain Gaussian answer stands, and the result says so.
+Steps 2 to 4 are a fixed number of array operations, so gradients go through them; REML's gradients
+come from the implicit function theorem. With fewer than eight used images, with given SDs, or where
+no law settles, the plain Gaussian answer stands, and the result says so.
 
 What to expect. The answer is nearly the posterior median over these laws, so it is better than
 conventional calibration on average, whatever the offsets' law; in a single trial it can be worse.
 Small samples do not tell the laws apart: there the answer stays near the Gaussian one.
-The cut at an image's bound is taken at the mean that step 2 found, and intervals take the tuned
-SDs for known, but for Student's factor (:mod:`jaxcal.diagnostics.intervals`).
+The cut at an image's bound uses the mean that step 2 found. Intervals treat the tuned SDs as known,
+except for Student's factor (:mod:`jaxcal.diagnostics.intervals`).
 """
 
 from __future__ import annotations
@@ -56,22 +57,22 @@ from jaxcal.solvers.offset_mean import MEAN_SD, believed, gained
 LARGEST_CHANGE = 0.4
 """A law counts as long as the last sweep moved no unknown by more than about this many SDs.
 
-Its evidence is stationary in the sites, and so nearly right before its mean is; the laws that do
-not settle at all are the ones to leave out."""
+The evidence is stationary in the sites, so it is nearly right before the mean is. Only laws that do
+not settle at all need to be left out."""
 
 MEDIAN_STEPS = 12
 """Weiszfeld's steps to the median."""
 
 
 class Averaged(eqx.Module):
-    """The estimate over all laws, lanes last but for the law.
+    """The estimate over all laws; lanes last, except in the law.
 
     Attributes:
         place: the unknowns.
         sigma: tuned SDs of the more probable noise model, mm.
         covariance: of the unknowns' tangent.
         elevation_sd: of every image's offset, mm; NaN for images left out.
-        law: what was found out, with a leading axis.
+        law: what was found out about the offsets, with a leading axis.
         own_covariances: where the images' own covariances are the more probable ones.
     """
 
@@ -102,7 +103,7 @@ def average_over_laws(
         shapes: the laws to weigh.
         variances: the images' own: lateral variance, covariance, range variance, mm^2; or None.
         bound: on the offsets, mm, which cuts the laws; or None.
-        medium: what is known of sound speed and delay besides.
+        medium: what is known of sound speed and delay beforehand.
     """
     used, unknowns = images.used, place.unknowns
     common = tune(place, observation, images, medium)
@@ -129,8 +130,8 @@ def average_over_laws(
     variance = unrolled.dot(direction, unrolled.apply(across, direction))
 
     enough = (used >= MINIMUM_SELF_TUNING) & answers.settled & jnp.all(jnp.isfinite(step), axis=0)
-    # From the linearisation the answer may be a hundredth of a radian away: turn by Exp, and not
-    # by the solvers' rotation, which is another one in the eighth digit.
+    # The answer may be a hundredth of a radian from the linearisation: turn by Exp, since the
+    # solvers' rotation (Cayley's) then differs from it in the eighth digit.
     moved = jax.vmap(lambda here, by: retract(here, by, place.blocks))(
         model.place.parameters(), step[:unknowns].T
     )
@@ -168,7 +169,7 @@ class Linearised(eqx.Module):
     Attributes:
         place: X, c and the further unknowns.
         mean: b, mm.
-        trust: share of what the data say of b that counts.
+        trust: share of the data's information about b that is used.
         sigma: SDs of the components of the common noise model, mm.
         information: of the unknowns in the measurements, upper triangle.
         gradient: of half the measurements' cost.
@@ -189,10 +190,10 @@ class Linearised(eqx.Module):
     def of(cls, tuned: NoiseModel, sigma: Array) -> Linearised:
         """From a tuned noise model."""
         sums = tuned.sums
-        # The offsets are left to their law.
+        # The offsets get no weight here; their law follows later.
         weight = jnp.concatenate([1 / tuned.sigma[:-1] ** 2, jnp.zeros_like(tuned.sigma[:1])])
         measured = sums.weighed(weight)
-        # h_i has -1 at v_y, so the sum of h_i is what v_y has in common with the others.
+        # h_i is -1 at v_y, so v_y's row of the sum of h_i h_i' is minus the sum of h_i.
         along = row_of(sums.matrix[-1], V_Y)
         return cls(
             tuned.place,
@@ -206,22 +207,22 @@ class Linearised(eqx.Module):
         )
 
     def offsets_metric(self) -> Float[Array, "q q lanes"]:
-        """Sum of h_i h_i' with b, which moves the offsets as v_y does."""
+        """Sum of h_i h_i' with b as the last unknown; b moves the offsets as v_y does."""
         matrix = stacked(self.squares)
         matrix = jnp.concatenate([matrix, matrix[V_Y][None]])
         return jnp.concatenate([matrix, matrix[:, V_Y][:, None]], axis=1)
 
 
 class Answers(eqx.Module):
-    """What every law says of the unknowns and of b, about one place; lanes last.
+    """The belief about the unknowns and b under every law, relative to one place; lanes last.
 
     Attributes:
         mean: of all unknowns and b.
         covariance: of these.
         weight: probability.
-        mean_probability: that there is a mean, under each.
-        settled: the propagation settles under one of them, as it always does under the Gaussian
-            law, unless that is cut.
+        mean_probability: probability under each law that there is a mean.
+        settled: the propagation settles under at least one law; under a Gaussian law that is not
+            cut it always does.
     """
 
     mean: Float[Array, "q k lanes"]
@@ -231,17 +232,17 @@ class Answers(eqx.Module):
     settled: Bool[Array, " lanes"]
 
     def shared(self, share: Float[Array, " lanes"]) -> Answers:
-        """With a share of their weight."""
+        """The answers with a share of their weight."""
         return eqx.tree_at(lambda each: each.weight, self, share * self.weight)
 
     def seen_from(self, step: Float[Array, "p lanes"], mean: Float[Array, " lanes"]) -> Answers:
-        """About another place, from which this one is a small step away."""
+        """The answers relative to another place; ``step`` leads from that one to this one."""
         step = jnp.concatenate([step, mean[None]])
         return eqx.tree_at(lambda each: each.mean, self, self.mean + step[:, None])
 
     @classmethod
     def joined(cls, first: Answers, second: Answers) -> Answers:
-        """Of two noise models."""
+        """The answers of two noise models together."""
 
         def both(name: str) -> Array:
             return jnp.concatenate([getattr(first, name), getattr(second, name)], axis=-2)
@@ -298,7 +299,7 @@ def with_own_covariances(
     variances: Float[Array, "3 lanes n"],
     medium: MediumPrior | None,
 ) -> tuple[Linearised, Float[Array, " lanes"]]:
-    """The noise model of the images' own covariances, and by how much more probable it is (ln)."""
+    """The noise model of the images' own covariances, and ln of how much more probable it is."""
     used, sigma = images.used, common.sigma
     shape, mean = unit_shape(variances, images)
     ratio = jnp.sqrt(mean / jnp.mean(mean, axis=0))
@@ -310,7 +311,7 @@ def with_own_covariances(
     tied = OwnCovariances(jnp.stack([scale, sigma[2]]), shape, jnp.ones_like(scale), tied=True)
     tuned = tune(common.place, tied, images, medium)
     determinant = shape[0] * shape[2] - shape[1] ** 2
-    # One more SD that is tuned costs half the log of the number of images.
+    # The common model tunes one SD more; that costs half the log of the number of images.
     penalty = 0.5 * jnp.sum(images.mask * jnp.log(determinant), axis=1) - 0.5 * jnp.log(used)
     more = tuned.log_evidence(tied.count(images)) - penalty
     more = more - common.log_evidence(observation.count(images))
@@ -323,11 +324,11 @@ def median(
 ) -> tuple[Float[Array, "q lanes"], Float[Array, "q q lanes"]]:
     """The answers' geometric median, and the covariance about it.
 
-    Mean RP is the average of a distance, not of its square, and so the answer is where the expected
-    distance is least: between laws that disagree that is nearer to the more probable one than their
-    mean is. Distance is that between the images' offsets, all together; that of x from an answer
-    N(m, C), averaged over the answer, is near (|x - m|^2 + 2/pi tr(C H))^1/2, which is exact at
-    x = m for one unknown, and far away.
+    Mean RP is the average of a distance, not of its square, so the answer is where the expected
+    distance is least. Where laws disagree, that is nearer to the more probable one than their mean
+    is. The distance is that of the images' offsets, all together. The expected distance of x from
+    an answer N(m, C) is near (|x - m|^2 + 2/pi tr(C H))^1/2; for one unknown this is exact at x = m
+    and far from it.
 
     Args:
         answers: whose.
@@ -359,9 +360,9 @@ def weights(
     change: Float[Array, "k ..."],
     prior: Float[Array, " k"],
 ) -> tuple[Array, Array]:
-    """The laws' probabilities, and which of them are numbers at all.
+    """The laws' probabilities, and which laws have finite results.
 
-    A law that is still on the move loses weight, the faster the more.
+    A law whose belief still moves loses weight: the more it moves, the more weight.
     """
     good = jnp.isfinite(log_evidence) & jnp.isfinite(change)
     prior = prior.reshape(-1, *(1,) * (log_evidence.ndim - 1))

@@ -1,27 +1,27 @@
 """Which images agree with each other: gross outliers found before the solve, and left out of it.
 
-A wrong echo, a wrong click or a slipped mount moves an image by tens of millimetres, and a third of
-the images may be such. Least squares on all of them is then far from the truth and its residuals do
-not tell the good from the bad, so the good ones are found by consensus:
+A wrong echo, a wrong click or a slipped mount moves an image by tens of millimetres, and this may
+happen to a third of the images. Least squares on all of them is then far from the truth and its
+residuals do not tell good images from bad ones, so the good ones are found by consensus:
 
 1. *Proposals.* Hundreds of small subsets of the images, the same ones every time, are solved in
    closed form (a linear system of 12 unknowns each, from per-image moments that are formed once),
    and each is scored on all images by sum_k ln s_k, with s_k the median magnitude of error
-   component k. Up to half of the images may be anything without spoiling a median.
+   component k. Up to half of the images may be arbitrary without spoiling a median.
 2. *Concentration.* The best of them take Gauss-Newton steps on their own subset, then on the 60 %
    of the images that fit them best, chosen anew each time.
 3. *Rejection with re-inclusion.* SDs from the median of the images in use, a step on them, and a
    test of *every* image, so that one left out too early returns.
-4. *Evidence.* What came of every finalist is weighed, and against them all that no image is wrong.
-   Of an image in use each error is Gaussian with the SDs of those in use; an image is wrong with
-   probability ``WRONG``, and then each of its errors is as predicted or may be anything within
-   ``ANYTHING_MM``. Half of a dozen images can be fitted very well with one component of the error
-   next to nothing, which medians take for agreement; and where nothing is gravely wrong, nothing
-   is left out, so that the robust answer is exactly the plain one.
+4. *Evidence.* The finalists' results compete with each other and with the fit to all images. An
+   image in use has Gaussian errors with the SDs of the images in use. An image is wrong with
+   probability ``WRONG``; each of its errors is then as predicted or anywhere in a range of
+   ``ANYTHING_MM``. Medians alone would not do: six of a dozen images can be fitted with almost no
+   error in one component, which looks like agreement. And where no image is gravely wrong none is
+   left out, so that the robust answer is exactly the plain one.
 
 The errors are those of the joint method (lateral position, range, elevational offset), each
-with its own SD. An image stands out where a component is more than ``CUT`` SDs off, its own
-leverage allowed for. All of it is a fixed number of array operations.
+with its own SD. An image stands out where a component, corrected for the image's leverage, is more
+than ``CUT`` SDs off. The whole search is a fixed number of array operations.
 
 References: Rousseeuw and Van Driessen 2006 (FAST-LTS: proposals and concentration); Fischler and
 Bolles 1981 (RANSAC); Huber and Ronchetti 2009 (hard rejection as reweighted least squares).
@@ -51,12 +51,12 @@ CONCENTRATION = 0.6
 CONCENTRATION_STEPS = 5
 REJECTION_STEPS = 6
 WRONG = 0.01
-"""How probable it is, to begin with, that an image is wrong."""
+"""Prior probability that an image is wrong."""
 ANYTHING_MM = 60.0
-"""Width of the range in which its errors may lie then. Larger ones are found all the same; a wider
-range lets a third of the images that slipped together pass for noise."""
+"""Width of the range in which a wrong image's errors may lie. Larger errors are found as well; with
+a wider range, a third of the images that slipped together would pass for noise."""
 HALVINGS = 24
-"""Of the bracket about a median: a ten-millionth of the largest value."""
+"""How often the bracket about a median is halved: to a ten-millionth of the largest value."""
 
 Errors = Callable[[Parameters, Problem], Float[Array, "n 3"]]
 Propose = Callable[[Problem, Float[Array, "k n"]], Parameters]
@@ -64,11 +64,11 @@ Propose = Callable[[Problem, Float[Array, "k n"]], Parameters]
 
 @dataclass(frozen=True)
 class ConsensusModel:
-    """What agreeing means; static.
+    """What it means that images agree; static.
 
     Attributes:
         blocks: the free unknowns.
-        errors: each image's three errors, mm, at given unknowns; the mask is ignored.
+        errors: each image's three errors, mm, at given unknowns; zeros for images masked out.
         propose: from (k, n) subset weights to k proposals (leading axis).
         isotropic: the three components share one SD.
         subset: images in a proposal's subset.
@@ -86,9 +86,9 @@ class Consensus(eqx.Module):
 
     Attributes:
         keep: (n,) 1 for used images that agree, 0 otherwise.
-        parameters: the unknowns that they agree on, to a few Gauss-Newton steps.
+        parameters: the unknowns fitted to these images by a few Gauss-Newton steps.
         sigma: (3,) SDs of the components over the images that agree, mm.
-        departure: (n, 3) errors in SDs, leverage allowed for; 0 where not used at all.
+        departure: (n, 3) errors in SDs, corrected for leverage; 0 for images masked out.
     """
 
     keep: Float[Array, " n"]
@@ -98,19 +98,19 @@ class Consensus(eqx.Module):
 
 
 def rigid_model(blocks: Blocks) -> ConsensusModel:
-    """The calibration's own: X and the target (and pixel scales where they are free)."""
+    """The calibration's own model: X and the target (and pixel scales where they are free)."""
     kept = tuple(name for name in blocks if name in ("translation", "rotation", "point", "scale"))
     return ConsensusModel(kept, steadied_errors, partial(linear_proposals, scaled="scale" in kept))
 
 
 def steadied_errors(parameters: Parameters, problem: Problem) -> Float[Array, "n 3"]:
-    """Lateral, range and elevational errors, the lateral ones less weighty where it is deep, mm.
+    """Lateral, range and elevational errors, mm, with the lateral ones of deep images scaled down.
 
-    An array's lateral error grows with the range: below the median range it is divided by what the
-    range exceeds that by, or deep images would stand out for no other reason.
+    An array's lateral error grows with the range. Beyond the median range it is divided by the
+    range over the median; otherwise images would stand out only because they are deep.
     """
     errors = measurement_residual(parameters, problem)
-    # The unknowns' own effect on the range is beside the point, and it must not be differentiated.
+    # The range at nominal unknowns is close enough for this, and must not be differentiated.
     distance = measured_points(nominal(problem), problem)[:, 1]
     beyond = jnp.maximum(distance / quantile(distance, problem.mask, 0.5), 1.0)
     return errors.at[:, 0].divide(jnp.where(problem.mask > 0, beyond, 1.0))
@@ -135,7 +135,7 @@ def find_consensus(problem: Problem, model: ConsensusModel) -> Consensus:
 
     count = finalists(used.shape[0])
     _, best = jax.lax.top_k(-jax.vmap(score)(proposed)[1:], count)
-    # The first lane is that all images are good: it is heard beside those that leave some out.
+    # The first lane assumes that all images are good; it competes with those that leave some out.
     chosen = jnp.concatenate([jnp.zeros(1, best.dtype), best + 1])
     everything = jnp.arange(count + 1) == 0
     finished: Consensus
@@ -151,7 +151,7 @@ def find_consensus(problem: Problem, model: ConsensusModel) -> Consensus:
 
 
 def finalists(images: int) -> int:
-    """How many proposals to go on with: with few images a clean subset need not look the best."""
+    """How many proposals to go on with: with few images, a clean subset need not score best."""
     return int(np.clip(400 // images, 6, 24))
 
 
@@ -162,9 +162,9 @@ def _finish(
     problem: Problem,
     model: ConsensusModel,
 ) -> tuple[Consensus, Float[Array, ""]]:
-    """Fit the subset, concentrate, reject; and weigh what came of it (the less, the better)."""
+    """Fit the subset, concentrate and reject; return the result and its cost (lower is better)."""
     used = problem.mask
-    # A consensus of less than half is none.
+    # Less than half of the images are no consensus.
     fewest = jnp.maximum(0.5 * jnp.sum(used), FEWEST_IMAGES)
 
     def one_round(index: Array, state: tuple[Parameters, Array]) -> tuple[Parameters, Array]:
@@ -178,7 +178,7 @@ def _finish(
         nearest = used * (squared <= quantile(squared, used, CONCENTRATION))
         departure = _studentised(errors, leverage, sigma, basis)
         fits = used * (1 - stands_out(departure, basis))
-        # With fewer than that, go on with the images that stand out least.
+        # If fewer than ``fewest`` fit, go on with the images that stand out least.
         largest = jnp.max(jnp.abs(departure), axis=1)
         least = used * (largest <= quantile(largest, used, fewest / jnp.sum(used)))
         fits = jnp.where(jnp.sum(fits) >= fewest, fits, least)
@@ -194,8 +194,8 @@ def _finish(
     leverage = _leverage(jacobian, _robust(errors, keep, model), keep)
     sigma, freedom = _efficient(errors, leverage, keep, model)
     departure = _studentised(errors, leverage, sigma, keep)
-    # Of an image in use, what is left of three Gaussian errors once the unknowns are fitted; of one
-    # that is left out, each of its errors is as predicted or may be anything.
+    # For images in use: the cost of three Gaussian errors each, less the freedom of the fitted
+    # unknowns. For an image left out: each of its errors is as predicted or may be anything.
     cost = jnp.sum(freedom * jnp.log(jnp.sqrt(2 * jnp.pi * jnp.e) * sigma))
     predicted = 0.5 * departure**2 + jnp.log(jnp.sqrt(2 * jnp.pi * (1 + leverage)) * sigma)
     wrong = jnp.sum(jnp.minimum(predicted, jnp.log(ANYTHING_MM)), axis=1) - jnp.log(WRONG)
@@ -208,7 +208,7 @@ def _finish(
 def departures(
     parameters: Parameters, problem: Problem, keep: Float[Array, " n"], model: ConsensusModel
 ) -> tuple[Float[Array, 3], Float[Array, "n 3"]]:
-    """How far every image is from what the kept ones say.
+    """How far every image departs from the fit to the kept ones.
 
     Args:
         parameters: fitted to the kept images.
@@ -218,7 +218,7 @@ def departures(
 
     Returns:
         sigma: (3,) robust SDs of the kept images' errors, mm.
-        departure: (n, 3) errors in SDs, leverage allowed for; 0 for images masked out.
+        departure: (n, 3) errors in SDs, corrected for leverage; 0 for images masked out.
     """
     errors, jacobian = _linearise(parameters, problem, model)
     sigma = _robust(errors, keep, model)
@@ -228,9 +228,9 @@ def departures(
 def stands_out(departure: Float[Array, "n 3"], keep: Float[Array, " n"]) -> Float[Array, " n"]:
     """1 where an image departs by more than the images in use can explain.
 
-    A median of a dozen images is itself uncertain: with few of them the limit is wider. To come
-    back an image has to fit better than that: what few images predict is uncertain, too, and an
-    outlier that is let in by such a wide limit draws the others after it.
+    A median of a dozen images is itself uncertain, so the limit is wider with few images. It is
+    not wider for an image that was left out: the prediction from few images is uncertain, too, and
+    an outlier that returned through the wide limit would bring the others back with it.
     """
     few = jnp.sqrt(jnp.maximum(FEW_IMAGES / jnp.maximum(jnp.sum(keep), 1.0), 1.0))
     limit = CUT * jnp.where(keep > 0, few, 1.0)
@@ -252,9 +252,9 @@ def _efficient(
     weight: Float[Array, " n"],
     model: ConsensusModel,
 ) -> tuple[Float[Array, 3], Float[Array, 3]]:
-    """SDs of the components from the mean squares of the weighted images, mm, and their freedom.
+    """SDs of the components from mean squares of the weighted images, mm; degrees of freedom.
 
-    A median of few images is itself uncertain; without gross errors these are twice as certain.
+    A median of few images is itself uncertain; without gross errors these SDs are twice as certain.
     """
     squares = jnp.sum(jnp.where(weight[:, None] > 0, errors**2, 0.0), axis=0)
     freedom = jnp.sum(weight[:, None] * (1 - leverage), axis=0)
@@ -270,8 +270,8 @@ def _studentised(
     sigma: Float[Array, 3],
     weight: Float[Array, " n"],
 ) -> Float[Array, "n 3"]:
-    """Errors in SDs, leverage allowed for."""
-    # An image in use pulls the fit towards itself; one that is not, is predicted by the fit.
+    """Errors in SDs, corrected for leverage."""
+    # An image in use pulls the fit towards itself; an image left out is predicted by the fit.
     inside = errors / jnp.sqrt(jnp.maximum(1 - leverage, 0.05))
     outside = errors / jnp.sqrt(1 + leverage)
     return jnp.where(weight[:, None] > 0, inside, outside) / sigma
@@ -342,7 +342,7 @@ def quantile(
     values = jnp.where(jnp.isnan(values), jnp.inf, values)
     wanted = share * jnp.sum(weight)
     finite = jnp.where((weight > 0) & jnp.isfinite(values), values, 0.0)
-    # Geometric steps first: the answer may be many orders below the largest.
+    # Geometric steps first: the answer may be orders of magnitude below the largest value.
     high = jnp.max(finite)
 
     def halve(_: Array, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -356,5 +356,5 @@ def quantile(
 
 
 def _with_floor(sigma: Float[Array, 3]) -> Float[Array, 3]:
-    """No SD below a fiftieth of the largest: what departs by less is no gross error."""
+    """No SD below a fiftieth of the largest: smaller departures are no gross errors."""
     return jnp.maximum(sigma, jnp.maximum(RELATIVE_FLOOR * jnp.max(sigma), 1e-6))

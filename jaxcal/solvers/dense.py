@@ -1,11 +1,11 @@
 """Small dense linear algebra in plain array operations, for matrices of a dozen rows in a batch.
 
 XLA hands ``jnp.linalg`` to LAPACK on the CPU, one small call a lane. Up to jaxlib 0.11.0 it spreads
-the lanes of a batch over its thread pool while a thread of that same pool waits for them; two such
-calls that do not depend on each other can then wait for each other for ever: with two cores that
-stopped whole studies (docs/developers/upstream/xla-cpu-lapack-deadlock.md). These loops of array
-operations cannot; they also vectorise over the batch and run unchanged on a GPU, where LAPACK is
-not.
+the lanes of a batch over its thread pool while a thread of that same pool waits for them. Two such
+calls that do not depend on each other can then wait for each other for ever, which stopped whole
+studies on two cores (docs/developers/upstream/xla-cpu-lapack-deadlock.md). These loops of array
+operations cannot deadlock; they also vectorise over the batch and run unchanged on a GPU, which has
+no LAPACK.
 
 References: Golub and Van Loan, Matrix Computations, 4th ed., 3.4, 5.2, 8.6; Brent and Luk 1985.
 """
@@ -39,7 +39,7 @@ def solve_positive(matrix: Float[Array, "p p"], rhs: Float[Array, "p k"]) -> Flo
         here = (rows == k).astype(work.dtype)
         column, row = _column(work, k), here @ work
         pivot = column @ here
-        # Elimination needs no pivoting here, and a pivot that is not positive tells all.
+        # No pivoting is needed; a pivot <= 0 shows that the matrix is not positive definite.
         row = row / jnp.where(pivot > 0, pivot, jnp.nan)
         return work - (column - here)[:, None] * row
 
@@ -52,8 +52,8 @@ def solve_symmetric(
 ) -> Float[Array, " p"]:
     """Solve a positive semidefinite system, scaled by the given diagonal of its unreduced matrix.
 
-    A singular matrix (an unobservable direction) is met by a ridge at the rounding level of the
-    scaled system, so the step there stays finite and small, and the other directions are exact.
+    A ridge at the rounding level of the scaled system allows for singular matrices: the step along
+    an unobservable direction stays finite and small, and the other directions are exact.
     """
     scale, scaled = _ridged(matrix, diagonal)
     return scale * solve_positive(scaled, (scale * vector)[:, None])[:, 0]
@@ -79,8 +79,8 @@ def _ridged(
 def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
     """Inverse of a square matrix by Gauss-Jordan elimination with partial pivoting.
 
-    An inverse and not a solution, so that a product with it stays linear in the right-hand side for
-    reverse-mode differentiation.
+    It returns the inverse and not a solution, so that a product with it stays linear in the
+    right-hand side for reverse-mode differentiation.
 
     Args:
         matrix: scaled to rows of order one.
@@ -107,7 +107,7 @@ def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
 
 
 def triangularise(matrix: Float[Array, "m q"], columns: int) -> Float[Array, "r q"]:
-    """Householder's R of the first columns, applied to all (so Q'b for columns that follow).
+    """Householder QR of the first columns, applied to all: R, and Q'b for those that follow.
 
     Args:
         matrix: [A, b], m >= columns.
@@ -171,8 +171,8 @@ def _singular_values_batch(size: int, batched: list, matrix: Array) -> tuple:
 def _side_by_side(matrix: Array) -> SingularValues:
     """The decompositions of (m, p, lanes) matrices, lanes last throughout.
 
-    Columns meet in pairs as in a round-robin tournament: the first player stays, the others move
-    round by one seat, and after one round less than there are seats all are where they were.
+    Columns meet in pairs as in a round-robin tournament: the first player stays and the others move
+    round by one seat. With s seats, all players are back in their seats after s - 1 rounds.
     """
     height, columns, lanes = matrix.shape
     even = columns + columns % 2
@@ -218,7 +218,7 @@ def _side_by_side(matrix: Array) -> SingularValues:
         jnp.zeros((), jnp.int32),
     )
     first, second, _, _ = jax.lax.while_loop(unfinished, sweep, start)
-    # After whole sweeps every column is where it was, so the padding is the last one again.
+    # After whole sweeps every column is back in its place, so the padding is the last one again.
     together = jnp.stack([first, second], axis=2).reshape(together.shape)[:, :columns]
     values = jnp.sqrt(jnp.sum(together[:height] ** 2, axis=0))
     ascending = jnp.argsort(values, axis=0)
@@ -263,8 +263,8 @@ def inverse_lanes_last(
 ) -> tuple[Float[Array, "p p lanes"], Float[Array, " lanes"]]:
     """:func:`inverse_positive` of many matrices, lanes last.
 
-    Written out scalar by scalar (:mod:`jaxcal.model.unrolled`) ten rows are no faster and take a
-    hundred times longer to compile.
+    For ten rows, code written out scalar by scalar (:mod:`jaxcal.model.unrolled`) is no faster and
+    takes a hundred times longer to compile.
     """
     size = matrix.shape[0]
     rows = jnp.arange(size)
@@ -293,8 +293,8 @@ def solve_lanes_last(
 ) -> Float[Array, "p lanes"]:
     """Solve positive definite systems, lanes last; NaN where one is not, in its own lane only.
 
-    Gauss-Jordan in a loop: 0.27 us a lane for nine unknowns where Cholesky written out scalar by
-    scalar (:mod:`jaxcal.model.unrolled`) takes 0.11, in a sixth of the time to compile.
+    Gauss-Jordan in a loop takes 0.27 us a lane for nine unknowns. Cholesky written out scalar by
+    scalar (:mod:`jaxcal.model.unrolled`) takes 0.11 us, but six times as long to compile.
     """
     rows = jnp.arange(matrix.shape[0])[:, None, None]
 

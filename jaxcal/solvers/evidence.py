@@ -1,12 +1,12 @@
-"""Gaussian noise models with a mean of the offsets, tuned, and how probable they make the data.
+"""Gaussian noise models with a mean of the offsets: how they are tuned, and their evidence.
 
-What a noise model takes for granted is asked of the data before any law of the offsets is: whether
-the offsets have a mean other than zero (:mod:`jaxcal.solvers.offset_mean`), and whether the
-covariances that came with the measurements describe their errors better than common SDs do. Own
-covariances fix the ratios of all measurements' SDs, so one factor is tuned for them, and one SD for
-the offsets; common SDs are tuned separately. Each is tuned by a few rounds of Gauss-Newton with
-Helmert's updates (:mod:`jaxcal.solvers.reml`) from the self-tuned fit, the mean at what is believed
-of it in every one, and judged by its Laplace evidence
+Two questions are put to the data before the laws of the offsets are compared: whether the offsets
+have a mean other than zero (:mod:`jaxcal.solvers.offset_mean`), and whether the covariances that
+came with the measurements describe their errors better than common SDs do. Own covariances fix the
+ratios of all measurements' SDs, so one factor is tuned for them, and one SD for the offsets; common
+SDs are tuned separately. Each noise model is tuned from the self-tuned fit by a few rounds of
+Gauss-Newton with Helmert's updates (:mod:`jaxcal.solvers.reml`). Every round sets the mean to its
+expectation under the belief about it. The model is judged by its Laplace evidence
 
     ln Z = -1/2 sum r' W r - 1/2 sum (q_y - b)^2 / s_y^2 + 1/2 sum ln |W| - n ln s_y
            + 1/2 ln tau - 1/2 tau b^2 - 1/2 ln |H|,
@@ -14,7 +14,7 @@ of it in every one, and judged by its Laplace evidence
 W_i the information of image i's measurements, H the curvature with respect to all unknowns, and
 b ~ N(0, 1/tau) with 1/tau = (2 s_y)^2.
 
-Everything happens on the sums that one pass over the images leaves for each component
+Everything is computed from the sums that one pass over the images forms for each component
 (:func:`jaxcal.solvers.normal_equations.component_sums`). A mean b needs no further sum: it moves
 q_iy - b as v_y does, so its row of N_y is that of v_y, and
 
@@ -43,13 +43,13 @@ from jaxcal.solvers.offset_mean import MEAN_SD, believed, gained, influences, tr
 from jaxcal.solvers.reml import helmert, least_sigma
 
 ROUNDS = 2
-"""Linearisations."""
+"""Number of linearisations."""
 
 UPDATES = 2
-"""Updates of the SDs on each of them."""
+"""Updates of the SDs in each linearisation."""
 
 V_Y = 1
-"""The unknown that moves every q_iy by -1."""
+"""Index of v_y, the unknown that moves every q_iy by -1."""
 
 
 class NoiseModel(eqx.Module):
@@ -59,8 +59,8 @@ class NoiseModel(eqx.Module):
         place: X, c and the further unknowns.
         mean: b, mm.
         sigma: SD of each component, mm.
-        sums: of the images there.
-        trust: what share of what the data say of b counts.
+        sums: of the images at ``place``.
+        trust: share of the data's information about b that is used.
     """
 
     place: Iterate
@@ -86,8 +86,8 @@ class System(eqx.Module):
 
     Attributes:
         sums: of the images.
-        border: b's row, of the offsets alone.
-        gradient: of every component, b's last.
+        border: b's row of the offsets' matrix; the other components do not depend on b.
+        gradient: of every component, b's entry last.
         squares: rss_k.
     """
 
@@ -98,7 +98,7 @@ class System(eqx.Module):
 
     @classmethod
     def of(cls, sums: ComponentSums, mean: Array) -> System:
-        """From what a pass left."""
+        """From the sums of a pass."""
         only = np.eye(len(sums.squares))[-1][:, None]
         along = row_of(sums.matrix[-1], V_Y)
         squares = mean * (2 * sums.gradient[-1, V_Y] + mean * along[V_Y])
@@ -109,7 +109,7 @@ class System(eqx.Module):
         return barrier(cls(sums, border, gradient, sums.squares + only * squares))
 
     def solved(self, sigma: Array, mean: Array) -> tuple[Array, Array, Array]:
-        """Inverse and step with given SDs where there is a mean, and ln Z but for the SDs."""
+        """Inverse and step with given SDs if there is a mean, and ln Z without the SDs' terms."""
         weight, precision = 1 / sigma**2, (MEAN_SD * sigma[-1]) ** -2.0
         normal = self.sums.weighed(weight)
         unknowns = normal.gradient.shape[0]
@@ -127,7 +127,7 @@ class System(eqx.Module):
         whole = jnp.concatenate([whole, border[None]])
         inverse, log_determinant = dense.inverse_lanes_last(whole)
         step = -dense.product_lanes_last(inverse, gradient)
-        # At the minimum, which is a small step away.
+        # The cost at the minimum, which is a small step away.
         cost = cost + jnp.sum(gradient * step, axis=0)
         return inverse, step, 0.5 * (jnp.log(precision) - cost - log_determinant)
 
@@ -161,12 +161,12 @@ def tune(
         place: to start from.
         observation: with the SDs to start from, mm.
         images: the data.
-        medium: what is known of sound speed and delay besides.
-        rounds: passes before the last.
+        medium: what is known of sound speed and delay beforehand.
+        rounds: passes before the last one.
     """
     count, start = observation.count(images), observation.sigma
-    # One floor for all rounds: one that followed each model's own offset SD would count a gain in
-    # that SD three times in the evidence, where data are exact.
+    # One floor for all rounds: where data are exact, a floor that followed a model's own offset SD
+    # would count a gain in that SD three times in the evidence.
     floor = least_sigma(start)
 
     def sums_at(place: Iterate) -> ComponentSums:
@@ -185,7 +185,7 @@ def tune(
             inverse, step, _ = barrier(system.solved(sigma, mean))
             variance = inverse[-1, -1]
             belief = believed(mean + step[-1], variance, sigma[-1], trust)
-            # The others follow b.
+            # The other unknowns follow b.
             along = inverse[:, -1] / variance
             step = step + along * (belief.mean - mean - step[-1])
             inverse = inverse + along[:, None] * along * (belief.variance - variance)
@@ -199,7 +199,7 @@ def tune(
         sigma, step = jax.lax.fori_loop(0, UPDATES, update, (sigma, none))
         return barrier((place.moved(step[:-1]), mean + step[-1], sigma, trust))
 
-    # The sums are made in one place, for rounds and result: they are half of the program.
+    # The code of the sums appears once, for the rounds and the result: it is half of the program.
     def one_round(index: Array, state: tuple) -> tuple:
         place, mean, sigma, trust, _ = state
         sums = sums_at(place)

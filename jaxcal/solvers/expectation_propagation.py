@@ -1,10 +1,10 @@
-"""Expectation propagation: unknowns that are Gaussian but for what the offsets' law says of them.
+"""Expectation propagation: unknowns that are Gaussian except for the law of the offsets.
 
-Linearised, the unknowns x (X, target, the offsets' mean and whatever else) have the Gaussian
-likelihood exp(-x' L x / 2 + e' x) of the measurements, and image i's offset is u_i = o_i + h_i' x.
-Its law p(u_i) is not Gaussian; expectation propagation (EP) puts a Gaussian *site* in its place,
-exp(nu_i u - tau_i u^2 / 2), which reproduces mean and variance of u_i under all the other sites
-times the true law:
+Linearised, the measurements' likelihood of the unknowns x (X, target, the offsets' mean and all
+others) is the Gaussian exp(-x' L x / 2 + e' x), and image i's offset is u_i = o_i + h_i' x. The law
+p(u_i) is not Gaussian. Expectation propagation (EP) replaces it by a Gaussian *site*,
+exp(nu_i u - tau_i u^2 / 2), chosen so that u_i keeps the mean and variance that it has under all
+the other sites times the true law:
 
     C = (L + sum tau_i h_i h_i')^-1,  m = C (e + sum (nu_i - tau_i o_i) h_i)       the belief now
     v_i = h_i' C h_i,  1/w_i = 1/v_i - tau_i,                                      without site i
@@ -13,22 +13,22 @@ times the true law:
     tau_i <- 1/variance - 1/w_i,  nu_i <- mean/variance - c_i/w_i                  all i, damped
 
 It starts from the Gaussian law of the same SD, for which it is exact, or from the sites of the same
-law with another SD, and a fixed number of sweeps is taken, so it can be differentiated like any
-other array code. With it comes the evidence, the probability of the data under that law, by which
-laws are compared.
+law with another SD. The number of sweeps is fixed, so it can be differentiated like any other array
+code. It also gives the evidence, the probability of the data under that law, by which laws are
+compared.
 
 Six unknowns suffice. An image's offset q_iy - b is, to first order in the step (v, w, d) of X and
 the target,
 
     u_i = o_i - s + q_iz w_x - q_ix w_z + (row y of M_i) d,      s = v_y + b,
 
-so the sites never see v_x, v_z, w_y nor the further unknowns, and see v_y and the mean b only
-together. All these are eliminated once, exactly, from what the measurements say (:func:`marginal`);
-the sweeps run on z = (s, w_x, w_z, d), 21 + 6 sums over the images and a 6x6 inverse each; and what
-comes out under each law is carried back to all unknowns (:class:`Lift`).
+so the sites do not depend on v_x, v_z, w_y or the further unknowns, and on v_y and the mean b only
+by their sum s. All other unknowns are eliminated once, exactly, from the measurements' likelihood
+(:func:`marginal`). The sweeps run on z = (s, w_x, w_z, d); each takes 21 + 6 sums over the images
+and a 6x6 inverse. The result under each law is carried back to all unknowns (:class:`Lift`).
 
-All laws share a program, in which only the moments' quadratures differ, and the laws of one family
-begin each with the sites of the one before.
+All laws share one program, in which only the quadratures of the moments differ. Within a family,
+each law starts with the sites of the law before it.
 
 Reference: Minka 2001; Rasmussen and Williams 2006, section 3.6.
 """
@@ -52,15 +52,15 @@ from jaxcal.solvers import dense
 from jaxcal.solvers.normal_equations import pairs, square_places, stacked
 
 SWEEPS = 3
-"""Sweeps under each law, from the sites of the one before; a family's first gets twice as many."""
+"""Sweeps under each law, from the sites of the law before; a family's first gets twice as many."""
 
 DAMPING = 0.8
 
 LEAST_ROOM = 1e-3
-"""Least 1 - tau_i v_i: with less, what is left without site i is no Gaussian any more."""
+"""Least 1 - tau_i v_i: at zero, the belief without site i is no Gaussian any more."""
 
 SEEN = (1, 3, 5, 6, 7, 8)
-"""v_y (as s), w_x, w_z and d: what the sites see."""
+"""v_y (as s), w_x, w_z and d: the unknowns on which the sites depend."""
 
 ELEVATION = SEEN[0]
 
@@ -68,7 +68,7 @@ TRIANGLE = pairs(len(SEEN))
 
 
 def hidden(unknowns: int) -> list[int]:
-    """What the sites do not see: v_x, v_z, w_y, the further unknowns, and b, which is the last."""
+    """The unknowns that z leaves out: v_x, v_z, w_y, the further unknowns and, last of all, b."""
     return [0, 2, 4, *range(RIGID_UNKNOWNS, unknowns + 1)]
 
 
@@ -80,7 +80,7 @@ class Sites(eqx.Module):
         offset: o_i, mm.
         used: 1 for used images.
         lower: least u_i that is allowed, mm, or None.
-        upper: largest.
+        upper: largest u_i that is allowed, mm, or None.
     """
 
     direction: Vector
@@ -168,7 +168,7 @@ def marginal(
     precision: Float[Array, " lanes"],
     mean: Float[Array, " lanes"],
 ) -> Marginal:
-    """Eliminate what the sites do not see.
+    """Eliminate the unknowns that z leaves out (:func:`hidden`).
 
     Args:
         information: of X, the target and the further unknowns in the measurements, upper triangle.
@@ -177,7 +177,7 @@ def marginal(
         mean: b here, mm.
     """
     unknowns = gradient.shape[0]
-    # b moves q_iy against s - v_y: in (s, b), b takes v_y's information along.
+    # With v_y = s - b, b has the rows and columns of v_y, with the opposite sign.
     order = np.array([*hidden(unknowns), *SEEN])
     is_mean = order == unknowns
     from_flat = np.where(is_mean, ELEVATION, order)
@@ -231,7 +231,7 @@ def propagate(
 ) -> Posterior:
     """Belief and evidence under every law, one law after the other.
 
-    Side by side they would not stay in the second-level cache.
+    All laws side by side would not fit in the second-level cache.
 
     Args:
         known: what the measurements say.
@@ -239,16 +239,16 @@ def propagate(
         squares: sum of h_i h_i' over the used images.
         pull: sum of h_i o_i.
         families: of the laws.
-        sd: their SDs, mm; of a family with edges, the widest first.
-        sweeps: how many under each law; the first of a family gets twice as many, since the others
-            begin with the sites of the one before.
+        sd: their SDs, mm; in a family with edges, the widest first.
+        sweeps: how many under each law; the first of a family gets twice as many, since each of the
+            others starts with the sites of the law before it.
     """
     names = tuple(dict.fromkeys(families))
     turns: list[tuple[int, int, bool]] = []
     last = []
     for which, name in enumerate(names):
         at = [k for k, family in enumerate(families) if family == name]
-        # A Gaussian law's first sites are right, but where it is cut.
+        # The first sites of a Gaussian law are exact, unless it is cut.
         ahead = [] if name == "gaussian" and sites.lower is None else [(which, at[0], True)]
         turns += ahead
         for k in at:
@@ -263,7 +263,7 @@ def propagate(
         state = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, state)
         return under.swept(family, sd, state, sweeps)
 
-    # The first turn is fresh.
+    # The first turn starts afresh, so it does not use this state.
     shape = jax.eval_shape(under.gaussian, sd[0])
     start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
     _, found = jax.lax.scan(one, start, (family, sd[law], fresh))
@@ -298,7 +298,7 @@ class _Found(eqx.Module):
 def seen(
     squares: Float[Array, "triangle lanes"], pull: Float[Array, "p lanes"]
 ) -> tuple[Float[Array, "6 6 lanes"], Float[Array, "6 lanes"]]:
-    """Of sums of h_i h_i' (upper triangle) and h_i o_i over all unknowns, those for z."""
+    """The parts for z of sums of h_i h_i' (upper triangle) and h_i o_i over all unknowns."""
     at = np.array(SEEN)
     return picked(squares, square_places(pull.shape[0])[np.ix_(at, at)]), picked(pull, at)
 
@@ -331,7 +331,7 @@ class _Laws(eqx.Module):
     def swept(
         self, family: Array, sd: Float[Array, " lanes"], state: _State, sweeps: int
     ) -> tuple[_State, _Found]:
-        """So many sweeps under a law; the evidence is that before the last one."""
+        """Take ``sweeps`` sweeps under a law; the evidence is that before the last one."""
 
         def sweep(_: Array, carry: tuple) -> tuple:
             before, _ = carry
@@ -350,7 +350,7 @@ class _Laws(eqx.Module):
     def sweep(
         self, family: Array, sd: Float[Array, " lanes"], state: _State
     ) -> tuple[_State, Array, Array]:
-        """All sites once; the log evidence before, and where a site left nothing for the others."""
+        """Update all sites once; the log evidence before, and where a site dominates the others."""
         h, offset, used = self.sites.direction, self.sites.offset, self.sites.used
         tau, nu, belief = state.tau, state.nu, state.belief
         entry = belief.covariance[..., None]
@@ -396,8 +396,8 @@ class _Laws(eqx.Module):
 
 
 def refreshed(found: Moments, centre: Array, without: Array) -> tuple[Array, Array]:
-    """The sites (tau, nu) that reproduce moments found, beside the Gaussian without them."""
+    """The sites (tau, nu) that reproduce the given moments, times the Gaussian without them."""
     tau = 1 / found.variance - 1 / without
-    # Beyond a heavy tail's bend a site is negative; a little of that is all that EP bears.
+    # Far out in a heavy tail a site's tau is negative; EP tolerates only a little of that.
     tau = jnp.maximum(tau, -0.2 / without)
     return tau, (tau + 1 / without) * found.mean - centre / without

@@ -1,11 +1,12 @@
-"""Our Levenberg-Marquardt for other people's problems, behind optimistix's interface.
+"""The package's Levenberg-Marquardt for any least-squares problem, behind optimistix's interface.
 
-The loop is that of :mod:`jaxcal.solvers.levenberg_marquardt`, which wants normal equations and a
-step; here they come from residuals of any shape by forward tangents, one for each unknown.
-:class:`LevenbergMarquardt` goes into ``optimistix.least_squares`` like any solver of optimistix,
-which then also has the derivatives of the solution. :func:`arrow_least_squares` is for problems
-with shared unknowns and one local unknown a row: one tangent of ones reads the derivatives by all
-local unknowns, since row i sees its own only, and they are eliminated by scalar divisions,
+The loop is that of :mod:`jaxcal.solvers.levenberg_marquardt`, which needs normal equations and a
+step; here the normal equations come from residuals of any shape by one forward tangent for each
+unknown. :class:`LevenbergMarquardt` is passed to ``optimistix.least_squares`` like any solver of
+optimistix, which then also provides the derivatives of the solution. :func:`arrow_least_squares` is
+for problems with shared unknowns and one local unknown a row. Row i depends on its own local
+unknown only, so one tangent of ones gives the derivatives by all of them, and they are eliminated
+by scalar divisions,
 
     S = A - sum_i E_i E_i' / D_i,     S dx = -(g - sum_i E_i d_i / D_i),
     dy_i = -(d_i + E_i' dx) / D_i,
@@ -47,7 +48,7 @@ class Flat(eqx.Module):
         shared: the unknowns.
         local: a row's own; None where there are none.
         slope: how the local unknowns follow a step: by dy = -(rest + slope dx).
-        rest: see there.
+        rest: the part of -dy that does not depend on dx.
         limit: largest magnitude of the local unknowns.
     """
 
@@ -76,14 +77,14 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         tolerance: gradient cosine to stop at: the largest between the residuals and a column of
             their Jacobian.
         damping: first lambda, relative to the diagonal.
-        rtol: without effect, as are
-        atol: and
-        norm: optimistix asks every solver for them.
+        rtol: without effect; optimistix asks every solver for it.
+        atol: without effect, as ``rtol``.
+        norm: without effect, as ``rtol``.
     """
 
     tolerance: float = 1e-10
     damping: float = 1e-3
-    # What optimistix asks every solver for; ours stops by its own rule.
+    # optimistix asks every solver for these; this one stops by its own rule.
     rtol: float = 0.0
     atol: float = 0.0
     norm: Callable[[PyTree], Array] = optx.max_norm
@@ -169,8 +170,8 @@ def arrow_least_squares(
         residual: from (shared, local, args) to (n, columns); row i depends on local[i] only.
         shared: first value of the shared unknowns, any pytree of floating arrays.
         local: first value of the local unknowns, one a row.
-        args: what the residuals are differentiable in: derivatives of the solution with respect to
-            it are optimistix's implicit ones.
+        args: passed to the residuals; the solution is differentiable with respect to it, by
+            optimistix's implicit derivatives.
         limit: bound on the magnitude of the local unknowns; inf where there is none.
         damping: first Levenberg-Marquardt lambda relative to the diagonal.
         tolerance: gradient cosine to stop at; by default 1e-10 in float64, 1e-4 in float32.

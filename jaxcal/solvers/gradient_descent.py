@@ -1,8 +1,9 @@
 """The paper's first step: gradient descent on the Euclidean group over all pairs of images.
 
-It minimises sum_{i<j} |B_i X p_i - B_j X p_j|^2; the target is no unknown there. Since
+It minimises sum_{i<j} |B_i X p_i - B_j X p_j|^2, in which the target is not an unknown. Since
 sum_{i<j} |a_i - a_j|^2 = n sum_i |a_i - mean a|^2, the pairs cost no more than the points, and the
-minimiser is that of Eq. 7 with c the mean; the path to it is not. It is kept for comparison.
+minimiser is that of Eq. 7 with c the mean; only the path to it differs. The method is kept for
+comparison.
 
 Reference: Ackerman, Cheng, Boctor, Chirikjian, "Online ultrasound sensor calibration using gradient
 descent on the Euclidean group", ICRA 2014.
@@ -52,12 +53,13 @@ def pairwise_gradient(start: Iterate, images: ImagePlanes, options: Options) -> 
     Args:
         start: first value of the unknowns; pixel scales are held.
         images: the data, of one lane.
-        options: a step that lowers the objective by less than ``gradient_tolerance`` of it and
-            moves X by less than that fraction of a radian, or of the lever arm, is the last.
+        options: the descent stops after a step that lowers the objective by less than the share
+            ``gradient_tolerance`` and moves X by less than that share of a radian, or of the lever
+            arm.
     """
     count = images.used
-    # In units of the lever arm a radian moves the target as far as a millimetre of translation
-    # does; without it steepest descent zigzags for tens of thousands of steps.
+    # Translation in units of the lever arm: one unit moves the target as far as a radian does.
+    # Without this, steepest descent zigzags for tens of thousands of steps.
     squares = images.mask * (images.lateral**2 + images.distance**2)
     lever = jnp.sqrt(jnp.sum(squares, axis=1) / count)
     unit = jnp.concatenate([jnp.broadcast_to(lever, (3,)), jnp.ones(3, lever.dtype)])

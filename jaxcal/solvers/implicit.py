@@ -1,16 +1,17 @@
 """Derivatives of an optimum with respect to the data, without unrolling the solver.
 
 At a solution the stationarity conditions F(unknowns, data) = 0 hold, so by the implicit function
-theorem d unknowns = -(dF/d unknowns)^-1 dF/d data. Both come from the pass over the images that the
-solvers take (:mod:`jaxcal.solvers.normal_equations`): the first is its exact curvature, the second
-the derivative of its gradient. Offsets are eliminated in their images there, and those that rest on
-their bound move with it. For the self-tuned solve the conditions are those of the unknowns together
-with those of the SDs (:func:`jaxcal.solvers.reml.update_at`).
+theorem d unknowns = -(dF/d unknowns)^-1 dF/d data. Both derivatives of F come from the pass over
+the images that the solvers take (:mod:`jaxcal.solvers.normal_equations`): the first is its exact
+curvature, the second the derivative of its gradient. The pass eliminates the offset of every image;
+an offset at its bound moves with the bound. For the self-tuned solve F also includes the conditions
+of the SDs (:func:`jaxcal.solvers.reml.update_at`).
 
-Both functions return the tangent (zero in value) by which the solution moves with the data; being
-``jax.custom_jvp`` with rules that call themselves, they work in forward and reverse mode, to any
-order, under vmap and jit. They hold where the solution is an isolated minimum with a fixed active
-set; ``Calibration.differentiable`` says whether that is so.
+Both functions return a step of the unknowns whose value is zero and whose tangent is how the
+solution moves with the data. They are ``jax.custom_jvp`` functions whose rules call the functions
+themselves, so they work in forward and reverse mode, to any order, under vmap and jit. They are
+valid where the solution is an isolated minimum with a fixed active set;
+``Calibration.differentiable`` says whether that is so.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def optimum(
         place: the solution (not differentiated).
         observation: the objective.
         images: the data.
-        medium: what is known of sound speed and delay besides.
+        medium: what is known of sound speed and delay beforehand.
 
     Returns:
         The step of the unknowns about the solution; zero in value.
@@ -75,9 +76,9 @@ def self_tuned_optimum(
     Args:
         place: the solution (not differentiated).
         sigma: its SDs, mm (not differentiated).
-        observation: what was tuned, with the SDs to hold where there are too few images.
+        observation: the objective; its SDs are held where too few images determine them.
         images: the data.
-        medium: what is known of sound speed and delay besides.
+        medium: what is known of sound speed and delay beforehand.
 
     Returns:
         The step of the unknowns about the solution (zero in value), and the SDs.
@@ -106,7 +107,7 @@ def _self_tuned_jvp(primals: tuple, tangents: tuple) -> tuple:
     # By rows: condition, unknown, lane.
     matrix = jnp.moveaxis(jax.vmap(along)(jnp.eye(len(here), dtype=here.dtype)), 0, 1)
     _, moved = jax.jvp(lambda *data: conditions(here, *data), tuple(data), tuple(tangents[2:]))
-    # Gradients of X come in 1/sigma^2, conditions of the SDs in units of one: balance the rows.
+    # The gradients' rows scale with 1/sigma^2, those of the SDs have no unit: balance the rows.
     scale = 1 / jnp.max(jnp.abs(matrix), axis=1)
     inverse = jax.vmap(dense.inverse, in_axes=-1, out_axes=-1)(scale[:, None] * matrix)
     step = -dense.product_lanes_last(inverse, scale * moved)
@@ -114,7 +115,7 @@ def _self_tuned_jvp(primals: tuple, tangents: tuple) -> tuple:
 
 
 def _no_step(place: Iterate) -> Float[Array, "p lanes"]:
-    # Zeros that depend on the lane: where only a custom rule's tangent is batched and its value is
-    # not, JAX (0.10.2) mixes them up in the linearisation of a scan over batches.
+    # These zeros must depend on the lane: where a custom rule's tangent is batched and its value is
+    # not, JAX (0.10.2) confuses the two when it linearises a scan over batches.
     zero = jnp.where(jnp.isfinite(place.translation[0]), 0.0, 0.0).astype(place.point.dtype)
     return jnp.broadcast_to(zero, (place.unknowns, *zero.shape))

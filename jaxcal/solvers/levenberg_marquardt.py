@@ -1,21 +1,21 @@
 """Levenberg-Marquardt on many problems side by side, one pass over the images an iteration.
 
-Every lane has its own damping, gate and stopping rule; a lane that has arrived waits for its
-neighbours with its answer kept. An iteration looks at the lanes' candidates: the cost decides
-whether a candidate is taken, and the same sums are already the normal equations for the next. The
-first candidate is the start, so that one loop body is all there is to compile.
+Every lane has its own damping, gate and stopping rule; a lane that has converged keeps its answer
+while the others go on. An iteration evaluates every lane's candidate: the cost decides whether the
+candidate is taken, and the same sums are the normal equations for the next one. The first candidate
+is the start, so that only one loop body has to be compiled.
 
 The acceptance rule is that of More (1978) with Nielsen's (1999) constants: a step is taken where
-the cost falls by a ten-thousandth of what the quadratic model predicts, the damping falls where it
-falls by a quarter of it, and grows tenfold where a step is refused. :func:`judge_step` has it, for
-every loop of the package. Steps are Gauss-Newton's where the gradient cosine is above
-:data:`EXACT_BELOW`, and exact Newton steps below it; where the exact matrix is indefinite the same
-place is looked at again without second derivatives.
+the cost falls by at least a ten-thousandth of the decrease that the quadratic model predicts. The
+damping falls where the cost falls by at least a quarter of it, and grows tenfold where a step is
+refused. Every loop of the package uses this rule, by :func:`judge_step`. Steps are Gauss-Newton's
+where the gradient cosine is above :data:`EXACT_BELOW`, and exact Newton steps below it; where the
+exact matrix is indefinite, the same place is evaluated again without second derivatives.
 
 A lane stops when the largest cosine between its residual and a column of its Jacobian is below the
-tolerance, when its residuals are nothing but rounding, or when steps no longer gain more than that.
-Newton's steps square what is left: from a cosine whose square is well below the tolerance, the
-last step is taken and not looked at again.
+tolerance, when its residuals are nothing but rounding, or when steps gain no more than rounding.
+Newton's steps square the cosine. So where its square is well below the tolerance, one last step is
+taken, and its result is not evaluated.
 
 The loop needs normal equations and a retraction, not residuals; :mod:`jaxcal.solvers.general` puts
 it behind optimistix's interface for residuals of any shape.
@@ -49,17 +49,17 @@ LESS, LESS_EXACT, MORE = 0.1, 1e-4, 10.0
 """Factors of the damping after a good Gauss-Newton step, a good exact one, a refused one."""
 
 LEAST_DAMPING, LARGEST_DAMPING = 1e-8, 1e12
-"""Least damping after a refused step, and that above which a lane gives up."""
+"""Least damping after a refused step, and the damping above which a lane gives up."""
 
 EXACT_BELOW = 0.2
-"""Gradient cosine below which second derivatives are exact."""
+"""Gradient cosine below which exact second derivatives are used."""
 
 SQUARED = 100.0
-"""The cosine after an exact Newton step, over the square of that before it, is taken to be below
-this. From below 1e-6, the worst of 1,024 simulated problems came to 2.3e-12."""
+"""Assumed upper bound on the cosine after an exact Newton step over the square of the cosine before
+it. From a cosine below 1e-6, the worst of 1,024 simulated problems came to 2.3e-12."""
 
 SMALL = 1e-11
-"""Predicted relative decrease of the cost above which no step is the last unseen one."""
+"""Largest predicted relative decrease of the cost by a last step that is not evaluated."""
 
 IDLE = 4
 """Steps in a row without a gain above rounding before a lane is called settled."""
@@ -70,11 +70,11 @@ Equations = Callable[[Any, Float[Array, " lanes"]], Normal]
 
 
 class Judged(eqx.Module):
-    """What a step brought.
+    """The judgement of a step.
 
     Attributes:
-        accept: it is taken.
-        damping: Marquardt's lambda for the next.
+        accept: the step is taken.
+        damping: Marquardt's lambda for the next step.
         idle: steps in a row without a gain.
     """
 
@@ -100,22 +100,22 @@ def judge_step(
 
     Args:
         decrease: of half the cost.
-        predicted: what the quadratic model said.
+        predicted: the decrease that the quadratic model predicts.
         half_cost: before the step.
         rounding: of one whitened residual.
         damping: of the step.
         idle: steps in a row without a gain before it.
-        exact: it came from exact second derivatives.
-        retry: it was no step, but the same place once more.
+        exact: the step came from exact second derivatives.
+        retry: there was no step; the same place was evaluated again.
         less_exact: factor of the damping after a good exact step.
-        allowance: half the cost may have grown by this much for another reason than the step.
+        allowance: by how much half the cost may have grown for other reasons than the step.
     """
-    # Each residual is off by its rounding, so half their sum of squares by this much.
+    # Each residual is off by its rounding, so half their sum of squares is off by this much.
     noise = 8 * jnp.finfo(half_cost.dtype).eps * half_cost + 2 * rounding * jnp.sqrt(half_cost)
     least = -noise - allowance
     accept = (decrease >= ENOUGH * predicted + least) | retry
     good = (decrease >= GOOD * predicted + least) & jnp.logical_not(retry)
-    # The exact matrix needs no damping; a Gauss-Newton one is wanted less and less.
+    # The exact matrix needs no damping; Gauss-Newton's needs less and less.
     factor = jnp.where(good, jnp.where(exact, less_exact, LESS), 1.0)
     raised = jnp.maximum(MORE * damping, LEAST_DAMPING)
     gained = jnp.where(decrease > noise, 0, idle + 1)
@@ -131,19 +131,19 @@ class Descent(eqx.Module):
 
     Attributes:
         place: the best so far.
-        cost: there; sum of squared (whitened) residuals.
-        cosine: the gradient cosine there; after a last step that was not looked at, its bound.
-        candidate: the place to look at next.
-        retry: that is the place once more, with more damping or without second derivatives.
+        cost: sum of squared (whitened) residuals at ``place``.
+        cosine: gradient cosine at ``place``; after a last step that was not evaluated, its bound.
+        candidate: the place to evaluate next.
+        retry: ``candidate`` is ``place`` again, with more damping or without second derivatives.
         exact_used: 1 where the step to the candidate came from an exact curvature.
         exact_next: 1 where the candidate's curvature is to be exact.
         damping: Marquardt's lambda.
-        predicted: decrease of half the cost by the step.
+        predicted: predicted decrease of half the cost by the step to the candidate.
         idle: steps in a row without a gain.
-        iterations: places looked at.
-        settled: arrived, as far as rounding allows.
+        iterations: number of evaluations.
+        settled: converged, as far as rounding allows.
         active: the lane goes on.
-        trace: best cost after each of the first looks; NaN beyond the last; None: not kept.
+        trace: best cost after each of the first evaluations; NaN beyond the last; None: not kept.
     """
 
     place: Any
@@ -165,7 +165,7 @@ class Descent(eqx.Module):
     def before(
         cls, start: Any, number: Float[Array, " lanes"], damping: float, *, trace: int = 0
     ) -> Descent:
-        """Nothing looked at yet.
+        """The state before the first evaluation.
 
         Args:
             start: the first candidate.
@@ -193,11 +193,11 @@ class Descent(eqx.Module):
 
 
 class Rounding(eqx.Module):
-    """What rounding of the coordinates leaves of residuals, in each lane.
+    """Rounding errors of the residuals due to the size of the coordinates, in each lane.
 
     Attributes:
-        residual: of one whitened residual.
-        vanished: the cost below which it is all there is.
+        residual: rounding error of one whitened residual.
+        vanished: the cost below which residuals are nothing but rounding.
     """
 
     residual: Float[Array, " lanes"]
@@ -210,7 +210,7 @@ class Rounding(eqx.Module):
 
     @classmethod
     def at(cls, reach: Array, weight: Array, images: ImagePlanes) -> Rounding:
-        """From that size and the largest weight of a mm."""
+        """From the size of the coordinates and the largest weight of a mm."""
         one = jnp.finfo(reach.dtype).eps * reach * weight
         return cls(one, 3 * images.mask.shape[1] * (2 * one) ** 2)
 
@@ -232,9 +232,9 @@ def gradient_cosine(normal: Normal, vanished: Float[Array, " lanes"]) -> Float[A
 def damped_step(
     normal: Normal, damping: Float[Array, " lanes"]
 ) -> tuple[Float[Array, "p lanes"], Float[Array, " lanes"], Bool[Array, " lanes"]]:
-    """The damped step, the decrease of half the cost that it predicts, and whether it is lost.
+    """The damped step, the decrease of half the cost that it predicts, and where it is lost.
 
-    It is lost where the matrix is not positive definite; the step is zero there.
+    A step is lost, and zero, where the matrix is not positive definite.
     """
     damping = damping + 16 * jnp.finfo(damping.dtype).eps
     diagonal = normal.diagonal()
@@ -259,10 +259,10 @@ def iterate_once(
     less_exact: float = LESS_EXACT,
     exact_below: float = EXACT_BELOW,
 ) -> Descent:
-    """Every active lane's candidate looked at, and the next one chosen.
+    """Evaluate every active lane's candidate, and choose the next one.
 
-    Normal equations are used where they are made and then forgotten: it is cheaper to look at a
-    place again, where a step from there has failed, than to keep them for every lane.
+    Normal equations are used at once and not stored: to evaluate a place again, where a step from
+    it has failed, is cheaper than to keep them for every lane.
     """
     normal = barrier(equations(state.candidate, state.exact_next))
 
@@ -374,7 +374,7 @@ def minimise(
         start: unknowns to start from.
         observation: the objective.
         images: the data.
-        medium: what is known of sound speed and delay besides.
+        medium: what is known of sound speed and delay beforehand.
         damping: first lambda, relative to the diagonal; 0 for Gauss-Newton, which takes every step.
         tolerance: gradient cosine to stop at; by default 1e-10 in float64, 1e-4 in float32.
         max_steps: most passes.
@@ -393,8 +393,8 @@ def minimise(
         return accumulate(iterate, observation, images, None if undamped else exact, medium)
 
     begun = Descent.before(start, jnp.zeros_like(images.mask[:, 0]), damping, trace=trace)
-    # Where offsets reach or leave their bounds the curvature jumps: an exact step says little of
-    # the next one.
+    # The curvature jumps where offsets reach or leave their bounds, so a good exact step says
+    # little about the next one.
     less_exact = LESS if isinstance(observation, LocalUnknown) else LESS_EXACT
     return descend(
         begun,

@@ -1,8 +1,8 @@
 """Every method on a batch of problems, as one pure function of arrays.
 
-The conventional fit from the closed-form start; the method itself from there; derivatives by the
-implicit function theorem; the average over the offsets' laws where they are to be weighed. One
-problem is a batch of one.
+The steps are: the conventional fit from the closed-form start; the method itself from that fit;
+derivatives by the implicit function theorem; and the average over the offsets' laws where they are
+weighed. One problem is a batch of one.
 """
 
 from __future__ import annotations
@@ -44,33 +44,33 @@ from jaxcal.solvers.reml import floored, self_tuned
 from jaxcal.solvers.start import ConventionalStart, GivenStart, conventional
 
 HELD_SIGMA = (0.5, 0.5, 1.0)
-"""SDs of lateral position, range and offset (mm), where too few images leave them unknown."""
+"""SDs of lateral position, range and offset (mm), used where too few images determine them."""
 
 HELD_CHANNEL_SIGMA = (0.5, 1.0)
-"""SDs of an element's distance and of the offset (mm), likewise."""
+"""SDs of an element's distance and of the offset (mm), used in the same case."""
 
 
 class Solution(eqx.Module):
-    """Where a method stopped; lanes last, but for the law.
+    """Where a method stopped; lanes last, except in the law.
 
     Attributes:
         place: X, c and the further unknowns.
         observation: the objective there, with its SDs.
-        medium: what was known of sound speed and delay besides, or None.
+        medium: what was known of sound speed and delay beforehand, or None.
         offset: y_i, mm, where offsets are bounded unknowns of their own; else None.
         cost: sum of squared (whitened) residuals.
         cosine: gradient cosine.
-        arrived: it stopped because it had arrived.
+        arrived: it stopped because it had converged.
         iterations: passes over the images, or rounds of the alternation.
         variance_rounds: of these, passes that updated SDs.
         sigma_floored: which SDs rest on their floor.
         rotation_change: of the alternation's last round, rad.
-        translation_change: likewise, mm.
+        translation_change: of the alternation's last round, mm.
         trace: the objective's values; None: not kept.
         searched: whether the start had to be searched for.
         covariance: of the unknowns over all laws of the offsets, where they were weighed.
-        elevation_sd: likewise, of the offsets, mm.
-        law: likewise, what was found out.
+        elevation_sd: SDs of the offsets over all laws, mm, where they were weighed.
+        law: what was found out about the offsets' law, where laws were weighed.
     """
 
     place: Iterate
@@ -99,14 +99,14 @@ def solve(
     plan: SolvePlan,
     begun: ConventionalStart | GivenStart | None = None,
 ) -> Solution:
-    """Solve a batch (one leading axis) whose images left out hold harmless values.
+    """Solve a batch (one leading axis); images left out must hold harmless values.
 
     Args:
         problems: the batch.
         images: its planes.
         given: numbers that came with the request.
-        plan: what is static about it.
-        begun: their conventional fits, where they have been made before.
+        plan: the static part of the request.
+        begun: the batch's conventional fits, where they have been made before.
     """
     # The solvers see constants; their answers become functions of the data again afterwards.
     frozen, planes, numbers = jax.lax.stop_gradient((problems, images, given))
@@ -128,8 +128,8 @@ def begin(images: ImagePlanes, plan: SolvePlan) -> ConventionalStart:
         max_steps=plan.options.max_iterations,
         undamped=alone and plan.options.solver == "gauss-newton",
         trace=plan.options.trace if alone else 0,
-        # With given SDs the descent arrives from the closed form as well; other answers may hang on
-        # the start.
+        # With given SDs the descent converges from the closed form as well; other answers may
+        # depend on the start.
         fitted=alone or plan.method == "alternating" or plan.self_tuning or plan.prior == "bounded",
     )
 
@@ -137,7 +137,7 @@ def begin(images: ImagePlanes, plan: SolvePlan) -> ConventionalStart:
 def observe(
     problems: Problem, images: ImagePlanes, given: Given, plan: SolvePlan
 ) -> tuple[Observation, MediumPrior | None]:
-    """The plan's objective; where SDs are tuned, with those to hold instead."""
+    """The plan's objective (if SDs are tuned: with the SDs to fall back on), and medium prior."""
     if plan.prior == "none":
         return InPlane.of(images), None
     if plan.prior == "bounded":
@@ -158,7 +158,7 @@ def observe(
     if plan.channels:
         return ChannelDistances(sigma), medium
     shape = None
-    # Where laws are weighed, so are the covariances, and the first fit does without.
+    # Where laws are weighed, the covariances are weighed as well; the first fit does without them.
     if problems.covariance is not None and not plan.laws:
         shape, _ = unit_shape(variance_planes(problems.covariance), images)
     if given.tracker_sd is not None:
@@ -170,7 +170,7 @@ def observe(
 
 
 def nominal_sound_speed(problem: Problem) -> Float[Array, "*batch"]:
-    """By which the problem's times of flight became distances, m/s; water's where unknown."""
+    """The speed by which times of flight became distances, m/s; water's where unknown."""
     if problem.sound_speed is None:
         return jnp.full(problem.batch_shape, WATER_M_S, problem.mask.dtype)
     return problem.sound_speed

@@ -1,10 +1,10 @@
 """One pass over the images: the normal equations of many problems in one fused reduction.
 
 Every objective here is a sum over images of phi_i(q_i, e), with q_i = X^-1 B_i^-1 c the target in
-image i's frame and e the further unknowns. What is particular to an observation
-(:mod:`jaxcal.model.observations`) ends at (q_i, e): it gives phi, its gradient g and its curvature
-K there. What remains is the same for all. With X = (R, t), B_i = (R_i, b_i), the right perturbation
-(v, w) of X and the step d of c,
+image i's frame and e the further unknowns. An observation (:mod:`jaxcal.model.observations`)
+provides only phi, its gradient g and its curvature K as functions of (q_i, e). The rest is the same
+for all observations. With X = (R, t), B_i = (R_i, b_i), the right perturbation (v, w) of X and the
+step d of c,
 
     q_i -> Exp(-w) (q_i - v + M_i d),     M_i = R' R_i',     q_i = M_i (c - b_i) - R' t,
     dq/dv = -1,     dq/dw = [q]x,     dq/dd = M_i,
@@ -12,15 +12,16 @@ K there. What remains is the same for all. With X = (R, t), B_i = (R_i, b_i), th
 so with J_i = (-1, [q]x, M_i) the gradient is sum J_i' g_i and the curvature sum J_i' K_i J_i, plus
 second derivatives of q itself: the symmetric part of g q' - (g.q) 1 in (w, w), [g]x M in (w, d),
 and [g]x in (v, w). All these sums and the cost come from one variadic reduction over the images,
-which XLA compiles to one loop: images are the minor axis, so it vectorises over them; nothing that
-belongs to an image is ever stored.
+which XLA compiles to one loop: images are the minor axis, so it vectorises over them; no
+intermediate value of an image is stored.
 
 An unknown y of the image itself is eliminated inside the pass: with D = phi_yy and b = phi_qy, the
 Schur complement of this image is K = phi_qq - b b' / D (the shared unknowns' part of the
 arrow-shaped system that X, c and all offsets make together; its cost is O(n p^2)).
 
 The curvature is Gauss-Newton's where a lane's ``gate`` is 0, and exact where it is 1: far from the
-optimum the exact one is indefinite, and near it Gauss-Newton crawls along what the data barely see.
+optimum the exact curvature may be indefinite, and near it Gauss-Newton is slow along directions
+that the data barely determine.
 
 Reference: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment: a modern synthesis", 2000.
 """
@@ -45,13 +46,13 @@ IN_IMAGE = 3
 
 @cache
 def pairs(unknowns: int) -> list[tuple[int, int]]:
-    """Places of the upper triangle in a flat row."""
+    """Row and column of every entry of a flat upper triangle, in order."""
     return [(i, j) for i in range(unknowns) for j in range(i, unknowns)]
 
 
 @cache
 def square_places(unknowns: int) -> np.ndarray:
-    """Where a flat upper triangle has the entries of the full matrix."""
+    """Position in a flat upper triangle of every entry of the full matrix."""
     places = np.zeros((unknowns, unknowns), int)
     for place, (i, j) in enumerate(pairs(unknowns)):
         places[i, j] = places[j, i] = place
@@ -63,8 +64,8 @@ class Term(eqx.Module):
 
     Attributes:
         cost: planes, or 0.
-        gradient: by q and then e.
-        curvature: likewise, symmetric.
+        gradient: with respect to q and then e.
+        curvature: with respect to the same, symmetric.
     """
 
     cost: Entry
@@ -77,8 +78,8 @@ class _Derived(eqx.Module):
 
     Attributes:
         components: the residuals.
-        slopes: of every component the rows of first derivatives.
-        bends: of every component the second derivatives, by (row, i, j).
+        slopes: for every component, the rows of first derivatives.
+        bends: for every component, the second derivatives by (row, i, j).
         free: 1 where the image's own unknown may move; None where there is none.
     """
 
@@ -91,7 +92,7 @@ class _Derived(eqx.Module):
 def _derive(
     observation: Observation, q: Vector, iterate: Iterate, images: ImagePlanes, *, exact: bool
 ) -> _Derived:
-    """Look at an observation at the places q."""
+    """An observation's residuals at q, with their derivatives."""
     still = jnp.zeros((images.lanes, 1), images.mask.dtype)
     further = [still] * (iterate.unknowns - RIGID_UNKNOWNS)
     arguments, free = [*q, *further], None
@@ -191,13 +192,14 @@ def _weighed(terms: list[Term], weights: list[Array]) -> Term:
 
 
 def _eliminated(term: Term, plain: Entry, free: Array) -> Term:
-    """A term without the image's own unknown, which is the last.
+    """A term with the image's own unknown, which is the last, eliminated.
 
-    What is left of its slope makes one more Newton step, to first order.
+    Where the slope by that unknown is not zero yet, the result includes one more Newton step of it,
+    to first order.
 
     Args:
         term: with that unknown.
-        plain: its curvature by Gauss and Newton, for where the exact one is not positive.
+        plain: Gauss-Newton's curvature by it, used where the exact one is not positive.
         free: 1 where it may move.
     """
     last = len(term.gradient) - 1
@@ -217,7 +219,7 @@ def _eliminated(term: Term, plain: Entry, free: Array) -> Term:
 
 
 def _shared(term: Term) -> Term:
-    """A term without the image's own unknown, which is held."""
+    """A term with the image's own unknown held fixed."""
     return Term(term.cost, term.gradient[:-1], [row[:-1] for row in term.curvature[:-1]])
 
 
@@ -226,9 +228,9 @@ def contributions(
 ) -> tuple[Vector, Vector]:
     """An image's part of the curvature (upper triangle) and the gradient, as planes or 0.
 
-    The gate says how much of the second derivatives of q there is to be; 0 for none. They come
-    with A = [q]x' K + [g]x in the place of [q]x' K: A M has all of (w, d), and A [q]x has (w, w)
-    but for an antisymmetric part that :func:`with_twist` takes from the summed gradient.
+    The gate is the factor on the second derivatives of q; 0 for none. They are included by using
+    A = [q]x' K + gate [g]x instead of [q]x' K: A M is then all of block (w, d), and A [q]x is block
+    (w, w) up to an antisymmetric part, which :func:`with_twist` takes from the summed gradient.
     """
     width = len(term.gradient)
     unknowns = RIGID_UNKNOWNS + width - IN_IMAGE
@@ -272,13 +274,13 @@ def contributions(
 
 
 def with_twist(flat: Vector, gradient: Vector, unknowns: int) -> Vector:
-    """A flat curvature completed by what the summed gradient knows of q's second derivatives.
+    """Complete a flat curvature by q's second derivatives that follow from the summed gradient.
 
     Args:
         flat: sums of :func:`contributions`.
-        gradient: summed along v and w, times the gate. The first is -sum g: (v, w) gets [sum g]x.
-            The second is sum g x q: the upper half of A [q]x has q_i g_j where (w, w) has the mean
-            of that and q_j g_i.
+        gradient: v and w parts of the summed gradient, times the gate. The v part is -sum g, so
+            block (v, w) gets [sum g]x. The w part is sum g x q: the upper half of A [q]x has
+            q_i g_j where block (w, w) needs the mean of q_i g_j and q_j g_i.
         unknowns: how many there are.
     """
     twist = unrolled.cross([-value for value in gradient[:3]])
@@ -301,8 +303,8 @@ class Normal(eqx.Module):
         curvature: upper triangle, in the order of :func:`pairs`.
         gradient: of half the cost.
         cost: sum of squared (whitened) residuals.
-        squares: |J_k|^2 of the unknowns' columns where images have unknowns of their own, whose
-            elimination leaves less than that on the diagonal; None where they are the same.
+        squares: |J_k|^2 of the unknowns' columns, where images have unknowns of their own and
+            eliminating these lowers the diagonal; None where the diagonal is |J_k|^2.
     """
 
     curvature: Float[Array, "triangle lanes"]
@@ -332,7 +334,7 @@ def stacked(flat: Float[Array, "triangle lanes"]) -> Float[Array, "p p lanes"]:
 
 
 def diagonal_places(unknowns: int) -> tuple[int, ...]:
-    """Where a flat upper triangle has the diagonal."""
+    """Positions of the diagonal in a flat upper triangle."""
     return tuple(pairs(unknowns).index((k, k)) for k in range(unknowns))
 
 
@@ -350,7 +352,7 @@ def accumulate(
         observation: whose residuals.
         images: the data.
         gate: 1 for exact second derivatives, 0 for Gauss-Newton's; None for the latter everywhere.
-        medium: what is known of sound speed and delay besides.
+        medium: what is known of sound speed and delay beforehand.
     """
     q, turned = targets(iterate, images)
     wide = None if gate is None else gate[:, None]
@@ -386,13 +388,13 @@ def accumulate(
 
 
 class ComponentSums(eqx.Module):
-    """What one pass leaves of the images for each component by itself, unweighted; lanes last.
+    """Sums of one pass over the images for each component separately, unweighted; lanes last.
 
     Attributes:
         squares: rss_k, mm^2.
         gradient: g_k.
         matrix: N_k, Gauss-Newton's, upper triangles.
-        rest: of the exact curvature with the SDs given, beside sum N_k / s_k^2; zeros without SDs.
+        rest: exact curvature with the given SDs less sum N_k / s_k^2; zeros without SDs.
         known: what is known of the medium: cost, gradient, diagonal of the curvature.
     """
 
@@ -426,11 +428,11 @@ def component_sums(
     """One pass that keeps the components apart.
 
     Args:
-        iterate: where.
+        iterate: X, c and the further unknowns of every lane.
         observation: one without an unknown in every image.
         images: the data.
-        sigma: SDs for the rest of the exact curvature, mm; None: it is left out.
-        medium: what is known of sound speed and delay besides.
+        sigma: SDs for the rest of the exact curvature, mm; None leaves it out.
+        medium: what is known of sound speed and delay beforehand.
     """
     q, turned = targets(iterate, images)
     derived = _derive(observation, q, iterate, images, exact=sigma is not None)
@@ -445,7 +447,7 @@ def component_sums(
         weights = [(1 / (sd * sd))[:, None] for sd in sigma]
         weighed = _weighed(terms, weights)
         bent = _summed([_bent(derived, k, images) for k in range(count)], weights)
-        # Of q's own second derivatives the weighted gradient knows.
+        # The second derivatives of q itself follow from the weighted gradient.
         planes += contributions(q, turned, Term(0, weighed.gradient, bent), 1)[0]
     sums = total(planes)
     squares, sums = sums[:count], sums[count:]

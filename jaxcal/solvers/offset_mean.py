@@ -6,24 +6,26 @@ So the belief about b is a mixture,
 
     b = 0 with probability 9/10,      b ~ N(0, (2 s_y)^2) with probability 1/10,
 
-and not one of the two: every answer moves continuously with the data, and where they leave it open
-whether there is a mean, the covariance knows. With the data's likelihood of b proportional to
-exp(eta b - lambda b^2 / 2), all other unknowns eliminated, and v = (2 s_y)^2,
+and not a choice between the two: every answer moves continuously with the data, and where the data
+do not tell whether there is a mean, the covariance includes that doubt. With v = (2 s_y)^2 and the
+data's likelihood of b, all other unknowns eliminated, proportional to exp(eta b - lambda b^2 / 2),
 
     ln odds = ln(1/9) + 1/2 v eta^2 / (1 + v lambda) - 1/2 ln(1 + v lambda),
     p = odds / (1 + odds),   m = v eta / (1 + v lambda),   w = v / (1 + v lambda),
     E b = p m,               var b = p w + p (1 - p) m^2.
 
-*Trust.* lambda is right where the errors are as the model says: Gaussian, alike, independent. The
-data show whether they are: image i moves b by d_i = (row b of H^-1) times its gradient, and the sum
-of d_i^2 is b's variance whatever the errors' law (the sandwich); with the products of neighbours in
-time added, also where these are alike (Newey and West). An image that tells much of b pulls b
-towards itself and so hides its error: d_i is divided by the share of what is known of b that is
-left without that image and its neighbours, as in a jackknife of blocks. Where the sum is more than
-the variance under the model, by a factor, eta and lambda are divided by it.
+*Trust.* lambda is right if the errors are as the model assumes: Gaussian, alike, independent. The
+data show whether they are. Image i moves b by d_i = (row b of H^-1) times its gradient, and the sum
+of d_i^2 estimates b's variance for any law of the errors (the sandwich). With the products of
+neighbours in time added, it does so for correlated errors, too (Newey and West). An image with much
+information about b pulls b towards itself and so hides its own error. Therefore d_i is divided by
+the share of the information about b that is left without that image and its neighbours, as in a
+jackknife of blocks. Where the sum exceeds the variance under the model by some factor, eta and
+lambda are divided by that factor.
 
-On the real cross-wire recording 0.41 of what the data say of the mean counts (``mean_trust`` in
-experiments/results/crosswire_real.csv). The price is power where images are few.
+On the real cross-wire recording, 0.41 of the data's information about the mean is used
+(``mean_trust`` in experiments/results/crosswire_real.csv). The price is less power to find a mean
+where images are few.
 
 References: Mitchell and Beauchamp 1988 (spike and slab); White 1980; Newey and West 1987;
 Kuensch 1989 (jackknife of blocks).
@@ -43,19 +45,19 @@ from jaxcal.model.observations import Component, Further, Observation
 from jaxcal.model.unrolled import Vector
 
 MEAN_SD = 2.0
-"""SD of the offsets' mean before the data are seen, in SDs of the offsets, where there is one."""
+"""Prior SD of the offsets' mean if there is one, in SDs of the offsets."""
 
 PROBABILITY = 0.1
-"""That there is one: it is one more thing to be wrong about."""
+"""Prior probability that there is a mean; low, as it is one more thing to be wrong about."""
 
 LAGS = 5
-"""How many images after it, in the order in which they come, an image's error may still be felt."""
+"""Errors are taken to be correlated up to this many images apart, in their given order."""
 
 FELT = tuple(1 - lag / (LAGS + 1) for lag in range(1, LAGS + 1))
-"""Bartlett's weights of these."""
+"""Bartlett's weights of these lags."""
 
 LEAST_LEFT = 0.05
-"""Least share of what is known of b that is taken to be left without an image and those near it."""
+"""Least share of the information about b assumed to be left without an image and its neighbours."""
 
 
 class MeanBelief(eqx.Module):
@@ -64,7 +66,7 @@ class MeanBelief(eqx.Module):
     Attributes:
         mean: expectation, mm.
         variance: mm^2.
-        log_odds: ln of how much more probable the data are with a mean than without.
+        log_odds: ln of how much more probable the data are with a mean than without one.
     """
 
     mean: Float[Array, "*lanes"]
@@ -73,18 +75,18 @@ class MeanBelief(eqx.Module):
 
     @property
     def probability(self) -> Float[Array, "*lanes"]:
-        """That there is one."""
+        """Probability that there is a mean other than zero."""
         return jax.nn.sigmoid(self.log_odds + np.log(PROBABILITY / (1 - PROBABILITY)))
 
 
 def believed(mean: Array, variance: Array, offset_sd: Array, trust: Array) -> MeanBelief:
-    """The belief about b from the Gaussian one that takes for granted that there is a mean.
+    """The belief about b, from the Gaussian belief that assumes that there is a mean.
 
     Args:
-        mean: b where there is a mean, mm.
-        variance: of b there, mm^2.
-        offset_sd: of the offsets, mm.
-        trust: the share of what the data say that counts (:func:`trust_in`).
+        mean: expectation of b if there is a mean, mm.
+        variance: of b if there is a mean, mm^2.
+        offset_sd: SD of the offsets, mm.
+        trust: share of the data's information about b that is used (:func:`trust_in`).
     """
     prior = (MEAN_SD * offset_sd) ** 2
     precision = trust * jnp.maximum(1 / variance - 1 / prior, 0.0)
@@ -99,7 +101,7 @@ def believed(mean: Array, variance: Array, offset_sd: Array, trust: Array) -> Me
 
 
 def gained(belief: MeanBelief) -> Array:
-    """Ln of the evidence over that which takes for granted that there is a mean."""
+    """Ln of the evidence over that under the assumption that there is a mean."""
     return jnp.logaddexp(np.log(PROBABILITY), np.log(1 - PROBABILITY) - belief.log_odds)
 
 
@@ -113,7 +115,7 @@ def influences(
     along: Float[Array, "q lanes"],
     step: Float[Array, "q lanes"],
 ) -> tuple[Float[Array, "lanes n"], Float[Array, "lanes n"]]:
-    """By how much each image moves b, to first order, mm, and its share of what is known of b.
+    """How far each image moves b, to first order, mm, and its share of the information about b.
 
     Args:
         place: X, c and the further unknowns.
@@ -164,12 +166,12 @@ def trust_in(
     moved: Float[Array, "lanes n"],
     share: Float[Array, "lanes n"],
 ) -> Float[Array, " lanes"]:
-    """The variance of b under the model over that which the images show, at most one.
+    """The variance of b under the model over the variance that the images show, at most one.
 
     Args:
         variance: under the model, mm^2.
-        moved: by how much each image moves b, mm, in the order in which they were taken.
-        share: of each image in what is known of b.
+        moved: how far each image moves b, mm, in the order in which the images were taken.
+        share: of each image in the information about b.
     """
 
     def shifted(plane: Array, lag: int) -> Array:

@@ -1,8 +1,8 @@
-"""Somebody else's optimistix solver in the place of ours, on the same residuals.
+"""Any solver of optimistix in place of the package's own, on the same residuals.
 
-Such a solver takes one problem at a time, here a batch of one, and stops by a rule of its own; a
-batch of many is a map over it. SDs are tuned as the historical method does: a whole weighted solve
-between two of Helmert's updates.
+Such a solver takes one problem at a time, here a batch of one, and stops by its own rule; a larger
+batch is mapped over it. SDs are tuned by the historical method: one complete weighted solve before
+each of Helmert's updates.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ class Fit(eqx.Module):
         place: X, c and the further unknowns.
         cost: sum of squared (whitened) residuals.
         cosine: gradient cosine there.
-        settled: the solver says that it arrived.
+        settled: the solver says that it converged.
         iterations: the solver's steps.
         updated: SDs after the last update, mm; those given where none are tuned.
-        trace: NaN: what the solver saw is not known.
+        trace: NaN, since the solver does not tell its values; None: not kept.
     """
 
     place: Iterate
@@ -81,8 +81,8 @@ def minimise_with(
         start: unknowns to start from.
         observation: the objective.
         images: the data, of one lane.
-        medium: what is known of sound speed and delay besides.
-        options: with the most steps and the length of the trace.
+        medium: what is known of sound speed and delay beforehand.
+        options: with the largest number of steps and the length of the trace.
     """
 
     def residual(step: Array, _: None) -> Array:
@@ -121,15 +121,15 @@ def self_tuned_with(
     tolerance: float = 1e-9,
     max_rounds: int = 60,
 ) -> Fit:
-    """Weighted solves with Helmert's updates between them, until the SDs stand still.
+    """Weighted solves with Helmert's updates between them, until the SDs no longer change.
 
     Args:
         solver: of optimistix.
         start: the conventional fit.
-        observation: with the SDs to hold where there are too few images to estimate them.
+        observation: the objective; its SDs are held where too few images determine them.
         images: the data, of one lane.
-        medium: what is known of sound speed and delay besides.
-        options: with the most steps of each solve.
+        medium: what is known of sound speed and delay beforehand.
+        options: with the largest number of steps of each solve.
         tolerance: relative change of the SDs to stop at.
         max_rounds: most updates.
     """

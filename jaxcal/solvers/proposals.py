@@ -1,7 +1,7 @@
 """Proposals for a consensus: closed-form solutions of many small subsets of the images at once.
 
-Every proposal is the start's linear system (:mod:`jaxcal.solvers.start`) on a few images; each
-image's moments are formed once, and a subset's system is the sum of those of its images.
+Every proposal solves the start's linear system (:mod:`jaxcal.solvers.start`) for a few images. Each
+image's moments are formed once, and a subset's system is the sum of its images' moments.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from jaxcal.model.residuals import measured_points
 from jaxcal.solvers import dense
 
 MOST_PROPOSALS, FEWEST_PROPOSALS = 512, 256
-"""Of a dozen images with a third of them outliers, one subset in 33 is clean."""
+"""If a third of a dozen images are outliers, one subset in 33 is clean."""
 SUBSET = 6
 """Images in a proposal's subset: four determine the linear system, two more steady it."""
 SEED = 20261121
 
 
 def proposals(images: int) -> int:
-    """How many subsets to try: the more the fewer images there are, for then few are clean."""
+    """How many subsets to try: more with fewer images, because fewer subsets are clean then."""
     return int(np.clip(12_800 // images, FEWEST_PROPOSALS, MOST_PROPOSALS))
 
 
@@ -111,7 +111,7 @@ def linear_proposals(problem: Problem, subsets: Float[Array, "k n"], *, scaled: 
         )
         translation = length * rest[:3] - mean[0] * lateral - mean[1] * axial
         scale = sizes if scaled else jnp.ones_like(sizes)
-        # A pixel's row 0 need not be the face: the face's range is not scaled.
+        # Pixel row 0 need not be at the transducer's face: the range of row 0 is not scaled.
         translation = (
             translation
             + jnp.where(jnp.asarray(scaled), (scale[1] - 1) * problem.face_offset, 0.0)
@@ -123,6 +123,6 @@ def linear_proposals(problem: Problem, subsets: Float[Array, "k n"], *, scaled: 
 
 
 def nominal(problem: Problem) -> Parameters:
-    """Nothing turned or moved, scales as given."""
+    """X the identity, the target at the origin, and the given scales."""
     zero = jnp.zeros(3, problem.mask.dtype)
     return Parameters.of(jnp.eye(3, dtype=zero.dtype), zero, zero)

@@ -1,28 +1,31 @@
-"""Self-tuning: the SDs of the measurements and of the elevational offset from the data themselves.
+"""Self-tuning: SDs of the measurements and of the elevational offset, estimated from the data.
 
 Restricted maximum likelihood (REML) by Helmert's iteration for variance components,
 
     s_k^2 = |residual_k|^2 / (n_k - leverage_k),      leverage_k = tr(S^-1 N_k) / s_k^2,
 
-where leverage_k is the number of degrees of freedom that the unknowns take from component k. So no
-noise level and no maximum elevational distance is chosen by hand. The components are those of the
-observation in use: lateral position, range and offset, or the elements' distances and the offset.
+where N_k is component k's normal matrix, S the weighted sum of them all, and leverage_k the number
+of degrees of freedom that the unknowns take from component k. So no noise level and no maximum
+elevational distance is chosen by hand. The components are those of the observation in use: lateral
+position, range and offset, or the elements' distances and the offset.
 
-The pass keeps the components apart (:func:`jaxcal.solvers.normal_equations.component_sums`). To
-first order in the step d these sums are all there is to know, whatever the SDs:
+The pass sums every component separately (:func:`jaxcal.solvers.normal_equations.component_sums`).
+To first order in the step d these sums give the following for any SDs, with C what exact second
+derivatives add to the curvature:
 
     H(s) = sum N_k / s_k^2,      d(s) = -(H(s) + C)^-1 sum g_k / s_k^2,
     rss_k(d) = rss_k + 2 g_k' d + d' N_k d,
     s_k^2 <- rss_k(d) / (n_k - tr(H(s)^-1 N_k) / s_k^2),
 
-so the SDs are updated a few times on these sums alone, the step that belongs to them is taken, and
-the next pass tells the truth. Steps are accepted by the decrease of the weighted cost with the new
-SDs, and damped as everywhere. A lane has arrived when, at one and the same place, the update leaves
-the SDs and the gradient leaves the unknowns where they are: the fixed point of Helmert's iteration.
+so the SDs are updated a few times from these sums alone, the step for the new SDs is taken, and the
+next pass computes the exact sums there. Steps are accepted by the decrease of the weighted cost
+with the new SDs, and damped as in :mod:`jaxcal.solvers.levenberg_marquardt`. A lane has converged
+when, at the same place, the update no longer changes the SDs and the gradient no longer moves the
+unknowns: the fixed point of Helmert's iteration.
 
 A component whose error truly vanishes (no noise, or every target in the plane) would drive its SD
-to zero and the weights to infinity; it is held at a thousandth of the largest SD, which is as good
-as exact for X. With too few images the SDs are held where they are given.
+to zero and the weights to infinity. The SD is held at a thousandth of the largest one, which is as
+good as exact for X. With too few images the SDs stay at their given values.
 
 References: Helmert 1924; Patterson and Thompson 1971 (REML); Foerstner 1979.
 """
@@ -65,10 +68,10 @@ LEAST_FREEDOM = 0.05
 """Least degrees of freedom of a component, as a share of its residuals."""
 
 EXACT_BELOW = 0.03
-"""Gradient cosine below which second derivatives are exact."""
+"""Gradient cosine below which exact second derivatives are used."""
 
 UPDATES = 3
-"""Updates of the SDs on the sums of one pass."""
+"""Updates of the SDs from the sums of one pass."""
 
 
 def least_sigma(sigma: Float[Array, " components ..."]) -> Float[Array, " ..."]:
@@ -95,7 +98,7 @@ def helmert(
         squares: sums of squared residuals, mm^2.
         leverage: tr(S^-1 N_k), mm^2.
         count: numbers of residuals.
-        sigma: the SDs with which S was made, mm.
+        sigma: the SDs with which S was formed, mm.
     """
     freedom = jnp.maximum(count - leverage / sigma**2, LEAST_FREEDOM * count)
     return jnp.sqrt(jnp.maximum(squares, 0.0) / freedom)
@@ -107,22 +110,22 @@ class SelfTuned(eqx.Module):
     Attributes:
         place: X, c and the further unknowns.
         sigma: the SDs, mm.
-        updated: the SDs after one more update there.
-        cost: of the weighted residuals.
+        updated: the SDs after one more update at ``place``.
+        cost: sum of squared (weighted) residuals.
         change: largest relative change of the SDs by that update.
         cosine: gradient cosine.
         candidate: the place to look at next.
-        proposed: the SDs there.
-        units: the SDs in whose units residuals were at the last look.
-        retry: that is the place once more, with more damping.
-        weighed: the SDs that belong to the step to the candidate.
-        half: half the cost before it, with these.
-        predicted: how much less it should be after it.
+        proposed: the SDs at ``candidate``.
+        units: the SDs that set the units of the residuals in the last pass.
+        retry: ``candidate`` is ``place`` again, with more damping.
+        weighed: the SDs for which the step to the candidate was computed.
+        half: half the cost before that step, with ``weighed``.
+        predicted: predicted decrease of ``half`` by that step.
         exact_used: 1 where the step came from exact second derivatives.
         damping: Marquardt's lambda.
         idle: steps in a row without a gain.
         iterations: passes.
-        settled: arrived, as far as rounding allows.
+        settled: converged, as far as rounding allows.
         active: the lane goes on.
         trace: best cost after each of the first passes; NaN beyond the last; None: not kept.
     """
@@ -150,7 +153,7 @@ class SelfTuned(eqx.Module):
 
     @classmethod
     def before(cls, start: Iterate, held: Float[Array, "k lanes"], trace: int) -> SelfTuned:
-        """Nothing looked at yet; with infinite SDs, the rest of the curvature vanishes."""
+        """The state before the first pass; infinite SDs leave out exact second derivatives."""
         number = jnp.zeros_like(start.point[0])
         no, count = jnp.zeros(number.shape, bool), jnp.zeros(number.shape, jnp.int32)
         sigma = jnp.zeros_like(held) + jnp.inf
@@ -185,9 +188,9 @@ def damped_step(
 
     Args:
         normal: Gauss-Newton's equations.
-        rest: of the exact curvature.
+        rest: what exact second derivatives add to the curvature.
         damping: Marquardt's lambda.
-        exact: 1 where the rest counts.
+        exact: 1 where ``rest`` is added.
     """
     diagonal = normal.diagonal()
     held = damping * jnp.where(diagonal > 0, diagonal, 1.0)
@@ -246,12 +249,11 @@ def self_tuned(
 
     Args:
         start: a conventional fit.
-        observation: with the SDs of lanes with too few images (fewer than 8 used ones) to
-            estimate them.
+        observation: the objective; lanes with fewer than 8 used images keep its SDs.
         images: the data.
-        medium: what is known of sound speed and delay besides.
-        tolerance: relative change of the SDs to stop at; 1e-9 in float64, 1e-4 in float32. The
-            gradient cosine stops at a tenth of it (at the same in float32).
+        medium: what is known of sound speed and delay beforehand.
+        tolerance: relative change of the SDs to stop at; by default 1e-9 in float64, 1e-4 in
+            float32. The gradient cosine always stops at 1e-10 in float64, 1e-4 in float32.
         max_rounds: most passes.
         trace: how many values of the objective to keep.
     """
@@ -262,13 +264,13 @@ def self_tuned(
     if tolerance is None:
         tolerance = 10 * standing if standing < 1e-9 else standing
     images, observation = barrier((images.padded(), observation.padded()))
-    # What belongs to a lane is made once, and not again for every image.
+    # Values of a lane are computed once, and not again for every image.
     coordinates, held, count, enough = barrier((reach(start, images), held, count, enough))
 
     def update(
         sums: ComponentSums, sigma: Array, damping: Array, exact: Array
     ) -> tuple[Array, Array, Array]:
-        """The step that belongs to SDs, the SDs after it, and where the matrix was indefinite."""
+        """The step for given SDs, the SDs after it, and where the matrix was indefinite."""
         normal = sums.weighed(1 / sigma**2)
         move = damped_step(normal, sums.rest, damping, exact)
         lost = jnp.logical_not(jnp.all(jnp.isfinite(move), axis=0))
@@ -278,7 +280,7 @@ def self_tuned(
         return move, after, lost
 
     def propose(sums: ComponentSums, sigma: Array, damping: Array, exact: Array) -> tuple:
-        """What the sums of a place say of the next: a few updates of the SDs and their step."""
+        """From the sums at a place, a few updates of the SDs and the step for the new SDs."""
 
         def again(carry: tuple) -> tuple:
             count, sigma, _, _, first, exact, _ = carry
@@ -304,7 +306,7 @@ def self_tuned(
         rounding = Rounding.at(coordinates, 1 / jnp.min(proposed, axis=0), images)
         cosine = gradient_cosine(normal, rounding.vanished)
 
-        # Other SDs may mean other units of the residuals, and so another cost without any step.
+        # New SDs may change the units of the residuals, and so the cost, without any step.
         whitened = sums.squares / state.weighed**2
         growth = observation.growth(state.units, state.proposed, whitened)
         judged = judge_step(
@@ -327,7 +329,7 @@ def self_tuned(
             )
         )
 
-        # Where the place was not taken, what its sums propose is not used.
+        # Where the candidate is refused, the proposal from its sums is not used.
         exact = jnp.where(cosine <= EXACT_BELOW, 1.0, 0.0).astype(coordinates.dtype)
         move, after, weighed, first, exact, bad, half, predicted = propose(
             sums, sigma, damping + 16 * eps, exact
@@ -382,8 +384,8 @@ def update_at(
 ) -> tuple[Normal, Float[Array, "k lanes"]]:
     """The normal equations with SDs, and the SDs after one update, at a place.
 
-    Both are functions whose fixed point :func:`self_tuned` finds; derivatives go through them
-    (:mod:`jaxcal.solvers.implicit`).
+    Where :func:`self_tuned` stops, the gradient is zero and the update leaves the SDs as they are;
+    :mod:`jaxcal.solvers.implicit` differentiates these two conditions.
     """
     observed = observation.with_sigma(sigma)
     sums = component_sums(place, observed, images, None, medium)

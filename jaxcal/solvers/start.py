@@ -5,16 +5,17 @@ With r1 and r3 the lateral and axial columns of X's rotation, B_i X p_i = c of E
 
     R_i (u_i a1 + v_i a3 + t) + b_i - c = 0,         3 n equations, 12 unknowns,
 
-whether the pixel scales s are known or not: unknown scales are |a1| and |a3|. The images are needed
-once: the normal matrix of the 12 unknowns consists of sums of u, v, their products and the
+whether the pixel scales s are known or not: unknown scales are |a1| and |a3|. The images enter by
+sums only: the normal matrix of the 12 unknowns consists of sums of u, v, their products and the
 rotations. The 3x2 matrix [a1, a3] is projected to orthonormal columns (y = z cross x completes it,
 so no reflection can arise), and t and c (and unknown scales) follow from the same sums.
 
-The system is singular where the poses or the points (all on a line in the image) determine less
-than 12 unknowns, and useless where few images and much noise drown it, although X's being a
-rotation may still determine it. A pivot well above rounding and columns of length near 1 (where the
-scales are known) make it sound; where it is not, t and c for each of the 24 rotations of the cube
-follow from the same sums, and the best of the fits from there is the answer.
+The system is singular where the poses or the points (all on a line in the image) determine fewer
+than 12 unknowns, and useless with few images and much noise. The constraint that X has a rotation
+may still determine the answer then. The start is called sound if the least pivot is well above
+rounding and the columns are far from parallel and (where the scales are known) of length near 1.
+Where it is unsound, t and c for each of the 24 rotations of the cube follow from the same sums, and
+the best of the fits from these starts is the answer.
 
 References: the linear form is the hand-eye (AX = XB family) elimination used for single-point
 phantoms, e.g. Melvaer et al. 2012; the projection is Schoenemann's.
@@ -42,7 +43,7 @@ from jaxcal.solvers import dense
 from jaxcal.solvers.levenberg_marquardt import Descent, minimise
 
 LEAST_PIVOT = 1e-10
-"""Of the start's normal matrix with a unit diagonal; below it the start is called unsound."""
+"""Least pivot of the normal matrix, scaled to a unit diagonal, with which a start is sound."""
 
 
 class ConventionalStart(eqx.Module):
@@ -60,12 +61,12 @@ class ConventionalStart(eqx.Module):
 
     @property
     def place(self) -> Iterate:
-        """Where methods begin that begin at the conventional fit."""
+        """The conventional fit, from which most methods start."""
         return self.fit.place
 
 
 class GivenStart(eqx.Module):
-    """The same where the conventional fits were found before.
+    """Conventional fits that were found before.
 
     Attributes:
         place: the conventional fits.
@@ -77,7 +78,7 @@ class GivenStart(eqx.Module):
 
     @classmethod
     def of(cls, start: Start, blocks: Blocks) -> GivenStart:
-        """Of starts with a leading axis."""
+        """From starts with a leading axis."""
         plain = jax.vmap(Parameters.of)(start.rotation, start.translation, start.point, start.scale)
         parameters = replace(plain, sound_speed=start.sound_speed)
         return cls(Iterate.of(parameters, blocks), start.searched)
@@ -87,12 +88,12 @@ class Reduced(eqx.Module):
     """The least-squares problem of the start with c and t eliminated; lanes last.
 
     Half its objective is a'Qa / 2 - b'a, a = (a1, a3) in probe coordinates; points and pose origins
-    are taken from their means.
+    are relative to their means.
 
     Attributes:
         count: used images.
         mean: of lateral position and range, mm.
-        face: range of pixel row 0, mm; the mean range holds it.
+        face: range of pixel row 0, mm; the mean range includes it.
         centre: of the poses' origins, mm.
         matrix: Q.
         rhs: b.
@@ -101,7 +102,7 @@ class Reduced(eqx.Module):
         rotation: sum of R_i.
         pulled: sum of R_i'(centre - b_i).
         spread: inverse of t's normal matrix, c eliminated.
-        least: least part of a diagonal entry that the other unknowns leave.
+        least: smallest share of t's diagonal entries that eliminating c and the rest of t leaves.
     """
 
     count: Float[Array, " lanes"]
@@ -178,7 +179,7 @@ class Reduced(eqx.Module):
 
         Args:
             lateral: its first column, (3, lanes).
-            axial: its last.
+            axial: its last column.
             blocks: the free unknowns.
         """
         one = jnp.ones_like(self.count)
@@ -205,7 +206,7 @@ class Reduced(eqx.Module):
         )
 
     def _scales(self, lateral: Array, axial: Array) -> Float[Array, "2 lanes"]:
-        """The best factors of two columns of a rotation."""
+        """The scales that fit best, given two columns of a rotation."""
         forces = [
             dense.product_lanes_last(self.matrix[:, :3], lateral),
             dense.product_lanes_last(self.matrix[:, 3:], axial),
@@ -231,7 +232,7 @@ class Reduced(eqx.Module):
 def closed_form(
     images: ImagePlanes, blocks: Blocks
 ) -> tuple[Iterate, Bool[Array, " lanes"], Reduced]:
-    """The start, whether it is sound, and the sums that it is made of."""
+    """The start, whether it is sound, and the sums from which it is computed."""
     sums = Reduced.of(images)
     inverse, _ = dense.inverse_lanes_last(sums.matrix)
     columns = barrier(dense.product_lanes_last(inverse, sums.rhs))
@@ -240,14 +241,14 @@ def closed_form(
     a, b = columns[:3], columns[3:]
     long, deep = jnp.sqrt(jnp.sum(a * a, axis=0)), jnp.sqrt(jnp.sum(b * b, axis=0))
     cosine = jnp.abs(jnp.sum(a * b, axis=0)) / (long * deep)
-    # Comparisons with NaN are false: whatever went wrong is not sound.
+    # Comparisons with NaN are false, so a start with NaN is not sound.
     sound = (least > LEAST_PIVOT) & (cosine < 0.5)
     for size_of in (long, deep):
         known = (size_of > 0.5) & (size_of < 2.0)
         sound = sound & ((size_of > 0) if "scale" in blocks else known)
     eye = jnp.eye(3, dtype=a.dtype)
-    # The nearest orthonormal pair to two unit vectors a, b has their sum and their difference
-    # (orthogonal to each other) for its diagonals.
+    # The diagonals of the orthonormal pair nearest to two unit vectors a, b lie along a + b and
+    # a - b, which are orthogonal.
     a = jnp.where(sound, a / long, eye[:, :1])
     b = jnp.where(sound, b / deep, eye[:, 1:2])
     plus, minus = a + b, a - b
@@ -274,7 +275,7 @@ def conventional(
         max_steps: most passes of each fit.
         undamped: Gauss-Newton instead of Levenberg-Marquardt.
         trace: how many values of the objective to keep.
-        fitted: refine sound starts too; else they are handed on as they are.
+        fitted: refine sound starts too; otherwise they are returned as they are.
     """
     start, sound, sums = closed_form(images, blocks)
     cubes = jnp.asarray(cube_rotations(), images.mask.dtype)
@@ -283,8 +284,8 @@ def conventional(
     )
     observation = InPlane.of(images)
 
-    # One loop whose first round starts in closed form, and which has further rounds only where a
-    # lane's start was unsound: the search costs nothing where it is not needed.
+    # The loop's first round starts in closed form. It has further rounds only where some lane's
+    # start was unsound, so the search costs nothing where it is not needed.
     def one_round(state: tuple) -> tuple:
         index, best = state
         cube = cubes[jnp.maximum(index - 1, 0)]
@@ -303,13 +304,13 @@ def conventional(
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     _, fit = jax.lax.while_loop(unfinished, one_round, (jnp.zeros((), jnp.int32), empty))
     if not fitted:
-        # Whatever happened to a lane's neighbours.
+        # A sound lane keeps its start, even if other lanes needed the search.
         fit = replace(fit, place=choose(sound, start, fit.place))
     return ConventionalStart(fit, choose(sound, start, fit.place), jnp.logical_not(sound))
 
 
 def cube_rotations() -> np.ndarray:
-    """The 24 rotations of the cube: no rotation is farther than 63 degrees from one of them."""
+    """The cube's 24 rotations: no rotation is over 63 degrees from the nearest of them."""
     found = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):

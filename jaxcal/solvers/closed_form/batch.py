@@ -1,8 +1,8 @@
 """Closed-form conventional calibration of many problems at once, and its derivatives.
 
 The mathematics is that of :mod:`jaxcal.solvers.closed_form.single`, written for arrays whose last
-axis counts problems. The images enter by about fifty sums; from there on a problem is a 6x6 matrix
-Q = C'C, a vector b = -C'g and the multipliers of its constraints:
+axis counts problems. The images enter by about fifty sums only. After that a problem is a 6x6
+matrix Q = C'C, a vector b = -C'g and the multipliers of its constraints:
 
     (Q + sum_j l_j A_j) x = b,    x' A_j x = e_j.
 
@@ -15,7 +15,7 @@ Derivatives follow from the implicit function theorem: with M = Q + sum_j l_j A_
 
     M dx + G dl = db - dQ x,    G' dx = 0.
 
-They cost two solves with a factor that is known, in forward and reverse mode, and may be nested.
+They cost two solves with a known factor, in forward and reverse mode, and may be nested.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ def solve_lanes(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     rounding = ROUNDING * jnp.finfo(x.dtype).eps
     certified = definite & (count >= FEWEST_IMAGES)
     certified = certified & (gap <= TOLERANCE * objective + rounding * size)
-    # What fits as well lies in a ball about the dual's minimiser, see the certificate.
+    # All that fits as well lies in a ball about the dual's minimiser (see ``certificate._alone``).
     ball = 4 * (gap + rounding * size)
     alone = ball <= NEARBY**2 * least * jnp.sum(x * x, axis=0)
     return ClosedForm(
@@ -300,7 +300,7 @@ def _optimum(
     start = _multipliers(constraints, matrix, vector, _feasible(first, constraints))
     inside = jnp.zeros_like(start)
     if not constraints.free:
-        # |x| is at most 1 there: far inside.
+        # With these multipliers |x| is at most 1, so they lie far inside.
         inside = inside.at[:2].set(jnp.sqrt(jnp.sum(vector**2, axis=0)))
     lanes = vector.shape[1]
 
@@ -320,7 +320,7 @@ def _optimum(
         trial = values + step
         new_x, new_step, new_off = evaluate(trial)
         better = new_off < off
-        # Comparisons with NaN are false: a trial outside is not better.
+        # Comparisons with NaN are false, so a trial outside is not better.
         outside_at_first = (index == 0) & ~better
         step = jnp.where(better, new_step, CUT * step)
         step = jnp.where(outside_at_first, inside - start, step)
@@ -369,7 +369,7 @@ def _optimum_jvp(estimate: tuple[str, ...], primals: tuple, tangents: tuple) -> 
 def _multipliers(
     constraints: QuadraticConstraints, matrix: Array, vector: Array, x: Array
 ) -> Array:
-    """Least squares for the multipliers that make x stationary."""
+    """The multipliers that make x most nearly stationary, by least squares."""
     products = _products(constraints, list(x))
     rest = vector - jnp.einsum("ijl,jl->il", matrix, x)
     gram = [[unrolled.dot(a, b) for b in products] for a in products]
@@ -383,7 +383,7 @@ def _feasible(
     pair = x.reshape(2, 3, -1)
     lengths = jnp.sqrt(jnp.sum(pair**2, axis=1))
     a, b = pair[0] / lengths[0], pair[1] / lengths[1]
-    # The nearest orthonormal pair has the sum and the difference for its diagonals.
+    # The diagonals of the nearest orthonormal pair lie along the sum and the difference.
     plus, minus = a + b, a - b
     plus = plus / jnp.sqrt(jnp.sum(plus**2, axis=0))
     minus = minus / jnp.sqrt(jnp.sum(minus**2, axis=0))

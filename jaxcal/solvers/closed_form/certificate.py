@@ -7,7 +7,7 @@ e_j). For an x that satisfies the constraints
 
     f(x) - bound = r' M^-1 r,    r = M x + C'g,
 
-a sum of squares without cancellation, which vanishes where x is stationary and l its multipliers.
+a sum of squares without cancellation. It is zero where x is stationary and l are its multipliers.
 Where that proves nothing, :func:`certify` tries the bound of
 :mod:`jaxcal.solvers.closed_form.rotation_relaxation`. Nothing here depends on where the answer came
 from.
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from jaxcal.data.recording import Images, Recording
 
 TOLERANCE = 1e-9
-"""A gap below this share of the objective is none."""
+"""A gap below this share of the objective counts as zero."""
 
 SHIFTS = (0.0, 1e-15, 1e-14, 1e-12, 1e-9, 1e-6, 1e-4, 1e-2)
-"""Shares by which multipliers are moved into the inside of where M is positive definite."""
+"""Shares by which multipliers are moved into the region where M is positive definite."""
 
 ORTHONORMAL = 1e-6
 """A transform whose rotation stretches by more is refused; less is rounding, and is removed."""
@@ -103,7 +103,7 @@ def duality_gap(
 
 
 def unconstrained_gap(reduced: ReducedObjective, x: Float[np.ndarray, 6]) -> float:
-    """f(x) less its minimum without any constraint, which holds for a singular C as well."""
+    """f(x) less its minimum without any constraint; this bound holds for a singular C as well."""
     left, values, _ = np.linalg.svd(reduced.factor)
     within = left[:, values > SINGULAR * max(values[0], np.finfo(float).tiny)]
     return float(np.sum((within.T @ (reduced.factor @ x + reduced.shift)) ** 2))
@@ -122,10 +122,10 @@ def gap_of_multipliers(
     best = np.inf
     for share in SHIFTS:
         if constraints.free:
-            # M at l = 0 is C'C: along the way there it stays as definite as both ends are.
+            # M at l = 0 is C'C; on the way there, M is definite wherever both ends are.
             moved = (1 - share) * values
         else:
-            # |a1| and |a3| are known: l1 and l3 may grow together, and M with them.
+            # |a1| and |a3| are known: if their two multipliers grow together, M grows, too.
             moved = values + share * size * constraints.values
         gap = duality_gap(reduced, x, moved)
         if gap > best:
@@ -148,7 +148,7 @@ def certify_point(
         reduced: f and its constraints.
         x: (a1, a3).
         excess: mm^2 by which the answer's t and c make Eq. 7 larger than f(x).
-        values: multipliers, where a solver knows better ones than x tells.
+        values: a solver's multipliers, which may be better than those that follow from x.
         gap: f(x) less a bound that is known already, mm^2.
     """
     objective = float(reduced(x)) + excess
@@ -177,11 +177,11 @@ def _alone(
     values: Float[np.ndarray, " k"],
     excess: float,
 ) -> bool:
-    """Whether all that fits as well as x lies close to it.
+    """Whether everything that fits as well as x lies close to x.
 
-    With M positive definite, f(y) is above the bound by at least |y - x*|^2 times M's least
-    eigenvalue, x* the dual's minimiser, for every y that satisfies the constraints: what fits as
-    well as x lies, as x does, in a ball about x*.
+    Let M be positive definite, and x* the dual's minimiser. For every y that satisfies the
+    constraints, f(y) exceeds the bound by at least |y - x*|^2 times M's least eigenvalue. So x, and
+    everything that fits as well, lies in a ball about x*.
     """
     added = np.tensordot(values, reduced.constraints.matrices, 1)
     squared = reduced.factor.T @ reduced.factor
@@ -213,8 +213,8 @@ def certify(
             ``("common-scale",)`` or ``("sound-speed",)``.
 
     Returns:
-        A :class:`Certificate`. It is of the objective of Eq. 7, the conventional method's; joint
-        methods minimise another one.
+        A :class:`Certificate`. It is about the objective of Eq. 7, which the conventional method
+        minimises; joint methods minimise another one.
 
     Raises:
         InputError: data that cannot be used, no rotation, or a wanted scale that is missing.

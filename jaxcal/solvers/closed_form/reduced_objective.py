@@ -11,7 +11,7 @@ Linear least squares gives c and t for any a1, a3, and what remains of Eq. 7 is
 
 Only the constraints on x depend on which scales are known (:data:`CONSTRAINTS`). The second column
 r2 = r3 x r1 does not occur, so no reflection can arise. A known offset f of the transducer's face
-turns v_i a3 into v_i a3 + f r3, which t takes up, so that the form is exact with it as well.
+turns v_i a3 into v_i a3 + f r3. The added term is absorbed by t, so the form stays exact.
 
 This module needs numpy only. It holds no solver: :mod:`jaxcal.solvers.closed_form.single` minimises
 f, :mod:`jaxcal.solvers.closed_form.certificate` bounds it from below.
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from jaxcal.data.recording import Images, Recording
 
 FEWEST_IMAGES = 4
-"""Fewer give fewer than 12 equations."""
+"""Fewer images give fewer than 12 equations."""
 
 RANK_TOLERANCE = 1e-11
 """Singular values below this share of the largest possible one count as zero."""
@@ -75,7 +75,7 @@ def _constraints() -> dict[tuple[str, ...], QuadraticConstraints]:
 
 
 CONSTRAINTS = _constraints()
-"""By what is estimated beside X and the target."""
+"""The constraints, by what is estimated beside X and the target."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class ReducedObjective:
 def image_data(
     problem: Problem | Recording | Images, estimate: tuple[str, ...]
 ) -> tuple[ImageData, QuadraticConstraints]:
-    """The images in use and the constraints, from whatever a caller holds.
+    """The images in use and the constraints, from any of the types that a caller may have.
 
     Raises:
         InputError: unknown names, a scale where there is none, or unusable images.
@@ -173,7 +173,7 @@ def image_data(
 
 
 def check_estimate(estimate: tuple[str, ...], pixels: bool, spacing_known: bool) -> None:
-    """Refuse what has no closed form, and scales that are not there or not known.
+    """Refuse an ``estimate`` without a closed form, and scales that do not exist or are not known.
 
     Raises:
         InputError: says which.
@@ -237,7 +237,7 @@ def reduce(data: ImageData, constraints: QuadraticConstraints) -> ReducedObjecti
         ],
         axis=2,
     )
-    # c is the mean of what the images see; deviations from it are what remains.
+    # c is the mean of the images' points; only deviations from it remain.
     target = columns.mean(axis=0)
     columns = (columns - target).reshape(3 * count, 10)
     target[:, 9] += centre

@@ -1,17 +1,18 @@
 """A lower bound on Eq. 7 from a small semidefinite program, where three multipliers are too few.
 
-The dual of :mod:`jaxcal.solvers.closed_form.single` knows that a1 and a3 are orthogonal and of
-known length. More is true of a rotation: rows are orthonormal as columns are, and every column is
-the cross product of the two others. Each of these is a quadratic equation v' B_j v = 0 in v = (1,
+The dual of :mod:`jaxcal.solvers.closed_form.single` uses only that a1 and a3 are orthogonal and of
+known length. A rotation satisfies more: its rows are orthonormal as well, and every column is the
+cross product of the two others. Each of these is a quadratic equation v' B_j v = 0 in v = (1,
 a1, a2, a3), or in v = (1, s, a1, a2, a3) with one common unknown scale s. With f = v' F v, any
 multipliers for which
 
     Z = F - bound e0 e0' + sum_j lambda_j B_j
 
 is positive definite prove f >= bound: for a v that satisfies the equations, 0 <= v'Z v = f - bound.
-The largest such bound is found by a barrier method on the 21 or 22 multipliers, bound + weight ln
-det Z with falling weight, Newton's method for each. The iterates are strictly feasible, so that the
-bound holds wherever the iteration stops; how good the solver was decides only how tight it is.
+The largest such bound is found by a barrier method on the 21 or 22 multipliers: bound + weight ln
+det Z is maximised for falling weights, each time by Newton's method. The iterates are strictly
+feasible, so the bound holds wherever the iteration stops; the solver's accuracy decides only how
+tight it is.
 
 References: Briales and Gonzalez-Jimenez, "Convex global 3D registration with Lagrangian duality",
 CVPR 2017 (the redundant rotation constraints); Boyd and Vandenberghe, "Convex Optimization",
@@ -30,9 +31,9 @@ from jaxcal.runtime.array_types import Float
 from jaxcal.solvers.closed_form.reduced_objective import ReducedObjective
 
 FALL = 0.15
-"""By which the barrier's weight is multiplied when its problem is solved."""
+"""Factor on the barrier's weight once the problem with the present weight is solved."""
 CENTRED = 0.3
-"""Newton decrement at which the weight falls."""
+"""Newton decrement below which the weight falls."""
 MOST_STEPS = 300
 
 
@@ -42,7 +43,7 @@ class Relaxation:
 
     Attributes:
         gap: f at the given x less the proved bound, in f's unit; never negative.
-        x: (6,), the relaxation's own idea of the minimiser; it need not be a rotation.
+        x: (6,), the relaxation's estimate of the minimiser; it need not be a rotation.
     """
 
     gap: float
@@ -51,7 +52,7 @@ class Relaxation:
 
 @cache
 def _equations(scaled: bool) -> Float[np.ndarray, "m v v"]:
-    """Orthonormal basis of the matrices B_j; with a common scale s takes the place of 1."""
+    """Orthonormal basis of the matrices B_j; with a common scale, s takes the place of 1."""
     size, unit = (11, 1) if scaled else (10, 0)
     first = size - 9
 
@@ -76,7 +77,7 @@ def _equations(scaled: bool) -> Float[np.ndarray, "m v v"]:
         for k in range(3):
             p, q = (k + 1) % 3, (k + 2) % 3
             equation((a[p], b[q], 1.0), (a[q], b[p], -1.0), (unit, c[k], -1.0))
-    # The rows' trace repeats the columns'.
+    # The sum of the rows' squared lengths equals that of the columns, so one equation is redundant.
     _, values, right = np.linalg.svd(np.array(found), full_matrices=False)
     return right[values > 1e-9].reshape(-1, size, size)
 
@@ -92,8 +93,8 @@ def lower_bound(
         enough: stop when the gap is below this, mm^2.
 
     Returns:
-        None where there is no such relaxation: scales of their own, or a common one with a singular
-        factor.
+        None where there is no such relaxation: a lateral or axial scale of its own, a common scale
+        with a singular factor, or a factor of zero.
     """
     free = reduced.constraints.free
     if free not in ((), ("common",)):
@@ -111,7 +112,7 @@ def lower_bound(
     cost = np.zeros((size, size))
     cost[np.ix_(where, where)] = squared
     cost[0, where] = cost[where, 0] = slope
-    # So that the bound sought is 0: f(x) = |Cx + g|^2 + rest.
+    # With this constant f(x), and so the bound sought, is 0; f(x) = |Cx + g|^2 + rest.
     cost[0, 0] = -(x @ squared @ x + 2 * slope @ x)
     shape = np.zeros(size)
     if scaled:
@@ -124,7 +125,7 @@ def lower_bound(
         shape[0] = -3.0
     start = np.diag(shape)
     matrix = cost + start
-    # Schur's complement of the first row, and room below it.
+    # The Schur complement of the first row, less a margin.
     rest = np.linalg.solve(matrix[1:, 1:], matrix[1:, 0])
     bound = float(matrix[0, 0] - matrix[0, 1:] @ rest) - 1.0
     corner = np.zeros((1, size, size))

@@ -3,23 +3,23 @@
 Eq. 7 in the form f(x) = |C x + g|^2 + rest (:mod:`jaxcal.solvers.closed_form.reduced_objective`)
 has quadratic constraints x' A_j x = e_j only, and a dual d(l) = min_x f(x) + sum_j l_j (x' A_j x -
 e_j), concave in the multipliers l, one for each constraint. With M = C'C + sum_j l_j A_j positive
-definite, x(l) = -M^-1 C'g attains it, and d's gradient is x(l)' A_j x(l) - e_j: where that is zero,
-x(l) satisfies the constraints and is the global minimum, the only one.
+definite, x(l) = -M^-1 C'g attains it, and d's gradient is x(l)' A_j x(l) - e_j. Where the gradient
+is zero, x(l) satisfies the constraints and is the unique global minimum.
 
 - *Both scales unknown*: one multiplier. With W = C^-T (A / 2) C^-1 = V diag(w) V' and h = -V'g,
 
       phi(l) = sum_k w_k (h_k / (1 + l w_k))^2
 
-  falls on (-1 / w_max, -1 / w_min), and its root is the answer. One quadratic equality always has
-  strong duality, so that there is a root but for data in special position.
+  falls on (-1 / w_max, -1 / w_min), and its root is the answer. With one quadratic equality, strong
+  duality always holds, so there is a root except for data in special position.
 - *Known scales*: three multipliers; *one common scale*, or an unknown sound speed: two. Newton's
-  method on the dual, from the multiplier for |a1|^2 + |a3|^2 = 2 alone (known scales) or from zero.
-  With few images and large errors the dual's maximum may lie where M is singular. Then the best of
-  60 descents on the rotations is taken, and :mod:`jaxcal.solvers.closed_form.rotation_relaxation`
-  is asked for a proof.
+  method on the dual starts from the multiplier for |a1|^2 + |a3|^2 = 2 alone (known scales) or from
+  zero. With few images and large errors the dual's maximum may lie where M is singular. Then the
+  best of 60 descents on the rotations is taken, and
+  :mod:`jaxcal.solvers.closed_form.rotation_relaxation` is tried for a proof.
 
 The answer is polished by Newton's method on the rotation and certified by
-:mod:`jaxcal.solvers.closed_form.certificate`, which does not use how it was found.
+:mod:`jaxcal.solvers.closed_form.certificate`, which does not depend on how it was found.
 
 References: Boyd and Vandenberghe, "Convex Optimization", appendix B.1 (strong duality for one
 quadratic constraint); More, "Generalizations of the trust region problem", Optimization Methods and
@@ -58,15 +58,15 @@ DUAL_STEPS = 60
 DESCENT_STEPS = 400
 ARMIJO = 1e-4
 NEARLY_MET = 1e-6
-"""Constraints off by less than this share of |x|^2: the dual's maximum is inside."""
+"""M is regular at the dual's maximum if constraints are off by less than this share of |x|^2."""
 RISE = 1e-13
-"""The dual has arrived when a step raises it by less than this share."""
+"""Newton's method on the dual stops when a step raises it by less than this share."""
 SCREENED, KEPT = 12, 20
-"""After so many steps only so many of the descents go on, the lowest ones."""
+"""After the first number of steps, only the second number of descents go on: the lowest ones."""
 LEAST_SCALE = 1e-9
-"""Of the nominal scale; a free one stays above this, since at zero no direction would be left."""
+"""Least free scale over the nominal one: at zero, a column of X would have no direction."""
 RESTING = 1e-12
-"""A descent rests when its step is below this, in radians and in shares of the scale."""
+"""A descent is finished when its step is below this, in radians and in shares of the scale."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def calibrate_closed_form(
 
     Args:
         problem: a problem or a batch of them, a recording, or one set of images; covariances and
-            bounds are not used, Eq. 7 weighs all images equally.
+            bounds are not used, since Eq. 7 weighs all images equally.
         estimate: what is unknown beside X and the target: ``()``, ``("scale",)`` (both pixel
             scales), ``("common-scale",)`` (square pixels of unknown size) or ``("sound-speed",)``.
 
@@ -151,7 +151,7 @@ def solve(reduced: ReducedObjective) -> tuple[Float[np.ndarray, 6], Certificate]
     relaxed = lower_bound(reduced, best, 0.3 * enough)
     if relaxed is None:
         return best, certificate
-    # What the relaxation takes for the minimiser is a start of its own.
+    # The relaxation's estimate of the minimiser is one more start.
     again = descend(reduced, feasible(relaxed.x, constraints)[None])
     gained = float(reduced(best) - reduced(again))
     best, gap = (again, relaxed.gap - gained) if gained > 0 else (best, relaxed.gap)
@@ -168,7 +168,7 @@ def scalar_root(
     inverse = np.linalg.inv(reduced.factor)
     w, v = np.linalg.eigh(0.5 * inverse.T @ reduced.constraints.matrices[0] @ inverse)
     h = -(v.T @ reduced.shift)
-    # phi is of l / 2 times A, so that M = C'C + (l / 2) A.
+    # The l of phi belongs to A / 2, so M = C'C + (l / 2) A.
     low, high = -1 / w[-1], -1 / w[0]
     at = 0.0
     for _ in range(200):
@@ -272,7 +272,7 @@ def feasible(x: Float[np.ndarray, 6], constraints: QuadraticConstraints) -> Floa
 
 @cache
 def _rotations() -> Float[np.ndarray, "60 3 3"]:
-    """The 60 rotations of the icosahedron: none is farther than 45 degrees from one of them."""
+    """The icosahedron's 60 rotations: no rotation is over 45 degrees from the nearest of them."""
     golden = (1 + 5**0.5) / 2
     unit = [np.array(q) for q in itertools.product((0.5, -0.5), repeat=4)]
     unit += [np.roll([1.0, 0.0, 0.0, 0.0], k) for k in range(4)]
@@ -323,12 +323,12 @@ def _starts(reduced: ReducedObjective) -> Float[np.ndarray, "60 6"]:
     seen = reduced.factor @ columns
     rest = fixed @ reduced.factor.T + reduced.shift
     scales = -(np.linalg.pinv(seen) @ rest[:, :, None])
-    # Of a length of zero no direction is left to improve.
+    # A column of length zero has no direction to improve.
     scales = np.where(np.abs(scales) < 1e-6, 1e-6, scales)
     return fixed + (columns @ scales)[:, :, 0]
 
 
-# A step on a degenerate problem may be without bound: it makes no number, and is not taken.
+# On a degenerate problem a step may overflow; its value is then NaN or Inf, and it is not taken.
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def descend(reduced: ReducedObjective, x: Float[np.ndarray, "s 6"]) -> Float[np.ndarray, 6]:
     """The best of Newton's descents on rotation and free scales from several feasible points.
@@ -367,7 +367,7 @@ def descend(reduced: ReducedObjective, x: Float[np.ndarray, "s 6"]) -> Float[np.
         better = after <= value
         x = np.where(better[:, None], trial, x)
         value = np.where(better, after, value)
-        # Where it went well the damping vanishes, and the steps become Newton's own.
+        # After good steps the damping vanishes, and the steps become pure Newton steps.
         damping = np.where(better, np.where(damping < 1e-9, 0.0, 0.03 * damping), 10 * damping)
         damping = np.where(~better & (damping == 0), 1e-8, np.minimum(damping, 1e8))
         if np.all((np.abs(step).max(axis=1) < RESTING) | (damping >= 1e8)):
@@ -390,8 +390,8 @@ def _moved(
 ) -> Float[np.ndarray, "s 6"]:
     """Turn by Cayley's rotation and multiply free scales by one plus the step.
 
-    Degenerate images may be fitted best by a scale of zero: by factors it is reached in few steps,
-    by exponentials in hundreds.
+    Degenerate images may be fitted best by a scale of zero. Factors reach it in few steps,
+    exponentials in hundreds.
     """
     half = 0.5 * step[:, None, :3]
     once = _turns(pairs) @ half[..., None]
@@ -416,7 +416,7 @@ def _assemble(
     lengths = np.array([np.linalg.norm(lateral), np.linalg.norm(axial)])
     r1, r3 = lateral / lengths[0], axial / lengths[1]
     if {"lateral", "common"} & set(free):
-        # The face's offset was taken up by t.
+        # The offset of the face is part of t so far.
         origin = origin - data.face_offset * r3
     transform = np.eye(4)
     transform[:3, :3] = np.stack([r1, np.cross(r3, r1), r3], axis=1)
