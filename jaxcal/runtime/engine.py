@@ -45,7 +45,7 @@ def solve_problem(problem: Problem, given: Given, plan: SolvePlan) -> Calibratio
         given: numbers that came with the request.
         plan: what is static about it.
     """
-    if _is_kept(problem, given, plan):
+    if _is_kept(problem, plan, inside=inside_transformation(problem, given)):
         return _solve_kept(problem, given, plan)
     return _solve_compiled(problem, given, plan)
 
@@ -97,25 +97,25 @@ def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | N
     """
     shape = problems.batch_shape
     problems = with_bound(problems, given)
-    flat = map_arrays(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
-    largest = chunk or _side_by_side(problems, given, plan)
+    flat = problems
+    if len(shape) > 1:
+        flat = map_arrays(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
+    inside = inside_transformation(problems, given)
+    largest = chunk or _side_by_side(problems, plan, inside=inside)
     count = flat.mask.shape[0]
-    if count and _is_kept(problems, given, plan):
-        result = _solve_chunks_kept(flat, given, plan, largest)
-    else:
-        result = _solve_chunks_compiled(flat, given, plan, largest)
+    kept = count > 0 and _is_kept(problems, plan, inside=inside)
+    solve = _solve_chunks_kept if kept else _solve_chunks_compiled
+    result = solve(flat, given, plan, largest)
     result = map_arrays(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
-    return result.with_problem(problems)
+    # Only now: a slice of a numpy array is a view, one of a JAX array is a program that copies.
+    return (as_jax_holds(result, problems) if kept else result).with_problem(problems)
 
 
-def _side_by_side(problems: Problem, given: Given, plan: SolvePlan) -> int:
+def _side_by_side(problems: Problem, plan: SolvePlan, *, inside: bool) -> int:
     """How many problems are solved at once, unless the caller says."""
     import jax
 
-    if inside_transformation(problems, given):
-        platform = jax.default_backend()
-    else:
-        platform = _devices(problems)[0].platform
+    platform = jax.default_backend() if inside else _devices(problems)[0].platform
     if platform == "cpu":
         return CHANNELS_CHUNK if plan.channels else BATCH_CHUNK
     rows = problems.images
@@ -127,7 +127,10 @@ def _side_by_side(problems: Problem, given: Given, plan: SolvePlan) -> int:
 def _solve_chunks_kept(
     problems: Problem, given: Given, plan: SolvePlan, largest: int
 ) -> Calibration:
-    """A batch (one leading axis) by a program that serves all batches of nearly its size."""
+    """A batch (one leading axis) by a program that serves all batches of nearly its size.
+
+    The result is in numpy arrays, and may go on behind the last problem.
+    """
     count, images = problems.mask.shape
     given = replace(given, max_elevation=None)  # the problems have it
     chunk = min(buckets.size(count), largest)
@@ -149,7 +152,7 @@ def _solve_chunks_kept(
         flags=compiler.batch_wishes(),
         label=label,
     )
-    return as_jax_holds(buckets.cut(result, images), problems)
+    return buckets.cut(result, images)
 
 
 def _solve_chunks_compiled(
@@ -188,9 +191,15 @@ def _label(plan: SolvePlan, images: int) -> dict[str, Any]:
     }
 
 
-def _is_kept(problems: Problem, given: Given, plan: SolvePlan) -> bool:
-    """Whether the program for it is one that is kept: whole, on one CPU, and of our own solvers."""
-    if inside_transformation(problems, given) or not executables.is_describable(plan):
+def _is_kept(problems: Problem, plan: SolvePlan, *, inside: bool) -> bool:
+    """Whether the program for it is one that is kept: whole, on one CPU, and of our own solvers.
+
+    Args:
+        problems: one or many.
+        plan: what is static about the request.
+        inside: a jit, vmap or grad of the caller's looks at the code.
+    """
+    if inside or not executables.is_describable(plan):
         return False
     import jax
 
