@@ -4,7 +4,7 @@
     problem = jaxcal.Problem.from_recording(recording)
     result = jaxcal.calibrate(problem, method="joint")
 
-Names are imported on first use, so that ``import jaxcal`` costs nothing until JAX is needed.
+Names are imported on first use, so ``import jaxcal`` is fast and does not import JAX.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class InputError(CalibrationError, ValueError):
 
 
 class FormatError(InputError):
-    """A file is not what it should be: another format, truncated, a newer version, unsafe."""
+    """A file cannot be read: it has another format or a newer version, is truncated or unsafe."""
 
 
 class OutputError(CalibrationError, OSError):

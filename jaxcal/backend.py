@@ -1,17 +1,18 @@
-"""The engine's pieces, for those who bring a solver or a problem of their own.
+"""The parts of the engine, for those who bring a solver or a problem of their own.
 
-A calibration of jaxcal is least squares: unknowns that step on a manifold (:class:`Parameters`,
+A calibration in jaxcal is least squares: unknowns that step on a manifold (:class:`Parameters`,
 :func:`retract`), residuals (:func:`measurement_residual`, :func:`circle_residual`,
-:func:`channel_residual`), a minimiser of them, and the derivative of the minimum by the implicit
-function theorem. :func:`initial_fit` is where every method begins.
+:func:`channel_residual`), a minimiser, and the derivative of the minimum by the implicit function
+theorem. Every method begins at :func:`initial_fit`.
 
-In batches, laid out as planes with the problems last, the same are :class:`ImagePlanes` (the data),
-:class:`Iterate` (the unknowns), an :class:`Observation` (:class:`Points`, :class:`OwnCovariances`,
-:class:`TrackedPoints`, :class:`InPlane`, :class:`BoundedOffsets`, :class:`ChannelDistances`, or one
-of your own), :func:`accumulate` (the normal equations in one pass over the images),
-:func:`minimise` and :func:`implicit_tangent`. :class:`LevenbergMarquardt` is the same loop behind
-optimistix's interface for residuals of any shape, :func:`arrow_least_squares` that for problems
-with shared unknowns and one local unknown a row.
+There are versions of these for batches, where arrays are planes with the problems last:
+:class:`ImagePlanes` (the data), :class:`Iterate` (the unknowns), an :class:`Observation`
+(:class:`Points`, :class:`OwnCovariances`, :class:`TrackedPoints`, :class:`InPlane`,
+:class:`BoundedOffsets`, :class:`ChannelDistances`, or one of your own), :func:`accumulate` (the
+normal equations in one pass over the images), :func:`minimise` and :func:`implicit_tangent`.
+:class:`LevenbergMarquardt` is the same loop behind optimistix's interface, for residuals of any
+shape. :func:`arrow_least_squares` is the loop for problems with shared unknowns and one local
+unknown for each row.
 
 Unlike :func:`jaxcal.calibrate`, these functions compute in the caller's modes: switch 64 bits on
 (``jax.enable_x64``) before making a problem's arrays. ``docs/how-to/own-solver.md`` has worked
@@ -86,7 +87,7 @@ __all__ = [
 
 
 def initial_fit(problem: Problem, blocks: Blocks = RIGID) -> Parameters:
-    """The conventional fit (Eq. 7) from the closed form: where every method of jaxcal begins.
+    """The conventional fit (Eq. 7) from the closed form, at which every method of jaxcal begins.
 
     Args:
         problem: one problem (vmap for a batch).

@@ -1,1 +1,1 @@
-"""One problem, or a batch of them, to an answer that can be saved and applied."""
+"""Calibration of one problem or a batch; the answer can be saved and applied."""

@@ -1,19 +1,19 @@
-"""From where a method stopped to a :class:`jaxcal.Calibration`, in plain array operations.
+"""Builds a :class:`jaxcal.Calibration` from a method's solution, in plain array operations.
 
-What is computed here is there under jit, vmap and grad: offsets, SDs, covariance and status.
-Everything else about an answer is computed when it is read (:mod:`jaxcal.diagnostics`), from the
-problem and two p x p matrices:
+Offsets, SDs, covariance and status are computed here, so they are available under jit, vmap and
+grad. Everything else about an answer is computed when it is read (:mod:`jaxcal.diagnostics`), from
+the problem and two p x p matrices:
 
 - S, the *information* of the shared unknowns: the normal matrix of the whitened residuals with the
   offsets eliminated. Its inverse, times the residuals' variance where they are in mm, is the
   covariance (the Cramer-Rao bound, where no offset rests on its bound).
-- D, the *design*: the same of the unweighted residuals with the offsets known.
+- D, the *design*: the normal matrix of the unweighted residuals with the offsets known.
 
 The status needs no spectrum. Rotations, scales and sound speed are multiplied by the lever arm L,
-the root mean square distance of the points from the image origin: all unknowns are then mm at the
-target. The poses are degenerate where the smallest eigenvalue of D is below a threshold times its
-trace; a direction is unknown where that of S is below variance / (L / 2)^2. Whether the smallest
-eigenvalue of A exceeds a number c is told by the pivots of A - c 1.
+the root mean square distance of the points from the image origin, so that all unknowns are mm at
+the target. The poses are degenerate if the smallest eigenvalue of D is below a threshold times its
+trace. A direction is unknown if the smallest eigenvalue of S is below variance / (L / 2)^2. The
+pivots of A - c 1 show whether the smallest eigenvalue of a matrix A exceeds a number c.
 """
 
 from __future__ import annotations
@@ -39,19 +39,21 @@ from jaxcal.solvers.dense import inverse_lanes_last
 from jaxcal.solvers.methods import nominal_sound_speed
 
 LEAST_GAP_MM = 1e-6
-"""An offset nearer to its bound than this is about to reach it."""
+"""An offset is about to reach its bound if it is nearer to it than this."""
 
 LEAST_HOLD = 1e-6
-"""An offset held on its bound by less, in root mean square residuals, is about to leave it."""
+"""An offset is about to leave its bound if the force that holds it there is smaller than this, in
+root mean square residuals."""
 
 
 class Solved(eqx.Module):
     """Where a method stopped; one problem, or a batch with leading axes on every array.
 
     Attributes:
-        parameters: X, target and further unknowns; functions of the data, where the answer is to
-            be differentiated, and so are the following.
-        offset: offset unknowns, mm (of tracker noise: in its SDs); k = 0 where eliminated.
+        parameters: X, target and further unknowns. If the answer is to be differentiated, they are
+            functions of the data, and so are the following.
+        offset: offset unknowns, mm, or in the tracker's SDs for tracker noise; k = 0 where they
+            were eliminated.
         sigma: SDs that whiten the residuals, mm; None for residuals in mm.
         bound: on the offsets, mm; None where there is none.
         information: of the shared unknowns, offsets eliminated.
@@ -74,7 +76,7 @@ class Average(Protocol):
 
     @property
     def covariance(self) -> Float[Array, "*batch p p"]:
-        """Of the shared unknowns."""
+        """Covariance of the shared unknowns."""
         ...
 
     @property
@@ -84,7 +86,7 @@ class Average(Protocol):
 
     @property
     def law(self) -> OffsetLaw:
-        """What was found out about the distribution."""
+        """The result about the distribution."""
         ...
 
 
@@ -96,7 +98,7 @@ def assemble(
     given: Given,
     plan: SolvePlan,
 ) -> Calibration:
-    """A calibration but for its problem, which the front door adds (``with_problem``).
+    """A calibration without its problem, which the caller adds with ``with_problem``.
 
     Args:
         solved: where the method stopped.
@@ -104,11 +106,11 @@ def assemble(
             parameters and SDs of ``solved`` are then the average's.
         problem: the images in use, with one leading axis as in ``solved``.
         images: the same as planes.
-        given: numbers that came with the request, without leading axes.
+        given: the numbers in the request, without leading axes.
         plan: what is static about the request.
     """
     problem = problem.cleared(problem.mask)
-    # Or the compiler would repeat the end of the solve for every image.
+    # Without this barrier the compiler would repeat the end of the solve for every image.
     solved = barrier(solved)
     parameters, blocks, mask = solved.parameters, plan.blocks, problem.mask
     used = jnp.sum(mask, axis=-1)
@@ -134,7 +136,7 @@ def assemble(
         bounded=plan.prior == "bounded",
     )
     if averaged is not None:
-        # What the Gaussian solution cannot tell at all stays unknown.
+        # What the Gaussian solution cannot determine at all stays unknown.
         better = averaged.law.weighed[..., None, None] & jnp.isfinite(covariance)
         covariance = jnp.where(better, averaged.covariance, covariance)
     status = _status(solved, observed, used)
@@ -178,13 +180,13 @@ def assemble(
 
 
 def _further(parameters: Parameters, blocks: Blocks) -> Float[Array, "*batch k"] | None:
-    """The free further unknowns side by side; None where there are none."""
+    """The free ones of the further unknowns, in one array; None where there are none."""
     free = [parameters.further(name) for name in EXTRA if name in blocks]
     return jnp.concatenate(free, axis=-1) if free else None
 
 
 class Errors(eqx.Module):
-    """The target in every image, beside what was measured; arrays are (lanes, n).
+    """The target in every image, and what was measured; arrays are (lanes, n).
 
     Attributes:
         q: lateral, elevational and axial coordinate of the target, mm; (0, 0, 1) where left out.
@@ -200,7 +202,7 @@ class Errors(eqx.Module):
 
     @classmethod
     def of(cls, parameters: Parameters, images: ImagePlanes, blocks: Blocks) -> Errors:
-        """At some unknowns."""
+        """The errors at given unknowns."""
         mask = images.mask
         q, _ = targets(Iterate.of(parameters, blocks), images)
         further = {
@@ -208,16 +210,16 @@ class Errors(eqx.Module):
             for name, values in ((name, parameters.further(name)) for name in EXTRA)
         }
         lateral, distance = measured(images.lateral, images.axial, images.face[:, None], further)
-        # The range has no derivative at 0, where an image left out may well put the target.
+        # The range has no derivative at 0, and an image left out may put the target there.
         x, y, z = (
             jnp.where(mask > 0, value, unused) for value, unused in zip(q, (0, 0, 1), strict=True)
         )
         return cls((x, y, z), lateral, distance, mask)
 
     def squares(self, *planes: Array, axial: Array | None = None) -> Float[Array, "*batch"]:
-        """Sum over the images of |q - (lateral, 0, axial)|^2, axial the range by default.
+        """Sum over the images of |q - (lateral, 0, axial)|^2; axial is the range by default.
 
-        The planes take the place of q's elevational component.
+        The planes replace q's elevational component.
         """
         axial = self.distance if axial is None else axial
         parts = (self.q[0] - self.lateral, *planes, self.q[2] - axial)
@@ -229,7 +231,7 @@ class Errors(eqx.Module):
         return jnp.sqrt(jnp.sum(squares, axis=-1) / jnp.sum(mask, axis=-1))
 
     def mean_squares(self) -> tuple[Array, Array]:
-        """Sums over the images of lateral and range error squared, mm^2."""
+        """Sums over the images of the squared lateral and range errors, mm^2."""
         distance = jnp.sqrt(self.q[1] ** 2 + self.q[2] ** 2)
         errors = (self.q[0] - self.lateral, distance - self.distance)
         lateral, distance = (jnp.sum(self.mask * error**2, axis=-1) for error in errors)
@@ -237,7 +239,7 @@ class Errors(eqx.Module):
 
 
 class ActiveBounds(eqx.Module):
-    """Offsets within bounds at a solution.
+    """The state of bounded offsets at a solution.
 
     Attributes:
         resting: 1 where an offset rests on its bound.
@@ -256,14 +258,14 @@ class ActiveBounds(eqx.Module):
     def of(
         cls, errors: Errors, y: Float[Array, "*batch n"], bound: Array, problem: Problem
     ) -> ActiveBounds:
-        """At offsets y."""
+        """The state at offsets y."""
         distance, mask = errors.distance, errors.mask
         axial = jnp.sqrt(jnp.maximum(distance**2 - y**2, (1e-6 * distance) ** 2))
         slope = y / axial
         elevational = errors.q[1] - y
         cost = errors.squares(elevational, axial=axial)
         limit = jnp.minimum(bound, LARGEST_ELEVATION * jnp.abs(distance))
-        # The derivative of half the cost by y pushes outwards where an offset rests.
+        # The derivative of half the cost by y; at an offset on its bound it points outwards.
         force = slope * (errors.q[2] - axial) - elevational
         near = jnp.abs(y) >= (1 - AT_BOUND) * limit
         resting = mask * near * (jnp.sign(y) * force <= 0)
@@ -276,11 +278,11 @@ class ActiveBounds(eqx.Module):
 
 
 class Observability(eqx.Module):
-    """What the pivots of two matrices tell of the unknowns.
+    """What the pivots of two matrices show about the unknowns.
 
     Attributes:
         degenerate: the poses do not determine the unknowns.
-        weak: some direction is not known in any useful sense.
+        weak: the SD of some direction is too large to be useful.
         singular: degenerate, or the information with the active bounds is singular.
     """
 
@@ -303,11 +305,11 @@ def covariance_and_observability(
     Args:
         information: of the unknowns, offsets eliminated.
         design: of the unweighted residuals, offsets known.
-        variance: of the residuals that ``information`` is of.
-        scale: what makes every unknown's tangent mm at the target.
-        reach: a direction with a larger SD is not known in any useful sense, mm.
-        bounded: offsets are confined by bounds, and so is every direction: what matters of the
-            information is whether it is singular.
+        variance: of the residuals from which ``information`` was formed.
+        scale: factors that turn every unknown's tangent into mm at the target.
+        reach: largest useful SD of a direction, mm.
+        bounded: bounds confine the offsets, and with them every direction, so all that matters
+            about the information is whether it is singular.
     """
     batch, count, eps = scale.shape[:-1], scale.shape[-1], float(jnp.finfo(scale.dtype).eps)
     both, eye = scale[..., :, None] * scale[..., None, :], jnp.eye(count, dtype=scale.dtype)
@@ -315,10 +317,10 @@ def covariance_and_observability(
     total = jnp.trace(weighted, axis1=-2, axis2=-1)
     least = threshold(eps) * total if bounded else jax.lax.stop_gradient(variance / reach**2)
     floor = threshold(eps) * jnp.trace(unweighted, axis1=-2, axis2=-1)
-    # A ridge at the level of rounding: an unobservable direction stays finite.
+    # A ridge at the level of rounding keeps an unobservable direction finite.
     diagonal = jnp.diagonal(design if bounded else information, axis1=-2, axis2=-1)
     ridge = jax.lax.stop_gradient(16 * eps * diagonal)
-    # The logarithm of a pivot that is not positive is not finite.
+    # A pivot that is not positive makes the logarithm of the determinant not finite.
     matrices = [information + ridge[..., None] * eye, unweighted - floor[..., None, None] * eye]
     lanes_last = jnp.moveaxis(jnp.stack(matrices).reshape(-1, count, count), 0, -1)
     inverse, log_determinant = inverse_lanes_last(lanes_last)
@@ -331,13 +333,13 @@ def covariance_and_observability(
         lanes_last = jnp.moveaxis(reduced.reshape(-1, count, count), 0, -1)
         return jnp.isfinite(inverse_lanes_last(lanes_last)[1]).reshape(batch)
 
-    # No eigenvalue of an inverse is above its trace, which nearly always settles it.
+    # No eigenvalue of an inverse exceeds its trace; this test nearly always suffices.
     largest = jnp.sum(jnp.diagonal(inverse, axis1=-2, axis2=-1) * scale**2, axis=-1)
     clearly = jax.lax.stop_gradient(2 * least * largest < 1) & (largest > 0) & (not bounded)
     exceeds = jax.lax.cond(jnp.all(clearly), lambda: clearly, exceeding)
 
     degenerate = jnp.logical_not(observable)
-    # Of nearly exact data, what rounding leaves of the smallest eigenvalue may be enough.
+    # With nearly exact data the limit is below rounding, and then no direction counts as weak.
     below = jnp.logical_not(exceeds) & (bounded | (eps * total < least))
     found = Observability(
         degenerate=degenerate, weak=below & (not bounded), singular=degenerate | (below & bounded)
@@ -377,7 +379,7 @@ def _is_differentiable(
     good = (status == Status.CONVERGED) & (convergence.stationarity <= still)
     good = good & jnp.logical_not(jnp.any(convergence.sigma_floored, axis=-1))
     if bounds is not None:
-        # An offset about to reach its bound, or to leave it, makes the answer's kink.
+        # The answer has a kink where an offset reaches its bound or leaves it.
         good = good & (bounds.gap > LEAST_GAP_MM) & (bounds.hold > LEAST_HOLD)
         good = good & jnp.logical_not(observed.singular)
     return good & plan.options.differentiate
@@ -407,7 +409,7 @@ def _three_sigmas(
     problem: Problem,
     plan: SolvePlan,
 ) -> Float[Array, "*batch 3"]:
-    """SDs of lateral position, range and offset, mm: those that whiten, or of the residuals."""
+    """SDs of lateral position, range and offset, mm: those that whiten, or the residuals' own."""
     if solved.sigma is not None and not plan.channels:
         return solved.sigma
     if solved.sigma is not None:
@@ -423,9 +425,10 @@ def _three_sigmas(
 
 
 def _point_sd(errors: Errors, problem: Problem) -> Float[Array, "*batch 2"]:
-    """Root mean square SD of (lateral, axial) from an image's elements alone, per unit of theirs.
+    """SD of (lateral, axial) from an image's elements alone, for elements with an SD of 1.
 
-    The inverse of the 2x2 information of Eq. 5 (or 6) with the offset held.
+    It is the root mean square over the images; each image's variance is from the inverse of the 2x2
+    information of Eq. 5 (or 6) with the offset held.
     """
     assert problem.channels is not None
     channels, mask = problem.channels, problem.mask
@@ -437,7 +440,7 @@ def _point_sd(errors: Errors, problem: Problem) -> Float[Array, "*batch 2"]:
     a, b, c = (
         jnp.sum(weight * product, axis=-1) for product in (lateral**2, lateral * axial, axial**2)
     )
-    # Weights are 0 or 1, so that their squares are themselves.
+    # Weights are 0 or 1, so they equal their squares.
     determinant = a * c - b**2
     known = determinant > 0
     variance = jnp.stack([c, a], axis=-1) / jnp.where(known, determinant, 1.0)[..., None]

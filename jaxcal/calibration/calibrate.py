@@ -1,10 +1,10 @@
-"""The front door: one problem or a batch, by any method, to a :class:`Calibration`.
+"""Calibrate one problem or a batch, by any method; the result is a :class:`Calibration`.
 
-What was asked for is checked in :mod:`jaxcal.calibration.options`. Conventional calibration of one
-problem has a closed form, which needs numpy only (:mod:`jaxcal.calibration.conventional`).
-Everything else, and everything inside somebody's jit, vmap or grad, is solved by the engine:
-:mod:`jaxcal.calibration.pipeline` is the way that every problem takes there, one pure function of
-arrays, which :mod:`jaxcal.runtime.programs` compiles.
+:mod:`jaxcal.calibration.options` checks the request. Conventional calibration of one problem has a
+closed form, which needs numpy only (:mod:`jaxcal.calibration.conventional`). Everything else, and
+everything inside a caller's jit, vmap or grad, is solved by the engine:
+:mod:`jaxcal.calibration.pipeline` solves every problem there, as one pure function of arrays, which
+:mod:`jaxcal.runtime.programs` compiles.
 """
 
 from __future__ import annotations
@@ -67,48 +67,49 @@ def calibrate(
     options: Options | None = None,
     robust: bool = False,
 ) -> Calibration:
-    """Find X, the target and the elevational offsets; nobody supplies a starting guess.
+    """Find X, the target and the elevational offsets; no starting guess is needed.
 
     Args:
         problem: one problem (a batch is handed to :func:`calibrate_batch`), or a recording.
         method: ``joint`` (X, c and every offset together), ``alternating`` (the paper's Fig. 4) or
             ``conventional`` (Eq. 7, every target in the plane).
-        prior: of the joint method. ``auto``: errors have self-tuned SDs, and the law of the
-            offsets, their mean and the noise are weighed by the data (:mod:`jaxcal.solvers.auto`).
+        prior: of the joint method. ``auto``: errors have self-tuned SDs, and the data weigh the
+            offsets' laws, their mean and the noise models (:mod:`jaxcal.solvers.auto`).
             ``uniform``: the same with offsets that are uniform between unknown edges.
             ``gaussian``: offsets and errors are Gaussian, with the SDs of ``sigma`` or, without it,
             self-tuned by REML. ``bounded``: |y_i| <= max_elevation with equal weights, the
             alternation's objective. With given ``sigma``, ``auto`` is ``gaussian``.
-        max_elevation: bound m on |y|, mm, one number or (n,); overrides the problem's own. The
-            alternation and ``bounded`` take 1 mm where there is neither; ``auto`` and ``uniform``
-            cut the law of each image's offset there.
+        max_elevation: bound m on |y|, mm, one number or (n,); overrides the problem's own. Without
+            either bound, the alternation and ``bounded`` use 1 mm. ``auto`` and ``uniform`` cut off
+            the law of each image's offset at the bound.
         sigma: given SDs of lateral position, range and elevational offset, mm; on channels, of an
             element's distance and the elevational offset.
-        tracker_sd: isotropic SD of the tracked position, mm, beside given ``sigma``.
+        tracker_sd: isotropic SD of the tracked position, mm; only with a given ``sigma``.
         estimate: further unknowns: ``scale`` (the pixels' size), ``sound-speed``, ``delay``; one
             name, or several.
         data: ``channels``: the joint method's residuals are those of every element's time of flight
             (the recording must hold them); ``points``: those of the segmented points; ``auto``:
-            channels where they say more, on curvilinear probes and for sound speed or delay.
+            channels where they tell more: on curvilinear probes and for sound speed or delay.
         sound_speed_sd: how far the sound speed may be from nominal, m/s (joint only, not bounded).
         delay_sd: how far the delay may be from nominal, s (joint only, not bounded).
         options: tolerances and limits.
-        robust: first find the images that agree with each other, whatever up to nearly half of the
-            others are (:mod:`jaxcal.solvers.consensus`), and leave those out: ``outlier`` and
-            ``departure`` say which and why. Where no image is gravely wrong none is left out, and
-            the answer is the one without.
+        robust: first find the images that agree with each other, even if nearly half of all images
+            are wrong (:mod:`jaxcal.solvers.consensus`), and leave the others out. ``outlier`` and
+            ``departure`` say which and why. If no image is gravely wrong, none is left out, and the
+            answer is the same as without ``robust``.
 
     Returns:
-        A :class:`Calibration`; ask its ``status`` and ``warnings`` before using it. Frames of one
-        pose count once (:mod:`jaxcal.diagnostics.dependence`): the others are masked out in the
-        answer and in its ``problem``. Errors that are alike in successive images widen its
-        covariance (:mod:`jaxcal.diagnostics.serial_correlation`). Both are for one problem with
-        concrete arrays; under jit, vmap or grad, and in batches, images are taken for independent.
+        A :class:`Calibration`; read its ``status`` and ``warnings`` before using it. The frames of
+        one pose count as one image (:mod:`jaxcal.diagnostics.dependence`); the others are masked
+        out in the answer and in its ``problem``. Errors that are alike in successive images widen
+        its covariance (:mod:`jaxcal.diagnostics.serial_correlation`). Both are done for one problem
+        with concrete arrays only; under jit, vmap or grad, and in batches, images are treated as
+        independent.
 
     Raises:
         InputError: options that contradict each other or the problem; with concrete arrays also
             NaN, Inf and fewer than 4 different poses. Under jit, vmap or grad values cannot be
-            looked at, and such problems come back with status ``failed``.
+            checked, and such problems get the status ``failed``.
     """
     problem, estimate = as_problem(problem, "jaxcal.calibrate"), unknown_names(estimate)
     problem = _in_asked_precision(problem, options, "jaxcal.calibrate")
@@ -147,7 +148,7 @@ def calibrate(
 
 
 def _solve_alone(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
-    """One problem, without it in the result (traceable): in closed form, or by the engine."""
+    """Solve one problem in closed form or by the engine (traceable); the result is without it."""
     found = None
     if not inside_transformation(problem, given):
         found = closed_form_answer(problem, plan)
@@ -182,15 +183,16 @@ def calibrate_batch(
 ) -> Calibration:
     """:func:`calibrate` for a batch: compiled, vmapped, in chunks of lanes.
 
-    A lane that is bad (NaN, degenerate) gets its own status and leaves its neighbours alone.
+    A bad lane (NaN, degenerate) gets its own status and does not affect the others.
 
-    Plain problems are shared out among all of JAX's local devices: a processor is one device unless
-    ``jax.config.update("jax_num_cpu_devices", n)`` (or JAX_NUM_CPU_DEVICES=n) says before JAX's
-    first use that it is n, one a core. Results do not depend on it, but for rounding.
+    Problems that are not committed to a device are divided among all of JAX's local devices. A
+    processor is one device, unless ``jax.config.update("jax_num_cpu_devices", n)`` (or
+    JAX_NUM_CPU_DEVICES=n) before JAX's first use makes it n devices, one for each core. Except for
+    rounding, results do not depend on this.
 
     Args:
         problems: leading axes of any shape; see :func:`jaxcal.stack`. A list of problems or
-            recordings with as many images each is stacked.
+            recordings is stacked; all must have the same number of images.
         method: as for :func:`calibrate`, and so are the following.
         prior: see there.
         max_elevation: see there.
@@ -202,8 +204,8 @@ def calibrate_batch(
         delay_sd: see there.
         options: see there.
         robust: see there; it takes longer than the solve.
-        chunk: lanes solved side by side; by default 64 on a processor (on channels 8), on a GPU as
-            many as a million images make.
+        chunk: lanes solved side by side; by default 64 on a processor (on channels 8), and on a GPU
+            as many as have a million images together.
 
     Returns:
         A :class:`Calibration` whose arrays have the problems' leading axes.

@@ -1,13 +1,13 @@
-"""Conventional calibration of one problem in numpy: the closed form, with all that is said of it.
+"""Conventional calibration of one problem in numpy: the closed form, with its uncertainty.
 
-Eq. 7 has a closed-form global minimum with a proof (:mod:`jaxcal.solvers.closed_form.single`),
-found in less than a millisecond, where the engine's programs take seconds to import and to load. So
-where the answer is proved to be the only best one, it is *the* answer: :func:`closed_form_answer`
-is the one place that decides this, and the engine solves everything else.
+Eq. 7 has a closed-form global minimum with a proof (:mod:`jaxcal.solvers.closed_form.single`). It
+is found in less than a millisecond, while the engine's programs take seconds to import and to load.
+So if the closed form is proved to be the only best answer, it is returned. Only
+:func:`closed_form_answer` decides this, and the engine solves everything else.
 
-Covariance, status and SDs are those of :mod:`jaxcal.calibration.answer`, which computes them for
-every method under jit, vmap and grad; here they are computed from the images' errors and
-derivatives that diagnostics are made of.
+Covariance, status and SDs are defined as in :mod:`jaxcal.calibration.answer`, which computes them
+for every method under jit, vmap and grad. Here they are computed from the images' errors and
+derivatives, as the diagnostics are.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from jaxcal.solvers.closed_form.single import ClosedForm, calibrate_closed_form
 
 @array_tree
 class Start:
-    """Where methods begin that begin at the conventional fit: Eq. 7's minimum of one problem.
+    """The start of methods that begin at the conventional fit: Eq. 7's minimum of one problem.
 
     Attributes:
         rotation: of X.
@@ -58,12 +58,12 @@ STATIONARY = 1e-6
 def closed_form_answer(problem: Problem, plan: SolvePlan) -> Calibration | None:
     """The conventional calibration where the closed form is proved to be the answer, else None.
 
-    None is for other methods and solvers, a robust search, float32, further unknowns that have no
-    closed form (a delay), images that leave something open, and minima without a proof.
+    It is None for other methods and solvers, a robust search, float32, further unknowns that have
+    no closed form (a delay), images that do not determine all unknowns, and minima without a proof.
 
     Args:
         problem: one problem with concrete, finite values and at least 4 used images.
-        plan: what is asked for.
+        plan: the request.
     """
     options = plan.options
     asked = plan.method == "conventional" and options.solver == "lm" and not plan.robust
@@ -78,7 +78,7 @@ def closed_form_answer(problem: Problem, plan: SolvePlan) -> Calibration | None:
 
 
 def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
-    """Where a method begins, from the closed form of Eq. 7.
+    """The start of a method, from the closed form of Eq. 7.
 
     Args:
         problem: one problem with concrete, finite values and at least 4 used images.
@@ -104,7 +104,7 @@ def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
 
 
 def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> Calibration | None:
-    """The closed form as a calibration, but for its problem; None where poses are degenerate."""
+    """The closed form as a calibration without its problem; None where poses are degenerate."""
     blocks, eps = plan.blocks, float(np.finfo(float).eps)
     unknowns = _unknowns(found, problem)
     seen = ImageErrors.of(unknowns, map_arrays(lambda a: a[None], problem), blocks)
@@ -117,7 +117,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     objective = float(errors @ errors)
     variance = objective / max(3 * used - size(blocks), 1.0)
 
-    # As jaxcal.calibration.answer: which directions are known, in mm at the target.
+    # As in jaxcal.calibration.answer: which directions are known, in mm at the target.
     lever = seen.lever(seen.mask)
     scaled = information / np.outer(*[mm_at_target(lever, blocks)[0]] * 2)
     values = np.linalg.eigvalsh(scaled)
@@ -134,7 +134,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     further = [part[0] for block in parts for part in block]
     gradient = np.abs(errors @ rows)
     length = np.sqrt(np.diag(information) * objective)
-    # Of exact data errors are rounding, and have no direction.
+    # With exact data the errors are only rounding, and their gradient means nothing.
     rounding = used * (64 * eps * lever[0]) ** 2
     cosine = 0.0 if objective <= rounding else float(np.max(gradient / np.maximum(length, 1e-300)))
     trace = None
@@ -197,7 +197,7 @@ def _unknowns(found: ClosedForm, problem: Problem) -> Unknowns:
 
 
 def _sigmas(seen: ImageErrors, used: float, blocks: tuple[str, ...]) -> Float[np.ndarray, 3]:
-    """SDs of lateral position, range and offset; each has lost a third of the unknowns."""
+    """SDs of lateral position, range and offset, each with n less a third of the unknowns."""
     return np.sqrt((seen.errors[0] ** 2).sum(axis=0) / max(used - size(blocks) / 3, 1.0))
 
 

@@ -1,4 +1,4 @@
-"""What callers hand over in the place of a problem, and what to tell them if it is none."""
+"""Converts what callers give as a problem, with errors that say what to do."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _HOW = (
 
 
 def as_problem(value: Any, name: str) -> Problem:
-    """The problem that was handed over, a recording's included.
+    """The problem that a caller gave; recordings and images are converted.
 
     Args:
         value: a problem, a recording or one set of images.
@@ -43,7 +43,7 @@ def as_problem(value: Any, name: str) -> Problem:
 
 
 def as_batch(value: Any, name: str) -> Problem:
-    """The batch of problems that was handed over; a list of problems or recordings is stacked.
+    """The batch of problems that a caller gave; a list of problems or recordings is stacked.
 
     Raises:
         InputError: anything else, or problems that differ in their number of images or in parts.
@@ -56,7 +56,7 @@ def as_batch(value: Any, name: str) -> Problem:
 
 
 def unknown_names(estimate: Any) -> tuple[str, ...]:
-    """Further unknowns as a tuple: one name stands for itself, names may be separated by commas."""
+    """Names of further unknowns as a tuple; a text may hold one name or several with commas."""
     if isinstance(estimate, str):
         return tuple(name.strip() for name in estimate.split(",") if name.strip())
     if estimate is None:

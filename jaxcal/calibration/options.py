@@ -1,7 +1,7 @@
-"""What a caller may ask of a solve, and the checks that a request has to pass.
+"""The options of a solve, and the checks that a request must pass.
 
-Everything static about a solve is a :class:`SolvePlan`, so that each combination is compiled once;
-the numbers that came with the request are a :class:`Given`, which is traced.
+Everything static about a solve is a :class:`SolvePlan`, so that each combination is compiled once.
+The numbers in the request are a :class:`Given`, which is traced.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ PriorName = Literal["auto", "gaussian", "uniform", "bounded"]
 Data = Literal["auto", "points", "channels"]
 
 LAWS: dict[str, tuple[Shape, ...]] = {"auto": SHAPES, "uniform": UNIFORM}
-"""The priors of the joint method that weigh laws of the offsets, and which."""
+"""The priors of the joint method that weigh laws of the offsets, each with its laws."""
 
 DEFAULT_MAX_ELEVATION_MM = 1.0
-"""The bound on the offsets where none is given: the paper's."""
+"""The bound on the offsets if none is given; it is that of the paper."""
 
 SOUND_SPEED_SD_M_S = 20.0
-"""How far the sound speed may well be from its nominal value, m/s: some seven kelvin of water."""
+"""Prior SD of the sound speed about its nominal value, m/s: some seven kelvin of water."""
 
 DELAY_SD_S = 1e-6
-"""How far the electronic delay may well be from its nominal value, s."""
+"""Prior SD of the electronic delay about its nominal value, s."""
 
 
 @dataclass(frozen=True)
@@ -46,21 +46,23 @@ class Options:
     """How to solve; static, so each combination is compiled once.
 
     Attributes:
-        solver: ``lm`` is ours. The conventional method also has ``gauss-newton`` and ``gradient``.
-            An optimistix least-squares solver, e.g. ``optimistix.Dogleg(1e-10, 1e-10)``, takes the
-            place of ours in the conventional method and, but for its prior ``bounded``, the joint
-            one; it begins where ours would, stops by its own rule, and takes longer in a batch.
-        gradient_tolerance: where ``gradient`` stops, relative.
-        tolerance_rad: the alternation stops when a round turns X by less than this (rad) and
-        tolerance_mm: moves its origin by less than this (mm). The paper does not state it.
+        solver: ``lm`` is jaxcal's own. The conventional method also has ``gauss-newton`` and
+            ``gradient``. An optimistix least-squares solver, e.g.
+            ``optimistix.Dogleg(1e-10, 1e-10)``, replaces ``lm`` in the conventional method and in
+            the joint one (except for its prior ``bounded``). It has the same start, stops by its
+            own rule, and takes longer in a batch.
+        gradient_tolerance: relative tolerance at which ``gradient`` stops.
+        tolerance_rad: the alternation stops when a round turns X by less than this, rad, and also
+            moves its origin by less than ``tolerance_mm``. The paper does not state these limits.
+        tolerance_mm: see ``tolerance_rad``; mm.
         max_rounds: most rounds of the alternation.
-        inner_steps: Gauss-Newton steps on X and c in each of its rounds.
+        inner_steps: Gauss-Newton steps on X and c in each round of the alternation.
         max_iterations: most linearisations of the other solvers.
         trace: how many values of the objective to keep in the result.
-        differentiate: False where nobody will differentiate the answer: inside a grad of the
-            caller it is then a constant, and derivatives are neither traced nor compiled.
-        precision: ``float64``, whatever the problem's arrays hold, or ``float32``, which is faster
-            on some devices and loses six digits.
+        differentiate: False if the answer will not be differentiated. Inside a caller's grad it is
+            then a constant, and derivatives are neither traced nor compiled.
+        precision: ``float64``, whatever the dtype of the problem's arrays, or ``float32``, which is
+            faster on some devices and loses six digits.
     """
 
     solver: Literal["lm", "gauss-newton", "gradient"] | optx.AbstractLeastSquaresSolver = "lm"
@@ -99,13 +101,13 @@ class Options:
 
 
 def _is_optimistix(solver: Any) -> TypeGuard[optx.AbstractLeastSquaresSolver]:
-    """Whether this is a least-squares solver of optimistix, which takes long to import."""
+    """Whether this is a least-squares solver of optimistix, without the slow import of it."""
     found = sys.modules.get("optimistix")
     return found is not None and isinstance(solver, found.AbstractLeastSquaresSolver)
 
 
 def _check_static(solver: optx.AbstractLeastSquaresSolver) -> None:
-    """A solver is part of what is compiled, so its tolerances must be plain numbers."""
+    """Check that a solver's settings are plain numbers, since a solver is part of the program."""
     try:
         hash(solver)
     except TypeError:
@@ -118,8 +120,8 @@ def _check_static(solver: optx.AbstractLeastSquaresSolver) -> None:
 class SolvePlan:
     """Everything static about a solve: method, belief about the offsets, data, unknowns.
 
-    ``laws`` are those to weigh after the self-tuned Gaussian solve; none: that is the answer.
-    ``robust``: find the images that agree first, and leave the others out.
+    ``laws`` are weighed after the self-tuned Gaussian solve; if there are none, the Gaussian solve
+    is the answer. ``robust``: find the images that agree first, and leave the others out.
     """
 
     method: Method
@@ -133,31 +135,31 @@ class SolvePlan:
 
     @property
     def other_solver(self) -> optx.AbstractLeastSquaresSolver | None:
-        """The caller's solver, where one was handed over."""
+        """The caller's own solver; None if there is none."""
         solver = self.options.solver
         return solver if _is_optimistix(solver) else None
 
     @property
     def one_by_one(self) -> bool:
-        """Whether the solver takes one problem at a time: somebody else's and the historical do."""
+        """Whether problems are solved one at a time, as a caller's solver and ``gradient`` do."""
         return self.other_solver is not None or self.options.solver == "gradient"
 
     @property
     def reported_prior(self) -> str:
-        """The prior's name in the result: that of the laws which were weighed, if any were."""
+        """The prior's name in the result: if laws were weighed, the name of their prior."""
         names = [name for name, laws in LAWS.items() if laws == self.laws]
         return names[0] if names else self.prior
 
 
 @array_tree
 class Given:
-    """Numbers given by the caller beside the problem.
+    """Numbers that the caller gave in addition to the problem.
 
     Attributes:
         sigma: SDs of (lateral, range, offset), or of (element distance, offset) on channels, mm.
-        tracker_sd: mm.
-        max_elevation: mm.
-        medium_sd: SDs of the sound speed (m/s) and the delay (s).
+        tracker_sd: SD of the tracked position, mm.
+        max_elevation: bound on the offsets, mm.
+        medium_sd: prior SDs of the sound speed (m/s) and the delay (s).
     """
 
     sigma: Float[AnyArray, " components"] | None
@@ -168,7 +170,7 @@ class Given:
 
 @dataclass(frozen=True)
 class Request:
-    """What a caller asks for, as it came; :func:`jaxcal.calibrate` documents each."""
+    """A caller's request before any check; :func:`jaxcal.calibrate` documents each part."""
 
     method: Method = "joint"
     prior: PriorName = "auto"
@@ -184,7 +186,7 @@ class Request:
 
 
 def prepare(problem: Problem, request: Request) -> tuple[SolvePlan, Given]:
-    """Check a request against its problem and sort it into what is static and what is traced.
+    """Check a request against its problem, and divide it into a static and a traced part.
 
     Raises:
         InputError: parts that contradict each other or the problem.
@@ -206,7 +208,7 @@ def prepare(problem: Problem, request: Request) -> tuple[SolvePlan, Given]:
     dtype = problem.mask.dtype
 
     def array(value: Any) -> AnyArray | None:
-        # Of numbers a numpy array: JAX would compile their conversion.
+        # Plain numbers become numpy arrays, since JAX would compile their conversion.
         return None if value is None else array_module(value).asarray(value, dtype)
 
     blocks = RIGID + tuple(name for name in EXTRA if name in request.estimate)
@@ -300,8 +302,8 @@ def _uses_channels(problem: Problem, request: Request, kind: str) -> bool:
         return True
     if request.data == "points" or problem.channels is None or kind != "gaussian":
         return False
-    # A straight array's points with their covariances say all that its channels do, unless sound
-    # speed or delay are unknown, which bend the wavefront; a curved array's do not.
+    # A straight array's points with their covariances tell as much as its channels, unless sound
+    # speed or delay are unknown, which bend the wavefront. A curved array's points tell less.
     wanted = problem.curved or any(name in request.estimate for name in MEDIUM)
     three = request.sigma is not None and np.size(request.sigma) == 3
     return wanted and request.tracker_sd is None and not three
@@ -318,10 +320,10 @@ def _check_size(name: str, value: object, least: float) -> None:
 
 
 def check_values(problem: Problem) -> None:
-    """Refuse NaN, Inf and too few images, where the values can be looked at.
+    """Refuse NaN, Inf and too few images, if the values are concrete.
 
     Raises:
-        InputError: with the row named.
+        InputError: NaN or Inf, with the number of the image, or too few images.
     """
     if is_traced(problem):
         return

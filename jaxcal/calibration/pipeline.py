@@ -1,8 +1,8 @@
 """From a batch of problems to its calibrations, as one pure function of arrays.
 
-Images that do not agree are found first, where that was asked; then the plan's method
-(:mod:`jaxcal.solvers.methods`); then the answer is put together (:mod:`jaxcal.calibration.answer`).
-:mod:`jaxcal.calibration.calibrate` compiles it.
+If the plan is robust, the images that do not agree are found first. Then the plan's method solves
+the problems (:mod:`jaxcal.solvers.methods`), and the answer is put together
+(:mod:`jaxcal.calibration.answer`). :mod:`jaxcal.runtime.programs` compiles this function.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ def solve_problems(
 
     Args:
         problems: the batch.
-        given: numbers that came with the request.
-        plan: what is static about it.
-        agreed: what :func:`agreed_images` found, where it was asked before.
-        begun: their conventional fits, where they have been made before.
+        given: the numbers in the request.
+        plan: the static part of the request.
+        agreed: the result of :func:`agreed_images`, if it was called before.
+        begun: conventional fits of the problems, if they were made before.
     """
     if not plan.options.differentiate:
         problems, given = jax.lax.stop_gradient((problems, given))
     problems = problems.cleared(problems.mask)
     if plan.robust:
         if agreed is None:
-            # Which images are left out is piecewise constant in the data: no derivative passes.
+            # Which images are left out is piecewise constant in the data, so it has no derivative.
             seen = jax.lax.stop_gradient(problems.points_only())
             agreed = jax.vmap(_one_at_a_time(plan.blocks))(seen)
         problems = replace(problems, mask=agreed)
@@ -75,8 +75,8 @@ def solve_problems(
 
 
 def _one_at_a_time(blocks: Blocks):
-    # One problem at a time, in a batch too: its finalists fill the vector units, and more problems
-    # at once would only leave the cache.
+    # One problem at a time, even in a batch: its finalists fill the vector units, and several
+    # problems at once would not fit in the cache.
     agreed = in_standard_promotion(lambda problem: agreed_images(problem, blocks))
     return jax.custom_batching.sequential_vmap(agreed)
 
@@ -91,8 +91,8 @@ class AveragedAnswer(eqx.Module):
 
     Attributes:
         covariance: of the unknowns.
-        elevation_sd: of the offsets, mm.
-        law: what was found out.
+        elevation_sd: SDs of the offsets, mm.
+        law: the result about the distribution of the offsets.
     """
 
     covariance: Float[Array, "lanes p p"]
@@ -142,7 +142,7 @@ def _normal_matrices(
     """The weighted normal matrix at a solution, and that of the unweighted components."""
     observation, place = found.observation, found.place
     if isinstance(observation, (Points, ChannelDistances)):
-        # One pass for both.
+        # One pass over the images gives both matrices.
         sums = component_sums(place, observation, images, None, found.medium)
         weighted = sums.weighed(1 / observation.sigma**2).stacked()
         return weighted, stacked(jnp.sum(sums.matrix, axis=0))

@@ -1,9 +1,9 @@
 """Pivot calibration: the tip of a tracked tool from poses taken while it turns about its tip.
 
-The degenerate case of Eq. 7: B_i p = c for all i, with p the tip in the tool's frame and c the
-pivot point. It is the calibration with every measurement (0, 0), which makes p the translation of
-X, and with X's rotation held fixed: the free blocks are X's translation and the point. Solver,
-consensus, covariance and observability are the calibration's own.
+This is the degenerate case of Eq. 7: B_i p = c for all i, with p the tip in the tool's frame and c
+the pivot point. In this calibration every measurement is (0, 0), so p is the translation of X, and
+X's rotation is held fixed: the free blocks are X's translation and the point. Solver, consensus,
+covariance and observability are the same as for image calibration.
 
 The errors of the three axes share one SD, so this is plain least squares on the images that agree.
 """
@@ -41,7 +41,7 @@ from jaxcal.solvers.consensus import (
 
 BLOCKS = ("translation", "point")
 AXES = ("x", "y", "z")
-"""Of the tool's frame: what a departure's components are."""
+"""Axes of the tool's frame, along which the components of a departure are."""
 _SUBSET = 4
 
 
@@ -57,7 +57,7 @@ class Pivot(eqx.Module):
         residual: those errors in the tool's frame, mm; 0 where not used.
         mask: 1 for used poses.
         outlier: 1 where a pose does not fit the rest; a robust solve leaves it out.
-        departure: errors in robust SDs of the used poses', those of poses left out included.
+        departure: errors of all poses, in robust SDs of the used poses' errors.
         status_code: a :class:`jaxcal.calibration.result.Status`.
         information: of (tip, point) for errors with an SD of 1 mm.
         robust: poses that do not fit the rest were left out (static).
@@ -95,7 +95,7 @@ class Pivot(eqx.Module):
 
     @property
     def weakest_sd(self) -> Float[np.ndarray, "*batch"]:
-        """SD along the least known direction of tip and point, mm; NaN where it has none."""
+        """SD along the least known direction of tip and point, mm; NaN if it is not finite."""
         return self._weakest()[1]
 
     def _weakest(self) -> tuple[np.ndarray, np.ndarray]:
@@ -137,11 +137,11 @@ def calibrate_pivot(
         poses: tool -> tracker, mm, (n, 4, 4) or (n, 3, 4); concrete ones are checked and their
             rotations projected to SO(3). Leading axes make a batch.
         mask: 1 (or True) for poses to use; all by default.
-        robust: find the poses that agree, whatever up to nearly half of the others are, and leave
-            those out.
+        robust: find the poses that agree with each other, even if nearly half of all poses are
+            wrong, and leave the others out.
 
     Raises:
-        InputError: concrete poses that are none, or fewer than 4 used ones.
+        InputError: concrete poses that are not rigid transforms, or fewer than 4 used ones.
     """
     if not is_traced(poses) and np.ndim(poses) == 3:
         used = np.ones(len(poses), bool) if mask is None else np.asarray(mask) > 0
@@ -171,10 +171,10 @@ def _program(platform: str | None):
 def _solve_kept(
     poses: Float[np.ndarray, "n 4 4"], mask: Float[np.ndarray, " n"], robust: bool
 ) -> Pivot:
-    """One calibration by a kept program, which serves every number of poses of a bucket."""
+    """One calibration by a kept program, which solves every number of poses of its bucket."""
     count = len(mask)
     padded = buckets.size(count)
-    rows = np.minimum(np.arange(padded), count - 1)  # a masked pose must be one, too
+    rows = np.minimum(np.arange(padded), count - 1)  # masked poses must be valid, too
     weight = np.where(np.arange(padded) < count, mask[rows], 0.0)
     label = {"method": "pivot", "images": padded, "robust": robust}
     arguments = (poses[rows], weight)
@@ -203,7 +203,7 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
     keep = find_consensus(everything, model).keep if robust else mask
     problem = eqx.tree_at(lambda p: p.mask, everything, keep)
     parameters = jax.tree.map(lambda leaf: leaf[0], _proposals(problem, keep[None]))
-    # The problem is linear: two steps take what the moments' rounding has left.
+    # The problem is linear; two steps remove the rounding errors of the moments.
     information, gradient = _normal(parameters, problem)
     diagonal = jnp.diagonal(information)
     step = dense.solve_symmetric(information, gradient, diagonal)

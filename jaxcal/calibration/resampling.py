@@ -1,11 +1,11 @@
-"""Cross-validation and bootstrap: one problem solved many times over, as one batch.
+"""Cross-validation and bootstrap: one problem is solved many times, as one batch.
 
-Cross-validation masks images out and looks at them through the calibration of the rest: what Eq. 8
-says of images that the calibration has not seen. Leaving out one image at a time also tells how
-much each image moves the answer (its influence). The bootstrap draws the images anew with
-replacement and tells how the answer scatters (reproducibility).
+Cross-validation masks images out and calibrates from the rest; the precision of Eq. 8 is then that
+of images that the calibration has not used. Leaving out one image at a time also shows how much
+each image moves the answer (its influence). The bootstrap draws the images anew with replacement
+and shows how the answer scatters (reproducibility).
 
-All of it is :func:`jaxcal.calibrate_batch` on masks or rows of the same problem: pure functions of
+Both run :func:`jaxcal.calibrate_batch` on masks or rows of the same problem: pure functions of
 arrays (and a key), which work under jit.
 """
 
@@ -37,27 +37,27 @@ LARGEST_RESAMPLES = 100_000
 
 
 class CrossValidation(eqx.Module):
-    """Images seen through calibrations that did not use them.
+    """Errors of images under calibrations that did not use them.
 
     Attributes:
         residual: (n, 3) lateral, range and elevational errors of each held-out image, mm; 0 where
             not used.
         cloud: (n, 3) the target as reconstructed from each held-out image (in the plane), less the
-            target of the calibration that held it out, mm.
-        precision: norm of the SD of that cloud (Eq. 8 for images that were not seen), mm.
-        rms: its root mean square length, mm.
+            target of the calibration that held the image out, mm.
+        precision: norm of the SD of ``cloud`` (Eq. 8 for images that were not used), mm.
+        rms: root mean square length of ``cloud``, mm.
         log_density: (n,) log predictive density of each image's three errors under the Gaussian
-            SDs of the calibration that held it out; 0 where not used.
+            SDs of the calibration that held the image out; 0 where not used.
         moved: (n, 6) [v, omega] by which leaving the image (its fold) out moves X, right
             perturbation, mm and rad.
-        influence: (n,) length of that in SDs of X: sqrt(moved' Cov^-1 moved / 6); NaN without a
-            covariance.
+        influence: (n,) length of ``moved`` in SDs of X: sqrt(moved' Cov^-1 moved / 6); NaN without
+            a covariance.
         image_to_probe: (folds, 4, 4) X of each fold.
-        converged: (folds,) whether its solve converged.
+        converged: (folds,) whether the solve of each fold converged.
         fold_cost: (n,) minimised objective of the calibration that held the image out.
         mask: (n,) 1 for used images.
-        image_moved: (n,) root mean square over ``image_points`` of how far leaving the image (its
-            fold) out moves them, estimated pixel sizes included, mm.
+        image_moved: (n,) how far leaving the image (its fold) out moves ``image_points``, as a root
+            mean square over these points, estimated pixel sizes included, mm.
         image_points: (m, 2) [lateral, axial] of those points, mm: corners and middle of the box
             that the measured points fill.
     """
@@ -82,11 +82,11 @@ class Bootstrap(eqx.Module):
 
     Attributes:
         image_to_probe: (k, 4, 4) X of each resample.
-        converged: (k,) 1 where its solve converged; only those count below.
-        spread: (6,) SD of X about the full data's, [v, omega], mm and rad; a median-based one, so
-            that a few resamples without enough different images do not spoil it.
-        reproducibility: (m,) mean distance of an image point from its mean over the resamples, mm;
-            estimated pixel sizes count.
+        converged: (k,) 1 where the resample's solve converged; the following use only those.
+        spread: (6,) SD of X about the X of all images, [v, omega], mm and rad. It is computed from
+            medians, so a few resamples with too few different images do not spoil it.
+        reproducibility: (m,) mean distance of an image point from its mean over the resamples, mm,
+            estimated pixel sizes included.
         image_points: (m, 2) [lateral, axial] of those points, mm: corners and middle of the box
             that the measured points fill.
     """
@@ -111,8 +111,8 @@ def cross_validate(
     Args:
         problem: one problem or a recording.
         folds: image i belongs to fold i mod folds; by default every image is a fold of its own.
-        result: the calibration of all images, where it is at hand. Images that it left out
-            as outliers are neither used nor held out.
+        result: the calibration of all images, if it exists already. Images that it left out as
+            outliers are neither used nor held out.
         arguments: as for :func:`jaxcal.calibrate`.
 
     Raises:
@@ -128,7 +128,7 @@ def cross_validate(
     fold = np.arange(count) % folds
     rest = jnp.asarray(fold[None, :] != np.arange(folds)[:, None], problem.mask.dtype)
     _check_left(problem.mask, rest)
-    # What is an outlier was decided on all images.
+    # Outliers were found with all images, so no fold looks for them again.
     options: dict[str, Any] = {**arguments, "robust": False}
     fits = calibrate_batch(_many(problem, problem.mask * rest), **options)
     held = jax.tree.map(lambda leaf: leaf[fold], fits)
@@ -176,8 +176,8 @@ def bootstrap(
         problem: one problem or a recording.
         resamples: how many draws.
         key: of the draws, or a seed; draw k is fold_in(key, k).
-        result: the calibration of all images, where it is at hand. Images that it left out
-            as outliers are not drawn.
+        result: the calibration of all images, if it exists already. Images that it left out as
+            outliers are not drawn.
         arguments: as for :func:`jaxcal.calibrate`.
 
     Raises:
@@ -194,12 +194,12 @@ def bootstrap(
 
     def draw(index: Array) -> Array:
         uniform = jax.random.uniform(jax.random.fold_in(root, index), mask.shape, mask.dtype)
-        # The image at whose place the count of used ones passes the draw; unused ones never do.
+        # The first image at which the count of used images exceeds the draw is always a used one.
         chosen = jnp.searchsorted(cumulative, uniform * cumulative[-1], side="right")
         return jnp.minimum(chosen, mask.shape[0] - 1)
 
     rows = jax.vmap(draw)(jnp.arange(resamples))
-    # As many images as were used: the places of unused ones stay empty.
+    # Each draw has as many images as were used, since the mask leaves out the other rows.
     options: dict[str, Any] = {**arguments, "robust": False}
     fits = calibrate_batch(_drawn(problem, rows, mask), **options)
     converged = jnp.asarray(fits.converged, mask.dtype)
@@ -208,7 +208,7 @@ def bootstrap(
     moved = jax.vmap(relative_twist, (None, 0))(whole, drawn)
     moved = jnp.where(converged[:, None] > 0, jnp.abs(moved), jnp.nan)
     points = _corners(problem, result)
-    # A resample that did not converge stands at the whole's X: it adds nothing to the scatter.
+    # A resample that did not converge gets the X of all images, and adds nothing to the scatter.
     transforms = jnp.where(converged[:, None, None] > 0, _with_scale(fits, result), whole)
     share = jnp.maximum(jnp.mean(converged), 1e-9)
     return Bootstrap(
@@ -223,7 +223,8 @@ def bootstrap(
 def relative_twist(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> Float[Array, 6]:
     """[v, omega] that take the first transform to the second: first Exp([v, omega]), mm and rad.
 
-    Exact for v, and for omega to third order: a calibration moves by fractions of a degree.
+    It is exact for v. For omega the error is of third order, since a calibration moves by fractions
+    of a degree.
     """
     rotation = first[:3, :3].T @ second[:3, :3]
     shift = first[:3, :3].T @ (second[:3, 3] - first[:3, 3])
@@ -238,10 +239,10 @@ def relative_twist(first: Float[Array, "4 4"], second: Float[Array, "4 4"]) -> F
 
 
 def _with_scale(fits: Calibration, result: Calibration) -> Float[Array, "k 4 4"]:
-    """X of many calibrations, stretched by their pixel sizes over those of the whole.
+    """X of many calibrations, scaled by their pixel sizes over those of the full calibration.
 
-    It takes a point of the image, in mm as the whole has it, to the probe. (A face offset, which
-    only pixels of known size have, is stretched along with the range.)
+    It takes a point of the image, in mm of the full calibration, to the probe. (A face offset is
+    scaled together with the range; only pixels of known size have one.)
     """
     if fits.scale_mm_per_px is None or result.scale_mm_per_px is None:
         return jnp.asarray(fits.image_to_probe)
@@ -254,7 +255,7 @@ def _with_scale(fits: Calibration, result: Calibration) -> Float[Array, "k 4 4"]
 def _apart(
     transforms: Float[Array, "k 4 4"], whole: Float[Array, "4 4"], points: Float[Array, "m 2"]
 ) -> Float[Array, " k"]:
-    """Root mean square distance of image points under each transform and under the whole's."""
+    """Root mean square distance of image points under each transform from those under ``whole``."""
     zero, one = jnp.zeros_like(points[:, 0]), jnp.ones_like(points[:, 0])
     there = jnp.stack([points[:, 0], zero, points[:, 1], one])
     moved = ((transforms - whole) @ there)[:, :3]
@@ -262,7 +263,7 @@ def _apart(
 
 
 def _one_problem(problem: Problem | Recording, arguments: dict[str, Any]) -> Problem:
-    """One problem; where its values can be looked at, every pose counts once."""
+    """One problem; if its values are concrete, every pose counts once."""
     if isinstance(problem, Recording):
         problem = Problem.from_recording(problem)
     if problem.batch_shape:
@@ -270,7 +271,7 @@ def _one_problem(problem: Problem | Recording, arguments: dict[str, Any]) -> Pro
     if any(is_traced(leaf) for leaf in jax.tree.leaves(problem)):
         return problem
     alone = independent(problem, arguments.get("estimate", ()))[0]
-    # Where JAX's 64 bits are off a problem holds numpy arrays, which a traced index cannot index.
+    # If JAX's 64 bits are off, a problem holds numpy arrays, which a traced index cannot index.
     return jax.tree.map(jnp.asarray, alone)
 
 
@@ -348,7 +349,7 @@ def _seen(held: Calibration, problem: Problem) -> tuple[Array, Array]:
 
 def _in_sds(moved: Float[Array, "n 6"], covariance: Float[Array, "6 6"]) -> Float[Array, " n"]:
     scale = jnp.sqrt(jnp.diagonal(covariance))
-    # In SDs of each unknown the matrix is a correlation, well scaled for elimination.
+    # In SDs of the unknowns the matrix is a correlation matrix, well scaled for elimination.
     unit = moved / scale
     solved = dense.solve_positive(covariance / (scale[:, None] * scale), unit.T)
     return jnp.sqrt(jnp.sum(unit.T * solved, axis=0) / 6)

@@ -45,12 +45,12 @@ class Convergence:
         tolerance_met: the method's own stopping rule was met.
         iterations: linearisations (joint, conventional) or rounds (alternating).
         variance_rounds: variance updates of the self-tuning; 0 without.
-        searched_start: the closed-form start was unsound and one was searched for.
-        sigma_floored: which SDs rest on their floor.
+        searched_start: the closed-form start was unsound, so a search found another start.
+        sigma_floored: which SDs are at their floor.
         rotation_change: X's last move in rad (alternating), else 0.
         translation_change: X's last move in mm (alternating), else 0.
-        trace: objective after each of the first iterations, NaN beyond the last; None where none
-            was asked for.
+        trace: objective after each of the first iterations, NaN beyond the last; None if no trace
+            was requested.
     """
 
     cost: Float[AnyArray, "*batch"]
@@ -72,10 +72,10 @@ class Medium:
     Attributes:
         sound_speed_m_s: estimate, m/s.
         sound_speed_sd_m_s: its SD, m/s.
-        sound_speed_prior_m_s: SD that was believed before, m/s; None without such a belief.
+        sound_speed_prior_m_s: prior SD, m/s; None without a prior.
         delay_s: electronic delay, s.
         delay_sd_s: its SD, s.
-        delay_prior_s: SD that was believed before, s; None without such a belief.
+        delay_prior_s: prior SD, s; None without a prior.
     """
 
     sound_speed_m_s: Float[AnyArray, "*batch"] | None = None
@@ -93,11 +93,12 @@ class Linearisation:
     Attributes:
         information: of the whitened residuals, offsets eliminated (mm, rad, log units).
         design: of the unweighted residuals, offsets known.
-        variance: of the residuals that ``information`` is of: 1 where they are whitened, else mm^2.
+        variance: of the residuals behind ``information``: 1 where they are whitened, else mm^2.
         tracker_sd: SD of the tracked position, mm, or None.
         average_elevation_sd: SDs of the offsets under the average over distributions, mm, or None.
-        further: values of the free further unknowns in the order of ``Calibration.blocks``, factors
-            on nominal ones and mm (:func:`jaxcal.model.unknowns.measured`); None without any.
+        further: values of the free further unknowns in the order of ``Calibration.blocks``: factors
+            on the nominal values, and mm (:func:`jaxcal.model.unknowns.measured`); None if there
+            are none.
     """
 
     information: Float[AnyArray, "*batch p p"]
@@ -112,12 +113,13 @@ class Linearisation:
 class Calibration:
     """A calibration of one problem, or of a batch (then every array has the batch axes in front).
 
-    Units are mm and rad; X's perturbations are right ones, X Exp([v, omega]), so they are along and
-    about the image's axes (lateral, elevational, axial).
+    Units are mm and rad. Perturbations of X are right perturbations, X Exp([v, omega]), so they are
+    along and about the image's axes (lateral, elevational, axial).
 
-    The attributes below are arrays of the solve, also under jit, vmap and grad. The properties are
-    computed on the host when they are first read, for the whole batch at once, with numpy
-    (:mod:`jaxcal.diagnostics`); reading one of them inside a transformation is an error.
+    The attributes below are arrays of the solve and are available under jit, vmap and grad. The
+    properties that are numpy arrays or text are computed on the host when they are first read, for
+    the whole batch at once (:mod:`jaxcal.diagnostics`); reading one of them inside a transformation
+    is an error.
 
     Attributes:
         image_to_probe: X, mm.
@@ -125,26 +127,27 @@ class Calibration:
         elevation: estimated elevational offset of the target in every image (q_iy), mm; 0 where an
             image was left out.
         sigma: SDs of lateral position, range and elevational offset, mm.
-        offset_law: what the data say of the offsets' law, their mean and the noise; None where no
-            laws were weighed.
+        offset_law: what the data say about the offsets' law, their mean and the noise; None where
+            no laws were weighed.
         channel_sigma: SD of an element's distance, mm; None for solves on points.
-        unknowns_covariance: of all unknowns, in the order of ``blocks`` (mm, rad, log units); NaN
-            where X is not observable.
+        unknowns_covariance: covariance of all unknowns, in the order of ``blocks`` (mm, rad, log
+            units); NaN where X is not observable.
         scale_mm_per_px: [lateral, axial], or None for points in mm.
         medium: sound speed and delay, or None where neither was estimated.
         rms: root mean square of ``residual``'s length over the used images, mm.
         mask: 1 for used images.
         status_code: a :class:`Status`.
-        differentiable: gradients through this answer by the implicit function theorem are valid: a
-            stationary point, well determined, and no offset about to reach or leave its bound.
+        differentiable: whether gradients through this answer by the implicit function theorem are
+            valid: it is a stationary point, it is well determined, and no offset is about to reach
+            or leave its bound.
         sigma_tuned: the SDs were estimated from the data.
         convergence: how the method ended.
         linearisation: the normal matrices, from which the properties are computed.
-        problem: the data that were solved, images left out included.
+        problem: the data that were solved, including images left out.
         method: ``conventional``, ``alternating`` or ``joint`` (static).
         prior: ``none``, ``bounded``, ``gaussian``, or, where laws of the offsets were weighed,
             ``auto`` or ``uniform`` (static).
-        data: ``points`` or ``channels``: whose residuals were minimised (static).
+        data: ``points`` or ``channels``, whichever residuals were minimised (static).
         blocks: the free unknowns (static).
         robust: images that do not fit the rest were left out (static).
         notes: what was done to the data before the solve, in words (static; one problem).
@@ -176,7 +179,7 @@ class Calibration:
 
     @property
     def converged(self) -> Bool[AnyArray, "*batch"]:
-        """Whether the answer is a converged and observable one (traceable)."""
+        """Whether the solve converged and X is observable (traceable)."""
         converged = self.status_code == Status.CONVERGED
         return array_module(converged).asarray(converged)
 
@@ -188,17 +191,17 @@ class Calibration:
 
     @property
     def covariance(self) -> Float[AnyArray, "*batch 6 6"]:
-        """Of X (v mm, omega rad), whatever the other unknowns; NaN where X is not observable."""
+        """Covariance of X (v mm, omega rad), other unknowns free; NaN where X is not observable."""
         return self.unknowns_covariance[..., :6, :6]
 
     @property
     def point_covariance(self) -> Float[AnyArray, "*batch 3 3"]:
-        """Of the target in the tracker's frame, mm^2."""
+        """Covariance of the target in the tracker's frame, mm^2."""
         return self.unknowns_covariance[..., 6:9, 6:9]
 
     @property
     def information(self) -> Float[AnyArray, "*batch p p"]:
-        """Information of all unknowns, offsets eliminated, per ``linearisation.variance``."""
+        """Information of all unknowns, offsets eliminated, times ``linearisation.variance``."""
         return self.linearisation.information
 
     @property
@@ -213,7 +216,7 @@ class Calibration:
 
     @property
     def tolerance_met(self) -> Bool[AnyArray, "*batch"]:
-        """The method's own stopping rule was met."""
+        """Whether the method's own stopping rule was met."""
         return self.convergence.tolerance_met
 
     @property
@@ -228,12 +231,12 @@ class Calibration:
 
     @property
     def searched_start(self) -> Bool[AnyArray, "*batch"]:
-        """The closed-form start was unsound and one was searched for."""
+        """Whether the closed-form start was unsound, so that a search found another start."""
         return self.convergence.searched_start
 
     @property
     def sigma_floored(self) -> Bool[AnyArray, "*batch 3"]:
-        """Which SDs rest on their floor."""
+        """Which SDs are at their floor."""
         return self.convergence.sigma_floored
 
     @property
@@ -248,7 +251,7 @@ class Calibration:
 
     @property
     def trace(self) -> Float[AnyArray, "*batch trace"] | None:
-        """Objective after each of the first iterations; None where none was asked for."""
+        """Objective after each of the first iterations; None if no trace was requested."""
         return self.convergence.trace
 
     @property
@@ -258,12 +261,12 @@ class Calibration:
 
     @property
     def sound_speed_sd_m_s(self) -> Float[AnyArray, "*batch"] | None:
-        """Its standard deviation, m/s."""
+        """Standard deviation of the estimated sound speed, m/s."""
         return None if self.medium is None else self.medium.sound_speed_sd_m_s
 
     @property
     def sound_speed_prior_m_s(self) -> Float[AnyArray, "*batch"] | None:
-        """SD of the sound speed that was believed before, m/s; None without such a belief."""
+        """Prior SD of the sound speed, m/s; None without a prior."""
         return None if self.medium is None else self.medium.sound_speed_prior_m_s
 
     @property
@@ -273,12 +276,12 @@ class Calibration:
 
     @property
     def delay_sd_s(self) -> Float[AnyArray, "*batch"] | None:
-        """Its standard deviation, s."""
+        """Standard deviation of the estimated delay, s."""
         return None if self.medium is None else self.medium.delay_sd_s
 
     @property
     def delay_prior_s(self) -> Float[AnyArray, "*batch"] | None:
-        """SD of the delay that was believed before, s; None without such a belief."""
+        """Prior SD of the delay, s; None without a prior."""
         return None if self.medium is None else self.medium.delay_prior_s
 
     @property
@@ -286,7 +289,7 @@ class Calibration:
         """converged, max_iterations, unobservable or failed; an array of these for a batch.
 
         Raises:
-            CalibrationError: under jit, vmap or grad, where text cannot be: use ``status_code``.
+            CalibrationError: under jit, vmap or grad, where there is no text: use ``status_code``.
         """
         names = np.array([status.name.lower() for status in Status])
         chosen = names[self._concrete(self.status_code)]
@@ -294,7 +297,7 @@ class Calibration:
 
     @cached_property
     def _summary(self) -> Summary:
-        """Everything that is computed when it is read."""
+        """The diagnostics, computed when one of them is first read."""
         from jaxcal.diagnostics.summary import summarise
 
         if is_traced(self):
@@ -321,7 +324,7 @@ class Calibration:
 
     @property
     def condition(self) -> Float[np.ndarray, "*batch"]:
-        """Of the information about all unknowns, in scaled units (largest / smallest)."""
+        """Largest over smallest eigenvalue of all unknowns' information, in scaled units."""
         return self._summary.condition
 
     @property
@@ -331,14 +334,14 @@ class Calibration:
 
     @property
     def weakest_sd(self) -> Float[np.ndarray, "*batch"]:
-        """Standard deviation along it, mm at the lever arm; NaN where it has none."""
+        """SD along ``weakest``, mm at the lever arm; NaN where there is no finite SD."""
         return self._summary.weakest_sd
 
     @property
     def prior_direction(self) -> Float[np.ndarray, "*batch p"]:
-        """Direction that the measurements alone, without the offset's prior or bound, leave open.
+        """Direction that the measurements do not determine without the offsets' prior or bound.
 
-        A unit vector in scaled units; zeros where there is none.
+        It is a unit vector in scaled units; zeros where there is no such direction.
         """
         return self._summary.prior_direction
 
@@ -354,16 +357,15 @@ class Calibration:
 
     @property
     def departure(self) -> Float[np.ndarray, "*batch n 3"]:
-        """Each image's lateral, range and elevational errors in robust SDs of those in use."""
+        """Each image's lateral, range and elevational errors in robust SDs of the used images."""
         return self._summary.inspection.departure
 
     @cached_property
     def wrong_frames(self) -> str | None:
         """What is wrong with the data's frames or units, in words, and what to do (one problem).
 
-        None where nothing seems wrong; see :mod:`jaxcal.diagnostics.frame_checks`. An answer of
-        which something is said here is not to be used, whatever its residuals and standard
-        deviations are.
+        None where nothing seems wrong; see :mod:`jaxcal.diagnostics.frame_checks`. If there is
+        a text, do not use the answer, however small its residuals and standard deviations are.
         """
         from jaxcal.diagnostics.frame_checks import wrong_frames
 
@@ -392,21 +394,21 @@ class Calibration:
         Raises:
             IndexError: beyond the batch, or for one calibration.
         """
-        # As numpy indexes: it raises where jax would clip.
+        # Numpy raises an error for an index outside the batch; JAX would clip it.
         np.empty(self.mask.shape[:-1])[index]
 
         def taken(leaf: AnyArray) -> AnyArray:
-            # A number of a numpy array is none any more.
+            # An element of a numpy array is a scalar, not an array.
             return np.asarray(leaf[index]) if isinstance(leaf, np.ndarray) else leaf[index]
 
         return map_arrays(taken, self)
 
     def with_problem(self, problem: Problem) -> Calibration:
-        """The same with the data that were solved."""
+        """The same calibration with the data that were solved."""
         return replace(self, problem=problem)
 
     def image_transform(self) -> ImageTransform:
-        """The transform by itself: to apply it to pixels, and to save it for other programs.
+        """The transform alone, to apply it to pixels and to save it for other programs.
 
         Raises:
             CalibrationError: under a JAX transformation.
@@ -454,14 +456,14 @@ class Calibration:
         """What ``jaxcal calibrate --json`` prints, as plain values.
 
         Args:
-            tre_points: further image points, in the images' unit, whose error is wanted.
+            tre_points: further image points, in the images' unit, for which to give the error.
         """
         from jaxcal.report.summary import record_of
 
         return record_of(self, tre_points)
 
     def verdict(self) -> list[str]:
-        """How accurate, what limits it and what to do, in sentences."""
+        """How accurate the calibration is, what limits it and what to do, in sentences."""
         from jaxcal.report.verdict import verdict
 
         return verdict(self.record())
@@ -471,13 +473,12 @@ class Calibration:
 
         Args:
             path: the file to make or replace.
-            format: as for :meth:`jaxcal.ImageTransform.save`; by default what the extension says.
-                ``json`` holds everything that is known of the calibration.
+            format: as for :meth:`jaxcal.ImageTransform.save`; by default that of the extension.
+                ``json`` holds the whole record of the calibration.
 
         Raises:
-            InputError: a format that the extension does not tell, pixels that are not known, or a
-                batch.
-            OutputError: it could not be written; the file is as it was.
+            InputError: an extension without a format, an unknown pixel size, or a batch.
+            OutputError: the file could not be written and is unchanged.
         """
         if format == "json" or (format is None and os.fspath(path).lower().endswith(".json")):
             from jaxcal.report.write import write_json
@@ -524,7 +525,7 @@ class Calibration:
         return plots.plot_limits(self)
 
     def __str__(self) -> str:
-        """Table and verdict; of a batch how many converged; traced: the names of the arrays."""
+        """Table and verdict; for a batch how many converged; if traced, the names of the arrays."""
         if self.problem is None or is_traced(self):
             return repr(self)
         from jaxcal.report import summary
@@ -534,7 +535,7 @@ class Calibration:
         return summary.text_of(self)
 
     def _repr_html_(self) -> str | None:
-        """For notebooks; None (so that the text is shown) where there is nothing to draw."""
+        """HTML for notebooks; None, so that the text is shown, if there is nothing to draw."""
         traced = is_traced(self)
         if self.problem is None or traced or np.ndim(self.mask) != 1:
             return None
@@ -543,7 +544,7 @@ class Calibration:
         return html_of(self)
 
     def numpy(self) -> Calibration:
-        """The same with numpy arrays (concrete values).
+        """The same calibration with numpy arrays (concrete values).
 
         Raises:
             CalibrationError: under a JAX transformation.

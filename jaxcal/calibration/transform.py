@@ -1,14 +1,16 @@
 """A calibration in use: loaded, applied to pixels, saved for other programs. Numpy only.
 
-Two descriptions of the same thing. jaxcal's own is rigid and in mm: X = [a e z | t] takes the image
-plane (lateral, elevational, axial) to the probe, and a pixel is (s_u u, 0, s_v v + f) in it. PLUS's
-``ImageToProbe`` takes (u, v, 0, 1) in pixels to the probe and carries the pixel size:
+There are two descriptions of the same calibration. jaxcal's own is rigid and in mm: X = [a e z | t]
+takes the image plane (lateral, elevational, axial) to the probe, and in this plane a pixel is
+(s_u u, 0, s_v v + f). PLUS's ``ImageToProbe`` takes (u, v, 0, 1) in pixels to the probe and
+includes the pixel size:
 
     M[:3, 0] = s_u a,  M[:3, 1] = s_v z,  M[:3, 2] = -(s_u + s_v) / 2 e,  M[:3, 3] = t + f z,
 
-where s_v is the pixel's size at the sound speed that was found, and f the range of row 0 there.
+where s_v is the pixel's size at the estimated sound speed, and f the range of row 0 at this speed.
 
-The third column is *minus* the elevational axis: y = z cross x here, and z = x cross y there.
+The third column is *minus* the elevational axis, since jaxcal has y = z cross x and PLUS has
+z = x cross y.
 """
 
 from __future__ import annotations
@@ -39,15 +41,15 @@ SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
 
 _ROUNDING = 1e-13
 _SKEWED = 1e-3
-"""Cosine between the columns of a matrix from which on they are not taken for orthogonal."""
+"""Largest cosine between two columns of a matrix that count as orthogonal."""
 
 
 @dataclass(frozen=True)
 class AppliedPoints:
-    """Where pixels are.
+    """Positions of pixels.
 
     Attributes:
-        points: (n, 3), mm, in the tracker's frame where a pose was given, else in the probe's.
+        points: (n, 3), mm, in the tracker's frame if a pose was given, else in the probe's.
         covariance: (n, 3, 3), mm^2; NaN where the calibration's is not known.
     """
 
@@ -57,19 +59,20 @@ class AppliedPoints:
 
 @dataclass(frozen=True)
 class ImageTransform:
-    """A calibration without what it was made from.
+    """A calibration without the data from which it was made.
 
     Attributes:
         image_plane_to_probe: (4, 4) X, rigid, mm, from (lateral, elevational, axial).
         scale_mm_per_px: [lateral, axial]; None where points were in mm.
         face_offset_mm: range of pixel row 0, or of a measured range of 0, mm.
         covariance: (6, 6) of X's right perturbation X Exp([v, omega]), mm and rad; None if unknown.
-        range_factor: estimated sound speed over the nominal one, by which ranges are larger.
+        range_factor: estimated sound speed over the nominal one; ranges are multiplied by it.
         unknowns: blocks of estimated unknowns that move an image point, X's first.
-        image_covariance: (q, q) of all of these (mm, rad, log units); None: ``covariance`` alone.
+        image_covariance: (q, q) of all ``unknowns`` (mm, rad, log units); if it is None, only
+            ``covariance`` counts.
         error_mm: root mean square residual of the calibration, mm; None if unknown.
         converged: whether the calibration can be used; None if unknown.
-        source: the file.
+        source: the file, for messages.
     """
 
     image_plane_to_probe: Float[np.ndarray, "4 4"]
@@ -101,7 +104,7 @@ class ImageTransform:
     def with_pixels(
         self, size_mm: tuple[float, float], origin_px: tuple[float, float] = (0.0, 0.0)
     ) -> ImageTransform:
-        """The same for pixels of a known size, of a calibration from points in mm.
+        """A calibration from points in mm, converted to pixels of a known size.
 
         Args:
             size_mm: [lateral, axial] of a pixel.
@@ -118,7 +121,7 @@ class ImageTransform:
         def shifted(covariance: np.ndarray | None) -> np.ndarray | None:
             if covariance is None:
                 return None
-            # X' = X T with T a shift by d along lateral: the perturbation at the new origin.
+            # X' = X T with T a shift by d along lateral moves the perturbation to the new origin.
             adjoint = np.eye(len(covariance))
             adjoint[:3, 3:6] = -_cross(np.array([-scale[0] * origin_px[0], 0.0, 0.0]))
             return adjoint @ covariance @ adjoint.T
@@ -147,8 +150,8 @@ class ImageTransform:
             pixel_sd_px: SD of the points themselves, one number or [u, v] (mm without pixels).
 
         Returns:
-            Points and covariances. They hold the calibration's covariance, that of estimated pixel
-            sizes, sound speed and delay included, and the points' own; not the pose's.
+            Points and covariances. The covariances include the calibration's (also that of
+            estimated pixel sizes, sound speed and delay) and the points' own, but not the pose's.
 
         Raises:
             InputError: shapes that do not agree, NaN or Inf, or a pose that is not rigid.
@@ -219,12 +222,12 @@ class ImageTransform:
             format: ``json`` (ours), ``plus`` (a ``<Transform>`` to paste), ``slicer`` or ``itk``
                 (``.tfm``, ``.txt`` or ``.h5``), ``ros`` (YAML, metres), ``tusrec``
                 (``calib_matrix.csv``) or ``numpy`` (``.npy``: PLUS's matrix; ``.npz``: all). By
-                default what the extension says.
+                default that of the extension.
             frames: names of the image's and the probe's frame.
 
         Raises:
-            InputError: a format that the extension does not tell, or pixels that are not known.
-            OutputError: it could not be written; the file is as it was.
+            InputError: an extension without a format, or an unknown pixel size.
+            OutputError: the file could not be written and is unchanged.
         """
         name = os.fspath(path)
         chosen = _format_of(name) if format is None else format
@@ -242,10 +245,10 @@ class ImageTransform:
             write_text(path, self.text(chosen, frames=frames))
 
     def text(self, format: SaveFormat, *, frames: FramePair = ("Image", "Probe")) -> str:
-        """The text that :meth:`save` writes in a format; ``numpy`` prints PLUS's matrix.
+        """The text that :meth:`save` writes in a format; for ``numpy`` it is PLUS's matrix.
 
         Raises:
-            InputError: a name that is no format, or pixels that are not known.
+            InputError: an unknown format, or an unknown pixel size.
         """
         if format == "json":
             return json.dumps(self._record(), indent=2, allow_nan=False) + "\n"
@@ -327,16 +330,17 @@ def _format_of(name: str) -> SaveFormat:
 def transform_from_plus_matrix(
     matrix: Float[np.ndarray, "4 4"], *, error_mm: float | None = None, source: str = "memory"
 ) -> ImageTransform:
-    """The calibration of a PLUS ImageToProbe, whose third column is not looked at.
+    """The calibration of a PLUS ImageToProbe; its third column is checked but not used.
 
     Args:
         matrix: (u, v, 0, 1), px, to the probe, mm.
-        error_mm: as stated beside it.
-        source: for messages.
+        error_mm: the error that the file states, mm.
+        source: the file, for messages.
 
     Raises:
         InputError: NaN, a last row other than 0 0 0 1, a reflection, pixels without a size, or
-            columns that are not orthogonal to 1e-3: no rigid transform and pixel size makes them.
+            columns that are not orthogonal to 1e-3, which a rigid transform with a pixel size
+            cannot have.
     """
     matrix = np.asarray(matrix, dtype=np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
@@ -376,7 +380,8 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
 
     Raises:
         FormatError: not such a file.
-        InputError: matrices that cannot be used. Either is one line that starts with the path.
+        InputError: matrices that cannot be used. The message of either error is one line that
+            starts with the path.
     """
     name = os.fspath(path)
     lower = name.lower()
@@ -443,8 +448,7 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     """The calibration in an object of ``jaxcal calibrate --json``, of this or an older version.
 
     Raises:
-        FormatError: another format, a newer version, or a field that is missing or not as it
-            should be.
+        FormatError: another format, a newer version, or a field that is missing or invalid.
     """
     if record.get("format", FORMAT) != FORMAT:
         raise FormatError(f"is not a calibration: its format is {quoted(str(record['format']))}")
@@ -454,14 +458,14 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
             f"is version {quoted(str(version))} of the calibration format; this jaxcal understands "
             f"version {VERSION}: update jaxcal"
         )
-    # Before version 1 the field had the name of PLUS's matrix, which is another.
+    # Before version 1 the field had the name of PLUS's matrix, which is a different one.
     key = "image_to_probe" if version == 0 else "image_plane_to_probe"
     matrix = _array(record, key, (4, 4))
     if matrix is None:
         raise FormatError(f"is not a calibration: {key} is missing, or the solve had failed")
     transform = check_poses(matrix[None], what=key)[0]
     if np.abs(transform - matrix).max() < _ROUNDING:
-        transform = matrix  # what was written is what is read, to the last digit
+        transform = matrix  # keeps every digit of the file
     scale = _array(record, "scale_mm_per_px", (2,))
     if scale is not None and not (scale > 0).all():
         raise FormatError("scale_mm_per_px must be positive")
@@ -507,7 +511,7 @@ def _array(record: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarr
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise FormatError(f"{key} must be numbers of shape {shape}") from None
-    # NaN in the place of null: the solve had failed.
+    # If the solve had failed, there may be NaN instead of null.
     if array.shape != shape:
         raise FormatError(f"{key} must have shape {shape}, it has {array.shape}")
     return array if np.isfinite(array).all() else None

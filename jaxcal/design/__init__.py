@@ -1,21 +1,22 @@
-"""Which poses: an experiment that reaches the wanted error with few images.
+"""Design of an experiment: choose poses that reach the wanted error with few images.
 
-With S the covariance of the unknowns (X's right perturbation, the target), an image at a pose adds
-the information G'G of its whitened 3x9 Jacobian G, and what a lab asks for is linear in S: the
-squared target registration error and the squared reconstruction precision are traces tr(W S).
+Let S be the covariance of the unknowns (X's right perturbation, the target). An image at a pose
+adds the information G'G of its whitened 3x9 Jacobian G. The quantities of interest are linear in S:
+the squared target registration error and the squared reconstruction precision are traces tr(W S).
 
 constraints.py  where a pose may be: image region, cone, turn, box, reach
 noise.py        SDs as functions of where the target is in the image
-information.py  G of a pose; what a calibration already knows
+information.py  G of a pose; the information of a calibration
 criteria.py     W of TRE and RP; the gain of a pose in closed form
-candidates.py   poses to choose from: of a probe and a region, or around a recording
-greedy.py       one pose after the other; exchange.py: each of them against all others
-polish.py       off the grid, along the gradient on SE(3), inside the constraints
+candidates.py   poses to choose from: for a probe and a region, or around a recording
+greedy.py       chooses one pose after the other
+exchange.py     exchanges each chosen pose for the best candidate
+polish.py       moves poses along the gradient on SE(3), inside the constraints
 planning.py     plan, next_poses
-bound.py        what no choice among the candidates goes below
-predict.py      what a plan promises; images_to
-words.py        a pose for a person who holds the probe
-figure.py       the plan, and how many images are needed
+bound.py        an error that no choice among the candidates can go below
+predict.py      predicted errors of a plan; images_to
+words.py        a pose in words, for a person who holds the probe
+figure.py       figure of the plan and of how many images are needed
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 """How good the best set of poses can be: a bound that no choice among the candidates beats.
 
-A set of n poses has the information B + sum_i k_i I_i, with whole numbers k_i that sum to n. Let
-them be any shares n w_i instead: tr(W (B + n sum w_i I_i)^-1) is convex in w, and with
-d_i = n tr(M^-1 W M^-1 I_i) its gradient is -d. So from any w
+A set of n poses has the information B + sum_i k_i I_i, with whole numbers k_i that sum to n. Allow
+any shares n w_i instead of k_i, and let M = B + n sum w_i I_i. Then tr(W M^-1) is convex in w, and
+with d_i = n tr(M^-1 W M^-1 I_i) its gradient is -d. So for any w
 
     tr(W M^-1) - (max_i d_i - sum_i w_i d_i)
 
-is below what every set of n poses leaves (the equivalence theorem turned into a bound), and
-w_i <- w_i sqrt(d_i), normalised, brings both together.
+is a lower bound on tr(W S) for every set of n poses (the equivalence theorem used as a bound). The
+step w_i <- w_i sqrt(d_i), normalised, brings tr(W M^-1) and the bound together.
 
 References: Kiefer and Wolfowitz 1960; Silvey, Titterington and Torsney 1978; Yu 2010.
 """
@@ -34,10 +34,10 @@ from jaxcal.design.planning import (
 from jaxcal.design.predict import student_factor
 
 NEAR = 1e-3
-"""Of the squared error: how near to the best shares is near enough."""
+"""The steps end when the bound is nearer than this share of the squared error."""
 
 MOST_STEPS = 4000
-"""The bound holds wherever the steps end; more of them only bring it nearer."""
+"""The bound holds after any number of steps; more steps only make it tighter."""
 
 
 def least_error(
@@ -46,11 +46,11 @@ def least_error(
     criterion: Criterion = "tre",
     prior: Known | Plan | Calibration | np.ndarray | None = None,
 ) -> float:
-    """The predicted error that no n of the candidates go below, mm.
+    """A lower bound on the predicted error of any n of the candidates, mm.
 
-    It compares with ``tre_mm[-1]`` and ``rp_mm[-1]`` of a plan without polish, which moves poses
-    off the candidates. The same pose may be taken several times; space filling and the cap on
-    replicates (:class:`jaxcal.design.Rules`) are left out, so a plan that keeps them is above.
+    Compare it with ``tre_mm[-1]`` or ``rp_mm[-1]`` of a plan without polish (which would move poses
+    off the candidates). The bound allows the same pose several times and ignores space filling and
+    the limit on replicates (:class:`jaxcal.design.Rules`), so a plan that keeps these is above it.
 
     Args:
         candidates: to choose from.
@@ -59,8 +59,8 @@ def least_error(
         prior: what is known already, as for :func:`jaxcal.design.plan`.
 
     Raises:
-        InputError: criterion ``d``, no number of poses, or candidates from which nothing can be
-            calibrated.
+        InputError: criterion ``d``, fewer than one pose, or candidates that do not determine the
+            unknowns.
     """
     check_criterion(criterion)
     if criterion == "d":

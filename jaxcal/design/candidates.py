@@ -1,8 +1,8 @@
-"""Poses to choose from: what a probe can do over a region, or what a recording can be added to.
+"""Poses to choose from: those of a probe over a region, or those to add to a recording.
 
-Candidates run through one Sobol sequence over the five numbers of
-:mod:`jaxcal.design.constraints`, turned round by a seed: tilts uniform over the cone's cap, turns
-and places even. Those that the constraints do not allow are passed over.
+Candidates follow one Sobol sequence over the five numbers of :mod:`jaxcal.design.constraints`,
+shifted by a seed. Tilts are uniform over the cone's cap; turns and places are uniform, too. Poses
+that the constraints do not allow are skipped.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jaxcal.data.recording import Recording
 
 COUNT = 5000
-"""Candidates of a plan; twice as many change the predicted error by less than 1 %."""
+"""Number of candidates of a plan; twice as many change the predicted error by less than 1 %."""
 MOST_CANDIDATES = 200_000
 SOBOL: tuple[tuple[int, tuple[int, ...]], ...] = (
     (0, (1,) * 30),
@@ -53,8 +53,8 @@ class Candidates:
         poses: (m, 4, 4) probe -> tracker, mm.
         model: X, target and SDs.
         constraints: what polished poses must keep.
-        taken: (k, 4, 4) poses of the images that there are already.
-        used: (k,) which of these a calibration used.
+        taken: (k, 4, 4) poses of the images taken already.
+        used: (k,) which of these images a calibration used.
     """
 
     poses: Float[np.ndarray, "m 4 4"]
@@ -72,7 +72,7 @@ class Candidates:
                 f"there must be 1 to {MOST_CANDIDATES} candidates, not {len(self.poses)}"
             )
         object.__setattr__(self, "poses", check_poses(self.poses, what="candidate pose"))
-        # Copies with other SDs, or with some of the poses, need not look again.
+        # Copies with other SDs, or with some of the poses, need no new check.
         object.__setattr__(self, "_checked", True)
 
     def __len__(self) -> int:
@@ -88,15 +88,16 @@ class Candidates:
 def sobol_numbers(count: int, constraints: Constraints, seed: int) -> Float[np.ndarray, "n 5"]:
     """The first ``count`` points of the sequence (rounded up to a power of two)."""
     draws = sobol_sequence(1 << int(np.ceil(np.log2(max(count, 2)))))
-    # Sobol points are balanced in powers of two; turned round in the unit cube, they stay even.
+    # Sobol points are balanced in powers of two; a shift modulo 1 keeps them uniform.
     fraction = (draws + np.random.default_rng(seed).random(5)) % 1.0
     return numbers_of(fraction, constraints)
 
 
 def sobol_sequence(count: int) -> Float[np.ndarray, "n 5"]:
-    """The first points of Sobol's sequence in the unit cube, as ``scipy.stats.qmc`` has them.
+    """The first points of Sobol's sequence in the unit cube, the same as in ``scipy.stats.qmc``.
 
-    Importing that takes longer than planning. In Gray code, after Antonov and Saleev 1979.
+    The import of ``scipy.stats.qmc`` takes longer than planning. The points are in the order of the
+    Gray code, after Antonov and Saleev 1979.
     """
     order = np.arange(count, dtype=np.int64)
     gray = order ^ (order >> 1)
@@ -118,7 +119,7 @@ def sobol_sequence(count: int) -> Float[np.ndarray, "n 5"]:
 def numbers_of(
     fraction: Float[np.ndarray, "n 5"], constraints: Constraints
 ) -> Float[np.ndarray, "n 5"]:
-    """Five numbers of points of the unit cube: tilt and azimuth, turn, lateral, depth."""
+    """The five numbers for points of the unit cube (tilt, azimuth, turn, lateral, depth)."""
     tilt = np.arccos(1 - fraction[:, 0] * (1 - np.cos(np.radians(constraints.cone_deg))))
     azimuth = 2 * np.pi * fraction[:, 1]
     return np.column_stack(
@@ -135,14 +136,14 @@ def numbers_of(
 def sobol_poses(
     count: int, model: Model, constraints: Constraints, seed: int = 0
 ) -> tuple[Float[np.ndarray, "n 4 4"], int]:
-    """The first ``count`` allowed poses of the sequence, and how many were passed over before.
+    """The first ``count`` allowed poses of the sequence, and how many others were skipped.
 
-    Fewer where the constraints leave fewer of 50 tries a pose.
+    There are fewer poses if the constraints allow fewer than ``count`` of 50 ``count`` tries.
     """
     x, point = model.image_to_probe, model.point
     found: list[np.ndarray] = []
     passed = first = 0
-    # A part of the sequence is nearly always enough, and a check may be dear.
+    # A part of the sequence is nearly always enough, and a check may take long.
     for tries in (2 * count, 8 * count, _TRIES_PER_POSE * count):
         numbers = sobol_numbers(tries, constraints, seed)[first:]
         first += len(numbers)
@@ -165,18 +166,18 @@ def make_candidates(
     model: Model | None = None,
     seed: int = 0,
 ) -> Candidates:
-    """Candidates from nothing but a probe and a region.
+    """Candidates from a probe and a region alone.
 
-    X and the target's place need not be known: which poses tell most depends on where the target is
-    in the image and on how the image is turned, not on where the probe's frame is on the probe.
+    X and the target's position need not be known. Which poses tell most depends on where the target
+    is in the image and on the image's orientation, not on where the probe's frame is on the probe.
 
     Args:
-        probe: the transducer, for the region and for the SDs; a linear one without.
-        region: of the image, for the target; by default most of what lies in front of the probe.
+        probe: the transducer, for the region and for the SDs; None: a linear one.
+        region: of the image, for the target; by default most of the area in front of the probe.
         count: how many candidates.
-        constraints: cone, turns, box, reach; its region counts where ``region`` is None.
+        constraints: cone, turns, box, reach; its region is used if ``region`` is None.
         model: X, target and SDs as far as they are known.
-        seed: another one gives other candidates of the same quality.
+        seed: another seed gives other candidates of the same quality.
 
     Raises:
         InputError: constraints that leave too few poses.
@@ -208,16 +209,16 @@ def candidates_around(
     constraints: Constraints | None = None,
     seed: int = 0,
 ) -> Candidates:
-    """Candidates for what to add to a recording: about the mean orientation of its images.
+    """Candidates for poses to add to a recording, about the mean orientation of its images.
 
     Args:
         recording: what was calibrated.
-        result: its calibration; it may be an unobservable one.
+        result: the recording's calibration; it may be unobservable.
         count: how many.
         region: of the image; by default where the target was, and the probe's face over that depth.
-        cone_deg: half angle of the cone; by default what the images covered, at least 30 degrees.
-        turn_deg: turns either way; by default what they covered, at least 60 degrees.
-        constraints: instead of the three before, and of the mean orientation.
+        cone_deg: half angle of the cone; by default that of the images, at least 30 degrees.
+        turn_deg: largest turn either way; by default that of the images, at least 60 degrees.
+        constraints: replace ``region``, ``cone_deg``, ``turn_deg`` and the mean orientation.
         seed: see :func:`make_candidates`.
 
     Raises:
@@ -254,7 +255,7 @@ def candidates_around(
 
 
 def seen_region(recording: Recording, targets: Float[np.ndarray, "n 3"]) -> Region:
-    """Where the target was, somewhat wider; at least most of the probe's face where it is known."""
+    """Where the target was, slightly enlarged; at least most of the face of a known probe."""
     probe = recording.probe
     whole = Region() if probe is None else Region.of_probe(probe)
     if probe is not None and whole.radius_mm is not None:

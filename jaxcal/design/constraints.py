@@ -1,6 +1,6 @@
-"""Where a pose may be, and the five numbers that a pose of the plan has.
+"""Where a pose may be, and the five numbers that describe a pose of the plan.
 
-A planned pose puts the target into the image plane. What is left of its six degrees of freedom:
+A planned pose puts the target into the image plane. This leaves five of its six degrees of freedom:
 
     s1, s2   where in the image region the target is, each from -1 to 1
     w1, w2   the tilt, a rotation vector (rad) in the plane across the reference's axial direction
@@ -8,8 +8,8 @@ A planned pose puts the target into the image plane. What is left of its six deg
 
 With the reference orientation L (image axes in the tracker's frame), the image's orientation is
 L Exp([w1, w2, 0]) Exp([0, 0, turn]): every rotation whose axial direction is less than half a turn
-from the reference's has exactly one tilt and one turn. In these numbers region, cone and turn are
-intervals and a disc; box, reach and whatever else is asked of the pose itself.
+from the reference's has exactly one tilt and one turn. In these numbers region and turn are
+intervals and the cone is a disc. Box, reach and further conditions are checked on the pose itself.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jaxcal.data.probe import CurvilinearProbe, Probe
 from jaxcal.runtime.array_types import Bool, Float
 
 _INSIDE = 1e-9
-"""Rounding that is not outside."""
+"""Numbers outside by less than this, due to rounding, count as inside."""
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 Allowed = Callable[[Float[np.ndarray, "n 4 4"]], Bool[np.ndarray, " n"]]
@@ -34,7 +34,7 @@ Allowed = Callable[[Float[np.ndarray, "n 4 4"]], Bool[np.ndarray, " n"]]
 
 @dataclass(frozen=True)
 class Region:
-    """Where in the image the target may be; the errors are meant over the same region.
+    """Where in the image the target may be; errors are averaged over the same region.
 
     Attributes:
         lateral_mm: least and largest position along the array, mm.
@@ -63,7 +63,7 @@ class Region:
         depth_mm: tuple[float, float] = (15.0, 82.0),
         lateral_mm: tuple[float, float] | None = None,
     ) -> Region:
-        """What lies in front of a probe: 0.82 of its aperture unless told otherwise."""
+        """The region in front of a probe; by default 0.82 of its aperture."""
         half = 0.41 * probe.width_mm
         radius = probe.radius_mm if isinstance(probe, CurvilinearProbe) else None
         return cls((-half, half) if lateral_mm is None else lateral_mm, depth_mm, radius)
@@ -83,7 +83,7 @@ class Region:
         return xp.stack([along, xp.zeros_like(along), depth], axis=-1)
 
     def unit(self, target: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-        """The numbers of targets in the image frame; outside -1 to 1 where they are outside."""
+        """The two numbers of targets in the image frame; beyond -1 to 1 outside the region."""
         along, depth = target[..., 0], target[..., 2]
         if self.radius_mm is not None:
             angle = np.arctan2(along, depth + self.radius_mm)
@@ -103,17 +103,18 @@ class Region:
 
 @dataclass(frozen=True)
 class Constraints:
-    """What a pose must keep.
+    """Constraints on a pose.
 
     Attributes:
         region: of the image, for the target.
         reference: (3, 3) middle orientation, image -> tracker.
         cone_deg: half angle of the cone of axial directions about the reference's.
-        turn_deg: turns about the axial direction, up to this either way.
-        box_mm: least and largest corner, in the tracker's frame, for the image's origin (the tip).
+        turn_deg: largest turn about the axial direction, either way.
+        box_mm: least and largest corner of a box for the image's origin (the tip), in the tracker's
+            frame.
         reach_mm: least and largest distance of the probe's frame from the tracker's origin.
-        allowed: says of (n, 4, 4) poses probe -> tracker which may be visited beyond all that, e.g.
-            by an arm's kinematics.
+        allowed: a function of (n, 4, 4) poses probe -> tracker that says which may be visited, as a
+            further condition, e.g. an arm's kinematics.
     """
 
     region: Region = field(default_factory=Region)
@@ -141,7 +142,7 @@ class Constraints:
         image_to_probe: Float[np.ndarray, "4 4"],
         point: Float[np.ndarray, 3],
     ) -> Bool[np.ndarray, " n"]:
-        """Which poses keep everything.
+        """Which poses satisfy all constraints.
 
         Args:
             poses: probe -> tracker, mm.
@@ -169,7 +170,7 @@ class Constraints:
         image_to_probe: Float[np.ndarray, "4 4"],
         point: Float[np.ndarray, 3],
     ) -> Float[np.ndarray, "n 4 4"]:
-        """Poses probe -> tracker (mm) of their five numbers."""
+        """Poses probe -> tracker (mm) from their five numbers."""
         tilt, turn = np.zeros((len(numbers), 3)), np.zeros((len(numbers), 3))
         tilt[:, :2], turn[:, 2] = numbers[:, 2:4], numbers[:, 4]
         image = self.reference @ rotations_from_vectors(tilt) @ rotations_from_vectors(turn)
@@ -185,7 +186,7 @@ class Constraints:
         image_to_probe: Float[np.ndarray, "4 4"],
         point: Float[np.ndarray, 3],
     ) -> Float[np.ndarray, "n 5"]:
-        """The five numbers of poses; the elevational offset, which has none, is dropped."""
+        """The five numbers of poses; the elevational offset is not among them and is ignored."""
         image = poses[:, :3, :3] @ image_to_probe[:3, :3]
         in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], point - poses[:, :3, 3])
         target = (in_probe - image_to_probe[:3, 3]) @ image_to_probe[:3, :3]

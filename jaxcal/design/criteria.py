@@ -1,8 +1,8 @@
-"""What a plan is for: the weight matrices W, and what a further pose gains.
+"""The criteria of a plan: the weight matrices W, and the gain of a further pose.
 
-TRE. At an image point p the error of X Exp(d) p is J_p d with J_p = [I, -[p]x] (mm) and, where the
-pixel scales are unknown, two columns more (:mod:`jaxcal.diagnostics.image_points`), so its mean
-square over an image region is tr(W S), W = mean of J_p'J_p.
+TRE. At an image point p the error of X Exp(d) p is J_p d with J_p = [I, -[p]x] (mm); unknown pixel
+scales add two columns (:mod:`jaxcal.diagnostics.image_points`). So the mean square over an image
+region is tr(W S), W = mean of J_p'J_p.
 
 RP (Eq. 8). The reconstructed points B_i X p_i scatter by J_i d about their mean, J_i = R_i R_X J_p;
 the expected square is tr(W S), W = sum_i (J_i - mean J)'(J_i - mean J) / (n - 1) over the test set.
@@ -15,8 +15,8 @@ Gain. With G of one more pose, A = G S G' and Woodbury's identity, tr(W S) falls
 
 and ln det S by ln det(I + A): matrices of 3x3.
 
-SDs that nobody has tuned may be wrong. A criterion is then the mean of ln tr(W S) over a few sets
-of SDs (:func:`hypotheses`), of which only the ratios matter.
+SDs that are not tuned to data may be wrong. The criterion is then the mean of ln tr(W S) over a few
+sets of SDs (:func:`hypotheses`); only the ratios of the SDs matter.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
 
 
 def check_criterion(criterion: str) -> None:
-    """Raise InputError for a name that is no criterion."""
+    """Raise InputError if the name is not that of a criterion."""
     if criterion not in CRITERIA:
         raise InputError(
             f"criterion must be {', '.join(CRITERIA[:-1])} or {CRITERIA[-1]}, not {criterion!r}"
@@ -83,9 +83,10 @@ def _point_jacobian(points: Float[np.ndarray, "m 3"], size: int) -> Float[np.nda
 
 
 def hypotheses(doubt: float) -> Float[np.ndarray, "k 3"]:
-    """Factors on the SDs (lateral, range, elevational) between which a plan must not choose.
+    """Factors on the SDs (lateral, range, elevational) over which a plan averages its criterion.
 
-    The SDs as they are, and range and elevational ones larger or smaller by the doubt, each alone.
+    The first set is the SDs as they are. For a doubt of 1.5 or more there are four other sets, with
+    either the range SD or the elevational SD multiplied or divided by the doubt.
     """
     if doubt < 1.5:
         return np.ones((1, 3))
@@ -121,7 +122,7 @@ def gains(
     covariance: Float[np.ndarray, "p p"],
     weight: Float[np.ndarray, "p p"] | None,
 ) -> Float[np.ndarray, " m"]:
-    """:func:`gain` of many poses (numpy), as a share of tr(W S); without W that of ln det S.
+    """The gains of many poses (numpy), in ln tr(W S), or in ln det S without W; see :func:`gain`.
 
     Args:
         rows: G of every pose.
@@ -129,7 +130,7 @@ def gains(
         weight: W; None: the D criterion.
 
     Returns:
-        -ln(1 - gain / tr(W S)), or ln det(I + A) / p: both fall in logarithms.
+        -ln(1 - gain / tr(W S)), or ln det(I + A) / p: the decrease of either logarithm.
     """
     size = rows.shape[2]
     spread = _times(rows, covariance)
@@ -147,14 +148,14 @@ def gains(
 def _times(
     rows: Float[np.ndarray, "m 3 p"], matrix: Float[np.ndarray, "p p"]
 ) -> Float[np.ndarray, "m 3 p"]:
-    """Product with a matrix, in pieces: for a larger one BLAS starts threads, which take longer."""
+    """Product with a matrix, in pieces: for larger ones BLAS starts threads, which is slower."""
     pieces = range(0, len(rows), _PIECE)
     flat = [rows[k : k + _PIECE].reshape(-1, len(matrix)) @ matrix for k in pieces]
     return np.concatenate(flat).reshape(rows.shape)
 
 
 def _symmetric(first: np.ndarray, second: np.ndarray) -> Float[np.ndarray, "6 m"]:
-    """Entries 11, 22, 33, 23, 13, 12 of first @ second' where that is symmetric."""
+    """Entries 11, 22, 33, 23, 13, 12 of first @ second', which must be symmetric."""
     pairs = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
     return np.stack([np.einsum("mp,mp->m", first[:, i], second[:, j]) for i, j in pairs])
 

@@ -1,9 +1,9 @@
-"""Exchange (Fedorov 1972): every chosen pose against the others, until nothing gains.
+"""Exchange (Fedorov 1972): replace chosen poses by better candidates until nothing improves.
 
-Greedy poses are the best after those before them, not beside those after them. Each pose is taken
-out in turn and the best candidate put in its place, which never makes the plan worse. The first
-pass looks at a shortlist only: the candidates that gain most at the greedy plan's end, and every
-few of the rest.
+The greedy choice makes each pose the best in addition to those before it, but not in addition to
+those after it. Each pose is taken out in turn and replaced by the best candidate, which never makes
+the plan worse. Only a shortlist of candidates is tried: those that gain most at the end of the
+greedy plan, and an even selection of the rest.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def exchange(search: Search, chosen: Chosen, passes: int = PASSES) -> Chosen:
     Args:
         search: candidates and what is known.
         chosen: by :func:`jaxcal.design.greedy.choose`.
-        passes: over all poses.
+        passes: largest number of passes over all poses.
     """
     rows, information = list(chosen.rows), chosen.information.copy()
     scores = search.scores(information)

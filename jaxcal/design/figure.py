@@ -1,4 +1,4 @@
-"""The figure of a plan: where the target goes, how the probe is held, how many images it takes."""
+"""The figure of a plan: places of the target, tilts of the probe, and the number of images."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
 
     Args:
         plan: what to draw.
-        wanted_mm: a wanted TRE, to mark.
+        wanted_mm: a wanted TRE to mark in the figure.
     """
     from matplotlib.figure import Figure
 

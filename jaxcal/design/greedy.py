@@ -1,11 +1,11 @@
-"""A plan pose by pose: each the one that gains most after those before it.
+"""Greedy choice: each pose is the one that gains most in addition to those before it.
 
-Every fifth pose fills space instead: the one that brings the candidates nearest to the poses so
-far, on average. The optimum sits on a few poses, which would not show that the model is wrong
-elsewhere. Replicates are capped, since errors that belong to a pose (the response of the target,
-the tracker's field) do not average out over replicates of that pose.
+By default every fifth pose fills space instead: it is the pose that most reduces the candidates'
+mean distance to the nearest chosen pose. The optimum consists of a few poses, which would not show
+that the model is wrong elsewhere. The number of replicates is limited, since errors that belong to
+a pose (the response of the target, the tracker's field) do not average out over its replicates.
 
-Cost: for m candidates and k sets of SDs a pose costs k products of 3m x 9 with 9 x 9.
+Cost: with m candidates and k sets of SDs, each pose takes k products of 3m x 9 with 9 x 9.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from jaxcal.runtime.array_types import Bool, Float
 
 @dataclass(frozen=True)
 class Rules:
-    """What a plan keeps beside the constraints.
+    """Rules that a plan keeps in addition to the constraints.
 
     Attributes:
         space_filling: share of the poses that fill space.
-        replicates: most poses that are alike.
-        apart_deg: orientations less than this apart,
-        apart_mm: with the target less than this apart in the image, are alike.
+        replicates: largest number of poses that are alike.
+        apart_deg: two poses are alike if their orientations are less than this apart and the target
+            moves by less than ``apart_mm`` in the image.
+        apart_mm: see ``apart_deg``.
     """
 
     space_filling: float = 0.2
@@ -40,19 +41,18 @@ class Rules:
 
 @dataclass
 class Search:
-    """What greedy, exchange and polish share: candidates, information and what was chosen.
+    """Input that greedy, exchange and polish share: candidates, known information and rules.
 
     Attributes:
         rows: (k, m, 3, p) G of the candidates under every set of SDs.
-        factors: (k, 3) of the SDs.
-        known: (k, p, p) information before.
+        factors: (k, 3) factors on the SDs.
+        known: (k, p, p) information before the plan.
         weight: W, or None for the D criterion.
-        rules: see there.
-        numbers: (m, 5) of the candidates.
-        rotations: (m, 9) and
-        places: (m, 3) of the target in the image, for what is alike.
-        taken_rotations: (t, 9) of images that there are already.
-        taken_places: (t, 3).
+        rules: space filling and replicates.
+        rotations: (m, 9) orientations of the candidates, to find poses that are alike.
+        places: (m, 3) places of the target in the image, for the same purpose.
+        taken_rotations: (t, 9) orientations of the images taken already.
+        taken_places: (t, 3) places of the target in these images.
     """
 
     rows: Float[np.ndarray, "k m 3 p"]
@@ -72,7 +72,7 @@ class Search:
     def scores(
         self, information: Float[np.ndarray, "k p p"], chosen: slice | np.ndarray = slice(None)
     ) -> Float[np.ndarray, " m"]:
-        """What each candidate gains, the mean over the sets of SDs."""
+        """The gain of each candidate, as the mean over the sets of SDs."""
         total = 0.0
         for rows, covariance in zip(self.rows, covariance_of(information), strict=True):
             total = total + gains(rows[chosen], covariance, self.weight)
@@ -85,7 +85,7 @@ class Search:
         return are_alike(self.rotations, self.places, rotation, place, self.rules)
 
     def counts(self, rows: Sequence[int]) -> Float[np.ndarray, " m"]:
-        """How many poses, taken or of these rows, each candidate is alike."""
+        """For each candidate, how many poses are alike: images taken already and these rows."""
         found = np.zeros(len(self.rotations))
         for rotation, place in zip(self.taken_rotations, self.taken_places, strict=True):
             found += self.alike(rotation, place)
@@ -101,21 +101,21 @@ def are_alike(
     place: Float[np.ndarray, 3],
     rules: Rules,
 ) -> Bool[np.ndarray, " m"]:
-    """Which poses are alike one other pose."""
+    """Which poses are like one other pose."""
     cosine = 0.5 * (rotations @ rotation - 1)
     near = cosine > np.cos(np.radians(rules.apart_deg))
     return near & (((places - place) ** 2).sum(axis=1) < rules.apart_mm**2)
 
 
 def space_features(candidates: Candidates) -> Float[np.ndarray, "m 5"]:
-    """The five numbers in shares of what the constraints allow, for distances between poses."""
+    """The five numbers as shares of what the constraints allow, to measure distances of poses."""
     bounds = candidates.constraints
     scale = np.array([1.0, 1.0, *np.radians([bounds.cone_deg] * 2), np.radians(bounds.turn_deg)])
     return candidates.numbers / np.maximum(scale, 1e-3)
 
 
 class Cover:
-    """How near every part of the candidates' space is to a pose.
+    """Distances from all parts of the candidates' space to the nearest pose.
 
     Args:
         features: (m, 5) of the candidates.
@@ -130,15 +130,15 @@ class Cover:
 
     @property
     def begun(self) -> bool:
-        """Whether there is a pose."""
+        """Whether there is a pose already."""
         return bool(np.isfinite(self._nearest[0]))
 
     def add(self, feature: Float[np.ndarray, " 5"]) -> None:
-        """Take a pose."""
+        """Add a pose."""
         self._nearest = np.minimum(self._nearest, _apart(feature[None], self._references)[0])
 
     def gains(self) -> Float[np.ndarray, " m"]:
-        """By how much each candidate would bring the references nearer, summed."""
+        """By how much each candidate would reduce the sum of the references' distances."""
         return np.maximum(self._nearest - self._apart, 0.0).sum(axis=1)
 
 
@@ -151,12 +151,12 @@ def _apart(
 
 @dataclass
 class Chosen:
-    """What greedy chose.
+    """The chosen poses.
 
     Attributes:
-        rows: candidates, in order.
+        rows: indices of the chosen candidates, in order.
         filling: which of them fill space.
-        information: (k, p, p) with all of them.
+        information: (k, p, p) information with all of them.
     """
 
     rows: list[int]
@@ -175,10 +175,10 @@ def choose(
 
     Args:
         search: candidates and what is known.
-        features: of the candidates (:func:`space_features`); none where nothing fills space.
-        taken_features: of the images that there are.
+        features: of the candidates (:func:`space_features`); empty if no pose fills space.
+        taken_features: of the images taken already.
         count: how many.
-        cost_s: seconds that each candidate takes; gains are then compared a second.
+        cost_s: seconds that each candidate takes; gains per second are then compared.
     """
     information = search.known.copy()
     chosen = Chosen([], [], information)
@@ -193,7 +193,7 @@ def choose(
         filling = int((k + 1) * share + 1e-9) > int(k * share + 1e-9)
         open_to = free & (alike < search.rules.replicates)
         if not open_to.any():
-            # Few candidates: better alike than none.
+            # With few candidates, poses that are alike are better than none.
             open_to = free if free.any() else np.ones_like(free)
         if filling and cover is not None and cover.begun:
             value = cover.gains()

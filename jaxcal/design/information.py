@@ -1,13 +1,13 @@
-"""What an image at a pose tells: its whitened Jacobian, and what a calibration already knows.
+"""The information of an image at a pose (its whitened Jacobian) and that of a calibration.
 
 With q = X^-1 B^-1 c the target in the image of a probe at pose B, and X Exp([v, omega]), c + u
 (mm, rad, mm), to first order
 
     dq = -v + [q]x omega + M u,    M = R_X' R_B',
 
-and the image's errors are dq's lateral, axial (range) and elevational components over their SDs:
-three rows, the 3x9 matrix G. Near the plane the range's derivative is the axial one. With unknown
-pixel scales two columns follow, of the logarithms of the lateral and the axial scale.
+and the image's errors are dq's lateral, axial (range) and elevational components divided by their
+SDs: three rows, the 3x9 matrix G. Near the plane the range has the same derivative as the axial
+position. Unknown pixel scales add two columns, for the logarithms of the lateral and axial scale.
 
 Information adds up: after n images it is J = prior + sum_i G_i'G_i, and S = J^-1.
 """
@@ -28,23 +28,23 @@ if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
 
 BELIEVED_SD = (50.0, 0.5, 50.0, 0.3)
-"""What is believed before any image (ours): SDs of X's translation (mm) and rotation (rad), of the
-target (mm) and of a pixel scale's logarithm. Weak: five images know more."""
+"""Prior SDs before any image (our choice): of X's translation (mm) and rotation (rad), of the
+target (mm) and of a pixel scale's logarithm. This prior is weak: five images tell more."""
 
 _EFFICIENCY = (0.2, 5.0)
 _HALVINGS = 22
-"""Of the logarithm of that interval, which is then known to 1e-6."""
+"""So often the interval of the factor's logarithm is halved, which gives it to 1e-6."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """What the Jacobian of a pose depends on beside the pose.
+    """Everything that the Jacobian of a pose depends on, except the pose.
 
     Attributes:
         image_to_probe: X as far as it is known, mm.
         point: the target in the tracker's frame, mm.
         noise: SDs.
-        scale: whether the two pixel scales are unknown too.
+        scale: whether the two pixel scales are unknown, too.
     """
 
     image_to_probe: Float[Any, "4 4"] = field(default_factory=lambda: np.eye(4))
@@ -75,7 +75,7 @@ class Model:
         turned = xp.swapaxes(poses[..., :3, :3] @ self.image_to_probe[:3, :3], -1, -2)
         x, y, z = q[..., 0], q[..., 1], q[..., 2]
         zero, one = xp.zeros_like(x), xp.ones_like(x)
-        # Rows lateral, range, elevational of [-I, [q]x].
+        # The lateral, range and elevational rows of [-I, [q]x].
         rigid = [
             [-one, zero, zero, zero, -z, y],
             [zero, zero, -one, -y, x, zero],
@@ -100,7 +100,7 @@ class Model:
 
 
 def covariance_of(information: Float[np.ndarray, "*k p p"]) -> Float[np.ndarray, "*k p p"]:
-    """Inverse of information, scaled to a unit diagonal first: mm and rad differ in size."""
+    """Inverse of information, first scaled to a unit diagonal, since mm and rad differ in size."""
     size = 1.0 / np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
     inverse = np.linalg.inv(information * size[..., :, None] * size[..., None, :])
     found = inverse * size[..., :, None] * size[..., None, :]
@@ -110,11 +110,11 @@ def covariance_of(information: Float[np.ndarray, "*k p p"]) -> Float[np.ndarray,
 def known_information(
     result: Calibration, model: Model, poses: Float[np.ndarray, "n 4 4"]
 ) -> Float[np.ndarray, "p p"]:
-    """Information of a calibration about all unknowns, its weak directions included.
+    """Information of a calibration about all unknowns, including its weak directions.
 
-    It is the inverse of the calibration's covariance of these unknowns. Where that is not known (X
-    is not observable), it is what the images' poses tell, with the beliefs that any plan begins
-    with.
+    It is the inverse of the calibration's covariance of these unknowns. If this covariance is not
+    known (X is not observable), it is the information of the images' poses plus the prior with
+    which every plan begins.
 
     Args:
         result: of one problem.
@@ -149,16 +149,16 @@ def effective_elevational(
     poses: Float[np.ndarray, "n 4 4"],
     weight: Float[np.ndarray, "p p"],
 ) -> float:
-    """Factor on the elevational SD after which the images tell as much as the calibration says.
+    """Factor on the elevational SD with which the images tell as much as the calibration says.
 
-    An offset from a law with edges tells more than its SD does, one with a mean to be found tells
-    less; what further images of the same kind will bring follows this factor.
+    If the offsets' law has edges, an offset tells more than its SD says; if their mean must be
+    estimated, it tells less. The factor applies to further images of the same kind, too.
 
     Args:
         result: of one problem.
         model: with the calibration's X, target and SDs.
         poses: of the images.
-        weight: W of what counts.
+        weight: W of the criterion.
     """
     answer = result.numpy()
     covariance = _of_model(result, model)

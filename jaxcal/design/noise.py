@@ -1,12 +1,12 @@
 """SDs of lateral position, range and elevational offset as functions of where the target is.
 
-Beams are worst in the corners of an image, which is where a plan for equal SDs puts most of its
-poses. The logarithm of each SD is a polynomial of the target's place,
+Beams are worst in the corners of an image, but a plan for equal SDs puts most of its poses there.
+So the logarithm of each SD is a polynomial of the target's place,
 
     ln s_k = a_k0 + a_k1 d + a_k2 d^2 + a_k3 x^2,   d = depth / 50 mm - 1,  x = lateral / 25 mm,
 
-learned from a calibration's residuals where there are enough images, and from the geometry of the
-probe before. The elevational SD is that of the target's distance from the mid-plane.
+learned from a calibration's residuals if there are enough images, and before that taken from the
+geometry of the probe. The elevational SD is that of the target's distance from the mid-plane.
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
 
 FEWEST_TO_LEARN = 20
-"""Images from which on SDs are learned as functions of the place."""
+"""Fewest images from which SDs are learned as functions of the place."""
 
 _DEPTH_MM, _LATERAL_MM = 50.0, 25.0
 _PRIOR_SD = 0.3
-"""Of the coefficients beyond the first (ours): a factor of e^0.3 for 50 mm of depth is common."""
+"""Prior SD of all coefficients but the first (our choice): a factor of e^0.3 for 50 mm of depth is
+common."""
 _SCORING_STEPS = 30
 _LEAST_SD_MM = 1e-3
 UNKNOWN_BY = 3.0
-"""A factor by which SDs that nobody has tuned may be wrong."""
+"""A factor by which SDs that are not tuned to data may be wrong."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,8 @@ class Noise:
     """A noise model.
 
     Attributes:
-        coefficients: (3, 4), a of the head; rows lateral, range, elevational.
-        doubt: factor by which the ratios of the three SDs may be wrong; 1: known.
+        coefficients: (3, 4), a_k0 to a_k3 for the rows k = lateral, range, elevational.
+        doubt: factor by which the ratios of the three SDs may be wrong; 1: they are known.
     """
 
     coefficients: Float[Any, "3 4"]
@@ -75,10 +76,10 @@ class Noise:
         focus_mm: float = 40.0,
         doubt: float = UNKNOWN_BY,
     ) -> Noise:
-        """What a probe's geometry says before there are images.
+        """The noise expected from a probe's geometry before there are images.
 
-        Lateral position and range are least-squares fits of the distances to all elements (Eq. 5),
-        each with the same SD; the elevational SD grows away from the focus like the beam's width.
+        Lateral position and range are least-squares fits to the distances of all elements (Eq. 5),
+        which have equal SDs. The elevational SD grows away from the focus like the beam's width.
 
         Args:
             probe: the transducer.
@@ -94,7 +95,7 @@ class Noise:
         apart = place[:, None, ::2] - probe.element_positions()[None, :, ::2]
         slope = apart / np.linalg.norm(apart, axis=-1, keepdims=True)
         inverse = np.linalg.inv(np.einsum("nka,nkb->nab", slope, slope))
-        # A beam of 0.8 mm at its focus that spreads by 0.03 mm a mm.
+        # A beam of 0.8 mm at its focus that spreads by 0.03 mm for each mm of range.
         width = np.hypot(1.0, 0.03 / 0.8 * (place[:, 2] - focus_mm))
         sigma = np.stack(
             [
@@ -110,12 +111,13 @@ class Noise:
 
     @classmethod
     def learned(cls, result: Calibration, targets: Float[np.ndarray, "n 3"]) -> Noise:
-        """From a calibration's SDs and residuals.
+        """The noise model from a calibration's SDs and residuals.
 
-        The variance of each error is a Gamma regression with a logarithmic link (Fisher scoring) on
-        the place, its coefficients held near zero by a normal prior; at the images' mean it is the
-        calibration's own. With fewer than :data:`FEWEST_TO_LEARN` images the SDs are equal
-        everywhere; so they are for methods other than joint, which weigh all errors alike.
+        The variance of each error is a Gamma regression on the place with a logarithmic link
+        (Fisher scoring). A normal prior holds its coefficients near zero; at the images' mean the
+        variance is the calibration's own. With fewer than :data:`FEWEST_TO_LEARN` images, each SD
+        is the same everywhere. For methods other than joint, which weigh all errors alike, it is so
+        with any number of images, and the three SDs are equal.
 
         Args:
             result: of one problem.
@@ -128,9 +130,9 @@ class Noise:
         used = np.asarray(answer.mask) > 0
         count = int(used.sum())
         if result.method != "joint":
-            # They weigh all errors alike, and so must what is predicted of them.
+            # These methods weigh all errors alike, so the prediction must do the same.
             return cls.constant(np.full(3, np.sqrt(np.mean(sigma**2))), 1.0)
-        # A tuned SD is off by a factor of about 1 + 1 / sqrt(2 n).
+        # The relative error of a tuned SD is about 1 / sqrt(2 n).
         left = max(count - 3, 1)
         tuned = bool(answer.sigma_tuned) and count >= 8
         doubt = float(np.exp(1.0 / np.sqrt(2.0 * left))) if tuned else UNKNOWN_BY
@@ -163,12 +165,12 @@ def _basis(target: Float[Any, "*n 3"]) -> Float[Any, "*n 4"]:
 def _gamma_slopes(
     basis: Float[np.ndarray, "n 4"], ratio: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, 3]:
-    """Slopes of the log variance: maximises sum(-ln v - r / v) / 2 with the normal prior."""
+    """Slopes of the log variance, which maximise sum(-ln v - r / v) / 2 plus the log prior."""
     precision = np.diag([0.0, *np.full(3, 0.25 / _PRIOR_SD**2)])
     slopes = np.zeros(4)
     for _ in range(_SCORING_STEPS):
         part = ratio * np.exp(-basis @ slopes)
-        # Fisher's information of a squared normal's log variance is a half.
+        # A squared normal error has the Fisher information 1/2 about its log variance.
         step = np.linalg.solve(
             0.5 * basis.T @ basis + precision, 0.5 * basis.T @ (part - 1) - precision @ slopes
         )

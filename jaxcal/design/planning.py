@@ -1,4 +1,4 @@
-"""Plans: which poses, from nothing or to add to images that there are."""
+"""Plans of poses: for a new recording, or to add to images taken already."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ if TYPE_CHECKING:
 
 MOST_POSES = 2000
 _SINGULAR = 1e-10
-"""Eigenvalue ratio (scaled units, equal SDs) below which candidates determine nothing."""
+"""Eigenvalue ratio (scaled units, equal SDs) below which a direction is not determined."""
 _TRIED_RAD, _TRIED_SHARE = 0.4, 0.6
 
 
 @dataclass(frozen=True)
 class Known:
-    """What is known before a plan.
+    """The information before a plan.
 
     Attributes:
-        information: (p, p) about the unknowns; includes what any plan begins with.
-        images: that it rests on.
+        information: (p, p) about the unknowns, including the prior with which every plan begins.
+        images: number of images from which it comes.
     """
 
     information: Float[np.ndarray, "p p"]
@@ -53,20 +53,20 @@ class Known:
 
 @dataclass(frozen=True)
 class Plan:
-    """Chosen poses and what they promise.
+    """Chosen poses and their predicted errors.
 
     Attributes:
-        poses: (n, 4, 4) probe -> tracker, mm, in the order of gain.
-        targets: (n, 3) where the target should then be in the image, mm.
-        filling: which of them fill space.
-        rows: (n,) the candidates that they come from.
+        poses: (n, 4, 4) probe -> tracker, mm, in the order in which they were chosen.
+        targets: (n, 3) where the target should be in the image at each pose, mm.
+        filling: which of the poses fill space.
+        rows: (n,) indices of the candidates from which they come.
         criterion: ``tre``, ``rp`` or ``d``.
-        candidates: chosen from; their model has the SDs that the promises rest on.
-        known: before the plan.
+        candidates: the candidates; their model has the SDs on which the predictions rest.
+        known: the information before the plan.
         tre_mm: (n + 1,) predicted root mean square TRE over the region with 0, 1, ... n of the
             poses, mm.
-        rp_mm: (n + 1,) predicted reconstruction precision, likewise.
-        rules: see there.
+        rp_mm: (n + 1,) predicted reconstruction precision with 0, 1, ... n of the poses, mm.
+        rules: space filling and replicates.
     """
 
     poses: Float[np.ndarray, "n 4 4"]
@@ -85,12 +85,12 @@ class Plan:
 
     @property
     def information(self) -> Float[np.ndarray, "p p"]:
-        """With all poses of the plan."""
+        """Information with all poses of the plan."""
         return self.known.information + self.candidates.model.information(self.poses)
 
     @property
     def covariance(self) -> Float[np.ndarray, "p p"]:
-        """Predicted, of X (v mm, omega rad), the target (mm) and, if unknown, the scales' logs."""
+        """Predicted covariance of X (v mm, omega rad), the target (mm) and unknown log scales."""
         return covariance_of(self.information)
 
 
@@ -112,16 +112,17 @@ def plan(
         n: how many.
         criterion: ``tre``: target registration error over the region; ``rp``: reconstruction
             precision over poses like the candidates; ``d``: volume of the confidence ellipsoid.
-        prior: what is known already: a calibration of the images ``candidates.taken`` (its weak
-            directions are what further poses aim at), an earlier plan, information (p, p), or None.
-        polish: move the poses off the grid, along the gradient.
-        swap: exchange poses after greedy.
-        cost_s: (m,) seconds that each candidate takes; greedy then compares gains a second.
+        prior: what is known already: a calibration of the images ``candidates.taken`` (further
+            poses then improve its weak directions), an earlier plan, information (p, p), or None.
+        polish: move the poses off the candidates, along the gradient.
+        swap: exchange poses after the greedy choice.
+        cost_s: (m,) seconds that each candidate takes; the greedy choice then compares gains per
+            second, and poses are not exchanged.
         rules: space filling and replicates.
 
     Raises:
-        InputError: candidates from which nothing can be calibrated (it says what is missing), or a
-            number of poses that is none.
+        InputError: candidates that do not determine the unknowns (the message says what is
+            missing), or a number of poses that is too small or too large.
     """
     check_criterion(criterion)
     known = known_before(prior, candidates)
@@ -158,7 +159,7 @@ def next_poses(
     cost_s: Float[np.ndarray, " m"] | None = None,
     rules: Rules | None = None,
 ) -> Plan:
-    """The k poses that would help most after a calibration; milliseconds.
+    """The k poses that would help most after a calibration; this takes milliseconds.
 
     Args:
         result: a calibration of the images ``candidates.taken``
@@ -166,12 +167,12 @@ def next_poses(
         candidates: to choose from.
         k: how many.
         criterion: see :func:`plan`.
-        polish: move them off the grid.
+        polish: see :func:`plan`.
         cost_s: see :func:`plan`.
-        rules: likewise; by default none of them fills space.
+        rules: see :func:`plan`; by default no pose fills space.
 
     Returns:
-        A plan of k poses; ``tre_mm[0]`` is the error now, ``tre_mm[-1]`` with all of them.
+        A plan of k poses; ``tre_mm[0]`` is the error now, ``tre_mm[-1]`` that with all k poses.
     """
     rules = Rules(space_filling=0.0) if rules is None else rules
     return plan(
@@ -182,7 +183,7 @@ def next_poses(
 def known_before(
     prior: Known | Plan | Calibration | np.ndarray | None, candidates: Candidates
 ) -> Known:
-    """What a prior says about the unknowns of the candidates' model."""
+    """The information of a prior about the unknowns of the candidates' model."""
     size = candidates.model.size
     if prior is None:
         return Known(candidates.model.beliefs())
@@ -206,7 +207,7 @@ def known_before(
 
 
 def with_effective_noise(prior: object, candidates: Candidates) -> Candidates:
-    """Candidates whose elevational SD is what the calibration got out of its images."""
+    """Candidates whose elevational SD is the calibration's effective one."""
     from jaxcal.calibration.result import Calibration
 
     if not isinstance(prior, Calibration) or candidates.taken is None:
@@ -227,7 +228,7 @@ def _with_taken(candidates: Candidates, before: Plan) -> Candidates:
 
 
 def make_search(candidates: Candidates, known: Known, criterion: Criterion, rules: Rules) -> Search:
-    """What greedy, exchange and polish need."""
+    """The input of greedy, exchange and polish."""
     model = candidates.model
     factors = hypotheses(model.noise.doubt)
     rows = model.jacobian(candidates.poses)
@@ -263,7 +264,7 @@ def weight_of(criterion: Criterion, candidates: Candidates) -> Float[np.ndarray,
 
 
 def _taken_features(candidates: Candidates) -> Float[np.ndarray, "t 5"]:
-    """Of the images that there are."""
+    """Space features of the images taken already."""
     if candidates.taken is None or not len(candidates.taken):
         return np.zeros((0, 5))
     return space_features(replace(candidates, poses=candidates.taken))
@@ -295,10 +296,10 @@ def _finished(
 
 
 def check_candidates(candidates: Candidates) -> None:
-    """Whether images at all candidates, with those taken, would determine the unknowns.
+    """Check that images at all candidates, with those taken, would determine the unknowns.
 
     Raises:
-        InputError: they would not; the direction, and what kind of pose would show it.
+        InputError: they would not; the message has the direction and a kind of pose that helps.
     """
     model = replace(candidates.model, noise=Noise.constant((1.0, 1.0, 1.0)))
     every = candidates.poses
@@ -319,14 +320,14 @@ def check_candidates(candidates: Candidates) -> None:
 
 
 def _purest(null: Float[np.ndarray, "p j"]) -> Float[np.ndarray, " p"]:
-    """The vector of a null space that lies closest to one unknown."""
+    """The unit vector of a null space that is nearest to a single unknown."""
     projector = null @ null.T
     column = projector[:, int(np.argmax(np.diagonal(projector)))]
     return column / np.linalg.norm(column)
 
 
 def _missing(candidates: Candidates, model: Model, null: Float[np.ndarray, "p j"]) -> str:
-    """Kinds of poses that would notice the directions that the candidates leave open."""
+    """Kinds of poses that would determine the directions that the candidates leave open."""
     bounds = candidates.constraints
     x, point = model.image_to_probe, model.point
     middle = np.median(candidates.numbers, axis=0)

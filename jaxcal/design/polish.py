@@ -1,9 +1,9 @@
-"""Off the grid: each chosen pose climbs along the gradient of its gain, inside the constraints.
+"""Moves each chosen pose along the gradient of its gain, inside the constraints.
 
-A pose moves in the five numbers of :mod:`jaxcal.design.constraints`, in which region, cone and turn
-are cut off exactly; a step that leaves box, reach or what else is asked for, or becomes a replicate
-too many, is halved and, in the end, not taken. So a polished pose keeps whatever its candidate
-kept.
+A pose moves in the five numbers of :mod:`jaxcal.design.constraints`, where region, cone and turn
+are exact limits. A step is halved, and in the end not taken, if it leaves the box, the reach or
+another constraint, or if the pose would be one replicate too many. So a polished pose satisfies all
+constraints that its candidate satisfied.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jaxcal.runtime.precision import in_own_modes
 _STEPS = 8
 _HALVINGS = 5
 _FIRST_STEP = 0.25
-"""In units of :func:`_scale`: an eighth of the region, of the cone, of the turns."""
+"""In units of :func:`_scale`: an eighth of the full range of region, cone and turns."""
 _LEAST_GAIN = 1e-6
 
 
@@ -37,7 +37,7 @@ def pose_of(
     point: Float[Array, " 3"],
     region: Region,
 ) -> Float[Array, "4 4"]:
-    """Pose probe -> tracker (mm) of five numbers (JAX, differentiable)."""
+    """Pose probe -> tracker (mm) from five numbers (JAX, differentiable)."""
     zero = jnp.zeros_like(numbers[4])
     tilt = rotation_from_vector(jnp.stack([numbers[2], numbers[3], zero]))
     turn = rotation_from_vector(jnp.stack([zero, zero, numbers[4]]))
@@ -93,12 +93,12 @@ def polish(
     """Move the chosen poses, one after the other; those that fill space stay.
 
     Args:
-        search: as chosen from.
-        candidates: likewise.
-        chosen: which.
+        search: the search that chose the poses.
+        candidates: the candidates of the search.
+        chosen: the chosen poses.
 
     Returns:
-        the poses, and the information with all of them under every set of SDs.
+        The poses, and the information with all of them under every set of SDs.
     """
     model, bounds = candidates.model, candidates.constraints
     x, point = np.asarray(model.image_to_probe), np.asarray(model.point)

@@ -1,7 +1,7 @@
-"""What poses promise: predicted errors, and how many images a wanted error takes.
+"""Predicted errors of poses, and how many images a wanted error takes.
 
-The prediction is the Cramer-Rao bound under the model's SDs, times Student's factor: SDs are tuned
-from the same images, and with few of them the errors are larger than with known ones
+The prediction is the Cramer-Rao bound under the model's SDs, times Student's factor: the SDs are
+tuned to the same images, and with few images this makes the errors larger than with known SDs
 (:mod:`jaxcal.diagnostics.intervals`).
 """
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 MOST_IMAGES = 1000
 _ENOUGH = 1000
-"""Candidates from which images are counted: more change the count by less than one in a hundred."""
+"""Number of candidates for counting images; more of them change the count by less than 1 %."""
 
 
 def student_factor(images: int, size: int = 9) -> float:
@@ -61,13 +61,13 @@ def images_to(
     """How many more images a wanted target registration error takes.
 
     Args:
-        result: a plan, whose poses are the next ones and which is gone on with after them; or a
-            calibration of the images ``candidates.taken``.
+        result: a plan, whose poses come first and which is then continued; or a calibration of
+            the images ``candidates.taken``.
         tre_mm: wanted root mean square TRE over the region, mm.
         candidates: to choose further poses from; a plan's own by default.
 
     Returns:
-        The number of images; 0 where it is reached already.
+        The number of images; 0 if the error is reached already.
 
     Raises:
         InputError: more than 1000 would be needed.
@@ -97,7 +97,7 @@ def images_to(
         if len(reached):
             return first + int(reached[0])
         now = float(more.tre_mm[-1])
-        # The square falls as 1 / n: jump to where that is enough.
+        # The squared error falls as 1 / n: jump to the number at which it is small enough.
         wanted = size * min(8.0, max(2.0, 1.3 * (now / tre_mm) ** 2))
         if size < MOST_IMAGES < wanted:
             wanted = MOST_IMAGES

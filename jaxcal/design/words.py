@@ -1,9 +1,9 @@
-"""A pose for a person who holds the probe.
+"""A pose in words, for a person who holds the probe.
 
-Directions are those of somebody who holds the probe with its marker to the right, beam away from
-the hand. The marker is on the side to which the image's lateral axis points (the last element; the
-marked side of PLUS). A tilt names the side to which the handle goes. In the image, left is where
-the lateral position is smallest (u = 0 in pixels), low is deep.
+Directions are those of a person who holds the probe with its marker to the right and the beam away
+from the hand. The marker is on the side to which the image's lateral axis points (the last element;
+the marked side of PLUS). A tilt is named after the side to which the handle goes. In the image,
+left is where the lateral position is smallest (u = 0 in pixels), and lower is deeper.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from jaxcal.runtime.array_types import Float
 
 _LEAST_TILT_DEG, _LEAST_TURN_DEG = 3.0, 5.0
 _DIAGONAL = float(np.tan(np.radians(67.5)))
-"""Ratio of the two components beyond which only the larger is named."""
+"""If one component is larger than the other by more than this factor, only it is named."""
 _MIDDLE = 0.4
-"""Places within this share of the region's half are in its middle."""
+"""Places within this share of the region's half-width are in its middle."""
 
 
 def pose_in_words(
@@ -26,11 +26,11 @@ def pose_in_words(
     image_to_probe: Float[np.ndarray, "4 4"],
     point: Float[np.ndarray, 3],
 ) -> str:
-    """How to hold the probe, from the middle orientation, and where the target is to be.
+    """How to hold the probe, from the middle orientation, and where the target should be.
 
     Args:
         pose: probe -> tracker, mm.
-        constraints: with the middle orientation.
+        constraints: with the middle orientation as reference.
         image_to_probe: X.
         point: the target, mm.
 
@@ -55,7 +55,7 @@ def _rounded(angle_deg: float) -> int:
 
 
 def _side(w1: float, w2: float) -> str:
-    """Where the handle goes, against the beam.
+    """Where the handle goes, which is opposite to the beam.
 
     The beam leans by w2 along the lateral axis, which points to the marker, and by -w1 along the
     elevational one, which points to the person.

@@ -1,7 +1,7 @@
-"""What is said about an answer, computed with numpy on the host when somebody reads it.
+"""Diagnostics of an answer, computed with numpy on the host when somebody reads them.
 
-    image_errors     every image's errors and their derivatives: what the rest is computed from
-    uncertainty      offsets' SDs, weakest direction, what only the prior tells
+    image_errors     every image's errors and their derivatives; the rest is computed from these
+    uncertainty      offsets' SDs, weakest direction, what is known from the prior alone
     residual_checks  images that stand out, the fit of the noise model, which poses to add
     summary          all of these for a calibration or a batch
     messages         the same in words

@@ -14,8 +14,8 @@ T = TypeVar("T")
 
 
 def is_traced(*values: object) -> bool:
-    """Whether a jit, vmap or grad looks at one of these values (pytrees)."""
-    # Where JAX was not imported nothing is traced.
+    """Whether one of these values (pytrees) is traced by a jit, vmap or grad."""
+    # If JAX is not imported, nothing is traced.
     jax = sys.modules.get("jax")
     if jax is None:
         return False
@@ -28,7 +28,7 @@ def array_module(*values: object) -> Any:
 
 
 def traceable(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorate a function of :func:`array_module`: traced, it runs in JAX's standard modes."""
+    """Decorate a user of :func:`array_module`, which then runs traced in JAX's standard modes."""
 
     @wraps(function)
     def in_standard_modes(*args: P.args, **kwargs: P.kwargs) -> T:

@@ -1,25 +1,25 @@
-"""Images that say the same: repeated poses, and streams whose errors change slowly.
+"""Images with the same errors: repeated poses, and streams whose errors change slowly.
 
-Calibration takes the errors of different images for independent. They are not where a probe is held
-still while frames come in at 20 Hz: the target's offset from the image plane is one number for the
-whole hold, and so are the errors of tracking and speckle. Sixty frames of three holds determine
-three images' worth of unknowns, however small their residuals are.
+Calibration assumes that the errors of different images are independent. They are not if a probe is
+held still while frames come in at 20 Hz: the target's offset from the image plane is one number for
+the whole hold, and so are the errors of tracking and speckle. Sixty frames of three holds tell only
+as much as three images, however small their residuals are.
 
 *Repeated poses.* Two poses are the same if no point within ``LEVER_MM`` of the tracked origin moves
-by more than ``SAME_POSE_MM`` between them. That is what an optical tracker errs by at such a lever
-(0.25 to 0.35 mm at a marker, more beyond it), less than the thickness of an ultrasound beam, and
-less than the offsets, so that such images share their offset and their speckle. Images linked by
+by more than ``SAME_POSE_MM`` between them. This is the error of an optical tracker at such a lever
+(0.25 to 0.35 mm at a marker, more beyond it). It is less than the thickness of an ultrasound beam
+and less than the offsets, so such images share their offset and their speckle. Images linked by
 such pairs are one pose while they stay within ``HOLD_MM``; a longer chain is a slow sweep, and is
-cut into pieces of ``SAME_POSE_MM``. Every group becomes one image: mean pose, and mean point (the
-median from five frames on, so that one wrong click in a hold does no harm). Its errors are those
-*between* holds, which the solver estimates from the holds' residuals; what the errors *within* a
-hold leave in the mean is part of them. The other frames of a group are masked out.
+cut into pieces of ``SAME_POSE_MM``. Every group becomes one image with the mean pose and the mean
+point (the median from five frames on, so one wrong click in a hold does no harm). Its errors are
+those *between* holds, which the solver estimates from the holds' residuals; they include what the
+mean leaves of the errors *within* a hold. The other frames of a group are masked out.
 
 *Streams.* Images of a moving probe may differ in pose and still share slowly changing errors. The
 residuals of the conventional fit (closed form, :mod:`jaxcal.solvers.closed_form.single`) have an
-integrated autocorrelation time t, and n images are worth n / t. Where t reaches ``STREAM`` images
-and that is beyond chance, every t-th image is kept. Weaker correlation is left to
-:mod:`jaxcal.diagnostics.serial_correlation`.
+integrated autocorrelation time t, and n images are worth n / t independent ones. Where t reaches
+``STREAM`` images and chance does not explain it, every t-th image is kept. For weaker correlation
+see :mod:`jaxcal.diagnostics.serial_correlation`.
 
 References: Wiles, Thompson and Frantz 2004 (accuracy of optical trackers); Sokal 1997,
 section 3 (integrated autocorrelation time); Liang and Zeger 1986 (clustered data).
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from jaxcal.solvers.closed_form.single import ClosedForm
 
 SAME_POSE_MM = 1.0
-"""Poses between which no point within the lever moves farther are the same."""
+"""Two poses are the same if no point within the lever moves farther than this between them."""
 
 LEVER_MM = 100.0
 """The lever, from the tracked origin: about the distance of a target from the probe's marker."""
@@ -52,32 +52,32 @@ HOLD_MM = 3.0
 """Images linked by pairs of the same pose are one hold if they all lie within this."""
 
 ROBUST_FROM = 5
-"""The point of a group with so many frames is their median."""
+"""From so many frames on, the point of a group is the median of its frames' points."""
 
 STREAM = 4.0
-"""A recording is a stream if its errors stay alike for so many images,"""
+"""Least autocorrelation time of a stream, in images."""
 SURE = 5.0
-"""and the correlation of successive ones is so many SDs from zero."""
+"""In a stream the correlation of successive errors is more than so many SDs above zero."""
 
 FEWEST_OF_STREAM = 40
 """Shorter recordings are not examined for slowly changing errors."""
 
 ABSORBED = 6.0
-"""Independent elevational errors that the fit takes up: so many unknowns move them,"""
+"""Independent elevational errors that the fit absorbs: the number of unknowns that move them."""
 LEAST_SHARE = 0.4
-"""but never more than leaves this share of them."""
+"""At least this share of the errors is assumed to be left after the fit."""
 
 
 @dataclass(frozen=True)
 class Independent:
-    """Which images may be taken for independent.
+    """Which images can be treated as independent.
 
     Attributes:
         group: (n,) number of each image's pose; -1 where it is not used.
         keep: (n,) True for the one image that stands for its group.
         frames: number of used images.
         poses: number of different poses among them.
-        stride: of a stream, every so many poses are kept; otherwise 1.
+        stride: one of so many poses of a stream is kept; 1 where the recording is no stream.
     """
 
     group: Int[np.ndarray, " n"]
@@ -113,12 +113,13 @@ def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, Indepen
 
     Args:
         data: one problem with concrete values, or one set of images with points.
-        estimate: what the calibration will estimate; with ``scale`` or unknown pixels, so do the
-            fits that are made here.
+        estimate: what the calibration will estimate; with ``scale`` or an unknown pixel size, the
+            fits in this module estimate the scale, too.
 
     Returns:
-        The data, of the same shape: for every group one image has its mean pose and point, and the
-        others are masked out. The same object where all images are independent. And what was found.
+        The data, and which images are independent. The data have the same shape: one image of every
+        group has the group's mean pose and point, and the others are masked out. Where all images
+        are independent, the data are the same object.
 
     Raises:
         InputError: fewer than 4 different poses.
@@ -139,7 +140,7 @@ def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, Indepen
         if stride > 1:
             left = np.flatnonzero(found.keep)
             keep = np.zeros_like(found.keep)
-            # The middle of every piece.
+            # Keep the middle of every piece.
             keep[left[stride // 2 :: stride]] = True
             found = replace(found, keep=keep, stride=stride)
             data = _changed(data, {"mask": keep})
@@ -157,7 +158,7 @@ def same_pose(
     """
     used = np.flatnonzero(mask)
     group = np.full(len(mask), -1)
-    # Corners of a rigid body: the distance of two poses is at most twice that of their corners.
+    # Points of a rigid body: between two poses none moves farther than the poses' displacement.
     corners = np.concatenate(
         [poses[used, :3, 3:], poses[used, :3, :3] * LEVER_MM + poses[used, :3, 3:]], axis=2
     )
@@ -176,7 +177,7 @@ def same_pose(
 def displacement(
     first: Float[np.ndarray, "*#k 4 4"], second: Float[np.ndarray, "*#k 4 4"]
 ) -> Float[np.ndarray, "*k"]:
-    """By how much points within the lever of the tracked origin move at most, mm."""
+    """A bound on how far points within the lever of the tracked origin move, mm."""
     shift = np.linalg.norm(first[..., :3, 3] - second[..., :3, 3], axis=-1)
     # |R1 - R2| = sqrt(8) sin(angle / 2), and a chord is 2 L sin(angle / 2).
     turn = np.linalg.norm(first[..., :3, :3] - second[..., :3, :3], axis=(-2, -1)) / np.sqrt(2)
@@ -190,7 +191,7 @@ def _near(
     empty = np.zeros(0, int)
     if len(places) < 2:
         return empty, empty
-    # Sorted along one coordinate, partners are few places apart; a second one spares most of them.
+    # Sorted by one coordinate, partners are few places apart; a second one rules out most others.
     along, across = np.argsort(-np.ptp(places, axis=0))[:2]
     order = np.argsort(places[:, along], kind="stable")
     line, found = places[order], []
@@ -211,7 +212,7 @@ def _near(
 def _components(
     count: int, first: Int[np.ndarray, " k"], second: Int[np.ndarray, " k"]
 ) -> Int[np.ndarray, " n"]:
-    """The least number of every connected component."""
+    """For every pose, the least index in its connected component."""
     label = np.arange(count)
     while True:
         least = np.minimum(label[first], label[second])
@@ -232,7 +233,7 @@ def _split(label: Int[np.ndarray, " n"]) -> list[Int[np.ndarray, " m"]]:
 
 
 def _pieces(poses: Float[np.ndarray, "m 4 4"]) -> Int[np.ndarray, " m"]:
-    """0 for all poses of a hold; pieces of a chain of poses, in order, by their first members."""
+    """The piece of every pose: 0 for all of a hold; in a chain, the index of the piece's first."""
     if displacement(poses, poses[:1]).max() <= HOLD_MM:
         return np.zeros(len(poses), int)
     leaders: list[int] = []
@@ -263,7 +264,7 @@ _AVERAGED = ("measurements", "covariance", "max_elevation", "amplitude", "time",
 
 
 def _joined(data: Any, found: Independent) -> Any:
-    """One image for every group, at the place of the one that is kept."""
+    """The data with one image for every group, at the index of the image that is kept."""
     values: dict[str, Any] = {"poses": np.array(data.poses)}
     names = {field.name for field in fields(data)}
     for name in _AVERAGED:
@@ -297,7 +298,7 @@ def _joined(data: Any, found: Independent) -> Any:
 
 
 def _changed(data: Any, values: dict[str, Any]) -> Any:
-    """The data with other arrays, each of the kind that it replaces: numpy's or JAX's."""
+    """The data with other arrays; each is a numpy or JAX array like the one that it replaces."""
     after = {}
     for name, value in values.items():
         before = getattr(data, name)
@@ -312,7 +313,7 @@ def _changed(data: Any, values: dict[str, Any]) -> Any:
 
 
 def _middle(values: np.ndarray, name: str) -> Any:
-    """Of one group's values of an array, a frame each."""
+    """The value for a group, from its frames' values of the array with this name."""
     if name == "time_of_flight":
         heard = np.isfinite(values).mean(axis=0) >= 0.5
         total = np.nansum(values, axis=0) / np.maximum(np.isfinite(values).sum(axis=0), 1)
@@ -323,18 +324,18 @@ def _middle(values: np.ndarray, name: str) -> Any:
 
 
 NEGLIGIBLE = 0.01
-"""Share of the mean square error below which a kind of error is not looked at: a tenth in size."""
+"""Kinds of error below this share of the variance (a tenth in size) do not make a stream."""
 
 
 def _stride(data: Images | Problem, estimate: tuple[str, ...]) -> int:
-    """Every which image of a stream is worth keeping; 1 for other recordings."""
+    """The number t for which every t-th image of a stream is kept; 1 for other recordings."""
     errors = conventional_errors(data, estimate)
     if errors is None:
         return 1
     time = 1.0
     cut = clipped(errors)
     for values in cut.T:
-        # Errors that are nothing beside the others cost no images, however slowly they change.
+        # Errors much smaller than the others do not count, however slowly they change.
         if np.var(values) < NEGLIGIBLE * np.sum(np.var(cut, axis=0)):
             continue
         correlation = autocorrelation(values)
@@ -344,7 +345,7 @@ def _stride(data: Images | Problem, estimate: tuple[str, ...]) -> int:
 
 
 def clipped(errors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-    """Errors about their mean, wild ones cut at three robust SDs."""
+    """Errors less their mean, after clipping at three robust SDs from the median."""
     middle = np.median(errors, axis=0)
     limit = 3 * 1.4826 * np.median(np.abs(errors - middle), axis=0)
     cut = np.clip(errors, middle - limit, middle + limit)
@@ -352,7 +353,7 @@ def clipped(errors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
 
 
 def autocorrelation(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """At lags 0, 1, ..., by the fast Fourier transform; zeros where nothing varies."""
+    """Autocorrelation at lags 0, 1, ..., by the fast Fourier transform; zeros if nothing varies."""
     count = len(values)
     power = np.abs(np.fft.rfft(values, 2 * count)) ** 2
     found = np.fft.irfft(power)[:count]
@@ -362,10 +363,10 @@ def autocorrelation(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 def correlation_time(correlation: Float[np.ndarray, " n"]) -> float:
     """The integrated autocorrelation time, in images, of an exponential correlation.
 
-    It is twice the lag at which the correlation is 1 / e, and that is taken from the lag of one
-    half: sums over all lags scatter more. Halved is the correlation of successive images, which
-    spares noise that is independent. The fit has taken up what changes slowest, ``ABSORBED`` of the
-    independent errors.
+    It is twice the lag at which the correlation is 1 / e. That lag is computed from the lag where
+    the correlation has fallen to half, since sums over all lags scatter more. The fall to half is
+    counted from lag 1, not from lag 0, so that independent noise has no effect. The result is then
+    enlarged, since the fit absorbs the slowest changes: ``ABSORBED`` of the independent errors.
     """
     below = np.flatnonzero(correlation[1:] < 0.5 * correlation[1])
     if not len(below):
@@ -386,7 +387,7 @@ def conventional_errors(
         estimate: what the calibration estimates.
 
     Returns:
-        Of the conventional fit in closed form; None where there is none.
+        The errors of the conventional fit in closed form; None where there is no such fit.
     """
     from jaxcal.solvers.closed_form.single import calibrate_closed_form
 

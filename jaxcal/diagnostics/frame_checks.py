@@ -1,22 +1,23 @@
-"""Poses and points in wrong frames or units that fit badly as given and well as somebody meant.
+"""Detect wrong frames or units: the data fit badly as given, and well once a slip is corrected.
 
-A calibration takes what it gets: poses from tracker to probe, rotations by columns instead of rows,
-one axis with the other sign all give a converged answer, with residuals of millimetres. So the
-conventional fit (Eq. 7) is made again under each of the common slips, in closed form with both
-scales free, which needs no start, no JAX and a few tenths of a millisecond. Where one of them fits
-far better, the data speak for it.
+A calibration does not notice wrong conventions by itself: poses from tracker to probe, rotations by
+columns instead of rows, or one axis with the other sign all give a converged answer, with residuals
+of millimetres. So the conventional fit (Eq. 7) is repeated with each of the common slips corrected.
+The fit is in closed form with both scales free, so it needs no start, no JAX and only a few tenths
+of a millisecond. Where a corrected fit is far better, the slip is reported.
 
-*Far better* means two things. With n images and p unknowns (both fits have the same) and errors of
-unknown size, the likelihoods have the ratio (f / f')^((3 n - p) / 2), f being the sums of squares:
-it must exceed ``ODDS``, so that chance is ruled out although some twenty slips are tried. And f
-must exceed f' by ``FACTOR``, so that no imperfection of good data is mistaken for a slip.
+*Far better* means two things. Both fits have n images, p unknowns and errors of unknown size. With
+f the sum of squares as given and f' the corrected one, the likelihood ratio is
+(f / f')^((3 n - p) / 2). It must exceed ``ODDS``, so that chance is ruled out although some twenty
+slips are tried. And f must exceed ``FACTOR`` times f', so that imperfect but correct data are not
+reported.
 
-What no fit can see: points that are mirrored (u or v counted from the other side), or swapped where
-both axes have the same or an unknown scale. Eq. 7 knows the image's lateral and axial directions
-only, and the fit of such points is as good, with these directions reversed or exchanged: every
-point of *these* images goes where it belongs in the tracker's frame. Poses in a left-handed frame,
-rotations and translations alike, are as consistent. The calibration is wrong only for images with
-another orientation than those that it was made with.
+What no fit can detect: points that are mirrored (u or v counted from the other side), or swapped
+where both axes have the same or an unknown scale. Eq. 7 knows the image's lateral and axial
+directions only, and such points fit as well, with these directions reversed or exchanged: every
+point of *these* images goes to its correct place in the tracker's frame. Poses in a left-handed
+frame (both rotations and translations) also fit as well. The calibration is then wrong only for
+images with another orientation than those that it was made with.
 """
 
 from __future__ import annotations
@@ -36,39 +37,39 @@ if TYPE_CHECKING:
     from jaxcal.solvers.closed_form.reduced_objective import ImageData
 
 ODDS = 1e6
-"""How much more probable the data must be under a slip."""
+"""How many times more probable the data must be with a slip corrected."""
 
 FACTOR = 4.0
-"""By how much its sum of squares must be less: twice in root mean square."""
+"""How many times smaller the corrected sum of squares must be: 2 times in root mean square."""
 
 UNKNOWNS = 11
-"""X, target and two scales."""
+"""Number of unknowns: X, target and two scales."""
 
 MOST_IMAGES = 150
-"""Of longer recordings so many images, evenly spread, are looked at."""
+"""Longer recordings are checked on so many images, evenly spread."""
 
 PIXELS_MM = (0.002, 3.0)
-"""A pixel is not smaller or larger."""
+"""Smallest and largest credible size of a pixel."""
 
 SAME_SCALE = 1.25
-"""Under a slip of the poses, known scales must come out within this factor."""
+"""With a slip corrected, known scales must come out within this factor."""
 
 UNFIT, UNFIT_MM = 0.5, 5.0
-"""Images do not fit together if their median error exceeds this share of the target's motion, and
-this length: a third of wrong images does not bring it there."""
+"""Images do not fit together if their median error exceeds both this share of the target's motion
+and this length. Even a third of wrong images does not raise the median so far."""
 
 UNITS = {1000.0: "metres", 100.0: "dm", 25.4: "inches", 10.0: "cm"}
-"""Units that are mistaken for mm, by their length in mm."""
+"""Units that may be mistaken for mm; the keys are their lengths in mm."""
 
 UNIT_WITHIN = 0.05
-"""A factor between poses and points is that of a unit if it is so near."""
+"""A scale factor is that of a unit if their logarithms differ by less than this."""
 
 ANISOTROPY = 1.02
-"""Scales that differ by less do not tell whether u and v are swapped."""
+"""If the two spacings differ by a smaller factor, they do not show whether u and v are swapped."""
 
 
 def wrong_frames(data: Problem | Images, estimate: tuple[str, ...] = ()) -> str | None:
-    """In one line, what is wrong with the frames or units and what to do; None if nothing is.
+    """What is wrong with the frames or units, and what to do, in one line; None if nothing is.
 
     Args:
         data: one problem with concrete values, or images with points.
@@ -122,7 +123,7 @@ def _typical_error(
     shifts: Float[np.ndarray, "n 3"],
     points: Float[np.ndarray, "n 2"],
 ) -> tuple[float, float]:
-    """Of the images under the best fit, by their median; and the target's motion in them, mm."""
+    """Median error of the images under the best fit, and the target's motion in them, mm."""
     from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS, ImageData, reduce
     from jaxcal.solvers.closed_form.single import scalar_root
 
@@ -155,7 +156,7 @@ def _free_fit(
         return np.inf, np.ones(2)
     x = found[1]
     scales = np.linalg.norm(x.reshape(2, 3), axis=1)
-    # Below this the sum of squares is rounding.
+    # A smaller sum of squares is only rounding.
     return max(float(reduced(x)), reduced.resolution), scales
 
 
@@ -177,7 +178,7 @@ def _slips(
     shifts: Float[np.ndarray, "n 3"],
     points: Float[np.ndarray, "n 2"],
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    """What may have been meant: words, rotations, translations and points."""
+    """The common slips: words, and the corrected rotations, translations and points."""
     turned = np.swapaxes(rotations, 1, 2)
     back = -np.einsum("nij,nj->ni", turned, shifts)
     yield ("the poses are from the tracker to the probe: invert them", turned, back, points)
@@ -249,7 +250,7 @@ def _with_quaternions_reordered(
 def _wrong_scale(
     images: ImageData, rows: np.ndarray, free: float, scales: Float[np.ndarray, 2]
 ) -> str | None:
-    """Known scales under which the images fit far worse than under others."""
+    """Words if the images fit far worse with the known scales than with free ones; else None."""
     from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS, ImageData, reduce
     from jaxcal.solvers.closed_form.single import descend, feasible, scalar_root
 

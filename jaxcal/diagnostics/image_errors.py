@@ -38,8 +38,9 @@ class Unknowns:
         rotation: of X.
         translation: of X, mm.
         point: the target in the tracker's frame, mm.
-        further: free further unknowns by name, an array (k,) for each component: factors on the
-            problem's spacing and on its sound speed, delay in mm at the nominal sound speed.
+        further: the free ones of the further unknowns, by name, with an array (k,) for each
+            component: factors on the problem's spacing and sound speed, and the delay in mm at the
+            nominal sound speed.
     """
 
     rotation: Float[Array, "k 3 3"]
@@ -49,13 +50,13 @@ class Unknowns:
 
     @classmethod
     def of(cls, answer: Calibration) -> Unknowns:
-        """Of calibrations with one leading axis."""
+        """The unknowns of calibrations with one leading axis."""
         x, values = np.asarray(answer.image_to_probe), answer.linearisation.further
         further = {} if values is None else split_further(np.asarray(values), answer.blocks)
         return cls(x[:, :3, :3], x[:, :3, 3], np.asarray(answer.point), further)
 
     def along(self, axes: int) -> dict[str, list[Array]]:
-        """Further unknowns with axes of length 1 behind the leading one."""
+        """Further unknowns with ``axes`` axes of length 1 after the leading one."""
         behind = (...,) + (None,) * axes
         return {name: [part[behind] for part in parts] for name, parts in self.further.items()}
 
@@ -66,7 +67,7 @@ class ImageErrors:
 
     Attributes:
         q: target in the image frame, mm; (0, 0, 1) where left out.
-        turned: M, by which the target's motion enters.
+        turned: M, the derivative of q by the target's position.
         lateral: measured lateral position, mm.
         distance: measured range, mm.
         errors: lateral, range and elevational, mm; 0 where left out.
@@ -90,10 +91,10 @@ class ImageErrors:
         blocks: Blocks,
         shift: Float[Array, "k n"] | float = 0.0,
     ) -> ImageErrors:
-        """At some unknowns.
+        """The errors at given unknowns.
 
         Args:
-            unknowns: where.
+            unknowns: X, target and further unknowns.
             problem: with one leading axis.
             blocks: the free unknowns.
             shift: by which the target's elevation differs from q_y (tracker noise), mm.
@@ -136,7 +137,7 @@ class ImageErrors:
     def from_circle(
         self, elevation: Float[Array, "k n"]
     ) -> tuple[Float[Array, "k n 3"], Float[Array, "k n"]]:
-        """Q - p(y) of Eq. 5, mm (0 where left out), and p's axial coordinate."""
+        """The residual q - p(y) of Eq. 5, mm (0 where left out), and p's axial coordinate."""
         axial = np.sqrt(np.maximum(self.distance**2 - elevation**2, (1e-6 * self.distance) ** 2))
         residual = self.q - np.stack([self.lateral, elevation, axial], axis=-1)
         return self.mask[..., None] * residual, axial
@@ -147,7 +148,7 @@ class ImageErrors:
         """Derivatives of :meth:`from_circle` by the unknowns, the elevation held."""
         rows = motion(self.q, self.turned, blocks) * self.mask[..., None, None]
         further = size(RIGID)
-        # The measured point moves by the unknowns between a measurement and mm.
+        # Further unknowns move the measured point instead of q.
         rows[..., 0, further:] = self.rows[..., 0, further:]
         stretch = self.distance / axial
         rows[..., 2, further:] = stretch[..., None] * self.rows[..., 1, further:]
@@ -171,14 +172,17 @@ def motion(
 def channel_rows(
     seen: ImageErrors, unknowns: Unknowns, problem: Problem, blocks: Blocks
 ) -> Float[Array, "k m p"]:
-    """Derivatives of every element's distance error |q - e| / s + delay, mm; m = n elements."""
+    """Derivatives of every element's distance error, mm; m is n times the number of elements.
+
+    The model of a measured distance is |q - e| / s + delay.
+    """
     channels = problem.channels
     assert channels is not None
     elements = np.asarray(channels.elements)
     apart = seen.q[:, :, None] - elements[:, None]
     far = np.linalg.norm(apart, axis=-1)
     further = unknowns.along(2)
-    # By the distance itself, too, by a complex step.
+    # The derivative by the distance is a complex step, too.
     gain = np.imag(model.heard(far + 1j * TINY, further)) / TINY
     rows = (gain / far)[..., None] * (apart @ motion(seen.q, seen.turned, blocks))
     for column, (change,) in further_derivatives(

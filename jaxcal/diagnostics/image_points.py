@@ -6,8 +6,8 @@ perturbation X Exp([v, omega]) and steps of the logarithms of s and k, to first 
 
     dp = v + omega x p + (x ds_u, 0, (z - o) ds_v + z dk - k ddelay),    o = k (f - delay),
 
-so that a pixel size that is too large and an origin that lies too deep can make up for each other:
-what is said of a point needs the covariance of all these unknowns, not of X alone.
+so errors of the pixel size and of the origin can compensate each other: the uncertainty of a point
+needs the covariance of all these unknowns, not of X alone.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def point_jacobian(
     zero, one = xp.zeros_like(x), xp.ones_like(x)
     origin = xp.asarray(origin)[..., None] * one
     speed = xp.asarray(speed)[..., None] * one
-    # Columns of I and of omega x p with p = (x, 0, z); then those of the further unknowns.
+    # The columns of I, those of omega x p with p = (x, 0, z), then those of the further unknowns.
     columns = {
         "translation": [(one, zero, zero), (zero, one, zero), (zero, zero, one)],
         "rotation": [(zero, -z, zero), (z, zero, -x), (zero, x, zero)],

@@ -1,21 +1,22 @@
-"""What each image and each kind of error does to an answer, from the normal equations at it.
+"""The effect of each image and each kind of error on an answer, from its normal equations.
 
-With R_i the whitened derivatives of image i's errors e_i by the unknowns, S_i = R_i'R_i and
-S = sum S_i (with what is believed besides), all to first order:
+Let R_i be the whitened derivatives of image i's errors e_i by the unknowns, S_i = R_i'R_i and
+S = sum S_i (plus the information of priors). Then, to first order:
 
-*Leaving an image out* moves the unknowns by (S - S_i)^-1 R_i'e_i. If the model holds, that has the
-covariance (S - S_i)^-1 - S^-1, so that both how much an image moves the answer, and whether that is
-more than it should, cost no further solve.
+*Leaving an image out* moves the unknowns by (S - S_i)^-1 R_i'e_i. If the model holds, this move has
+the covariance (S - S_i)^-1 - S^-1. So no further solve is needed to see how much an image moves the
+answer, and whether that is more than expected.
 
-*Kinds of errors.* S is the sum of what lateral position, range and offset tell: S = sum S_k. The
-covariance S^-1 = sum S^-1 S_k S^-1 then tells how much of it comes from each kind.
+*Kinds of errors.* S is the sum of the information from lateral position, range and offset:
+S = sum S_k. The covariance S^-1 = sum S^-1 S_k S^-1 then shows how much comes from each kind.
 
 *What the residuals say.* S^-1 (sum R_i'(I - H_i)^-1/2 e_i e_i'(I - H_i)^-1/2 R_i) S^-1 with the
-leverages H_i = R_i S^-1 R_i' has the expectation S^-1 if the model holds, and does not need it to:
-it is larger where a few images pull, or where errors are large where they matter.
+leverages H_i = R_i S^-1 R_i' has the expectation S^-1 if the model holds, and is a valid covariance
+even if it does not: it is larger where a few images pull, or where errors are large in images that
+matter.
 
-Equal weights (conventional, bounded) are whitened by their pooled SD; what depends on an offset
-that is free within bounds is projected out.
+Fits with equal weights (conventional, bounded) are whitened by their pooled SD; the part of an
+error that depends on an offset free within bounds is projected out.
 
 References: Cook 1977 (leaving out); MacKinnon and White 1985 (the residuals' covariance, HC2).
 """
@@ -51,20 +52,20 @@ KINDS = ("lateral", "range", "elevational")
 """Kinds of errors."""
 
 _LEAST_LEFT = 1e-6
-"""What is left of an error's variance, where its image is needed to determine the unknowns."""
+"""Least share of an error's variance after the fit, for images that the unknowns depend on."""
 
 
 @dataclass(frozen=True)
 class Influence:
-    """What images and kinds of errors do to the unknowns of one calibration.
+    """The effect of images and kinds of errors on the unknowns of one calibration.
 
     Attributes:
         moved: by how much the unknowns move if the image is left out; 0 where it is not in use.
-        expected: covariance of that, if the model holds.
-        shares: covariance that comes from each of :data:`KINDS`.
-        residual_covariance: of the unknowns, as the residuals tell it.
-        residual_rows: of every error; their squares under a weight add up to what it expects.
-        model_covariance: S^-1, of the same linearisation.
+        expected: covariance of ``moved``, if the model holds.
+        shares: the part of the covariance that comes from each of :data:`KINDS`.
+        residual_covariance: covariance of the unknowns, estimated from the residuals.
+        residual_rows: R_i S^-1: how far each error moves the unknowns per SD.
+        model_covariance: S^-1 of the same linearisation.
         log_density: of each image's three errors as predicted from the others (mm); 0 where not in
             use.
     """
@@ -87,8 +88,8 @@ class _Errors:
         rows: their derivatives.
         kind: index into :data:`KINDS` of each error.
         log_sd: sum of the logarithms of an image's SDs, mm.
-        used: which images.
-        images: of all images.
+        used: which images are in use.
+        images: number of all images.
     """
 
     errors: Float[Array, "m k"]
@@ -103,7 +104,7 @@ def influence_of(calibration: Calibration) -> Influence:
     """Influence of the images of one calibration, with concrete values.
 
     Raises:
-        CalibrationError: a batch, or a calibration without the problem that it is of.
+        CalibrationError: a batch, or a calibration without its problem.
     """
     if calibration.problem is None:
         raise CalibrationError(
@@ -121,7 +122,7 @@ def influence_of(calibration: Calibration) -> Influence:
 
 
 def _first(leaf: Any) -> Array:
-    """As the only one of a batch, in float64."""
+    """The array in float64 with a leading axis of length 1, as a batch of one."""
     values = np.asarray(leaf)
     return (values.astype(float) if values.dtype.kind == "f" else values)[None]
 
@@ -133,7 +134,7 @@ def _influence(
     components = rows.shape[1]
     inverse = inverses(information[None], np.finfo(float).eps)[0]
     if not settled:
-        # An answer averaged over laws is not where these errors' squares are least.
+        # An answer averaged over laws does not minimise these errors: take them at the minimum.
         gradient = np.einsum("mkp,mk->p", rows, errors)
         errors = errors - np.einsum("mkp,p->mk", rows, inverse @ gradient)
     each = np.swapaxes(rows, 1, 2) @ rows
@@ -153,7 +154,7 @@ def _influence(
     turned = np.einsum("mkl,mk->ml", vectors, errors)
     unbiased = np.einsum("mkl,ml->mk", vectors, turned / np.sqrt(values))
     steps = np.einsum("mk,mkp->mp", unbiased, rows) @ inverse
-    # Predicted from the others, an error e has become (I - H)^-1 e, with that covariance.
+    # Predicted from the others, an error is (I - H)^-1 e, with the covariance (I - H)^-1.
     density = -0.5 * np.sum(turned**2 / values, axis=1) + 0.5 * np.sum(np.log(values), axis=1)
     density = density - 0.5 * components * np.log(2 * np.pi) - found.log_sd
 
@@ -174,7 +175,7 @@ def _influence(
 
 
 def _whitened(answer: Calibration, problem: Problem | None) -> _Errors:
-    """Of a calibration with one leading axis of length 1."""
+    """Whitened errors of a calibration with one leading axis of length 1."""
     assert problem is not None
     blocks, unknowns = answer.blocks, Unknowns.of(answer)
     seen = ImageErrors.of(unknowns, problem, blocks)
@@ -210,14 +211,14 @@ def _on_points(
     if shape is not None:
         log_sd = 0.5 * np.log(np.linalg.det(shape[0][used]))
     if whitened.offset is not None:
-        # The image's own unknown has the variance 1 before: errors have I + o o'.
+        # The image's own unknown has the prior variance 1, so errors have the covariance I + o o'.
         own = whitened.offset[0][used]
         size = np.sum(own**2, axis=1, keepdims=True)
         log_sd = log_sd + 0.5 * np.log1p(size[:, 0])
         unit = own / np.sqrt(np.where(size > 0, size, 1.0))
         shrink = 1 / np.sqrt(1 + size) - 1
         rows = rows + (shrink * unit)[..., None] * np.einsum("mk,mkp->mp", unit, rows)[:, None]
-        # At the estimate of that unknown an error is (I + o o')^-1 of what it was without.
+        # The estimate of that unknown has multiplied the errors by (I + o o')^-1.
         errors = errors + (1 / (1 + shrink) - 1) * unit * np.sum(unit * errors, axis=1)[:, None]
     sigma = np.asarray(answer.sigma)[0]
     if tau is not None:
@@ -244,7 +245,7 @@ def _on_channels(
     offset = seen.errors[0][used, 2:] / sigma[2]
     errors = np.concatenate([errors, offset], axis=1)
     rows = np.concatenate([rows, seen.rows[0][used, 2:] / sigma[2]], axis=1)
-    # Lateral position and range come from the same elements: they count as the range.
+    # Lateral position and range come from the same elements, whose errors count as range errors.
     kind = np.array([1] * len(elements) + [2])
     log_sd = listened.sum(axis=1) * np.log(element_sd) + np.log(sigma[2])
     return _Errors(errors, rows, kind, log_sd, used, len(used))
@@ -275,10 +276,10 @@ def _equal_weights(
 
 @dataclass(frozen=True)
 class EqualWeights:
-    """The conventional fit of the same images, seen with the noise that was found.
+    """The conventional fit of the same images, judged by the noise that was found.
 
     Attributes:
-        covariance: of its unknowns, if errors have the given SDs.
+        covariance: of the fit's unknowns, if errors have the given SDs.
         log_density: of every image's three errors as predicted from the others; 0 where not used.
     """
 
@@ -293,13 +294,13 @@ def conventional_fit(
     used: Array,
     sigma: Float[Array, " 3"],
 ) -> EqualWeights:
-    """How good equal weights are, if errors have other SDs.
+    """How good the fit with equal weights is, if errors have other SDs.
 
     Its covariance is A^-1 (sum of sigma_k^2 A_k) A^-1 with A the sum of the three kinds' A_k.
 
     Args:
         unknowns: of the conventional fit (one leading axis of length 1).
-        problem: the same.
+        problem: the data, with the same leading axis.
         blocks: its unknowns.
         used: images in use.
         sigma: SDs of lateral position, range and offset, mm.
@@ -317,7 +318,7 @@ def conventional_fit(
 
 
 def excess(found: Influence, weight: Float[Array, "p p"]) -> tuple[float, float]:
-    """How much larger the mean square error is than stated, as the residuals tell it.
+    """The mean square error estimated from the residuals, over the stated one.
 
     Args:
         found: of a calibration.
@@ -338,10 +339,10 @@ def excess(found: Influence, weight: Float[Array, "p p"]) -> tuple[float, float]
 def in_image(
     found: Influence, weight: Float[Array, "p p"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """By how much leaving each image out moves the image (root mean square over W's points, mm).
+    """How far leaving each image out moves image points (root mean square over W's points, mm).
 
     Returns:
-        What it is, and what it should be if the model holds; both 0 where an image is not in use.
+        The move, and the move expected if the model holds; both 0 where an image is not in use.
     """
     moved = quadratic(found.moved[None], weight[None])[0]
     expected = np.einsum("npq,pq->n", found.expected, weight)

@@ -1,17 +1,17 @@
-"""Intervals of a calibration, and how far from the truth it puts what is seen in an image.
+"""Confidence intervals of a calibration, and its target registration error.
 
-A calibration's covariance takes the tuned SDs for known. They are estimates from the same images,
-so intervals use Student's t instead of the normal law. Its degrees of freedom are those left to one
-kind of residual: of the n used images' three kinds (lateral, range, offset) the unknowns take a
-third each. It is the usual small-sample approximation, and nothing more.
+A calibration's covariance treats the tuned SDs as known. They are estimates from the same images,
+so intervals use Student's t instead of the normal law. Its degrees of freedom are those of one of
+the three kinds of residual (lateral, range, offset): the number n of used images less a third of
+the unknowns. It is the usual small-sample approximation, and nothing more.
 
-The target registration error (TRE) at an image point is the distance between where the estimated
-and the true calibration put it. To first order it is |J d| with d ~ N(0, C), C the covariance of
-all unknowns that move the point and J its derivatives by them
+The target registration error (TRE) at an image point is the distance between the places where the
+estimated and the true calibration put it. To first order it is |J d| with d ~ N(0, C), C the
+covariance of all unknowns that move the point and J the point's derivatives by them
 (:mod:`jaxcal.diagnostics.image_points`); its root mean square is sqrt(trace(J C J')).
 
-Its distribution: with J C J' = L L', d = L u rho for a uniformly distributed direction u, and rho^2
-is chi squared, or with SDs that were tuned k F(k, nu). So
+Its distribution: with J C J' = L L', the error is L u rho for a uniformly distributed direction u
+in k dimensions. rho^2 is chi squared, or k F(k, nu) if the SDs were tuned. So
 
     P(TRE <= r) = mean over directions of P(rho^2 <= r^2 / |L u|^2),
 
@@ -43,21 +43,21 @@ if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
 
 DIRECTIONS = 1024
-"""Directions over which the distribution of an error is averaged. Quantiles are right to 0.5 %,
-lower ends of errors along a single axis to 5 %."""
+"""Directions over which the distribution of an error is averaged. Quantiles are right to 0.5 %;
+the lower ends of intervals for errors along a single axis are right to 5 %."""
 
 _RADII = 4000
-"""Values of rho^2 between which its distribution is interpolated."""
+"""Number of values of rho^2 between which its distribution is interpolated."""
 _AT_ONCE = 32
 _SPARSE = 16
-"""Every so many directions give a start."""
+"""The first rough solution uses one direction in so many."""
 _MOST_STEPS = 60
 _NEARLY = 3e-6
 
 
 @traceable
 def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
-    """What the used images leave for the noise's SDs (traceable); inf where SDs were given."""
+    """Degrees of freedom of the noise's SDs (traceable); inf where SDs were given."""
     xp = array_module(calibration)
     left = xp.sum(xp.asarray(calibration.mask) > 0, axis=-1) - size(calibration.blocks) / 3
     if calibration.prior not in TUNED:
@@ -67,18 +67,18 @@ def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
 
 @traceable
 def variance_factor(calibration: Calibration) -> Float[AnyArray, "*batch"]:
-    """What a mean square error is larger by than the covariance says (traceable).
+    """The factor by which mean square errors exceed what the covariance says (traceable).
 
-    1 for a single pooled variance, which is estimated without bias. SDs that are tuned to the same
-    images are used as weights, too: the answer errs by more than with known weights, and by more
-    than it says (Kackar and Harville 1984). Student's variance makes up for that: see
-    ``experiments/tre_calibration.py``.
+    It is 1 for a single pooled variance, which is estimated without bias. SDs that are tuned to the
+    same images are also the weights of the fit. This makes the answer's error larger than with
+    known weights, and larger than the covariance says (Kackar and Harville 1984). Student's
+    variance corrects for both: see ``experiments/tre_calibration.py``.
     """
     xp = array_module(calibration)
     left = degrees_of_freedom(calibration)
     if calibration.prior not in TUNED:
         return xp.ones_like(left)
-    # Given SDs leave infinitely many, whose quotient with themselves would be NaN.
+    # Given SDs have infinite degrees of freedom: inf / inf would be NaN.
     finite = xp.where(xp.isfinite(left), left, 4.0)
     return xp.where(xp.isfinite(left), finite / xp.maximum(finite - 2, 1.0), 1.0)
 
@@ -93,11 +93,11 @@ def transform_intervals(
         level: probability that an interval covers the true value.
 
     Returns:
-        mm along, then rad about the image's lateral, elevational and axial axes; NaN where X is not
-        observable.
+        Along the image's lateral, elevational and axial axes in mm, then about them in rad; NaN
+        where X is not observable.
 
     Raises:
-        InputError: a level that is no probability between 0 and 1.
+        InputError: a level that is not between 0 and 1.
     """
     _check_level(level)
     left = np.asarray(degrees_of_freedom(calibration), float)
@@ -131,10 +131,10 @@ def image_jacobian(
 def range_of_row_zero(
     calibration: Calibration,
 ) -> tuple[Float[AnyArray, "*batch"], Float[AnyArray, "*batch"]]:
-    """Range that measurements of 0 stand for, mm, and the factor on the nominal sound speed.
+    """The range of a measurement of 0, mm, and the factor on the nominal sound speed.
 
-    A calibration without its problem is taken to have no face offset and the nominal sound speed of
-    water.
+    A calibration without its problem is assumed to have no face offset and the nominal sound speed
+    of water.
     """
     xp = array_module(calibration)
     problem = calibration.problem
@@ -158,7 +158,7 @@ def predicted_tre(
 ) -> Float[AnyArray, "*shape"]:
     """Root mean square target registration error that the covariance predicts, mm (traceable).
 
-    Estimated pixel sizes, sound speed and delay count with their correlation with X.
+    Estimated pixel sizes, sound speed and delay are included, with their correlation with X.
 
     Args:
         calibration: one or a batch.
@@ -202,7 +202,7 @@ class TargetError:
     upper: Float[np.ndarray, "*shape"]
 
     def times(self, factor: float) -> TargetError:
-        """The same, larger by a factor."""
+        """All of it multiplied by a factor."""
         return TargetError(factor * self.rms, factor * self.lower, factor * self.upper)
 
 
@@ -220,7 +220,7 @@ def tre_at(
         Arrays of shape (*batch, *points); NaN where X is not observable.
 
     Raises:
-        InputError: a level that is no probability between 0 and 1.
+        InputError: a level that is not between 0 and 1.
     """
     points = np.asarray(points, float)
     covariance = np.asarray(error_covariance(calibration.numpy(), points.reshape(-1, 2)))
@@ -236,8 +236,8 @@ def tre_over(
 ) -> TargetError:
     """Root mean square over image points of the error of one calibration, with its interval.
 
-    It is sqrt(mean of |J_p d|^2 over the points p): what a comparison of two calibrations over the
-    image shows, and so its interval is one of a single number.
+    It is sqrt(mean of |J_p d|^2 over the points p), the single number with which two calibrations
+    are compared over the image. Its interval is that of this number.
 
     Args:
         calibration: one or a batch, with concrete values.
@@ -290,7 +290,7 @@ def _length_quantile(
     squares = (_directions(dimensions) ** 2).T
     radial = _radial(dimensions, freedom)
     found = np.empty(len(variances))
-    # A few vectors at a time stay in the processor's cache.
+    # The arrays of a few vectors fit in the processor's cache.
     for first in range(0, len(variances), _AT_ONCE):
         rows = slice(first, first + _AT_ONCE)
         # |L u|^2 of every direction, as a share of the trace.
@@ -308,16 +308,16 @@ def _solve(
     start: Float[np.ndarray, " m"],
     near: float,
 ) -> Float[np.ndarray, " m"]:
-    """The logarithms of r^2 where the mean over the directions reaches a probability.
+    """The logarithm of r^2 at which the mean over the directions reaches a probability.
 
-    Newton's method on the probability's logarithm, within a bracket.
+    It is found by Newton's method on the probability's logarithm, within a bracket.
 
     Args:
         along: logarithms of |L u|^2.
         radial: the distribution of rho^2.
         chance: the probability.
         start: where to begin.
-        near: length of the last step; the error is of the order of its square.
+        near: a step shorter than this is the last; the error is of the order of its square.
     """
     at = start
     low, high = np.full(len(at), radial.first), np.full(len(at), radial.last)
@@ -355,7 +355,7 @@ class _Radial:
         first: the least logarithm.
         last: the largest.
         below: the probabilities.
-        rise: from each to the next.
+        rise: from each probability to the next.
     """
 
     first: float
@@ -365,11 +365,11 @@ class _Radial:
 
     @property
     def spacing(self) -> float:
-        """Between two logarithms."""
+        """Distance of two successive logarithms."""
         return (self.last - self.first) / (len(self.below) - 1)
 
     def quantile(self, chance: float) -> float:
-        """The logarithm where a probability is reached, to the spacing."""
+        """The first of the logarithms at which a probability is reached."""
         return self.first + self.spacing * int(np.searchsorted(self.below, chance))
 
     def mean(

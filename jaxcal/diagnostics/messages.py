@@ -1,4 +1,4 @@
-"""What the numbers mean, in words: weak directions, outliers, and everything worth a warning.
+"""Diagnostics in words: weak directions, outliers, and everything that is worth a warning.
 
 All functions take one calibration, with concrete values.
 """
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class OutlierReason(TypedDict):
-    """Why an image stands out: its most deviant component, and by how many SDs (signed)."""
+    """Why an image is an outlier: its most deviant component, and by how many SDs (signed)."""
 
     image: int
     component: str
@@ -32,16 +32,16 @@ class OutlierReason(TypedDict):
 
 @runtime_checkable
 class HasOutliers(Protocol):
-    """What has images that may stand out."""
+    """A result whose images may be outliers."""
 
     @property
     def outlier(self) -> AnyArray:
-        """(n,) 1 where an image stands out."""
+        """(n,) 1 where an image is an outlier."""
         ...
 
     @property
     def departure(self) -> AnyArray:
-        """(n, 3) in SDs."""
+        """(n, 3) errors of each image in SDs."""
         ...
 
     @property
@@ -52,21 +52,22 @@ class HasOutliers(Protocol):
 
 COMPONENTS = ("lateral", "range", "elevational")
 SUSPECTED = 0.02
-"""Share of recordings with Gaussian errors in which some image is suspected by chance."""
+"""Half of this is the share of recordings with Gaussian errors in which chance alone makes an
+image suspect."""
 STEADY = 1e-3
 WEAK_MM = 1.5
-"""A weakest direction with a larger SD (mm at the target) is worth a warning."""
+"""If the SD of the weakest direction (mm at the target) is larger, there is a warning."""
 WORTH = 0.7
-"""Kinds of further images are advised that tell at least this much of what the best one does."""
+"""A kind of further image is advised if it tells at least this share of what the best one tells."""
 MISFIT_SCORE = 3.3
-"""A standard normal score beyond this contradicts the noise model; of nine scores, one in 170
-data sets that follow it has such a one."""
+"""A standard normal score beyond this contradicts the noise model. Where the model holds, one data
+set in 170 has such a score among its nine."""
 DRIFT_SCORE = 2.8
-"""The same for correlation in time: of three scores of successive images and three of the trend,
-one in 45 data sets without it has such a one."""
+"""The same limit for correlation in time. Without such correlation, one data set in 45 has a score
+beyond this, among three scores of successive images and three of the trend."""
 WEAK_TRANSLATION_MM = 0.3
 WEAK_SHARE = 0.7
-"""SDs of sound speed or delay above this share of their prior's tell that the data added little."""
+"""If the SD of sound speed or delay exceeds this share of its prior SD, the data added little."""
 
 
 def direction_in_words(vector: AnyArray, blocks: tuple[str, ...]) -> str:
@@ -83,7 +84,7 @@ def direction_in_words(vector: AnyArray, blocks: tuple[str, ...]) -> str:
     total = float(np.linalg.norm(vector))
     if not np.isfinite(total) or total == 0:
         return "unknown"
-    # X's own blocks lead: a target that moves along with X is a consequence for a person.
+    # X's own blocks are named first: to a reader the target's motion is a consequence of X's.
     leading = [block for block in blocks if size[block] > 0.35 * total]
     named = (
         [block for block in leading if block != "point"]
@@ -106,7 +107,7 @@ def _block_in_words(block: str, part: np.ndarray) -> str:
 
 
 def observability(result: Calibration) -> dict[str, float | str | None]:
-    """The least known direction and what is known only from the prior, as plain values."""
+    """The least known direction, and the direction known only from the prior, as plain values."""
     from_prior = None
     if np.any(result.prior_direction != 0):
         from_prior = direction_in_words(result.prior_direction, result.blocks)
@@ -128,7 +129,7 @@ _FAMILY = {
 
 
 def offset_law(result: Calibration) -> dict[str, object] | None:
-    """What the data say of the offsets' law and of the noise, as plain values and in words."""
+    """What the data say about the offsets' law and the noise, as plain values and in words."""
     law = result.offset_law
     if law is None:
         return None
@@ -202,7 +203,7 @@ def poses_to_add(result: Calibration) -> str:
 
 
 def noise_model(result: Calibration) -> dict[str, object]:
-    """How the residuals compare with the noise model: scores by name, kurtosis, and complaints."""
+    """How well the noise model fits the residuals: scores by name, kurtosis, and complaints."""
     scores = np.asarray(result.inspection.misfit, dtype=float)
     return {
         "checked": bool(int(result.images_used) >= FEWEST_TO_CHECK),
@@ -236,7 +237,7 @@ def misfits(result: Calibration) -> list[str]:
 
 
 def _in_time(name: str, scores: AnyArray, count: int) -> list[str]:
-    """How one kind of error changes in the course of the recording."""
+    """How one kind of error changes during the recording."""
     drift, trend = (float(scores[MISFITS.index(kind)]) for kind in ("drift", "trend"))
     parts = []
     if drift > DRIFT_SCORE:
@@ -264,10 +265,10 @@ def images_that_stand_out(result: HasOutliers) -> list[int]:
 def outlier_reasons(
     result: HasOutliers, components: tuple[str, ...] = COMPONENTS
 ) -> list[OutlierReason]:
-    """For every outlier: the component that stands out most, by how many SDs, and if it was used.
+    """For every outlier: its most deviant component, by how many SDs, and whether it was left out.
 
-    ``image``, ``component`` (lateral, range or elevational, if not named otherwise), ``sds``
-    (signed), ``left_out``.
+    The keys are ``image``, ``component`` (a name from ``components``), ``sds`` (signed) and
+    ``left_out``.
     """
     departure = np.asarray(result.departure, dtype=float)
     found: list[OutlierReason] = []
@@ -284,16 +285,16 @@ def outlier_reasons(
 
 
 def suspects(result: Calibration) -> list[OutlierReason]:
-    """Images in use that stand out by less than outliers do, but by more than chance explains.
+    """Images in use that deviate by less than outliers do, but by more than chance explains.
 
-    Their range error exceeds what the largest of so many Gaussian errors, in SDs that are medians,
-    does in one of a hundred recordings. Lateral errors grow with the depth and offsets may have any
-    law: large ones are no sign.
+    With Gaussian errors, the largest range error of all images (in SDs taken from medians) exceeds
+    the limit in one recording of a hundred. Only range errors count: lateral errors grow with the
+    depth and offsets may have any law, so large ones are no sign of a wrong image.
     """
     count = int(result.images_used)
     if count < FEWEST_TO_CHECK:
         return []
-    # The second factor, for medians of few images, is from simulated Gaussian errors.
+    # The second factor corrects medians of few images; it is from simulated Gaussian errors.
     limit = NormalDist().inv_cdf(1 - SUSPECTED / (4 * count)) * (1 + 8 / count)
     departure = np.asarray(result.departure, dtype=float)
     departure = np.where(np.asarray(result.mask)[:, None] > 0, departure, 0.0)
@@ -313,7 +314,7 @@ def suspects(result: Calibration) -> list[OutlierReason]:
 
 
 def suspects_in_words(result: Calibration) -> list[str]:
-    """The suspects, successive ones with errors of one kind and sign together."""
+    """The suspects in words; successive ones with errors of one kind and sign are joined."""
     runs: list[list[OutlierReason]] = []
     for each in suspects(result):
         last = runs[-1][-1] if runs else None
@@ -344,7 +345,7 @@ def suspects_in_words(result: Calibration) -> list[str]:
 
 
 def listed_departures(result: HasOutliers, components: tuple[str, ...] = COMPONENTS) -> str:
-    """The outliers with component and SDs, the first ten of them, in words."""
+    """The first ten outliers with component and SDs, in words."""
     reasons = outlier_reasons(result, components)
     told = [
         f"{reason['image']} ({reason['component']}, {abs(reason['sds'] or 0):.0f} SDs)"
@@ -366,7 +367,7 @@ def warnings(result: Calibration) -> list[str]:
         found.append("the solve failed: its result holds no usable numbers")
         return found
     if result.wrong_frames is not None:
-        # Whatever else there would be to say, it is of an answer that has no meaning.
+        # The answer has no meaning, so no other warning is of use.
         return [result.wrong_frames]
     if status == "unobservable":
         found.append(f"not observable: these images do not determine {weakest}; {sight['advice']}")
@@ -439,7 +440,7 @@ def warnings(result: Calibration) -> list[str]:
 
 
 def _weak_direction(result: Calibration) -> list[str]:
-    """The weakest direction of a solution that is none too certain, and what would help."""
+    """A warning about the weakest direction if its SD is large, and what would help."""
     sight = observability(result)
     sd = sight["weakest_sd_mm"]
     if result.status != "converged" or not isinstance(sd, float) or sd <= WEAK_MM:
@@ -454,7 +455,7 @@ def _weak_direction(result: Calibration) -> list[str]:
 
 
 def _medium_warnings(result: Calibration) -> list[str]:
-    """Sound speed and delay that only their priors tell, or that the data can hardly see."""
+    """Warnings about a sound speed or a delay that the data hardly determine."""
     found = []
     speed = (result.sound_speed_m_s, result.sound_speed_sd_m_s, result.sound_speed_prior_m_s)
     delay = (result.delay_s, result.delay_sd_s, result.delay_prior_s)

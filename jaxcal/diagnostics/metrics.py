@@ -18,7 +18,7 @@ def reconstruction_precision(
     Args:
         image_to_probe: X.
         poses: B_i of the *test* images, probe -> tracker, mm.
-        points: (n, 2) [lateral, range] taken in the plane, or (n, 3) points in the image frame, mm.
+        points: (n, 2) [lateral, range], assumed in the plane, or (n, 3) in the image frame, mm.
         mask: (n,) 1 for images to count; all by default.
 
     Returns:
@@ -59,7 +59,7 @@ def _transformed(transform: AnyArray, points: AnyArray) -> AnyArray:
 def calibration_reproducibility(
     transforms: Float[AnyArray, "k 4 4"], image_points: Float[AnyArray, "m 2"]
 ) -> Float[AnyArray, " m"]:
-    """How far repeated calibrations scatter at image points: mean distance from their mean, mm.
+    """Scatter of repeated calibrations at image points: mean distance from their mean, mm.
 
     Args:
         transforms: X of k repeated calibrations of one set-up.

@@ -1,12 +1,12 @@
 """Do the offsets follow the laws that were weighed? A test of fit for each.
 
-The probability of a law (:mod:`jaxcal.solvers.auto`) is relative to the others: of laws that are
-all wrong, one is still nearest. And what is wrong with a law need not be what one looks for: edges
-that a single image oversteps by a rounding exclude the uniform law although it describes 5,000
-offsets to the eye. So the estimated offsets are compared with each law of their own mean and
-spread, by the largest distance D of the distribution functions (Kolmogorov, Lilliefors). A law is
-contradicted where sqrt(n) D exceeds ``CONTRADICTED``, which of n offsets that follow it, mean and
-spread estimated, fewer than one set in a thousand does.
+The probability of a law (:mod:`jaxcal.solvers.auto`) is relative to the others: if all the laws are
+wrong, one still fits best. A law may also be excluded by a detail: if a single image oversteps the
+edges by rounding, the uniform law is excluded, even if it seems to describe 5,000 offsets well. So
+the estimated offsets are compared with each law of their own mean and spread, by the largest
+distance D of the distribution functions (Kolmogorov, Lilliefors). A law is contradicted where
+sqrt(n) D exceeds ``CONTRADICTED``. Of sets of n offsets that follow the law, with mean and spread
+estimated, fewer than one in a thousand exceed it.
 
 References: Lilliefors 1967 (estimated parameters); the limits are from 4,000 simulated sets of 50.
 """
@@ -20,14 +20,14 @@ import numpy as np
 from jaxcal.runtime.array_types import Float
 
 CONTRADICTED: dict[str, float] = {"uniform": 1.25, "bell": 1.25, "gaussian": 1.25, "student": 1.9}
-"""For each family of :data:`jaxcal.model.shapes.FAMILIES`."""
+"""The largest sqrt(n) D for each family of :data:`jaxcal.model.distributions.FAMILIES`."""
 
 MEDIAN_OF_STUDENT = 0.5237
 """Median magnitude of Student's t4, divided by its SD."""
 
 
 def law_distances(offsets: Float[np.ndarray, " n"]) -> dict[str, float]:
-    """Sqrt(n) D of the offsets from each law.
+    """The distance sqrt(n) D of the offsets from each law.
 
     Args:
         offsets: of the used images, mm; at least two, not all alike.
@@ -35,7 +35,7 @@ def law_distances(offsets: Float[np.ndarray, " n"]) -> dict[str, float]:
     count = len(offsets)
     centred = np.sort(offsets - offsets.mean())
     spread = centred.std(ddof=1)
-    # The spread of heavy tails hangs on a few offsets; their median does not.
+    # With heavy tails the SD depends on a few offsets; the median magnitude does not.
     middle = np.median(np.abs(centred - np.median(centred))) / MEDIAN_OF_STUDENT
     below, above = np.arange(count) / count, np.arange(1, count + 1) / count
     found = {}

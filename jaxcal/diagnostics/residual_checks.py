@@ -1,16 +1,18 @@
-"""A look at the residuals: which images stand out, does the noise model fit, what to add.
+"""Checks of the residuals: outliers, the fit of the noise model, and which poses to add.
 
-*Images.* Each image's departure from what the images in use say, in robust SDs; lateral errors of
-deep images count less, as those of an array grow with the range (:mod:`jaxcal.solvers.consensus`).
+*Images.* Each image's departure from the fit to the images in use, in robust SDs. Lateral errors of
+deep images count less, since an array's lateral errors grow with the range
+(:mod:`jaxcal.solvers.consensus`).
 
 *Noise model.* If lateral, range and elevational errors are Gaussian, independent and of one size,
-then statistics of the standardised residuals follow known laws, whatever the data. Five are taken
-for each component and turned into standard normal scores: kurtosis (heavy tails), skewness (one
-side), correlation of the magnitude with the range (errors that grow with depth), correlation of
-successive images in use (drift), and correlation with the image's number (trend).
+then statistics of the standardised residuals follow known laws, whatever the data. Five statistics
+of each component are turned into standard normal scores: kurtosis (heavy tails), skewness (errors
+to one side), correlation of the magnitude with the range (errors that grow with depth), correlation
+of successive images in use (drift), and correlation with the image's number (trend).
 
-*Poses to add.* The weakest direction is a motion of X, the target and the rest that the images
-hardly notice. For a few kinds of further images it is computed by how many SDs they would.
+*Poses to add.* The weakest direction is a motion of X, the target and the other unknowns that
+hardly changes the images. For a few kinds of further images it is computed by how many SDs this
+motion would change them.
 
 References: Anscombe and Glynn 1983 (kurtosis), D'Agostino 1970 (skewness): transformations to
 normality; Gelman et al. 2013, chapter 6 (posterior predictive checks).
@@ -40,10 +42,10 @@ MISFITS = ("tails", "skewness", "depth", "drift", "trend")
 """Rows of ``misfit``."""
 
 FEWEST_TO_CHECK = 20
-"""With fewer used images the noise model is not judged."""
+"""With fewer used images the noise model is not checked."""
 
 ADDITIONS = ("tilt lateral", "tilt elevational", "tilt axial", "depth", "sideways")
-"""Kinds of further images: the probe tilted about an image axis, or the target elsewhere in it."""
+"""Kinds of further images: tilted about an image axis, or with the target elsewhere in them."""
 
 TILT_RAD = 0.4363
 SIDEWAYS_MM = 25.0
@@ -85,7 +87,7 @@ def inspect(
     Args:
         answer: the calibrations.
         seen: all images that the caller wanted to use, those left out as outliers included.
-        shifted: the same with what the tracker's own error is taken to be.
+        shifted: the same images, shifted by the estimated error of the tracker.
         unknowns: the unknowns.
         problem: the data.
         uncertainty: of the calibrations.
@@ -111,10 +113,10 @@ def inspect(
 def departures(
     seen: ImageErrors, problem: Problem, kept: Float[Array, "k n"], blocks: Blocks, eps: float
 ) -> Float[Array, "k n 3"]:
-    """How far every image is from what the kept ones say, in robust SDs, leverage allowed for."""
+    """Every image's departure from the fit to the kept ones, in robust SDs, leverage included."""
     rigid = [name for name in blocks if name in ("translation", "rotation", "point", "scale")]
     columns = np.concatenate([np.r_[block_slice(blocks, name)] for name in rigid])
-    # The unknowns' own effect on the range is beside the point: it is that of nominal ones.
+    # This range only scales errors, so nominal values of the further unknowns are good enough.
     axial = np.where(seen.mask > 0, np.asarray(problem.measurements)[..., 1], 1.0)
     distance = axial * np.asarray(problem.spacing)[:, 1:] + np.asarray(problem.face_offset)[:, None]
     beyond = np.maximum(distance / medians(distance[..., None], seen.mask), 1.0)
@@ -130,13 +132,13 @@ def departures(
     used = rows * np.repeat(kept, 3, axis=1)[..., None]
     inverse = inverses(np.swapaxes(used, 1, 2) @ used, eps)
     leverage = quadratic(rows, inverse).reshape(errors.shape)
-    # An image in use pulls the fit towards itself; one that is not, is predicted by the fit.
+    # An image in use pulls the fit towards itself; the fit predicts an image that is not in use.
     left = np.where(kept[..., None] > 0, np.maximum(1 - leverage, 0.05), 1 + leverage)
     return errors / np.sqrt(left) / sigma
 
 
 def medians(values: Float[Array, "k n c"], weight: Float[Array, "k n"]) -> Float[Array, "k c"]:
-    """The least value that at least half of the used ones do not exceed; NaN counts as infinite."""
+    """The lower median of the used values; NaN counts as infinite."""
     used = weight > 0
     values = np.where(used[..., None] & ~np.isnan(values), values, np.inf)
     middle = np.maximum((used.sum(axis=1) + 1) // 2 - 1, 0)
@@ -146,8 +148,8 @@ def medians(values: Float[Array, "k n c"], weight: Float[Array, "k n"]) -> Float
 def stands_out(departure: Float[Array, "k n 3"], kept: Float[Array, "k n"]) -> Bool[Array, "k n"]:
     """Whether an image departs by more than the images in use can explain.
 
-    A median of a dozen images is itself uncertain: with few of them the limit is wider; for images
-    that were left out it is not (:func:`jaxcal.solvers.consensus.stands_out`).
+    A median of a dozen images is itself uncertain, so the limit is wider with few images. It is not
+    widened for images that were left out (:func:`jaxcal.solvers.consensus.stands_out`).
     """
     count = np.maximum(kept.sum(axis=1, keepdims=True), 1.0)
     few = np.sqrt(np.maximum(FEW_IMAGES / count, 1.0))
@@ -186,7 +188,7 @@ def check_noise_model(
     joint = np.sum(away * magnitude, axis=1)
     deeper = joint / np.where(lengths > 0, lengths, 1.0) * np.sqrt(count - 1)
 
-    # Images in use follow each other, whatever was left out between them.
+    # Images in use count as successive even if others between them were left out.
     order = np.argsort(mask <= 0, axis=1, kind="stable")[..., None]
     row, kept = np.take_along_axis(centred, order, axis=1), np.take_along_axis(used, order, axis=1)
     successive = np.sum(row[:, 1:] * row[:, :-1], axis=1)
@@ -232,12 +234,12 @@ def gains(
     problem: Problem,
     uncertainty: Uncertainty,
 ) -> Float[Array, "k 5"]:
-    """How much one more image of each of :data:`ADDITIONS` would notice of the weakest direction.
+    """By how many SDs the weakest direction would change one more image of each :data:`ADDITIONS`.
 
-    Tilts are of 25 degrees either way about the image's axes, from the pose nearest to the mean of
-    those in use and with the target at the middle of the used points; then the target half as deep
-    or half as deep again, and 25 mm to either side. An image whose pose puts the target at
-    q = (x, 0, z) sees it move by -v + [q]x w + M d.
+    The first three kinds are tilts of 25 degrees either way about the image's axes, from the pose
+    nearest to the mean of those in use, with the target at the middle of the used points. The other
+    two have the target at 0.5 or 1.5 times that depth, and 25 mm to either side. In an image whose
+    pose puts the target at q = (x, 0, z), the target moves by -v + [q]x w + M d.
     """
     blocks, kept = answer.blocks, np.asarray(answer.mask, float)
     count = kept.sum(axis=1)
@@ -266,8 +268,8 @@ def gains(
 
     errors = np.einsum("kmip,kp->kmi", motion(q, turned, blocks), step)
     errors = errors[..., [0, 2, 1]]
-    # The same places with the unknowns between a measurement and mm, of which it is a linear
-    # function: what would have been measured there is told by two others.
+    # The positions in mm are linear functions of the measurements, so the measurements at these
+    # places follow from the positions of two others.
     face, further = np.asarray(problem.face_offset)[:, None], unknowns.along(1)
     one = np.ones_like(places[..., 0])
     offset, end = (np.stack(measured(k * one, k * one, face, further), -1) for k in (0, 1))
@@ -283,7 +285,7 @@ def gains(
 
 
 def _tilts() -> Float[Array, "6 3 3"]:
-    """Transposed rotations by the tilt, either way about each image axis."""
+    """Transposes of the rotations by the tilt, either way about each image axis."""
     found = []
     for axis in range(3):
         first, second = (axis + 1) % 3, (axis + 2) % 3

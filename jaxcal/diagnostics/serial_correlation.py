@@ -1,4 +1,4 @@
-"""Errors that are alike in successive images, and what they cost in certainty.
+"""Errors that are alike in successive images, and how much they widen the covariance.
 
 A least-squares answer moves by dx = S^-1 sum_i J_i' e_i, with J_i the rows of image i and e_i its
 errors, both in SDs, and S = sum_i J_i' J_i. If errors of one kind k (lateral, range, elevational)
@@ -6,16 +6,17 @@ have correlation rho_k^|i - j| between images i and j, its covariance is
 
     S^-1 (sum_k sum_ij rho_k^|i - j| J_ik' J_jk) S^-1
 
-instead of S^-1. How much more that is depends on the order of the poses: where they change at
-random, a drift hardly matters; where they change as slowly as the errors, it is all there is.
+instead of S^-1. How much larger this is depends on the order of the poses: where the poses change
+at random, a drift hardly matters; where they change as slowly as the errors, it dominates.
 
-Each rho_k is the correlation of successive residuals (leverage allowed for), shrunk towards zero by
-1 - (``CHANCE`` / z)^2 with z in its SDs, and zero below ``CHANCE``: of independent errors 2 % of
-all recordings of a kind exceed that. So independent data keep the covariance that they have, and
-the correction grows continuously. It never makes an answer more certain.
+Each rho_k is the correlation of successive residuals, corrected for leverage. With z its value in
+SDs, it is multiplied by 1 - (``CHANCE`` / z)^2, and is zero where z is below ``CHANCE``; for
+independent errors z exceeds ``CHANCE`` in 2 % of recordings, for each kind of error. So independent
+data keep their covariance, and the correction grows continuously. It never makes an answer more
+certain.
 
-References: White 1980; Newey and West 1987 (covariances under dependent errors), here with a
-correlation of one parameter a kind instead of all lags.
+References: White 1980; Newey and West 1987 (covariances under dependent errors). Here one
+parameter for each kind of error describes the correlation at all lags.
 """
 
 from __future__ import annotations
@@ -43,19 +44,19 @@ LARGEST = 0.98
 
 
 def widened(result: Calibration) -> Calibration:
-    """The calibration with the covariance that errors alike in successive images leave it.
+    """The calibration with its covariance widened for errors that are alike in successive images.
 
     Args:
         result: of one problem, with concrete values.
 
     Returns:
-        The same object where nothing says that the errors depend on each other. Channels and
-        bounded offsets are left as they are.
+        The same object where there is no sign that the errors are correlated. Calibrations from
+        channels or with bounded offsets are returned unchanged.
     """
     if result.data != "points" or result.prior == "bounded" or result.problem is None:
         return result
     covariance = np.asarray(result.unknowns_covariance)
-    # Counted by numpy: JAX would compile the count for every number of images.
+    # Counted by numpy, since JAX would compile the count anew for every number of images.
     used = int(np.sum(np.asarray(result.mask) > 0))
     if not np.isfinite(covariance).all() or used < FEWEST_IMAGES:
         return result
@@ -77,7 +78,7 @@ def widened(result: Calibration) -> Calibration:
 
 
 def _like(before: Any, values: np.ndarray) -> Any:
-    """On the device of what they replace, if that was on one."""
+    """The values as a numpy or JAX array, like the array that they replace."""
     if isinstance(before, np.ndarray):
         return values
     import jax.numpy as jnp
@@ -127,7 +128,7 @@ def _ratio(
             filtered[index] += rho[k] * filtered[index - 1]
         half = filtered.T @ rows[:, k]
         both = half + half.T - each[k]
-        # Slow errors are taken for the unknowns more than quick ones, and the SD is too small.
+        # The fit absorbs slow errors more than quick ones, so the SD is too small: enlarge it.
         left = count - np.sum(before * each[k])
         middle += both * left / max(count - np.sum(before * both), 0.2 * count)
     lower = np.linalg.cholesky(before)
@@ -138,7 +139,7 @@ def _ratio(
 
 
 def believed_correlation(errors: Float[np.ndarray, "m k"]) -> Float[np.ndarray, " k"]:
-    """Correlation of successive images for every kind of error, shrunk by what chance may do."""
+    """Correlation of successive images for every kind of error, shrunk to allow for chance."""
     centred = errors - errors.mean(axis=0)
     square = np.sum(centred**2, axis=0)
     successive = np.sum(centred[1:] * centred[:-1], axis=0)
@@ -152,7 +153,7 @@ def _stretched(
     before: Float[np.ndarray, "p p"],
     after: Float[np.ndarray, "p p"],
 ) -> Float[np.ndarray, "p p"]:
-    """A covariance changed in proportion to another one, before and after."""
+    """A covariance changed in the same proportion as another one, from before to after."""
     stretch = np.linalg.cholesky(after) @ np.linalg.inv(np.linalg.cholesky(before))
     found = stretch @ covariance @ stretch.T
     return 0.5 * (found + found.T)

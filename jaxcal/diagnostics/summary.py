@@ -1,4 +1,4 @@
-"""Everything that is computed of an answer when it is read, for one problem or a batch at once."""
+"""All diagnostics of an answer, computed when first read, for one problem or a whole batch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Array = np.ndarray
 
 CHUNK = 128
-"""Problems at a time: their derivatives stay in the processor's caches."""
+"""Problems computed at a time, so that their derivatives fit in the processor's caches."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,12 @@ class Summary:
     """Diagnostics of a calibration, or of a batch with leading axes.
 
     Attributes:
-        elevation_sd: SDs of the offsets, mm; NaN where one rests on its bound or is not known.
+        elevation_sd: SDs of the offsets, mm; NaN where an offset is on its bound or not known.
         at_bound: 1 where an offset rests on its bound.
         residual: q_i - p_i with p_i in the plane, in the image frame, mm; 0 where left out.
         condition: largest over smallest eigenvalue of the scaled information.
         weakest: unit vector (scaled units) of the least known direction of all unknowns.
-        weakest_sd: SD along it, mm at the lever arm; NaN where it has none.
+        weakest_sd: SD along ``weakest``, mm at the lever arm; NaN where there is no finite SD.
         prior_direction: unit vector (scaled units) that the measurements alone leave open; zeros
             where there is none.
         inspection: what the residuals show.
@@ -56,7 +56,7 @@ def summarise(calibration: Calibration) -> Summary:
         calibration: one or a batch, with concrete values and its problem.
 
     Raises:
-        CalibrationError: a calibration without the problem that it is of.
+        CalibrationError: a calibration without its problem.
     """
     if calibration.problem is None:
         raise CalibrationError(
@@ -87,14 +87,14 @@ def summarise(calibration: Calibration) -> Summary:
 
 
 def _piece(answer: Calibration, eps: float) -> dict[str, Array]:
-    """Of calibrations with one leading axis."""
+    """Diagnostics by name, for calibrations with one leading axis."""
     problem = answer.problem
     assert problem is not None
     unknowns = Unknowns.of(answer)
     seen = ImageErrors.of(unknowns, problem, answer.blocks)
     shifted = seen
     if answer.linearisation.tracker_sd is not None:
-        # What the tracker's own error is taken to be moves the target's elevation.
+        # The estimated error of the tracker moves the target's elevation.
         shift = np.where(answer.mask > 0, answer.elevation - seen.q[..., 1], 0.0)
         shifted = ImageErrors.of(unknowns, problem, answer.blocks, shift)
     uncertainty = assess(answer, shifted, unknowns, problem, eps)

@@ -1,14 +1,15 @@
-"""How certain an answer is, and which directions the data do not see.
+"""How certain an answer is, and which directions the data do not determine.
 
 The information S of the shared unknowns (:class:`jaxcal.calibration.result.Linearisation`) tells
 how well each direction is known: eigenvectors with small eigenvalues are directions that the images
 barely determine. To compare mm with rad and log units, rotations, scales and sound speed are
 multiplied by the lever arm, the root mean square distance of the measured points from the image
-origin: all are then mm at the target.
+origin. All unknowns are then mm at the target.
 
-An offset that is an unknown of its own (bounded, or beside a tracker that errs) was eliminated from
-S. With k_i the derivative of image i's residuals by it, J_i that by the shared unknowns, D_i =
-k_i'k_i and E_i = J_i'k_i, a function of both with derivatives (a, b) has the variance
+An image may have an offset unknown of its own (bounded offsets, or a given tracker SD), which was
+eliminated from S. Let k_i be the derivative of image i's residuals by this unknown, J_i that by the
+shared unknowns, D_i = k_i'k_i and E_i = J_i'k_i. A function with the derivatives a by the shared
+unknowns and b by the offset unknown has the variance
 
     (a - b E_i / D_i)' S^-1 (a - b E_i / D_i) + b^2 / D_i.
 """
@@ -41,7 +42,7 @@ LARGEST_SD = 0.5
 """A direction whose SD exceeds this fraction of the lever arm is not known in any useful sense."""
 
 AT_BOUND = 1e-12
-"""An offset is on its bound where it is nearer than this part of it: that is rounding."""
+"""An offset within this fraction of its bound counts as on it; the difference is rounding."""
 
 TUNED = ("gaussian", "auto", "uniform")
 """Priors with SDs of lateral position, range and offset."""
@@ -49,17 +50,17 @@ TUNED = ("gaussian", "auto", "uniform")
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Of a batch (one leading axis, k).
+    """Uncertainty of a batch of calibrations (one leading axis, k).
 
     Attributes:
         elevation_sd: mm; NaN where an offset rests on its bound or an image is left out.
         at_bound: 1 where an offset rests on its bound.
         condition: largest over smallest eigenvalue of the scaled information.
-        weakest: unit vector of the smallest, in scaled units.
-        weakest_sd: SD along it, mm; NaN where it has none.
-        prior_direction: unit vector that the measurements alone leave open; zeros where none is.
+        weakest: unit eigenvector of the smallest eigenvalue, in scaled units.
+        weakest_sd: SD along ``weakest``, mm; NaN where there is no finite SD.
+        prior_direction: unit vector that the measurements alone leave open; zeros if there is none.
         inverse: of the information.
-        scale: what makes every unknown's tangent mm at the target.
+        scale: factors that turn every unknown's tangent into mm at the target.
     """
 
     elevation_sd: Float[Array, "k n"]
@@ -119,12 +120,13 @@ def assess(
 
 @dataclass(frozen=True)
 class Spectra:
-    """What the spectra of a scaled information and design tell.
+    """Results from the spectra of a scaled information and design.
 
     Attributes:
         condition: largest over smallest eigenvalue of the information.
-        weakest: unit vector of the smallest; of degenerate poses, one that they leave open.
-        weakest_sd: SD along it; NaN where it has none.
+        weakest: unit eigenvector of the smallest eigenvalue; for degenerate poses a direction that
+            they do not determine.
+        weakest_sd: SD along ``weakest``; NaN where there is no finite SD.
     """
 
     condition: Float[Array, " k"]
@@ -141,12 +143,12 @@ class Spectra:
         *,
         whitened: bool = False,
     ) -> Spectra:
-        """Of matrices per mm at the target.
+        """From matrices in units of mm at the target.
 
         Args:
             information: with the offsets eliminated.
             design: of unweighted residuals, offsets known.
-            variance: of the residuals that ``information`` is of.
+            variance: of the residuals from which ``information`` was formed.
             eps: relative rounding.
             whitened: the residuals are in SDs.
         """
@@ -165,14 +167,14 @@ class Spectra:
 
 
 def threshold(eps: float) -> float:
-    """Smallest eigenvalue over the trace below which a matrix is taken to be singular."""
+    """Smallest eigenvalue over the trace below which a matrix counts as singular."""
     return max(SINGULAR, 100 * eps)
 
 
 def mm_at_target(lever: Float[AnyArray, "*batch"], blocks: Blocks) -> Any:
-    """What makes each unknown's tangent mm at the target, (*batch, p): 1, or the lever arm.
+    """Factors that turn each unknown's tangent into mm at the target, (*batch, p).
 
-    Of a traced lever arm a traced array.
+    They are 1 or the lever arm, and a traced array if the lever arm is traced.
     """
     xp, one = array_module(lever), 0 * lever + 1
     rows = [TABLE[name] for name in blocks]
@@ -183,7 +185,7 @@ def mm_at_target(lever: Float[AnyArray, "*batch"], blocks: Blocks) -> Any:
 def spectrum(
     matrix: Float[Array, "k p p"],
 ) -> tuple[Float[Array, "k p"], Float[Array, "k p p"]]:
-    """Eigenvalues, ascending, and eigenvectors (columns); NaN of matrices that are not finite."""
+    """Eigenvalues, ascending, and eigenvectors (columns); NaN for matrices that are not finite."""
     finite = np.all(np.isfinite(matrix), axis=(1, 2))
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], matrix, np.eye(len(matrix.T))))
     lost = ~finite
@@ -192,9 +194,9 @@ def spectrum(
 
 
 def inverses(matrix: Float[Array, "k p p"], eps: float) -> Float[Array, "k p p"]:
-    """Inverses of positive definite matrices; NaN of others.
+    """Inverses of positive definite matrices; NaN for others.
 
-    Scaled to a unit diagonal, with a ridge at the level of rounding.
+    The matrices are first scaled to a unit diagonal and get a ridge at the level of rounding.
     """
     count = matrix.shape[-1]
     diagonal = np.einsum("kii->ki", matrix)
@@ -218,9 +220,9 @@ def inverses(matrix: Float[Array, "k p p"], eps: float) -> Float[Array, "k p p"]
 def nearest_unknown(
     vectors: Float[Array, "k p p"], null: Bool[Array, "k p"]
 ) -> Float[Array, "k p"]:
-    """The unit vector of a null space that lies closest to one single unknown, X's shift first.
+    """The unit vector of a null space that is nearest to a single unknown; X's shift goes first.
 
-    Where the space has several dimensions its eigenvectors are any mixture; this one has a name.
+    If the space has several dimensions, its eigenvectors are arbitrary mixtures of the unknowns.
     """
     chosen = np.where(null[:, None], vectors, 0.0)
     projector = chosen @ np.swapaxes(vectors, 1, 2)
@@ -232,7 +234,7 @@ def nearest_unknown(
 
 
 def bound_of(answer: Calibration, problem: Problem) -> Float[Array, "k n"] | None:
-    """The bounds on the offsets of calibrations that have bounds, mm."""
+    """The bounds on the offsets, mm; None for calibrations without bounds."""
     if answer.prior != "bounded":
         return None
     if problem.max_elevation is None:
@@ -241,7 +243,7 @@ def bound_of(answer: Calibration, problem: Problem) -> Float[Array, "k n"] | Non
 
 
 def quadratic(rows: Float[Array, "k m p"], matrix: Float[Array, "k p p"]) -> Float[Array, "k m"]:
-    """R' C r of every row."""
+    """The quadratic form r' C r of every row r, with C the matrix."""
     return np.einsum("kmp,kmp->km", rows @ matrix, rows)
 
 
@@ -261,7 +263,7 @@ def _offsets(
         residual, axial = seen.from_circle(y)
         slope = y / axial
         limit = np.minimum(bound, LARGEST_ELEVATION * np.abs(seen.distance))
-        # Half the derivative of the cost by y; it pushes outwards where an offset rests.
+        # Half the derivative of the cost by y; at an offset on its bound it points outwards.
         force = slope * residual[..., 2] - residual[..., 1]
         near = np.abs(y) >= (1 - AT_BOUND) * limit
         at_bound = (kept & near & (np.sign(y) * force <= 0)).astype(float)
@@ -283,14 +285,15 @@ def _offsets(
 
 @dataclass(frozen=True)
 class Whitened:
-    """A Gaussian belief's errors in SDs, decorrelated where images have own covariances.
+    """Errors under a Gaussian prior, in SDs, decorrelated where images have their own covariances.
 
     Attributes:
         errors: of lateral position, range and offset.
         rows: their derivatives by the shared unknowns.
-        offset: their derivatives by the image's own offset unknown (a tracker that errs), or None.
-        weight: D, of that unknown; 1 without.
-        pull: E / D, by which that unknown follows the shared ones; zeros without.
+        offset: their derivatives by the image's own offset unknown, or None where there is no such
+            unknown (it belongs to a given tracker SD).
+        weight: D of that unknown; 1 if there is none.
+        pull: E / D, by which that unknown follows the shared ones; zeros if there is none.
     """
 
     errors: Float[Array, "k n 3"]
@@ -301,7 +304,7 @@ class Whitened:
 
     @classmethod
     def of(cls, answer: Calibration, seen: ImageErrors, problem: Problem) -> Whitened:
-        """Of calibrations on points with Gaussian errors."""
+        """The errors of calibrations on points with Gaussian errors."""
         sigma, tau = np.asarray(answer.sigma), answer.linearisation.tracker_sd
         offset, shape = None, own_covariance(answer, problem)
         if tau is not None:
@@ -322,7 +325,7 @@ class Whitened:
         return cls(errors, rows, offset, weight, pull)
 
     def leverage(self, inverse: Float[Array, "k p p"]) -> Float[Array, "k n 3"]:
-        """What of each error's variance the unknowns take up."""
+        """The share of each error's variance that the fit absorbs."""
         rows, own = self.rows, 0.0
         if self.offset is not None:
             rows = rows - self.offset[..., None] * self.pull[:, :, None]
@@ -332,7 +335,7 @@ class Whitened:
 
 
 def own_covariance(answer: Calibration, problem: Problem) -> Float[Array, "k n 2 2"] | None:
-    """The shape of the images' own covariances where they whiten the errors, or None."""
+    """The shape of the images' own covariances, if these whiten the errors; else None."""
     if problem.covariance is None:
         return None
     kept = np.asarray(answer.mask)[..., None] > 0
@@ -369,7 +372,7 @@ def _known_from_prior(
     scale: Float[Array, "k p"],
     eps: float,
 ) -> Float[Array, "k p"]:
-    """The direction that the measurements do not see without a belief about the offsets."""
+    """The direction that the measurements do not determine without a prior on the offsets."""
     from jaxcal.diagnostics.image_errors import channel_rows
 
     found = np.zeros_like(scale)

@@ -1,1 +1,1 @@
-"""A calibration for a program (record), for a person (verdict, tables) and on paper (figures)."""
+"""Reports of a calibration: for programs (record), for people (verdict, tables) and as figures."""

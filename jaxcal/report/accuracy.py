@@ -1,16 +1,18 @@
 """How accurate a calibration is, what limits it and what contradicts it, as plain values.
 
-The number that everything else is about is the target registration error (TRE) to expect at the
-image: its root mean square over the region that the target filled, with a 95 % interval
-(:mod:`jaxcal.diagnostics.intervals`). The covariance that it comes from believes the noise model.
-Where the data contradict that, more is to be expected, and the larger number is stated:
+The main number is the target registration error (TRE) to expect at the image: its root mean square
+over the region that the target filled, with a 95 % interval (:mod:`jaxcal.diagnostics.intervals`).
+It comes from the covariance, which assumes that the noise model holds. If the data contradict it in
+one of the following ways, the expected error is larger, and the larger number is reported:
 
 - the residuals make the error larger than stated by more than three SDs of chance;
-- an image moves the image by more than half the stated error and by more than four times what it
-  should (one step from the normal equations, or by cross-validation where that was asked for);
-- cross-validation or bootstrap scatter by more than 1.3 times the stated error.
+- leaving one image out moves image points by more than half the stated error and by more than four
+  times the expected move (by one step from the normal equations, or by cross-validation if this was
+  requested);
+- the scatter in cross-validation or bootstrap is more than 1.3 times the stated error.
 
-The word belongs to that number: good up to 0.5 mm, fair up to 1.5 mm, otherwise uncertain.
+The word of the verdict depends on this number: good up to 0.5 mm, fair up to 1.5 mm, otherwise
+uncertain.
 """
 
 from __future__ import annotations
@@ -49,20 +51,20 @@ from jaxcal.solvers.closed_form.single import calibrate_closed_form
 Word = Literal["good", "fair", "uncertain"]
 
 GOOD_MM = 0.5
-"""Largest error to expect at the image (root mean square) that is called good,"""
+"""Largest error to expect at the image (root mean square) that is called good."""
 FAIR_MM = 1.5
-"""and fair."""
+"""Largest error that is called fair; larger ones are called uncertain."""
 
 CHANCE = 3.0
 """SDs of chance beyond which the residuals contradict the stated error."""
 MOVED_SHARE, MOVED_TIMES = 0.5, 4.0
-"""An image contradicts it that moves the image by more than this share of it, and so many times
-what it should."""
+"""An image contradicts the stated error if leaving it out moves image points by more than this
+share of the error, and by more than so many times the expected move."""
 SCATTER_TIMES = 1.3
-"""Resampled calibrations may scatter by so many times the stated error."""
+"""Resampled calibrations may scatter by up to so many times the stated error."""
 
 _ACROSS = 15
-"""Points of the map along each side."""
+"""Number of points along each side of the map."""
 _MOST_NAMED = 5
 
 
@@ -74,7 +76,7 @@ def accuracy_record(
     Args:
         result: of one problem, with concrete values.
         recording: what was calibrated.
-        wanted: further image points, in the images' own unit (px or mm).
+        wanted: further image points for the error, in the images' own unit (px or mm).
 
     Returns:
         Arrays and plain values; all of them None where X is not observable.
@@ -105,7 +107,7 @@ def accuracy_record(
 
 
 def region_of(answer: Calibration, recording: Recording) -> Region:
-    """The part of the image that the target filled, and the probe's face where it is known."""
+    """The part of the image that the target filled, and the face of the probe if it is known."""
     used = np.asarray(answer.mask) > 0
     targets = _targets(answer, recording.calibration.poses)
     return seen_region(recording, targets[used])
@@ -172,7 +174,7 @@ def _unit(answer: Calibration) -> str:
 
 
 def _affine(answer: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    """Size of a unit of the image (mm, [lateral, axial]), and where its origin is."""
+    """Size of the image's unit, and position of the image's origin; both mm, [lateral, axial]."""
     transform = answer.image_transform()
     scale = np.ones(2) if transform.scale_mm_per_px is None else transform.scale_mm_per_px
     return scale * [1.0, transform.range_factor], np.array([0.0, transform.face_offset_mm])
@@ -210,7 +212,7 @@ def _limits(
     if not np.isfinite(part).all() or not part.sum() > 0:
         part = np.full(len(KINDS), np.nan)
     elif answer.prior in ("none", "bounded"):
-        # These weigh all alike: what the kinds' own sizes make of that.
+        # These weigh all kinds alike: scale the shares by the kinds' own variances.
         part = part * sigma**2
     squares = np.mean(residual**2, axis=0)
     whole = float(squares.sum())
@@ -228,7 +230,7 @@ def _limits(
 def _comparison(
     answer: Calibration, recording: Recording, found: Influence, grid: Float[np.ndarray, "m 2"]
 ) -> dict[str, Any] | None:
-    """The conventional fit of the same images beside an answer of another method."""
+    """Compares an answer of another method with the conventional fit of the same images."""
     estimate = tuple(name for name in ("scale",) if name in answer.blocks)
     further = {"sound-speed", "delay"} & set(answer.blocks)
     images, problem = recording.calibration, answer.problem
@@ -256,7 +258,7 @@ def _comparison(
     jacobian = image_jacobian(answer, grid)
     error = np.einsum("mia,ab,mib->", jacobian, fit.covariance, jacobian) / len(grid)
     gaussian = np.einsum("mia,ab,mib->", jacobian, found.model_covariance, jacobian) / len(grid)
-    # From the image's pixels to the probe both ways.
+    # Compare where both calibrations put the image's pixels on the probe.
     mine = np.ones(2)
     if answer.scale_mm_per_px is not None:
         mine = np.asarray(answer.scale_mm_per_px) / spacing
@@ -282,15 +284,15 @@ def _batch_of_one(problem: Problem) -> Problem:
 
 
 def settle(record: dict[str, Any]) -> None:
-    """Say what error is to be expected, after whatever was found out about the calibration.
+    """Set the expected error and the verdict, from all that was found about the calibration.
 
-    Adds ``rms_mm``, ``interval_95_mm``, ``factor``, ``contradictions`` to ``record["tre"]``, the
-    same numbers to its points and map, and ``record["verdict"]``: good, fair, uncertain, or None
-    where there is no calibration to be used.
+    It adds ``rms_mm``, ``interval_95_mm``, ``factor`` and ``contradictions`` to ``record["tre"]``,
+    and ``tre_mm`` and ``interval_95_mm`` to the points of ``record["tre"]``. It sets
+    ``record["verdict"]`` to good, fair, uncertain, or None if the calibration must not be used.
 
     Args:
         record: of :func:`jaxcal.report.record.calibration_record`, with cross-validation and
-            bootstrap where they were asked for.
+            bootstrap if they were requested.
     """
     tre = record.get("tre")
     usable = record["converged"] and not record.get("wrong_frames")
@@ -320,7 +322,7 @@ def _from_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
 
 
 def _from_images(record: dict[str, Any]) -> list[tuple[float, str]]:
-    """The image that moves the answer most, if by more than it should; cross-validation first."""
+    """The image that moves the answer most, if too much; by cross-validation if there is one."""
     stated, influence = record["tre"]["stated_mm"], record["influence"]
     held = record.get("cross_validation")
     moved, how = influence["moved_mm"], "to first order"
@@ -344,7 +346,7 @@ def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
     if held is not None and held["folds"] == held["folds_converged"]:
         moved = [by for by in held["image_moved_mm"] if by is not None]
         folds, stated = held["folds"], held["stated_mm"]
-        # The jackknife: every image was held out once, with the others of its fold.
+        # The jackknife: every image was held out once, together with its fold.
         each = len(moved) / folds
         scatter = math.sqrt((folds - 1) / folds * sum(by**2 for by in moved) / each)
         if stated and scatter > SCATTER_TIMES * stated:
@@ -371,7 +373,7 @@ def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
 
 
 def stated_at(result: Calibration, points: Float[np.ndarray, "m 2"]) -> float | None:
-    """Root mean square over some image points of the error that the covariance states, mm."""
+    """The error that the covariance states, as root mean square over some image points, mm."""
     found = np.asarray(predicted_tre(result.numpy(), np.asarray(points, float)))
     value = float(np.sqrt(np.mean(found**2)))
     return value if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""What is proved of the conventional fit, for the record of a calibration and in words."""
+"""The certificate of the conventional fit, for the record of a calibration and in words."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from jaxcal.solvers.closed_form.single import calibrate_closed_form
 def certificate_record(result: Calibration, recording: Recording) -> dict[str, Any]:
     """``certified`` and ``gap_mm2`` of Eq. 7's minimum on the images in use.
 
-    For the conventional method they are the answer's own; for the others, which minimise something
-    else, those of the closed form of the same images. Both are None where there is no closed form
-    (an estimated delay, raw times of flight) or no answer.
+    For the conventional method they are those of the answer. The other methods minimise a different
+    objective; for them they are those of the closed form on the same images. Both are None if there
+    is no closed form (e.g. an estimated delay, raw times of flight) or no answer.
 
     Args:
         result: of one problem, with numpy arrays.
@@ -34,7 +34,7 @@ def certificate_record(result: Calibration, recording: Recording) -> dict[str, A
     if images.kind == "time_of_flight" or not (estimate in ((), ("scale",)) or own):
         return nothing
     try:
-        # What was solved counts every pose once.
+        # The solve counted every pose once, so the certificate must do the same.
         images = replace(independent(images, estimate)[0], mask=np.asarray(result.mask) > 0)
         if own:
             found = _of_answer(result, images, recording, estimate)
@@ -62,11 +62,11 @@ def _of_answer(
 
 
 def first_answer_words(images: Images, estimate: tuple[str, ...]) -> str | None:
-    """The conventional fit in a sentence, to be shown while another method is at work.
+    """The conventional fit in one sentence, to be shown while another method runs.
 
     Args:
-        images: to be calibrated.
-        estimate: further unknowns; without a closed form for them nothing is said.
+        images: the images to calibrate.
+        estimate: further unknowns; if there is no closed form for them, the result is None.
     """
     if images.kind == "time_of_flight":
         return None

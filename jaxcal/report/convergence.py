@@ -1,8 +1,8 @@
-"""How fast the methods fall on one and the same objective: the bounded problem of the paper.
+"""How fast the methods converge on the same objective: the bounded problem of the paper.
 
-The alternation is run on past its own stopping rule, so that its rate shows; where the rule would
-have stopped it is marked. The joint solver begins with a few rounds of the same alternation, so the
-two curves share their beginning.
+The alternation continues past its own stopping rule, so that its rate can be seen; the iteration at
+which the rule would have stopped it is marked. The joint solver begins with a few rounds of the
+same alternation from each of its starts, and its curve begins after these.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.runtime.array_types import Float
 
 KEPT = 200
-"""Iterations that are drawn."""
+"""Number of iterations that are drawn."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Curve:
     Attributes:
         label: for the legend.
         objective: (k,) after iteration 0 (the start), 1, 2 and so on; NaN where it was not kept.
-        stopped: iteration at which the method's own rule stopped, or None.
+        stopped: iteration at which the method's own rule stopped it, or None.
     """
 
     label: str
@@ -52,9 +52,9 @@ def bounded_curves(
 
     Args:
         problem: one problem.
-        max_elevation: bound, mm; the problem's own or 1 mm without.
+        max_elevation: bound, mm; if it is None, the problem's own or 1 mm.
         estimate: further unknowns.
-        alternating: an alternation that stopped by its own rule, to mark where that was.
+        alternating: an alternation that stopped by its own rule, to mark where it stopped.
 
     Returns:
         Curves of the sum of squares, mm^2.
@@ -69,15 +69,15 @@ def bounded_curves(
         estimate=estimate,
         options=Options(trace=KEPT),
     )
-    # A tolerance of nothing: every round is taken.
+    # With practically no tolerance, every round is taken.
     patient = Options(trace=KEPT, max_rounds=KEPT, tolerance_mm=1e-300, tolerance_rad=1e-300)
     slow = calibrate(
         problem, "alternating", max_elevation=max_elevation, estimate=estimate, options=patient
     )
     # The alternation keeps no value before its first round.
     rounds = np.concatenate([[np.nan], _trace(slow)])
-    # The joint solver's first value is that of the best of its starts after their warm-up, which
-    # keeps no values of its own.
+    # The joint solver's first value is that of its best start after the warm-up rounds, whose
+    # values are not kept.
     steps = np.concatenate([np.full(WARM_UP_ROUNDS, np.nan), _trace(joint)])
     stopped = None if alternating is None else int(alternating.iterations)
     return [

@@ -1,4 +1,4 @@
-"""How the objective fell, drawn without any display and without pyplot's global state."""
+"""Figure of how the objective fell, drawn without a display and without pyplot's global state."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from jaxcal.report.convergence import Curve
 from jaxcal.report.plots import BLUE, GREEN, GREY, ORANGE, PAGE_MM, canvas, styled
 
 _ROUNDING = 3e-14
-"""Relative excess of an objective below which there is only rounding."""
+"""An excess of the objective below this relative size is only rounding."""
 
 
 def convergence_figure(curves: list[Curve]) -> Figure:
-    """Objective above the best that any of the curves reached (mm^2), against the iteration.
+    """Objective less the lowest value of all curves (mm^2), against the iteration.
 
     Args:
-        curves: of one and the same objective.
+        curves: of the same objective.
     """
     figure = canvas(PAGE_MM, 80.0)
     panel = styled(figure.subplots())
@@ -28,7 +28,7 @@ def convergence_figure(curves: list[Curve]) -> Figure:
         styles = zip(reached, (ORANGE, BLUE, GREEN), ("s", "o", "^"), strict=False)
         for curve, colour, marker in styles:
             excess = np.maximum(curve.objective - best, floor)
-            # Down there the values only jitter.
+            # After the minimum the values vary only by rounding.
             excess = excess[: int(np.nanargmin(excess)) + 1]
             panel.plot(
                 np.arange(len(excess)),

@@ -23,9 +23,9 @@ def next_poses_record(result: Calibration, recording: Recording) -> dict[str, An
 
     Returns:
         ``tre_now_mm`` and ``tre_then_mm`` (predicted, root mean square over the image),
-        ``images_to_half`` (how many would halve the error; None: over 1000) and ``poses``: of each
-        ``words``, ``target_mm`` [lateral, axial], ``pose`` (4x4, probe -> tracker) and ``tre_mm``
-        once it and those before it are taken.
+        ``images_to_half`` (how many would halve the error; None: over 1000) and ``poses``. Each
+        pose has ``words``, ``target_mm`` [lateral, axial], ``pose`` (4x4, probe -> tracker),
+        ``fills_space`` and ``tre_mm``, the error with this pose and those before it.
     """
     if result.status == "failed":
         return None
@@ -66,7 +66,7 @@ def pose_records(plan: design.Plan) -> list[dict[str, Any]]:
 
 
 def next_poses_sentences(record: dict[str, Any]) -> list[str]:
-    """The same for a person, from the record of a calibration; nothing where there is nothing."""
+    """The next poses in sentences, from the record of a calibration; empty if it has none."""
     found = record.get("next_poses")
     if found is None:
         return []

@@ -1,8 +1,8 @@
 """One page for a browser: verdict, error map, matrix in every form, scene, residuals, comparison.
 
-It is one file that asks for nothing: styles, script, figures (SVG) and the whole record are inside,
-and a content security policy forbids the rest. Every word that comes from a recording is escaped.
-Numbers that are also in the JSON carry their path in it (``data-record``).
+The page is one file that loads nothing else: styles, script, figures (SVG) and the whole record are
+inside, and a content security policy forbids everything else. All text from a recording is escaped.
+Numbers that are also in the JSON have their path in it as ``data-record``.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from jaxcal.report.verdict import (
 from jaxcal.runtime.array_types import Float
 
 MOST_POSES, MOST_PLANES = 300, 60
-"""Poses that are drawn in space, and planes of images;"""
+"""Most poses, and most image planes, that are drawn in space."""
 LONGEST_LIST = 3000
-"""and entries of a list that is kept in the page's record."""
+"""Longer lists are left out of the page's record."""
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 _KINDS = (
@@ -80,7 +80,7 @@ def write_page(
 def page(record: dict[str, Any], result: Calibration, recording: Recording) -> str:
     """The page as text."""
     answer = result.numpy()
-    # Of wrong frames there is nothing to be copied or believed.
+    # With wrong frames there are no results to copy or to trust.
     known = _usable(record)
     sections = [
         _head(record),
@@ -115,13 +115,13 @@ def _usable(record: dict[str, Any]) -> bool:
 
 
 def _embedded(name: str, value: Any) -> str:
-    """JSON inside the page; nothing in it can end the element."""
+    """JSON inside the page; no text in it can close the script element."""
     text = json.dumps(value, allow_nan=False).replace("<", "\\u003c")
     return f'<script type="application/json" id="{name}">{text}</script>'
 
 
 def _shortened(record: dict[str, Any]) -> dict[str, Any]:
-    """The record without the lists of recordings with very many images."""
+    """The record without very long lists."""
 
     def short(value: Any) -> Any:
         if isinstance(value, dict):
@@ -132,7 +132,7 @@ def _shortened(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _number(record: dict[str, Any], path: str, form: str, unit: str = "") -> str:
-    """A number of the record, with where it is."""
+    """A number of the record, with its path there."""
     value: Any = record
     for key in path.split("."):
         value = value[int(key)] if isinstance(value, list) else value[key]
@@ -188,7 +188,7 @@ def _head(record: dict[str, Any]) -> str:
 
 
 def _findings(record: dict[str, Any]) -> str:
-    """What looks wrong and what to do about it, whoever found it."""
+    """What looks wrong, from all checks, and what to do about it."""
     found = [str(text) for text in [*record.get("findings", ()), *record["warnings"]]]
     parts = []
     if found:
@@ -296,7 +296,7 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     x, point = np.asarray(answer.image_to_probe), np.asarray(answer.point)
     images = recording.calibration.poses[shown] @ x
     seen = _targets(answer, recording)[shown]
-    # What was measured: the target taken in the plane at its lateral position and range.
+    # The measured point is in the plane, at the measured lateral position and range.
     residual = np.asarray(answer.residual)[shown]
     measured = seen - residual
     cloud = np.asarray(reconstruct(x, recording.calibration.poses[shown], measured))
@@ -380,7 +380,7 @@ def _close_up(
             )
             lines.append({"points": _rounded(ring), "colour": "var(--text)", "width": 0.8})
     away = np.linalg.norm(cloud - point, axis=1)
-    # A few that are far off must not make the rest a single dot.
+    # A few points that are far off must not shrink the others to a single dot.
     radius = max(1.15 * float(np.quantile(away, 0.97)) if len(away) else 1.0, 1.2 * reach, 1e-3)
     dots = [
         {
@@ -403,7 +403,7 @@ def _close_up(
 
 
 def _rounded(values: Any) -> Any:
-    """Numbers with a hundredth of a micrometre, as plain lists."""
+    """Numbers (mm) rounded to a hundredth of a micrometre, as plain lists."""
     return np.round(np.asarray(values, float), 5).tolist()
 
 

@@ -1,7 +1,8 @@
-"""Figures for a publication, of a calibration in memory: one style, units, colours for everybody.
+"""Figures of a calibration in memory, for publications: one style, with units and safe colours.
 
-Each function returns a matplotlib Figure that belongs to no window: ``figure.savefig("a.pdf")``; a
-notebook shows it. Sizes are those of a journal's column (88 mm) or page (180 mm).
+Each function returns a matplotlib Figure without a window: save it with
+``figure.savefig("a.pdf")``, or show it in a notebook. Sizes are those of a journal's column (88 mm)
+or page (180 mm).
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from jaxcal.runtime.array_types import Float
 
 COLUMN_MM, PAGE_MM = 88.0, 180.0
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
-"""Okabe and Ito's, which the colour-blind can tell apart; one a kind of error."""
+"""Colours of Okabe and Ito, which the colour-blind can tell apart; each kind of error has one."""
 COLOURS = {"lateral": BLUE, "range": GREEN, "axial": GREEN, "elevational": ORANGE}
 
 
 def canvas(width_mm: float, height_mm: float) -> Figure:
-    """A figure of a size on paper, without pyplot."""
+    """A figure of the given size on paper, made without pyplot."""
     figure = Figure(figsize=(width_mm / 25.4, height_mm / 25.4), dpi=200, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -167,7 +168,7 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
 
 
 def plot_influence(calibration: Calibration) -> Figure:
-    """How far leaving out each image moves the image, mm, and how far it should."""
+    """How far leaving out each image moves image points, mm, and how far is expected."""
     answer, recording = _one(calibration)
     if not np.isfinite(answer.unknowns_covariance).all():
         raise InputError("these images do not determine the calibration: nothing can be left out")
@@ -260,7 +261,7 @@ def _scale_bar(axes: Axes, length: float) -> None:
     axes.plot(
         [x - length, x], [y, y], color="white", linewidth=2.0, solid_capstyle="butt", zorder=6
     )
-    # Above the contours' labels, and readable on whatever lies below.
+    # In front of the contours' labels, and readable on any background.
     axes.text(
         x - length / 2,
         y + 0.025 * (top - bottom),

@@ -64,10 +64,10 @@ def calibration_record(
         result: of one problem (not a batch), with concrete values.
         recording: what was calibrated; its truth and test set are used where it has them.
         test: another recording whose calibration images are the test set instead.
-        tre_points: further image points, in the images' unit, whose error is wanted.
+        tre_points: further image points, in the images' unit, for which to give the error.
 
     Returns:
-        A dictionary that ``json.dumps(..., allow_nan=False)`` takes.
+        A dictionary that ``json.dumps(..., allow_nan=False)`` accepts.
 
     Raises:
         InputError: test images that cannot be brought to mm (see :func:`check_test_images`).
@@ -156,12 +156,12 @@ def truth_error(result: Calibration, truth: Truth) -> dict[str, float]:
 
 
 def check_test_images(recording: Recording, test: Recording | None = None) -> Images | None:
-    """The images of the independent test set, if there are any, and whether they can be used.
+    """The images of the independent test set, checked; None if there is no test set.
 
     Args:
         recording: what is to be calibrated.
-        test: another recording whose calibration images are the test set; without it the
-            recording's own test set is.
+        test: another recording whose calibration images are the test set; if it is None, the
+            recording's own test set is used.
 
     Raises:
         InputError: times of flight, or pixels without a spacing beside points in mm.
@@ -215,7 +215,7 @@ def _points_mm(images: Images, result: Calibration) -> Float[np.ndarray, "n 2"]:
     """[lateral, range] in mm."""
     if images.kind != "pixel":
         return images.measurements
-    # An estimated scale replaces whatever was written down; a known one is each set's own.
+    # An estimated scale replaces any given one; if it is not estimated, each set uses its own.
     scale = result.scale_mm_per_px
     if images.spacing_mm is not None and "scale" not in result.blocks:
         scale = images.spacing_mm

@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from jaxcal.calibration.resampling import Bootstrap, CrossValidation
 
 INFLUENTIAL = 1.0
-"""An image that moves X by more than this many of its SDs is worth naming."""
+"""An image is named if leaving it out moves X by more than this many of X's SDs."""
 
 
 def cross_validation_record(found: CrossValidation, result: Calibration) -> dict[str, Any]:
-    """For ``calibration.json`` and ``--json``.
+    """Cross-validation as plain values, for ``calibration.json`` and ``--json``.
 
     Args:
-        found: by holding images out.
+        found: the cross-validation.
         result: the calibration of all images.
     """
     influence = np.asarray(found.influence, dtype=float)
@@ -45,10 +45,10 @@ def cross_validation_record(found: CrossValidation, result: Calibration) -> dict
 
 
 def bootstrap_record(found: Bootstrap, result: Calibration) -> dict[str, Any]:
-    """For ``calibration.json`` and ``--json``.
+    """The bootstrap as plain values, for ``calibration.json`` and ``--json``.
 
     Args:
-        found: by drawing images anew.
+        found: the bootstrap.
         result: the calibration of all images.
     """
     spread = np.asarray(found.spread, dtype=float)
@@ -66,7 +66,7 @@ def bootstrap_record(found: Bootstrap, result: Calibration) -> dict[str, Any]:
 
 
 def resampled_sentences(record: dict[str, Any]) -> list[str]:
-    """What both say, for the verdict."""
+    """Sentences about cross-validation and bootstrap, for the verdict."""
     lines = []
     held = record.get("cross_validation")
     if held is not None and held["precision_mm"] is not None:

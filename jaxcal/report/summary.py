@@ -1,7 +1,7 @@
-"""A calibration in Python: as a table with its verdict, for a notebook, and as a file.
+"""Text, notebook view and record of a calibration in Python.
 
-What the command line says of a recording's calibration is said here of one in memory, from the
-problem that it holds.
+They are the same as what the command line gives for a recording, but for a calibration in memory,
+from the problem that it holds.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxcal.report.record import calibration_record
 
 
 def recording_of(calibration: Calibration) -> Recording:
-    """The data that a calibration is of, as a recording.
+    """The data of a calibration, as a recording.
 
     Raises:
         CalibrationError: a calibration without its problem, or a batch.
@@ -51,11 +51,11 @@ def recording_of(calibration: Calibration) -> Recording:
 def record_of(
     calibration: Calibration, tre_points: tuple[tuple[float, float], ...] = ()
 ) -> dict[str, Any]:
-    """What ``jaxcal calibrate --json`` prints, of a calibration in memory.
+    """What ``jaxcal calibrate --json`` prints, for a calibration in memory.
 
     Args:
         calibration: of one problem, with concrete values.
-        tre_points: further image points, in the images' unit, whose error is wanted.
+        tre_points: further image points, in the images' unit, for which to give the error.
     """
     return calibration_record(calibration, recording_of(calibration), tre_points=tre_points)
 
@@ -89,7 +89,7 @@ def text_of(calibration: Calibration, width: int = 100) -> str:
 
 
 def batch_text(calibration: Calibration) -> str:
-    """How many of a batch converged, and where to look on."""
+    """How many calibrations of a batch ended with each status, and how to see one of them."""
     status = np.asarray(calibration.status)
     names, counts = np.unique(status, return_counts=True)
     told = ", ".join(f"{count} {name}" for name, count in zip(names, counts, strict=True))
@@ -98,7 +98,7 @@ def batch_text(calibration: Calibration) -> str:
 
 
 def html_of(calibration: Calibration) -> str:
-    """Verdict, error map and numbers, for a notebook: no script, and styles of its own."""
+    """Verdict, error map and numbers for a notebook, without script and with their own styles."""
     from jaxcal.report import svg
     from jaxcal.report.verdict import verdict
 

@@ -1,8 +1,8 @@
-"""Small vector figures as text: axes with units, stems, bars, maps. Nothing else is needed.
+"""Small vector figures as text: axes with units, stems, bars and maps, without other libraries.
 
-Coordinates are those of a figure 380 units wide, which a page shows at any width. Colours are CSS
-variables of the page, so that a figure follows its light or dark scheme; those of data are Okabe
-and Ito's, which the colour-blind can tell apart.
+Coordinates are those of a figure 380 units wide, which a page can show at any width. Colours are
+CSS variables of the page, so a figure follows the page's light or dark scheme. Colours of data are
+those of Okabe and Ito, which the colour-blind can tell apart.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _VIRIDIS = (
     (170, 220, 50),
     (253, 231, 37),
 )
-"""Nine colours of matplotlib's viridis (public domain, CC0), evenly lighter."""
+"""Nine colours of matplotlib's viridis (public domain, CC0), with even steps of lightness."""
 
 
 def viridis(share: Number) -> str:
@@ -47,7 +47,7 @@ def viridis(share: Number) -> str:
 
 
 def ticks(low: Number, high: Number, most: int = 6) -> list[Any]:
-    """Round numbers between two others, at most so many."""
+    """Round numbers between two others, at most ``most`` of them."""
     if not high > low:
         return [low]
     rough = (high - low) / max(most - 1, 1)
@@ -89,7 +89,7 @@ def line(
 
 
 def figure(height: Number, parts: Iterable[str], label: str) -> str:
-    """An SVG element with a name that is read aloud."""
+    """An SVG element with a label for screen readers."""
     return (
         f'<svg viewBox="0 0 {_at(WIDTH)} {_at(height)}" role="img" aria-label="{escape(label)}">'
         f"{''.join(parts)}</svg>"
@@ -117,14 +117,14 @@ class Panel:
         self.box, self.x, self.y, self.down = box, x, y, down
 
     def place(self, x: Number, y: Number) -> tuple[Any, Any]:
-        """Where a point is in the figure."""
+        """The position of a point in the figure."""
         left, top, right, bottom = self.box
         across = left + (right - left) * (x - self.x[0]) / (self.x[1] - self.x[0])
         share = (y - self.y[0]) / (self.y[1] - self.y[0])
         return across, top + (bottom - top) * (share if self.down else 1 - share)
 
     def axes(self, x_label: str = "", y_label: str = "", *, most: int = 6) -> list[str]:
-        """Grid, ticks and labels; an empty x label leaves the numbers out, too."""
+        """Grid, ticks and labels; without an x label the numbers of x are left out, too."""
         left, top, right, bottom = self.box
         parts = []
         for value in ticks(*self.x, most):
@@ -156,7 +156,7 @@ class Panel:
         *,
         radius: Number = 1.9,
     ) -> list[str]:
-        """Points with a line to zero; one path for all lines, and with titles a dot each."""
+        """Points with a line to zero; all lines are one path, and a dot may have a title."""
         zero = min(max(0.0, self.y[0]), self.y[1])
         moves, dots = [], []
         for k, (a, b) in enumerate(zip(x, y, strict=True)):
@@ -188,7 +188,7 @@ def series(
     x_label: str = "image",
     height: Number = 96.0,
 ) -> str:
-    """Panels one above the other, with one scale for all: a value of each image.
+    """Panels one above the other, with one scale for all; each shows a value of every image.
 
     Args:
         panels: name with unit, image numbers, values, colour.
@@ -255,7 +255,7 @@ def error_map(
     y = (float(axial.min()), float(axial.max()))
     pad = 0.03 * max(x[1] - x[0], y[1] - y[0])
     x, y = (x[0] - pad, x[1] + pad), (y[0] - pad, y[1] + pad)
-    # One unit for both axes; the figure is as high as that makes it.
+    # Both axes have the same scale, which determines the height of the figure.
     across = min(250.0, 300.0 * (x[1] - x[0]) / (y[1] - y[0]))
     down = across * (y[1] - y[0]) / (x[1] - x[0])
     panel = Panel((48.0, 10.0, 48.0 + across, 10.0 + down), x, y, down=True)
@@ -269,7 +269,7 @@ def error_map(
             places = [panel.place(float(lateral[c]), float(axial[c])) for c in corners]
             outline = " ".join(f"{_at(a)},{_at(b)}" for a, b in places)
             colour = viridis((mean - low) / span)
-            # The same stroke closes the seams between cells.
+            # A stroke of the same colour closes the gaps between cells.
             cells.append(
                 f'<polygon points="{outline}" fill="{colour}" stroke="{colour}" '
                 f'stroke-width="0.6"><title>{mean:.3f} mm</title></polygon>'

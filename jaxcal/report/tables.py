@@ -40,7 +40,7 @@ def comparison_table(
     """Several calibrations of one recording, a row each.
 
     Args:
-        records: by the name to show.
+        records: the records, by the names to show.
         milliseconds: solve times by the same names, if they were measured.
     """
     table = Table(box=box.SIMPLE)
@@ -115,7 +115,7 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
             )
         )
     sight = record["observability"]
-    # Where it is not determined at all, the SD says only where rounding begins.
+    # If the direction is not determined at all, the SD only shows where rounding begins.
     sd = sight["weakest_sd_mm"] if record["status"] != "unobservable" else None
     facts.append(
         ("least known", sight["weakest_direction"] + ("" if sd is None else f" (SD {sd:.2f} mm)"))
@@ -134,7 +134,7 @@ def _facts(record: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _accuracy(record: dict[str, Any]) -> list[tuple[str, str]]:
-    """The error to expect at the image, over it and at points."""
+    """The error to expect, over the image and at points."""
     tre = record.get("tre")
     if tre is None or tre.get("rms_mm") is None:
         return []

@@ -1,6 +1,6 @@
 """A calibration in a few plain sentences: how good, how certain, what looks wrong, what to do.
 
-The first sentence has one word and one number, and both are the target registration error to expect
+The first sentence has one word and one number; both express the target registration error to expect
 at the image (:mod:`jaxcal.report.accuracy`).
 """
 
@@ -16,7 +16,8 @@ from jaxcal.report.resampled import resampled_sentences
 
 FEW_IMAGES = 20
 _MOST_MOVED_SHARE = 0.3
-"""Images that move the image by more than this share of the stated error are worth naming."""
+"""An image is named if leaving it out moves image points by more than this share of the stated
+error."""
 
 _AXES = ("lateral (sideways)", "elevational (out-of-plane)", "axial (depth)")
 _MORE_VARIED = (
@@ -57,7 +58,7 @@ def verdict(record: dict[str, Any]) -> list[str]:
 
 
 def headline(record: dict[str, Any]) -> str:
-    """Word and number."""
+    """The first sentence, with the word and the number of the verdict."""
     status, tre = record["status"], record.get("tre")
     if status == "failed":
         return "Failed: there is no calibration."
@@ -82,7 +83,7 @@ def headline(record: dict[str, Any]) -> str:
 
 
 def _mm(value: float | None) -> str:
-    """Two significant digits, at least hundredths."""
+    """A length in words: hundredths of mm; tenths from 10 mm on; more digits near zero."""
     if value is None:
         return "an unknown distance"
     digits = 2 if value >= 0.0095 else 4
@@ -90,7 +91,7 @@ def _mm(value: float | None) -> str:
 
 
 def contradictions(record: dict[str, Any]) -> list[str]:
-    """What makes the error larger than the covariance states."""
+    """Why the error is larger than the covariance states."""
     tre = record.get("tre")
     if tre is None or not tre.get("contradictions"):
         return []
@@ -101,7 +102,7 @@ def contradictions(record: dict[str, Any]) -> list[str]:
 
 
 def where(record: dict[str, Any]) -> list[str]:
-    """Where in the image, and the points that were asked for."""
+    """Where in the image the error is smallest and largest, and the error at requested points."""
     tre = record.get("tre")
     if tre is None or tre.get("rms_mm") is None:
         return []
@@ -161,7 +162,7 @@ def limits(record: dict[str, Any]) -> list[str]:
 
 
 def _scatter(record: dict[str, Any]) -> str:
-    """Why the target scatters as it does, which is not how far off the calibration is."""
+    """Why the target scatters; this scatter is not the error of the calibration."""
     found = record["limits"]
     precision = record["reconstruction_precision_mm"]
     shown = (
@@ -200,7 +201,7 @@ def _poses(record: dict[str, Any]) -> str | None:
 
 
 def believe(record: dict[str, Any]) -> list[str]:
-    """Why this answer and not the conventional one, with the comparison."""
+    """Why to prefer this answer to the conventional one, from the comparison of both."""
     beside = record.get("comparison")
     if beside is None:
         return []
@@ -242,7 +243,7 @@ def spread_of_transform(record: dict[str, Any]) -> tuple[float, float] | None:
 
 
 def certainty(record: dict[str, Any]) -> list[str]:
-    """How certain the transform is, and what that rests on."""
+    """How certain the transform is, and on which assumptions this rests."""
     spread = spread_of_transform(record)
     if spread is None:
         return ["How certain the transform is cannot be said from these images."]
@@ -265,7 +266,7 @@ def certainty(record: dict[str, Any]) -> list[str]:
 
 
 def _addition(record: dict[str, Any]) -> str:
-    """What tells most about the weakest direction first, then what is good for all of them."""
+    """First the poses that tell most about the weakest direction, then those that always help."""
     first = record["observability"].get("advice")
     if not first:
         return _MORE_VARIED

@@ -32,19 +32,19 @@ COLUMNS = (
     "elevation_sd_mm",
     "at_bound",
 )
-"""Of residuals.csv: the residual from the image plane, then the estimated offset."""
+"""Columns of residuals.csv: the residual from the image plane, then the estimated offset."""
 
 
 @contextmanager
 def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Make a folder, and see that it can be written to, before any work is done for it.
+    """Make a folder, and check that files can be written to it, before other work begins.
 
     Args:
         path: the folder; missing parents are made.
 
     Yields:
-        The folder. Where the block raises, folders that were made for it and are still empty are
-        removed again.
+        The folder. If the block raises an error, folders that were made here and are still empty
+        are removed again.
 
     Raises:
         OutputError: it cannot be made or written to.
@@ -75,17 +75,17 @@ def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """See that a file can be made or replaced, before any work is done for it.
+    """Check that a file can be made or replaced, before other work begins.
 
     Raises:
-        OutputError: it cannot.
+        OutputError: it cannot be made or replaced.
     """
     with suppress(_Unwritten), atomic_path(path):
         raise _Unwritten
 
 
 class _Unwritten(Exception):
-    """Nothing is to be written."""
+    """Ends a check before anything is written."""
 
 
 def write_report(
@@ -102,17 +102,17 @@ def write_report(
         record: of :func:`jaxcal.report.record.calibration_record`.
         result: the calibration.
         recording: what was calibrated.
-        curves: of the method's objective, for convergence.png; none: no such figure.
+        curves: of the method's objective, for the figure convergence; empty: no such figure.
 
     Returns:
         The files: calibration.json, verdict.txt, residuals.csv, and each figure as .png and .svg:
-        accuracy, influence and limits (not of an answer that is not determined), residuals,
-        offsets, convergence.
+        residuals and offsets; accuracy, influence and limits, if the answer is determined; and
+        convergence.
 
     Raises:
-        OutputError: a file could not be written; it is as it was.
+        OutputError: a file could not be written and is unchanged.
     """
-    # Matplotlib takes half a second to import: only when there is something to draw.
+    # Matplotlib takes half a second to import, so it is imported only here, to draw.
     from jaxcal.report import plots
     from jaxcal.report.figures import convergence_figure
 
@@ -164,5 +164,5 @@ def _residual_table(result: Calibration) -> str:
 
 
 def _cell(value: np.floating) -> str:
-    """Nothing where a number is not known: NaN means something else in every program."""
+    """A number as text; empty if it is not known, since programs treat NaN differently."""
     return repr(float(value)) if np.isfinite(value) else ""
