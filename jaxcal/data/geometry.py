@@ -1,7 +1,7 @@
 """Rigid transforms in JAX: 4x4 matrices in millimetres whose rotations can be trusted.
 
-:mod:`jaxcal.data.poses` makes them from somebody else's matrices; its functions can be had here
-too.
+Matrices from elsewhere are checked and converted by :mod:`jaxcal.data.poses`, some of whose
+functions can be imported from here, too.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ AnyArray = Array | np.ndarray
 """Public functions of arrays take numpy's as well as JAX's."""
 
 _SMALL_ANGLE_SQUARED = 1e-2
-"""rad^2; below it a series replaces quotients, whose derivatives divide by powers of the angle."""
+"""rad^2. Below it a series is used: derivatives of quotients divide by powers of the angle."""
 _TERMS = 7
-"""The first term left out is below 1e-26, its second derivative below 1e-20."""
+"""Terms of the series. The first one left out is below 1e-26, its second derivative below 1e-20."""
 
 
 def transform_points(
@@ -72,7 +72,8 @@ def _series(squared: Float[Array, ""], order: int) -> Float[Array, ""]:
 def chord_angle(difference: Float[Array, "3 3 *lanes"]) -> Float[Array, "*lanes"]:
     """Angle (rad) between two rotations, from their difference; lanes last.
 
-    2 asin(|R1 - R2| / sqrt 8) keeps its digits near zero, where acos of the trace loses half.
+    2 asin(|R1 - R2| / sqrt 8) keeps its digits near zero, where acos of the trace loses half
+    of them.
     """
     chord = jnp.sqrt(jnp.sum(difference**2, axis=(0, 1)))
     return 2 * jnp.arcsin(jnp.minimum(chord / math.sqrt(8.0), 1.0))

@@ -1,8 +1,8 @@
 """Poses at the boundary: 4x4 matrices in millimetres, checked and projected to SE(3). Numpy only.
 
-This module is where somebody else's matrices and quaternions become poses whose rotations can be
-trusted. A rotation block within 1e-2 (Frobenius) of SO(3) is projected to it by SVD (text files
-and optical trackers round); anything farther is refused with its row named.
+Matrices and quaternions from elsewhere become poses whose rotations can be trusted. A rotation
+block within 1e-2 (Frobenius) of SO(3) is projected to it by SVD, since text files and optical
+trackers round their numbers. A block that is farther away is refused, and its row is named.
 
 Nothing here imports JAX, so that files can be read and converted without its start-up time.
 """
@@ -18,10 +18,10 @@ from jaxcal import InputError
 from jaxcal.runtime.array_types import Float
 
 ROTATION_TOLERANCE = 1e-2
-"""Largest Frobenius distance from SO(3) that is taken for rounding."""
+"""Largest Frobenius distance from SO(3) that counts as rounding."""
 
 QUATERNION_TOLERANCE = 1e-2
-"""Largest distance of a quaternion's length from 1 that is taken for rounding."""
+"""Largest distance of a quaternion's length from 1 that counts as rounding."""
 
 QuaternionOrder = Literal["xyzw", "wxyz"]
 """Whether the scalar comes last (ROS, Motive, scipy) or first (NDI)."""

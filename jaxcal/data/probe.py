@@ -3,8 +3,8 @@
 Image frame: x lateral along the elements, z axial away from the transducer, y = z cross x
 elevational; millimetres. The origin is the centre of the element line of a linear array, the apex
 of the arc of a curvilinear one. Elements are counted k = 0 to E - 1 along x; a *scan line* belongs
-to an element and leaves the array at right angles, so that a place in the image plane has a line
-(an element number, which need not be whole) and a range from the array.
+to an element and leaves the array at right angles. So a point in the image plane is given by a scan
+line (an element number, which need not be whole) and a range from the array.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class _Array:
 
         Args:
             times_s: s; NaN stays NaN.
-            delay_s: instead of the probe's own delay, s.
+            delay_s: s, used instead of the probe's own delay.
         """
         delay = self.delay_s if delay_s is None else delay_s
         return (np.asarray(times_s, dtype=np.float64) - delay) * (1e3 * self.sound_speed_m_s)
@@ -84,7 +84,7 @@ class LinearProbe(_Array):
         elements: number of transducer elements, at least 2.
         pitch_mm: distance between neighbouring element centres, mm.
         sound_speed_m_s: sound speed assumed for ranges, m/s (1490: water at room temperature;
-            :func:`jaxcal.data.sound.sound_speed_in_water` knows it for others).
+            :func:`jaxcal.data.sound.sound_speed_in_water` gives it for others).
         delay_s: fixed delay of the electronics, s: time of flight = distance / sound speed + delay.
     """
 
@@ -137,7 +137,7 @@ class CurvilinearProbe(_Array):
     """A convex array on an arc about (0, -radius); the origin is the apex of the arc.
 
     Element k stands at the angle theta = (k - (E - 1)/2) pitch / radius, that is at lateral
-    R sin(theta), axial R cos(theta) - R: the apex is its foremost place.
+    R sin(theta), axial R cos(theta) - R: the apex is the foremost point of the arc.
 
     Attributes:
         elements: number of transducer elements, at least 2.

@@ -1,8 +1,8 @@
-"""Arrays that a solver eats. From here on everything is pure, batched and differentiable.
+"""The arrays that a solver takes. From here on everything is pure, batched and differentiable.
 
 Every array of a :class:`Problem` is floating, the mask included, so that ``jax.grad`` takes a whole
-problem as its argument; whatever is not an array (are the measurements pixels?) is static. A batch
-is the same class with leading axes on every array.
+problem as its argument. Fields that are not arrays, such as ``pixels``, are static. A batch is the
+same class with leading axes on every array.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 @array_tree
 class Channels:
-    """What every element heard, for the solves on the times of flight themselves.
+    """The distances that every element measured, for solvers that use times of flight directly.
 
     Attributes:
-        distances: one-way distances at the nominal sound speed and delay, mm; 0 where not heard.
+        distances: one-way distances at the nominal sound speed and delay, mm; 0 without one.
         heard: 1 where an element's time of flight is used, 0 where it is missing or rejected.
         elements: positions in the image frame [lateral, elevational, axial], mm.
     """
@@ -54,15 +54,15 @@ class Problem:
         spacing: [lateral, axial] mm per px (1 for points in mm); where pixels come without a known
             spacing it only sets the unit of the estimated scale.
         face_offset: range of pixel row 0, mm.
-        covariance: of the measurements, in their unit squared, or None. Its *shape* across images
-            and axes is used by the joint solver, whose sigmas scale it.
+        covariance: of the measurements, in their unit squared, or None. The joint solver uses its
+            *shape* across images and axes, and scales it by its sigmas.
         max_elevation: bound on |elevational offset| of each image, mm, or None.
-        sound_speed: the nominal one, by which times of flight became distances, m/s.
-        delay: the nominal electronic delay, already taken off the times of flight, s.
+        sound_speed: nominal, with which times of flight were converted to distances, m/s.
+        delay: nominal delay of the electronics, already subtracted from the times of flight, s.
         channels: the distances of every element, or None.
         pixels: whether the measurements are pixels (static).
         spacing_known: whether ``spacing`` was given (static); if not, the scale must be estimated.
-        curved: whether the elements lie on an arc (static): only the channels then tell lateral
+        curved: whether the elements lie on an arc (static). If so, only the channels tell lateral
             position, range and elevational offset apart without bias.
     """
 
@@ -91,9 +91,9 @@ class Problem:
         return self.mask.shape[:-1]
 
     def cleared(self, used: Float[AnyArray, "*batch n"]) -> Problem:
-        """With harmless values where an image is not used: NaN times a mask of 0 is NaN, not 0.
+        """The problem with harmless values in images that are not used: NaN times 0 is NaN, not 0.
 
-        The mask stays as it is, and so do all shapes.
+        The mask and all shapes stay as they are.
 
         Args:
             used: 0 for images whose values are not to be read.
@@ -119,7 +119,7 @@ class Problem:
         )
 
     def points_only(self) -> Problem:
-        """Without what says more than points and poses."""
+        """The problem without channels, covariances, bounds, sound speed and delay."""
         return replace(
             self,
             channels=None,
@@ -147,7 +147,7 @@ class Problem:
         images = recording.calibration if isinstance(recording, Recording) else recording
         dtype = np.float64 if dtype is None else dtype
 
-        # Not jax.numpy.asarray of a number, which JAX would compile.
+        # device_put, since JAX would compile jax.numpy.asarray of a number.
         put: Any = sys.modules["jax"].device_put if "jax" in sys.modules else lambda array: array
 
         def array(values: np.ndarray | float) -> Any:
@@ -212,7 +212,7 @@ class Problem:
             dtype: float64 by default.
 
         Raises:
-            InputError: whatever cannot be a calibration problem, with the row named.
+            InputError: arrays that cannot be a calibration problem; the row is named.
         """
         images = make_images(
             poses,
@@ -229,10 +229,10 @@ class Problem:
 @importing_jax
 @in_own_modes
 def stack(problems: list[Problem]) -> Problem:
-    """Problems of one structure as a batch with one leading axis.
+    """Stack problems of the same structure into a batch with one leading axis.
 
     Args:
-        problems: each of one problem, at least one.
+        problems: at least one; none of them is a batch.
 
     Raises:
         InputError: where they differ in the number of images or in what they hold.

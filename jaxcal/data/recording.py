@@ -1,8 +1,8 @@
 """What was measured: poses, image measurements and their circumstances, in numpy and with units.
 
-A :class:`Recording` is one file's worth of data as it came in; a :class:`jaxcal.Problem` is what a
-solver eats. Recordings are checked when they are made, so that everything downstream may trust
-shapes, units and finiteness.
+A :class:`Recording` holds the data of one file as measured; a :class:`jaxcal.Problem` holds the
+arrays that a solver takes. Recordings are checked when they are made, so that all later code may
+rely on shapes, units and finite values.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MINIMUM_IMAGES = 4
 """With fewer used images nothing can be solved: 3 residuals an image against 9 unknowns."""
 
 LARGEST = 1e7
-"""No coordinate in mm or px, no variance of one, is larger: ten kilometres."""
+"""Largest coordinate accepted, in mm or px, and largest variance of one: ten kilometres."""
 
 Kind = Literal["point", "pixel", "time_of_flight"]
 _UNIT = {"point": "mm", "pixel": "px", "time_of_flight": "s"}
@@ -64,7 +64,7 @@ class Images:
 
 @dataclass(frozen=True)
 class Truth:
-    """What a simulation knows.
+    """The true values, which only a simulation knows.
 
     Attributes:
         image_to_probe: (4, 4) X, mm.
@@ -84,7 +84,7 @@ class Recording:
     Attributes:
         calibration: the images to calibrate with.
         test: the images of an independent test set, or None.
-        truth: what a simulation knows, or None.
+        truth: the true values of a simulation, or None.
         probe: the transducer, or None.
         source: the file that it came from, for messages.
     """
@@ -115,7 +115,7 @@ def make_images(
     minimum: int = MINIMUM_IMAGES,
     where: str = "",
 ) -> Images:
-    """Check somebody's arrays and make them one set of images.
+    """Check arrays and make one set of images of them.
 
     Args:
         poses: (n, 4, 4) probe -> tracker, mm.
@@ -240,7 +240,7 @@ def _make_images(
 def _raw_times(
     times: np.ndarray | None, kind: Kind, count: int, used: np.ndarray
 ) -> Float[np.ndarray, "n elements"] | None:
-    """Rows of images left out are kept: another segmentation may have a use for them."""
+    """Rows of images left out are kept, because another segmentation may use them."""
     if times is None:
         return None
     if kind != "point":
@@ -259,7 +259,7 @@ def _raw_times(
 
 
 def _check_magnitude(name: str, values: np.ndarray, used: np.ndarray) -> None:
-    """Refuse what no unit makes sense of, before it overflows somewhere; NaN and Inf come later."""
+    """Refuse numbers too large in any unit, before they overflow; NaN and Inf are checked later."""
     rows = np.abs(values.reshape(len(used), -1)) if len(used) else np.zeros((0, 1))
     bad = (np.isfinite(rows) & (rows > LARGEST)).any(axis=1) & used
     if bad.any():
@@ -318,7 +318,7 @@ def _covariance(
 
 
 def _check_units(images: Images) -> None:
-    """Refuse metres where millimetres are due; only what no real set-up can look like."""
+    """Refuse metres in place of millimetres, but only numbers that no real set-up gives."""
     used = images.mask
     if not used.any():
         return

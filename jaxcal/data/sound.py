@@ -1,4 +1,4 @@
-"""The speed of sound: in water from its temperature, and what can be one at all."""
+"""The speed of sound: in water from its temperature, and a check of given values."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxcal.runtime.array_types import Float
 _MARCZAK = (1.402385e3, 5.038813, -5.799136e-2, 3.287156e-4, -1.398845e-6, 2.787860e-9)
 
 WATER_M_S = 1490.0
-"""Of water at room temperature: what is assumed where nobody says otherwise."""
+"""Speed of sound in water at room temperature, assumed where none is given."""
 
 SLOWEST_M_S, FASTEST_M_S = 100.0, 10_000.0
 

@@ -1,8 +1,8 @@
 """Time alignment: poses between samples, a device's clock against the host's, a stream's latency.
 
-A pose and an image that belong together carry stamps of different clocks. Three steps make one of
-them: :func:`fit_clock` takes device stamps to the host's clock; :func:`estimate_latency` finds
-what remains, the time by which images lag behind poses, from a motion that both show;
+A pose and an image that belong together have time stamps of different clocks. Three steps match
+them: :func:`fit_clock` converts device stamps to the host's clock; :func:`estimate_latency` finds
+the remaining time by which images lag behind poses, from a motion that both show;
 :func:`interpolate_poses` gives the pose at an image's time, and refuses where it would have to
 guess.
 
@@ -102,7 +102,7 @@ def interpolate_poses(
 
     Raises:
         InputError: a time before the first pose or after the last, in a gap, or next to a pose
-            that cannot be used; the time is named. :func:`can_interpolate` tells beforehand.
+            that cannot be used; the time is named. :func:`can_interpolate` checks it beforehand.
     """
     times = _increasing(t, "time of pose")
     asked = np.asarray(query, dtype=np.float64)
@@ -132,12 +132,12 @@ class ClockFit:
     """A device's clock in terms of the host's: host = device + offset + drift (device - reference).
 
     Attributes:
-        offset_s: host minus device at the reference, with the shortest delay in it: stamps alone
-            cannot tell a clock that is late from a message that is.
+        offset_s: host minus device at the reference. It includes the shortest delay, since stamps
+            alone cannot tell a late clock from a late message.
         drift: seconds per second by which the host's clock gains.
-        reference_s: device time at which the offset is meant.
-        delay_s: (n,) what is left: by how much each sample was later (regression: or earlier)
-            than the line.
+        reference_s: device time at which the offset holds.
+        delay_s: (n,) s, residuals: by how much each sample was later than the line (with
+            ``regression``, negative if earlier).
         method: ``envelope`` or ``regression``.
     """
 
@@ -161,15 +161,16 @@ def fit_clock(
 ) -> ClockFit:
     """Offset and drift between a device's clock and the host's, from stamps of the same samples.
 
-    ``envelope``: messages come late, never early. The line sought lies under all samples (device,
-    host - device) and as near to them as can be, in the sum of distances: the edge of their lower
-    convex hull over the mean device time (Moon, Skelly and Towsley 1999, "Estimation and removal
-    of clock skew from network delay measurements", INFOCOM; there a linear programme). Load on
-    the host, which delays many samples by much, does not move it; a single stamp that is wrongly
+    ``envelope``: messages come late, never early. The line lies below all samples (device,
+    host - device) and has the least sum of distances to them. It is the edge of their lower convex
+    hull at the mean device time (Moon, Skelly and Towsley 1999, "Estimation and removal of clock
+    skew from network delay measurements", INFOCOM, who solve a linear programme). Load on the
+    host, which delays many samples by much, does not move the line; a single stamp that is wrongly
     early does.
 
-    ``regression``: the line through host stamps of equal jitter either way, which Theil and Sen's
-    median of slopes keeps from outliers; for device stamps that are a frame count times a period.
+    ``regression``: the line for host stamps whose jitter is equal in both directions. Theil and
+    Sen's median of slopes makes it robust to outliers. It is for device stamps that are a frame
+    count times a period.
 
     Args:
         t_device: (n,) device times, s, increasing.
@@ -183,7 +184,7 @@ def fit_clock(
     host = np.asarray(t_host, dtype=np.float64)
     if host.shape != device.shape or not np.isfinite(host).all():
         raise InputError(f"host times must be {len(device)} numbers, one for each device time")
-    # Stamps since 1970 have few digits left for microseconds: count from the samples' own start.
+    # Seconds since 1970 have few digits left for microseconds: count from the first sample.
     reference = float(device[0])
     x, y = device - reference, host - device
     base = float(y[0])
@@ -198,14 +199,14 @@ def fit_clock(
 
 
 def _theil_sen(x: np.ndarray, y: np.ndarray, most: int = 1000) -> float:
-    """Median of the slopes of all pairs; n^2, so of a long recording every so many samples."""
+    """Median of the slopes of all pairs. There are n^2, so long recordings are thinned out."""
     step = -(-len(x) // most)
     fit: Any = theilslopes(y[::step], x[::step])
     return float(fit.slope)
 
 
 def _lower_envelope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Slope and level of the edge of the lower convex hull above which the mean of x lies."""
+    """Slope and level of the edge that the lower convex hull has at the mean of x."""
     hull: list[int] = []
     for i in range(len(x)):
         while len(hull) > 1:
@@ -260,16 +261,16 @@ def estimate_latency(
     As in PLUS's temporal calibration (Lasso et al. 2014, IEEE Trans. Biomed. Eng. 61, 2527): the
     probe is moved to and fro; the video's signal stays fixed, the tracker's is moved along the time
     axis in steps of a millisecond, and the normalised correlation over the same samples tells how
-    well they agree. A parabola about the best gives the part of a step. The signals may
-    have any scale and sign.
+    well they agree. A parabola about the best lag refines it to a fraction of a step. The signals
+    may have any scale and sign.
 
     Args:
         t_video: (n,) stamps of the images, s, on the tracker's clock.
         video: (n,) position of something at rest as the images show it, in any unit.
         t_tracker: (m,) stamps of the poses, s.
         tracker_mm: (m,) position of the probe, mm (:func:`motion_along_main_axis`).
-        max_lag_s: largest lag looked for, either way.
-        step_s: of the search.
+        max_lag_s: largest lag looked for, in both directions.
+        step_s: step of the search.
         minimum_motion_mm: least span of the tracker's motion.
 
     Raises:
@@ -287,7 +288,7 @@ def estimate_latency(
         raise InputError("a motion holds NaN or Inf: leave those samples out")
     if not (0 < step_s <= max_lag_s and max_lag_s / step_s <= _MOST_STEPS):
         raise InputError(f"the step ({step_s:g} s) must be small against {max_lag_s:g} s")
-    # The same images at every lag, or lags with fewer of them would win by chance.
+    # The same images are used at every lag: a lag with fewer images could win by chance.
     used = (t_video - max_lag_s >= t_tracker[0]) & (t_video + max_lag_s <= t_tracker[-1])
     t, signal = t_video[used], video[used]
     if len(t) < 8 or t[-1] - t[0] < _SHORTEST_OVERLAP_S:
@@ -331,7 +332,7 @@ def _peak(lags: np.ndarray, correlation: np.ndarray, samples: int) -> Latency:
                 f"lags of {lags[best]:.3f} and {lags[other]:.3f} s fit alike: move the probe less "
                 "regularly"
             )
-    # Interpolation between samples makes kinks of the size of a step, so the parabola spans more.
+    # Interpolation between samples makes kinks of the size of a step, so the parabola is wider.
     step = lags[1] - lags[0]
     half = max(1, min(round(_PARABOLA_S / step), best, len(lags) - 1 - best))
     near = slice(best - half, best + half + 1)
@@ -339,8 +340,8 @@ def _peak(lags: np.ndarray, correlation: np.ndarray, samples: int) -> Latency:
     if bend >= 0:
         raise InputError("the best lag is no peak: move the probe farther or faster")
     shift = float(np.clip(-slope / (2 * bend), -half * step, half * step))
-    # With unit signals the lag's variance is that of the misfit, (1 - r^2) / n, over the power of
-    # the slope, -r'' / r, times r^2.
+    # With unit signals, the lag's variance is that of the misfit, (1 - r^2) / n, divided by the
+    # power of the slope, (-r'' / r) r^2.
     top = min(float(top), 1.0)
     sd = float(np.sqrt((1 - top**2) / (samples * top * -2 * bend)))
     return Latency(float(lags[best]) + shift, float(correlation[best]), sd)

@@ -27,13 +27,13 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
             replaced. An existing file keeps its permissions, a new one gets the umask's.
 
     Yields:
-        An existing, empty file in the same folder and with the same suffix. The block fills it,
-        and has closed it when it ends.
+        An existing, empty file in the same folder and with the same suffix. The block must fill it
+        and close it.
 
     Raises:
         OutputError: on any OSError (no such folder, no permission, a directory, disk full), the
-            block's own included. The temporary file is gone then, and the target as it was; so it
-            is after every other exception, which passes through.
+            block's own included. The temporary file is then removed and the target is as it was.
+            The same holds after every other exception, which is passed on.
     """
     name = os.fspath(target)
     try:
@@ -73,7 +73,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     Raises:
         OutputError: it could not be written; the file is as it was.
     """
-    # Names of files that are not UTF-8 reach us as lone surrogates, which have no encoding.
+    # File names that are not UTF-8 reach us as lone surrogates, which UTF-8 cannot encode.
     content = text.encode("utf-8", errors="backslashreplace")
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
@@ -97,7 +97,7 @@ def _existing_mode(final: Path) -> int | None:
 
 
 def _create_beside(final: Path, mode: int | None) -> Path:
-    # Not mkstemp: its 0600 would outlive the renaming, and reading the umask means setting it.
+    # Not mkstemp: its mode 0600 would stay after renaming, and to read the umask is to set it.
     temporary = final.parent / f".partial-{secrets.token_hex(8)}{final.suffix}"
     created = 0o666 if mode is None else (mode & 0o666) | 0o600
     os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, created))

@@ -1,4 +1,4 @@
-"""What the columns of a table are, by the names in its header.
+"""The meaning of a table's columns, by the names in its header.
 
 Names are compared without case, blanks and underscores. A unit may stand in brackets or behind an
 underscore: ``tx [mm]``, ``time (ms)``, ``u_px``.
@@ -64,7 +64,7 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Columns:
-    """Where in a row everything is; column numbers from 0.
+    """Which columns of a row hold what; column numbers count from 0.
 
     Attributes:
         width: number of columns.
@@ -204,7 +204,7 @@ def _quaternion(
 def _matrix(
     rest: list[int], bases: list[str], translation: tuple[int, ...] | None
 ) -> tuple[tuple[int, ...] | None, list[int]]:
-    """Columns of a matrix row by row, and those that are of no matrix."""
+    """Columns of a matrix row by row, and those that belong to no matrix."""
     if not rest:
         return None, []
     cells = [_CELL.fullmatch(bases[index]) for index in rest]

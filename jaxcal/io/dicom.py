@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pydicom import Dataset
 
 _MOST_BYTES = 2**24
-"""Read of a file: what stands before the pixels of a clip is a few KiB."""
+"""Most bytes read of a file; the data before the pixels of a clip are a few KiB."""
 _MOST_REGIONS = 64
 _TWO_DIMENSIONAL, _CM, _MM_PER_CM = 1, 3, 10.0
 _PLAUSIBLE_MM = (1e-3, 5.0)
@@ -51,12 +51,12 @@ def read_pixel_size(path: str | os.PathLike[str]) -> PixelSize:
     """The pixel size that a DICOM clip states.
 
     Args:
-        path: with ultrasound regions; needs pydicom (``jaxcal[dicom]``).
+        path: a file with ultrasound regions; needs pydicom (``jaxcal[dicom]``).
 
     Raises:
         MissingExtraError: pydicom is not installed.
         FormatError: no DICOM file, damaged, no two-dimensional region in cm, or several with
-            other sizes; one line that starts with the path.
+            different pixel sizes; one line that starts with the path.
     """
     name = os.fspath(path)
     check_readable(path)
@@ -87,10 +87,10 @@ def _dataset(name: str) -> Dataset:
     except ImportError:
         raise MissingExtraError(f"{name}: needs pydicom: pip install 'jaxcal[dicom]'") from None
     with open(name, "rb") as file:
-        # A length claimed in the file cannot ask for more than this holds.
+        # Whatever length the file claims, no more than this is read.
         content = BytesIO(file.read(_MOST_BYTES))
     try:
-        # One packed as a whole would be unpacked without a bound; nobody's clips are.
+        # A file deflated as a whole would be unpacked without a bound; real clips are not deflated.
         if _DEFLATED.encode() in content.getvalue()[:4096]:
             raise FormatError(f"{name}: is deflated as a whole, which is not read")
         return dcmread(content, stop_before_pixels=True)

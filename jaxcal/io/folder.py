@@ -67,13 +67,14 @@ def with_pose_table(images: TrackedSequence, table: PoseTable) -> tuple[TrackedS
         images: of :func:`read_folder`.
         table: of poses from probe to tracker. Rows belong to images by a column ``file``, by a
             column ``frame`` (the number that ends the name of the file), or, without either, in
-            their order; then there must be as many.
+            their order; then there must be as many rows as images.
 
     Returns:
-        The sequence, in which images without a pose are not valid; and what there is to say.
+        The sequence, in which images without a pose are not valid; and notes for the user.
 
     Raises:
-        InputError: rows that belong to no image or to the same one; one line with file and line.
+        InputError: a row that belongs to no image, or two rows of the same image; one line with
+            file and line.
     """
     assert isinstance(images.pixels, FolderPixels)
     if table.poses is None:
@@ -108,7 +109,7 @@ def with_pose_table(images: TrackedSequence, table: PoseTable) -> tuple[TrackedS
 
 
 def _rows(images: TrackedSequence, paths: tuple[Path, ...], table: PoseTable) -> np.ndarray:
-    """Which image each row of the table is of."""
+    """The image that each row of the table belongs to."""
     if table.file is not None:
         places = {path.name: index for index, path in enumerate(paths)}
         places |= {path.stem: index for path, index in zip(paths, places.values(), strict=True)}

@@ -30,8 +30,8 @@ def check_frame(name: str) -> str:
     """A frame's name that PLUS and Slicer accept, capitalised.
 
     Raises:
-        FormatError: anything but letters and digits that begins with a letter, or a name in which
-            "To" stands before a capital letter: ``ProbeToTracker`` could not be split again.
+        FormatError: a name that is not letters and digits after a first letter, or in which "To"
+            stands before a capital letter: ``ProbeToTracker`` could not be split again.
     """
     capital = capitalised(name)
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*", name) or _SEPARATOR.search(capital):

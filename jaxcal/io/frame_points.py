@@ -16,8 +16,8 @@ from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Float, Int
 
 Assignment = Literal["order", "labels"]
-"""How points without a time or a frame's number belong to frames: one for each frame in their
-order, or by the number that ends each point's label, frames counted from 0."""
+"""How points without a time or a frame's number are assigned to frames: one for each frame in
+order, or by the number at the end of each point's label, with frames counted from 0."""
 
 _SLACK = 0.5
 """A point belongs to the frame nearest in time, within this part of the median interval."""
@@ -45,7 +45,7 @@ def points_of_markups(
     """Points placed in Slicer.
 
     Raises:
-        InputError: a list that cannot be read, or points that belong to no frame, or to the same.
+        InputError: a list that cannot be read, a point in no frame, or two points in the same one.
     """
     name = os.fspath(source)
     markups = read_markups(source)
@@ -62,7 +62,7 @@ def points_of_table(
     """Points of a table, by frame, by time, or in order.
 
     Raises:
-        InputError: no points, or points that belong to no frame, or to the same.
+        InputError: no points, a point in no frame, or two points in the same one.
     """
     if table.points is None:
         raise InputError(f"{table.name}: holds no points (columns u and v, or lateral and range)")

@@ -15,8 +15,8 @@
     /segmentation  where the points came from, for other programs; not read (see _write_fate,
                  _write_frames)
 
-Where both ``point`` and ``time_of_flight`` are there, the points were segmented from the times: the
-points are what is read, and the times are kept beside them. Datasets may have a ``units``
+If a group has both ``point`` and ``time_of_flight``, the points were segmented from the times. The
+points are then the measurements, and the times are kept beside them. Datasets may have a ``units``
 attribute; one that differs is refused.
 """
 
@@ -112,7 +112,7 @@ def save(
             :func:`jaxcal.data.recording.make_images`, or are too large).
         OutputError: the file could not be written; it is as it was.
     """
-    # Built in memory: HDF5 takes a full disk badly, an ordinary write reports it.
+    # Built in memory: HDF5 handles a full disk badly, but an ordinary write reports it.
     image = io.BytesIO()
     with h5py.File(image, "w") as file:
         _write(file, recording)
@@ -359,7 +359,7 @@ def _write_fate(target: h5py.Group, found: Segmentation) -> None:
 
 
 def _write_frames(target: h5py.Group, found: FrameResults) -> None:
-    """What became of every frame of a sequence; ``frame`` are those of /calibration, in order."""
+    """What became of every frame; ``frame`` has the numbers of those in /calibration, in order."""
     target.attrs["method"] = found.target
     target.attrs["fates"] = ", ".join(FATES)
     _put(target, "frame", found.found, _FREE)

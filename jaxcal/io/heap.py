@@ -6,12 +6,12 @@ its bytes padded to 8; index 0 is the free rest, whose size includes its header.
 without checking that it moves on, so one flipped byte makes it loop for ever, in C code that no
 signal or time-out of ours can end (HDFGroup/hdf5 issue 1707, h5py issue 2088).
 
-So HDF5 reads an untrusted file through :class:`CheckedFile`: whatever it asks for is searched for
-the beginning of a heap, and a heap that begins there is walked in Python before HDF5 gets the
-bytes. Nothing else of the file is read, so that the cost does not depend on the file's size.
+So HDF5 reads an untrusted file through :class:`CheckedFile`. All bytes that it asks for are
+searched for the beginning of a heap, and a heap that begins there is walked in Python before HDF5
+gets the bytes. Nothing else of the file is read, so that the cost does not depend on its size.
 
-What this does not see is a reference to a heap that lies about the length of its text: HDF5 then
-allocates that much, at most 4 GiB, before it notices and reports an error.
+One kind of damage is not detected: a reference to a heap that states a wrong length for its text.
+HDF5 then allocates that much, at most 4 GiB, before it notices and reports an error.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from jaxcal import FormatError
 
 _LARGEST_HEAP = 2**26
 _MOST_BYTES = 2**28
-"""Of all heaps together; every one is walked once."""
+"""Most bytes of all heaps together; every heap is walked once."""
 
 _MOST_OBJECTS = 10**6
 _LOOKALIKE = 10
-"""Objects that a place counts for where only the first bytes are a heap's."""
+"""Number of objects that a place counts for if only its first bytes are those of a heap."""
 
 _START = b"GCOL\x01"
 _BEFORE = len(_START) - 1
@@ -40,11 +40,11 @@ class CheckedFile(io.RawIOBase):
 
     Args:
         source: a path or a binary file object that can seek.
-        length: bytes that the file is to have, zeros beyond its end; None: those it has.
+        length: bytes that the file is to have, with zeros beyond its end; None: its own length.
 
     Attributes:
-        damage: what was found; HDF5 gets zeros in place of such a heap, and an exception. Its
-            own error hides this one, so whoever reads must ask.
+        damage: what was found. HDF5 gets zeros in place of a damaged heap, and an exception. Its
+            own error hides this one, so the reader must look at this attribute.
 
     Raises:
         BlockingIOError: another program has the file open for writing.
@@ -134,10 +134,10 @@ class CheckedFile(io.RawIOBase):
             place = data.find(_START, place + 1)
 
     def _walk(self, heap: int) -> None:
-        """Walk the objects of one collection as HDF5 does, but with the eyes open."""
+        """Walk the objects of one collection as HDF5 does, but with checks."""
         header = self._read(heap + 8, 8)
         length = int.from_bytes(header, "little")
-        # The five bytes may be anything; HDF5 takes no heap beyond the file's end.
+        # The five bytes may be other data: HDF5 accepts no heap beyond the file's end.
         if len(header) < 8 or length > self._length - heap:
             self._spend(0, _LOOKALIKE)
             return
@@ -162,7 +162,7 @@ class CheckedFile(io.RawIOBase):
 
 
 def _lock(descriptor: int) -> None:
-    """HDF5's own lock of a file that it reads, which it does not take through a file object."""
+    """Take the lock that HDF5 takes itself when it reads a file by its path."""
     if os.environ.get("HDF5_USE_FILE_LOCKING", "").upper() in ("FALSE", "0"):
         return
     try:

@@ -1,9 +1,9 @@
-"""From other programs' files to a recording: poses from one, points from another, or from pixels.
+"""Recordings from other programs' files: poses from one, points from another, or from pixels.
 
-A sequence (:mod:`jaxcal.io.sequence`) has the poses and perhaps the frames. Where the target is in
-them comes from a table, from points placed in Slicer, or from segmenting the frames. Frames whose
-tracking was not OK are left out and counted, as are those without a point; what was assumed is
-told in words.
+A sequence (:mod:`jaxcal.io.sequence`) has the poses and perhaps the frames. The target's position
+in the frames comes from a table, from points placed in Slicer, or from segmenting the frames.
+Frames whose tracking was not OK are left out and counted, as are those without a point. Notes say
+in words what was assumed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from jaxcal.runtime.array_types import Bool, Float, Int
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What is asked for beside the files.
+    """The options of an import.
 
     Attributes:
         source: tracked frame on the probe; the sequence's only one, or ``Probe``, by default.
@@ -46,7 +46,7 @@ class ImportOptions:
         quaternion: where a quaternion's scalar stands.
         pose_units: of translations in tables.
         skip_invalid: leave out rows of tables that are marked as invalid, and count them.
-        points: how points without time or number belong to frames.
+        points: how points without time or number are assigned to frames.
         target_kind: what to look for in frames where no points are given: ``echo`` or ``cross``.
         region: (first column, first row, columns, rows) to look in, px.
         orientation: of the stored pixels, where the file does not say.
@@ -75,7 +75,7 @@ class ImportOptions:
 
 
 class Imported(NamedTuple):
-    """A recording and how it came to be.
+    """A recording and how it was made.
 
     Attributes:
         recording: of the files.
@@ -91,7 +91,7 @@ class Imported(NamedTuple):
 def import_files(
     sources: Sequence[str | os.PathLike[str]], options: ImportOptions | None = None
 ) -> Imported:
-    """Make a recording of other programs' files.
+    """Make a recording from other programs' files.
 
     Args:
         sources: one of: a table with poses and points; a sequence, a folder of PNG or a tracker's
@@ -100,7 +100,7 @@ def import_files(
         options: what is asked for.
 
     Returns:
-        The recording, and what there is to say of it.
+        The recording, with notes, and with results for every frame if frames were segmented.
 
     Raises:
         InputError: files that cannot be read or do not belong together; one line that names the
@@ -133,7 +133,7 @@ _SEQUENCES = ("sequence", "tracker", "scan", "folder")
 
 
 def is_sequence(source: str | os.PathLike[str]) -> bool:
-    """Whether a source is one of frames or tracking: a sequence, a folder, a tracker's export."""
+    """Whether a source has frames or tracking: a sequence, a folder, a tracker's export."""
     return _kind(source) in _SEQUENCES
 
 
@@ -232,7 +232,7 @@ def _from_sequence(
 def open_sequence(
     source: str | os.PathLike[str], options: ImportOptions
 ) -> tuple[TrackedSequence, list[str]]:
-    """A sequence of any kind with the poses that belong to it, and what there is to say.
+    """A sequence of any kind with the poses that belong to it, and notes for the user.
 
     Args:
         source: a sequence, a folder of PNG, a tracker's export or a TUS-REC scan.
@@ -278,7 +278,7 @@ def tracked_poses(
     if options.poses is None:
         start, end, notes = _frames(sequence, options)
     else:
-        # Said when they were matched.
+        # The assumptions were noted when the poses were matched.
         (start, end), notes = next(iter(sequence.transforms)), []
     poses, valid = sequence.poses(start, end)
     lost = len(sequence) - int(valid.sum())
@@ -406,7 +406,7 @@ def _segmented(
     options: ImportOptions,
     notes: list[str],
 ) -> Imported:
-    """The target looked for in every frame that was tracked."""
+    """Search for the target in every frame that was tracked."""
     results = search_target(
         sequence, valid, options.target_kind, region=options.region, orientation=options.orientation
     )

@@ -51,7 +51,7 @@ def matrix_from_itk(
         fixed: centre of rotation c; the offset is t + c - A c.
 
     Raises:
-        FormatError: another kind or other numbers.
+        FormatError: another kind, or parameters that do not belong to the kind.
     """
     name = kind.split("_")[0]
     parameters, fixed = np.asarray(parameters, float), np.asarray(fixed, float)
@@ -208,7 +208,7 @@ def _length(node: Node) -> int:
 
 
 def _text(node: Node) -> str:
-    """The one string of a dataset, whose type and place are looked at before it is read."""
+    """The one string of a dataset; its type and storage are checked before it is read."""
     try:
         dataset = node.item
         assert isinstance(dataset, h5py.Dataset)

@@ -21,7 +21,7 @@ def text_lines(
 
     Args:
         path: the file.
-        comments: also those that begin with ``#``.
+        comments: yield lines that begin with ``#``, too.
 
     Raises:
         FormatError: cannot be read, too large, not text; one line with path and line.
@@ -41,7 +41,7 @@ def text_lines(
         line = text.count("\n", 0, text.index("\0")) + 1
         raise FormatError(f"{name}:{line}: is not text (UTF-8): it holds a zero byte")
     del content
-    # Not splitlines: it also breaks at form feeds and the like, and then no editor's numbers match.
+    # Not splitlines: it also breaks at form feeds and the like, where editors count no new line.
     for number, line in enumerate(io.StringIO(text, newline=None), start=1):
         if line.strip() and (comments or not line.lstrip().startswith("#")):
             yield number, line.rstrip("\n")

@@ -58,7 +58,7 @@ def read_metaimage(path: Path, name: str) -> TrackedSequence:
     _check_data_name(fields["ElementDataFile"])
     kind = fields.get("ElementType", "")
     pixels = None
-    # Three forms of tracking alone: 0 0 N with either type, and 1 1 N with one dummy pixel a frame.
+    # Tracking alone has three forms: 0 0 N with either type, or 1 1 N with a dummy pixel a frame.
     if kind != "MET_OTHER" and columns > 1 and rows > 1:
         pixels = _metaimage_pixels(path, header, columns, rows, count)
     return sequence_of(header, count, pixels, "ImageStatus", name)

@@ -7,13 +7,13 @@ big-endian ``version u16, type char[12], device char[20], time stamp u32 s + u32
 size u64, CRC-64 of the body u64``; in header version 2 the body begins with an extended header
 that holds a message id, and ends with metadata. What is read here comes from a socket and is not
 trusted: sizes are bounded, counts must agree with sizes, and nothing is allocated for what has
-not arrived. The protocol's CRC is the body's: a wrong bit in a header's name or time stamp
-passes, since nothing tells. The CRC-64 is ECMA-182, not reflected, zero at the start.
+not arrived. The protocol's CRC covers the body only: a wrong bit in a header's name or time
+stamp is not detected. The CRC-64 is ECMA-182, not reflected, zero at the start.
 
-Units: translations are mm; an image's spacing is mm per pixel. Only plane images are taken: of one
-component, uint8 (B-mode) or int16, or in colour of three uint8, which become grey. No wire format
-for RF channel data is public; that such data come as an int16 IMAGE of the device ``RF``, samples
-down and lines across, is **an assumption**.
+Units: translations are mm; an image's spacing is mm per pixel. Only plane images are accepted: with
+one component, uint8 (B-mode) or int16, or in colour with three of uint8, which become grey. No wire
+format for RF channel data is public. It is **an assumption** that such data come as an int16 IMAGE
+of the device ``RF``, with samples down and lines across.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ RF_DEVICE = "RF"
 """Device name under which RF channel data are assumed to come."""
 
 MAXIMUM_BODY = 32 << 20
-"""Largest body taken, bytes; every size beyond is a broken header."""
+"""Largest body accepted, bytes; a larger size means a broken header."""
 
 _HEADER = struct.Struct(">H12s20sIIQQ")
 _EXTENDED = struct.Struct(">HHII")
@@ -44,7 +44,7 @@ _METADATA = struct.Struct(">HHI")
 _MOST_METADATA = 64
 _US_ASCII = 3
 _TRANSFORM_STATUS = "TransformStatus"
-"""Under this name PlusServer sends the status with a TRANSFORM."""
+"""Name under which PlusServer sends a status with a TRANSFORM."""
 _SMALL = 1 << 16
 _MOST_TRACKED = 256
 _LARGEST = {
@@ -92,7 +92,7 @@ class Tracked:
 
 @dataclass(frozen=True)
 class StatusMessage:
-    """Content of a STATUS: code 1 is well, the rest are listed in the protocol."""
+    """Content of a STATUS: code 1 means OK, the others are listed in the protocol."""
 
     code: int
     subcode: int
@@ -146,8 +146,8 @@ class Message:
         device: name of the sender's device.
         t_device: s of the sender's clock, NaN where it is not set.
         message_id: of header version 2; 0 where there is none.
-        content: None of types that are not read here.
-        t_host: arrival of the message's first bytes, as the receiver was told.
+        content: None for types that are not read here.
+        t_host: arrival of the message's first bytes, as stated by the receiver.
     """
 
     kind: str
@@ -179,13 +179,13 @@ def parse_header(data: bytes | bytearray | memoryview) -> Header | None:
 
 
 BEGINNING = _EXTENDED.size + _IMAGE.size
-"""So many bytes of a body tell :func:`size_agrees` all that it asks."""
+"""Bytes at the beginning of a body that :func:`size_agrees` needs."""
 
 
 def size_agrees(header: Header, beginning: bytes | bytearray | memoryview) -> bool:
-    """Whether the size in a header is the one that the beginning of the body asks for.
+    """Whether the size in a header agrees with the beginning of the body.
 
-    A wrong bit in the size would have megabytes waited for; an image says itself how large it is.
+    With a wrong bit in the size, we would wait for megabytes; an image itself states its size.
 
     Args:
         header: parsed.
@@ -198,7 +198,7 @@ def size_agrees(header: Header, beginning: bytes | bytearray | memoryview) -> bo
         size, names, metadata, _ = _EXTENDED.unpack_from(beginning)
         around = size + names + metadata
         if size != _EXTENDED.size:
-            # Larger ones are allowed; where the content begins is then not in the beginning.
+            # Larger headers are allowed; then the content may begin after ``beginning``.
             return size > _EXTENDED.size and header.size >= around
     if header.kind == "TRANSFORM":
         return header.size == around + _TRANSFORM.size
@@ -209,7 +209,7 @@ def size_agrees(header: Header, beginning: bytes | bytearray | memoryview) -> bo
         return False
     _, components, scalar, _, _, width, height, depth, *_ = _IMAGE.unpack_from(beginning, start)
     voxels = components * width * height * depth * _BYTES.get(scalar, 0)
-    # Of a part of an image fewer voxels come than it has.
+    # If only a part of an image is sent, there are fewer voxels than its size says.
     return header.size <= around + _IMAGE.size + voxels and (
         header.size == around + _IMAGE.size + voxels or _is_part(beginning, start)
     )
@@ -224,7 +224,7 @@ def decode_body(header: Header, body: bytes, t_host: float = math.nan) -> Messag
     """The message of a body whose CRC has been checked.
 
     Raises:
-        ContentError: sizes that do not agree, or an image of a kind that is not taken.
+        ContentError: sizes that do not agree, or an image of a kind that is not accepted.
     """
     content, metadata, message_id = _content_bytes(header, body)
     found: Content = None
@@ -238,7 +238,7 @@ def decode_body(header: Header, body: bytes, t_host: float = math.nan) -> Messag
         case "STATUS":
             found = _status(content)
         case "TRACKEDFRAME":
-            # That module needs this one.
+            # Imported late, since that module imports this one.
             from jaxcal.io.tracked_frame import decode_tracked_frame
 
             found = decode_tracked_frame(content)
@@ -260,7 +260,7 @@ def _content_bytes(header: Header, body: bytes) -> tuple[memoryview, dict[str, s
 
 
 def _metadata(view: memoryview, size: int) -> dict[str, str]:
-    """Names and values: a table of their sizes, then their texts one behind the other."""
+    """Names and values: a table of their sizes, then their texts one after the other."""
     if size < 2:
         return {}
     count = int.from_bytes(view[:2], "big")
@@ -297,7 +297,7 @@ def _image(content: memoryview) -> Picture:
     if len(content) != _IMAGE.size + width * height * components * kind.itemsize:
         raise ContentError(f"{len(content)} bytes are not an image of {width} x {height} pixels")
     across, down = np.array(numbers[3:9], float).reshape(2, 3)
-    # The wire has float32: 0.1 mm, not 0.10000000149.
+    # Numbers are sent as float32: this gives 0.1 mm, not 0.10000000149.
     spacing = (float(f"{np.linalg.norm(across):.7g}"), float(f"{np.linalg.norm(down):.7g}"))
     if not all(math.isfinite(step) and step > 0 for step in spacing):
         raise ContentError(f"an image spacing of {spacing} mm")

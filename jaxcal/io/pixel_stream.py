@@ -1,4 +1,4 @@
-"""Pixels of a file in their order, without what is not asked for; its sizes are not trusted."""
+"""Pixels of a file in order, without those not asked for; the file's sizes are not trusted."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _MOST_INFLATION = 1032
 class PixelStream:
     """Read forwards from a place in a file, unpacking on the way; a context manager.
 
-    Memory is one request's, whatever the file claims.
+    Memory is needed for one request at a time, whatever the file claims.
 
     Args:
         path: the file.
         start: byte where the pixels begin.
         packing: ``raw``, ``zlib`` or ``gzip``.
-        size: bytes that the unpacked pixels have by the file's header.
+        size: bytes of the unpacked pixels according to the file's header.
 
     Raises:
-        FormatError: fewer bytes than the header says, or packed bytes that cannot be as many.
+        FormatError: fewer bytes than the header says, or packed bytes that cannot hold as many.
     """
 
     def __init__(self, path: Path, start: int, packing: Packing, size: int) -> None:

@@ -28,7 +28,7 @@ _ROOT = "PlusConfiguration"
 _COORDINATES = "CoordinateDefinitions"
 
 PIXELS_AGREE = 2e-3
-"""Relative: fCal's own two statements of the pixel size differ by up to 7e-4."""
+"""Relative tolerance: fCal's own two statements of the pixel size differ by up to 7e-4."""
 
 
 @dataclass(frozen=True)
@@ -111,9 +111,9 @@ class PlusResult:
     Attributes:
         transforms: ``ImageToProbe`` and others, by their frames.
         calibration_error_mm: mean of the lowest 95 % of the calibration's errors, by PLUS.
-        validation_error_mm: the same of the validation's.
-        calibration: frames that were calibrated with.
-        validation: frames that were not.
+        validation_error_mm: the same for the validation's errors.
+        calibration: frames used for the calibration.
+        validation: frames used for the validation.
     """
 
     transforms: tuple[PlusTransform, ...]
@@ -303,7 +303,7 @@ def transform_element(
         newline: of the file.
 
     Raises:
-        InputError: a matrix that PLUS would not take, or names that it could not.
+        InputError: a matrix or names that PLUS would not accept.
     """
     matrix = np.asarray(matrix, dtype=np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
@@ -338,10 +338,10 @@ def patched_configuration(
     error_mm: float | None = None,
     date: datetime.datetime | None = None,
 ) -> tuple[bytes, list[str]]:
-    """A configuration in which one transform is another; every other byte stays as it is.
+    """A configuration with one transform replaced; every other byte stays as it is.
 
-    The element between the two frames, in either direction, is replaced (PLUS refuses both at
-    once). Without one the transform is put at the end of CoordinateDefinitions.
+    The element between the two frames, in either direction, is replaced (PLUS refuses a file with
+    both). If there is none, the transform is added at the end of CoordinateDefinitions.
 
     Args:
         content: of the configuration's file.
@@ -351,10 +351,10 @@ def patched_configuration(
         date: stated in PLUS's form.
 
     Returns:
-        The new content, and what a person should know.
+        The new content, and notes for the user.
 
     Raises:
-        FormatError: not a configuration, or one that PLUS would refuse then: several transforms
+        FormatError: not a configuration, or a new one that PLUS would refuse: several transforms
             between the frames, or another path from one to the other.
         InputError: a matrix or names that cannot be written.
     """
@@ -435,10 +435,10 @@ def patch_configuration(
         date: stated in PLUS's form.
 
     Returns:
-        What a person should know.
+        Notes for the user.
 
     Raises:
-        FormatError: see there; one line that starts with the path.
+        FormatError: see :func:`patched_configuration`; one line that starts with the path.
         OutputError: the file could not be written; it is as it was.
     """
     _, content = read_xml(path)
@@ -452,7 +452,7 @@ def patch_configuration(
 
 
 def _ascii(text: str) -> bytes:
-    """An element for a file of whatever encoding: beyond ASCII, characters by their number."""
+    """An element for a file of any encoding: characters beyond ASCII are written by number."""
     return text.encode("ascii", "xmlcharrefreplace")
 
 
@@ -478,7 +478,7 @@ def _indent(content: bytes, position: int) -> str:
 def _stale_scale(
     elements: list[Element], wanted: FramePair, matrix: Float[np.ndarray, "4 4"]
 ) -> list[str]:
-    """PLUS keeps the pixel size once more, between two frames of the transducer."""
+    """A note if PLUS's second statement of the pixel size, for the transducer, differs."""
     if wanted[0] != "Image":
         return []
     scale = np.linalg.norm(np.asarray(matrix)[:3, :2], axis=0)
@@ -495,7 +495,7 @@ def _stale_scale(
 
 
 def _other_sources(root: Element, elements: list[Element], wanted: FramePair) -> list[str]:
-    """What PLUS learns of the first frame only while it runs, and what then goes wrong.
+    """Notes on transforms of the first frame that PLUS gets only while it runs, and that conflict.
 
     Source: PlusLib, vtkPlusUsDevice; IGSIO, vtkIGSIOTransformRepository::SetTransform.
     """

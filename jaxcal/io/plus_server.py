@@ -52,8 +52,8 @@ def update_transform(
         timeout_s: longest time to wait for the connection and the reply.
 
     Returns:
-        What the server says. It keeps the transform until it ends, and writes it to its file on the
-        command SaveConfig only.
+        What the server says. It keeps the transform until it ends, and only the command SaveConfig
+        makes it write the transform to its file.
 
     Raises:
         InputError: no connection, no reply in time, or the server refuses.
@@ -78,7 +78,7 @@ def update_transform(
 
 
 def _reply(link: socket.socket, device: str, due: float) -> bytes:
-    """The body of the message from a device; others are thrown away as they come."""
+    """The body of the message from a device; other messages are discarded."""
     while True:
         header = parse_header(_take(link, HEADER_SIZE, due))
         if header is None:

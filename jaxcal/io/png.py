@@ -1,4 +1,4 @@
-"""PNG files: grey frames in and out. Their sizes are looked at before anything is unpacked."""
+"""PNG files: grey frames in and out. Their sizes are checked before anything is unpacked."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_PIXELS = 2**24
 """Largest image that is read, px."""
 _MOST_BYTES = 2**28
 _WEIGHTS = (0.299, 0.587, 0.114)
-"""Of red, green and blue in grey, by ITU-R BT.601."""
+"""Weights of red, green and blue in grey, by ITU-R BT.601."""
 
 
 def png_size(path: str | os.PathLike[str]) -> tuple[int, int]:

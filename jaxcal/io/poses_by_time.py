@@ -32,12 +32,12 @@ def with_poses_by_time(
         time: (m,) of the poses, s, on the same clock.
         poses: (m, 4, 4), mm.
         valid: (m,) which of them can be used.
-        pair: from which frame to which they lead.
+        pair: frames (from, to) of the poses.
         source: file of the poses, for messages.
         lag_s: an image stamped t shows what was at t - lag.
 
     Returns:
-        The sequence, valid where a pose could be interpolated; and what there is to say.
+        The sequence, valid where a pose could be interpolated; and notes for the user.
 
     Raises:
         InputError: images or poses without times, times that go back, or no image between poses.

@@ -1,4 +1,4 @@
-"""What every reader asks of a file before it opens it, and how it quotes what it found."""
+"""Checks of a file before it is opened, and ways to quote its content in messages."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Transforms for ROS: tf2's static publisher and easy_handeye's YAML. Metres, scalar last.
 
 A transform here is the pose of a child frame in its parent, which is the matrix that takes the
-child's coordinates to the parent's: of the image in the probe it is the calibration itself. It is
-rigid, so it begins in the image plane in *metres*, not in pixels.
+child's coordinates to the parent's. For the image in the probe it is the calibration itself. It is
+rigid, so coordinates in the image are in *metres*, not in pixels.
 
 Source: tf2_ros static_transform_publisher; easy_handeye2.
 """
@@ -32,7 +32,7 @@ def _seven(matrix: Float[np.ndarray, "4 4"]) -> dict[str, str]:
 
 
 def _digits(value: float) -> str:
-    """All digits, with the decimal point without which YAML 1.1 takes 1e-05 for text."""
+    """All digits and a decimal point; without the point, YAML 1.1 reads 1e-05 as text."""
     text = repr(value + 0.0)
     return text.replace("e", ".0e") if "e" in text and "." not in text else text
 
@@ -71,7 +71,7 @@ def ros_yaml(
     Args:
         matrix: rigid, mm, child -> parent.
         parent: frame; easy_handeye2's ``robot_effector_frame``.
-        child: frame; its ``tracking_base_frame``.
+        child: frame; easy_handeye2's ``tracking_base_frame``.
 
     Raises:
         InputError: a matrix that is not rigid, or names that ROS does not take.

@@ -21,8 +21,8 @@ from jaxcal.io.readable import quoted
 from jaxcal.runtime.array_types import Bool, Float
 
 Orientation = Literal["MF", "UF", "MN", "UN"]
-"""Of pixels as they are stored: M or U, the marked or the unmarked side at the end of a row; F or
-N, far from or near to the transducer at the end of a column."""
+"""Orientation of stored pixels. M or U: a row ends at the marked or the unmarked side. F or N: a
+column ends far from or near to the transducer."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class TrackedSequence:
     def poses(
         self, source: str, target: str
     ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"]]:
-        """Poses from one frame to another, through whatever transforms lead there.
+        """Poses from one frame to another, through all transforms that are needed.
 
         Args:
             source: frame, for instance ``Probe``.

@@ -57,7 +57,7 @@ def write_sequence(
         path: ends in ``.mha``, ``.mhd`` or ``.nrrd``; the pixels of ``.mhd`` go to a ``.raw`` or
             ``.zraw`` beside it.
         transforms: (n, 4, 4), mm, by their frames (from, to).
-        time: (n,) s, at least a millisecond apart: Slicer tells frames by rounded milliseconds.
+        time: (n,) s, at least a millisecond apart: Slicer knows frames by rounded milliseconds.
         valid: (n,) by the same frames; where False the status is INVALID. All by default.
         images: n arrays (rows, columns), or (rows, columns, 3), uint8 or int16. None: tracking
             alone, one dummy pixel a frame, as PLUS writes it.

@@ -30,7 +30,7 @@ MAXIMUM_HEADER = 64 * 2**20
 """Largest header, bytes: some 60,000 frames."""
 MOST_FRAMES = 100_000
 LARGEST_FRAME = 2**26
-"""Bytes of one frame."""
+"""Most bytes of one frame."""
 
 _LONGEST_LINE = 2**16
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,18})_(.+)", re.DOTALL)
@@ -89,7 +89,7 @@ def whole_numbers(text: str, what: str) -> list[int]:
 
 
 def checked_pixels(pixels: Pixels, count: int) -> Pixels:
-    """The same, after sizes were compared with bounds and with the file."""
+    """The pixels, after their sizes were compared with bounds and with the file."""
     if pixels.channels not in (1, 3, 4):
         raise FormatError(f"{pixels.channels} channels a pixel; 1, 3 or 4 are read")
     if pixels.frame_bytes > LARGEST_FRAME:
@@ -97,13 +97,13 @@ def checked_pixels(pixels: Pixels, count: int) -> Pixels:
             f"a frame of {pixels.columns} x {pixels.rows} pixels is larger than "
             f"{LARGEST_FRAME} bytes"
         )
-    # Opening compares the claim with the file.
+    # Opening the stream compares the size with the file.
     with PixelStream(pixels.path, pixels.start, pixels.packing, pixels.frame_bytes * count):
         return pixels
 
 
 def check_count(count: int, header: SequenceHeader) -> None:
-    """Refuse absurd numbers of frames, and fields of frames that are not there."""
+    """Refuse absurd numbers of frames, and fields of frames that do not exist."""
     if count > MOST_FRAMES:
         raise FormatError(f"claims {count} frames; at most {MOST_FRAMES} are read")
     if count < 1:
@@ -254,7 +254,7 @@ def frame_fields(
 
 
 def written_orientation(orientation: str) -> str:
-    """With the third letter, which follows from the others: images are right-handed."""
+    """The orientation with its third letter; right-handed images leave no choice for it."""
     third = {"MF": "A", "UF": "D", "UN": "A", "MN": "D"}
     if orientation not in third:
         raise InputError(f"orientation must be MF, UF, MN or UN, not {quoted(orientation)}")

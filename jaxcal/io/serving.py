@@ -15,7 +15,7 @@ from jaxcal.io.openigtlink import Message, Tracked, encode
 from jaxcal.runtime.array_types import Float
 
 PORT = 18945
-"""Beside 18944, which PlusServer takes."""
+"""Default port; 18944 is PlusServer's."""
 
 MOST_CLIENTS = 32
 _LONGEST_NAME = 20
@@ -24,13 +24,13 @@ _LONGEST_NAME = 20
 class TransformServer:
     """Sends a transform to whoever connects, at once and then again and again; a context manager.
 
-    A client that takes nothing for so long that the system's buffer is full is disconnected. What
-    clients send is thrown away.
+    A client is disconnected if it reads nothing for so long that the system's buffer is full. What
+    clients send is discarded.
 
     Args:
         name: device name, for instance ``ImageToProbe``; at most 20 bytes.
         matrix: (4, 4), mm; sent as it is, row by row becoming column by column, in float32.
-        host: address to listen at; other machines can connect to none but their own network's.
+        host: address to listen at; other machines can connect only to one in their network.
         port: 0 takes a free one.
 
     Raises:
@@ -128,7 +128,7 @@ class TransformServer:
             sent = client.send(message)
         except OSError:
             sent = -1
-        # A message that was cut in two could not be told from the next one.
+        # After a part of a message a client could not find the beginning of the next one.
         if sent != len(message):
             self._drop(client)
 

@@ -30,7 +30,7 @@ class Table:
         name: of the file.
         header: names of the columns, or None without a header.
         rows: cells, as they stand.
-        lines: of each row.
+        lines: line number of each row.
         separator: between cells; "" for white space.
     """
 
@@ -99,9 +99,9 @@ def read_table(
 
     Args:
         path: cells separated by semicolons, tabs, commas or white space: whichever of these the
-            first line has, in this order. Where it is not commas, a comma may be the decimal sign.
+            first line has, in this order. If it is not a comma, a comma may be the decimal sign.
         header: the first line names the columns if none of its cells is a number.
-        separator: the one that is known to be used; "" for white space.
+        separator: the separator, if it is known; "" for white space.
 
     Raises:
         FormatError: cannot be read, no rows, or rows of different lengths; file and line are named.

@@ -1,9 +1,9 @@
-"""The target looked for in the frames of a sequence, and what became of every frame.
+"""Search for the target in the frames of a sequence, and what became of every frame.
 
-One frame is in memory at a time. A frame counts as ``found``; as ``not credible`` where nothing in
-it can be told from speckle (the reasons are those of :mod:`jaxcal.data.segmentation.image`); as
-``not tracked`` where a transform's status was not OK; as ``image not OK`` where the file marks its
-pixels so.
+One frame is in memory at a time. A frame counts as ``found``; as ``not credible`` if no credible
+target was found in it (the reasons are those of :mod:`jaxcal.data.segmentation.image`); as
+``not tracked`` if a transform's status was not OK; as ``image not OK`` if the file marks its pixels
+so.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class FrameResults:
         position: (n, 2) [u, v], px; NaN where not found.
         covariance: (n, 2, 2), px^2; NaN where not found.
         contrast_db: (n,) the target's envelope over the background, dB; NaN where not measured.
-        margin_db: (n,) over the next bright place, dB; NaN likewise.
+        margin_db: (n,) the target's envelope over the next brightest place, dB; NaN likewise.
     """
 
     target: str

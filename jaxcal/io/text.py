@@ -88,9 +88,9 @@ def read_pose_table(
     Args:
         path: with a header, columns in any order and units as it says. Without one, columns are
             time (s), a pose (12 or 16 numbers row by row, or x y z and a quaternion), u and v.
-        quaternion: where the scalar stands, which is never guessed: needed where columns are not
-            named.
-        pose_units: of translations; mm where neither this nor the header says.
+        quaternion: where the scalar stands. It is never guessed: it is needed where columns are
+            not named.
+        pose_units: of translations; mm if neither this nor the header states it.
         units: of u and v, where the header does not say; px by default.
         skip_invalid: leave out rows that a column ``valid`` or ``status`` marks as invalid, and
             rows with empty cells, NaN or Inf; otherwise they are errors.

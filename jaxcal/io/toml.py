@@ -1,9 +1,8 @@
 """TOML that somebody else wrote: bounded before it is parsed.
 
-``tomllib`` takes any text for its word: one dotted key of 60,000 parts takes gigabytes and does not
-end, nested arrays end in a RecursionError, and a number of 5000 digits in Python's own complaint.
-So the text is looked through first, strings and comments aside, and refused with one line that
-says where.
+``tomllib`` has no bounds: one dotted key of 60,000 parts takes gigabytes and does not end, nested
+arrays end in a RecursionError, and a number of 5000 digits in an error of Python's own. So the text
+outside strings and comments is checked first, and refused with one line that says where.
 """
 
 from __future__ import annotations
@@ -20,16 +19,16 @@ MAXIMUM_BYTES = 2**20
 """Largest file that is read."""
 
 MOST_PARTS = 8
-"""Of a dotted key, ``a.b.c``, and of a date or a number with dots."""
+"""Most parts of a dotted key, ``a.b.c``, and of a date or a number with dots."""
 
 MOST_DEEP = 16
-"""Arrays and inline tables in one another."""
+"""Most arrays and inline tables nested in one another."""
 
 MOST_KEYS = 10_000
-"""Keys, tables and arrays."""
+"""Most keys, tables and arrays."""
 
 LONGEST_WORD = 100
-"""Characters of a bare key or a number."""
+"""Most characters of a bare key or a number."""
 
 # Longest first: a multi-line string begins like an empty one, and may end in quotes of its own.
 _TOKEN = re.compile(
@@ -50,7 +49,7 @@ def load_toml(
 
     Args:
         path: the file.
-        maximum_bytes: largest that is read.
+        maximum_bytes: largest file that is read.
 
     Raises:
         FormatError: no such file, too large, not UTF-8, not TOML, or beyond the bounds of this
@@ -95,7 +94,7 @@ def _check(text: str) -> None:
             what = "a number" if found.lstrip("+-")[:1].isdigit() else "a name"
             raise _refused(line, f"{what} of {len(found)} characters", LONGEST_WORD)
         if kind == "mark":
-            # A dot goes on with a key (or a number); whatever else stands there ends it.
+            # A dot continues a key (or a number); any other mark ends it.
             parts = parts + 1 if found == "." else 1
             keys += found == "=" or (found == "[" and deep == 0)
             deep = max(0, deep + (found in "[{") - (found in "]}"))

@@ -1,7 +1,7 @@
 """PlusServer's TRACKEDFRAME: an image, and the transforms that were tracked with it.
 
-The body as PlusLib writes it (``igtlPlusTrackedFrameMessage``), big-endian but for the pixels and
-the embedded matrix, which are in the sender's order and which PLUS itself does not turn round:
+The body as PlusLib writes it (``igtlPlusTrackedFrameMessage``), big-endian except for the pixels
+and the embedded matrix, which have the sender's byte order (PLUS itself does not change it):
 
     scalar type u16, components u16, image type u16 (1 B-mode, 5 colour), columns, rows, slices u16,
     size of the pixels u32, size of the XML u32, orientation u16, embedded transform 16 float32
@@ -9,8 +9,8 @@ the embedded matrix, which are in the sender's order and which PLUS itself does 
          <FrameField Name="ProbeToTrackerTransformStatus" Value="OK"/>...</TrackedFrame>
     pixels
 
-The embedded transform takes pixels to some frame by PLUS's present calibration, which is what is to
-be found: it is not used.
+The embedded transform takes pixels to some frame by PLUS's present calibration. It is not used,
+since the calibration is what is to be found.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _HEAD = struct.Struct(">HHH3HIIH64s")
 _UINT8 = 3
 _BRIGHTNESS, _COLOUR = 1, 5
 _ORIENTATIONS = {0: "", 1: "UF", 2: "UF", 3: "UN", 4: "UN", 5: "MF", 6: "MF", 8: "MN", 9: "MN"}
-"""PLUS's enumeration; of B-mode images only, 0 where it does not know."""
+"""PLUS's numbers for the orientations of B-mode images; 0 is unknown to PLUS, MF here."""
 _MOST_XML = 2**18
 _MOST_TRANSFORMS = 256
 _TRANSFORM, _STATUS = "Transform", "TransformStatus"
@@ -40,7 +40,7 @@ def decode_tracked_frame(content: memoryview) -> TrackedFrame:
     """The content of a body.
 
     Raises:
-        ContentError: sizes that do not agree, RF data, volumes, or XML that is none.
+        ContentError: sizes that do not agree, RF data, volumes, or XML that cannot be read.
     """
     if len(content) < _HEAD.size:
         raise ContentError("a tracked frame that is cut off")
@@ -71,7 +71,7 @@ def decode_tracked_frame(content: memoryview) -> TrackedFrame:
 
 
 def encode_tracked_frame(frame: TrackedFrame, t: float, orientation: int = 5) -> bytes:
-    """The content of a message, as PlusServer sends it; for an image that is stored as it is."""
+    """The content of a message, as PlusServer sends it; the pixels are written as they are."""
     rows, columns = frame.picture.array.shape
     fields = []
     for tracked in frame.transforms:

@@ -1,7 +1,7 @@
 """What trackers' own programs export: NDI ToolBox CSV and OptiTrack Motive CSV.
 
-Both go by the names of columns, never by their numbers. Every tool becomes a transform from the
-tool to ``Tracker``.
+In both, columns are found by their names, never by their numbers. Every tool becomes a transform
+from the tool to ``Tracker``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from jaxcal.io.table import parse_number
 TRACKER = "Tracker"
 MOST_ROWS = 1_000_000
 _ABSENT = -1e20
-"""NDI writes -3.697314E28 where there is no number."""
+"""A number below this is missing: NDI writes -3.697314E28 in its place."""
 _METRES = {"meters": 1e3, "centimeters": 10.0, "millimeters": 1.0}
 
 
@@ -56,7 +56,7 @@ def read_tracker(path: str | os.PathLike[str]) -> TrackedSequence:
 
 
 class _Tool:
-    """Poses of one tool as they come in."""
+    """Poses of one tool, collected row by row."""
 
     def __init__(self) -> None:
         self.quaternions: list[list[float]] = []

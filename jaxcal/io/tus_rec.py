@@ -35,7 +35,7 @@ def read_scan(path: str | os.PathLike[str]) -> TrackedSequence:
             uint8; without time stamps.
 
     Returns:
-        The transforms from ``Tool`` to ``Tracker``; frames are taken for MF-oriented.
+        The transforms from ``Tool`` to ``Tracker``; frames are assumed to be MF-oriented.
 
     Raises:
         FormatError: not such a file; one line that starts with the path.

@@ -2,8 +2,8 @@
 
 HDF5 lets a file point at other files (external links, external storage, virtual datasets), claim
 sizes that it does not hold, and inflate to a thousand times its size. Everything here looks before
-it reads, and reads only what is asked for by name; no untrusted file is ever iterated. Messages
-name the object but not the file: whoever knows the file's name puts it in front.
+it reads, and reads only what is asked for by name (:func:`members` lists at most a stated number
+of names). Messages name the object but not the file: the caller puts the file's name in front.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def open_root(
     Args:
         source: a path (checked by :func:`jaxcal.io.readable.check_readable`) or a binary file
             object.
-        length: bytes that the file is taken to have, zeros beyond its end; None: those it has.
+        length: bytes that the file is to have, with zeros beyond its end; None: its own length.
 
     Yields:
         The root.
@@ -80,7 +80,7 @@ def open_root(
         with _opened(checked, source) as file:
             yield Node(file, "")
     except FormatError:
-        # What HDF5 makes of a heap that was not handed out says nothing to a person.
+        # HDF5's own error for a heap that it did not get says nothing to a person.
         if checked.damage is not None:
             raise checked.damage from None
         raise
@@ -167,7 +167,7 @@ def members(node: Node, most: int) -> list[Node]:
 
 
 def check_attributes(node: Node) -> None:
-    """Check all attributes, whose text is read so that its heaps have been walked.
+    """Check all attributes; their text is read, so that its heaps are walked.
 
     Raises:
         FormatError: too many, neither text nor numbers, or damaged.
@@ -187,7 +187,7 @@ def check_attributes(node: Node) -> None:
 
 
 def check_rows(node: Node, axes: int, most_bytes: int, kinds: str) -> tuple[int, ...]:
-    """Look at a dataset that will be read row by row, and is too large for :func:`array`.
+    """Check a dataset that will be read row by row because it is too large for :func:`array`.
 
     Args:
         node: the dataset.
@@ -317,7 +317,7 @@ def _reading(what: str) -> Iterator[None]:
     except CalibrationError:
         raise
     # A damaged file makes h5py raise OSError, RuntimeError, KeyError, ValueError, TypeError and
-    # more, without a common base. Nothing but its calls and our own checks stands in these blocks.
+    # more, without a common base. These blocks contain only its calls and our own checks.
     except Exception as error:
         raise FormatError(f"{what} cannot be read: {one_line(error)}") from None
 
@@ -406,7 +406,7 @@ def _check_chunks(node: Node, dataset: h5py.Dataset, layout) -> None:
 
 
 def _check_filters(node: Node, layout) -> int | None:
-    """Refuse filters that may load code or are repeated; the place of gzip in the pipeline."""
+    """Refuse filters that may load code or are repeated; returns the place of gzip among them."""
     codes = []
     for index in range(layout.get_nfilters()):
         code, _, _, name = layout.get_filter(index)

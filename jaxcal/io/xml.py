@@ -80,7 +80,7 @@ def parse_xml(content: bytes) -> Element:
     """:func:`read_xml` from bytes; errors do not name the file."""
     if len(content) > MAXIMUM_BYTES:
         raise FormatError(f"is too large (at most {MAXIMUM_BYTES} bytes are read)")
-    # Byte offsets into UTF-16 could not be spliced.
+    # In UTF-16, parts could not be replaced by their byte offsets.
     if content[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in content[:4]:
         raise FormatError("is UTF-16 or UTF-32; save it as UTF-8")
     parser = expat.ParserCreate()

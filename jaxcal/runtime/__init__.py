@@ -1,1 +1,1 @@
-"""In a process: JAX's modes and arrays, compiled programs and where they are kept."""
+"""What belongs to a process: JAX's modes and arrays, compiled programs and their storage."""

@@ -1,9 +1,9 @@
 """jaxtyping's array annotations, without its import where nobody checks annotations.
 
-Importing jaxtyping takes 0.07 s of CPU (it imports ``unittest.mock`` and with it asyncio), a third
-of what reading a file, or starting a small process that talks to a device, takes; its ``Array``
-imports JAX. Annotations are strings that nothing evaluates at run time but a checker, and whoever
-checks has imported jaxtyping before.
+Importing jaxtyping takes 0.07 s of CPU (it imports ``unittest.mock`` and with it asyncio). That is
+a third of the time to read a file, or to start a small process that talks to a device. Its
+``Array`` imports JAX. Annotations are strings; at run time only a type checker evaluates them, and
+that has imported jaxtyping before.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING or "jaxtyping" in sys.modules:
 else:
 
     class Annotation:
-        """Stands for an annotation: evaluated, it is the array's type."""
+        """Stands in for an annotation; it evaluates to the array's type."""
 
         def __class_getitem__(cls, item: tuple[type, str]) -> type:
             return item[0]
@@ -49,4 +49,4 @@ if TYPE_CHECKING:
     HeldArray = Array
 else:
     HeldArray = AnyArray
-    """What a tree of arrays holds: JAX's in the solvers' eyes, numpy's too at run time."""
+    """What a tree of arrays holds: JAX's for the type checker, numpy's too at run time."""

@@ -1,7 +1,7 @@
 """Sizes that problems are padded to, so that a few programs serve any number of images.
 
-A padded problem has further images that are masked: no answer depends on them. What a result holds
-for each image is cut back. Which axis of an array counts images is read from its annotation, where
+A padded problem has additional masked images, on which no answer depends. Arrays of the result with
+an axis of images are cut to the original number. This axis is found by an array's annotation, where
 every class of jaxcal names it ``n``.
 """
 
@@ -29,13 +29,13 @@ def size(count: int) -> int:
     """The bucket of a number of images or problems: 8, 12, 16, 24, 32, 48, 64, 96, 128, ..."""
     bucket = SMALLEST
     while bucket < count:
-        # Powers of two, and between each and the next half as much again.
+        # Powers of two, and 1.5 times each of them.
         bucket = bucket * 3 // 2 if bucket & (bucket - 1) == 0 else bucket * 4 // 3
     return bucket
 
 
 def padded(problem: Problem) -> Problem:
-    """The problem with masked images up to its bucket's size, in numpy arrays where it grows.
+    """The problem filled up with masked images to its bucket's size; numpy arrays if it grows.
 
     Args:
         problem: one, or a batch.
@@ -43,7 +43,7 @@ def padded(problem: Problem) -> Problem:
     more = size(problem.images) - problem.images
     if not more:
         return problem
-    rows = [*range(problem.images), *[problem.images - 1] * more]  # a masked pose must be one, too
+    rows = [*range(problem.images), *[problem.images - 1] * more]  # a masked pose must be rigid
     mask = np.asarray(problem.mask)
     mask = np.concatenate([mask, np.zeros((*mask.shape[:-1], more), mask.dtype)], axis=-1)
     longer = taken(problem, rows)
@@ -56,7 +56,7 @@ def taken(problem: Problem, rows: list[int]) -> Problem:
 
     Args:
         problem: without leading axes.
-        rows: which images, in order; the same may come again.
+        rows: which images, in order; one may occur several times.
     """
     return _each_image(problem, lambda values, axis: np.take(np.asarray(values), rows, axis))
 
@@ -78,7 +78,7 @@ def cut(result: T, images: int) -> T:
 
 
 def _each_image(tree: Any, change: Callable[[Any, int], Any]) -> Any:
-    """The tree with every array that has an axis of images changed."""
+    """The tree with ``change`` applied to every array that has an axis of images."""
     changed: dict[str, Any] = {}
     for field in fields(tree):
         value = getattr(tree, field.name)

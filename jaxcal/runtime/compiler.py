@@ -1,12 +1,12 @@
-"""Flags that XLA compiles our programs with, on a CPU; elsewhere its defaults stand.
+"""Flags with which XLA compiles our programs on a CPU; elsewhere its defaults apply.
 
-Two wishes contradict each other. Plain batches are solved by the million, and their inner loops
-should run as fast as the hardware allows: :func:`fast_to_run`. Of one problem, a person waits for
+Two aims contradict each other. Plain batches hold millions of problems, and their inner loops
+should run as fast as the hardware allows: :func:`fast_to_run`. For one problem, a person waits for
 the compiler and not for the answer: :func:`quick_to_compile`.
 
 Flags belong to a whole program, so none are given inside somebody else's jit, vmap or grad:
-:func:`is_whole_program`. They come and go with versions of XLA, so each is a wish: it is offered to
-the compiler once, and left out where the compiler does not know it (:func:`known`).
+:func:`is_whole_program`. Flags come and go with versions of XLA, so each is only a wish: it is
+tried once, and left out if the compiler does not know it (:func:`known`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 SWITCH = "JAXCAL_FAST_MATH"
-"""Environment variable; 0 leaves batches the compiler's default flags."""
+"""Environment variable; with 0, batches are compiled with the default flags."""
 
 Flags = dict[str, Any]
 
@@ -36,13 +36,13 @@ FAST_MATH: Flags = {
     "xla_cpu_fast_math_honor_nans": True,
     "xla_cpu_fast_math_honor_infs": True,
 }
-"""The compiler must know all of these, or gets none."""
+"""The compiler gets all of these, or none if it does not know one of them."""
 
 _log = logging.getLogger(__name__)
 
 
 def known(platform: str, flags: Flags) -> Flags:
-    """Those of some compiler flags that the present compiler knows.
+    """The flags that the present compiler knows.
 
     Args:
         platform: ``cpu``, ``gpu`` or ``tpu``, as :func:`jax.default_backend` says it.
@@ -55,7 +55,7 @@ def known(platform: str, flags: Flags) -> Flags:
     if _are_known(platform, items):
         return dict(flags)
     found = {name: value for name, value in items if _are_known(platform, ((name, value),))}
-    # Without NaN and Inf, a bad lane would become a wrong answer: all three or none.
+    # Fast math without NaN and Inf makes a wrong answer of a bad lane: all three or none.
     if not FAST_MATH.keys() <= found.keys():
         found = {name: value for name, value in found.items() if FAST_MATH.get(name) != value}
     return found
@@ -65,7 +65,7 @@ def known(platform: str, flags: Flags) -> Flags:
 def _are_known(platform: str, flags: tuple[tuple[str, Any], ...]) -> bool:
     import jax
 
-    # Tried on the smallest program; XLA refuses all flags of a call where it refuses one.
+    # Tried on the smallest program; XLA refuses all flags of a call if it refuses one.
     try:
         with jax.default_device(jax.local_devices(backend=platform)[0]):
             program = jax.jit(lambda x: x, compiler_options=dict(flags))
@@ -79,9 +79,9 @@ def _are_known(platform: str, flags: tuple[tuple[str, Any], ...]) -> bool:
 def batch_wishes() -> Flags:
     """Wishes for a program that solves batches on a CPU.
 
-    Sums over images vectorise only where their order is free, and that is what fast math allows;
-    NaN and Inf keep their meaning. Reruns are bitwise equal, and answers within 1e-12 mm of those
-    with default flags.
+    Sums over images vectorise only if they may be reordered, which fast math allows. NaN and Inf
+    keep their meaning. Reruns are bitwise equal, and answers are within 1e-12 mm of those with
+    default flags.
     """
     if os.environ.get(SWITCH, "1") == "0":
         return {}
@@ -95,10 +95,10 @@ def fast_to_run(platform: str) -> Flags | None:
 
 
 def quick_to_compile(platform: str) -> Flags | None:
-    """Flags for the general road, or None.
+    """Flags for a program that a person waits for, or None.
 
-    Building every fusion with MLIR is half of the compiler's work with jax 0.10, and makes nothing
-    faster there that could be measured. jaxlib 0.11.2 dropped the flag.
+    With jax 0.10, building every fusion with MLIR is half of the compiler's work, and no gain in
+    speed could be measured. jaxlib 0.11.2 dropped the flag.
     """
     return known(platform, {"xla_cpu_use_fusion_emitters": False}) if platform == "cpu" else None
 
@@ -121,18 +121,18 @@ def single_threaded(platform: str) -> Flags:
 
 
 def computed_once(make: Callable[[], T], witness: ArrayLike) -> T:
-    """What a function makes, as arrays that whoever reads them does not compute again.
+    """The result of a function, as arrays that are not computed again where they are read.
 
-    On a CPU, XLA puts a loop that several others read into each of them, unless it holds what is
-    thought expensive (integer rounds and polynomials are not), and drops optimization_barrier
-    before it does. A branch is where that ends, provided that the compiler cannot tell that it is
+    On a CPU, XLA copies a loop into each of the loops that read its result, unless it considers the
+    loop expensive (integer rounds and polynomials are not). It drops optimization_barrier before it
+    does so. It does not copy out of a branch, provided that it cannot tell that the branch is
     always taken.
 
     Args:
         make: without arguments; what it closes over may be traced.
-        witness: a number that is not negative and, for an effect, an argument of the program and
-            the same for the whole batch. Where it is negative or NaN, everything is NaN, which
-            nobody takes for an answer.
+        witness: a number that is not negative. To have an effect, it must be an argument of the
+            program and the same for the whole batch. If it is negative or NaN, everything is NaN,
+            which nobody mistakes for an answer.
 
     Returns:
         The same arrays as ``make()``, which have to be floating or complex.
@@ -151,5 +151,5 @@ def computed_once(make: Callable[[], T], witness: ArrayLike) -> T:
 
 
 def is_whole_program(*arguments: object) -> bool:
-    """Whether arrays have values, so that what is called with them is a program of its own."""
+    """Whether all arrays have values, so that a call with them compiles a whole program."""
     return not inside_transformation(*arguments)

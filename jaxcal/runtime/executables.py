@@ -1,18 +1,18 @@
 """Programs of one problem, compiled once and kept: in this process and in the user's cache folder.
 
-Most of the time to a first answer is tracing and compiling. Both are spared where the program of
-the same plan and shapes was compiled before, by whichever process: :func:`run` then loads machine
-code and does not call the function at all.
+Most of the time to a first answer is tracing and compiling. Both are skipped if any process has
+compiled the program of the same plan and shapes before: :func:`run` then loads machine code and
+does not call the function at all.
 
-A program is kept under a key that says everything it depends on: the function's name, the static
+A program is kept under a key that names everything it depends on: the function's name, the static
 plan, the shapes and dtypes of all arrays, the compiler's flags, and this installation
 (:func:`installation`): jaxlib's binary, the processor's features, the versions of what is traced
 through, and the sources of jaxcal. Who may write such files is the subject of
 :mod:`jaxcal.runtime.program_cache`. None of JAX's settings is changed.
 
-Trees of arrays are described in words (:func:`describe`), so that neither pickles nor a trace are
-needed to put a result together. Programs that call out of XLA (LAPACK, callbacks) are compiled for
-this process only: their addresses mean nothing to the next one.
+Trees of arrays are described as JSON (:func:`describe`), so that neither pickles nor a trace are
+needed to put a result together. Programs that call functions outside XLA (LAPACK, callbacks) are
+compiled for this process only: the addresses mean nothing to another process.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from jaxcal.runtime import compiler, program_cache
 from jaxcal.runtime.trees import assembled
 
 LOADED = 32
-"""Programs kept in this process; the least recently used gives way."""
+"""Most programs kept in this process; the least recently used is dropped."""
 
 TRACED_THROUGH = ("jax", "jaxlib", "equinox", "optimistix", "numpy")
 """Packages whose versions change what is compiled."""
@@ -76,13 +76,13 @@ JAX_SETTINGS = (
 """Settings of the caller that change what is traced."""
 
 Description = Any
-"""A tree in words: what JSON can hold."""
+"""The description of a tree, which JSON can hold."""
 
 _log = logging.getLogger(__name__)
 
 
 class NotDescribableError(TypeError):
-    """A tree holds something that cannot be said in words, such as a function."""
+    """A tree holds something that JSON cannot describe, such as a function."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class _Program:
     Attributes:
         executable: jaxlib's.
         device: where it runs.
-        result: what it returns, in words.
+        result: description of what it returns.
         from_disk: it was loaded, not compiled.
     """
 
@@ -120,7 +120,7 @@ def run(
     flags: compiler.Flags,
     label: dict[str, Any],
 ) -> Any:
-    """``function(*arguments, plan)``, compiled, by the kept program where there is one.
+    """Call ``function(*arguments, plan)``, compiled; by the kept program if there is one.
 
     Args:
         function: a pure function of a module, or ``module:name``, which is imported and called
@@ -131,10 +131,10 @@ def run(
         label: what the program is, for ``jaxcal cache show``.
 
     Returns:
-        The function's result, as numpy arrays: JAX would compile every change of theirs.
+        The function's result, as numpy arrays: JAX would compile every operation on its own arrays.
 
     Raises:
-        NotDescribableError: arguments or plan hold what cannot be said in words.
+        NotDescribableError: arguments or plan hold what cannot be described.
     """
     leaves: list[Any] = []
     described = describe(arguments, leaves)
@@ -223,7 +223,7 @@ def _load(key: str, device: Any) -> _Program | None:
         devices = xla_client.DeviceList((device,))
         executable = device.client.deserialize_executable(content, executable_devices=devices)
         return _Program(executable, device, header["result"], from_disk=True)
-    # Whatever jaxlib makes of it: a program that does not load is compiled anew.
+    # jaxlib may raise anything: a program that does not load is compiled again.
     except Exception as error:
         _log.debug("a compiled program in the cache is not used: %s", error)
         return None
@@ -246,8 +246,8 @@ def _compile(
         results.append(describe(function(list(flat_leaves)), found))
         return found
 
-    # A name of its own keeps JAX's compilation cache from handing out a loaded executable: once
-    # more serialised, such a one lacks its machine code.
+    # A unique name keeps JAX's compilation cache from returning an executable that it has loaded:
+    # such an executable lacks its machine code when it is serialised again.
     flat.__name__ = f"kept_{secrets.token_hex(8)}"
     place = jax.sharding.SingleDeviceSharding(device)
     shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place) for leaf in leaves]
@@ -263,7 +263,7 @@ def _compile(
         "seconds": round(time.perf_counter() - began, 3),
     }
     try:
-        # Before the first run: sorting makes comparators then, which cannot be serialised.
+        # Before the first run, in which sorting makes comparators that cannot be serialised.
         content = device.client.serialize_executable(executable)
     except Exception as error:  # not every compiler's programs can be
         _log.debug("a compiled program is not kept: %s", error)
@@ -273,7 +273,7 @@ def _compile(
 
 
 def _device(leaves: list[Any]) -> Any:
-    """Where the arrays are bound to, else JAX's default."""
+    """The device that an array is committed to, else JAX's default."""
     for leaf in leaves:
         if isinstance(leaf, jax.Array) and leaf.committed:
             return next(iter(leaf.devices()))
@@ -282,11 +282,11 @@ def _device(leaves: list[Any]) -> Any:
 
 
 def describe(tree: Any, leaves: list[Any]) -> Description:
-    """A tree in words, which JSON can hold.
+    """Describe a tree by what JSON can hold.
 
     Args:
         tree: of dataclasses of jaxcal (modules too), tuples, lists, None, numbers, texts, arrays.
-        leaves: the arrays are added to it.
+        leaves: a list, to which the arrays are appended.
 
     Raises:
         NotDescribableError: it holds anything else.
@@ -311,7 +311,7 @@ def describe(tree: Any, leaves: list[Any]) -> Description:
 
 
 def is_describable(tree: Any) -> bool:
-    """Whether :func:`describe` takes it."""
+    """Whether :func:`describe` accepts a tree."""
     try:
         describe(tree, [])
     except NotDescribableError:
@@ -342,9 +342,9 @@ def rebuild(description: Description, leaves: list[Any]) -> Any:
 def installation() -> str:
     """A digest of everything outside a plan that a compiled program depends on.
 
-    A few milliseconds. jaxlib's binary has 350 MB, whose digest would take 0.6 s: the list of
-    digests that was installed with it is taken, and the binaries' sizes and times of change, which
-    tell where one was replaced by hand.
+    It takes a few milliseconds. A digest of jaxlib's binary, 350 MB, would take 0.6 s. So the list
+    of digests that was installed with it is used, and the binaries' sizes and times of change,
+    which show if one was replaced by hand.
     """
     facts: list[Any] = [sys.implementation.name, sys.version_info[:3], platform.machine()]
     facts += [os.environ.get("XLA_FLAGS", ""), _processor()]
@@ -360,7 +360,7 @@ def installation() -> str:
 
 
 def _sources() -> str:
-    """A digest of the sources that compiled programs come from: those who change one recompile."""
+    """A digest of the sources of compiled programs: to change one of them means to recompile."""
     home = Path(__file__).parents[1]
     found = hashlib.sha256()
     for path in sorted(home.rglob("*.py")):

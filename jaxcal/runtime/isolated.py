@@ -4,8 +4,8 @@
 a ``queue.py`` among somebody's data would be run. Every helper process of jaxcal is started by
 :func:`python_command` instead: isolated (``-I``: no current directory, no ``PYTHON*`` variables, no
 user site), with the import path of the process that starts it handed over, less the current
-directory. What the parent could import its helpers can, from the same places, editable
-installations and ``PYTHONPATH`` included.
+directory. Helpers can import what the parent can, from the same places, including editable
+installations and ``PYTHONPATH``.
 
 The console scripts ``jaxcal`` and ``jaxcal-hw`` do not have the current directory on their path
 either; ``python -m jaxcal`` does (use ``python -P -m``).
@@ -33,7 +33,7 @@ def python_command(module: str, *arguments: str) -> list[str]:
     """The command that runs a module of an installed package in a new, isolated interpreter.
 
     Args:
-        module: with its packages, e.g. ``hw.recorder_process``.
+        module: its full name, e.g. ``hw.recorder_process``.
         arguments: for it, as ``sys.argv[1:]``.
     """
     return [sys.executable, "-I", "-c", _START, json.dumps(import_path()), module, *arguments]

@@ -1,4 +1,4 @@
-"""A guest in the caller's process: which of JAX's modes jaxcal computes in, and when.
+"""Which of JAX's modes jaxcal computes in, and when, as a guest in the caller's process.
 
 A calibration loses six digits in float32, so it is computed in float64, which JAX has switched off
 by default. jaxcal changes none of the process' settings. A public function that is called with
@@ -6,14 +6,14 @@ values enters the modes that it needs and leaves them when it returns (:func:`in
 
 - 64 bits. Where the caller has them switched off, results come back as numpy arrays, which keep
   their 64 bits; JAX makes 32-bit arrays of them where the caller hands them on to JAX.
-- JAX's standard promotion of dtypes and ranks: strict promotion is a wish about the caller's code.
+- JAX's standard promotion of dtypes and ranks: strict promotion is meant for the caller's code.
 - no ``debug_nans``, ``debug_infs``: a lane without an answer holds NaN on purpose, and says so.
 
-Inside a jit, vmap or grad of the caller, the number of bits is the caller's: arrays have lost
-theirs before any function sees them. A calibration there needs 64 bits, or a word that 32 will do
-(:func:`require_float64`); promotion is standard all the same.
+Inside a jit, vmap or grad of the caller, the caller decides the number of bits: arrays have lost
+theirs before any function sees them. A calibration there needs 64 bits (:func:`require_float64`),
+unless ``float32`` is asked for. Promotion is standard there, too.
 
-What needs no JAX does not import it: where nobody has, there are no modes to enter.
+Functions that need no JAX do not import it: if nobody has imported it, there are no modes to enter.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def is_float64_on() -> bool:
 
 
 def inside_transformation(*arguments: object) -> bool:
-    """Whether a jit, vmap or grad of somebody else looks at the code that runs now."""
+    """Whether the code that runs now is inside somebody else's jit, vmap or grad."""
     if "jax" not in sys.modules:
         return False
     import jax
@@ -64,10 +64,11 @@ def inside_transformation(*arguments: object) -> bool:
 
 @contextmanager
 def own_modes(*, bits_too: bool = True) -> Iterator[None]:
-    """JAX's modes as jaxcal's code is written for, in this thread.
+    """The modes of JAX that jaxcal's code is written for, in this thread.
 
     Args:
-        bits_too: switch 64 bits on; not inside a transformation that began without.
+        bits_too: also switch 64 bits on, and ``debug_nans`` and ``debug_infs`` off; not inside a
+            transformation that began without.
     """
     import jax
 
@@ -84,8 +85,8 @@ def own_modes(*, bits_too: bool = True) -> Iterator[None]:
 def in_own_modes(function: Callable[P, T]) -> Callable[P, T]:
     """Decorate a public function: its body runs in :func:`own_modes`.
 
-    Called with values where the caller has 64 bits switched off, JAX arrays of its result (a
-    pytree) come back as numpy arrays.
+    If it is called with values and the caller has 64 bits switched off, the JAX arrays of its
+    result (a pytree) are returned as numpy arrays.
     """
 
     @wraps(function)
@@ -106,9 +107,9 @@ def in_own_modes(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def importing_jax(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorate a public function that cannot do without JAX, outside :func:`in_own_modes`.
+    """Decorate a public function that needs JAX; placed outside :func:`in_own_modes`.
 
-    Where the function itself imported JAX, it would have begun in the caller's modes.
+    If the function imported JAX itself, it would run in the caller's modes.
     """
 
     @wraps(function)
@@ -168,6 +169,6 @@ def _without_jax(leaf: Any) -> Any:
     import jax
     import jax.numpy as jnp
 
-    # A key has no numpy form.
+    # A random key cannot become a numpy array.
     is_key = isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
     return np.asarray(leaf) if isinstance(leaf, jax.Array) and not is_key else leaf

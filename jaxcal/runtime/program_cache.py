@@ -3,12 +3,12 @@
 An entry is machine code: whoever can write one runs code as its user. So the folder and every entry
 must belong to this user alone (our uid, nothing for group and others, no symbolic links), and what
 does not is not read. The SHA-256 in an entry finds damage, such as a truncated file. It is no
-defence against somebody who can write to the folder: that person is the user or root, could read
-any key that lay there as well, and has shorter ways to run code. Nothing is unpickled.
+defence against somebody who can write to the folder: that person is the user or root, could also
+read any key kept there, and has shorter ways to run code. Nothing is unpickled.
 
-Entries are complete or absent: a temporary file takes its name when it is written. The least
-recently used are removed where all together exceed :data:`LIMIT_BYTES`. Where nothing can be
-written (read-only home, full disk) nothing is kept, and no caller notices but by the time it takes.
+Entries are complete or absent: a temporary file is renamed when it is written. The least recently
+used are removed if all together exceed :data:`LIMIT_BYTES`. If nothing can be written (read-only
+home, full disk), nothing is kept, and callers notice only the time that compiling takes.
 ``JAXCAL_NO_CACHE=1`` turns reading and writing off.
 """
 
@@ -30,10 +30,10 @@ from pathlib import Path
 from typing import Any
 
 SWITCH = "JAXCAL_NO_CACHE"
-"""Environment variable; anything but 0 or nothing turns the cache off."""
+"""Environment variable; any value but 0 or an empty one turns the cache off."""
 
 LIMIT_BYTES = 512 * 2**20
-"""Size of all entries together, of which the least recently used give way."""
+"""Largest size of all entries together; beyond it the least recently used are removed."""
 
 MAGIC = b"jaxcal\x00\x01"
 """First bytes of an entry; the last of them is the version of the layout."""
@@ -60,7 +60,7 @@ class Entry:
         path: where it lies.
         size: on the disk, bytes.
         used: when it was last used, s since the epoch.
-        header: what it is; empty where the entry would be refused.
+        header: what the program is; empty if the entry would be refused.
     """
 
     path: Path
@@ -114,7 +114,7 @@ def _base() -> Path:
 
 
 def read(key: str) -> tuple[dict[str, Any], bytes] | None:
-    """The entry of a key: its header and its program; None where there is none to be trusted."""
+    """The entry of a key: its header and its program; None if there is none that can be trusted."""
     if not is_on():
         return None
     try:
@@ -207,13 +207,13 @@ def _name(key: str) -> str:
 
 
 def _content(path: Path) -> bytes:
-    """The bytes of a file that is ours alone.
+    """The bytes of a file that belongs to this user alone.
 
     Raises:
-        RefusedError: it is not.
+        UntrustedProgramError: it does not.
         OSError: it cannot be read.
     """
-    # A link is not followed, and what is checked is the file that was opened.
+    # A link is not followed, and the checks are of the file that was opened.
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
     with open(os.open(path, flags | getattr(os, "O_NONBLOCK", 0)), "rb") as file:
         found = os.fstat(file.fileno())
@@ -225,10 +225,10 @@ def _content(path: Path) -> bytes:
 
 
 def _parsed(content: bytes) -> tuple[dict[str, Any], bytes]:
-    """Header and packed program of an entry that is whole.
+    """Header and packed program of a complete entry.
 
     Raises:
-        RefusedError: it is not.
+        UntrustedProgramError: it is damaged.
     """
     start = len(MAGIC) + _DIGEST_BYTES
     digest, rest = content[len(MAGIC) : start], content[start:]

@@ -1,4 +1,4 @@
-"""The pure functions that are compiled, and their compiled forms in the hands of JAX.
+"""The pure functions that are compiled, and their forms compiled by JAX.
 
 :mod:`jaxcal.runtime.engine` decides which of them solves a problem; on a CPU it keeps their machine
 code (:mod:`jaxcal.runtime.executables`) instead of compiling them here.
@@ -31,13 +31,13 @@ def solve_one(
     start: Start | None,
     plan: SolvePlan,
 ) -> Calibration:
-    """One problem is a batch of one (traceable).
+    """Solve one problem as a batch of one (traceable).
 
     Args:
         problem: checked.
         given: numbers that came with the request.
         agreed: 1 for the images to use, where a robust search was made before.
-        start: where methods but the conventional begin; without it the program finds one.
+        start: of all methods but the conventional; without it the program finds one.
         plan: what is static about the request.
     """
     alone = jax.tree.map(lambda leaf: leaf[None], (problem, agreed, start))
@@ -55,7 +55,7 @@ def one_problem(platform: str | None):
 
 @cache
 def agreement(platform: str | None):
-    """The compiled consensus of one problem's images, likewise."""
+    """The compiled consensus of one problem's images; with a platform, as a program of its own."""
     flags = None if platform is None else compiler.quick_to_compile(platform)
     return jax.jit(agreed_images, static_argnums=1, compiler_options=flags)
 
@@ -73,7 +73,7 @@ def solve_chunks(problems: Problem, given: Given, plan: SolvePlan, chunk: int) -
 def solve_some_chunks(
     problems: Problem, given: Given, used: Int[Array, ""], how: tuple[SolvePlan, int]
 ) -> Calibration:
-    """Solve the first chunks of a batch, of which the others hold anything; theirs are zeros.
+    """Solve the first chunks of a batch. The others may hold anything; their results are zeros.
 
     Args:
         problems: a batch whose size is a multiple of the chunk's.
@@ -102,7 +102,7 @@ def solve_some_chunks(
 
 @cache
 def chunks(devices: tuple[Any, ...], alone: bool):
-    """The compiled solve of chunks, which several devices share; alone: a program of its own."""
+    """The compiled solve of chunks, shared by the devices; ``alone``: as a program of its own."""
     options = compiler.fast_to_run(devices[0].platform) if alone else None
     if len(devices) == 1:
         return jax.jit(solve_chunks, static_argnums=(2, 3), compiler_options=options)

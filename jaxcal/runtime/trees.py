@@ -1,7 +1,7 @@
 """Frozen dataclasses of arrays that JAX sees through (pytrees), without importing JAX.
 
-They are registered when JAX is imported (:mod:`jaxcal.runtime.when_jax`): problems and answers that
-were made before are trees as well.
+The classes are registered when JAX is imported (:mod:`jaxcal.runtime.when_jax`), so problems and
+answers that were made before that are trees as well.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def array_tree(kind: type[T]) -> type[T]:
 def assembled(kind: type[T], values: dict[str, Any]) -> T:
     """An object of a dataclass with these fields, without its constructor.
 
-    A constructor's annotations say what people hand over; a tree may hold anything that JAX puts
+    A constructor's annotations say what callers may pass; a tree may hold anything that JAX puts
     into it (tracers, shapes, None).
     """
     made = object.__new__(kind)
@@ -49,7 +49,7 @@ def assembled(kind: type[T], values: dict[str, Any]) -> T:
 
 
 def map_arrays(function: Callable[[Any], Any], tree: T) -> T:
-    """The tree with a function of every array; like ``jax.tree.map``, without JAX.
+    """The tree with a function applied to every array; like ``jax.tree.map``, without JAX.
 
     Args:
         function: of one array.

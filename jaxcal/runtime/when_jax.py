@@ -1,8 +1,8 @@
-"""What has to happen once JAX is imported, without importing it.
+"""Actions for the time when JAX is imported, without importing it here.
 
-A recording can be calibrated without JAX, whose import takes longer than the calibration. What
-jaxcal sets up for JAX is therefore done when somebody imports it: by a finder in front of the
-import system's own, which steps aside at the first ``import jax``.
+A recording can be calibrated without JAX, whose import takes longer than the calibration. So jaxcal
+sets up its parts of JAX when somebody imports it. A finder in front of the import system's own ones
+does this at the first ``import jax`` and then removes itself.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _waiting: list[Callable[[], None]] = []
 
 
 def when_jax_is_imported(action: Callable[[], None]) -> None:
-    """Do something at once where JAX is imported, and otherwise when it is, in order."""
+    """Run an action at once if JAX is imported, and otherwise when it is; actions run in order."""
     if "jax" in sys.modules:
         action()
         return
@@ -26,7 +26,7 @@ def when_jax_is_imported(action: Callable[[], None]) -> None:
 
 
 class _Finder:
-    """Lets the others find JAX, and does what waits once it is imported."""
+    """Lets the other finders find JAX, and runs the waiting actions once it is imported."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -47,6 +47,6 @@ class _Finder:
             while _waiting:
                 _waiting.pop(0)()
 
-        # Of this loader only; who merely asks whether JAX is installed never runs it.
+        # Only this loader is changed. To ask whether JAX is installed does not run it.
         spec.loader.exec_module = execute_and_act
         return spec

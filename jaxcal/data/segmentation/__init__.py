@@ -1,1 +1,1 @@
-"""From what the electronics or the image deliver to points: lateral position and range."""
+"""Points (lateral position and range) from times of flight or from images."""

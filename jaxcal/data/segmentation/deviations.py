@@ -1,19 +1,19 @@
 """The distance fit of simulations: least squares on Eq. 5, written in deviations from the truth.
 
-Where a target is known to be at lateral position x0 and range r0 and its distances are h_k + n_k,
-h_k = hypot(x0 - e_k, r0), the fit to these distances is solved for its deviation (u, v) from
-(x0, r0). Nothing is gained in what is found: it starts from the distances' closed form, not from
-the truth, and minimises the same sum of squares. What is gained is that float32 suffices, because
-all that is rounded is of the size of the noise, 1e-7 of which is lost. With
+A simulation knows the target's lateral position x0 and range r0; its distances are h_k + n_k, with
+h_k = hypot(x0 - e_k, r0). The fit to these distances is solved for its deviation (u, v) from
+(x0, r0). The result is that of the plain fit: it starts from the closed form of the distances, not
+from the truth, and minimises the same sum of squares. The gain is that float32 suffices: all
+rounded numbers are of the size of the noise, and only 1e-7 of that is lost. With
 
     t = u (2 (x0 - e_k) + u) + v (2 r0 + v),     hypot(x0 + u - e_k, r0 + v) - h_k = t / (h + h_k)
 
-no two large numbers are subtracted. The start is the straight line that d_k^2 - e_k^2 is over the
-elements; the steps are Newton's with exact second derivatives, which (Gauss-Newton's where the
-matrix is indefinite) squares the error at each.
+no two large numbers are subtracted. The start comes from the straight line that d_k^2 - e_k^2 forms
+over the elements. The steps are Newton's with exact second derivatives, so that each one squares
+the error. (They are Gauss-Newton's where the matrix is indefinite or nearly singular.)
 
-:func:`jaxcal.data.segmentation.time_of_flight.fit_distances` is the plain form, to which the tests
-hold this one.
+:func:`jaxcal.data.segmentation.time_of_flight.fit_distances` is the plain form; the tests compare
+this fit with it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Complex64, Float
 
 ENOUGH_MM = 2e-3
-"""A Newton step below this leaves less than 1e-6 mm: it was the last."""
+"""A Newton step shorter than this is the last: the error left is below 1e-6 mm."""
 
 MOST_STEPS = 12
 
@@ -41,8 +41,8 @@ def fit_deviations(
     """Lateral position and range that fit noisy distances best, mm.
 
     Args:
-        noise: standard normals, those of the first half of the elements as the real parts and
-            those of the others as the imaginary ones (with one too many where elements are odd).
+        noise: standard normals. Real parts are for the first half of the elements, imaginary parts
+            for the others (the last is not used if the number of elements is odd).
         size: SD of a distance, mm.
         lateral: true lateral position, mm.
         distance: true range, mm.
@@ -59,7 +59,7 @@ def fit_deviations(
         return list(zip(halves(noise, count), split(elements), strict=True))
 
     def start(u: Array, v: Array) -> tuple[Array, Array]:
-        """The closed form, as a step from wherever."""
+        """The closed form, as a step from any (u, v)."""
         sums = _sums(_line(x0, far0, size * normal, e, middle) for normal, e in each())
         square, slope, far = sums
         across = -0.5 * slope / spread
@@ -82,15 +82,15 @@ def fit_deviations(
         )
         determinant = a * c - b * b
         du, dv = (c * gx - b * gr) / determinant, (a * gr - b * gx) / determinant
-        # A step of more than the range itself can only come from a start far off.
+        # A step longer than the range itself can only come from a start that is far off.
         r = r0 + v
         du, dv = jnp.clip(du, -r, r), jnp.clip(dv, -0.5 * r, r)
         return du, jnp.maximum(dv, LEAST_RANGE_MM - r)
 
     def iterate(state: tuple) -> tuple:
         u, v, going, taken = state
-        # The start is a pass of the loop as well: what another loop made, this one only reads,
-        # and the noise is drawn once, not once for the start and once for the steps.
+        # The start is a pass of this loop, too. The loop only reads the noise, which another loop
+        # draws; so it is drawn once, not once for the start and once for the steps.
         du, dv = jax.lax.cond(taken == 0, start, newton, u, v)
         du, dv = (jnp.where(going[..., None], move, 0.0) for move in (du, dv))
         moved = jnp.max(jnp.maximum(jnp.abs(du), jnp.abs(dv)), axis=-1)
@@ -121,7 +121,7 @@ def split(elements: np.ndarray) -> list[np.ndarray]:
 
 
 def _line(x0: Array, r0: Array, n: Array, e: np.ndarray, middle: float) -> list[Array]:
-    """Sums of the closed form: of d^2 - h^2, the same times e, and d."""
+    """Terms of the closed form's sums: d^2 - h^2, that times (e - middle), and d."""
     along = x0 - e
     h = jnp.sqrt(along * along + r0 * r0)
     square = n * (2 * h + n)
@@ -129,12 +129,12 @@ def _line(x0: Array, r0: Array, n: Array, e: np.ndarray, middle: float) -> list[
 
 
 def _newton(x0: Array, r0: Array, n: Array, e: np.ndarray, u: Array, v: Array) -> list[Array]:
-    """Sums of a step: J'J, J' times the residual, and the residual times its second derivatives."""
+    """Terms of a step's sums: J'J, J' times the residual, the residual times second derivatives."""
     before = x0 - e
     along, r = before + u, r0 + v
     h0 = jnp.sqrt(before * before + r0 * r0)
     square = along * along + r * r
-    # With fast math an rsqrt by itself differs between a vector and what is left of a row.
+    # With fast math, rsqrt differs between full vectors and the remainder of a row.
     h = jnp.sqrt(square)
     inverse = 1 / h
     residual = n - (u * (before + along) + v * (r0 + r)) / (h0 + h)
@@ -145,7 +145,7 @@ def _newton(x0: Array, r0: Array, n: Array, e: np.ndarray, u: Array, v: Array) -
 
 
 def _sums(parts) -> list[Array]:
-    """Of the halves' terms over the elements, in one reduction; halves of one size are added."""
+    """Sums of the halves' terms over the elements, by reductions; equal halves are added first."""
     parts = list(parts)
     if parts[0][0].shape == parts[1][0].shape:
         parts = [[a + b for a, b in zip(*parts, strict=True)]]

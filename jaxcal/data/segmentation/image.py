@@ -1,18 +1,19 @@
-"""Where the target is in a B-mode frame: sub-pixel, with a covariance and a reason where it is not.
+"""The target's position in a B-mode frame: sub-pixel with a covariance, or why it was not found.
 
 Pixels: a frame's axis 0 is v (axial, the row), axis 1 is u (lateral, the column); pixel centres lie
 at integers, so the middle of the first pixel is (u, v) = (0, 0). Positions are [u, v], px.
 
-:mod:`~jaxcal.data.segmentation.speckle` takes the frame back to the envelope and measures the
-background; :mod:`~jaxcal.data.segmentation.spot` fits the target. It is credible where its envelope
-could not be the brightest of all the speckles of the region (a false alarm in a thousand such
-frames by default), where nothing else is nearly as bright, and where it has the extent of a spot.
-Everything else is reported as not found.
+:mod:`~jaxcal.data.segmentation.speckle` computes the envelope of the frame and measures the
+background; :mod:`~jaxcal.data.segmentation.spot` fits the target. A target is credible if its
+envelope is too high for the brightest speckle of the region (by default with one false alarm in a
+thousand frames of mere speckle), if nothing else is nearly as bright, and if it has the extent of a
+spot. Everything else is reported as not found.
 
-The covariance is of where the *echo* is. Where on a target the echo comes from changes with the
-angle of incidence, and a frame does not show it: the spots of real wires in water scatter by 0.6 to
-0.8 px from frame to frame where the frames themselves account for 0.15 px. State it with
-``target_sd_px`` where it is known; the joint calibration rescales what it is given anyway.
+The covariance is that of the *echo's* position. The echo comes from a place on the target that
+changes with the angle of incidence, and a frame does not show this place: the spots of real wires
+in water scatter by 0.6 to 0.8 px from frame to frame, but the frames themselves account for only
+0.15 px. If this scatter is known, state it as ``target_sd_px``; the joint calibration rescales the
+covariances in any case.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class Localisation:
         found: (n,) whether there is a credible target.
         contrast_db: (n,) the target's envelope over the background's root mean square, dB; NaN
             where nothing could be measured.
-        margin_db: (n,) the brightest place over the next bright one, dB; NaN likewise.
+        margin_db: (n,) the brightest spot over the next brightest, dB; NaN likewise.
         residual: (n,) root mean square residual of the fit over the target's envelope; NaN where
             not found.
         width: (n, 2) SD of the fitted spot along u and v, px; NaN where not found.
@@ -101,16 +102,16 @@ def localise(
         target: ``echo``, one bright spot; ``cross``, a bright crossing with tails along the wires.
         region: (first column, first row, columns, rows) to look in, px; the whole frame by default.
         near: [u, v] px where the target is expected, (2,) or (n, 2); with ``within_px``.
-        within_px: look no farther than this from ``near``, px. The background is still the
-            region's.
+        within_px: look no farther than this from ``near``, px. The background is still that of
+            the whole region.
         compression: ``log`` for a displayed frame, ``none`` where pixels are the envelope.
         decibels_per_level: what one unit of a log-compressed pixel stands for, dB (60 dB in 8 bits:
             60 / 255). None: measured on the speckle or, where the background is black, 60 dB over
             the display's range.
         false_alarm: accepted probability that mere speckle is taken for a target in a frame.
         minimum_margin_db: least distance to the next bright spot, dB.
-        target_sd_px: SD of where the echo comes from about where the target is, px, one number or
-            [u, v]; added to the covariance. No single frame shows it.
+        target_sd_px: SD of the place that the echo comes from about the target's position, px, one
+            number or [u, v]. Its square is added to the covariance. No single frame shows it.
 
     Returns:
         Positions with covariances; frames that are constant, hold NaN or Inf, or have no credible
@@ -118,7 +119,7 @@ def localise(
 
     Raises:
         InputError: arrays of other dimensions or types, frames or regions that are too small or too
-            large, contradicting options.
+            large, options that contradict each other.
     """
     stack = _check_frames(frames)
     if target not in ("echo", "cross"):
@@ -333,7 +334,7 @@ def _localise_one(
     rms = np.sqrt(2.0) * speckle.sigma
     contrast = decibel(envelope[peak] / rms)
     margin = decibel(envelope[peak] / max(rival(keep_out), rms))
-    # Of N independent speckles the brightest exceeds t with probability N exp(-t^2 / 2 sigma^2).
+    # The brightest of N speckles exceeds t with probability of about N exp(-t^2 / 2 sigma^2).
     cell = np.prod([max(np.sqrt(2 * np.pi) * size, 1.0) for size in speckle.size])
     needed = decibel(np.sqrt(np.log(max(envelope.size / cell, 1.0) / false_alarm)))
     if contrast < needed:

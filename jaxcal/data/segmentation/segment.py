@@ -1,7 +1,7 @@
-"""From times of flight to points: checks, the fit, and what became of every frame.
+"""Points from times of flight: checks, the fit, and what became of every frame.
 
-A frame without enough answers is left out and counted, never fatal; what cannot be times of flight
-in seconds is refused with its row named.
+A frame without enough answers is left out and counted; it is not an error. Numbers that cannot be
+times of flight in seconds are refused, and their row is named.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ Method = Literal["least-squares", "shortest"]
 Scale = Literal["frame", "pooled"]
 
 MINIMUM_LINES = 8
-"""With fewer answers a frame's noise is anybody's guess, and an outlier is not seen."""
+"""With fewer answers a frame's noise cannot be estimated and an outlier cannot be seen."""
 
 _LONGEST_S = 2e-3
 # |elevation| is determined where its square lies this many SDs above zero.
 _SIGNIFICANT = 3.0
-# A frame this many times as noisy as the median one was fitted to something else.
+# In a frame this many times as noisy as the median frame, the fit found something else.
 _NOISIEST = 5.0
 _MANY = 0.1
 # An answer this many SDs from the fit is not the target's.
 _FAR = 6.0
-# Up to so many frames a person waits longer for the compiler than for the fit.
+# Up to this many frames, compiling takes longer than the fit.
 _FEW_FRAMES = 4096
 
 
 Fits = DistanceFit | tuple[DistanceFit, DistanceFit]
-"""Of a linear array; of a curved one in the plane and out of it."""
+"""The fit of a linear array, or the in-plane and out-of-plane fits of a curved one."""
 
 
 @dataclass(frozen=True)
 class OutOfPlane:
-    """What a curved array's distances say of the elevation (Eq. 6); its sign is not resolved.
+    """The elevation from a curved array's distances (Eq. 6), without its sign.
 
     Attributes:
         position: (n, 3) [lateral, axial, elevation squared], mm, mm, mm^2; the square may come out
@@ -78,15 +78,15 @@ class Segmentation:
     """Segmented points, and what became of every frame.
 
     Attributes:
-        images: of kind ``point``, with a covariance for each frame (none from the shortest time,
-            which does not tell its noise), the raw times beside them; frames that could not be
-            segmented are masked out.
+        images: of kind ``point``, with a covariance for each frame (none with ``shortest``, which
+            does not estimate the noise), and with the raw times. Frames that could not be segmented
+            are masked out.
         method: ``least-squares`` or ``shortest``.
         lines: (n,) elements that answered.
         missing: (n,) elements that did not.
         rejected: (n,) elements whose answer was given no weight.
-        failed: (n,) frames that were in use and have been masked out here.
-        accepted: (n, elements) which elements' answers stand: there, and near what was fitted.
+        failed: (n,) frames that were used before and were masked out here.
+        accepted: (n, elements) answers in frames not masked out; after a robust fit, those near it.
         noise_mm: (n,) SD of one distance from the residuals, mm; NaN where there is none.
         out_of_plane: curved arrays by least squares only.
         warnings: for a person.
@@ -118,18 +118,19 @@ def segment(
 ) -> Segmentation:
     """Segment the target in every frame of times of flight.
 
-    Points of a curved array are the in-plane fit, what an image would show: its own estimate of
-    the elevation is so uncertain (y^2 has an SD of hundreds of mm^2 for a mm of noise) that points
-    freed of it would be several times worse. It is in ``out_of_plane``, without a sign.
+    Points of a curved array come from the in-plane fit, which is what an image would show. The
+    array's own estimate of the elevation is so uncertain (y^2 has an SD of hundreds of mm^2 for a
+    mm of noise) that points corrected by it would be several times worse. That estimate is in
+    ``out_of_plane``, without a sign.
 
     Args:
-        data: times of flight, or points that have their times of flight beside them; of a recording
-            the calibration images.
+        data: times of flight, or points with their times of flight; of a recording, the
+            calibration images are taken.
         probe: the transducer; by default the recording's.
         method: ``least-squares`` on every element (Eqs. 5 and 6) or ``shortest`` (Eqs. 2 and 3).
         robust: bisquare weights against lines that are not the target's echo (up to a fifth of a
-            frame's are certainly seen); frames that are 5 times as noisy as the median one are
-            left out: they have more, and the fit found something else.
+            frame's lines are certainly detected). Frames that are 5 times as noisy as the median
+            frame are left out: more of their lines are wrong, and the fit found something else.
         scale: noise of each ``frame`` by itself, or ``pooled``: the median over the frames, better
             where all are alike and few lines answer.
         interpolate: between elements, for ``shortest``.
@@ -228,8 +229,8 @@ def segment_recording(
         options: of :func:`segment`.
 
     Returns:
-        The recording with points in the place of times (which stay beside them), and what became of
-        the calibration frames.
+        The recording with points instead of times (the times are kept beside them), and what became
+        of the calibration frames.
 
     Raises:
         InputError: as :func:`segment`.
@@ -274,7 +275,7 @@ def check_times_of_flight(
                 f"time_of_flight row {row} has {what} time, {rows[row, element]:.6g} s at element "
                 f"{element}"
             )
-    # One line may hold nonsense; a whole frame that took metres of water is another unit.
+    # A single line may be wrong; a frame whose times mean metres of water is in another unit.
     answers = np.isfinite(rows).sum(axis=1)
     late = (rows > _LONGEST_S).sum(axis=1)
     wrong = (answers > 0) & (2 * late > answers)
@@ -296,10 +297,11 @@ def _shortest(
 
 
 def _fit(distances: np.ndarray, probe: Probe, robust: bool, scale: Scale, failed: np.ndarray):
-    """Points, covariances, noise, rejected lines and, curved arrays, [x, z, y^2] and covariance."""
+    """Points, covariances, noise, rejected lines; for curved arrays [x, z, y^2] with covariance."""
     curved = isinstance(probe, CurvilinearProbe)
     fits = _fitted(np.asarray(distances, float), probe.element_positions(), (curved, robust))
-    # Far out of the plane the in-plane fit has more than noise in its residuals; the other has not.
+    # The out-of-plane fit gives the noise: far out of the plane the residuals of the in-plane fit
+    # are more than noise.
     plane, whole = fits if isinstance(fits, tuple) else (fits, fits)
     noise, rejected = np.asarray(whole.noise), np.asarray(whole.rejected).astype(int)
 
@@ -320,7 +322,7 @@ def _fit(distances: np.ndarray, probe: Probe, robust: bool, scale: Scale, failed
 def _near(
     distances: np.ndarray, probe: Probe, position: np.ndarray, noise: np.ndarray
 ) -> Bool[np.ndarray, "n elements"]:
-    """Answers within several SDs of the fit: an unknown sound speed bends all, and none by more."""
+    """Answers within 6 SDs of the fit; a wrong sound speed shifts all, but none by more."""
     apart = position[:, None, :2] - probe.element_positions()[:, [0, 2]]
     square = np.sum(apart**2, axis=-1)
     if position.shape[1] == 3:
@@ -344,8 +346,8 @@ def _out_of_plane(position: np.ndarray, covariance: np.ndarray, kept: np.ndarray
 def compiled_fit(curved: bool, robust: bool):
     """The fit as a compiled function of (distances, element positions); any leading axes.
 
-    Sums over the elements vectorise by the batches' flags; NaN and Inf are turned into weights
-    before any arithmetic.
+    The compiler flags for batches let sums over the elements vectorise. NaN and Inf become weights
+    of zero before any arithmetic.
     """
 
     def fit(distances: AnyArray, positions: AnyArray) -> Fits:
@@ -365,7 +367,7 @@ def fit_frames(distances: AnyArray, positions: AnyArray, how: tuple[bool, bool])
     curved, robust = how
     if curved:
         return fit_out_of_plane(distances, positions, robust=robust)
-    # What the compiler knows to be zero it does not compute with.
+    # The compiler leaves out arithmetic with numbers that it knows to be zero.
     zero = jnp.zeros_like(positions[:, 0])
     line = jnp.stack([jnp.asarray(positions)[:, 0], zero, zero], axis=-1)
     return fit_in_plane(distances, line, robust=robust)
@@ -374,7 +376,7 @@ def fit_frames(distances: AnyArray, positions: AnyArray, how: tuple[bool, bool])
 def _fitted(
     distances: Float[np.ndarray, "n elements"], positions: np.ndarray, how: tuple[bool, bool]
 ) -> Fits:
-    """The fit by a program that is kept, where programs are; it serves a bucket of frames."""
+    """The fit; on a CPU by a kept program, which serves a bucket of frame counts."""
     if jax.default_backend() != "cpu":
         return compiled_fit(*how)(distances, positions)
     count, elements = distances.shape

@@ -1,12 +1,11 @@
-"""From a displayed frame back to the echo's envelope, and what its speckle says of the noise.
+"""The echo's envelope from a displayed frame, and the noise estimated from its speckle.
 
 A log-compressed frame is a + k ln(envelope), and fully developed speckle says what k is: the
-logarithm of a Rayleigh variable has quantiles ln sigma + ln(-2 ln(1 - p)) / 2 [1, 2]. A scale k
-that is off raises the envelope to a power, which makes a spot narrower or wider but does not move
-it.
+logarithm of a Rayleigh variable has quantiles ln sigma + ln(-2 ln(1 - p)) / 2 [1, 2]. A wrong
+scale k raises the envelope to a power, which makes a spot narrower or wider but does not move it.
 
 For point spreads of Gaussian shape with SD s of the envelope, the in-phase part of the speckle has
-correlation exp(-k^2 / 4 s^2) at lag k, and the envelope about the square of that [3].
+correlation exp(-d^2 / 4 s^2) at lag d, and the envelope about the square of that [3].
 
 References:
     [1] R. F. Wagner et al., Statistics of speckle in ultrasound B-scans, 1983.
@@ -27,7 +26,7 @@ Compression = Literal["log", "none"]
 SMALLEST_REGION = 16
 """Least rows and columns to search: with fewer there is no background to compare with."""
 USUAL_DECIBELS = 60.0
-"""Range of a log-compressed frame where its background is too black to measure it."""
+"""Range assumed for a log-compressed frame whose background is too black to measure it, dB."""
 HALF_MAXIMUM = 2 * np.log(2.0)
 """Squared half width at half maximum of a Gaussian over its variance; also the squared median of a
 Rayleigh variable over sigma^2."""
@@ -108,12 +107,12 @@ def background(envelope: np.ndarray, peak: tuple[int, int], keep_out: list[int])
     if away.sum() < SMALLEST_REGION**2 / 2:
         raise NotFoundError("the bright area fills the region: there is no background")
     level = float(np.median(envelope[away]))
-    # The median of a Rayleigh variable is sqrt(2 ln 2) sigma; black pixels have none, and the
-    # least that can be told of them is a step of the display.
+    # The median of a Rayleigh variable is sqrt(2 ln 2) sigma. It is zero where most pixels are
+    # black: then the mean square gives sigma, which is taken to be at least 1e-3.
     sigma = level / np.sqrt(HALF_MAXIMUM)
     if sigma <= 0:
         sigma = max(float(np.sqrt(0.5 * np.mean(envelope[away] ** 2))), 1e-3)
-    # Bright structures are not speckle: their shape would pass for its size.
+    # Bright structures are clipped: they are not speckle, and their shape would change its size.
     centred = np.where(away, np.minimum(envelope, 4 * sigma), 0.0)
     centred = np.where(away, centred - centred[away].mean(), 0.0)
     centred = centred[:_SPECKLE_SAMPLE, :_SPECKLE_SAMPLE]
@@ -124,8 +123,8 @@ def background(envelope: np.ndarray, peak: tuple[int, int], keep_out: list[int])
 def _speckle_size(centred: np.ndarray, weight: np.ndarray) -> float:
     """SD s of a speckle along axis 0, px: the envelope's correlation at lag k is exp(-k^2 / 2 s^2).
 
-    The lag at which the correlation falls to a half is used, which neither white noise of the
-    electronics nor slow shading moves by much; zero for uncorrelated pixels.
+    It comes from the lag at which the correlation falls to a half; neither white noise of the
+    electronics nor slow shading moves that lag by much. Zero for uncorrelated pixels.
     """
     variance = float(np.sum(centred**2) / max(np.sum(weight), 1.0))
     if variance <= 0:
@@ -135,7 +134,7 @@ def _speckle_size(centred: np.ndarray, weight: np.ndarray) -> float:
         pairs = np.sum(weight[lag:] * weight[:-lag])
         now = float(np.sum(centred[lag:] * centred[:-lag]) / max(pairs, 1.0)) / variance
         if now < 0.5:
-            # At such lags a Gaussian's logarithm is far better interpolated in the squared lag.
+            # A Gaussian's logarithm is linear in the squared lag, so it is interpolated in that.
             if lag == 1:
                 return 0.0 if now < 0.02 else float(np.sqrt(-0.5 / np.log(now)))
             a, b = np.log(before), np.log(max(now, 0.02))

@@ -1,17 +1,17 @@
-"""A bright spot in an envelope: where it is to a fraction of a pixel, and how well that is known.
+"""A bright spot in an envelope: its position to a fraction of a pixel, and its covariance.
 
-To the envelope e a spot with the target's centre is fitted by least squares,
+A spot centred on the target is fitted to the envelope by least squares,
 
     m = sqrt(b^2 + sum_j A_j^2 exp(-|L_j d|^2)),    d = (u, v) - centre,
 
 with one elliptical component for the active echo, whose point spread is wider laterally than
 axially, and two that share their centre for a crossing of two wires seen with the beam's thickness.
 
-Around a bright target the envelope is A g plus the in-phase part of the speckle, of variance
-sigma^2 and correlated over the width of a speckle, which is about that of the spot itself.
-Residuals of the fit cannot show such noise (it looks like a shift) and pixels are far from
-independent. So sigma and the correlation are measured on the background, and propagated through
-the fit: W C W', W the pseudo-inverse of the Jacobian.
+Around a bright target the envelope is that of the spot plus the in-phase part of the speckle. This
+noise has variance sigma^2 and is correlated over the width of a speckle, which is about that of the
+spot itself. So it looks like a shift, residuals of the fit cannot show it, and pixels are far from
+independent. Therefore sigma and the correlation are measured on the background and propagated
+through the fit: W C W', where C is the noise's covariance and W the pseudo-inverse of the Jacobian.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from jaxcal.data.segmentation.speckle import (
 Target = Literal["echo", "cross"]
 
 FINEST_SD = 0.005
-"""No position is claimed to be better than this, px: no point spread is that symmetric."""
+"""Least SD stated for a position, px: no point spread is symmetric enough for a smaller one."""
 
 _WINDOW = 2.5
 """Half width of the fitted window, in SDs of the spot."""
 _LARGEST_WINDOW = 60
 """Most pixels on each side of the centre; larger spots are fitted on their middle."""
 _HOLD = 0.01
-"""Weight of the start of the shape in the fit; a pixel of the target has 1."""
+"""Weight that holds the shape near its start in the fit; a pixel of the target has weight 1."""
 _EXCESS = 2.0
-"""Squared residuals up to this many times what speckle explains are left to chance."""
+"""Squared residuals up to this many times those expected of speckle count as chance."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Spot:
         position: [u, v], px.
         covariance: (2, 2), px^2.
         contrast_db: envelope over the background's root mean square, dB.
-        margin_db: over the next bright place, dB.
+        margin_db: envelope over the next brightest place, dB.
         residual: root mean square of the fit's residual over the target's envelope.
         width: SDs along u and v, px.
     """
@@ -70,7 +70,7 @@ class Spot:
 
 
 def saturated_pixels(values: np.ndarray) -> Bool[np.ndarray, "rows columns"]:
-    """Pixels cut off at the top: they only say that the echo was stronger."""
+    """Pixels cut off at the largest value: the echo there was stronger than stored."""
     top = values == values.max()
     return top if top.sum() >= 4 else np.zeros_like(top)
 
@@ -78,7 +78,7 @@ def saturated_pixels(values: np.ndarray) -> Bool[np.ndarray, "rows columns"]:
 def brightest(
     envelope: np.ndarray, expected: np.ndarray | None, radius: float
 ) -> tuple[tuple[int, int], Callable[[list[int]], float]]:
-    """Row and column of the brightest place, and how bright the next one is outside a distance."""
+    """The brightest place (row, column); a function for the brightness of the next, farther off."""
     place = np.ones(envelope.shape, bool)
     if expected is not None:
         v, u = np.indices(envelope.shape)
@@ -101,8 +101,8 @@ def brightest(
 def local_maxima(values: Float[np.ndarray, "rows columns"]) -> Int[np.ndarray, "peaks 2"]:
     """Pixels that none of their eight neighbours exceeds, highest first.
 
-    Of a plateau every pixel counts. Pixels of the least value do not, nor does any pixel where
-    every one of them equals its neighbours.
+    Every pixel of a plateau counts. Pixels of the least value do not count, and constant values
+    have no maximum.
 
     Returns:
         Rows and columns; equal heights are in the order of the rows.
@@ -119,7 +119,7 @@ def half_maximum(
 ) -> tuple[Bool[np.ndarray, "rows columns"], tuple[float, float]]:
     """The area around the peak above half of it, and the SDs along v and u of a spot of that size.
 
-    Of an ellipse filled evenly the variance is a quarter of its squared half axis.
+    The variance of an evenly filled ellipse is a quarter of its squared half axis.
     """
     areas: Any = ndimage.label(envelope >= 0.5 * envelope[peak], structure=np.ones((3, 3)))
     labels = areas[0]
@@ -153,7 +153,7 @@ def fit_spot(
     grid_v, grid_u = np.meshgrid(v, u, indexing="ij")
     top = float(envelope[shape].max())
 
-    # exp(-|L d|^2) of the square of the envelope: L is the inverse of the spot's SD.
+    # The envelope's square falls as exp(-|L d|^2), so L is the inverse of the envelope's SD.
     across, along = 1 / extent[1], 1 / extent[0]
     if target == "echo":
         first = [*start, np.log(speckle.sigma), np.log(top), np.log(across), np.log(along), 0.0]
@@ -185,8 +185,8 @@ def fit_spot(
         value = np.sqrt(power)
         return value, np.stack(slopes, axis=-1) / (2 * value[..., None])
 
-    # Scaled so that the unknowns are of order 1; what shapes the spot is held near its start, too
-    # weakly to matter unless two components make one spot and only their sum is seen.
+    # The unknowns are scaled to order 1. The shape is held near its start, but so weakly that this
+    # only matters where two components make one spot and only their sum is seen.
     steps = _steps(first, extent)
     hold = np.diag(_HOLD / steps)[3:]
 
@@ -234,7 +234,7 @@ def fit_spot(
     covariance = _propagate(weights, value, misfit, speckle, (width[1], width[0]), v, u)
     if not np.isfinite(covariance).all():
         raise NotFoundError("the position is not determined", contrast, margin)
-    # The shape may still be on its way where the data hardly determine it; the centre may not.
+    # The centre must have converged. The shape need not, where the data hardly determine it.
     if (np.abs(inverse @ residual(unknowns)) > 0.1 * np.sqrt(np.diag(covariance))).any():
         raise NotFoundError("no spot could be fitted", contrast, margin)
     height = float(np.sqrt(np.sum(np.exp(2 * unknowns[3::4]))))
@@ -276,7 +276,7 @@ def _propagate(
     """Covariance of the centre, px^2, from correlated speckle under the fitted spot.
 
     Args:
-        weights: (2, rows, columns) how the centre follows each pixel, zero for those not fitted.
+        weights: (2, rows, columns) derivatives of the centre by each pixel; zero if not fitted.
         value: (rows, columns) the fitted envelope.
         misfit: mean squared residual.
         speckle: the background's.
@@ -284,14 +284,14 @@ def _propagate(
         v: (rows,) of the window, px.
         u: (columns,) of the window, px.
     """
-    # Variance of a Rician envelope: that of a Rayleigh one without signal, sigma^2 under a strong
-    # one; in between an interpolation.
+    # Variance of a Rician envelope, interpolated between that of a Rayleigh envelope (no signal)
+    # and sigma^2 (strong signal).
     rayleigh = 2 - np.pi / 2
     signal = np.maximum(value**2 - value.min() ** 2, 0.0) / (2 * speckle.sigma**2)
     variance = speckle.sigma**2 * (1 - (1 - rayleigh) * np.exp(-signal))
     covariance = spread(weights * np.sqrt(variance), speckle.size, v, u)
-    # A spot that is not of the fitted shape fits worse than speckle explains, and differs from it
-    # over lengths like its own.
+    # A spot of another shape fits worse than speckle explains. The misfit is correlated over
+    # lengths like those of the spot itself.
     expected = float(np.mean(variance[weights.any(axis=0)]))
     if misfit > _EXCESS * expected:
         covariance += spread(weights * np.sqrt(misfit - expected), spot, v, u)

@@ -1,20 +1,21 @@
-"""Where the target is, from its distances to the elements: pure JAX, any leading axes.
+"""The target's position from its distances to the elements: pure JAX, any leading axes.
 
-The distances obey Eq. 6 of the paper, d_k^2 = (e_kx - x)^2 + (e_kz - z)^2 + y^2, and Eq. 5 is its
-linear array: there every e_kz is zero, so that y^2 + z^2 = r^2 is one unknown and "z" below stands
+The distances obey Eq. 6 of the paper, d_k^2 = (e_kx - x)^2 + (e_kz - z)^2 + y^2. Eq. 5 is the case
+of a linear array: every e_kz is zero, so that y^2 + z^2 = r^2 is one unknown, and "z" below stands
 for the range r. Three estimators:
 
 * :func:`shortest`: Eqs. 2 and 3, the one element with the shortest distance;
 * :func:`fit_in_plane`: least squares on every distance for (x, z) with y = 0, which for a linear
   array is the whole of Eq. 5;
-* :func:`fit_out_of_plane`: for (x, z, y^2), curved arrays only. y^2 is the unknown, because the
-  problem is well-behaved in it: noise may carry it below zero, and then it says so.
+* :func:`fit_out_of_plane`: for (x, z, y^2), curved arrays only. The unknown is y^2, because the
+  problem is well-behaved in it; noise may make the estimate negative, which is not hidden.
 
 Both fits take a fixed number of Gauss-Newton steps. A step passes once over the elements and
 accumulates all its sums in one reduction, so that XLA keeps residuals and derivatives in registers.
-The robust fits are MM-estimators (Yohai 1987; Maronna, Martin and Yohai 2006, section 5.4): from
-plain least squares, steps by absolute deviations, then with Tukey's bisquare weights, whose scale
-is the S-scale of half breakdown, then steps with the efficient scale of the weighted residuals.
+The robust fits are MM-estimators (Yohai 1987; Maronna, Martin and Yohai 2006, section 5.4). They
+start from plain least squares. First come steps by absolute deviations, then steps with Tukey's
+bisquare weights and the S-scale of half breakdown, and last such steps with the efficient scale of
+the weighted residuals.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ from jaxtyping import Array, Float
 
 from jaxcal.data.geometry import AnyArray
 
-# Tukey's bisquare: 95 % efficiency for the place, half breakdown for the S-scale.
+# Tukey's bisquare: 95 % efficiency for the position, half breakdown for the S-scale.
 _CUT, _CUT_SCALE = 4.685, 1.547645
-# Residuals of less than this many S-scales count alike in the steps by absolute deviations.
+# Residuals below this many S-scales have about equal weight in the steps by absolute deviations.
 _KNEE = 0.5
-# Under a unit normal law: E w, E w u^2 and the variance of the estimate of place.
+# For a unit normal distribution: E w, E w u^2 and the variance of the estimated position.
 _MEAN_WEIGHT, _MEAN_SQUARE, _VARIANCE = 0.9151076239875573, 0.757775918619908, 1.0526345151671421
-# No scale below this (mm): clocks are coarser, and a residual of rounding is no outlier.
+# Least scale, mm: clocks are coarser, and a residual from rounding is no outlier.
 _FINEST_MM = 1e-6
 
 ABSOLUTE_STEPS, SCALE_STEPS, LAST_STEPS = 5, 3, 3
@@ -73,7 +74,7 @@ def fit_distances(
 ) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch 2 2"]]:
     """Least squares on Eq. 5 from every element's distance to the target, complete frames only.
 
-    The plain form of :func:`fit_in_plane`, which simulations use: differentiable, of any shape.
+    The plain form of :func:`fit_in_plane`: differentiable, of any shape.
 
     Args:
         distances: d_k, mm; any leading axes.
@@ -81,8 +82,8 @@ def fit_distances(
         steps: Gauss-Newton steps from the closed form.
 
     Returns:
-        points [lateral, range] mm, and the inverse normal matrices: times the variance of a
-        distance they are the points' covariances.
+        points [lateral, range] mm, and the inverse normal matrices; multiplied by the variance of a
+        distance, these are the points' covariances.
     """
     e, distances = jnp.asarray(element_lateral), jnp.asarray(distances)
     centred = e - jnp.mean(e)
@@ -128,8 +129,8 @@ def shortest(
         pitch_mm: where given, the minimum is placed between elements, by the parabola through the
             squared distances of the first element and its neighbours (for a linear array the
             squares *are* a parabola, Eq. 5), kept within half an element. Noise of more than about
-            pitch^2 / range spoils it; it is not done where a neighbour is farther by more than the
-            pitch, which no echo of the same target can be.
+            pitch^2 / range spoils it. It is not done where a neighbour's distance is larger by more
+            than the pitch, which is impossible for echoes of the same target.
 
     Returns:
         the element's number (whole unless interpolated) and the distance, mm; NaN for a frame
@@ -162,7 +163,7 @@ def fit_in_plane(
     robust: bool = False,
     steps: int = 4,
 ) -> DistanceFit:
-    """Least squares for [lateral, axial], every target taken for in-plane (Eq. 5, or 6 with y = 0).
+    """Least squares for [lateral, axial], as if all targets were in-plane (Eq. 5, or 6 with y = 0).
 
     For a linear array "axial" is the range, and nothing is neglected.
 
@@ -194,7 +195,7 @@ def fit_out_of_plane(
 
     Args:
         distances: mm; NaN or not positive where an element did not answer.
-        element_positions: [lateral, elevational, axial], mm; not all of one axial position.
+        element_positions: [lateral, elevational, axial], mm; not all at one axial position.
         robust: as in :func:`fit_in_plane`.
         steps: Gauss-Newton steps of the fit that is not robust.
 
@@ -212,7 +213,7 @@ def fit_out_of_plane(
 
 
 class _State(eqx.Module):
-    """Where a fit stands: x, z, y^2, and the scale of the residuals (mm)."""
+    """The current values of a fit: x, z, y^2, and the scale of the residuals (mm)."""
 
     x: Float[Array, "*batch"]
     z: Float[Array, "*batch"]
@@ -228,7 +229,7 @@ def _cleaned(distances, element_positions) -> tuple[Array, Array, Array, Array]:
 
 
 def _sums(*terms: Float[Array, "*batch elements"]) -> tuple[Float[Array, "*batch"], ...]:
-    """Sums over the last axis, all in one reduction: one pass, nothing written in between."""
+    """Sums over the last axis, all in one reduction: one pass, no arrays in between."""
     zeros = tuple(jnp.zeros((), term.dtype) for term in terms)
 
     def add(one: tuple[Array, ...], other: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -240,7 +241,7 @@ def _sums(*terms: Float[Array, "*batch elements"]) -> tuple[Float[Array, "*batch
 def _closed_form(d: Array, m: Array, ex: Array, ez: Array) -> tuple[Array, Array, Array]:
     """Number of lines, x and z from d^2 - |e|^2 = (x^2 + z^2) - 2 x e_x - 2 z e_z.
 
-    Over the elements that is nearly a straight line in e_x: its slope gives x, its mean then z.
+    Over the elements this is nearly a straight line in e_x: its slope gives x, then its mean z.
     """
     ex, ez = jnp.broadcast_to(ex, d.shape), jnp.broadcast_to(ez, d.shape)
     square = m * (d * d - ex * ex - ez * ez)
@@ -253,7 +254,7 @@ def _closed_form(d: Array, m: Array, ex: Array, ez: Array) -> tuple[Array, Array
     for _ in range(2):
         x = -0.5 * (slope + 2 * z * along) / spread
         under = mq + mz * mz + 2 * x * mx - x * x
-        # Noise can make it negative; half the mean distance is then as good a start as any.
+        # Noise can make the square negative; then half the mean distance is a good start.
         z = mz + jnp.sqrt(jnp.where(under > 1e-6, under, 0.25 * (largest / lines) ** 2))
     return lines, x, z
 
@@ -305,7 +306,7 @@ def _iterate(
         scale = jnp.maximum(at.scale, _FINEST_MM)
         square = (residual / scale[..., None]) ** 2
         root = jnp.maximum(1 - square / _CUT**2, 0.0)
-        # About 1/|residual| where that is large: a convex loss, without false minima.
+        # Absolute deviations: about 1/|residual| if that is large, a convex loss, no false minima.
         weight = m * (jax.lax.rsqrt(1 + square / _KNEE**2) if stage == "absolute" else root * root)
         efficient = stage == "efficient"
         extra = weight if efficient else m * jnp.maximum(1 - square / _CUT_SCALE**2, 0.0) ** 3
@@ -318,7 +319,7 @@ def _iterate(
             kept = total / _MEAN_WEIGHT
             ratio = spread / (_MEAN_SQUARE * jnp.maximum(kept - unknowns, 1.0))
         else:
-            # S-scale: mean rho = 1/2. Its own fixed-point step, squared, is twice as quick.
+            # S-scale: mean rho = 1/2. The usual fixed-point step is squared, to be twice as quick.
             ratio = (2 * (lines - total) / (lines - unknowns)) ** 2
         scale = jnp.maximum(scale * jnp.sqrt(ratio), _FINEST_MM)
         return moved(at, step, scale), inverse, lost
@@ -354,7 +355,7 @@ def _iterate(
     )
 
 
-# Where the entries of a symmetric matrix are in its upper triangle, row by row.
+# Indices of a symmetric matrix's entries in its upper triangle, which is stored row by row.
 _ROWS = {2: ((0, 1), (1, 2)), 3: ((0, 1, 2), (1, 3, 4), (2, 4, 5))}
 
 

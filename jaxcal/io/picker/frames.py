@@ -15,7 +15,7 @@ _KEPT = 48
 
 
 class Frames:
-    """Frames as PNG. Sequences are read forwards: those before the last one begin anew.
+    """Frames as PNG. Sequences are read forwards; for an earlier frame the reading begins again.
 
     Args:
         sequence: with pixels.
@@ -54,7 +54,7 @@ class Frames:
             raise IndexError(number)
 
     def _begin(self, number: int) -> None:
-        # What is skipped is not unpacked where the file is not packed.
+        # Frames before this one are skipped; only a packed file must be read through them.
         self._next = number
         wanted = range(number, len(self._sequence))
         self._stream = self._sequence.images(wanted, orientation=self._orientation)

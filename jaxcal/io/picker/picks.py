@@ -5,8 +5,9 @@
     frame,u,v
     0,123.25,45.5
 
-``jaxcal import`` reads it as any other table of points. The two comments are for going on later:
-the first says what the points belong to, the second in which frames there is nothing to place.
+``jaxcal import`` reads it as any other table of points. The two comments make it possible to
+continue later: the first says which sequence the points belong to, the second which frames have no
+point.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Picks:
     """Points placed in the frames of one sequence; every change is on the disk when it returns.
 
     Args:
-        path: of the table; one that is there is gone on with.
+        path: of the table; an existing one is continued.
         name: of the sequence.
         size: columns and rows of its frames, px.
         count: of its frames.
@@ -41,10 +42,10 @@ class Picks:
 
     Attributes:
         points: [u, v] by the number of the frame, px.
-        skipped: numbers of the frames without one.
+        skipped: numbers of the frames without a target.
 
     Raises:
-        FormatError: a file that this did not write, or one of another sequence.
+        FormatError: a file that was not written here, or one of another sequence.
     """
 
     def __init__(
@@ -69,10 +70,10 @@ class Picks:
         return next((k for k in self.shown if k not in self.points and k not in self.skipped), None)
 
     def pick(self, frame: int, u: float, v: float) -> None:
-        """Put the point of a frame to a place.
+        """Set the point of a frame.
 
         Raises:
-            InputError: no such frame, or no place in it.
+            InputError: no such frame, or a position outside it.
             OutputError: the table cannot be written; nothing has changed.
         """
         if not (
@@ -91,7 +92,7 @@ class Picks:
         self._change(frame, None, True)
 
     def undo(self) -> int | None:
-        """Take the last change back; the frame that it was in, or None where there was none.
+        """Undo the last change; returns the frame that it was in, or None if there was none.
 
         Raises:
             OutputError: the table cannot be written; nothing has changed.

@@ -88,11 +88,11 @@ class Picker:
         self._thread.join()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Until the person is done; whether they are."""
+        """Wait until the person is done; returns whether they are."""
         return self._done.wait(timeout_s)
 
     def may(self, path: str) -> str | None:
-        """What is asked for under the token; None without it."""
+        """The part of a path after the token; None without the right token."""
         token, _, rest = path.removeprefix("/").partition("/")
         known = hmac.compare_digest(token.encode(), self._token.encode())
         return rest if known and path == f"/{token}/{rest}" else None
@@ -110,7 +110,7 @@ class Picker:
         }
 
     def do(self, what: str, asked: dict[str, Any]) -> dict[str, Any]:
-        """A click or a key.
+        """Carry out a click or a key.
 
         Raises:
             InputError: what cannot be done.
@@ -133,17 +133,17 @@ class Picker:
 
 
 class _Server(ThreadingHTTPServer):
-    """One thread a connection; the library would look its own name up and print tracebacks."""
+    """One thread a connection; unlike the library, no look-up of the host's name, no tracebacks."""
 
     daemon_threads = True
 
     def server_bind(self) -> None:
-        """Bind, and ask no name server who this is."""
+        """Bind without asking a name server for this host's name."""
         TCPServer.server_bind(self)
         self.server_name, self.server_port = HOST, int(self.server_address[1])
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A connection that broke off is nobody's business."""
+        """Say nothing of a connection that broke off."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -155,7 +155,7 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "jaxcal", ""
 
     def do_GET(self) -> None:
-        """The page, what it shows, and a frame."""
+        """Send the page, its state, or a frame."""
         rest = self._allowed()
         if rest is None:
             return
@@ -210,7 +210,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self._json({"error": str(error)}, HTTPStatus.INTERNAL_SERVER_ERROR)
 
     def _allowed(self) -> str | None:
-        """What is asked for, after token, host and origin; None where it was refused."""
+        """The requested path, if token, host and origin are right; None if it was refused."""
         names = [f"{HOST}:{self.page.port}", f"localhost:{self.page.port}"]
         origin = self.headers.get("Origin")
         rest = self.page.may(self.path)
@@ -244,12 +244,12 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(content)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Malformed requests get no page of the library's."""
+        """Refuse a malformed request without the library's own error page."""
         self.close_connection = True
         self._refuse(HTTPStatus(code))
 
     def log_message(self, format: str, *args: object) -> None:
-        """Nothing: the terminal is the person's."""
+        """Log nothing: the terminal belongs to the person."""
 
 
 def _frame(asked: dict[str, Any]) -> int:
