@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 
 from jaxcal.io.atomic import atomic_path
-from jaxcal.study.offsets import OffsetLaw
+from jaxcal.study.laws import OffsetLaw
 
 # The scripts' own arrays; jaxcal computes in 64 bits anyway.
 jax.config.update("jax_enable_x64", True)

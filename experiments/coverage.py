@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal import Protocol, calibrate_batch, predicted_tre, simulate, transform_intervals
 from jaxcal.io.atomic import atomic_path
-from jaxcal.study.offsets import OffsetLaw
+from jaxcal.study.laws import OffsetLaw
 
 SEED = 20261125
 LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "heavy-tailed")

@@ -24,7 +24,7 @@ from jaxtyping import Array
 import jaxcal
 from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.diagnostics import messages
-from jaxcal.study.offsets import OffsetLaw
+from jaxcal.study.laws import OffsetLaw
 
 SEED = 20261124
 LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "heavy-tailed")

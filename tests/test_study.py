@@ -20,7 +20,8 @@ from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.study import load_spec, open_results, run_study
-from jaxcal.study.offsets import OFFSET_LAWS, nominal_bound, standard_deviation, standard_offsets
+from jaxcal.study.laws import OFFSET_LAWS
+from jaxcal.study.offsets import nominal_bound, standard_deviation, standard_offsets
 from jaxcal.study.pipeline import (
     Block,
     _options,
@@ -176,6 +177,13 @@ def test_the_grid_is_counted_in_order():
 
 
 # --- offsets
+
+
+def test_every_law_can_be_simulated_in_a_study():
+    laws = ", ".join(f'"{law}"' for law in OFFSET_LAWS)
+    spec = parse_spec(f"{MINIMAL}[conditions]\nelevation_distribution = [{laws}]{METHOD}")
+    shapes = [shape_of(condition, spec.probe) for condition in spec.conditions()]
+    assert tuple(shape.law for shape in shapes) == OFFSET_LAWS
 
 
 @pytest.mark.parametrize("law", OFFSET_LAWS)

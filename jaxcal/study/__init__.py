@@ -1,7 +1,7 @@
 """Monte-Carlo studies: a grid of conditions x methods x trials, computed in resumable chunks.
 
 spec.py     what is to be computed, from a TOML file
-own.py      what the engine asks of a study, for studies of one's own
+own.py      what the engine needs of a study, for studies of one's own
 pipeline.py one chunk: draw, segment, solve by every method, compare with the truth
 store.py    one HDF5 file per chunk; what is there, what is missing
 run.py      the missing chunks, here or on a cluster (cluster.py)

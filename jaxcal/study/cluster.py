@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 CHUNKS_AHEAD = 2
-"""Chunks handed out for each worker's thread: one to compute, one to go on with."""
+"""Chunks handed out for each worker's thread: one to compute and the next one."""
 
 CONNECT_SECONDS = 30
 
@@ -81,7 +81,7 @@ def _spec(canonical: str, where: tuple[tuple[str, str], ...]) -> Study:
 
 
 def _threads(client: Client) -> dict[str, int]:
-    # Synchronous clients answer, asynchronous ones (not ours) promise to.
+    # A synchronous client, as ours is, returns the answer; an asynchronous one an awaitable.
     return cast("dict[str, int]", client.nthreads())
 
 

@@ -4,8 +4,8 @@ echo    the range is that of another echo: off by 20 to 100 mm
 click   the point was picked elsewhere: off by 20 to 100 mm in a random direction of the image
 pose    the tracker saw something else: the probe is off by 20 to 100 mm in a random direction and
         turned by up to 10 degrees
-slip    the probe slipped in its mount: the same such error of the pose in every image concerned
-mixed   each image concerned draws one of echo, click and pose
+slip    the probe slipped in its mount: one such error of the pose, the same in every spoilt image
+mixed   each spoilt image draws one of echo, click and pose
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ def contaminate(
         key: of the draws.
         problem: one problem.
         fraction: of the images; rounded to a whole number of them.
-        kind: see above.
+        kind: see the head of this module.
 
     Returns:
         The spoilt problem and (n,) 1 where an image was spoilt.
 
     Raises:
-        InputError: an unknown kind, or a fraction that is none.
+        InputError: an unknown kind, or a fraction outside 0 to 1.
     """
     if kind not in OUTLIER_KINDS:
         raise InputError(f"kind must be one of {', '.join(OUTLIER_KINDS)}, not {kind!r}")
@@ -66,7 +66,7 @@ def contaminate(
         axis=1,
     )
     in_image = jnp.where((chosen == 2)[:, None], 0.0, size[:, None] * in_image)
-    # There is nothing in front of the array: what would be there came later instead.
+    # Nothing lies in front of the array: an error that would lead there is made deeper instead.
     depth = problem.measurements[:, 1] + in_image[:, 1]
     later = problem.measurements[:, 1] - in_image[:, 1]
     depth = jnp.where(depth < _SHALLOWEST_MM, later, depth)

@@ -1,20 +1,20 @@
 """Random numbers by the million: counters through Threefry, normals by Box and Muller in float32.
 
-A simulated trial of 50 images and 128 elements needs 6,400 normals, and ``jax.random.normal`` made
-them the larger part of a study. Here every number is a function of a key, a stream (which quantity)
-and its place in it alone, as there: word pair i of stream s is Threefry-2x32 (20 rounds, Salmon et
-al. 2011) of the counter (i, s) under the key. But both words are used, the rounds are written out,
-so that they fuse with what follows, and normals come in pairs from a logarithm, a root and two
-polynomials (Box and Muller 1958).
+A simulated trial of 50 images and 128 elements needs 6,400 normals. With ``jax.random.normal``,
+drawing them took the larger part of a study's time. Here, as there, every number depends only on a
+key, a stream (which quantity) and its place in the stream: word pair i of stream s is Threefry-2x32
+(20 rounds, Salmon et al. 2011) of the counter (i, s) under the key. The differences: both words are
+used; the rounds are written out, so that they fuse with later operations; and normals come in pairs
+from a logarithm, a root and two polynomials (Box and Muller 1958).
 
-The measurements' noise, nearly all of the numbers, is evaluated in float32 and promoted: it has a
-relative rounding of 1e-7, which no statistic of a simulation sees. Everything else is evaluated in
-float64, for it is read in several places (a target both as the truth and in every pose): compiled
-loops that compute a number again may round it differently, and what must fit together would fit to
-seven digits only. No normal exceeds 6.7 SDs (the chance of a larger one is 2e-11), and uniforms
-have 32 bits.
-Words are the same wherever they are computed; the noise may differ in its last digit between
-programs that are compiled differently (another number of devices, say).
+The measurements' noise, nearly all of the numbers, is evaluated in float32 and promoted. Its
+relative rounding of 1e-7 has no effect on the statistics of a simulation. Everything else is
+evaluated in float64, since it is read in several places (a target both as the truth and in every
+pose): compiled loops that compute a number again may round it differently, and numbers that belong
+together would agree to seven digits only. No normal exceeds 6.8 SDs (the chance of a larger one is
+1e-11), and uniforms have 32 bits. Words are the same wherever they are computed; the noise may
+differ in its last digit between programs that are compiled differently (for another number of
+devices, say).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = np.uint32(0x1BD11BDA)
 
 _OWN = 0x6A780000
-"""Added to streams: no counter here is one that ``fold_in`` or ``split`` of the same key uses."""
+"""Added to streams, so that ``fold_in`` and ``split`` of the same key use other counters."""
 
 
 def words(

@@ -1,8 +1,9 @@
-"""Plain methods of a study, computed for what a study stores and nothing else.
+"""The methods of a study, computed only as far as a study stores their results.
 
-A study keeps X's errors, SDs, status and iterations of millions of solves. Here experiments stay
-what :mod:`jaxcal.model.batch` has, planes of numbers with the images minor; the conventional
-fit is made once for all methods; and of each calibration only what is stored is computed.
+A study keeps X's errors, SDs, status and iterations of millions of solves. Here experiments stay in
+the form of :mod:`jaxcal.model.batch`, planes of numbers with the images as the last axis. The
+conventional fit is made once for all methods, and of each calibration only what is stored is
+computed.
 """
 
 from __future__ import annotations
@@ -78,9 +79,9 @@ def experiments(
 ) -> tuple[Experiments, Iterate, Float[Array, "trials 3"]]:
     """Simulate a batch: its experiments, their truth, and the errors in them.
 
-    They are those of :func:`jaxcal.study.simulation.simulate`. The errors are root mean squares of
-    the lateral, range and elevational errors of each trial, mm, those that a tracker makes among
-    them: what self-tuned SDs estimate.
+    The experiments are those of :func:`jaxcal.study.simulation.simulate`. The errors are root mean
+    squares of the lateral, range and elevational errors of each trial, mm, including those that a
+    tracker makes. Self-tuned SDs estimate them.
     """
     one = jax.vmap(lambda key: arrange(draw(key, protocol), protocol))(keys)
     elements = protocol.probe.element_lateral()
@@ -91,7 +92,7 @@ def experiments(
         noise = jax.vmap(lambda key: draw_noise(key, protocol))(keys)
         return fit_deviations(noise, size, exact[:, 0], exact[:, 1], elements)
 
-    # The noise of so many stays in the second-level cache until the fit is done with it.
+    # A group is so small that its noise stays in the second-level cache until it is fitted.
     points = jax.lax.map(segmented, (_grouped(keys), _grouped(one.exact)))
     lateral, distance = (value.reshape(len(keys), -1) for value in points)
     images = _images(one.rotation, one.origin, lateral, distance)
@@ -124,7 +125,7 @@ def _images(rotation: Array, origin: Array, lateral: Array, distance: Array) -> 
 
 
 def problems_of(images: ImagePlanes) -> Problem:
-    """The same as problems with a leading axis; what nobody reads is not computed."""
+    """The images as problems with a leading axis; arrays that are not read are not computed."""
     lanes, count = images.mask.shape
     rotation = jnp.moveaxis(images.rotation, 0, -1).reshape(lanes, count, 3, 3)
     top = jnp.concatenate([rotation, jnp.moveaxis(images.origin, 0, -1)[..., None]], axis=-1)
@@ -155,7 +156,7 @@ def solve(
 
     Args:
         batch: the experiments.
-        truth: theirs.
+        truth: that of the experiments.
         begun: their conventional fits.
         kind: the method.
         options: its options.
@@ -165,7 +166,7 @@ def solve(
     problems = problems_of(images)
     options = replace(options, differentiate=False)
     plan, given = prepare(problems, Request(*kind, max_elevation=bound, options=options))
-    # What is not used of the calibration is not computed.
+    # Parts of the calibration that are not used are not computed.
     found = solve_problems(with_bound(problems, given), given, plan, begun=begun)
     matrix = jnp.asarray(found.image_to_probe)
     place = Iterate(
@@ -189,7 +190,7 @@ def solve(
 
 
 def _mean_squares(place: Iterate, images: ImagePlanes) -> Float[Array, "3 lanes"]:
-    """Of lateral error, range error and elevational offset at a place, mm^2."""
+    """Mean squares of lateral error, range error and elevational offset at an estimate, mm^2."""
     q, _ = targets(place, images)
     far = jnp.sqrt(q[1] * q[1] + q[2] * q[2])
     errors = [q[0] - images.lateral, far - images.distance, q[1]]
@@ -199,8 +200,8 @@ def _mean_squares(place: Iterate, images: ImagePlanes) -> Float[Array, "3 lanes"
 def _precision(place: Iterate, truth: Iterate, test: ImagePlanes) -> Float[Array, " lanes"]:
     """Eq. 8, as :func:`jaxcal.diagnostics.metrics.reconstruction_precision`, mm.
 
-    Reconstructed points are taken from the true target, near which they are: their mean and spread
-    then come from one pass without loss of digits.
+    Reconstructed points are taken relative to the true target. They are near it, so that one pass
+    gives their mean and spread without loss of digits.
     """
     rows = [[entry[:, None] for entry in row] for row in place.rotation]
     flat = [test.lateral, 0, test.distance]

@@ -8,7 +8,7 @@ Every law has one size in mm, a bound m or a standard deviation s:
     normal        of SD s
     heavy-tailed  Student's t with four degrees of freedom, scaled to SD s
 
-Laws that differ from those which prior ``auto`` weighs, and, last, what it believes of the mean:
+Laws other than those that the prior ``auto`` weighs (the last is what it assumes of the mean):
 
     exponential   of SD s, and so of mean s: mostly near the plane, always on the same side
     two-humped    half of them near -m, half near m, each hump of SD m / 4
@@ -23,8 +23,6 @@ the same seed.
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,25 +30,10 @@ from jaxtyping import Array, Float, Key
 
 from jaxcal import InputError
 from jaxcal.study import draws
-
-OffsetLaw = Literal[
-    "uniform",
-    "normal",
-    "one-sided",
-    "heavy-tailed",
-    "triangular",
-    "exponential",
-    "two-humped",
-    "drifting",
-    "outlying",
-    "off-centre",
-    "sometimes off-centre",
-]
-
-OFFSET_LAWS: tuple[OffsetLaw, ...] = get_args(OffsetLaw)
+from jaxcal.study.laws import OFFSET_LAWS, OffsetLaw
 
 DEGREES_OF_FREEDOM = 4.0
-"""Of the heavy-tailed law: the fewest whole ones with a variance that settles in a sample."""
+"""Of the heavy-tailed law: the least whole number for which a sample's variance settles."""
 
 _BOUNDED = ("uniform", "one-sided", "triangular", "two-humped")
 _HUMP = 0.25
@@ -62,7 +45,7 @@ _OUTLYING, _WIDER = 0.1, 5.0
 _FAR = 3.0
 """Mean of the off-centre law."""
 _SOMETIMES, _MEAN_SD = 0.1, 2.0
-"""How often the sometimes off-centre law has a mean, and its SD: what prior ``auto`` believes."""
+"""How often the sometimes off-centre law has a mean; the mean's SD. Prior ``auto`` assumes both."""
 
 
 def check_law(law: str) -> None:
@@ -75,7 +58,7 @@ def check_law(law: str) -> None:
 
 
 def standard_offsets(key: Key[Array, ""], law: OffsetLaw, count: int) -> Float[Array, " count"]:
-    """Draw ``count`` offsets of size 1 mm (bound or SD); times a size they have that size.
+    """Draw ``count`` offsets of size 1 mm (bound or SD), to be multiplied by another size.
 
     Args:
         key: of the draw.
@@ -128,10 +111,10 @@ def standard_offsets(key: Key[Array, ""], law: OffsetLaw, count: int) -> Float[A
 
 
 def nominal_bound(law: OffsetLaw, size: float) -> float:
-    """The bound that a method is told when it is told "the true one", mm.
+    """The bound that counts as the true one of a law, mm.
 
-    It is m itself where the law has one. Laws of an SD have none: sqrt(3) s is the bound of the
-    uniform law with the same SD.
+    It is m for laws with a bound. Laws with an SD have none: sqrt(3) s, the bound of the uniform
+    law with the same SD, takes its place.
     """
     check_law(law)
     return size if law in _BOUNDED else float(np.sqrt(3.0)) * size

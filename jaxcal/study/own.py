@@ -1,12 +1,12 @@
-"""Studies of one's own: what the engine asks of a study, and how workers find its class.
+"""Studies of one's own: what the engine needs of a study, and how workers find its class.
 
 :class:`jaxcal.study.spec.Spec` is the study that a TOML file describes. Any other class with the
 same few members runs through the same engine: in chunks that are resumed, in this process, on
 workers or on a Dask cluster.
 
 A worker is told the class by module and name and imports it. A module that belongs to no installed
-package (a script's neighbour) is looked for in the folder that this process found it in, and
-nowhere else; a Dask worker on another machine must have that folder, too.
+package (a file beside a script, say) is looked for in the folder where this process found it, and
+nowhere else. A Dask worker on another machine must have that folder, too.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ class Study(Protocol):
 
     @property
     def condition_count(self) -> int:
-        """Conditions."""
+        """Number of conditions."""
         ...
 
     @property
     def chunk_count(self) -> int:
-        """Files."""
+        """Number of chunks, each of which is a file."""
         ...
 
     @property
@@ -73,7 +73,7 @@ class Study(Protocol):
         """The study that the text was made from.
 
         Raises:
-            InputError: the text does not come from there.
+            InputError: the text was not made by :meth:`canonical`.
         """
         ...
 
@@ -110,14 +110,14 @@ def where_defined(study: Study) -> dict[str, str]:
 
 
 def study_from(where: dict[str, str], canonical: str) -> Study:
-    """The study of this canonical text, by :func:`where_defined`.
+    """The study with this canonical text, of the class that :func:`where_defined` describes.
 
     Raises:
         InputError: there is no such class, or the text is not of it.
     """
     folder = where.get("folder")
     if folder is not None and folder not in sys.path:
-        # Behind everything that is installed: it shadows nothing.
+        # At the end, so that it shadows nothing that is installed.
         sys.path.append(folder)
     try:
         kind = getattr(importlib.import_module(where["module"]), where["name"])

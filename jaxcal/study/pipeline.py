@@ -1,19 +1,18 @@
 """One chunk of a study: draw, segment, solve by every method, compare with the truth.
 
-One compiled program draws and segments (for each law of the offsets and number of images), one
-makes the conventional fits, and one solves for each method and set of static options; elevation,
-noise, bounds and all other numbers are arguments, so that a whole grid runs through the same
-programs. They take blocks of a fixed number of trials, whatever the chunks; a short last block is
-filled up, and what was filled in dropped.
+There is one compiled program that draws and segments for each law of the offsets and number of
+images, one that makes the conventional fits, and one that solves for each method and set of static
+options. Elevation, noise, bounds and all other numbers are arguments, so that a whole grid runs
+through the same programs. They take blocks of a fixed number of trials, whatever the size of the
+chunks. A short last block is filled up, and the results of the added trials are dropped.
 
-Plain methods are computed by :mod:`jaxcal.study.lean`; the others by
-:func:`jaxcal.calibrate_batch`.
+All methods are computed by :mod:`jaxcal.study.lean`.
 
 The programs are compiled for one thread each: trials are independent, so that processes, one for
 each group of cores (:mod:`jaxcal.study.cluster`), use several cores better than XLA's thread pool
 does, and neither results nor progress depend on how that pool is scheduled.
 
-Where a host has several devices each takes its share of a block.
+If a host has several devices, each takes its share of a block.
 """
 
 from __future__ import annotations
@@ -34,8 +33,9 @@ from jaxcal.model.batch import Iterate
 from jaxcal.runtime.compiler import fast_to_run, single_threaded
 from jaxcal.runtime.precision import in_own_modes
 from jaxcal.solvers.start import ConventionalStart
+from jaxcal.study.laws import OffsetLaw
 from jaxcal.study.lean import Experiments, Kind, Measured, begin, experiments, solve
-from jaxcal.study.offsets import OffsetLaw, nominal_bound
+from jaxcal.study.offsets import nominal_bound
 from jaxcal.study.simulation import Protocol
 from jaxcal.study.spec import Chunk, Condition, MethodSpec, Spec
 
@@ -43,16 +43,16 @@ LANES = {"cpu": 64}
 """Trials drawn or solved side by side on a device; on a CPU what they need stays in its caches."""
 
 OTHER_LANES = 4096
-"""And on whatever else: enough to fill it."""
+"""The same for other devices: enough to fill one."""
 
 MOST_PIECES = 8
-"""So many times these in one call of a program, one after the other; a call takes 0.1 ms."""
+"""Most such groups of trials for a device in one call, one by one; a call takes 0.1 ms."""
 
 Devices = tuple[Any, ...]
-"""jax.Device, which is no type to the type checker."""
+"""Of jax.Device, which the type checker does not accept as a type."""
 
 COMPONENTS = ("lateral", "range", "elevation")
-"""Of the SDs, in their order."""
+"""Components of the SDs, in this order."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +66,7 @@ class ProblemShape:
     tracked: bool
 
     def protocol(self, numbers: dict[str, Any]) -> Protocol:
-        """With the numeric fields, which may be traced; a tracker without errors draws none."""
+        """The protocol with these numbers, which may be traced; a perfect tracker draws none."""
         if not self.tracked:
             numbers = numbers | {"tracker_mm": 0.0, "tracker_rad": 0.0}
         return Protocol(
@@ -89,7 +89,7 @@ def compute_chunk(spec: Spec, chunk: Chunk) -> dict[str, np.ndarray]:
     Returns:
         Arrays by name: those of :class:`Measured` (methods, trials, ...) and ``realised`` (trials,
         3), the root mean square errors of lateral position, range and elevational offset that were
-        drawn, mm. They are the same whatever was computed before, and on whatever worker.
+        drawn, mm. They depend neither on what was computed before nor on the worker.
     """
     condition, devices = spec.condition(chunk.condition), tuple(jax.local_devices())
     pieces, lanes = _block(spec, devices)
@@ -165,8 +165,8 @@ def bound_mm(method: MethodSpec, condition: Condition) -> float:
         return method.max_elevation_mm
     if method.max_elevation_factor is None:
         return float("nan")
-    law: OffsetLaw = condition.elevation_distribution  # type: ignore[assignment]
-    return method.max_elevation_factor * nominal_bound(law, condition.elevation_mm)
+    bound = nominal_bound(condition.elevation_distribution, condition.elevation_mm)
+    return method.max_elevation_factor * bound
 
 
 def protocol(condition: Condition, probe: LinearProbe) -> Protocol:
@@ -176,8 +176,8 @@ def protocol(condition: Condition, probe: LinearProbe) -> Protocol:
 
 def shape_of(condition: Condition, probe: LinearProbe) -> ProblemShape:
     """What is static about a condition's draws."""
-    law: OffsetLaw = condition.elevation_distribution  # type: ignore[assignment]
     tracked = condition.tracker_mm > 0 or condition.tracker_deg > 0
+    law = condition.elevation_distribution
     return ProblemShape(law, condition.images, condition.test_images, probe, tracked)
 
 
@@ -210,18 +210,18 @@ def _as_numpy(measured: Measured) -> dict[str, np.ndarray]:
 
 
 def _trials(value: Array) -> np.ndarray:
-    """Without the pieces."""
+    """The array with the axis of pieces merged into that of trials."""
     return np.asarray(value).reshape(-1, *value.shape[2:])
 
 
 def compile_pieces(function: Any, devices: Devices, *, pieces: int, fast: bool = True) -> Any:
-    """Compile a function of a piece for many, which are cut where there are several devices.
+    """Compile a function of one piece for many pieces, which several devices share.
 
     Args:
         function: of arrays and nothing static.
         devices: one, or several that share the pieces.
-        pieces: so many of the function's arguments, the first ones, are given for every piece;
-            further ones are for all of them.
+        pieces: number of leading arguments that are given for every piece; further arguments are
+            the same for all pieces.
         fast: with the flags of :func:`jaxcal.runtime.compiler.fast_to_run`.
     """
     platform = devices[0].platform

@@ -28,20 +28,20 @@ Computed = tuple[Chunk, dict[str, np.ndarray], str]
 
 @runtime_checkable
 class Watcher(Protocol):
-    """Who wants to know how a study goes on."""
+    """Is told about the progress of a study."""
 
     def begin(self, trials: int, done: int) -> None:
-        """So many trials are to be done in all, so many were done before."""
+        """``trials`` are to be done in all; ``done`` of them were done before."""
 
     def advance(self, trials: int) -> None:
-        """So many more are done and written."""
+        """``trials`` more are done and written."""
 
     def note(self, message: str) -> None:
         """Something that a person should know."""
 
 
 class Silence:
-    """Nobody watches."""
+    """A watcher that says nothing."""
 
     def begin(self, trials: int, done: int) -> None:
         """Say nothing."""
@@ -58,7 +58,7 @@ class RunSummary:
     """How a run ended.
 
     Attributes:
-        chunks: of the study, all of which are there now.
+        chunks: of the study; all of them exist now.
         computed: chunks that this run computed.
         trials: that this run computed.
         seconds: that it took, compilation included.
@@ -81,7 +81,7 @@ def run_study(
 ) -> RunSummary:
     """Compute the missing chunks of a study and write each when it is done.
 
-    Killed or interrupted at any moment, it is continued by the same call with ``resume``; the
+    If it is killed or interrupted at any moment, the same call with ``resume`` continues it. The
     files are then the same as without the interruption (on one machine).
 
     Args:
@@ -92,12 +92,12 @@ def run_study(
         workers: processes on this machine, each on cores of its own; 0 computes in this process.
         scheduler: instead, the address of a running Dask scheduler, or a Dask cluster (whatever
             ``distributed.Client`` takes), e.g. a ``dask_jobqueue.SLURMCluster``.
-        watcher: is told how it goes on.
+        watcher: is told about the progress.
 
     Raises:
         InputError: another spec's results are there, or the folder is in use.
         OutputError: the folder or a file cannot be written; what was written before stays.
-        MissingExtraError: Dask is needed and not there.
+        MissingExtraError: Dask is needed and not installed.
         CalibrationError: the cluster was lost; ``resume`` continues.
     """
     if workers < 0 or (workers and scheduler is not None):
@@ -167,7 +167,7 @@ def _compute_here(spec: Study, missing: Iterable[Chunk]) -> Iterator[Computed]:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from computing the same study; the lock dies with its holder."""
+    """Keep other processes from computing the same study; the lock ends with its process."""
     if fcntl is None:
         yield
         return

@@ -1,8 +1,9 @@
 """Tables of a study: reconstruction precision per condition and method, and paired differences.
 
-Means are over all trials with a finite result, those included that did not converge: leaving them
-out would flatter the method that fails where it is bad. They are counted beside it. Intervals are
-Student's, 95 %, of the mean over trials; differences are of the same experiment solved twice.
+Means are over all trials with a finite result, including those that did not converge: leaving them
+out would flatter a method that fails in bad cases. Such trials are counted beside the mean.
+Intervals are Student's 95 % intervals of the mean over trials. A difference is between two methods
+on the same experiment.
 """
 
 from __future__ import annotations
@@ -31,21 +32,22 @@ class Row:
 
     Attributes:
         method: its name.
-        bound_mm: what it was told, or None.
+        bound_mm: the bound that it was told, or None.
         trials: done so far.
-        max_iterations: trials that ended so, and
-        unobservable: so, and
-        failed: so.
+        max_iterations: number of trials with this status.
+        unobservable: number of trials with this status.
+        failed: number of trials with this status.
         not_finite: trials without a finite RP; they are in no mean.
-        mean_mm: mean RP, with
-        sd_mm: SD over trials and
-        low_mm: confidence interval from here
-        high_mm: to here.
-        difference_mm: mean of RP minus conventional's RP, paired, with
-        difference_low_mm: confidence interval from here
-        difference_high_mm: to here; None for the conventional method, or without one.
+        mean_mm: mean RP.
+        sd_mm: SD of RP over trials.
+        low_mm: lower end of the mean's confidence interval.
+        high_mm: its upper end.
+        difference_mm: mean of RP minus conventional's RP, paired; None for the conventional method,
+            or without one.
+        difference_low_mm: lower end of the difference's confidence interval, or None.
+        difference_high_mm: its upper end, or None.
         rotation_rad: root mean square error of X's rotation.
-        translation_mm: and of its translation.
+        translation_mm: root mean square error of X's translation.
         iterations: median of the iterations or rounds.
     """
 
@@ -100,7 +102,7 @@ def summarise(store: Store[Spec]) -> list[Cell]:
 
 
 def mean_interval(values: np.ndarray) -> tuple[float, float, float] | None:
-    """Mean and Student's 95 % interval of the finite values; None of fewer than two."""
+    """Mean and Student's 95 % interval of the finite values; None for fewer than two."""
     values = values[np.isfinite(values)]
     if len(values) < 2:
         return None

@@ -1,11 +1,11 @@
 """Simulated experiments after the paper's section 3.1, as a pure function of a key.
 
-The target is imaged in n poses: lateral position and depth uniform over the field, the elevational
-offset after one of the laws of :mod:`jaxcal.study.offsets`, the probe turned about a random axis by
-up to 30 degrees, and white noise on the distance to every element; lateral position and range are
-then segmented from the distances by least squares on Eq. 5. The tracker may err, too. Test images
-lie in the plane and carry no noise. The paper leaves the ranges open; ``experiments/paper_tables``
-says which choices come near its tables (``test_fraction`` is a fitted one).
+The target is imaged in n poses. Lateral position and depth are uniform over the field, the
+elevational offset has one of the laws of :mod:`jaxcal.study.offsets`, the probe is turned about a
+random axis by up to 30 degrees, and the distance to every element has white noise. Lateral position
+and range are then segmented from the distances by least squares on Eq. 5. The tracker may have
+errors, too. Test images lie in the plane and carry no noise. The paper leaves the ranges open;
+``experiments/paper_tables`` says which choices come near its tables (``test_fraction`` is fitted).
 
 A curvilinear array sees a sector: the direction is uniform within 0.9 of its half angle, the depth
 counts from the arc. Its data are the distances themselves; the points beside them are the in-plane
@@ -34,19 +34,20 @@ from jaxcal.runtime import executables
 from jaxcal.runtime.compiler import ONE_PROBLEM, computed_once
 from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.study import draws
-from jaxcal.study.offsets import OffsetLaw, check_law, standard_offsets
+from jaxcal.study.laws import OffsetLaw
+from jaxcal.study.offsets import check_law, standard_offsets
 
 Scalar = float | Float[Array, ""]
-"""A number of a protocol: a plain one, or one that is traced and so shared by a compiled program
-among all the values it may take."""
+"""A number of a protocol: plain, or traced, so that one compiled program serves all its values."""
 
 
 @dataclass(frozen=True)
 class Protocol:
     """The distributions of a simulated experiment.
 
-    Counts, the law of the offsets and the probe shape the program that draws; every other field
-    may be a traced number (``dataclasses.replace`` inside the transformed function).
+    The program that draws is compiled for given counts, law of the offsets, ``probe`` and ``raw``.
+    Every other field may be a traced number (``dataclasses.replace`` inside the transformed
+    function).
 
     Attributes:
         images: calibration images.
@@ -149,14 +150,14 @@ class Experiment(eqx.Module):
 
 
 class Numbers(eqx.Module):
-    """The random numbers of one experiment but the noise, functions of its key and counts alone.
+    """The random numbers of one experiment except the noise.
 
     Attributes:
-        axis: of every rotation: of X, of the images', of the test images' poses.
-        turn: how far about it, as a part of the largest angle.
-        place: X's origin and the target, in their SDs.
-        position: of images and test images in their fields, each way between -1 and 1.
-        offset: of the law's size 1.
+        axis: of the rotations of X, of the images' poses and of the test images' poses.
+        turn: angles about these axes, as fractions of the largest angle.
+        place: X's origin and the target, in units of their SDs.
+        position: of the target in images and test images, each coordinate between -1 and 1.
+        offset: elevational offsets for a law of size 1.
         tracker: standard normals of the tracker's six errors, or None.
     """
 
@@ -169,18 +170,23 @@ class Numbers(eqx.Module):
 
 
 _AXIS, _TURN, _PLACE, _POSITION, _NOISE, _TRACKER = range(6)
-"""Streams of :mod:`jaxcal.study.draws`; the offsets' key is folded in: their law has several."""
+"""Streams of :mod:`jaxcal.study.draws`. Offsets have a folded key, as laws need several streams."""
 
 
 class Planes(eqx.Module):
-    """Where everything is in one experiment, images minor, as the fused solvers read it.
+    """The geometry of one experiment as the fused solvers read it: images are the last axis.
 
     Attributes:
-        rotation: R_i by rows. origin: b_i, mm.
-        exact: true lateral position and range (curvilinear: depth), mm. elevation: y_i, mm.
-        true_rotation: of X. true_translation: of X, mm. target: c, mm.
-        test_rotation: of the test images. test_origin: theirs, mm. test_point: exact lateral
-            position and range, mm.
+        rotation: R_i by rows.
+        origin: b_i, mm.
+        exact: true lateral position and range (curvilinear: depth), mm.
+        elevation: y_i, mm.
+        true_rotation: of X.
+        true_translation: of X, mm.
+        target: c, mm.
+        test_rotation: of the test images.
+        test_origin: of the test images, mm.
+        test_point: of the test images, exact lateral position and range, mm.
     """
 
     rotation: Float[Array, "9 n"]
@@ -232,7 +238,7 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
 
 
 def draw(key: Key[Array, ""], protocol: Protocol) -> Numbers:
-    """All random numbers of one experiment; of the protocol only what is static counts."""
+    """The random numbers of one experiment; only static fields of the protocol matter."""
     return computed_once(lambda: _numbers(key, protocol), protocol.noise_mm)
 
 
@@ -254,14 +260,14 @@ def _numbers(key: Key[Array, ""], protocol: Protocol) -> Numbers:
 def draw_noise(key: Key[Array, ""], protocol: Protocol) -> Complex64[Array, "n half"]:
     """Standard normals of the elements.
 
-    Those of their first half are the real parts, those of the others the imaginary ones.
+    Real parts are for the first half of the elements, imaginary parts for the others.
     """
     shape = (protocol.images, -(-protocol.probe.elements // 2))
     return computed_once(lambda: draws.normal_pairs(key, _NOISE, shape), protocol.noise_mm)
 
 
 def arrange(numbers: Numbers, protocol: Protocol) -> Planes:
-    """Poses and targets as the random numbers say; nothing is measured yet."""
+    """Poses and targets from the random numbers; nothing is measured yet."""
     probe, n = protocol.probe, protocol.images
     curved = isinstance(probe, CurvilinearProbe)
     witness = protocol.noise_mm
@@ -380,7 +386,7 @@ def _from_sector(
 
 
 def _tracked(protocol: Protocol) -> bool:
-    """Whether the tracker errs; a traced size may be anything."""
+    """Whether the tracker has errors; a traced size may be zero or not, so it counts as errors."""
     sizes = (protocol.tracker_mm, protocol.tracker_rad)
     return any(is_traced(size) or bool(size > 0) for size in sizes)
 
@@ -391,7 +397,7 @@ def times_of_flight(
     """One-way times as the electronics would report them, s.
 
     Args:
-        distances: measured, mm; what noise made negative is no answer (NaN).
+        distances: measured, mm; those that noise made negative become NaN (no answer).
         probe: its sound speed and delay apply.
         clock_hz: the counter's frequency: times are rounded to its period; None: not at all.
 
@@ -417,11 +423,11 @@ NUMBERS = (
     "tracker_mm",
     "tracker_rad",
 )
-"""Fields of a protocol that a program takes as numbers: one serves all their values."""
+"""Fields of a protocol that are arguments of a program, so that one serves all their values."""
 
 
 def _drawn(seed: int, protocol: Protocol) -> Experiment:
-    """One experiment by a program that is kept, where programs are."""
+    """One experiment; on a CPU by a program that is kept."""
     names = NUMBERS if _tracked(protocol) else NUMBERS[:-2]
     sizes = tuple(np.asarray(getattr(protocol, name), np.float64) for name in names)
     shape = replace(protocol, **{name: getattr(Protocol, name) for name in NUMBERS})
@@ -434,7 +440,7 @@ def _drawn(seed: int, protocol: Protocol) -> Experiment:
 
 def _from_numbers(seed: Int[Array, ""], sizes: tuple[Array, ...], shape: Protocol) -> Experiment:
     """Draw an experiment of a protocol whose numbers are traced."""
-    numbers = dict(zip(NUMBERS, sizes, strict=False))  # a perfect tracker has none
+    numbers = dict(zip(NUMBERS, sizes, strict=False))  # a perfect tracker has no sizes
     shallow, deep = numbers.pop("depth_mm")
     return simulate(jax.random.key(seed), replace(shape, depth_mm=(shallow, deep), **numbers))
 

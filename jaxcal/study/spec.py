@@ -63,6 +63,7 @@ from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
 from jaxcal.io.readable import quoted
 from jaxcal.io.toml import load_toml, parse_toml
+from jaxcal.study.laws import OFFSET_LAWS, OffsetLaw
 from jaxcal.study.own import ArraySpec
 
 MAXIMUM_BYTES = 2**20
@@ -106,7 +107,7 @@ UNITS = {
     "status": "1",
     "iterations": "1",
 }
-"""Of every array of a chunk."""
+"""Unit of every array of a chunk."""
 
 _COUNTS = {"images": (4, 100_000), "test_images": (2, 100_000)}
 _LIMITS = {
@@ -121,14 +122,13 @@ _LIMITS = {
     "tracker_deg": (0.0, 57.0),
 }
 _UNITS = ("_mm", "_deg", "_rad")
-_LAWS = ("uniform", "normal", "one-sided", "heavy-tailed", "triangular")
 
 
 @dataclass(frozen=True)
 class Condition:
     """One cell of the grid; the fields are those of ``[conditions]``, each with one value."""
 
-    elevation_distribution: str = "uniform"
+    elevation_distribution: OffsetLaw = "uniform"
     images: int = 50
     test_images: int = 50
     test_fraction: float = 0.75
@@ -150,14 +150,14 @@ class MethodSpec:
         name: how results call it.
         method: ``conventional``, ``alternating`` or ``joint``.
         prior: of the joint method: ``auto``, ``gaussian``, ``uniform`` or ``bounded``.
-        max_elevation_mm: bound on |y| of alternating and bounded; None where there is none, or
-            where the factor says it. Without either it is the paper's 1 mm.
+        max_elevation_mm: bound on |y| of alternating and bounded; None if there is none or if
+            ``max_elevation_factor`` gives it. In a file without either it is the paper's 1 mm.
         max_elevation_factor: the bound as a multiple of the true one.
-        tolerance_rad: see :class:`jaxcal.Options`, and so are the following.
-        tolerance_mm: see there.
-        max_rounds: see there.
-        inner_steps: see there.
-        max_iterations: see there.
+        tolerance_rad: see :class:`jaxcal.Options`.
+        tolerance_mm: see :class:`jaxcal.Options`.
+        max_rounds: see :class:`jaxcal.Options`.
+        inner_steps: see :class:`jaxcal.Options`.
+        max_iterations: see :class:`jaxcal.Options`.
     """
 
     name: str
@@ -173,7 +173,7 @@ class MethodSpec:
 
     @property
     def bounded(self) -> bool:
-        """Whether it needs a bound."""
+        """Whether the method needs a bound."""
         return self.method == "alternating" or self.prior == "bounded"
 
 
@@ -196,8 +196,8 @@ class Spec:
         seed: of all draws.
         trials: in each condition.
         chunk_trials: most trials in one file.
-        axes: for every field of :data:`AXES` its values, and
-        listed: the names of those that were given as lists: the axes of the results.
+        axes: for every field of :data:`AXES`, its values.
+        listed: names of the fields that were given as lists, which are the axes of the results.
         probe: the transducer.
         methods: in the order of the file.
     """
@@ -316,7 +316,7 @@ def parse_spec(text: str) -> Spec:
 
     Raises:
         FormatError: not TOML.
-        InputError: see there.
+        InputError: see :func:`load_spec`.
     """
     return _spec(parse_toml(text))
 
@@ -340,7 +340,7 @@ def spec_from_canonical(text: str) -> Spec:
     """The spec that :meth:`Spec.canonical` was made from (it travels to workers as this text).
 
     Raises:
-        InputError: the text does not come from there.
+        InputError: the text was not made by :meth:`Spec.canonical`.
     """
     try:
         content = json.loads(text)
@@ -442,8 +442,10 @@ def _axes(
 
 def _condition_value(name: str, label: str, value: object) -> float | int | str:
     if name == "elevation_distribution":
-        if value not in _LAWS:
-            raise InputError(f"{label} must be one of {', '.join(_LAWS)}, not {_shown(value)}")
+        if value not in OFFSET_LAWS:
+            raise InputError(
+                f"{label} must be one of {', '.join(OFFSET_LAWS)}, not {_shown(value)}"
+            )
         return str(value)
     if name in _COUNTS:
         return _integer(label, value, *_COUNTS[name])

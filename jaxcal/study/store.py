@@ -9,8 +9,8 @@
         status, iterations        (methods, trials) integers
         realised                  (trials, 3) [mm]
 
-A file has its name only when it is complete. It is believed only when it belongs to the spec and
-its checksum (SHA-256 of the arrays' bytes) is right, and is computed again otherwise. Files hold no
+A file gets its name only when it is complete. It is accepted only if it belongs to the spec and its
+checksum (SHA-256 of the arrays' bytes) is right; otherwise it is computed again. Files hold no
 times of day: the same chunk computed twice on one machine is the same file, byte by byte.
 """
 
@@ -56,15 +56,15 @@ class Store(Generic[S]):
 
     @classmethod
     def create(cls, folder: str | os.PathLike[str], spec: S, *, resume: bool) -> Store[S]:
-        """Make the folder of a study, or take up one that is there.
+        """Make the folder of a study, or continue one that exists.
 
         Args:
             folder: made if need be, with its parents.
             spec: the study.
-            resume: whether a study that is there may be continued.
+            resume: whether an existing study may be continued.
 
         Raises:
-            InputError: another study is there, or this one and ``resume`` is false.
+            InputError: the folder holds another study, or this one while ``resume`` is false.
             OutputError: the folder cannot be made or written to. Nothing was written then.
         """
         store = cls(folder, spec)
@@ -99,7 +99,7 @@ class Store(Generic[S]):
         return self.folder / "chunks" / f"chunk-{chunk.index:06d}.h5"
 
     def present(self) -> list[int]:
-        """Indices of the chunks that have a file, in order; whether they are sound is not asked."""
+        """Indices of the chunks that have a file, in order; their content is not checked."""
         folder = self.folder / "chunks"
         try:
             names = os.listdir(folder)
@@ -135,8 +135,8 @@ class Store(Generic[S]):
             for name in wanted
         }
         with atomic_path(path) as temporary:
-            # HDF5 only meets a full disk when it closes the file, and then loses the reason; a
-            # file in memory that is written in one go says it.
+            # HDF5 notices a full disk only when it closes the file, and then loses the reason. A
+            # file that is made in memory and written in one go reports it.
             image = _pack(
                 results,
                 {

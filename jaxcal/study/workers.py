@@ -38,13 +38,13 @@ class Worker:
 
     Args:
         spec: the study.
-        cores: that the process is kept on.
+        cores: the only ones that the process may use.
     """
 
     def __init__(self, spec: Study, cores: set[int]) -> None:
         cache = None
         if "jax" in sys.modules:
-            # Where this process keeps its compiled programs its workers may, too.
+            # Workers keep compiled programs in the same folder as this process.
             cache = getattr(sys.modules["jax"].config, "jax_compilation_cache_dir", None)
         environment = {**os.environ, **_ONE_THREAD}
         if cache is not None:
@@ -181,7 +181,7 @@ def compute_on_workers(
 def core_groups(workers: int) -> list[set[int]]:
     """This process's cores shared out to workers, as evenly as can be.
 
-    More workers than cores share them.
+    If there are more workers than cores, some share a core.
     """
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     cores = cores or list(range(os.cpu_count() or 1))
@@ -193,12 +193,12 @@ def core_groups(workers: int) -> list[set[int]]:
 def main() -> None:
     """What a worker does, until its standard input ends."""
     answers = os.fdopen(os.dup(1), "wb")
-    # JAX or a library may print; only answers may go where the parent listens.
+    # JAX or a library may print, but the pipe to the parent must carry only answers.
     os.dup2(2, 1)
     requests = sys.stdin.buffer
     given = json.loads(requests.readline())
     if given["cores"] and hasattr(os, "sched_setaffinity"):
-        # Before JAX is imported, which counts them.
+        # Before JAX is imported, since JAX counts the cores.
         os.sched_setaffinity(0, given["cores"])
     spec = study_from(given["where"], given["spec"])
     for line in requests:

@@ -1,0 +1,24 @@
+"""Names of the laws of the elevational offset; :mod:`jaxcal.study.offsets` says what each one is.
+
+Specifications of studies are read without JAX, which drawing from a law needs.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+OffsetLaw = Literal[
+    "uniform",
+    "normal",
+    "one-sided",
+    "heavy-tailed",
+    "triangular",
+    "exponential",
+    "two-humped",
+    "drifting",
+    "outlying",
+    "off-centre",
+    "sometimes off-centre",
+]
+
+OFFSET_LAWS: tuple[OffsetLaw, ...] = get_args(OffsetLaw)
