@@ -26,7 +26,9 @@ def main() -> int:
     """Run the command line; returns the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--execute", nargs="*", metavar="PAGE", help="run the pages' blocks first")
-    parser.add_argument("--check", action="store_true", help="with --execute: write nothing")
+    parser.add_argument(
+        "--check", action="store_true", help="with --execute: write nothing, compare outputs"
+    )
     parser.add_argument("--external", action="store_true", help="list links to other sites")
     parser.add_argument("--no-site", action="store_true", help="build no site")
     options = parser.parse_args()

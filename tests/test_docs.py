@@ -21,6 +21,7 @@ def _tools():
 
 QUICK = (
     "README.md",
+    "docs/start.md",
     "docs/how-to/latency.md",
     "docs/reference/formats.md",
     "docs/understand/certificate.md",
@@ -39,6 +40,25 @@ def test_the_blocks_of_a_page_run(page, tmp_path):
     assert text.count("figures/") == len(done.figures)
     for _, printed in done.printed:
         assert printed.strip()
+    assert pages.differences(ROOT / page, done) == []
+
+
+def test_an_output_that_a_page_shows_wrongly_is_found(tmp_path):
+    import pages
+
+    page = ROOT / "docs" / "no-such-page.md"
+    (block,) = pages.blocks("<!-- output -->\n```text\n12 images, 0.25 mm\n1.234567e-3\n```\n")
+    for printed, wrong in (
+        ("12 images, 0.26 mm 1.234567e-3", None),
+        ("12 images,\n0.25 mm 1.234568e-03", None),
+        ("12 images, 0.28 mm 1.234567e-3", "shows '0.25', and prints '0.28'"),
+        ("12 frames, 0.25 mm 1.234567e-3", "shows 'images,', and prints 'frames,'"),
+        ("12 images, 0.25 mm", "shows '1.234567e-3', and prints ''"),
+    ):
+        found = pages.differences(page, pages.Run(printed=[(block, printed)]))
+        assert found == ([] if wrong is None else [f"docs/no-such-page.md:3: {wrong}"])
+    (block,) = pages.blocks("<!-- output: times -->\n```text\nin 17.3 s\n```\n")
+    assert pages.differences(page, pages.Run(printed=[(block, "in 18.6 s")])) == []
 
 
 def test_a_block_that_fails_is_told_with_its_line(tmp_path):

@@ -9,6 +9,7 @@ otherwise:
 - ``<!-- setup: NAME -->``: the script of this name in ``docs/data`` is run first; it makes files
   that a reader has.
 - ``<!-- output -->``: the block is what the block before it printed; a build rewrites it.
+- ``<!-- output: REASON -->``: likewise, but its numbers are not compared (times, for example).
 
 A file ``NAME.svg`` or ``NAME.png`` that a page's code saves, and that the page shows from
 ``figures/``, becomes that figure. Commands of ``sh`` blocks run in this process, so that one
@@ -30,6 +31,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parents[1]
@@ -76,13 +78,13 @@ class Run:
 
     Attributes:
         names: of its Python blocks.
-        printed: by blocks whose output the page shows, with the span that it belongs to.
+        printed: by blocks whose output the page shows, each with the block that shows it.
         figures: files that the page shows and its code has saved.
         seconds: wall time.
     """
 
     names: dict[str, object] = field(default_factory=dict)
-    printed: list[tuple[tuple[int, int], str]] = field(default_factory=list)
+    printed: list[tuple[Block, str]] = field(default_factory=list)
     figures: list[Path] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -138,7 +140,7 @@ def run_page(page: Path, folder: Path) -> Run:
             if block.mark == "setup":
                 runpy.run_path(str(DATA / str(block.what)), run_name="__main__")
             if block.mark == "output":
-                done.printed.append((block.span, said))
+                done.printed.append((block, said))
             elif block.mark == "file":
                 assert block.what is not None, where
                 Path(block.what).write_text(block.code, encoding="utf-8")
@@ -153,10 +155,41 @@ def run_page(page: Path, folder: Path) -> Run:
     return done
 
 
+_NUMBER = re.compile(r"[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
+
+
+def differences(page: Path, done: Run) -> list[str]:
+    """Where a page shows another output than its blocks printed, one line each.
+
+    Words must be the same; line breaks do not count. Numbers may differ by rounding: by one and a
+    half units of their last digit, or by a millionth.
+    """
+    found = []
+    for block, printed in done.printed:
+        for shown, said in zip_longest(block.code.split(), printed.split(), fillvalue=""):
+            same = _NUMBER.sub("0", shown) == _NUMBER.sub("0", said)
+            if same and block.what is None:
+                pairs = zip(_NUMBER.findall(shown), _NUMBER.findall(said), strict=True)
+                same = all(_is_rounded(*pair) for pair in pairs)
+            if not same:
+                found.append(f"{name_of(page)}:{block.line}: shows {shown!r}, and prints {said!r}")
+                break
+    return found
+
+
+def _is_rounded(shown: str, said: str) -> bool:
+    """Whether two numbers agree but for rounding."""
+    first, second = (float(number.replace(",", "")) for number in (shown, said))
+    digits, _, exponent = shown.partition("e")
+    unit = 10.0 ** (int(exponent or 0) - len(digits.partition(".")[2]))
+    return abs(first - second) <= max(1.5 * unit, 1e-6 * abs(first))
+
+
 def rewrite(page: Path, done: Run) -> None:
     """Put what a run printed and drew into the page and beside it."""
     text = page.read_text(encoding="utf-8")
-    for (start, end), printed in sorted(done.printed, reverse=True):
+    for block, printed in reversed(done.printed):
+        start, end = block.span
         lines = [line.rstrip() for line in printed.splitlines()]
         text = text[:start] + "\n".join(lines).rstrip() + "\n" + text[end:]
     page.write_text(text, encoding="utf-8")
@@ -236,7 +269,7 @@ def run_all(chosen: list[Path], write: bool) -> Iterator[tuple[Path, Run | PageE
 
     Args:
         chosen: the pages; those on which nothing is run are passed over.
-        write: whether to put outputs and figures into the pages.
+        write: whether to put outputs and figures into the pages; else outputs are compared.
 
     Yields:
         A page, and what came of it or why it failed.
@@ -252,4 +285,7 @@ def run_all(chosen: list[Path], write: bool) -> Iterator[tuple[Path, Run | PageE
                 continue
             if write:
                 rewrite(page, done)
+            elif stale := differences(page, done):
+                yield page, PageError("\n".join(stale))
+                continue
         yield page, done
