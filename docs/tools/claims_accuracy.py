@@ -129,8 +129,8 @@ claim(
 
 claim(
     ACCURACY,
-    "is better in none: over it, at worst {:.2f}. From points without covariances: at worst "
-    "{:.2f}.",
+    "is better in no cell: auto's error over the alternation's is at worst {:.2f}. From points "
+    "without covariances: at worst {:.2f}.",
     lambda: [
         max(column("auto_grid", f"{name}_over_alternating")) for name in ("auto", "auto_points")
     ],
@@ -289,8 +289,8 @@ claim(
 )
 claim(
     ACCURACY,
-    "beat one by {:.1f} +- {:.1f} in leave-one-out log-likelihood. Elevational errors have "
-    "kurtosis {:.1f}, range errors {:.1f};",
+    "beat one common SD by {:.1f} +- {:.1f} in leave-one-out log-likelihood. Elevational errors "
+    "have kurtosis {:.1f}, range errors {:.1f};",
     lambda: _crosswire(
         "log_density_gained",
         "log_density_gained_standard_error",
@@ -312,7 +312,7 @@ claim(
 claim(
     ACCURACY,
     "mean of the offsets (probability {:.2f}), since the residuals are heavy-tailed and alike in "
-    "successive images: {:.2f} of what they say",
+    "successive images: {:.2f} of their information",
     lambda: _crosswire("mean_probability", "mean_trust"),
 )
 claim(

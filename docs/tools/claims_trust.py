@@ -107,8 +107,8 @@ claim(
 )
 claim(
     ACCURACY,
-    "X moves by at most {:.2f} SD towards own covariances. Towards a mean of the offsets, and "
-    "while one image moves away by 3 mm, {:.0f} of {:.0f} paths of 30 images has a step",
+    "X moves by at most {:.2f} SD between such places. Where the offsets get a mean, and where one "
+    "image moves away by 3 mm, {:.0f} of {:.0f} paths of 30 images has a step",
     lambda: (
         max(_jumps("largest_step_sds", "own covariances")),
         max(_jumps("paths_above_a_tenth", path)[1] for path in ("mean", "outlier")),
@@ -269,8 +269,8 @@ def _closed_form() -> list[float]:
 claim(
     ACCURACY,
     "compares {:,.0f} random problems, degenerate ones among them, with Levenberg-Marquardt from "
-    "64 starts. The closed form is above its best in none by more than 1e-9, and no certificate is "
-    "false. Certified are {:.2f} % of the problems with 8 images and {:.2f} % of those with 12 or "
-    "more.",
+    "64 starts. In none of them is the closed form above its best by more than 1e-9, and no "
+    "certificate is false. A certificate is found for {:.2f} % of the problems with 8 images and "
+    "{:.2f} % of those with 12 or more.",
     _closed_form,
 )
