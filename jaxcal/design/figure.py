@@ -23,6 +23,7 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
         wanted_mm: a wanted TRE to mark in the figure.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import StrMethodFormatter
 
     figure = Figure(figsize=(12.5, 4.2), dpi=130, layout="constrained")
     image, cone, errors = (
@@ -48,8 +49,14 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
         xlabel="lateral (mm)", ylabel="depth (mm)", title="target in the image", aspect="equal"
     )
     image.invert_yaxis()
-    image.legend(fontsize="small")
-    cone.set_title("tilt (degrees)")
+    # Below the image: in it, the legend would hide targets.
+    image.legend(
+        fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False
+    )
+    cone.set_title("tilt (degrees)", pad=18)
+    rings = np.arange(10, cone.get_rmax() + 1, 10)
+    if len(rings):
+        cone.set_rgrids(rings, fontsize="small")
     count = plan.known.images + np.arange(len(plan.tre_mm))
     seen = count >= 6
     errors.plot(count[seen], plan.tre_mm[seen], color=_BLUE, label="TRE")
@@ -59,6 +66,8 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
     errors.set(
         xlabel="images", ylabel="predicted error (mm)", yscale="log", title="how many images?"
     )
+    for formatted in (errors.yaxis.set_major_formatter, errors.yaxis.set_minor_formatter):
+        formatted(StrMethodFormatter("{x:g}"))
     errors.grid(alpha=0.3, which="both")
     errors.legend(fontsize="small")
     return figure
