@@ -2,8 +2,8 @@
 
 A matrix is a list of rows of arrays that all have the same shape, one entry for every problem
 ("lane"). Written out, a 9x9 Cholesky solve is one straight stretch of code that XLA turns into a
-few vectorised loops over the lanes. It takes 0.07 us a lane; with loops over rows and columns it
-takes 2 us. Structural zeros are the number 0 and cost nothing.
+few vectorised loops over the lanes. This form is the fastest to run and the slowest to compile.
+Structural zeros are the number 0 and cost nothing.
 
 A matrix that is not positive definite gives NaN or Inf, in its own lane only.
 """
