@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal.cli.common import ExitCode, exit_code
@@ -16,6 +17,7 @@ from jaxcal.data.poses import inverse_poses
 from jaxcal.data.recording import make_images
 from jaxcal.diagnostics.frame_checks import wrong_frames
 from jaxcal.io.text import read_crosswire
+from jaxcal.report.next_poses import next_poses_record
 from jaxcal.report.record import calibration_record
 from jaxcal.report.verdict import verdict
 
@@ -51,6 +53,25 @@ def test_every_slip_is_named_or_refused_and_no_right_file_is(slips, form):
                 assert said is not None, (slip, number)
                 assert any(word in said for word in words), said
                 assert "\n" not in said
+
+
+def test_residuals_that_no_beam_explains_are_named(slips):
+    """Quaternions whose x and z are exchanged turn poses in a way that nobody looks for."""
+    right = slips.recorded(0, "mm")
+    poses = right.poses.copy()
+    numbers = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    poses[:, :3, :3] = Rotation.from_quat(numbers[:, [2, 1, 0, 3]]).as_matrix()
+    for images, wrong in ((right.images(), False), (make_images(poses, right.points), True)):
+        result = jaxcal.calibrate(jaxcal.Recording(images), "conventional")
+        assert any("larger than a beam is thick" in text for text in result.warnings) == wrong
+
+
+def test_whoever_has_wrong_frames_is_not_sent_for_more_poses(slips):
+    make, _ = slips.SLIPS["inverse poses"]
+    recording = jaxcal.Recording(make(slips.recorded(0, "mm")).images())
+    result = jaxcal.calibrate(recording, "conventional")
+    assert result.wrong_frames is not None
+    assert next_poses_record(result, recording) is None
 
 
 def test_noise_outliers_and_few_images_are_no_slips(slips):

@@ -112,6 +112,35 @@ def test_quaternion_order_is_asked_for(tmp_path):
         np.testing.assert_allclose(other.poses[:, :3, :3], expected, atol=1e-12)
 
 
+def test_an_order_that_contradicts_the_header_is_refused(tmp_path):
+    (tmp_path / "t.csv").write_text("\n".join(table(NAMES, COLUMNS)))
+    named = import_files([tmp_path / "t.csv"], ImportOptions(quaternion="xyzw"))[0].calibration
+    np.testing.assert_allclose(named.poses, POSES, atol=1e-11)
+    with pytest.raises(FormatError, match="numbers are x y z w, and --quaternion says wxyz"):
+        import_files([tmp_path / "t.csv"], ImportOptions(quaternion="wxyz"))
+    first = table([*NAMES[:5], "qw", "qx", "qy", "qz"], SCALAR_FIRST)
+    (tmp_path / "t.csv").write_text("\n".join(first))
+    named = import_files([tmp_path / "t.csv"], ImportOptions(quaternion="wxyz"))[0].calibration
+    np.testing.assert_allclose(named.poses, POSES, atol=1e-11)
+
+
+def test_the_poses_of_a_pair_may_be_in_metres(tmp_path):
+    def pair(factor):
+        poses = POSES[:, :3].copy()
+        poses[:, :, 3] *= factor
+        rows = [" ".join(map(repr, row)) for row in poses.reshape(-1, 4).tolist()]
+        (tmp_path / "poses.txt").write_text("\n".join(rows) + "\n")
+        return [tmp_path / "poses.txt", tmp_path / "points.txt"]
+
+    (tmp_path / "points.txt").write_text("".join(f"{u} {v}\n" for u, v in PIXELS.tolist()))
+    with pytest.raises(InputError, match=r"look like metres.*--pose-units m"):
+        import_files(pair(1e-3))
+    images = import_files(pair(1e-3), ImportOptions(pose_units="m"))[0].calibration
+    np.testing.assert_allclose(images.poses, POSES, atol=1e-11)
+    with pytest.raises(InputError, match="holds no quaternions"):
+        import_files(pair(1.0), ImportOptions(quaternion="wxyz"))
+
+
 def test_invalid_rows_are_counted(tmp_path):
     lines = table([*NAMES, "status"], [*COLUMNS, np.ones(6)])
     more = [lines[1].replace(",1.0", ",OUT_OF_VIEW"), "nan" + lines[2][lines[2].index(",") :]]

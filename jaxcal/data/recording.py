@@ -351,8 +351,9 @@ def _check_units(images: Images) -> None:
     # hundreds of times smaller than the target's path through the image, was recorded in metres.
     if 0 < spread < 0.02 * extent and reach < 5.0:
         raise InputError(
-            f"pose translations reach only {reach:.3g} while the target moves over {extent:.3g} mm "
-            "of the image: the poses look like metres; give them in mm"
+            f"pose translations reach only {reach:.3g} mm while the target moves over about "
+            f"{extent:.0f} mm of the image: the poses look like metres; give them in mm (jaxcal "
+            "import converts them with --pose-units m)"
         )
 
 

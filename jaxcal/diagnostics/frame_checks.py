@@ -189,13 +189,14 @@ def _slips(
         shifts,
         points,
     )
-    for words, order in (
-        ("first but is read as last", [1, 2, 3, 0]),
-        ("last but is read as first", [3, 0, 1, 2]),
+    for words, right, order in (
+        ("first but is read as last", "wxyz", [1, 2, 3, 0]),
+        ("last but is read as first", "xyzw", [3, 0, 1, 2]),
     ):
         reordered = _with_quaternions_reordered(rotations, order)
         yield (
-            f"the quaternions' scalar stands {words}: change its place",
+            f"the quaternions' scalar stands {words}: correct the header where it names the "
+            f"columns, else import with --quaternion {right}",
             reordered,
             shifts,
             points,

@@ -54,7 +54,11 @@ COMPONENTS = ("lateral", "range", "elevational")
 SUSPECTED = 0.02
 """Half of this is the share of recordings with Gaussian errors in which chance alone makes an
 image suspect."""
+IMPLAUSIBLE_RMS_MM = 10.0
+"""Residuals with a larger root mean square do not come from a target within the beam."""
+
 STEADY = 1e-3
+"""If the scaled KKT residual of a stopped alternation is larger, there is a warning."""
 WEAK_MM = 1.5
 """If the SD of the weakest direction (mm at the target) is larger, there is a warning."""
 WORTH = 0.7
@@ -377,6 +381,12 @@ def warnings(result: Calibration) -> list[str]:
             f"(scaled KKT residual {float(result.stationarity):.1e})"
         )
     found += result.notes
+    rms = float(result.rms)
+    if rms > IMPLAUSIBLE_RMS_MM:
+        found.append(
+            f"residuals of {rms:.1f} mm are larger than a beam is thick: either some images are "
+            "far off, or the poses are wrong (order or signs of their numbers, units, direction)"
+        )
     found += _weak_direction(result)
     if bounded and from_prior:
         held = f"{resting} of {used} images rest on it"

@@ -100,7 +100,8 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
 
     Args:
         names: cells of the header.
-        quaternion: order of columns that are only numbered (q1 to q4, q0 to q3).
+        quaternion: order of columns that are only numbered (q1 to q4, q0 to q3); it must not
+            contradict names.
 
     Raises:
         FormatError: a name that is not known, twice, or missing beside others; units that differ.
@@ -198,7 +199,15 @@ def _quaternion(
             )
         first = numbered[0]
         return (*numbered[1:], first) if order == "wxyz" else tuple(numbered)
-    return _complete(roles, ("qx", "qy", "qz", "qw"), "qx, qy, qz and qw")
+    columns = _complete(roles, ("qx", "qy", "qz", "qw"), "qx, qy, qz and qw")
+    if columns is not None and order is not None:
+        named = "".join(part for _, part in sorted(zip(columns, "xyzw", strict=True)))
+        if named != order:
+            raise FormatError(
+                f"the header says that the quaternion's numbers are {' '.join(named)}, and "
+                f"--quaternion says {order}: correct the header, or leave the option out"
+            )
+    return columns
 
 
 def _matrix(

@@ -44,7 +44,7 @@ class ImportOptions:
         spacing_mm: [lateral, axial] mm per px, when known.
         units: of u and v in tables.
         quaternion: where a quaternion's scalar stands.
-        pose_units: of translations in tables.
+        pose_units: of translations in tables and in pairs of text files.
         skip_invalid: leave out rows of tables that are marked as invalid, and count them.
         points: how points without time or number are assigned to frames.
         target_kind: what to look for in frames where no points are given: ``echo`` or ``cross``.
@@ -117,7 +117,12 @@ def import_files(
     if len(sources) == 2 and "markups" not in kinds:
         if options.units == "mm":
             raise InputError("a pair of text files holds pixels: --units mm does not go with it")
-        return Imported(read_crosswire(*sources, spacing_mm=options.spacing_mm), [])
+        if options.quaternion is not None:
+            raise InputError("a pair of text files holds no quaternions: leave --quaternion out")
+        pair = read_crosswire(
+            *sources, spacing_mm=options.spacing_mm, pose_units=options.pose_units or "mm"
+        )
+        return Imported(pair, [])
     if len(sources) != 1 or kinds[0] != "table":
         raise InputError(
             f"{os.fspath(sources[0])}: holds no poses: a sequence, a tracker's export or a table "

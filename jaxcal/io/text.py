@@ -190,14 +190,16 @@ def read_crosswire(
     points_path: str | os.PathLike[str],
     *,
     spacing_mm: np.ndarray | tuple[float, float] | None = None,
+    pose_units: LengthUnit = "mm",
 ) -> Recording:
     """Read a cross-wire recording: a text file of poses and one of pixels.
 
     Args:
         transforms_path: 3 rows ``R_i0 R_i1 R_i2 t_i`` for each image, i = 0, 1, 2: probe ->
-            tracker, mm; separated by white space. The row 0 0 0 1 is left out.
+            tracker; separated by white space. The row 0 0 0 1 is left out.
         points_path: a row ``u v`` for each image: lateral and axial, px.
         spacing_mm: [lateral, axial] mm per px, when known.
+        pose_units: of translations in the file.
 
     Returns:
         Images of kind ``pixel``; rotations are projected to SO(3).
@@ -219,8 +221,13 @@ def read_crosswire(
     pixels = _fixed(points, (2,), "u and v")
     name = f"{transforms.name} with {points.name}"
     if len(rows) // 3 != len(pixels):
-        raise FormatError(f"{name}: {len(rows) // 3} poses but {len(pixels)} points")
-    images = make_images(rows.reshape(-1, 3, 4), pixels, "pixel", spacing_mm=spacing_mm, where=name)
+        raise FormatError(
+            f"{name}: {len(rows) // 3} poses but {len(pixels)} points: each image has one pose "
+            "(3 rows) and one point (1 row)"
+        )
+    poses = rows.reshape(-1, 3, 4)
+    poses[:, :, 3] *= LENGTHS_MM[pose_units]
+    images = make_images(poses, pixels, "pixel", spacing_mm=spacing_mm, where=name)
     return Recording(images, source=name)
 
 

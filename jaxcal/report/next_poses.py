@@ -27,7 +27,7 @@ def next_poses_record(result: Calibration, recording: Recording) -> dict[str, An
         pose has ``words``, ``target_mm`` [lateral, axial], ``pose`` (4x4, probe -> tracker),
         ``fills_space`` and ``tre_mm``, the error with this pose and those before it.
     """
-    if result.status == "failed":
+    if result.status == "failed" or result.wrong_frames is not None:
         return None
     try:
         candidates = design.candidates_around(recording, result, count=_CANDIDATES)
