@@ -162,13 +162,15 @@ def problems() -> list[str]:
 
 
 def write() -> None:
-    """Put the tables' present values into the pages."""
+    """Put the tables' present values into the pages; sentences that are right keep their lines."""
     for piece in CLAIMS:
-        path = ROOT / piece.page
+        path, wanted = ROOT / piece.page, piece.text()
+
+        def renewed(match: re.Match[str], wanted: str = wanted) -> str:
+            return match[0] if match[0].split() == wanted.split() else wanted
+
         text = path.read_text(encoding="utf-8")
-        path.write_text(
-            piece.pattern().sub(lambda _, piece=piece: piece.text(), text), encoding="utf-8"
-        )
+        path.write_text(piece.pattern().sub(renewed, text), encoding="utf-8")
 
 
 def main() -> int:
