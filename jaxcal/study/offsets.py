@@ -33,7 +33,7 @@ from jaxcal.study import draws
 from jaxcal.study.laws import OFFSET_LAWS, OffsetLaw
 
 DEGREES_OF_FREEDOM = 4.0
-"""Of the heavy-tailed law: the least whole number for which a sample's variance settles."""
+"""Of the heavy-tailed law, Student's t."""
 
 _BOUNDED = ("uniform", "one-sided", "triangular", "two-humped")
 _HUMP = 0.25
