@@ -54,9 +54,10 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
         fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False
     )
     cone.set_title("tilt (degrees)", pad=18)
-    rings = np.arange(10, cone.get_rmax() + 1, 10)
+    rings = np.arange(10, cone.get_ylim()[1] + 1, 10)
     if len(rings):
-        cone.set_rgrids(rings, fontsize="small")
+        cone.set_yticks(rings)
+    cone.tick_params(axis="y", labelsize="small")
     count = plan.known.images + np.arange(len(plan.tre_mm))
     seen = count >= 6
     errors.plot(count[seen], plan.tre_mm[seen], color=_BLUE, label="TRE")
