@@ -383,7 +383,11 @@ def propagate(linear: Linear, sd: float, recipe: Recipe, bound: np.ndarray | Non
     def belief(tau: np.ndarray, nu: np.ndarray):
         information = linear.information + (h.T * tau) @ h
         right = linear.gradient + h.T @ (nu - tau * o)
-        covariance = np.linalg.inv(information)
+        try:
+            covariance = np.linalg.inv(information)
+        except np.linalg.LinAlgError:
+            # Where the sites run away, rounding decides whether the matrix still has an inverse.
+            covariance = np.full_like(information, np.nan)
         return covariance, covariance @ right, information, right
 
     def tilt(family, scale, tau, nu, covariance, mean):
