@@ -110,8 +110,11 @@ def assemble(
         plan: what is static about the request.
     """
     problem = problem.cleared(problem.mask)
-    # Without this barrier the compiler would repeat the end of the solve for every image.
-    solved = barrier(solved)
+    # Without this barrier the compiler would repeat the end of the solve for every image. The
+    # matrices stay without, so that they are not moved from lanes last and back.
+    parts = (solved.parameters, solved.offset, solved.sigma, solved.bound)
+    parts, convergence = barrier((parts, solved.convergence))
+    solved = Solved(*parts, solved.information, solved.design, convergence)
     parameters, blocks, mask = solved.parameters, plan.blocks, problem.mask
     used = jnp.sum(mask, axis=-1)
     errors = Errors.of(parameters, images, blocks)
@@ -128,13 +131,14 @@ def assemble(
 
     lever = jax.lax.stop_gradient(errors.lever(mask))
     covariance, observed = covariance_and_observability(
-        solved.information,
-        solved.design,
+        jnp.moveaxis(solved.information, 0, -1),
+        jnp.moveaxis(solved.design, 0, -1),
         variance,
-        mm_at_target(lever, blocks),
+        mm_at_target(lever, blocks).T,
         LARGEST_SD * lever,
         bounded=plan.prior == "bounded",
     )
+    covariance = jnp.moveaxis(covariance, -1, 0)
     if averaged is not None:
         # What the Gaussian solution cannot determine at all stays unknown.
         better = averaged.law.weighed[..., None, None] & jnp.isfinite(covariance)
@@ -286,21 +290,21 @@ class Observability(eqx.Module):
         singular: degenerate, or the information with the active bounds is singular.
     """
 
-    degenerate: Bool[Array, "*batch"]
-    weak: Bool[Array, "*batch"]
-    singular: Bool[Array, "*batch"]
+    degenerate: Bool[Array, " lanes"]
+    weak: Bool[Array, " lanes"]
+    singular: Bool[Array, " lanes"]
 
 
 def covariance_and_observability(
-    information: Float[Array, "*batch p p"],
-    design: Float[Array, "*batch p p"],
-    variance: Float[Array, "*batch"],
-    scale: Float[Array, "*batch p"],
-    reach: Float[Array, "*batch"],
+    information: Float[Array, "p p lanes"],
+    design: Float[Array, "p p lanes"],
+    variance: Float[Array, " lanes"],
+    scale: Float[Array, "p lanes"],
+    reach: Float[Array, " lanes"],
     *,
     bounded: bool = False,
-) -> tuple[Float[Array, "*batch p p"], Observability]:
-    """Covariance (NaN where there is none) and observability, by one elimination.
+) -> tuple[Float[Array, "p p lanes"], Observability]:
+    """Covariance (NaN where there is none) and observability, by one elimination; lanes last.
 
     Args:
         information: of the unknowns, offsets eliminated.
@@ -311,30 +315,26 @@ def covariance_and_observability(
         bounded: bounds confine the offsets, and with them every direction, so all that matters
             about the information is whether it is singular.
     """
-    batch, count, eps = scale.shape[:-1], scale.shape[-1], float(jnp.finfo(scale.dtype).eps)
-    both, eye = scale[..., :, None] * scale[..., None, :], jnp.eye(count, dtype=scale.dtype)
+    lanes, eps = variance.shape[0], float(jnp.finfo(scale.dtype).eps)
+    eye = jnp.eye(len(scale), dtype=scale.dtype)[..., None]
+    both = scale[:, None] * scale
     weighted, unweighted = jax.lax.stop_gradient((information / both, design / both))
-    total = jnp.trace(weighted, axis1=-2, axis2=-1)
+    total = jnp.trace(weighted)
     least = threshold(eps) * total if bounded else jax.lax.stop_gradient(variance / reach**2)
-    floor = threshold(eps) * jnp.trace(unweighted, axis1=-2, axis2=-1)
+    floor = threshold(eps) * jnp.trace(unweighted)
     # A ridge at the level of rounding keeps an unobservable direction finite.
-    diagonal = jnp.diagonal(design if bounded else information, axis1=-2, axis2=-1)
-    ridge = jax.lax.stop_gradient(16 * eps * diagonal)
+    ridge = jax.lax.stop_gradient(16 * eps * (design if bounded else information) * eye)
     # A pivot that is not positive makes the logarithm of the determinant not finite.
-    matrices = [information + ridge[..., None] * eye, unweighted - floor[..., None, None] * eye]
-    lanes_last = jnp.moveaxis(jnp.stack(matrices).reshape(-1, count, count), 0, -1)
-    inverse, log_determinant = inverse_lanes_last(lanes_last)
-    inverse = jnp.moveaxis(inverse.reshape(count, count, 2, -1)[:, :, 0], -1, 0)
-    inverse = inverse.reshape(*batch, count, count)
-    observable = jnp.isfinite(log_determinant).reshape(2, *batch)[1]
+    matrices = [information + ridge, unweighted - floor * eye]
+    inverse, log_determinant = inverse_lanes_last(jnp.concatenate(matrices, axis=-1))
+    inverse = inverse[..., :lanes]
+    observable = jnp.isfinite(log_determinant[lanes:])
 
-    def exceeding() -> Bool[Array, "*batch"]:
-        reduced = weighted - least[..., None, None] * eye
-        lanes_last = jnp.moveaxis(reduced.reshape(-1, count, count), 0, -1)
-        return jnp.isfinite(inverse_lanes_last(lanes_last)[1]).reshape(batch)
+    def exceeding() -> Bool[Array, " lanes"]:
+        return jnp.isfinite(inverse_lanes_last(weighted - least * eye)[1])
 
     # No eigenvalue of an inverse exceeds its trace; this test nearly always suffices.
-    largest = jnp.sum(jnp.diagonal(inverse, axis1=-2, axis2=-1) * scale**2, axis=-1)
+    largest = jnp.sum(jnp.diagonal(inverse).T * scale**2, axis=0)
     clearly = jax.lax.stop_gradient(2 * least * largest < 1) & (largest > 0) & (not bounded)
     exceeds = jax.lax.cond(jnp.all(clearly), lambda: clearly, exceeding)
 
@@ -344,8 +344,7 @@ def covariance_and_observability(
     found = Observability(
         degenerate=degenerate, weak=below & (not bounded), singular=degenerate | (below & bounded)
     )
-    covariance = variance[..., None, None] * 0.5 * (inverse + jnp.swapaxes(inverse, -1, -2))
-    return jnp.where(found.singular[..., None, None], jnp.nan, covariance), found
+    return jnp.where(found.singular, jnp.nan, variance * inverse), found
 
 
 def _status(

@@ -18,7 +18,7 @@ from jaxcal.calibration.answer import Solved, assemble
 from jaxcal.calibration.options import Given, SolvePlan
 from jaxcal.calibration.result import Calibration, Convergence
 from jaxcal.data.problem import Problem
-from jaxcal.model.batch import ImagePlanes
+from jaxcal.model.batch import ImagePlanes, barrier
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.observations import (
     BoundedOffsets,
@@ -33,7 +33,7 @@ from jaxcal.runtime.precision import in_standard_promotion
 from jaxcal.solvers import methods
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.solvers.methods import Solution
-from jaxcal.solvers.normal_equations import accumulate, component_sums, stacked
+from jaxcal.solvers.normal_equations import accumulate, information_and_design
 from jaxcal.solvers.start import ConventionalStart, GivenStart
 
 
@@ -116,7 +116,7 @@ def _solved(
     """The method's solution with its normal matrices, problems first."""
     found = methods.solve(problems, images, given, plan, begun)
     observation = found.observation
-    information, design = _normal_matrices(found, images)
+    information, design = barrier(_normal_matrices(found, images))
     offset = jnp.zeros((images.lanes, 0), images.mask.dtype)
     if isinstance(observation, LocalUnknown):
         offset = local_unknowns(found.place, observation, images)
@@ -142,10 +142,7 @@ def _normal_matrices(
     """The weighted normal matrix at a solution, and that of the unweighted components."""
     observation, place = found.observation, found.place
     if isinstance(observation, (Points, ChannelDistances)):
-        # One pass over the images gives both matrices.
-        sums = component_sums(place, observation, images, None, found.medium)
-        weighted = sums.weighed(1 / observation.sigma**2).stacked()
-        return weighted, stacked(jnp.sum(sums.matrix, axis=0))
+        return information_and_design(place, observation, images, found.medium)
     weighted = accumulate(place, observation, images, None, found.medium).stacked()
     if isinstance(observation, InPlane):
         return weighted, weighted

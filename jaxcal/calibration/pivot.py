@@ -223,12 +223,13 @@ def _solve(poses: Float[Array, "n 4 4"], mask: Float[Array, " n"], *, robust: bo
     finite = jnp.all(jnp.isfinite(parameters.translation))
     failed = jnp.logical_not(finite) | (jnp.sum(mask) < MINIMUM_IMAGES)
     covariance, observed = covariance_and_observability(
-        information,
-        information,
-        variance,
-        jnp.ones(6, poses.dtype),
-        LARGEST_SD * jnp.maximum(length, _spread(problem)),
+        information[..., None],
+        information[..., None],
+        variance[None],
+        jnp.ones((6, 1), poses.dtype),
+        LARGEST_SD * jnp.maximum(length, _spread(problem))[None],
     )
+    covariance, observed = jax.tree.map(lambda leaf: leaf[..., 0], (covariance, observed))
     unknown = observed.degenerate | observed.weak
     status = jnp.where(unknown, Status.UNOBSERVABLE, Status.CONVERGED)
     return Pivot(

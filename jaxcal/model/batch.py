@@ -78,8 +78,11 @@ class ImagePlanes(eqx.Module):
         def plane(values: Array, instead: float) -> Array:
             return jnp.where(used, values, jnp.asarray(instead, problems.mask.dtype))
 
-        poses, points = problems.poses, problems.measurements * problems.spacing[:, None, :]
-        rotation = [plane(poses[..., i, j], float(i == j)) for i in range(3) for j in range(3)]
+        points = problems.measurements * problems.spacing[:, None, :]
+        # Turned round all at once: entry by entry, every plane would read all of the poses.
+        entries = problems.poses.reshape(*problems.mask.shape, 16)
+        entries = barrier(jnp.moveaxis(entries, -1, 0)).reshape(4, 4, *problems.mask.shape)
+        rotation = [plane(entries[i, j], float(i == j)) for i in range(3) for j in range(3)]
         elements = None
         if channels and problems.channels is not None:
             known = used[..., None]
@@ -90,7 +93,7 @@ class ImagePlanes(eqx.Module):
             )
         return cls(
             rotation=jnp.stack(rotation),
-            origin=jnp.stack([plane(poses[..., i, 3], 0.0) for i in range(3)]),
+            origin=jnp.stack([plane(entries[i, 3], 0.0) for i in range(3)]),
             lateral=plane(points[..., 0], 0.0),
             axial=jnp.where(used, points[..., 1], 1.0 - problems.face_offset[:, None]),
             face=problems.face_offset,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from jaxcal.data.problem import Problem
 from jaxcal.runtime import buckets, compiler, executables
 from jaxcal.runtime.precision import in_own_modes, inside_transformation
 from jaxcal.runtime.trees import map_arrays
+
+T = TypeVar("T")
 
 BATCH_CHUNK = 64
 """Problems solved side by side: enough to fill the vector units, few enough to stay in cache."""
@@ -104,8 +106,12 @@ def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | N
     largest = chunk or _side_by_side(problems, plan, inside=inside)
     count = flat.mask.shape[0]
     kept = count > 0 and _is_kept(problems, plan, inside=inside)
-    solve = _solve_chunks_kept if kept else _solve_chunks_compiled
-    result = solve(flat, given, plan, largest)
+    if kept:
+        result, done = _solve_chunks_kept(flat, given, plan, largest, flat is problems)
+        if done:
+            return result.with_problem(problems)
+    else:
+        result = _solve_chunks_compiled(flat, given, plan, largest)
     result = map_arrays(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
     # Only now: a slice of a numpy array is a view, one of a JAX array is a program that copies.
     return (as_jax_holds(result, problems) if kept else result).with_problem(problems)
@@ -125,11 +131,20 @@ def _side_by_side(problems: Problem, plan: SolvePlan, *, inside: bool) -> int:
 
 
 def _solve_chunks_kept(
-    problems: Problem, given: Given, plan: SolvePlan, largest: int
-) -> Calibration:
+    problems: Problem, given: Given, plan: SolvePlan, largest: int, last: bool
+) -> tuple[Calibration, bool]:
     """A batch (one leading axis) by a program that serves all batches of nearly its size.
 
-    The result is in numpy arrays, and may go on behind the last problem.
+    Args:
+        problems: the batch.
+        given: numbers that came with the request.
+        plan: what is static about it.
+        largest: most problems solved side by side.
+        last: nothing is done to the result afterwards.
+
+    Returns:
+        The result in JAX's arrays and True, if it is the last and was not padded. Else in numpy
+        arrays, which may go on behind the last problem, and False.
     """
     count, images = problems.mask.shape
     given = replace(given, max_elevation=None)  # the problems have it
@@ -140,6 +155,7 @@ def _solve_chunks_kept(
         # Here a person waits for the compiler; of thousands, masked images would cost run time.
         padded = buckets.padded(problems)
     size = buckets.size(pieces) if pieces > 1 else 1
+    done = last and size * chunk == count and padded.images == images
     if size * chunk != count:
         # A copy of everything, which costs as much as the cheapest solves.
         rows = np.arange(size * chunk) % count
@@ -151,8 +167,9 @@ def _solve_chunks_kept(
         (plan, chunk),
         flags=compiler.batch_wishes(),
         label=label,
+        hold=partial(_as_jax_holds, problems) if done else list,
     )
-    return buckets.cut(result, images)
+    return (result, True) if done else (buckets.cut(result, images), False)
 
 
 def _solve_chunks_compiled(
@@ -211,9 +228,13 @@ def _is_kept(problems: Problem, plan: SolvePlan, *, inside: bool) -> bool:
 
 def as_jax_holds(result: Calibration, problem: Problem) -> Calibration:
     """JAX's arrays, where the problem's are."""
+    return _as_jax_holds(problem, result)
+
+
+def _as_jax_holds(problem: Problem, arrays: T) -> T:
     import jax
 
-    return jax.device_put(result, next(iter(_held(problem)), None))
+    return jax.device_put(arrays, next(iter(_held(problem)), None))
 
 
 def _devices(problems: Problem) -> tuple[Any, ...]:

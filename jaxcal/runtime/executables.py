@@ -78,6 +78,9 @@ JAX_SETTINGS = (
 Description = Any
 """The description of a tree, which JSON can hold."""
 
+Hold = Callable[[list[np.ndarray]], list[Any]]
+"""Makes of numpy arrays those that a caller wants."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -101,10 +104,10 @@ class _Program:
     result: Description
     from_disk: bool
 
-    def __call__(self, leaves: list[Any]) -> Any:
+    def __call__(self, leaves: list[Any], hold: Hold) -> Any:
         arrays = jax.device_put(leaves, self.device)
         pieces = self.executable.execute_sharded(arrays).disassemble_into_single_device_arrays()
-        return rebuild(self.result, [np.asarray(shards[0]) for shards in pieces])
+        return rebuild(self.result, hold([np.asarray(shards[0]) for shards in pieces]))
 
 
 _loaded: OrderedDict[str, _Program] = OrderedDict()
@@ -119,6 +122,7 @@ def run(
     *,
     flags: compiler.Flags,
     label: dict[str, Any],
+    hold: Hold = list,
 ) -> Any:
     """Call ``function(*arguments, plan)``, compiled; by the kept program if there is one.
 
@@ -129,9 +133,11 @@ def run(
         plan: everything static about it.
         flags: wished for; those unknown to the compiler are left out.
         label: what the program is, for ``jaxcal cache show``.
+        hold: what to make of the result's arrays. By default they are numpy's, since JAX would
+            compile every operation on its own.
 
     Returns:
-        The function's result, as numpy arrays: JAX would compile every operation on its own arrays.
+        The function's result.
 
     Raises:
         NotDescribableError: arguments or plan hold what cannot be described.
@@ -169,7 +175,7 @@ def run(
         program = _recall(key) or _load(key, device) or compiled()
         _remember(key, program)
     try:
-        return program(leaves)
+        return program(leaves, hold)
     except jax.errors.JaxRuntimeError as error:
         if not program.from_disk:
             raise
@@ -177,7 +183,7 @@ def run(
     with turn:
         program = compiled()
         _remember(key, program)
-    return program(leaves)
+    return program(leaves, hold)
 
 
 def _name_of(function: str | Callable[..., Any]) -> str:

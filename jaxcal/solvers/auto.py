@@ -49,6 +49,7 @@ from jaxcal.model.distributions import FAMILIES, Family, OffsetLaw, Shape
 from jaxcal.model.observations import MediumPrior, Observation, OwnCovariances, Points, unit_shape
 from jaxcal.model.parameters import retract
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
+from jaxcal.solvers import dense
 from jaxcal.solvers.evidence import V_Y, NoiseModel, row_of, tune
 from jaxcal.solvers.expectation_propagation import SEEN, Sites, marginal, propagate, seen
 from jaxcal.solvers.normal_equations import stacked
@@ -343,8 +344,7 @@ def median(
 
     def once(_: Array, share: Array) -> Array:
         off = means - jnp.sum(share * means, axis=1, keepdims=True)
-        # H (q, q) times off (q, k), summed against off.
-        length = jnp.sum(off * jnp.sum(metric * off, axis=1), axis=0)
+        length = jnp.sum(off * dense.product_lanes_last(metric, off), axis=0)
         pull = weight / jnp.sqrt(jnp.maximum(jnp.maximum(length, 0.0) + within, tiny))
         whole = jnp.sum(pull, axis=0)
         return pull / jnp.where(whole > 0, whole, 1.0)

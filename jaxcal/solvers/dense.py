@@ -12,14 +12,23 @@ References: Golub and Van Loan, Matrix Computations, 4th ed., 3.4, 5.2, 8.6; Bre
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import add, mul
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxcal.model import unrolled
 from jaxcal.runtime.precision import in_standard_promotion
 
 MAX_SWEEPS = 30
+"""Most sweeps of Jacobi's rotations."""
+
+BLOCK = 3
+"""Most rows that are swept at once."""
 
 
 def solve_positive(matrix: Float[Array, "p p"], rhs: Float[Array, "p k"]) -> Float[Array, "p k"]:
@@ -261,59 +270,89 @@ def inverse_positive(matrix: Float[Array, "p p"]) -> tuple[Float[Array, "p p"], 
 def inverse_lanes_last(
     matrix: Float[Array, "p p lanes"],
 ) -> tuple[Float[Array, "p p lanes"], Float[Array, " lanes"]]:
-    """:func:`inverse_positive` of many matrices, lanes last.
+    """:func:`inverse_positive` of many matrices, lanes last, by sweeping a few rows at a time.
 
-    For ten rows, code written out scalar by scalar (:mod:`jaxcal.model.unrolled`) is no faster and
-    takes a hundred times longer to compile.
+    With the leading block A = L L', W = L^-1 and the rows B beside it, one sweep makes
+
+        [A  B ]        [C - G'G   H ]
+        [B' C ]   ->   [H'       -Q ],    G = W B, H = G'W, Q = W'W.
+
+    The swept rows go to the end, so that the next block is in the same place again. After a sweep
+    of all blocks, every row is back in its place, and the matrix is minus the inverse. W and G
+    stand in one array F = [G W], and all four blocks come from F'F. For nine rows this takes
+    0.07 us a lane, where an elimination row by row takes 0.17.
+
+    Where a matrix is not positive definite, its log determinant and its inverse are not finite.
+
+    Reference: Goodnight 1979 (the sweep operator).
     """
     size = matrix.shape[0]
-    rows = jnp.arange(size)
-    scale = jax.lax.rsqrt(jnp.stack([matrix[k, k] for k in range(size)]))
+    block = min((BLOCK - 1, BLOCK), key=lambda rows: (-size % rows, -rows))
+    whole = size + -size % block
+    if whole > size:
+        ends = (np.arange(whole) >= size).astype(matrix.dtype)
+        matrix = jnp.pad(matrix, [(0, whole - size), (0, whole - size), (0, 0)])
+        matrix = matrix + np.diag(ends)[..., None]
+    now = np.arange(whole) >= whole - block
+    sign = np.where(now[:, None] == now, -1.0, 1.0).astype(matrix.dtype)[..., None]
 
-    def eliminate(k: Array, state: tuple) -> tuple:
+    def sweep(_: Array, state: tuple) -> tuple:
         work, log_determinant = state
-        here = rows == k
-        at, column = (jax.lax.dynamic_index_in_dim(work, k, axis, False) for axis in (0, 1))
-        pivot = jax.lax.dynamic_index_in_dim(at, k, 0, False)
-        pivot = jnp.where(pivot > 0, pivot, jnp.nan)
-        # In place: the eliminated column makes room for the inverse's.
-        row = jnp.where(here[:, None], 1.0, at) / pivot
-        rest = jnp.where(here[None, :, None], 0.0, work) - column[:, None] * row[None]
-        work = jnp.where(here[:, None, None], row[None], rest)
-        return jax.lax.optimization_barrier((work, log_determinant + jnp.log(pivot)))
+        own = jax.lax.optimization_barrier(_inverse_of_cholesky(work[:block, :block]))
+        factor = jnp.concatenate([_outer_products(own, work[:block, block:]), own], axis=1)
+        factor = jax.lax.optimization_barrier(factor)
+        rest = jnp.pad(work[block:, block:], [(0, block), (0, block), (0, 0)])
+        work = rest + sign * _outer_products(jnp.swapaxes(factor, 0, 1), factor)
+        # NaN or infinite where a pivot is not positive.
+        pivots = reduce(mul, [own[k, k] for k in range(block)])
+        return jax.lax.optimization_barrier((work, log_determinant - 2 * jnp.log(pivots)))
 
-    state = (matrix * scale[:, None] * scale, jnp.zeros_like(scale[0]))
-    work, log_determinant = jax.lax.fori_loop(0, size, eliminate, state)
-    log_determinant = log_determinant - 2 * jnp.sum(jnp.log(scale), axis=0)
-    return work * scale[:, None] * scale, log_determinant
+    state = (matrix, jnp.zeros_like(matrix[0, 0]))
+    work, log_determinant = jax.lax.fori_loop(0, whole // block, sweep, state)
+    return -work[:size, :size], log_determinant
 
 
 def solve_lanes_last(
     matrix: Float[Array, "p p lanes"], vector: Float[Array, "p lanes"]
 ) -> Float[Array, "p lanes"]:
-    """Solve positive definite systems, lanes last; NaN where one is not, in its own lane only.
+    """Solve positive definite systems, lanes last; where one is not, its own lane is not finite.
 
-    Gauss-Jordan in a loop takes 0.27 us a lane for nine unknowns. Cholesky written out scalar by
-    scalar (:mod:`jaxcal.model.unrolled`) takes 0.11 us, but six times as long to compile.
+    For nine unknowns it takes 0.09 us a lane. Cholesky written out scalar by scalar
+    (:mod:`jaxcal.model.unrolled`) takes 0.05 us, but eight times as long to compile.
     """
-    rows = jnp.arange(matrix.shape[0])[:, None, None]
+    inverse, _ = inverse_lanes_last(matrix)
+    return product_lanes_last(inverse, vector)
 
-    def eliminate(k: Array, work: Array) -> Array:
-        row = jax.lax.dynamic_index_in_dim(work, k, 0, False)
-        pivot = jax.lax.dynamic_index_in_dim(row, k, 0, False)
-        row = row / jnp.where(pivot > 0, pivot, jnp.nan)
-        column = jax.lax.dynamic_index_in_dim(work, k, 1, True)
-        work = jnp.where(rows == k, row[None], work - column * row[None])
-        return jax.lax.optimization_barrier(work)
 
-    both = jnp.concatenate([matrix, vector[:, None]], axis=1)
-    return jax.lax.fori_loop(0, len(rows), eliminate, both)[:, -1]
+def _inverse_of_cholesky(matrix: Float[Array, "b b lanes"]) -> Float[Array, "b b lanes"]:
+    """L^-1 of A = L L', for a few rows."""
+    size = matrix.shape[0]
+    factor, pivots = unrolled.cholesky([[matrix[i, j] for j in range(size)] for i in range(size)])
+    zero = jnp.zeros_like(matrix[0, 0])
+    columns = []
+    for k in range(size):
+        unit: unrolled.Vector = [int(i == k) for i in range(size)]
+        column = unrolled.forward(factor, pivots, unit)
+        columns.append(jnp.stack([zero if unrolled.is_zero(entry) else entry for entry in column]))
+    return jnp.stack(columns, axis=1)
 
 
 def product_lanes_last(
-    first: Float[Array, "p q lanes"], second: Float[Array, "q *r lanes"]
-) -> Float[Array, "p *r lanes"]:
+    first: Float[Array, "p q *lanes"], second: Float[Array, "q *#r"]
+) -> Float[Array, "p *#r"]:
     """Products of many matrices (or of matrices and vectors), lanes last."""
-    if second.ndim == 2:
+    if first.ndim > second.ndim:
         return jnp.sum(first * second, axis=1)
+    if len(second) > BLOCK:
+        return _outer_products(first, second)
     return jnp.sum(first[:, :, None] * second, axis=1)
+
+
+def _outer_products(
+    first: Float[Array, "p q *#lanes"], second: Float[Array, "q r *#lanes"]
+) -> Float[Array, "p r *#lanes"]:
+    """The product of matrices as a sum of outer products.
+
+    For nine rows and columns XLA's reduction takes ten times as long; it compiles sooner.
+    """
+    return reduce(add, [first[:, k, None] * second[k] for k in range(len(second))])

@@ -157,9 +157,10 @@ class Lift(eqx.Module):
     ) -> tuple[Float[Array, "q k lanes"], Float[Array, "q q k lanes"]]:
         """Mean and covariance of all unknowns from those of z."""
         slope = self.slope[:, :, None]
-        found = self.shift[:, None] + jnp.sum(slope * mean, axis=1)
-        across = barrier(jnp.sum(slope[:, :, None] * covariance, axis=1))
-        return found, self.spread[:, :, None] + jnp.sum(across[:, None] * slope, axis=2)
+        found = self.shift[:, None] + dense.product_lanes_last(slope, mean)
+        across = barrier(dense.product_lanes_last(slope, covariance))
+        back = jnp.swapaxes(slope, 0, 1)
+        return found, self.spread[:, :, None] + dense.product_lanes_last(across, back)
 
 
 def marginal(

@@ -387,6 +387,36 @@ def accumulate(
     return Normal(jnp.stack(flat), jnp.stack(gradient), cost, lengths)
 
 
+def information_and_design(
+    iterate: Iterate,
+    observation: Observation,
+    images: ImagePlanes,
+    medium: MediumPrior | None = None,
+) -> tuple[Float[Array, "p p lanes"], Float[Array, "p p lanes"]]:
+    """Gauss-Newton's matrix, and that of the unweighted residuals, in one pass.
+
+    Args:
+        iterate: X, c and the further unknowns of every lane.
+        observation: one without an unknown in every image.
+        images: the data.
+        medium: what is known of sound speed and delay beforehand.
+    """
+    q, turned = targets(iterate, images)
+    derived = _derive(observation, q, iterate, images, exact=False)
+    curvatures = [_plain(derived, k, images).curvature for k in range(len(derived.components))]
+    planes: Vector = []
+    for weights in ([(1 / (sd * sd))[:, None] for sd in observation.sigma], [1] * len(curvatures)):
+        curvature = _summed(curvatures, weights)
+        planes += contributions(q, turned, Term(0, [0] * len(curvature), curvature), 0)[0]
+    sums = total(planes)
+    flat, design = sums[: len(sums) // 2], sums[len(sums) // 2 :]
+    if medium is not None:
+        places = diagonal_places(iterate.unknowns)
+        for k, _, precision in medium.deviations(iterate):
+            flat[places[k]] = flat[places[k]] + precision
+    return stacked(jnp.stack(flat)), stacked(jnp.stack(design))
+
+
 class ComponentSums(eqx.Module):
     """Sums of one pass over the images for each component separately, unweighted; lanes last.
 

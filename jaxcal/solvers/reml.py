@@ -197,7 +197,7 @@ def damped_step(
     matrix = stacked(normal.curvature + exact * rest)
     places = jnp.eye(len(diagonal), dtype=diagonal.dtype)[..., None]
     matrix, gradient = barrier((matrix + places * held, normal.gradient))
-    return -dense.product_lanes_last(dense.inverse_lanes_last(matrix)[0], gradient)
+    return dense.solve_lanes_last(matrix, -gradient)
 
 
 def updated(
@@ -217,11 +217,9 @@ def updated(
         count: residuals of each component.
     """
     diagonal = normal.diagonal()
-    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1.0))
-    unit = stacked(normal.curvature) * scale[:, None] * scale
-    eps = jnp.finfo(count.dtype).eps
-    unit = barrier(unit + 16 * eps * jnp.eye(len(diagonal), dtype=diagonal.dtype)[..., None])
-    inverse = dense.inverse_lanes_last(unit)[0] * scale[:, None] * scale
+    ridge = 16 * jnp.finfo(count.dtype).eps * jnp.where(diagonal > 0, diagonal, 1.0)
+    eye = jnp.eye(len(diagonal), dtype=diagonal.dtype)[..., None]
+    inverse, _ = dense.inverse_lanes_last(stacked(normal.curvature) + eye * ridge)
     places = pairs(len(diagonal))
     twice = np.array([1 if i == j else 2 for i, j in places], diagonal.dtype)[:, None]
 
