@@ -66,9 +66,17 @@ def profile(family: Family, base: Array) -> Array:
 
 
 class Moments(eqx.Module):
-    """Of a shape times a normalised Gaussian: log of the mass, mean and variance."""
+    """Of a shape times a normalised Gaussian.
 
-    log_mass: Float[Array, "k n"]
+    Attributes:
+        mass: over e to the power of ``fall``, which keeps it within the range of numbers.
+        fall: part of the logarithm of the mass.
+        mean: mm.
+        variance: mm^2.
+    """
+
+    mass: Float[Array, "k n"]
+    fall: Float[Array, "k n"]
     mean: Float[Array, "k n"]
     variance: Float[Array, "k n"]
 
@@ -93,38 +101,38 @@ def tilted(
     """
     sd = sd[:, None]
     cut = lower is not None or upper is not None
-    log_height = 0.0
+    fall = 0.0
     edge = EDGE[family] * sd
     if family == "gaussian":
         # A Gaussian times a Gaussian is a Gaussian; if it is cut, it is a flat shape times one.
         both = variance + sd**2
-        log_height = -0.5 * (jnp.log(2 * np.pi * both) + mean**2 / both)
+        fall = -0.5 * mean**2 / both
+        height = jax.lax.rsqrt(2 * np.pi * both)
         mean, variance = mean * sd**2 / both, variance * sd**2 / both
         if not cut:
-            return Moments(log_height, mean, variance)
+            return Moments(height, fall, mean, variance)
         family = "uniform"
     else:
-        log_height = jnp.log(HEIGHT[family] / sd)
+        height = HEIGHT[family] / sd
     low = -edge if lower is None else jnp.clip(lower, -edge, edge)
     high = edge if upper is None else jnp.clip(upper, -edge, edge)
-    # Within ``fall`` of the interval's point nearest to its mean, the Gaussian falls by a factor
+    # Within ``side`` of the interval's point nearest to its mean, the Gaussian falls by a factor
     # exp(-REACH^2 / 2), whether the mean is inside the interval or far out.
     nearest = jnp.clip(mean, low, high)
     out = mean - nearest
     reach = REACH**2 * variance
-    fall = reach / (jnp.abs(out) + jnp.sqrt(out * out + reach))
-    low, high = jnp.maximum(low, nearest - fall), jnp.minimum(high, nearest + fall)
+    side = reach / (jnp.abs(out) + jnp.sqrt(out * out + reach))
+    low, high = jnp.maximum(low, nearest - side), jnp.minimum(high, nearest + side)
     middle, step = 0.5 * (low + high), (high - low) / (2 * NODES - 1)
     abrupt = cut or family != "student"
-    total, line, parabola = _sums(
-        family, abrupt, (middle, step, nearest, out, 1 / variance, 1 / sd)
-    )
+    precision = 1 / variance
+    total, line, parabola = _sums(family, abrupt, (middle, step, nearest, out, precision, 1 / sd))
     inverse = 1 / total
     place = line * inverse
     spread = parabola * inverse - place * place
-    log_mass = log_height + jnp.log(total * step)
-    log_mass = log_mass - 0.5 * (jnp.log(2 * np.pi * variance) + out * out / variance)
-    return Moments(log_mass, middle + place * step, spread * (step * step))
+    mass = height * total * step * jnp.sqrt(precision / (2 * np.pi))
+    fall = fall - 0.5 * out * out * precision
+    return Moments(mass, fall, middle + place * step, spread * (step * step))
 
 
 Window = tuple[Array, Array, Array, Array, Array, Array]

@@ -281,6 +281,8 @@ def answers_under(model: Linearised, sites: Sites, shapes: tuple[Shape, ...]) ->
     weight, good = weights(found.log_evidence + gained(belief), found.change, prior)
     # The other unknowns follow b.
     along = covariance[:, -1] / variance
+    # Values of a law are computed once, and not again for every entry of its covariance.
+    belief, weight, good, along = barrier((belief, weight, good, along))
     mean = mean + along * (belief.mean - model.mean - mean[-1])
     covariance = covariance + along[:, None] * along * (belief.variance - variance)
     size = len(mean)
@@ -337,14 +339,19 @@ def median(
 
     Reference: Weiszfeld 1937.
     """
-    means, weight, metric = answers.mean, answers.weight, metric[:, :, None]
+    weight, metric = answers.weight, metric[:, :, None]
     within = (2 / np.pi) * jnp.sum(metric * answers.covariance, axis=(0, 1))
-    within = barrier(within)
+    centre = jnp.sum(weight * answers.mean, axis=1)
+    means = answers.mean - centre[:, None]
+    # Of the answers, only their scalar products matter.
+    forward = jnp.swapaxes(means, 0, 1)[:, :, None]
+    products = jnp.sum(forward * dense.product_lanes_last(metric, means), axis=1)
+    within, means, products = barrier((within, means, products))
     tiny = jnp.finfo(weight.dtype).tiny
 
     def once(_: Array, share: Array) -> Array:
-        off = means - jnp.sum(share * means, axis=1, keepdims=True)
-        length = jnp.sum(off * dense.product_lanes_last(metric, off), axis=0)
+        toward = jnp.sum(products * share, axis=1)
+        length = jnp.diagonal(products).T - 2 * toward + jnp.sum(share * toward, axis=0)
         pull = weight / jnp.sqrt(jnp.maximum(jnp.maximum(length, 0.0) + within, tiny))
         whole = jnp.sum(pull, axis=0)
         return pull / jnp.where(whole > 0, whole, 1.0)
@@ -352,6 +359,7 @@ def median(
     share = barrier(jax.lax.fori_loop(0, MEDIAN_STEPS, once, weight))
     place = jnp.sum(share * means, axis=1)
     off = means - place[:, None]
+    place = centre + place
     return place, jnp.sum(weight * (answers.covariance + off[:, None] * off), axis=2)
 
 

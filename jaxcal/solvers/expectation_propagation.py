@@ -250,7 +250,8 @@ def propagate(
     for which, name in enumerate(names):
         at = [k for k, family in enumerate(families) if family == name]
         # The first sites of a Gaussian law are exact, unless it is cut.
-        ahead = [] if name == "gaussian" and sites.lower is None else [(which, at[0], True)]
+        exact = name == "gaussian" and sites.lower is None
+        ahead = [] if exact else [(which, at[0], True)]
         turns += ahead
         for k in at:
             turns.append((which, k, k == at[0] and not ahead))
@@ -260,8 +261,7 @@ def propagate(
 
     def one(state: _State, turn: tuple) -> tuple[_State, _Found]:
         family, sd, fresh = turn
-        begun = under.gaussian(sd)
-        state = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, state)
+        state = jax.lax.cond(fresh, lambda: under.gaussian(sd), lambda: state)
         return under.swept(family, sd, state, sweeps)
 
     # The first turn starts afresh, so it does not use this state.
@@ -269,7 +269,7 @@ def propagate(
     start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
     _, found = jax.lax.scan(one, start, (family, sd[law], fresh))
     order = jnp.asarray([turn for _, turn in sorted(last)])
-    found = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[order], 0, -2), found)
+    found = barrier(jax.tree.map(lambda leaf: jnp.moveaxis(leaf[order], 0, -2), found))
     return Posterior(found.mean, found.covariance, found.log_evidence, found.change)
 
 
@@ -373,7 +373,7 @@ class _Laws(eqx.Module):
 
         # The evidence is stationary in the sites, so it is as good before the last sweep as after.
         joined = 1 + tau * without
-        site = found.log_mass + 0.5 * jnp.log(joined)
+        site = found.fall + jnp.log(found.mass * jnp.sqrt(joined))
         site = site - 0.5 * ((centre + without * nu) ** 2 / joined - centre**2) / without
         site = site + nu * offset - 0.5 * tau * offset**2
         crowded = jnp.where(tau * without > 0.99 / LEAST_ROOM, used, 0.0)

@@ -53,8 +53,8 @@ PROBABILITY = 0.1
 LAGS = 5
 """Errors are taken to be correlated up to this many images apart, in their given order."""
 
-FELT = tuple(1 - lag / (LAGS + 1) for lag in range(1, LAGS + 1))
-"""Bartlett's weights of these lags."""
+FELT = tuple(1 - lag / (LAGS + 1) for lag in range(LAGS + 1))
+"""Bartlett's weights of these lags, from 0 on."""
 
 LEAST_LEFT = 0.05
 """Least share of the information about b assumed to be left without an image and its neighbours."""
@@ -174,15 +174,25 @@ def trust_in(
         share: of each image in the information about b.
     """
 
-    def shifted(plane: Array, lag: int) -> Array:
-        return jnp.pad(plane[:, lag:], [(0, 0), (0, min(lag, plane.shape[1]))])
+    size = share.shape[1]
 
-    near = share
-    for lag, weight in enumerate(FELT, start=1):
-        before = jnp.flip(shifted(jnp.flip(share, axis=1), lag), axis=1)
-        near = near + weight * (shifted(share, lag) + before)
+    def around(plane: Array) -> Array:
+        return jnp.pad(plane, [(0, 0), (LAGS, LAGS)])
+
+    def shifted(plane: Array, by: Array) -> Array:
+        return jax.lax.dynamic_slice_in_dim(plane, LAGS + by, size, axis=1)
+
+    # Loops, since what goes into a loop is computed before it. Otherwise XLA would compute an
+    # image's influence again for each of its neighbours.
+    def add_neighbours(lag: Array, near: Array) -> Array:
+        return near + felt[lag] * (shifted(shares, lag) + shifted(shares, -lag))
+
+    def add_products(lag: Array, shown: Array) -> Array:
+        return shown + 2 * felt[lag] * jnp.sum(moved * shifted(moves, lag), axis=1)
+
+    felt, shares = jnp.asarray(FELT, share.dtype), around(share)
+    near = jax.lax.fori_loop(1, LAGS + 1, add_neighbours, share)
     moved = moved / jnp.maximum(1 - near, LEAST_LEFT)
-    shown = jnp.sum(moved**2, axis=1)
-    for lag, weight in enumerate(FELT, start=1):
-        shown = shown + 2 * weight * jnp.sum(moved * shifted(moved, lag), axis=1)
+    moves = around(moved)
+    shown = jax.lax.fori_loop(1, LAGS + 1, add_products, jnp.sum(moved**2, axis=1))
     return variance / jnp.maximum(variance, shown)
