@@ -173,7 +173,6 @@ def trust_in(
         moved: how far each image moves b, mm, in the order in which the images were taken.
         share: of each image in the information about b.
     """
-
     size = share.shape[1]
 
     def around(plane: Array) -> Array:
