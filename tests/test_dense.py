@@ -23,6 +23,35 @@ def test_positive_systems_and_a_lane_that_is_not():
     np.testing.assert_allclose(got[good], np.linalg.solve(matrix[good], rhs[good]), rtol=1e-9)
 
 
+@pytest.mark.parametrize("size", [1, 2, 3, 5, 9, 10, 11])
+def test_swept_matrices_and_a_lane_that_is_not_positive(size: int):
+    """Blocks of two and three rows, with and without rows added to fill the last block."""
+    root = RANDOM.normal(size=(6, size, size + 3))
+    matrix = root @ root.swapaxes(1, 2)
+    unit = 10.0 ** RANDOM.uniform(-4, 4, size)  # mm and rad may be apart by as much
+    matrix = matrix * unit * unit[:, None]
+    bad = matrix.copy()
+    bad[3, -1, -1] *= -1
+    vector = RANDOM.normal(size=(6, size))
+
+    def solve(matrix, vector):
+        inverse, log_determinant = dense.inverse_lanes_last(matrix)
+        return inverse, log_determinant, dense.solve_lanes_last(matrix, vector)
+
+    got = jax.jit(solve)(jnp.moveaxis(bad, 0, -1), vector.T)
+    inverse, log_determinant, solution = (np.moveaxis(np.asarray(part), -1, 0) for part in got)
+    good = [0, 1, 2, 4, 5]
+    for part in (inverse[3], log_determinant[3], solution[3]):
+        assert not np.isfinite(part).any()
+    scaled = inverse[good] * unit * unit[:, None]
+    wanted = np.linalg.inv(matrix[good] / unit / unit[:, None])
+    np.testing.assert_allclose(scaled, wanted, atol=1e-10 * np.abs(wanted).max())
+    np.testing.assert_allclose(log_determinant[good], np.linalg.slogdet(matrix[good])[1])
+    back = np.einsum("lij,lj->li", matrix[good], solution[good])
+    largest = np.einsum("lij,lj->li", np.abs(matrix[good]), np.abs(solution[good]))
+    np.testing.assert_array_less(np.abs(back - vector[good]), 1e-12 * largest)
+
+
 def test_inverse_needs_pivots_and_has_a_derivative():
     matrix = RANDOM.normal(size=(5, 12, 12))
     matrix[:, 0, 0] = 0.0
