@@ -112,10 +112,11 @@ def assemble(
     problem = problem.cleared(problem.mask)
     # Without this barrier the compiler would repeat the end of the solve for every image. The
     # matrices stay without, so that they are not moved from lanes last and back.
-    parts = (solved.parameters, solved.offset, solved.sigma, solved.bound)
-    parts, convergence = barrier((parts, solved.convergence))
-    solved = Solved(*parts, solved.information, solved.design, convergence)
-    parameters, blocks, mask = solved.parameters, plan.blocks, problem.mask
+    parts = (solved.parameters, solved.offset, solved.sigma, solved.bound, solved.convergence)
+    parameters, offset, sigma, bound, convergence = barrier(parts)
+    information, design = solved.information, solved.design
+    solved = Solved(parameters, offset, sigma, bound, information, design, convergence)
+    blocks, mask = plan.blocks, problem.mask
     used = jnp.sum(mask, axis=-1)
     errors = Errors.of(parameters, images, blocks)
     elevation = _elevation(solved, errors, given, problem)
