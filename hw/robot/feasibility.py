@@ -326,9 +326,11 @@ def _check_speed(
     if duration_s is None or not duration_s > 0:
         return 0.0
     speeds = np.abs(rates) / duration_s
-    where, joint = np.unravel_index(int(np.argmax(speeds)), speeds.shape)
-    fastest = float(speeds[where, joint])
+    fastest = float(np.max(speeds))
     if not fastest <= arm.joint_speed:
+        # Base and wrist 3 often turn alike: not rounding, but the order decides which is named.
+        first = int(np.argmax(~(speeds < (1 - 1e-6) * fastest)))
+        where, joint = np.unravel_index(first, speeds.shape)
         raise _refuse(
             f"{what} turns joint {joint + 1} ({JOINT_NAMES[joint]}) at "
             f"{math.degrees(fastest):.0f} deg/s, over the cap of "
