@@ -167,7 +167,7 @@ def _solve_chunks_kept(
         (plan, chunk),
         flags=compiler.batch_wishes(),
         label=label,
-        hold=partial(_as_jax_holds, problems) if done else list,
+        hold=partial(as_jax_holds, problem=problems) if done else list,
     )
     return (result, True) if done else (buckets.cut(result, images), False)
 
@@ -226,12 +226,8 @@ def _is_kept(problems: Problem, plan: SolvePlan, *, inside: bool) -> bool:
     return one and devices[0].platform == "cpu" and not interpreted
 
 
-def as_jax_holds(result: Calibration, problem: Problem) -> Calibration:
+def as_jax_holds(arrays: T, problem: Problem) -> T:
     """JAX's arrays, where the problem's are."""
-    return _as_jax_holds(problem, result)
-
-
-def _as_jax_holds(problem: Problem, arrays: T) -> T:
     import jax
 
     return jax.device_put(arrays, next(iter(_held(problem)), None))
