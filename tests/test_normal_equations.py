@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +20,13 @@ from jaxcal.model.batch import ImagePlanes, Iterate, targets, total
 from jaxcal.model.observations import (
     BoundedOffsets,
     ChannelDistances,
+    Component,
     Further,
     HeldOffsets,
     InPlane,
     LocalUnknown,
     MediumPrior,
+    Observation,
     OwnCovariances,
     Points,
     TrackedPoints,
@@ -108,6 +110,24 @@ OFFSETS = jnp.asarray(np.random.default_rng(9).normal(size=(LANES, IMAGES)))
 OFFSETS = OFFSETS.at[:, LEFT_OUT].set(0.0)
 TAU = jnp.asarray([0.3, 0.2, 0.5])
 
+DIRECTIONS = jnp.asarray(np.random.default_rng(10).normal(size=(3, LANES, IMAGES)))
+
+
+class OnLine(Observation):
+    """Where a wire through the target, along a known direction, crosses the image."""
+
+    sigma: jax.Array
+    direction: jax.Array
+    oriented: ClassVar[bool] = True
+
+    def components(self, q, further, images):
+        assert further.axes is not None
+        lateral, distance = further.points(images)
+        along = unrolled.apply(further.axes, [*self.direction])
+        crossing = [q[k] - q[1] / along[1] * along[k] for k in (0, 2)]
+        return [Component([crossing[0] - lateral]), Component([crossing[1] - distance])]
+
+
 CASES = {
     "points": (lambda images: Points(SIGMA), RIGID + EXTRA),
     "own covariances": (
@@ -129,6 +149,7 @@ CASES = {
         lambda images: BoundedOffsets.of(jnp.full((LANES, IMAGES), 1.2), images),
         RIGID + EXTRA,
     ),
+    "on a line": (lambda images: OnLine(SIGMA[:2], DIRECTIONS), (*RIGID, "scale", "delay")),
     "channels": (lambda images: ChannelDistances(SIGMA[1:]), (*RIGID, "sound-speed", "delay")),
 }
 """Every observation, and the unknowns it is looked at with."""
@@ -139,7 +160,7 @@ def case(drawn, name: str) -> tuple[Iterate, Any, ImagePlanes, MediumPrior | Non
     problems, near = drawn
     images = ImagePlanes.of(problems, channels=name == "channels")
     medium = None
-    if "delay" in blocks and name != "bounded offsets":
+    if name in ("points", "channels"):
         medium = MediumPrior(jnp.asarray([[0.01] * LANES, [0.4] * LANES]), blocks)
     return Iterate.of(near, blocks), make(images), images, medium
 
@@ -147,9 +168,9 @@ def case(drawn, name: str) -> tuple[Iterate, Any, ImagePlanes, MediumPrior | Non
 def whitened(step, local, place: Iterate, observation, images: ImagePlanes, medium):
     """All whitened residuals of every lane after a step, (lanes, n, residuals of an image)."""
     moved = place.moved(list(step))
-    q, _ = targets(moved, images)
+    q, axes = targets(moved, images)
     still = [jnp.zeros((LANES, 1))] * moved.extras.shape[0]
-    further = Further.of(moved, still)
+    further = Further.of(moved, still, axes)
     if local is None:
         parts = observation.components(q, further, images)
     else:
@@ -226,7 +247,7 @@ def test_sums_are_the_derivatives_of_the_cost(drawn, name):
         assert_close(normal.diagonal(), squares, 1e-12)
 
 
-@pytest.mark.parametrize("name", ["points", "own covariances", "channels"])
+@pytest.mark.parametrize("name", ["points", "own covariances", "on a line", "channels"])
 def test_components_apart_come_to_the_whole(drawn, name):
     """The second derivatives of all go into the rest."""
     place, observation, images, medium = case(drawn, name)

@@ -46,24 +46,27 @@ from jaxcal.model.unknowns import (
     step_between,
     stepped,
 )
-from jaxcal.model.unrolled import Vector, add
+from jaxcal.model.unrolled import Matrix, Vector, add
 
 TRACKER_STEPS = 4
 """Newton steps for a tracker's elevational error; the range curves so little that two would do."""
 
 
 class Further(eqx.Module):
-    """The free further unknowns as an image sees them (:mod:`jaxcal.model.unknowns`).
+    """What an image sees beside q: the free further unknowns, and where the tracker's axes point.
 
     Attributes:
-        values: by name, a plane (lanes, 1) for each component.
+        values: by name (:mod:`jaxcal.model.unknowns`), a plane (lanes, 1) for each component.
+        axes: M_i = R' R_i', which turns directions in the tracker's frame into the image's; it
+            may be None where no observation is :attr:`Observation.oriented`.
     """
 
     values: dict[str, Vector]
+    axes: Matrix | None = None
 
     @classmethod
-    def of(cls, iterate: Iterate, tangent: Vector) -> Further:
-        """The iterate's further unknowns, moved by a step."""
+    def of(cls, iterate: Iterate, tangent: Vector, axes: Matrix | None = None) -> Further:
+        """The iterate's further unknowns, moved by a step, and the tracker's axes."""
         values = {}
         for name in EXTRA:
             components = iterate.extra(name)
@@ -74,7 +77,7 @@ class Further(eqx.Module):
                     stepped(name, value[:, None], step, jnp.exp)
                     for value, step in zip(components, steps, strict=True)
                 ]
-        return cls(values)
+        return cls(values, axes)
 
     def points(self, images: ImagePlanes) -> tuple[Array, Array]:
         """Lateral position and range of every image, mm."""
@@ -108,6 +111,8 @@ class Observation(eqx.Module):
     sigma: eqx.AbstractVar[Float[Array, "components lanes"]]
     whitened: ClassVar[bool] = True
     """Whether residuals are in SDs; otherwise their variance is estimated from them."""
+    oriented: ClassVar[bool] = False
+    """Whether residuals depend on how the image is turned in other ways than through q."""
 
     @abc.abstractmethod
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
@@ -368,9 +373,9 @@ def local_unknowns(
     iterate: Iterate, observation: LocalUnknown, images: ImagePlanes
 ) -> Float[Array, "lanes n"]:
     """Every image's own unknown at its best; 0 for images left out."""
-    q, _ = targets(iterate, images)
+    q, axes = targets(iterate, images)
     still = [jnp.zeros_like(images.mask[:, :1])] * iterate.extras.shape[0]
-    return images.mask * observation.local(q, Further.of(iterate, still), images)[0]
+    return images.mask * observation.local(q, Further.of(iterate, still, axes), images)[0]
 
 
 class BoundedOffsets(LocalUnknown):

@@ -2,9 +2,10 @@
 
 Every objective here is a sum over images of phi_i(q_i, e), with q_i = X^-1 B_i^-1 c the target in
 image i's frame and e the further unknowns. An observation (:mod:`jaxcal.model.observations`)
-provides only phi, its gradient g and its curvature K as functions of (q_i, e). The rest is the same
-for all observations. With X = (R, t), B_i = (R_i, b_i), the right perturbation (v, w) of X and the
-step d of c,
+provides only phi, its gradient g and its curvature K as functions of (q_i, e); one that is
+oriented, as functions of (q_i, w, e), since it also depends on the directions M_i. The rest is the
+same for all observations. With X = (R, t), B_i = (R_i, b_i), the right perturbation (v, w) of X
+and the step d of c,
 
     q_i -> Exp(-w) (q_i - v + M_i d),     M_i = R' R_i',     q_i = M_i (c - b_i) - R' t,
     dq/dv = -1,     dq/dw = [q]x,     dq/dd = M_i,
@@ -43,6 +44,9 @@ from jaxcal.model.unrolled import Entry, Matrix, Vector
 IN_IMAGE = 3
 """Coordinates of q."""
 
+ROTATION = (3, 4, 5)
+"""Places of w among the unknowns."""
+
 
 @cache
 def pairs(unknowns: int) -> list[tuple[int, int]]:
@@ -64,7 +68,7 @@ class Term(eqx.Module):
 
     Attributes:
         cost: planes, or 0.
-        gradient: with respect to q and then e.
+        gradient: with respect to q, then the rotation of an oriented observation, then e.
         curvature: with respect to the same, symmetric.
     """
 
@@ -74,15 +78,17 @@ class Term(eqx.Module):
 
 
 class _Derived(eqx.Module):
-    """An observation's residuals with their derivatives by (q, e) and the image's own unknown.
+    """An observation's residuals with their derivatives by (q, w, e) and the image's own unknown.
 
     Attributes:
+        unknowns: which unknowns the arguments after q are.
         components: the residuals.
         slopes: for every component, the rows of first derivatives.
         bends: for every component, the second derivatives by (row, i, j).
         free: 1 where the image's own unknown may move; None where there is none.
     """
 
+    unknowns: tuple[int, ...]
     components: list[Component]
     slopes: list[Matrix]
     bends: list[dict[tuple[int, int, int], Entry]]
@@ -90,21 +96,37 @@ class _Derived(eqx.Module):
 
 
 def _derive(
-    observation: Observation, q: Vector, iterate: Iterate, images: ImagePlanes, *, exact: bool
+    observation: Observation,
+    q: Vector,
+    turned: Matrix,
+    iterate: Iterate,
+    images: ImagePlanes,
+    *,
+    exact: bool,
 ) -> _Derived:
     """An observation's residuals at q, with their derivatives."""
     still = jnp.zeros((images.lanes, 1), images.mask.dtype)
-    further = [still] * (iterate.unknowns - RIGID_UNKNOWNS)
-    arguments, free = [*q, *further], None
+    unknowns = tuple(range(RIGID_UNKNOWNS, iterate.unknowns))
+    further = [still] * len(unknowns)
+    direct, free = further, None
+    if observation.oriented:
+        unknowns, direct = (*ROTATION, *unknowns), [still] * len(ROTATION) + further
+    arguments = [*q, *direct]
     if isinstance(observation, LocalUnknown):
-        local, free = observation.local(q, Further.of(iterate, further), images)
+        local, free = observation.local(q, Further.of(iterate, further, turned), images)
         arguments.append(local)
 
     def evaluate(*at: Array) -> list[Component]:
-        beside = Further.of(iterate, list(at[IN_IMAGE : IN_IMAGE + len(further)]))
+        here, moved = list(at[:IN_IMAGE]), list(at[IN_IMAGE : IN_IMAGE + len(direct)])
+        axes = None
+        if observation.oriented:
+            # X turns by w, so directions in its frame turn back.
+            axes = unrolled.product(unrolled.rotation([-w for w in moved[:3]]), turned)
+            moved = moved[3:]
+        beside = Further.of(iterate, moved, axes)
         if isinstance(observation, LocalUnknown):
-            return observation.components_at(list(at[:IN_IMAGE]), at[-1], beside, images)
-        return observation.components(list(at[:IN_IMAGE]), beside, images)
+            return observation.components_at(here, at[-1], beside, images)
+        return observation.components(here, beside, images)
 
     components = evaluate(*arguments)
     slopes, bends = [], []
@@ -115,7 +137,7 @@ def _derive(
 
         slopes.append(derivatives.first(errors, arguments)[1])
         bends.append(derivatives.second(errors, arguments) if exact else {})
-    return _Derived(components, slopes, bends, free)
+    return _Derived(unknowns, components, slopes, bends, free)
 
 
 def _over_elements(plane: Entry) -> Entry:
@@ -224,16 +246,21 @@ def _shared(term: Term) -> Term:
 
 
 def contributions(
-    q: Vector, turned: Matrix, term: Term, gate: Float[Array, "lanes 1"] | int
+    q: Vector,
+    turned: Matrix,
+    term: Term,
+    direct: tuple[int, ...],
+    gate: Float[Array, "lanes 1"] | int,
 ) -> tuple[Vector, Vector]:
     """An image's part of the curvature (upper triangle) and the gradient, as planes or 0.
+
+    ``direct`` tells which unknowns the term's arguments after q are.
 
     The gate is the factor on the second derivatives of q; 0 for none. They are included by using
     A = [q]x' K + gate [g]x instead of [q]x' K: A M is then all of block (w, d), and A [q]x is block
     (w, w) up to an antisymmetric part, which :func:`with_twist` takes from the summed gradient.
     """
-    width = len(term.gradient)
-    unknowns = RIGID_UNKNOWNS + width - IN_IMAGE
+    unknowns = RIGID_UNKNOWNS + sum(place >= RIGID_UNKNOWNS for place in direct)
     g = term.gradient[:IN_IMAGE]
     k = [row[:IN_IMAGE] for row in term.curvature[:IN_IMAGE]]
     lever = unrolled.cross(q)
@@ -262,14 +289,22 @@ def contributions(
         found += unrolled.apply(unrolled.transpose(lever), values)
         return found + unrolled.apply(inverse, values)
 
-    for a in range(IN_IMAGE, width):
-        place = RIGID_UNKNOWNS + a - IN_IMAGE
+    gradient = in_rigid(g) + [0] * (unknowns - RIGID_UNKNOWNS)
+    # Of w's own part of the gradient there is no antisymmetric part to take out again.
+    own: Vector = [0] * unknowns
+    for a, place in enumerate(direct, IN_IMAGE):
+        own[place] = term.gradient[a]
+        gradient[place] = unrolled.add(gradient[place], own[place])
         column = in_rigid([term.curvature[i][a] for i in range(IN_IMAGE)])
-        for i in range(RIGID_UNKNOWNS):
-            full[i][place] = column[i]
-        for b in range(a, width):
-            full[place][RIGID_UNKNOWNS + b - IN_IMAGE] = term.curvature[a][b]
-    gradient = in_rigid(g) + term.gradient[IN_IMAGE:]
+        for i, entry in enumerate(column):
+            twice = unrolled.times(2, entry) if i == place else entry
+            row, col = sorted((i, place))
+            full[row][col] = unrolled.add(full[row][col], twice)
+        for b, other in enumerate(direct[a - IN_IMAGE :], a):
+            full[place][other] = unrolled.add(full[place][other], term.curvature[a][b])
+    kept = unrolled.cross([unrolled.times(0.5, unrolled.times(gate, own[k])) for k in ROTATION])
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        full[3 + i][3 + j] = unrolled.add(full[3 + i][3 + j], kept[i][j])
     return [full[i][j] for i, j in pairs(unknowns)], gradient
 
 
@@ -356,7 +391,7 @@ def accumulate(
     """
     q, turned = targets(iterate, images)
     wide = None if gate is None else gate[:, None]
-    derived = _derive(observation, q, iterate, images, exact=gate is not None)
+    derived = _derive(observation, q, turned, iterate, images, exact=gate is not None)
     weights = [(1 / (sd * sd))[:, None] for sd in observation.sigma]
     count = len(derived.components)
     term = _weighed([_plain(derived, k, images) for k in range(count)], weights)
@@ -368,10 +403,12 @@ def accumulate(
     places = diagonal_places(iterate.unknowns)
     columns: Vector = []
     if derived.free is not None:
-        every, _ = contributions(q, turned, _shared(whole), 0)
+        every, _ = contributions(q, turned, _shared(whole), derived.unknowns, 0)
         columns = [every[k] for k in places]
         term = _eliminated(term, own_bend, derived.free)
-    curvature, gradient = contributions(q, turned, term, 0 if wide is None else wide)
+    curvature, gradient = contributions(
+        q, turned, term, derived.unknowns, 0 if wide is None else wide
+    )
     cost, *sums = total([term.cost, *curvature, *gradient, *columns])
     flat, gradient = sums[: len(curvature)], sums[len(curvature) : len(curvature) + len(gradient)]
     squares = sums[len(curvature) + len(gradient) :]
@@ -402,12 +439,13 @@ def information_and_design(
         medium: what is known of sound speed and delay beforehand.
     """
     q, turned = targets(iterate, images)
-    derived = _derive(observation, q, iterate, images, exact=False)
+    derived = _derive(observation, q, turned, iterate, images, exact=False)
     curvatures = [_plain(derived, k, images).curvature for k in range(len(derived.components))]
     planes: Vector = []
     for weights in ([(1 / (sd * sd))[:, None] for sd in observation.sigma], [1] * len(curvatures)):
         curvature = _summed(curvatures, weights)
-        planes += contributions(q, turned, Term(0, [0] * len(curvature), curvature), 0)[0]
+        term = Term(0, [0] * len(curvature), curvature)
+        planes += contributions(q, turned, term, derived.unknowns, 0)[0]
     sums = total(planes)
     flat, design = sums[: len(sums) // 2], sums[len(sums) // 2 :]
     if medium is not None:
@@ -465,20 +503,21 @@ def component_sums(
         medium: what is known of sound speed and delay beforehand.
     """
     q, turned = targets(iterate, images)
-    derived = _derive(observation, q, iterate, images, exact=sigma is not None)
+    derived = _derive(observation, q, turned, iterate, images, exact=sigma is not None)
     count, unknowns = len(derived.components), iterate.unknowns
     terms = [_plain(derived, k, images) for k in range(count)]
     planes: Vector = [term.cost for term in terms]
     each = unknowns + len(pairs(unknowns))
     for term in terms:
-        matrix, gradient = contributions(q, turned, term, 0)
+        matrix, gradient = contributions(q, turned, term, derived.unknowns, 0)
         planes += [*gradient, *matrix]
     if sigma is not None:
         weights = [(1 / (sd * sd))[:, None] for sd in sigma]
         weighed = _weighed(terms, weights)
         bent = _summed([_bent(derived, k, images) for k in range(count)], weights)
         # The second derivatives of q itself follow from the weighted gradient.
-        planes += contributions(q, turned, Term(0, weighed.gradient, bent), 1)[0]
+        term = Term(0, weighed.gradient, bent)
+        planes += contributions(q, turned, term, derived.unknowns, 1)[0]
     sums = total(planes)
     squares, sums = sums[:count], sums[count:]
     parts = [sums[k * each : (k + 1) * each] for k in range(count)]

@@ -48,10 +48,10 @@ def whitened_residuals(
     place: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
 ) -> Float[Array, "residuals lanes"]:
     """All residuals of every lane in SDs, zeros where an image is left out; lanes last."""
-    q, _ = targets(place, images)
+    q, axes = targets(place, images)
     still = [jnp.zeros_like(images.mask[:, :1])] * place.extras.shape[0]
     parts = []
-    found = observation.components(q, Further.of(place, still), images)
+    found = observation.components(q, Further.of(place, still, axes), images)
     for component, sd in zip(found, observation.sigma, strict=True):
         for error in component.errors:
             present = images.mask if error.ndim == 2 else images.mask[..., None]
