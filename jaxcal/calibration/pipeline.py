@@ -20,14 +20,7 @@ from jaxcal.calibration.result import Calibration, Convergence
 from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, barrier
 from jaxcal.model.distributions import OffsetLaw
-from jaxcal.model.observations import (
-    BoundedOffsets,
-    ChannelDistances,
-    InPlane,
-    LocalUnknown,
-    Points,
-    local_unknowns,
-)
+from jaxcal.model.observations import BoundedOffsets, LocalUnknown, local_unknowns
 from jaxcal.model.parameters import Blocks
 from jaxcal.runtime.precision import in_standard_promotion
 from jaxcal.solvers import methods
@@ -141,12 +134,13 @@ def _normal_matrices(
 ) -> tuple[Float[Array, "p p lanes"], Float[Array, "p p lanes"]]:
     """The weighted normal matrix at a solution, and that of the unweighted components."""
     observation, place = found.observation, found.place
-    if isinstance(observation, (Points, ChannelDistances)):
+    geometry = observation.geometry(images)
+    if geometry is observation and observation.whitened:
         return information_and_design(place, observation, images, found.medium)
     weighted = accumulate(place, observation, images, None, found.medium).stacked()
-    if isinstance(observation, InPlane):
+    if geometry is observation:
         return weighted, weighted
-    return weighted, accumulate(place, InPlane.of(images), images, None).stacked()
+    return weighted, accumulate(place, geometry, images, None).stacked()
 
 
 def _convergence(found: Solution, plan: SolvePlan) -> Convergence:

@@ -130,6 +130,11 @@ class Observation(eqx.Module):
         """Largest change of a whitened residual for a mm of error, 1/mm."""
         return 1 / jnp.min(self.sigma, axis=0)
 
+    def geometry(self, images: ImagePlanes) -> Observation:
+        """What shows which unknowns the poses determine, by its residuals without their SDs."""
+        del images
+        return self
+
     def padded(self) -> Observation:
         """The same for images that are padded."""
         return self
@@ -241,6 +246,9 @@ class OwnCovariances(Observation):
 
     def with_sigma(self, sigma: Float[Array, "components lanes"]) -> Observation:
         return super().with_sigma(sigma).in_units(sigma)
+
+    def geometry(self, images: ImagePlanes) -> Observation:
+        return InPlane.of(images)
 
     def padded(self) -> OwnCovariances:
         return eqx.tree_at(lambda o: o.shape, self, whole(self.shape))
@@ -367,6 +375,9 @@ class LocalUnknown(Observation):
 
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         return self.components_at(q, self.local(q, further, images)[0], further, images)
+
+    def geometry(self, images: ImagePlanes) -> Observation:
+        return InPlane.of(images)
 
 
 def local_unknowns(
