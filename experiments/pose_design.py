@@ -17,6 +17,11 @@ test images of random poses within the same limits. *predicted* is the root mean
 calibration's own covariance predicts, *planned* what the plan promised before any image. Standard
 errors are in the table.
 
+Part ``predicted``: actual TRE of ``auto`` at planned and random poses against two predictions made
+before any image: that of simulated recordings under the law (``design.simulate_errors``) and that
+of the plan, which knows the SDs only (the root mean square over the sets for random poses). 4,000
+recordings each.
+
 Part ``bench``: emulated benches without sockets, the target placed by amplitude scans: 36 planned
 poses (the planner knows a drawing and guesses at the SDs) against 60 and 36 of the Sobol plan.
 
@@ -34,6 +39,7 @@ many), ``--quick`` for 24 of two laws.
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from dataclasses import replace
 from functools import cache
@@ -62,6 +68,9 @@ MOST = max(COUNTS)
 SD_MM, CHANNEL_MM = 1.0, 0.5
 POOL = 4000
 RATIO_ASKED = {"wide": 0.75, "narrow": 0.60}
+SIMULATED = 4000
+"""Recordings from which errors are predicted."""
+PARTS = ("all", "simulated", "predicted", "bound", "bench", "real", "figure")
 ARMS = ("random", "sobol", "optimal", "wrong+", "wrong-", "replanned")
 DATA = Path(__file__).parents[2] / "shared" / "data" / "crosswire"
 
@@ -442,6 +451,47 @@ def benches(count: int) -> list[list[object]]:
     return rows
 
 
+def predictions(trials: int, folder: Path) -> None:
+    """Actual TRE against what is predicted before any image; draws of its own."""
+    header = ["cone", "law", "poses", "images", "trials", "tre_mm", "tre_error_mm",
+              "simulated_tre_mm", "simulated_tre_error_mm", "simulated_over_actual",
+              "planned_tre_mm", "planned_over_actual"]  # fmt: skip
+    rows: list[list[object]] = []
+    for cone, count, arm in itertools.product(CONES, COUNTS, ("random", "optimal")):
+        candidates = pool(cone)
+        points = candidates.constraints.region.grid()
+        tests = candidates.poses[:2]
+        known = design.plan(candidates, 4, polish=False).known
+        rng = np.random.default_rng([SEED, list(CONES).index(cone), count, ARMS.index(arm), 7])
+        if arm == "optimal":
+            foreseen = planned(cone, count).poses
+            told = float(planned(cone, count).tre_mm[-1])
+        else:
+            foreseen = np.stack([pose_set(arm, cone, count, 0, rng) for _ in range(SIMULATED)])
+            each = [curve(candidates, known, poses)[0][-1] ** 2 for poses in foreseen[:400]]
+            told = float(np.sqrt(np.mean(each)))
+        for law in LAWS:
+            images = [taken(pose_set(arm, cone, count, k, rng), law, rng) for k in range(trials)]
+            found = solve(problems(*map(list, zip(*images, strict=True))), "auto")
+            squared, _ = errors(np.asarray(found.image_to_probe), tests, points)
+            tre = float(np.sqrt(squared.mean()))
+            simulation = design.simulate_errors(
+                foreseen, law, candidates, trials=SIMULATED, seed=count
+            )
+            rows.append([
+                cone, law, arm, count, trials, tre,
+                float(squared.std() / np.sqrt(trials) / 2 / tre), simulation.tre_mm,
+                simulation.tre_error_mm, simulation.tre_mm / tre, told, told / tre,
+            ])  # fmt: skip
+            print(*(f"{v:.3g}" if isinstance(v, float) else v for v in rows[-1]), flush=True)
+    write_table(folder / "pose_design_predicted.csv", header, rows)
+    for name, column in (("simulated", 9), ("planned", 11)):
+        ratios = np.array([row[column] for row in rows], float)
+        within = int(np.sum(np.abs(ratios - 1) <= 0.1))
+        print(f"{name} over actual: {ratios.min():.2f} to {ratios.max():.2f}, "
+              f"within 10 % in {within} of {len(rows)} cells")  # fmt: skip
+
+
 def bounds() -> list[list[object]]:
     """Predicted TRE of random and planned poses, and what no set of the pool goes below."""
     rows: list[list[object]] = []
@@ -486,9 +536,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="few trials of two laws")
     parser.add_argument("--trials", type=int, default=1000, help="of each cell")
     parser.add_argument("--benches", type=int, default=64, help="emulated benches")
-    parser.add_argument(
-        "--part", choices=("all", "simulated", "bound", "bench", "real", "figure"), default="all"
-    )
+    parser.add_argument("--part", choices=PARTS, default="all")
     given = parser.parse_args()
     enable_compilation_cache()
     folder = results_folder(given.quick)
@@ -499,6 +547,8 @@ def main() -> None:
         header = ["cone", "images", "random_tre_mm", "planned_tre_mm", "least_tre_mm",
                   "planned_over_random", "least_over_random"]  # fmt: skip
         write_table(folder / "pose_design_bound.csv", header, bounds())
+    if given.part in ("all", "predicted"):
+        predictions(24 if given.quick else SIMULATED, folder)
     if given.part in ("all", "real"):
         if DATA.is_dir():
             rows = crosswire(DATA, 40 if given.quick else 200)

@@ -597,6 +597,17 @@ def test_plan_from_nothing_is_words_and_counts(capfd):
     assert out.count("target") >= 6
 
 
+def test_a_plan_is_tried_in_simulated_recordings(capfd):
+    arguments = ["plan", "--images", "12", "--simulate", "normal"]
+    assert main(arguments) == 0
+    out, _ = capfd.readouterr()
+    assert "In 1000 simulated recordings with normal offsets" in " ".join(out.split())
+    assert main([*arguments, "--json"]) == 0
+    (found,) = json.loads(capfd.readouterr().out)["simulated"]
+    assert (found["images"], found["trials"], found["lost"]) == (12, 1000, 0)
+    assert f"error over the image {found['tre_mm']:.2g} mm" in " ".join(out.split())
+
+
 def test_plans_that_cannot_be(capfd, tmp_path):
     for arguments, match in (
         (["--images", 10, "--until-tre", 0.2], "either --images or"),

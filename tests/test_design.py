@@ -429,3 +429,64 @@ def test_the_figure_is_a_figure(tmp_path):
 def test_sobols_sequence_is_scipys():
     expected = qmc.Sobol(5, scramble=False).random_base2(9)
     np.testing.assert_array_equal(sobol_sequence(512), expected)
+
+
+@pytest.mark.parametrize("scale", [False, True])
+def test_simulated_errors_with_equal_sds_are_the_bound(scale):
+    """For equal Gaussian errors the conventional fit is the maximum of the likelihood."""
+    model = replace(MODEL, noise=Noise.constant((0.2, 0.2, 0.2), doubt=1.0), scale=scale)
+    candidates = some(60, model=model)
+    poses = candidates.poses[:16]
+    found = design.simulate_errors(poses, "normal", candidates, method="conventional", seed=1)
+    covariance = covariance_of(model.information(poses))
+    points = candidates.constraints.region.grid()
+    bound = np.sqrt(np.sum(tre_weight(points, model.size) * covariance))
+    assert found.lost == 0
+    assert abs(found.tre_mm - bound) < 4 * found.tre_error_mm + 0.005 * bound
+    assert found.tre_error_mm < 0.02 * bound
+    tests = candidates.poses[::2]
+    in_plane = model.targets(tests) * np.array([1.0, 0.0, 1.0])
+    scatter = np.sqrt(np.sum(rp_weight(tests, in_plane, MOUNT, model.size) * covariance))
+    # The mean of roots is below the root of the mean.
+    assert 0.85 * scatter < found.rp_mm < scatter
+
+
+def test_simulated_errors_know_the_law():
+    """Offsets with edges tell more than their SD says, and a mean cannot be told from a shift."""
+    candidates = some(100, model=replace(MODEL, noise=Noise.constant((0.1, 0.1, 1.0))))
+    sets = candidates.poses[np.random.default_rng(2).integers(100, size=(200, 24))]
+    found = {
+        law: design.simulate_errors(sets, law, candidates, seed=3)
+        for law in ("uniform", "normal", "one-sided")
+    }
+    assert found["uniform"].trials == 200
+    assert found["uniform"].tre_mm < 0.8 * found["normal"].tre_mm
+    assert found["one-sided"].tre_mm > 1.5 * found["normal"].tre_mm
+    assert found["normal"].tre_mm < found["normal"].tre_95_mm
+
+
+def test_simulated_errors_count_the_images_taken_before():
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=10), seed=1)
+    result = jaxcal.calibrate(recording, "conventional")
+    around = design.candidates_around(recording, result, count=60)
+    more = design.next_poses(result, around, 4)
+    found = design.simulate_errors(more, "normal", around, method="conventional", trials=50)
+    alone = design.simulate_errors(more.poses, "normal", around, method="conventional", trials=50)
+    assert (found.images, alone.images) == (14, 4)
+    assert found.tre_mm < 0.5 * alone.tre_mm
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"candidates": None}, "candidates"),
+        ({"poses": np.tile(np.eye(4), (2, 2, 5, 1, 1))}, "poses must be"),
+        ({"trials": 1}, "trials"),
+        ({"law": "gaussian"}, "elevation_distribution"),
+    ],
+)
+def test_simulations_that_cannot_be(change, match):
+    candidates = some(8)
+    given = {"poses": candidates.poses, "law": "normal", "candidates": candidates} | change
+    with pytest.raises(InputError, match=match):
+        design.simulate_errors(given.pop("poses"), **given)

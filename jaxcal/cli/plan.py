@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,6 +19,7 @@ from jaxcal.cli.common import (
     print_page,
     progress,
 )
+from jaxcal.study.laws import OFFSET_LAWS, OffsetLaw
 
 if TYPE_CHECKING:
     from jaxcal.design import Candidates, Plan
@@ -91,6 +93,14 @@ _COUNTED = (0.5, 0.3, 0.2, 0.1)
     metavar="N",
     help="Seed of the candidate poses.",
 )
+@click.option(
+    "--simulate",
+    type=click.Choice(OFFSET_LAWS),
+    multiple=True,
+    metavar="LAW",
+    help="Calibrate 1,000 simulated recordings of the planned poses, and say how far off they are. "
+    f"LAW is that of the elevational offsets: {', '.join(OFFSET_LAWS)}. May be repeated.",
+)
 @click.option("--figure", type=click.Path(), metavar="PNG", help="Draw the plan.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def plan(
@@ -106,6 +116,7 @@ def plan(
     sigma: tuple[float, float, float] | None,
     estimate: str | None,
     seed: int,
+    simulate: tuple[OffsetLaw, ...],
     figure: str | None,
     as_json: bool,
 ) -> int:
@@ -144,6 +155,12 @@ def plan(
         if figure is not None:
             _draw(found, until_tre, figure)
         record = _record(found, recording)
+    if simulate:
+        with progress("calibrating simulated recordings"):
+            record["simulated"] = [
+                asdict(design.simulate_errors(found, law, candidates, seed=seed))
+                for law in simulate
+            ]
     if as_json:
         print_json(record)
     else:
@@ -267,5 +284,15 @@ def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
         f"Predicted with these {len(found)} images{before}: error over the image "
         f"{found.tre_mm[-1]:.2g} mm, reconstruction precision {found.rp_mm[-1]:.2g} mm.",
         *([f"How many images an error takes: {'; '.join(counts)}."] if counts else []),
+        *(_simulated_in_words(errors) for errors in record.get("simulated", ())),
         *([] if figure is None else [f"figure: {figure}"]),
+    )
+
+
+def _simulated_in_words(errors: dict[str, Any]) -> str:
+    lost = f" {errors['lost']} had no answer." if errors["lost"] else ""
+    return (
+        f"In {errors['trials']} simulated recordings with {errors['law']} offsets: error over the "
+        f"image {errors['tre_mm']:.2g} mm (below {errors['tre_95_mm']:.2g} mm in 95 of 100), "
+        f"reconstruction precision {errors['rp_mm']:.2g} mm.{lost}"
     )

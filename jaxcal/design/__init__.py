@@ -15,6 +15,7 @@ polish.py       moves poses along the gradient on SE(3), inside the constraints
 planning.py     plan, next_poses
 bound.py        an error that no choice among the candidates can go below
 predict.py      predicted errors of a plan; images_to
+simulated.py    errors of many simulated calibrations at given poses
 words.py        a pose in words, for a person who holds the probe
 figure.py       figure of the plan and of how many images are needed
 """
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
     from jaxcal.design.planning import next_poses as next_poses
     from jaxcal.design.planning import plan as plan
     from jaxcal.design.predict import images_to as images_to
+    from jaxcal.design.simulated import SimulatedErrors as SimulatedErrors
+    from jaxcal.design.simulated import simulate_errors as simulate_errors
     from jaxcal.design.words import pose_in_words as pose_in_words
 
 _HOME = {
@@ -51,6 +54,7 @@ _HOME = {
     "Plan": "planning",
     "Region": "constraints",
     "Rules": "greedy",
+    "SimulatedErrors": "simulated",
     "candidates_around": "candidates",
     "gain": "criteria",
     "images_to": "predict",
@@ -61,6 +65,7 @@ _HOME = {
     "plan": "planning",
     "plan_figure": "figure",
     "pose_in_words": "words",
+    "simulate_errors": "simulated",
 }
 
 

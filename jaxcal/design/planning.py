@@ -45,10 +45,12 @@ class Known:
     Attributes:
         information: (p, p) about the unknowns, including the prior with which every plan begins.
         images: number of images from which it comes.
+        tuned: whether the SDs were tuned to these images.
     """
 
     information: Float[np.ndarray, "p p"]
     images: int = 0
+    tuned: bool = False
 
 
 @dataclass(frozen=True)
@@ -190,7 +192,7 @@ def known_before(
     if isinstance(prior, Known):
         return prior
     if isinstance(prior, Plan):
-        return Known(prior.information, prior.known.images + len(prior))
+        return Known(prior.information, prior.known.images + len(prior), prior.known.tuned)
     if isinstance(prior, np.ndarray):
         if prior.shape != (size, size) or not np.isfinite(prior).all():
             raise InputError(f"information must be a finite {size} x {size} matrix")
@@ -202,8 +204,10 @@ def known_before(
             "poses as their 'taken'"
         )
     model = with_effective_noise(prior, candidates).model
-    used = int(np.sum(np.asarray(prior.numpy().mask) > 0))
-    return Known(known_information(prior, model, candidates.taken), used)
+    answer = prior.numpy()
+    used = int(np.sum(np.asarray(answer.mask) > 0))
+    information = known_information(prior, model, candidates.taken)
+    return Known(information, used, bool(answer.sigma_tuned))
 
 
 def with_effective_noise(prior: object, candidates: Candidates) -> Candidates:

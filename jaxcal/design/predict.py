@@ -1,8 +1,8 @@
 """Predicted errors of poses, and how many images a wanted error takes.
 
-The prediction is the Cramer-Rao bound under the model's SDs, times Student's factor: the SDs are
-tuned to the same images, and with few images this makes the errors larger than with known SDs
-(:mod:`jaxcal.diagnostics.intervals`).
+The prediction is the Cramer-Rao bound under the model's SDs. After a calibration, whose SDs were
+tuned to its images, it is multiplied by Student's factor, as the errors that the calibration itself
+states are (:mod:`jaxcal.diagnostics.intervals`).
 """
 
 from __future__ import annotations
@@ -28,9 +28,14 @@ _ENOUGH = 1000
 """Number of candidates for counting images; more of them change the count by less than 1 %."""
 
 
-def student_factor(images: int, size: int = 9) -> float:
-    """Variance of Student's distribution for SDs tuned from so many images, at most 3."""
-    left = max(images - size / 3, 3.0)
+def variance_factor(known: Known, more: int, size: int = 9) -> float:
+    """By how much squared errors with so many more images exceed the bound.
+
+    It is the variance of Student's distribution if the SDs were tuned to images, at most 3, else 1.
+    """
+    if not known.tuned:
+        return 1.0
+    left = max(known.images + more - size / 3, 3.0)
     return left / (left - 2.0)
 
 
@@ -48,7 +53,7 @@ def curve(
         tre_weight(candidates.constraints.region.grid(), model.size),
         rp_weight(candidates.poses, targets, model.image_to_probe, model.size),
     )
-    factor = np.array([student_factor(known.images + k, model.size) for k in range(len(total))])
+    factor = np.array([variance_factor(known, k, model.size) for k in range(len(total))])
     tre, rp = (np.sqrt(factor * np.einsum("ab,nab->n", weight, covariance)) for weight in weights)
     return tre, rp
 
