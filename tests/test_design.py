@@ -16,6 +16,7 @@ from scipy.stats import qmc
 
 import jaxcal
 from jaxcal import InputError, design
+from jaxcal.data import geometry
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.design import Constraints, Model, Noise, Region
 from jaxcal.design.candidates import sobol_poses, sobol_sequence
@@ -92,8 +93,8 @@ def test_gain_is_that_of_brute_force_and_its_gradient_that_of_differences():
     pose = jnp.asarray(candidates.poses[20])
 
     def along(tangent):
-        turn = jaxcal.data.geometry.rotation_from_vector(tangent[3:])
-        moved = jaxcal.data.geometry.matrix_from_rotation(
+        turn = geometry.rotation_from_vector(tangent[3:])
+        moved = geometry.matrix_from_rotation(
             pose[:3, :3] @ turn, pose[:3, 3] + pose[:3, :3] @ tangent[:3]
         )
         return design.gain(moved, covariance, weight, model)
