@@ -207,6 +207,37 @@ claim(
 )
 
 
+def _foreseen(of: str, *laws: str) -> tuple[float, float]:
+    return span(
+        column("pose_design_predicted", f"{of}_over_actual", **({"law": laws} if laws else {}))
+    )
+
+
+claim(
+    ACCURACY,
+    "predicts a TRE that is {:.2f} to {:.2f} times the actual one of `auto`, in {:.0f} cells of "
+    "{:.0f} recordings: five laws, planned and random poses, both limits of tilt, {:.0f} to {:.0f} "
+    "images",
+    lambda: (
+        *_foreseen("simulated"),
+        len(column("pose_design_predicted", "simulated_over_actual")),
+        *set(column("pose_design_predicted", "trials")),
+        *span(column("pose_design_predicted", "images")),
+    ),
+)
+claim(
+    ACCURACY,
+    "It is {:.2f} to {:.2f} times the actual TRE for normal, triangular and heavy-tailed offsets, "
+    "up to {:.2f} times for uniform ones, whose edges `auto` finds in many images, and {:.2f} to "
+    "{:.2f} times for one-sided ones,",
+    lambda: (
+        *_foreseen("planned", "normal", "triangular", "heavy-tailed"),
+        _foreseen("planned", "uniform")[1],
+        *_foreseen("planned", "one-sided"),
+    ),
+)
+
+
 BOTH = ("tre_mm", "tre_error_mm")
 claim(
     ACCURACY,
