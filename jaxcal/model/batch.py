@@ -251,15 +251,17 @@ def _extra_names(blocks: Blocks) -> list[str]:
     return [name for name in EXTRA if name in blocks for _ in range(size((name,)))]
 
 
+@jax.jit
 def targets(iterate: Iterate, images: ImagePlanes) -> tuple[Vector, Matrix]:
     """q_i, and its derivative M_i = R' R_i' by the target, as planes."""
-    inverse = [[iterate.rotation[k, a][:, None] for k in range(3)] for a in range(3)]
+    rotation, translation = iterate.rotation[..., None], iterate.translation[..., None]
+    inverse = [[rotation[k, a] for k in range(3)] for a in range(3)]
     back = [[images.rotation[3 * j + i] for j in range(3)] for i in range(3)]
-    from_probe = [iterate.point[j][:, None] - images.origin[j] for j in range(3)]
+    from_probe = unrolled.rows_of(iterate.point[..., None] - images.origin)
     # q_i is not computed from M_i, so that callers of q_i alone need not have M_i in memory.
     in_probe = [
-        value - shift[:, None]
-        for value, shift in zip(unrolled.apply(back, from_probe), iterate.translation, strict=True)
+        value - shift
+        for value, shift in zip(unrolled.apply(back, from_probe), translation, strict=True)
     ]
     return unrolled.apply(inverse, in_probe), unrolled.product(inverse, back)
 
@@ -276,12 +278,16 @@ def barrier(values):
 
 @jax.custom_jvp
 def _sums(planes: tuple[Array, ...]) -> tuple[Array, ...]:
-    none = tuple(jnp.zeros((), plane.dtype) for plane in planes)
+    return _reduced(planes, jnp.zeros((), planes[0].dtype))
 
+
+# A function of its own, since the same constant for every plane would be written out each time.
+@jax.jit
+def _reduced(planes: tuple[Array, ...], zero: Array) -> tuple[Array, ...]:
     def plus(a: tuple, b: tuple) -> tuple:
         return tuple(x + y for x, y in zip(a, b, strict=True))
 
-    return tuple(jax.lax.reduce(planes, none, plus, (planes[0].ndim - 1,)))
+    return tuple(jax.lax.reduce(planes, (zero,) * len(planes), plus, (planes[0].ndim - 1,)))
 
 
 @_sums.defjvp

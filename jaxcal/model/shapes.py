@@ -30,7 +30,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxcal.model import unrolled
 from jaxcal.model.distributions import Family
+from jaxcal.model.unrolled import Entry
 from jaxcal.runtime.precision import in_standard_promotion
 
 NODES = 8
@@ -163,14 +165,16 @@ def _sums(family: Family, abrupt: bool, window: Window) -> tuple[Array, Array, A
     growth = 2 * curvature * stride * stride
     # Sums of sums: with d = NODES, NODES - 1, ... 1 towards the middle they are the sums of
     # (1, d, d (d + 1) / 2) times the mass.
-    total = line = parabola = jnp.zeros_like(value)
+    total: Entry = 0
+    line: Entry = 0
+    parabola: Entry = 0
     for node in range(NODES):
         mass = value if family == "uniform" else value * profile(family, base)
         if abrupt and node < len(END_WEIGHTS):
             mass = float(END_WEIGHTS[node]) * mass
-        total = total + mass
-        line = line + total
-        parabola = parabola + line
+        total = unrolled.add(total, mass)
+        line = unrolled.add(line, total)
+        parabola = unrolled.add(parabola, line)
         value, ratio = value * ratio, ratio * bend
         base, change = base + change, change + growth
     # |x| = d - 1/2.

@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array
 
 Entry = Any
@@ -40,8 +41,10 @@ def times(first: Entry, second: Entry) -> Entry:
     """Product; 0 where either is a structural zero."""
     if is_zero(first) or is_zero(second):
         return 0
-    # 1 needs no multiplication either.
-    return second if isinstance(first, int) and first == 1 else first * second
+    # 1 and -1 need no multiplication either.
+    if isinstance(first, int) and abs(first) == 1:
+        return second if first == 1 else -second
+    return first * second
 
 
 def dot(first: Vector, second: Vector) -> Entry:
@@ -139,6 +142,12 @@ def rotation(vector: Vector) -> Matrix:
         [add(int(i == j), factor * add(turn[i][j], square[i][j])) for j in range(3)]
         for i in range(3)
     ]
+
+
+@jax.jit
+def as_array(entries: Vector) -> Array:
+    """The array whose first axis counts the entries; the inverse of :func:`rows_of`."""
+    return jnp.stack(entries)
 
 
 def rows_of(stacked: Array) -> Vector:

@@ -43,7 +43,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxcal.model import unrolled
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose, targets
 from jaxcal.model.distributions import FAMILIES, Family, OffsetLaw, Shape
 from jaxcal.model.observations import MediumPrior, Observation, OwnCovariances, Points, unit_shape
@@ -126,9 +125,8 @@ def average_over_laws(
     step, covariance = median(answers, model.offsets_metric())
     step, covariance = barrier((step, covariance))
 
-    direction = sites.direction
-    across = [[covariance[i, j][:, None] for j in SEEN] for i in SEEN]
-    variance = unrolled.dot(direction, unrolled.apply(across, direction))
+    at = np.array(SEEN)
+    variance = sites.variance(covariance[at[:, None], at])
 
     enough = (used >= MINIMUM_SELF_TUNING) & answers.settled & jnp.all(jnp.isfinite(step), axis=0)
     # The answer may be a hundredth of a radian from the linearisation: turn by Exp, since the

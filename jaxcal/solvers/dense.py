@@ -267,6 +267,7 @@ def inverse_positive(matrix: Float[Array, "p p"]) -> tuple[Float[Array, "p p"], 
     return inverse * scale[:, None] * scale[None, :], log_determinant - 2 * jnp.sum(jnp.log(scale))
 
 
+@jax.jit
 def inverse_lanes_last(
     matrix: Float[Array, "p p lanes"],
 ) -> tuple[Float[Array, "p p lanes"], Float[Array, " lanes"]]:
@@ -324,6 +325,7 @@ def solve_lanes_last(
     return product_lanes_last(inverse, vector)
 
 
+@jax.jit
 def _inverse_of_cholesky(matrix: Float[Array, "b b lanes"]) -> Float[Array, "b b lanes"]:
     """L^-1 of A = L L', for a few rows."""
     size = matrix.shape[0]

@@ -104,6 +104,19 @@ class Sites(eqx.Module):
         direction = [jnp.full_like(q[1], -1.0), q[2], -q[0], *turned[1]]
         return cls(direction, q[1] - about, used, lower, upper)
 
+    @jax.jit
+    def variance(self, covariance: Float[Array, "6 6 lanes"]) -> Float[Array, "lanes n"]:
+        """h_i' C h_i, mm^2: the variance of every image's offset."""
+        h, entry, size = self.direction, covariance[..., None], len(self.direction)
+        # Of the entries off the diagonal both are counted at once.
+        doubled = [
+            unrolled.add(
+                *(unrolled.times(1 if i == j else 2, entry[i, j] * h[j]) for j in range(i, size))
+            )
+            for i in range(size)
+        ]
+        return unrolled.dot(h, doubled)
+
 
 class Marginal(eqx.Module):
     """What the measurements say of z, and how the other unknowns follow from it; lanes last.
@@ -354,13 +367,8 @@ class _Laws(eqx.Module):
         """Update all sites once; the log evidence before, and where a site dominates the others."""
         h, offset, used = self.sites.direction, self.sites.offset, self.sites.used
         tau, nu, belief = state.tau, state.nu, state.belief
-        entry = belief.covariance[..., None]
-        doubled = [
-            unrolled.add(*((1 if i == j else 2) * entry[i, j] * h[j] for j in range(i, 6)))
-            for i in range(6)
-        ]
-        variance = unrolled.dot(h, doubled)
-        at = offset + unrolled.dot(h, [row[:, None] for row in belief.mean])
+        variance = self.sites.variance(belief.covariance)
+        at = offset + unrolled.dot(h, unrolled.rows_of(belief.mean[..., None]))
         shrink = 1 / jnp.maximum(1 - tau * variance, LEAST_ROOM)
         centre = shrink * (at - variance * nu)
         without = jnp.where(used > 0, variance * shrink, 1.0)
@@ -390,8 +398,8 @@ class _Laws(eqx.Module):
         evidence = site + 0.5 * gained - 0.5 * belief.log_determinant
         size = len(TRIANGLE)
         after = _solved(
-            self.known.information + stacked(jnp.stack(sums[:size])),
-            self.known.gradient + jnp.stack(sums[size:]),
+            self.known.information + stacked(unrolled.as_array(sums[:size])),
+            self.known.gradient + unrolled.as_array(sums[size:]),
         )
         return _State(tau, nu, after), evidence, crowded > 0
 

@@ -421,7 +421,7 @@ def accumulate(
             gradient[k] = gradient[k] + precision * away
             cost = cost + precision * away * away
     lengths = jnp.stack(squares) if squares else None
-    return Normal(jnp.stack(flat), jnp.stack(gradient), cost, lengths)
+    return Normal(unrolled.as_array(flat), unrolled.as_array(gradient), cost, lengths)
 
 
 def information_and_design(
@@ -452,7 +452,7 @@ def information_and_design(
         places = diagonal_places(iterate.unknowns)
         for k, _, precision in medium.deviations(iterate):
             flat[places[k]] = flat[places[k]] + precision
-    return stacked(jnp.stack(flat)), stacked(jnp.stack(design))
+    return stacked(unrolled.as_array(flat)), stacked(unrolled.as_array(design))
 
 
 class ComponentSums(eqx.Module):
@@ -521,7 +521,7 @@ def component_sums(
     sums = total(planes)
     squares, sums = sums[:count], sums[count:]
     parts = [sums[k * each : (k + 1) * each] for k in range(count)]
-    gradient = jnp.stack([jnp.stack(part[:unknowns]) for part in parts])
+    gradient = jnp.stack([unrolled.as_array(part[:unknowns]) for part in parts])
     if sigma is None:
         rest = [jnp.zeros_like(squares[0])] * len(pairs(unknowns))
     else:
@@ -534,11 +534,11 @@ def component_sums(
         for k, value, precision in medium.deviations(iterate):
             away = away + precision * value * value
             slope[k], diagonal[k] = precision * value, precision + zero
-        known = (away, jnp.stack(slope), jnp.stack(diagonal))
+        known = (away, unrolled.as_array(slope), unrolled.as_array(diagonal))
     return ComponentSums(
         jnp.stack(squares),
         gradient,
-        jnp.stack([jnp.stack(part[unknowns:]) for part in parts]),
-        jnp.stack(rest),
+        jnp.stack([unrolled.as_array(part[unknowns:]) for part in parts]),
+        unrolled.as_array(rest),
         known,
     )

@@ -133,7 +133,7 @@ class Reduced(eqx.Module):
         for weight in (x, z, images.mask):
             planes += [weight * entry for row in turn for entry in row]
             planes += [weight * entry for entry in back]
-        sums = barrier(jnp.stack(total(planes)))
+        sums = barrier(unrolled.as_array(total(planes)))
         parts = sums[3:].reshape(3, 12, -1)
         lateral, axial, rotation = parts[:, :9].reshape(3, 3, 3, -1)
         turned = jnp.concatenate([lateral, axial], axis=1)
