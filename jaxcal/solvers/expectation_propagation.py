@@ -257,32 +257,38 @@ def propagate(
         sweeps: how many under each law; the first of a family gets twice as many, since each of the
             others starts with the sites of the law before it.
     """
-    names = tuple(dict.fromkeys(families))
+    # Under the Gaussian law the first sites are exact, unless it is cut.
+    exact = [k for k, name in enumerate(families) if name == "gaussian" and sites.lower is None]
+    names = tuple(dict.fromkeys(name for k, name in enumerate(families) if k not in exact))
     turns: list[tuple[int, int, bool]] = []
     last = []
     for which, name in enumerate(names):
         at = [k for k, family in enumerate(families) if family == name]
-        # The first sites of a Gaussian law are exact, unless it is cut.
-        exact = name == "gaussian" and sites.lower is None
-        ahead = [] if exact else [(which, at[0], True)]
-        turns += ahead
+        turns.append((which, at[0], True))
         for k in at:
-            turns.append((which, k, k == at[0] and not ahead))
-            last.append((k, len(turns) - 1))
-    family, law, fresh = (jnp.asarray(column) for column in zip(*turns, strict=True))
+            last.append((k, len(turns)))
+            turns.append((which, k, False))
     under = _Laws(names, sites, known, squares, pull)
+    parts: list[_Found] = []
+    if turns:
+        family, law, fresh = (jnp.asarray(column) for column in zip(*turns, strict=True))
 
-    def one(state: _State, turn: tuple) -> tuple[_State, _Found]:
-        family, sd, fresh = turn
-        state = jax.lax.cond(fresh, lambda: under.gaussian(sd), lambda: state)
-        return under.swept(family, sd, state, sweeps)
+        def one(state: _State, turn: tuple) -> tuple[_State, _Found]:
+            family, sd, fresh = turn
+            state = jax.lax.cond(fresh, lambda: under.gaussian(sd), lambda: state)
+            return under.swept(family, sd, state, sweeps)
 
-    # The first turn starts afresh, so it does not use this state.
-    shape = jax.eval_shape(under.gaussian, sd[0])
-    start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
-    _, found = jax.lax.scan(one, start, (family, sd[law], fresh))
+        # The first turn starts afresh, so it does not use this state.
+        shape = jax.eval_shape(under.gaussian, sd[0])
+        start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
+        parts.append(jax.lax.scan(one, start, (family, sd[law], fresh))[1])
+    for k in exact:
+        last.append((k, len(turns) + exact.index(k)))
+        parts.append(jax.tree.map(lambda leaf: leaf[None], under.under_gaussian(sd[k])))
     order = jnp.asarray([turn for _, turn in sorted(last)])
-    found = barrier(jax.tree.map(lambda leaf: jnp.moveaxis(leaf[order], 0, -2), found))
+    found = barrier(
+        jax.tree.map(lambda *leaf: jnp.moveaxis(jnp.concatenate(leaf)[order], 0, -2), *parts)
+    )
     return Posterior(found.mean, found.covariance, found.log_evidence, found.change)
 
 
@@ -292,6 +298,11 @@ class _Belief(eqx.Module):
     information: Float[Array, "6 6 lanes"]
     rhs: Float[Array, "6 lanes"]
     log_determinant: Float[Array, " lanes"]
+
+    def evidence(self, site: Float[Array, " lanes"]) -> Float[Array, " lanes"]:
+        """The log evidence, from the sites' part of it."""
+        gained = jnp.sum(self.rhs * self.mean, axis=0)
+        return site + 0.5 * gained - 0.5 * self.log_determinant
 
 
 class _State(eqx.Module):
@@ -341,6 +352,13 @@ class _Laws(eqx.Module):
             self.known.information + self.squares / sd**2, self.known.gradient - self.pull / sd**2
         )
         return _State(tau, jnp.zeros_like(tau), belief)
+
+    def under_gaussian(self, sd: Float[Array, " lanes"]) -> _Found:
+        """The result under the Gaussian law itself."""
+        belief = self.gaussian(sd).belief
+        used, square = total([self.sites.used, self.sites.used * self.sites.offset**2])
+        site = -0.5 * (used * jnp.log(2 * np.pi * sd**2) + square / sd**2)
+        return _Found(belief.mean, belief.covariance, belief.evidence(site), jnp.zeros_like(sd))
 
     def swept(
         self, family: Array, sd: Float[Array, " lanes"], state: _State, sweeps: int
@@ -394,8 +412,7 @@ class _Laws(eqx.Module):
         force = nu - tau * offset
         planes = [weighted[i] * h[j] for i, j in TRIANGLE]
         *sums, site, crowded = total([*planes, *(force * row for row in h), site, crowded])
-        gained = jnp.sum(belief.rhs * belief.mean, axis=0)
-        evidence = site + 0.5 * gained - 0.5 * belief.log_determinant
+        evidence = belief.evidence(site)
         size = len(TRIANGLE)
         after = _solved(
             self.known.information + stacked(unrolled.as_array(sums[:size])),

@@ -1,8 +1,8 @@
 """Every method on a batch of problems, as one pure function of arrays.
 
-The steps are: the conventional fit from the closed-form start; the method itself from that fit;
-derivatives by the implicit function theorem; and the average over the offsets' laws where they are
-weighed. One problem is a batch of one.
+The steps are: the start in closed form, and the conventional fit from it where answers may depend
+on the start; the method itself; derivatives by the implicit function theorem; and the average over
+the offsets' laws where they are weighed. One problem is a batch of one.
 """
 
 from __future__ import annotations
@@ -128,9 +128,9 @@ def begin(images: ImagePlanes, plan: SolvePlan) -> ConventionalStart:
         max_steps=plan.options.max_iterations,
         undamped=alone and plan.options.solver == "gauss-newton",
         trace=plan.options.trace if alone else 0,
-        # With given SDs the descent converges from the closed form as well; other answers may
-        # depend on the start.
-        fitted=alone or plan.method == "alternating" or plan.self_tuning or plan.prior == "bounded",
+        # Gaussian offsets converge from the closed form in as many passes; answers within bounds
+        # may depend on the start.
+        fitted=alone or plan.prior == "bounded",
     )
 
 
