@@ -12,7 +12,7 @@ the other sites times the true law:
     mass Z_i, mean and variance of p(u) N(u; c_i, w_i)                             a quadrature
     tau_i <- 1/variance - 1/w_i,  nu_i <- mean/variance - c_i/w_i                  all i, damped
 
-It starts from the Gaussian law of the same SD, for which it is exact, or from the sites of the same
+It starts from the Gaussian law of the same SD, which needs no sweep, or from the sites of the same
 law with another SD. The number of sweeps is fixed, so it can be differentiated like any other array
 code. It also gives the evidence, the probability of the data under that law, by which laws are
 compared.
@@ -259,7 +259,8 @@ def propagate(
     """
     # Under the Gaussian law the first sites are exact, unless it is cut.
     exact = [k for k, name in enumerate(families) if name == "gaussian" and sites.lower is None]
-    names = tuple(dict.fromkeys(name for k, name in enumerate(families) if k not in exact))
+    swept = [name for k, name in enumerate(families) if k not in exact]
+    names: tuple[Family, ...] = tuple(dict.fromkeys(swept))
     turns: list[tuple[int, int, bool]] = []
     last = []
     for which, name in enumerate(names):
