@@ -259,8 +259,8 @@ def propagate(
     """
     # Under the Gaussian law the first sites are exact, unless it is cut.
     exact = [k for k, name in enumerate(families) if name == "gaussian" and sites.lower is None]
-    swept = [name for k, name in enumerate(families) if k not in exact]
-    names: tuple[Family, ...] = tuple(dict.fromkeys(swept))
+    swept: list[Family] = [name for k, name in enumerate(families) if k not in exact]
+    names = tuple(dict.fromkeys(swept))
     turns: list[tuple[int, int, bool]] = []
     last = []
     for which, name in enumerate(names):
