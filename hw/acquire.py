@@ -285,9 +285,10 @@ def acquire(
     if recorder.error is not None and not interrupted:
         # The recorder's failure is the cause of what went wrong.
         reason = str(recorder.error)
+    where = "--setup TOML" if job.request.bench is None else "--bench"
     raise AcquisitionStopped(
         f"{reason}; {estimator.count} of {job.images} images are in {recorder.kept}; put it "
-        f"right, then: jaxcal-hw acquire --resume {recorder.kept}",
+        f"right, then: jaxcal-hw acquire --resume {recorder.kept} {where}",
         interrupted=interrupted,
         by_itself=recorder.error is None,
     )

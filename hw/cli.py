@@ -144,7 +144,8 @@ def acquire(
     RECORDING is the file to make (by default one named after the time), or to --resume.
     """
     if bench == (setup_path is not None):
-        raise InputError("give either --bench or --setup TOML")
+        also = ", also to --resume" if resume else ""
+        raise InputError(f"give either --bench or --setup TOML{also}")
     if not bench and (speed, controller, bench_seed) != (None, None, None):
         raise InputError("--speed, --controller and --bench-seed need --bench")
     given = [
@@ -172,8 +173,14 @@ def acquire(
         raise InputError("--until-tre needs --plan optimal")
     if unattended is not None and not move:
         raise InputError("--unattended needs --move")
+    from hw.extras import missing
     from hw.recording_check import check_resumable, settings_of
 
+    if bench or move:
+        # Before a file is made: whoever lacks them cannot receive a single line.
+        for module in ("cobs", "serial"):
+            if (cure := missing(module, extra="serial")) is not None:
+                raise InputError(cure)
     if resume:
         assert recording is not None
         check_resumable(recording)

@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.calibration.conventional import closed_form_answer
-from jaxcal.calibration.inputs import as_batch, as_problem, unknown_names
+from jaxcal.calibration.inputs import as_batch, as_problem, converting, unknown_names
 from jaxcal.calibration.options import (
     DELAY_SD_S,
     SOUND_SPEED_SD_M_S,
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from jax import Array
 
 
+@converting
 @in_own_modes
 def calibrate(
     problem: Problem | Recording,

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 from jaxcal import InputError
 from jaxcal.data.problem import Problem, stack
 from jaxcal.data.recording import Images, Recording
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 _HOW = (
     "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "
@@ -40,6 +45,25 @@ def as_problem(value: Any, name: str) -> Problem:
         )
     kind = "a dictionary" if isinstance(value, dict) else f"{type(value).__name__}"
     raise InputError(f"{name} takes a problem or a recording, not {kind}: {_HOW}")
+
+
+def converting(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a public function whose first argument is a problem: it takes recordings as well.
+
+    Placed outside :func:`jaxcal.runtime.precision.in_own_modes`: to segment times of flight imports
+    JAX, and what imports JAX within would run in the caller's modes.
+    """
+
+    @wraps(function)
+    def converted(*args: P.args, **kwargs: P.kwargs) -> T:
+        name = f"jaxcal.{function.__name__}"
+        if args:
+            return function(*(as_problem(args[0], name), *args[1:]), **kwargs)  # pyright: ignore[reportCallIssue]
+        if "problem" in kwargs:
+            kwargs["problem"] = as_problem(kwargs["problem"], name)
+        return function(*args, **kwargs)
+
+    return converted
 
 
 def as_batch(value: Any, name: str) -> Problem:

@@ -21,6 +21,7 @@ import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
@@ -36,6 +37,10 @@ from jaxcal.runtime.array_types import Float
 FORMAT = "jaxcal-calibration"
 VERSION = 1
 MAXIMUM_BYTES = 64 * 2**20
+
+_NPZ = ("image_plane_to_probe", "scale_mm_per_px", "covariance", "face_offset_mm", "range_factor")
+_NPZ_BYTES = 65536
+"""Largest size of an ``.npz``, also unpacked."""
 
 SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
 
@@ -375,8 +380,8 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
     Args:
         path: our JSON (of ``jaxcal calibrate --json`` or ``--out``, of any version), a
             configuration or fCal result of PLUS (``.xml``), a transform of ITK (``.tfm``, ``.txt``,
-            ``.h5``), a ``calib_matrix.csv`` of TUS-REC, a YAML of easy_handeye, or PLUS's matrix as
-            ``.npy``.
+            ``.h5``), a ``calib_matrix.csv`` of TUS-REC, a YAML of easy_handeye, our ``.npz``, or
+            PLUS's matrix as ``.npy``.
 
     Raises:
         FormatError: not such a file.
@@ -404,6 +409,8 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
             return ImageTransform(read_ros_yaml(path), source=name)
         if lower.endswith(".npy"):
             return transform_from_plus_matrix(_load_npy(path), source=name)
+        if lower.endswith(".npz"):
+            return _load_npz(path)
         return _load_json(path)
 
 
@@ -431,6 +438,21 @@ def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
         return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
     except (OSError, ValueError, EOFError) as error:
         raise FormatError(f"is not an array of numbers: {one_line(error)}") from None
+
+
+def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
+    """What :meth:`ImageTransform.save` writes; the covariance is X's alone."""
+    check_readable(path, maximum_bytes=_NPZ_BYTES)
+    try:
+        with ZipFile(path) as archive:
+            if sum(member.file_size for member in archive.infolist()) > _NPZ_BYTES:
+                raise FormatError("holds more than a calibration")
+        with np.load(path, allow_pickle=False) as file:
+            names = [name for name in _NPZ if name in file.files]
+            record = {name: np.asarray(file[name], dtype=np.float64).tolist() for name in names}
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        raise FormatError(f"holds no arrays of numbers: {one_line(error)}") from None
+    return transform_from_record({"version": VERSION} | record, source=os.fspath(path))
 
 
 def _load_json(path: str | os.PathLike[str]) -> ImageTransform:

@@ -75,6 +75,11 @@ def apply(
     if source is not None:
         points, poses, kind = _read(source, quaternion, pose_units)
         _check_kind(kind, transform.scale_mm_per_px is not None, source)
+    elif transform.scale_mm_per_px is None:
+        click.echo(
+            f"{calibration}: knows no pixel size, so --pixel takes points in mm: lateral, range",
+            err=True,
+        )
     applied = transform.apply(points, poses, pixel_sd_px=pixel_sd)
     table = io.StringIO()
     rows = csv.writer(table, lineterminator="\n")

@@ -203,6 +203,14 @@ def _make_images(
         bad = (values[:, 1] <= 0) & used
         if bad.any():
             raise InputError(f"point {np.flatnonzero(bad)[0]} has a range that is not positive")
+    if kind == "pixel" and used.any():
+        bad = (values[:, 1] < 0) & used
+        if bad.any():
+            first = np.flatnonzero(bad)[0]
+            raise InputError(
+                f"pixel {first} has row v = {values[first, 1]:g}: rows count from the top of the "
+                "image, where v = 0; are u and v exchanged, or counted from the image's middle?"
+            )
 
     spacing = None
     if spacing_mm is not None:
@@ -213,6 +221,15 @@ def _make_images(
             raise InputError(f"spacing_mm belongs to pixels, not to {kind} data")
     if not np.isfinite(face_offset_mm):
         raise InputError("face_offset_mm must be finite")
+    if kind == "pixel":
+        # Without a spacing, any positive one will do: rows are not negative.
+        along = 1.0 if spacing is None else spacing[1]
+        bad = (along * values[:, 1] + face_offset_mm <= 0) & used
+        if bad.any() and (spacing is not None or face_offset_mm == 0):
+            raise InputError(
+                f"pixel {np.flatnonzero(bad)[0]} has a range that is not positive: its row lies at "
+                "or above the transducer's face (face_offset_mm is the range of row 0)"
+            )
     bound = max_elevation
     if bound is not None:
         bound = np.broadcast_to(np.asarray(bound, dtype=np.float64), (count,)).copy()

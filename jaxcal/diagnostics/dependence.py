@@ -62,6 +62,10 @@ SURE = 5.0
 FEWEST_OF_STREAM = 40
 """Shorter recordings are not examined for slowly changing errors."""
 
+CONTINUOUS = 0.25
+"""In a stream the probe moves between successive images by less than this share of the distance of
+poses half a recording apart."""
+
 ABSORBED = 6.0
 """Independent elevational errors that the fit absorbs: the number of unknowns that move them."""
 LEAST_SHARE = 0.4
@@ -329,6 +333,9 @@ NEGLIGIBLE = 0.01
 
 def _stride(data: Images | Problem, estimate: tuple[str, ...]) -> int:
     """The number t for which every t-th image of a stream is kept; 1 for other recordings."""
+    if not _moves_continuously(np.asarray(data.poses, float)[np.asarray(data.mask) > 0]):
+        # Errors that are alike for long are then no stream's: a mount has slipped, say.
+        return 1
     errors = conventional_errors(data, estimate)
     if errors is None:
         return 1
@@ -342,6 +349,13 @@ def _stride(data: Images | Problem, estimate: tuple[str, ...]) -> int:
         if correlation[1] * np.sqrt(len(values)) > SURE:
             time = max(time, correlation_time(correlation))
     return int(time) if time >= STREAM else 1
+
+
+def _moves_continuously(poses: Float[np.ndarray, "n 4 4"]) -> bool:
+    """Whether successive poses are much closer to each other than any two poses are."""
+    steps = displacement(poses[1:], poses[:-1])
+    apart = displacement(poses, np.roll(poses, len(poses) // 2, axis=0))
+    return bool(np.median(steps) < CONTINUOUS * np.median(apart))
 
 
 def clipped(errors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:

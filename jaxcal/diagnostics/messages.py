@@ -57,6 +57,9 @@ image suspect."""
 IMPLAUSIBLE_RMS_MM = 10.0
 """Residuals with a larger root mean square do not come from a target within the beam."""
 
+USUAL_PIXEL_MM = (0.02, 1.0)
+"""Estimated pixel sizes outside this interval lead to a warning."""
+
 STEADY = 1e-3
 """If the scaled KKT residual of a stopped alternation is larger, there is a warning."""
 WEAK_MM = 1.5
@@ -431,6 +434,7 @@ def warnings(result: Calibration) -> list[str]:
                 f"(SD {sd:.2f} mm) and rests on {on}"
             )
     found += _medium_warnings(result)
+    found += _unusual_pixels(result)
     if status == "converged":
         found += [f"noise model: {text}" for text in misfits(result)]
     if status == "converged":
@@ -461,6 +465,20 @@ def _weak_direction(result: Calibration) -> list[str]:
     return [
         f"weakly determined: {sight['weakest_direction']} (SD {sd:.1f} mm at the target{only}); "
         f"{sight['advice']}"
+    ]
+
+
+def _unusual_pixels(result: Calibration) -> list[str]:
+    """A warning about estimated pixel sizes that hardly any image has."""
+    if result.scale_mm_per_px is None or "scale" not in result.blocks:
+        return []
+    lateral, axial = (float(size) for size in np.asarray(result.scale_mm_per_px))
+    least, largest = USUAL_PIXEL_MM
+    if least <= min(lateral, axial) and max(lateral, axial) <= largest:
+        return []
+    return [
+        f"pixels of {lateral:.3g} x {axial:.3g} mm are unusual for ultrasound ({least:g} to "
+        f"{largest:g} mm): are the poses' translations in mm?"
     ]
 
 

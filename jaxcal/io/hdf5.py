@@ -164,7 +164,7 @@ def _check_header(root: Node) -> None:
     if flag(root, "complete") is False:
         raise FormatError(
             "is marked incomplete (complete = false), its writer did not finish: "
-            "resume it (jaxcal-hw acquire --resume)"
+            "resume it (jaxcal-hw acquire --resume, with --bench or --setup TOML as before)"
         )
     _check_units(root, "mm")
 

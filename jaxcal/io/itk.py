@@ -184,7 +184,10 @@ def _read_text(path: str | os.PathLike[str]) -> tuple[str, np.ndarray, np.ndarra
 def _read_hdf5(root: Node) -> tuple[str, np.ndarray, np.ndarray]:
     transforms = group(root, "TransformGroup")
     if transforms is None:
-        raise FormatError("is not an ITK transform: /TransformGroup is missing")
+        raise FormatError(
+            "is not an ITK transform: /TransformGroup is missing (a recording must be calibrated "
+            "first: jaxcal calibrate)"
+        )
     if child(transforms, "1") is not None:
         raise FormatError("holds several transforms; one is read")
     one = group(transforms, "0")

@@ -129,7 +129,7 @@ class PlusResult:
 
 
 def read_configuration(path: str | os.PathLike[str]) -> PlusConfiguration:
-    """Read a device-set configuration; the file is not trusted.
+    """Read a device-set configuration, or a Transform element alone; the file is not trusted.
 
     Raises:
         FormatError: not such a file, a DTD, a transform that is not 16 finite numbers; one line
@@ -138,6 +138,8 @@ def read_configuration(path: str | os.PathLike[str]) -> PlusConfiguration:
     root, _ = read_xml(path)
     name = os.fspath(path)
     try:
+        if root.tag == "Transform":
+            return PlusConfiguration((_transform(root),), (), {}, {})
         if root.tag != _ROOT:
             raise FormatError(f"is not a configuration of PLUS: its root is {quoted(root.tag)}")
         return PlusConfiguration(

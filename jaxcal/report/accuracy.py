@@ -44,6 +44,7 @@ from jaxcal.diagnostics.intervals import (
     tre_at,
     tre_over,
 )
+from jaxcal.diagnostics.messages import DRIFT_SCORE
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.trees import map_arrays
 from jaxcal.solvers.closed_form.single import calibrate_closed_form
@@ -60,9 +61,13 @@ CHANCE = 3.0
 MOVED_SHARE, MOVED_TIMES = 0.5, 4.0
 """An image contradicts the stated error if leaving it out moves image points by more than this
 share of the error, and by more than so many times the expected move."""
+TEST_TIMES = 3.0
+"""Test images contradict the stated error if they scatter by more than so many times what the
+calibration's own errors and uncertainty explain."""
 SCATTER_TIMES = 1.3
 """Resampled calibrations may scatter by up to so many times the stated error."""
 
+_WAYS = {"lateral": "sideways", "range": "in depth"}
 _ACROSS = 15
 """Number of points along each side of the map."""
 _MOST_NAMED = 5
@@ -300,6 +305,7 @@ def settle(record: dict[str, Any]) -> None:
     if tre is None or tre["stated_mm"] is None:
         return
     told = [*_from_residuals(record), *_from_images(record), *_from_resampling(record)]
+    told += [*_from_test_images(record), *_from_slow_changes(record)]
     factor = max([1.0, *(times for times, _ in told)])
     tre["factor"] = factor
     tre["contradictions"] = [words for _, words in told]
@@ -338,6 +344,47 @@ def _from_images(record: dict[str, Any]) -> list[tuple[float, str]]:
         return []
     words = f"image {worst} alone moves the image by {size:.2f} mm ({how})"
     return [(math.hypot(1.0, size / stated), words)]
+
+
+def _from_test_images(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Independent images among which the target scatters by far more than it may."""
+    found, stated = record["reconstruction_precision_mm"], record["tre"]["stated_mm"]
+    if record["reconstruction_precision_set"] != "test" or found is None or not stated:
+        return []
+    names = ("sigma_lateral_mm", "sigma_range_mm", "sigma_elevation_mm")
+    errors = [record[name] or 0.0 for name in names]
+    # Poses that turn the image see its error twice as large.
+    expected = math.hypot(*errors, 2 * stated)
+    if found <= TEST_TIMES * expected:
+        return []
+    words = (
+        f"the test images scatter by {found:.2f} mm, where {expected:.2f} mm is expected (is it "
+        "the same probe, depth and mount?)"
+    )
+    return [(math.sqrt(found**2 - math.hypot(*errors) ** 2) / stated, words)]
+
+
+def _from_slow_changes(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Points that move in the image in the course of the recording, as after a slip of the mount.
+
+    Slow elevational errors do not count: they come from the placement, not from the image.
+    """
+    stated, scores = record["tre"]["stated_mm"], record["noise_model"]["scores"]["drift"]
+    found: list[tuple[float, str]] = []
+    for score, kind, name in zip(
+        scores, ("lateral", "range"), ("sideways", "in depth"), strict=False
+    ):
+        size = record[f"sigma_{kind}_mm"]
+        if score is None or not size or not stated or score <= DRIFT_SCORE:
+            continue
+        slow = size * math.sqrt(min(score / math.sqrt(record["images_used"] - 1), 1.0))
+        words = (
+            f"the points move {name} by {slow:.2f} mm (SD) in the course of the recording, so that "
+            "the image is elsewhere at its end than at its start"
+        )
+        if slow > stated:
+            found.append((math.hypot(1.0, slow / stated), words))
+    return found
 
 
 def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
