@@ -95,9 +95,10 @@ def calibrate(
         delay_sd: how far the delay may be from nominal, s (joint only, not bounded).
         options: tolerances and limits.
         robust: first find the images that agree with each other, even if nearly half of all images
-            are wrong (:mod:`jaxcal.solvers.consensus`), and leave the others out. ``outlier`` and
-            ``departure`` say which and why. If no image is gravely wrong, none is left out, and the
-            answer is the same as without ``robust``.
+            are wrong (:mod:`jaxcal.solvers.consensus`), and leave the others out. Many images that
+            are wrong in the same way, by a few mm (a mount that slipped), agree with each other and
+            may stay. ``outlier`` and ``departure`` say which and why. If no image is gravely wrong,
+            none is left out, and the answer is the same as without ``robust``.
 
     Returns:
         A :class:`Calibration`; read its ``status`` and ``warnings`` before using it. The frames of

@@ -25,8 +25,19 @@ _TEXTS = {
 
 def _formats(command):
     for name, text in reversed(_TEXTS.items()):
-        command = click.option(f"--{name}", "format", flag_value=name, help=text)(command)
+        option = click.option(
+            f"--{name}", "format", flag_value=name, help=text, callback=_one_format, multiple=True
+        )
+        command = option(command)
     return command
+
+
+def _one_format(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> str | None:
+    """The one format that was asked for."""
+    if len(given) > 1:
+        listed = " and ".join(f"--{name}" for name in given)
+        raise click.UsageError(f"{listed}: one format at a time")
+    return given[0] if given else None
 
 
 @click.command()

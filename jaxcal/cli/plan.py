@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
+import numpy as np
 
 from jaxcal import InputError
 from jaxcal.cli.calibrate import _segmented, unknowns
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from jaxcal.design import Candidates, Plan
     from jaxcal.design.constraints import Region
 
+_FEWEST = 8
+"""Poses of a plan without a recording: with fewer, SDs are not tuned."""
+
 _COUNTED = (0.5, 0.3, 0.2, 0.1)
 """Errors (mm) for which the images are counted, where none is asked for."""
 
@@ -38,7 +42,7 @@ _COUNTED = (0.5, 0.3, 0.2, 0.1)
     "--until-tre",
     type=POSITIVE,
     metavar="MM",
-    help="As many poses as this predicted error over the image takes.",
+    help="As many poses as this predicted error over the image takes; at least 8 without REC.",
 )
 @click.option(
     "--criterion",
@@ -147,11 +151,15 @@ def plan(
         count = images or (30 if result is None else 10)
         if until_tre is not None:
             if result is None:
-                first = design.plan(candidates, 8, criterion, polish=False)
-                count = max(design.images_to(first, until_tre), 8)
+                first = design.plan(candidates, _FEWEST, criterion, polish=False)
+                count = max(design.images_to(first, until_tre), _FEWEST)
             else:
                 count = max(design.images_to(result, until_tre, candidates), 1)
         found = design.plan(candidates, min(count, MOST_IMAGES), criterion, result)
+        reached = np.flatnonzero(found.tre_mm <= (until_tre or 0.0))
+        if len(reached):
+            # Exchange and polish may have made fewer poses enough.
+            found = found.first(max(int(reached[0]), _FEWEST if result is None else 1))
         if figure is not None:
             _draw(found, until_tre, figure)
         record = _record(found, recording)

@@ -15,6 +15,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import Probe
+from jaxcal.diagnostics.arrays import is_traced
 from jaxcal.runtime.array_types import Bool, Float
 
 MINIMUM_IMAGES = 4
@@ -139,6 +140,12 @@ def make_images(
         InputError: with the array and row named.
     """
     prefix = f"{where}: " if where else ""
+    if is_traced(poses, measurements, mask, covariance, max_elevation):
+        raise InputError(
+            f"{prefix}arrays are checked by their values, and these are traced by a jit, vmap or "
+            "grad: make the problem outside, and change its arrays inside "
+            "(dataclasses.replace(problem, measurements=...))"
+        )
     try:
         return _make_images(
             poses,

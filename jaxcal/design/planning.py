@@ -85,6 +85,18 @@ class Plan:
     def __len__(self) -> int:
         return len(self.poses)
 
+    def first(self, count: int) -> Plan:
+        """The plan's first poses alone."""
+        return replace(
+            self,
+            poses=self.poses[:count],
+            targets=self.targets[:count],
+            filling=self.filling[:count],
+            rows=self.rows[:count],
+            tre_mm=self.tre_mm[: count + 1],
+            rp_mm=self.rp_mm[: count + 1],
+        )
+
     @property
     def information(self) -> Float[np.ndarray, "p p"]:
         """Information with all poses of the plan."""

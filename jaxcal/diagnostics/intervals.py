@@ -55,9 +55,18 @@ _MOST_STEPS = 60
 _NEARLY = 3e-6
 
 
+def _check(calibration: object) -> None:
+    if not hasattr(calibration, "linearisation"):
+        raise InputError(
+            f"{type(calibration).__name__} is not a result of jaxcal.calibrate, which alone knows "
+            "its errors' degrees of freedom; a loaded calibration's apply() gives covariances"
+        )
+
+
 @traceable
 def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     """Degrees of freedom of the noise's SDs (traceable); inf where SDs were given."""
+    _check(calibration)
     xp = array_module(calibration)
     left = xp.sum(xp.asarray(calibration.mask) > 0, axis=-1) - size(calibration.blocks) / 3
     if calibration.prior not in TUNED:
@@ -136,6 +145,7 @@ def range_of_row_zero(
     A calibration without its problem is assumed to have no face offset and the nominal sound speed
     of water.
     """
+    _check(calibration)
     xp = array_module(calibration)
     problem = calibration.problem
     face, before, nominal = 0.0, 0.0, WATER_M_S
