@@ -358,6 +358,49 @@ def test_verdict_falls_when_the_covariance_is_contradicted(record, kind):
     assert again == changed
 
 
+def test_test_images_that_scatter_contradict_the_error(record):
+    changed = stating(record, 0.4)
+    changed |= {"reconstruction_precision_set": "test", "reconstruction_precision_mm": 0.9}
+    settle(changed)
+    assert changed["tre"]["factor"] == 1.0
+    changed["reconstruction_precision_mm"] = 55.7
+    settle(changed)
+    assert changed["verdict"] == "uncertain"
+    assert changed["tre"]["rms_mm"] == pytest.approx(55.7, rel=0.01)
+    assert "the test images scatter by 55.70 mm, where" in " ".join(verdict(changed))
+
+
+@pytest.mark.parametrize("shift_mm", [0.0, 6.0])
+def test_a_slip_of_the_mount_is_no_stream_and_lowers_the_verdict(shift_mm):
+    recording = experiment(3, images=48)
+    images = recording.calibration
+    points = np.array(images.measurements)
+    points[24:, 0] += shift_mm
+    slipped = jaxcal.make_images(images.poses, points)
+    result = jaxcal.calibrate(jaxcal.Recording(slipped))
+    assert int(result.images_used) == 48
+    told = result.record()["tre"]["contradictions"]
+    moved = [words for words in told if "the points move sideways by" in words]
+    assert len(moved) == (shift_mm > 0)
+    assert (result.record()["verdict"] == "uncertain") == (shift_mm > 0)
+
+
+def test_pixels_of_an_unusual_size_are_named():
+    recording = experiment(3, images=24)
+    images = recording.calibration
+    pixels = images.measurements / [0.12, 0.1] + [260.0, 0.0]
+    for factor in (1.0, 0.1):
+        poses = np.array(images.poses)
+        poses[:, :3, 3] *= factor
+        found = jaxcal.calibrate(
+            jaxcal.Recording(jaxcal.make_images(poses, pixels, "pixel")),
+            "conventional",
+            estimate="scale",
+        )
+        unusual = [text for text in found.warnings if "are unusual for ultrasound" in text]
+        assert len(unusual) == (factor < 1)
+
+
 def test_resampling_that_agrees_changes_nothing(record):
     changed = stating(record, 0.4)
     count = changed["images"]

@@ -222,6 +222,18 @@ def test_the_command_without_jax(saved):
     assert record["next_poses"] is not None
 
 
+def test_times_of_flight_in_a_process_that_has_not_imported_jax(tmp_path):
+    """To segment them imports JAX in the middle of the call."""
+    path = tmp_path / "raw.h5"
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=8, raw=True), seed=1)
+    jaxcal.save(recording, path)
+    program = (
+        "import sys, jaxcal; raw = jaxcal.load(sys.argv[1]); assert 'jax' not in sys.modules; "
+        "print(jaxcal.calibrate(raw, 'conventional').status)"
+    )
+    assert python("-c", program, path) == "converged\n"
+
+
 # First something, then everything
 
 

@@ -1,5 +1,8 @@
 """What a recording refuses, beyond what the readers' own tests hold."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -10,6 +13,43 @@ from jaxcal import InputError
 def arrays() -> dict:
     images = jaxcal.simulate_recording(jaxcal.Protocol(images=6, test_images=4)).calibration
     return {"poses": np.array(images.poses), "measurements": np.array(images.measurements)}
+
+
+def test_rows_above_the_image_are_refused():
+    """Columns that are exchanged or counted from the middle give an answer, and a wrong one."""
+    given = arrays()
+    pixels = given["measurements"] / [0.12, 0.1] + [200.0, 0.0]
+    jaxcal.make_images(given["poses"], pixels, "pixel")
+    changed = pixels.copy()
+    changed[2, 1] = -40.0
+    with pytest.raises(InputError, match=r"pixel 2 has row v = -40: .* are u and v exchanged"):
+        jaxcal.make_images(given["poses"], changed, "pixel")
+    changed[2, 1] = 0.0
+    with pytest.raises(InputError, match="pixel 2 has a range that is not positive"):
+        jaxcal.make_images(given["poses"], changed, "pixel")
+    jaxcal.make_images(given["poses"], changed, "pixel", face_offset_mm=1.0)
+    changed[2, 1] = 10.0
+    with pytest.raises(InputError, match="pixel 2 has a range that is not positive"):
+        jaxcal.make_images(
+            given["poses"], changed, "pixel", spacing_mm=(0.12, 0.1), face_offset_mm=-1.5
+        )
+
+
+TRACED = """
+import jax, jaxcal, numpy as np
+
+poses = np.tile(np.eye(4), (4, 1, 1))
+try:
+    jax.grad(lambda points: jaxcal.Problem.from_arrays(poses, points).mask[0])(np.ones((4, 2)))
+except jaxcal.InputError as error:
+    print(error)
+"""
+
+
+def test_traced_arrays_are_refused_in_words():
+    # In another process: here, annotations are checked at every call.
+    done = subprocess.run([sys.executable, "-c", TRACED], capture_output=True, text=True)
+    assert "make the problem outside" in done.stdout, done.stderr
 
 
 @pytest.mark.parametrize("name", ["poses", "measurements", "covariance"])
