@@ -292,9 +292,10 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
         matrix = tuple(range(1, width - 2))
         return Columns(width, matrix=matrix, time=0, point=(width - 2, width - 1))
     if width != 10:
+        alone = " (name two columns of points by a first line u,v)" if width == 2 else ""
         raise FormatError(
             f"{table.row(0)}: {width} columns without a header; 15 or 19 (time, 12 or 16 "
-            "pose numbers, u and v) or 10 (time, x, y, z, a quaternion, u and v) are needed"
+            f"pose numbers, u and v) or 10 (time, x, y, z, a quaternion, u and v) are needed{alone}"
         )
     if quaternion is None:
         raise FormatError(
