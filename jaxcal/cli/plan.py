@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
-import numpy as np
 
 from jaxcal import InputError
 from jaxcal.cli.calibrate import _segmented, unknowns
@@ -156,10 +155,10 @@ def plan(
             else:
                 count = max(design.images_to(result, until_tre, candidates), 1)
         found = design.plan(candidates, min(count, MOST_IMAGES), criterion, result)
-        reached = np.flatnonzero(found.tre_mm <= (until_tre or 0.0))
-        if len(reached):
+        if until_tre is not None:
             # Exchange and polish may have made fewer poses enough.
-            found = found.first(max(int(reached[0]), _FEWEST if result is None else 1))
+            enough = (k for k, error in enumerate(found.tre_mm) if error <= until_tre)
+            found = found.first(max(next(enough, len(found)), _FEWEST if result is None else 1))
         if figure is not None:
             _draw(found, until_tre, figure)
         record = _record(found, recording)
