@@ -608,6 +608,12 @@ def test_a_plan_is_tried_in_simulated_recordings(capfd):
     assert f"error over the image {found['tre_mm']:.2g} mm" in " ".join(out.split())
 
 
+def test_a_plan_has_no_more_poses_than_its_error_takes(capfd):
+    assert main(["plan", "--until-tre", "0.3", "--json"]) == 0
+    errors = json.loads(capfd.readouterr().out)["tre_mm"]
+    assert errors[-1] <= 0.3 < errors[-2]
+
+
 def test_plans_that_cannot_be(capfd, tmp_path):
     for arguments, match in (
         (["--images", 10, "--until-tre", 0.2], "either --images or"),
