@@ -176,11 +176,6 @@ def acquire(
     from hw.extras import missing
     from hw.recording_check import check_resumable, settings_of
 
-    if bench or move:
-        # Before a file is made: whoever lacks them cannot receive a single line.
-        for module in ("cobs", "serial"):
-            if (cure := missing(module, extra="serial")) is not None:
-                raise InputError(cure)
     if resume:
         assert recording is not None
         check_resumable(recording)
@@ -188,6 +183,11 @@ def acquire(
         bench_seed = _recorded_bench(recorded, bench)
         phantom = _recorded_phantom(recorded)
         operator = _recorded_operator(recorded)
+    if bench and phantom in (None, PHANTOMS[0]):
+        # Before a file is made: without them not a single line of the active echo is received.
+        for module in ("cobs", "serial"):
+            if (cure := missing(module, extra="serial")) is not None:
+                raise InputError(cure)
     path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
     from jaxcal.cli.cache import enable_compilation_cache
 
