@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.calibration.conventional import closed_form_answer
-from jaxcal.calibration.inputs import as_batch, as_problem, converting, unknown_names
+from jaxcal.calibration.inputs import as_batch, converting, unknown_names
 from jaxcal.calibration.options import (
     DELAY_SD_S,
     SOUND_SPEED_SD_M_S,
@@ -113,7 +113,8 @@ def calibrate(
             NaN, Inf and fewer than 4 different poses. Under jit, vmap or grad values cannot be
             checked, and such problems get the status ``failed``.
     """
-    problem, estimate = as_problem(problem, "jaxcal.calibrate"), unknown_names(estimate)
+    assert isinstance(problem, Problem)  # converted
+    estimate = unknown_names(estimate)
     problem = _in_asked_precision(problem, options, "jaxcal.calibrate")
     request = Request(
         method,

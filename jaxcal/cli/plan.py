@@ -19,14 +19,12 @@ from jaxcal.cli.common import (
     print_page,
     progress,
 )
+from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.study.laws import OFFSET_LAWS, OffsetLaw
 
 if TYPE_CHECKING:
     from jaxcal.design import Candidates, Plan
     from jaxcal.design.constraints import Region
-
-_FEWEST = 8
-"""Poses of a plan without a recording: with fewer, SDs are not tuned."""
 
 _COUNTED = (0.5, 0.3, 0.2, 0.1)
 """Errors (mm) for which the images are counted, where none is asked for."""
@@ -41,7 +39,8 @@ _COUNTED = (0.5, 0.3, 0.2, 0.1)
     "--until-tre",
     type=POSITIVE,
     metavar="MM",
-    help="As many poses as this predicted error over the image takes; at least 8 without REC.",
+    help="As many poses as this predicted error over the image takes; without REC at least "
+    f"{MINIMUM_SELF_TUNING}, since fewer do not tune the SDs.",
 )
 @click.option(
     "--criterion",
@@ -150,15 +149,17 @@ def plan(
         count = images or (30 if result is None else 10)
         if until_tre is not None:
             if result is None:
-                first = design.plan(candidates, _FEWEST, criterion, polish=False)
-                count = max(design.images_to(first, until_tre), _FEWEST)
+                first = design.plan(candidates, MINIMUM_SELF_TUNING, criterion, polish=False)
+                count = max(design.images_to(first, until_tre), MINIMUM_SELF_TUNING)
             else:
                 count = max(design.images_to(result, until_tre, candidates), 1)
         found = design.plan(candidates, min(count, MOST_IMAGES), criterion, result)
         if until_tre is not None:
             # Exchange and polish may have made fewer poses enough.
             enough = (k for k, error in enumerate(found.tre_mm) if error <= until_tre)
-            found = found.first(max(next(enough, len(found)), _FEWEST if result is None else 1))
+            found = found.first(
+                max(next(enough, len(found)), MINIMUM_SELF_TUNING if result is None else 1)
+            )
         if figure is not None:
             _draw(found, until_tre, figure)
         record = _record(found, recording)

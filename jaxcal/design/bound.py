@@ -31,7 +31,7 @@ from jaxcal.design.planning import (
     weight_of,
     with_effective_noise,
 )
-from jaxcal.design.predict import variance_factor
+from jaxcal.design.predict import student_factor
 
 NEAR = 1e-3
 """The steps end when the bound is nearer than this share of the squared error."""
@@ -89,4 +89,4 @@ def least_error(
             break
         share = share * np.sqrt(gains)
         share = share / share.sum()
-    return math.sqrt(variance_factor(known, n, size) * best)
+    return math.sqrt(student_factor(known, n, size) * best)

@@ -28,7 +28,7 @@ _ENOUGH = 1000
 """Number of candidates for counting images; more of them change the count by less than 1 %."""
 
 
-def variance_factor(known: Known, more: int, size: int = 9) -> float:
+def student_factor(known: Known, more: int, size: int = 9) -> float:
     """By how much squared errors with so many more images exceed the bound.
 
     It is the variance of Student's distribution if the SDs were tuned to images, at most 3, else 1.
@@ -53,7 +53,7 @@ def curve(
         tre_weight(candidates.constraints.region.grid(), model.size),
         rp_weight(candidates.poses, targets, model.image_to_probe, model.size),
     )
-    factor = np.array([variance_factor(known, k, model.size) for k in range(len(total))])
+    factor = np.array([student_factor(known, k, model.size) for k in range(len(total))])
     tre, rp = (np.sqrt(factor * np.einsum("ab,nab->n", weight, covariance)) for weight in weights)
     return tre, rp
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from jaxcal.study.laws import OffsetLaw
 
 MOST_TRIALS = 100_000
+"""Of one call; they are all in memory at once."""
 _TEST_POSES = 50
 """Poses over which the reconstruction precision of every trial is computed."""
 
@@ -72,8 +73,7 @@ def simulate_errors(
 ) -> SimulatedErrors:
     """What calibrations of simulated images at these poses are off by.
 
-    The first call compiles the method for a batch; then 1,000 trials of 30 images take less than a
-    second.
+    The first call compiles the method for a batch, which takes most of its time.
 
     Args:
         poses: a plan (after the images taken already, where there are some), or poses probe ->

@@ -68,6 +68,7 @@ SCATTER_TIMES = 1.3
 """Resampled calibrations may scatter by up to so many times the stated error."""
 
 _WAYS = {"lateral": "sideways", "range": "in depth"}
+"""Errors within the image, in the order of the residuals, and in words."""
 _ACROSS = 15
 """Number of points along each side of the map."""
 _MOST_NAMED = 5
@@ -371,9 +372,7 @@ def _from_slow_changes(record: dict[str, Any]) -> list[tuple[float, str]]:
     """
     stated, scores = record["tre"]["stated_mm"], record["noise_model"]["scores"]["drift"]
     found: list[tuple[float, str]] = []
-    for score, kind, name in zip(
-        scores, ("lateral", "range"), ("sideways", "in depth"), strict=False
-    ):
+    for score, (kind, name) in zip(scores[:2], _WAYS.items(), strict=True):
         size = record[f"sigma_{kind}_mm"]
         if score is None or not size or not stated or score <= DRIFT_SCORE:
             continue
