@@ -20,11 +20,11 @@ from jaxcal.data import geometry
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.design import Constraints, Model, Noise, Region
 from jaxcal.design.candidates import sobol_poses, sobol_sequence
-from jaxcal.design.criteria import check_criterion, gains, rp_weight, tre_weight
+from jaxcal.design.criteria import check_criterion, gains, rp_weight, tre_weight, weight_of
 from jaxcal.design.greedy import Rules, are_alike
 from jaxcal.design.information import covariance_of, known_information
 from jaxcal.design.noise import _basis, _gamma_slopes
-from jaxcal.design.planning import Known, weight_of
+from jaxcal.design.planning import Known
 from jaxcal.design.predict import curve
 
 MOUNT = np.eye(4)
@@ -47,10 +47,10 @@ def measured(model: Model, pose: np.ndarray) -> np.ndarray:
     return np.array([q[0], np.hypot(q[1], q[2]), q[1]])
 
 
-@pytest.mark.parametrize("scale", [False, True])
-def test_jacobian_is_that_of_the_measurements(scale):
+@pytest.mark.parametrize(("scale", "face"), [(False, 0.0), (True, 0.0), (True, 12.0)])
+def test_jacobian_is_that_of_the_measurements(scale, face):
     noise = Noise(np.random.default_rng(0).normal(0, 0.2, (3, 4)))
-    model = Model(MOUNT, TARGET, noise, scale)
+    model = Model(MOUNT, TARGET, noise, scale, face)
     for pose in some(5, model=model).poses:
         columns = []
         for k in range(9):
@@ -67,7 +67,7 @@ def test_jacobian_is_that_of_the_measurements(scale):
         sigma = noise.sigma(model.targets(pose))
         if scale:
             lateral, depth, _ = measured(model, pose)
-            columns += [np.array([-lateral, 0, 0]), np.array([0, -depth, 0])]
+            columns += [np.array([-lateral, 0, 0]), np.array([0, face - depth, 0])]
         wanted = np.array(columns).T / sigma[:, None]
         np.testing.assert_allclose(model.jacobian(pose), wanted, rtol=1e-6, atol=1e-5)
 
@@ -77,7 +77,7 @@ def test_gain_is_that_of_brute_force_and_its_gradient_that_of_differences():
     candidates = some(60, model=model)
     information = model.information(candidates.poses[:9]) + model.beliefs()
     covariance = covariance_of(information)
-    weight = tre_weight(candidates.constraints.region.grid())
+    weight = tre_weight(candidates.constraints.region.grid(), model)
     rows = model.jacobian(candidates.poses)
     quick = gains(rows, covariance, weight)
     volume = gains(rows, covariance, None)
@@ -117,7 +117,7 @@ def test_weights_are_the_errors_that_they_stand_for():
     points = candidates.constraints.region.grid()
     draws = rng.normal(size=(4000, 6)) @ spread.T
     poses = candidates.poses
-    places = MODEL.targets(poses)
+    places = MODEL.targets(poses) * np.array([1.0, 0.0, 1.0])
     squared, precision = [], []
     for draw in draws:
         x = MOUNT.copy()
@@ -127,8 +127,10 @@ def test_weights_are_the_errors_that_they_stand_for():
         squared.append((apart**2).sum(axis=1).mean())
         cloud = np.einsum("nij,nj->ni", poses[:, :3, :3], places @ x[:3, :3].T + x[:3, 3])
         precision.append((cloud + poses[:, :3, 3]).var(axis=0, ddof=1).sum())
-    assert np.mean(squared) == pytest.approx(np.sum(tre_weight(points) * covariance), rel=0.05)
-    wanted = np.sum(rp_weight(poses, places, MOUNT) * covariance)
+    assert np.mean(squared) == pytest.approx(
+        np.sum(tre_weight(points, MODEL) * covariance), rel=0.05
+    )
+    wanted = np.sum(rp_weight(poses, MODEL) * covariance)
     assert np.mean(precision) == pytest.approx(wanted, rel=0.05)
 
 
@@ -432,22 +434,22 @@ def test_sobols_sequence_is_scipys():
     np.testing.assert_array_equal(sobol_sequence(512), expected)
 
 
-@pytest.mark.parametrize("scale", [False, True])
-def test_simulated_errors_with_equal_sds_are_the_bound(scale):
+@pytest.mark.parametrize(("scale", "face"), [(False, 0.0), (True, 12.0)])
+def test_simulated_errors_with_equal_sds_are_the_bound(scale, face):
     """For equal Gaussian errors the conventional fit is the maximum of the likelihood."""
     model = replace(MODEL, noise=Noise.constant((0.2, 0.2, 0.2), doubt=1.0), scale=scale)
+    model = replace(model, face_offset_mm=face)
     candidates = some(60, model=model)
     poses = candidates.poses[:16]
     found = design.simulate_errors(poses, "normal", candidates, method="conventional", seed=1)
     covariance = covariance_of(model.information(poses))
     points = candidates.constraints.region.grid()
-    bound = np.sqrt(np.sum(tre_weight(points, model.size) * covariance))
+    bound = np.sqrt(np.sum(tre_weight(points, model) * covariance))
     assert found.lost == 0
     assert abs(found.tre_mm - bound) < 4 * found.tre_error_mm + 0.005 * bound
     assert found.tre_error_mm < 0.02 * bound
     tests = candidates.poses[::2]
-    in_plane = model.targets(tests) * np.array([1.0, 0.0, 1.0])
-    scatter = np.sqrt(np.sum(rp_weight(tests, in_plane, MOUNT, model.size) * covariance))
+    scatter = np.sqrt(np.sum(rp_weight(tests, model) * covariance))
     # The mean of roots is below the root of the mean.
     assert 0.85 * scatter < found.rp_mm < scatter
 

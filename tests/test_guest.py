@@ -116,6 +116,12 @@ def test_a_float64_problem_inside_a_transformation_without_64_bits_gets_one_clea
 def test_32_bits_where_they_are_asked_for():
     there = problem(3, images=12)
     single = Options(precision="float32")
+    covariance = jnp.broadcast_to(0.04 * jnp.eye(2), (12, 2, 2))
+    for each in (there, replace(there, covariance=covariance)):
+        own = jaxcal.calibrate(each, options=single)
+        reference = jaxcal.calibrate(each)
+        assert own.image_to_probe.dtype == own.elevation.dtype == jnp.float32
+        np.testing.assert_allclose(own.image_to_probe, reference.image_to_probe, atol=0.02)
     wide = jaxcal.calibrate(there, "conventional")
     with jax.enable_x64(False):
         inside = jax.jit(lambda p: jaxcal.calibrate(p, "conventional", options=single))(there)

@@ -82,7 +82,7 @@ def as_batch(value: Any, name: str) -> Problem:
 def unknown_names(estimate: Any) -> tuple[str, ...]:
     """Names of further unknowns as a tuple; a text may hold one name or several with commas."""
     if isinstance(estimate, str):
-        return tuple(name.strip() for name in estimate.split(",") if name.strip())
+        return tuple(name.strip() for name in estimate.split(","))
     if estimate is None:
         return ()
     return tuple(estimate)

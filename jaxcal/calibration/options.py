@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.names import Data, Method, PriorName, SolverName
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.diagnostics.arrays import array_module, is_traced
@@ -24,9 +25,15 @@ from jaxcal.runtime.trees import array_tree
 if TYPE_CHECKING:
     import optimistix as optx
 
-Method = Literal["joint", "alternating", "conventional"]
-PriorName = Literal["auto", "gaussian", "uniform", "bounded"]
-Data = Literal["auto", "points", "channels"]
+Prior = Literal["none", "gaussian", "bounded"]
+"""What is assumed about the offsets: in the image plane, Gaussian (or weighed laws), bounded."""
+
+PRIORS: dict[str, tuple[PriorName, ...]] = {
+    "joint": get_args(PriorName),
+    "alternating": ("bounded",),
+    "conventional": (),
+}
+"""The priors that go with each method, beside ``auto``."""
 
 LAWS: dict[str, tuple[Shape, ...]] = {"auto": SHAPES, "uniform": UNIFORM}
 """The priors of the joint method that weigh laws of the offsets, each with its laws."""
@@ -65,7 +72,7 @@ class Options:
             faster on some devices and loses six digits.
     """
 
-    solver: Literal["lm", "gauss-newton", "gradient"] | optx.AbstractLeastSquaresSolver = "lm"
+    solver: SolverName | optx.AbstractLeastSquaresSolver = "lm"
     gradient_tolerance: float = 1e-6
     tolerance_rad: float = 1e-3
     tolerance_mm: float = 0.1
@@ -79,7 +86,7 @@ class Options:
     def __post_init__(self) -> None:
         if _is_optimistix(self.solver):
             _check_static(self.solver)
-        elif self.solver not in ("lm", "gauss-newton", "gradient"):
+        elif self.solver not in get_args(SolverName):
             raise InputError(
                 "solver must be lm, gauss-newton, gradient or an optimistix least-squares solver, "
                 f"not {self.solver!r}"
@@ -125,7 +132,7 @@ class SolvePlan:
     """
 
     method: Method
-    prior: Literal["none", "gaussian", "bounded"]
+    prior: Prior
     self_tuning: bool
     laws: tuple[Shape, ...]
     channels: bool
@@ -191,20 +198,9 @@ def prepare(problem: Problem, request: Request) -> tuple[SolvePlan, Given]:
     Raises:
         InputError: parts that contradict each other or the problem.
     """
-    _check_names(request)
-    kind: Literal["none", "gaussian", "bounded"] = "gaussian"
-    if request.method == "conventional":
-        kind = "none"
-    elif request.method == "alternating" or request.prior == "bounded":
-        kind = "bounded"
-    _check_combination(request, kind)
+    kind = check_request(request)
     _check_unknowns(problem, request)
     channels = _uses_channels(problem, request, kind)
-    for name in ("sigma", "sound_speed_sd", "delay_sd"):
-        _check_size(name, getattr(request, name), np.finfo(float).tiny)
-    for name in ("tracker_sd", "max_elevation"):
-        _check_size(name, getattr(request, name), 0.0)
-
     dtype = problem.mask.dtype
 
     def array(value: Any) -> AnyArray | None:
@@ -234,22 +230,42 @@ def prepare(problem: Problem, request: Request) -> tuple[SolvePlan, Given]:
     return plan, given
 
 
+def check_request(request: Request) -> Prior:
+    """Check a request as far as that is possible without its problem.
+
+    Returns:
+        What is assumed about the offsets.
+
+    Raises:
+        InputError: unknown names, or parts that contradict each other or would have no effect.
+    """
+    _check_names(request)
+    prior: Prior = "gaussian"
+    if request.method == "conventional":
+        prior = "none"
+    elif request.method == "alternating" or request.prior == "bounded":
+        prior = "bounded"
+    _check_combination(request, prior)
+    for name in ("sigma", "sound_speed_sd", "delay_sd"):
+        _check_size(name, getattr(request, name), np.finfo(float).tiny)
+    for name in ("tracker_sd", "max_elevation"):
+        _check_size(name, getattr(request, name), 0.0)
+    return prior
+
+
 def _check_names(request: Request) -> None:
-    if request.method not in ("joint", "alternating", "conventional"):
-        raise InputError(
-            f"method must be joint, alternating or conventional, not {request.method!r}"
-        )
-    if request.prior not in get_args(PriorName):
-        names = "auto, gaussian, uniform or bounded"
-        raise InputError(f"prior must be {names}, not {request.prior!r}")
-    if request.data not in ("auto", "points", "channels"):
-        raise InputError(f"data must be auto, points or channels, not {request.data!r}")
+    for name, names in (("method", Method), ("prior", PriorName), ("data", Data)):
+        value = getattr(request, name)
+        if value not in get_args(names):
+            raise InputError(f"{name} must be one of {', '.join(get_args(names))}, not {value!r}")
     for name in request.estimate:
         if name not in EXTRA:
             raise InputError(f"cannot estimate {name!r}; there are: {', '.join(EXTRA)}")
 
 
-def _check_combination(request: Request, kind: str) -> None:
+def _check_combination(request: Request, kind: Prior) -> None:
+    if request.prior not in (*PRIORS[request.method], "auto"):
+        raise InputError(f"the prior {request.prior} does not go with the method {request.method}")
     if kind != "gaussian" and (request.sigma is not None or request.tracker_sd is not None):
         raise InputError("sigma and tracker_sd belong to the joint method's gaussian prior")
     if request.tracker_sd is not None and request.sigma is None:
@@ -257,20 +273,25 @@ def _check_combination(request: Request, kind: str) -> None:
     if request.sigma is not None and request.prior == "uniform":
         raise InputError("the uniform prior tunes its SDs: sigma belongs to the gaussian one")
     weighing = kind == "gaussian" and request.prior in LAWS and request.sigma is None
+    if request.data == "channels" and kind != "gaussian":
+        raise InputError("channels are solved by the joint method with the gaussian prior only")
+    if request.data == "channels" and request.tracker_sd is not None:
+        raise InputError("tracker_sd is for points; on channels there is no such unknown")
     if request.max_elevation is not None and kind != "bounded" and not weighing:
         raise InputError(
             "max_elevation belongs to the alternating method and to the joint one's priors auto, "
             "uniform (without given sigma) and bounded"
         )
     options = request.options
-    other = options is not None and _is_optimistix(options.solver)
-    if other and kind == "bounded":
+    solver = "lm" if options is None else options.solver
+    if _is_optimistix(solver) and kind == "bounded":
         raise InputError(
             "another solver would not keep the offsets within their bounds: it goes with the "
             "conventional method and the joint one's priors auto, uniform and gaussian"
         )
-    historical = options is not None and options.solver == "gradient"
-    if request.estimate and historical and request.method == "conventional":
+    if solver in ("gauss-newton", "gradient") and request.method != "conventional":
+        raise InputError(f"the solver {solver} belongs to the conventional method")
+    if request.estimate and solver == "gradient":
         raise InputError(
             f"the gradient solver moves X only: it cannot estimate the {request.estimate[0]}"
         )
@@ -295,10 +316,6 @@ def _uses_channels(problem: Problem, request: Request, kind: str) -> bool:
     if request.data == "channels":
         if problem.channels is None:
             raise InputError("data='channels' needs times of flight; this problem has points only")
-        if kind != "gaussian":
-            raise InputError("channels are solved by the joint method with the gaussian prior only")
-        if request.tracker_sd is not None:
-            raise InputError("tracker_sd is for points; on channels there is no such unknown")
         return True
     if request.data == "points" or problem.channels is None or kind != "gaussian":
         return False

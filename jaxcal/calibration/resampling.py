@@ -186,7 +186,7 @@ def bootstrap(
     problem = _one_problem(problem, arguments)
     if not 2 <= resamples <= LARGEST_RESAMPLES:
         raise InputError(f"resamples must be between 2 and {LARGEST_RESAMPLES}, not {resamples}")
-    root = jax.random.key(key) if isinstance(key, int) else key
+    root = jax.random.key(int(key)) if isinstance(key, int | np.integer) else key
     result = calibrate(problem, **arguments) if result is None else result
     mask = jnp.asarray(result.mask, problem.mask.dtype)
     problem = replace(problem, mask=mask)

@@ -12,11 +12,12 @@ import time
 import warnings
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
 from jaxcal import InputError, OutputError
+from jaxcal.calibration.names import Method
 from jaxcal.cli.common import ExitCode, print_json, print_page, progress
 from jaxcal.runtime import program_cache
 from jaxcal.runtime.when_jax import when_jax_is_imported
@@ -82,7 +83,7 @@ def show(as_json: bool) -> int:
 @click.option(
     "--method",
     "methods",
-    type=click.Choice(["joint", "alternating", "conventional"]),
+    type=click.Choice(get_args(Method)),
     multiple=True,
     default=("joint",),
     show_default=True,
@@ -96,7 +97,7 @@ def show(as_json: bool) -> int:
 def warm(
     recording: str | None,
     images: tuple[int, ...],
-    methods: tuple[Literal["joint", "alternating", "conventional"], ...],
+    methods: tuple[Method, ...],
     estimate: str | None,
 ) -> int:
     """Compile now what later runs of "jaxcal calibrate" need.
@@ -111,10 +112,10 @@ def warm(
     except (OSError, RuntimeError) as error:
         raise OutputError(f"the cache cannot be used: {error}") from error
     from jaxcal.calibration.calibrate import calibrate
-    from jaxcal.cli.calibrate import unknowns
+    from jaxcal.calibration.inputs import unknown_names
     from jaxcal.runtime.buckets import size
 
-    names = unknowns(estimate)
+    names = unknown_names(estimate)
     like = _problem(recording, "scale" in names)
     for method in methods:
         for count in sorted({size(count) for count in images}):

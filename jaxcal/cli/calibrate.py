@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
 from jaxcal import InputError
+from jaxcal.calibration.names import Data, Method, PriorName, SolverName
 from jaxcal.cli.common import (
     POSITIVE,
     import_engine,
@@ -22,36 +23,22 @@ from jaxcal.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from jaxcal.calibration.options import Request
     from jaxcal.calibration.result import Calibration
     from jaxcal.data.recording import Recording
     from jaxcal.report.convergence import Curve
 
-Method = Literal["joint", "alternating", "conventional"]
 MOST_FOLDS = 100
 """With more images than this, cross-validation holds out several at a time."""
 
 EXPORTS = ("plus", "slicer", "itk", "ros", "tusrec", "numpy")
 
 
-@dataclass(frozen=True)
-class _Request:
-    """What was asked for, checked as far as it can be without the data."""
-
-    method: Method
-    prior: Literal["auto", "gaussian", "uniform", "bounded"]
-    max_elevation: float | None
-    estimate: tuple[str, ...]
-    data: Literal["auto", "points", "channels"]
-    sigma: tuple[float, float, float] | None
-    options: dict[str, Any]
-    robust: bool = False
-
-
 @click.command()
 @click.argument("recording", type=click.Path(), metavar="REC")
 @click.option(
     "--method",
-    type=click.Choice(["joint", "alternating", "conventional"]),
+    type=click.Choice(get_args(Method)),
     default="joint",
     show_default=True,
     help="joint: transform, target and elevational offsets together; alternating: the paper's; "
@@ -59,7 +46,7 @@ class _Request:
 )
 @click.option(
     "--prior",
-    type=click.Choice(["auto", "gaussian", "uniform", "bounded"]),
+    type=click.Choice(get_args(PriorName)),
     default="auto",
     show_default=True,
     help="Distribution of the offsets in the joint method; auto: an average over several, "
@@ -86,7 +73,7 @@ class _Request:
 )
 @click.option(
     "--data",
-    type=click.Choice(["auto", "points", "channels"]),
+    type=click.Choice(get_args(Data)),
     default="auto",
     show_default=True,
     help="What the joint method fits where the recording holds times of flight: the points that "
@@ -101,7 +88,7 @@ class _Request:
 )
 @click.option(
     "--solver",
-    type=click.Choice(["lm", "gauss-newton", "gradient"]),
+    type=click.Choice(get_args(SolverName)),
     help="Of the conventional method; lm by default.",
 )
 @click.option(
@@ -173,15 +160,15 @@ class _Request:
 def calibrate(
     recording: str,
     method: Method,
-    prior: str,
+    prior: PriorName,
     max_elevation: float | None,
     sigma: tuple[float, float, float] | None,
     estimate: str | None,
-    solver: str | None,
+    solver: SolverName | None,
     tolerance_mm: float | None,
     tolerance_rad: float | None,
     max_rounds: int | None,
-    data: Literal["auto", "points", "channels"],
+    data: Data,
     robust: bool,
     test: str | None,
     cross_validate: bool,
@@ -194,15 +181,31 @@ def calibrate(
     as_json: bool,
 ) -> int:
     """Calibrate from the recording REC; nobody has to supply a starting guess."""
+    targets = [_export_target(export) for export in exports]
+    import_engine()
+    from jaxcal.calibration.inputs import unknown_names
+    from jaxcal.calibration.options import Options, Request, check_request
+
     alternation = {
         "tolerance_mm": tolerance_mm,
         "tolerance_rad": tolerance_rad,
         "max_rounds": max_rounds,
     }
-    request = _request(method, prior, max_elevation, sigma, estimate, data, solver, alternation)
-    request = replace(request, robust=robust)
-    targets = [_export_target(export) for export in exports]
-    import_engine()
+    chosen = {name: value for name, value in alternation.items() if value is not None}
+    if chosen and method != "alternating":
+        given = " and ".join("--" + name.replace("_", "-") for name in chosen)
+        raise InputError(f"{given} need{'s' * (len(chosen) == 1)} --method alternating")
+    request = Request(
+        method,
+        prior,
+        max_elevation,
+        sigma,
+        estimate=unknown_names(estimate),
+        data=data,
+        options=Options(**chosen, solver=solver or "lm"),
+        robust=robust,
+    )
+    check_request(request)
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.io.hdf5 import load
     from jaxcal.report.accuracy import settle
@@ -300,79 +303,21 @@ def _segmented(recording: Recording) -> tuple[Recording, list[str]]:
     return segmented, list(found.warnings)
 
 
-def _request(
-    method: Method,
-    prior: str,
-    max_elevation: float | None,
-    sigma: tuple[float, float, float] | None,
-    estimate: str | None,
-    data: Literal["auto", "points", "channels"],
-    solver: str | None,
-    alternation: dict[str, Any],
-) -> _Request:
-    """Refuse options that would be without effect: whoever gives one counts on it."""
-    fitting = {
-        "joint": ("auto", "gaussian", "uniform", "bounded"),
-        "alternating": ("auto", "bounded"),
-    }
-    if prior not in fitting.get(method, ("auto",)):
-        raise InputError(f"--prior {prior} does not go with --method {method}")
-    bounding = method == "alternating" or (method == "joint" and prior != "gaussian")
-    if max_elevation is not None and (not bounding or sigma is not None):
-        raise InputError(
-            "--max-elevation needs --method alternating, or --prior auto, uniform or bounded "
-            "without --sigma"
-        )
-    if sigma is not None and (method != "joint" or prior in ("uniform", "bounded")):
-        raise InputError("--sigma needs --method joint with the gaussian prior")
-    if solver is not None and method != "conventional":
-        raise InputError("--solver needs --method conventional")
-    options: dict[str, Any] = {
-        key: value for key, value in alternation.items() if value is not None
-    }
-    if options and method != "alternating":
-        given = " and ".join("--" + name.replace("_", "-") for name in options)
-        raise InputError(f"{given} need{'s' * (len(options) == 1)} --method alternating")
-    if data == "channels" and (method != "joint" or prior == "bounded"):
-        raise InputError("--data channels needs --method joint with the gaussian prior")
-    if solver is not None:
-        options["solver"] = solver
-    chosen: Literal["auto", "gaussian", "uniform", "bounded"] = "auto"
-    if prior == "gaussian" or prior == "uniform" or prior == "bounded":
-        chosen = prior
-    return _Request(method, chosen, max_elevation, unknowns(estimate), data, sigma, options)
-
-
-def unknowns(estimate: str | None) -> tuple[str, ...]:
-    """The names in the option --estimate."""
-    from jaxcal.model.unknowns import EXTRA
-
-    if estimate is None:
-        return ()
-    names = tuple(name.strip() for name in estimate.split(","))
-    for name in names:
-        if name not in EXTRA:
-            raise InputError(f"cannot estimate {name!r}; there are: {', '.join(EXTRA)}")
-    return names
-
-
-def _solve(recording: Recording, request: _Request, *, traced: bool) -> Calibration:
+def _solve(recording: Recording, request: Request, *, traced: bool) -> Calibration:
     from jaxcal.calibration.calibrate import calibrate as solve
-    from jaxcal.calibration.options import Options
 
-    kept = 0
+    arguments: dict[str, Any] = dict(vars(request))
     if traced:
+        from jaxcal.calibration.options import Options
         from jaxcal.report.convergence import KEPT
 
-        kept = KEPT
-    options = Options(**request.options, trace=kept)
-    arguments: dict[str, Any] = {**_arguments(request), "options": options}
+        arguments["options"] = replace(request.options or Options(), trace=KEPT)
     return solve(recording, **arguments)
 
 
 @contextmanager
 def _first_answer(
-    recording: Recording, request: _Request, show: Callable[[str], None]
+    recording: Recording, request: Request, show: Callable[[str], None]
 ) -> Iterator[None]:
     """Show the conventional fit while another method's program is loaded or compiled."""
     from jaxcal.report.certified import first_answer_words
@@ -402,25 +347,9 @@ def _first_answer(
         log.removeHandler(handler)
 
 
-def _arguments(request: _Request) -> dict[str, Any]:
-    """The request as the arguments of :func:`jaxcal.calibrate`."""
-    from jaxcal.calibration.options import Options
-
-    return {
-        "method": request.method,
-        "prior": request.prior,
-        "max_elevation": request.max_elevation,
-        "sigma": request.sigma,
-        "estimate": request.estimate,
-        "data": request.data,
-        "options": Options(**request.options),
-        "robust": request.robust,
-    }
-
-
 def _resampled(
     recording: Recording,
-    request: _Request,
+    request: Request,
     result: Calibration,
     cross_validate: bool,
     draws: int | None,
@@ -434,7 +363,7 @@ def _resampled(
     if result.status not in ("converged", "max_iterations"):
         return found
     problem = Problem.from_recording(recording)
-    arguments = _arguments(request)
+    arguments = vars(request)
     if cross_validate:
         folds = min(problem.images, MOST_FOLDS)
         held_out = resampling.cross_validate(problem, folds=folds, result=result, **arguments)
@@ -445,7 +374,7 @@ def _resampled(
     return found
 
 
-def _curves(recording: Recording, request: _Request, result: Calibration) -> list[Curve]:
+def _curves(recording: Recording, request: Request, result: Calibration) -> list[Curve]:
     from jaxcal.data.problem import Problem
     from jaxcal.report.convergence import bounded_curves, own_curve
 

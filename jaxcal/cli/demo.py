@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from jaxcal.calibration.names import Method
 from jaxcal.cli.common import exit_code, import_engine, print_json, print_page, progress
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
     from jaxcal.data.recording import Recording
 
-Method = Literal["joint", "alternating", "conventional"]
 _METHODS: tuple[Method, ...] = ("conventional", "alternating", "joint")
 IMAGES, ELEVATION_MM, NOISE_MM = 50, 2.0, 0.5
 

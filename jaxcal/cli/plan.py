@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from jaxcal import InputError
-from jaxcal.cli.calibrate import _segmented, unknowns
+from jaxcal.cli.calibrate import _segmented
 from jaxcal.cli.common import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -218,11 +218,12 @@ def _from_recording(
 ) -> tuple[Any, Candidates]:
     from jaxcal import design
     from jaxcal.calibration.calibrate import calibrate
+    from jaxcal.calibration.inputs import unknown_names
     from jaxcal.io.hdf5 import load
 
     measured, _ = _segmented(load(path))
     with progress("calibrating"):
-        result = calibrate(measured, estimate=unknowns(estimate))
+        result = calibrate(measured, estimate=unknown_names(estimate))
     if result.status == "failed":
         raise InputError(f"{path}: the calibration failed: there is nothing to plan from")
     candidates = design.candidates_around(

@@ -21,14 +21,13 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.calibration.result import Calibration
 from jaxcal.design.candidates import Candidates
-from jaxcal.design.criteria import Criterion, check_criterion
+from jaxcal.design.criteria import Criterion, check_criterion, weight_of
 from jaxcal.design.information import covariance_of
 from jaxcal.design.planning import (
     Known,
     Plan,
     check_candidates,
     known_before,
-    weight_of,
     with_effective_noise,
 )
 from jaxcal.design.predict import student_factor

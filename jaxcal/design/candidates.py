@@ -230,7 +230,8 @@ def candidates_around(
         raise InputError("the calibration failed: there is nothing to plan from")
     poses = recording.calibration.poses
     used = np.asarray(answer.mask) > 0
-    model = Model(x, point, scale="scale" in result.blocks)
+    face = float(recording.calibration.face_offset_mm)
+    model = Model(x, point, scale="scale" in result.blocks, face_offset_mm=face)
     targets = model.targets(poses)
     sigma = np.asarray(answer.sigma, float)
     if np.isfinite(sigma).all():

@@ -26,7 +26,9 @@ from typing import Literal, get_args
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.design.candidates import Candidates
 from jaxcal.design.information import Model
+from jaxcal.diagnostics.image_points import point_jacobian
 from jaxcal.runtime.array_types import AnyArray, Array, Float
 
 Criterion = Literal["tre", "rp", "d"]
@@ -44,42 +46,28 @@ def check_criterion(criterion: str) -> None:
         )
 
 
-def tre_weight(points: Float[np.ndarray, "m 3"], size: int = 9) -> Float[np.ndarray, "p p"]:
+def tre_weight(points: Float[np.ndarray, "m 3"], model: Model) -> Float[np.ndarray, "p p"]:
     """W of the mean squared TRE over image points [lateral, 0, axial], mm."""
-    moved = _point_jacobian(points, size)
+    moved = point_jacobian(points[:, [0, 2]], model.blocks, model.face_offset_mm)
     return np.einsum("mia,mib->ab", moved, moved) / len(points)
 
 
-def rp_weight(
-    poses: Float[np.ndarray, "m 4 4"],
-    points: Float[np.ndarray, "m 3"],
-    image_to_probe: Float[np.ndarray, "4 4"],
-    size: int = 9,
-) -> Float[np.ndarray, "p p"]:
-    """W of the expected square of Eq. 8 over a test set.
-
-    Args:
-        poses: of the test images, probe -> tracker.
-        points: where the target is in them, mm.
-        image_to_probe: X.
-        size: number of unknowns.
-    """
-    moved = poses[:, :3, :3] @ image_to_probe[:3, :3] @ _point_jacobian(points, size)
+def rp_weight(poses: Float[np.ndarray, "m 4 4"], model: Model) -> Float[np.ndarray, "p p"]:
+    """W of the expected square of Eq. 8 over test images at these poses (probe -> tracker)."""
+    points = model.targets(poses)[:, [0, 2]]
+    moved = point_jacobian(points, model.blocks, model.face_offset_mm)
+    moved = poses[:, :3, :3] @ model.image_to_probe[:3, :3] @ moved
     moved = moved - moved.mean(axis=0)
-    return np.einsum("mia,mib->ab", moved, moved) / max(len(points) - 1, 1)
+    return np.einsum("mia,mib->ab", moved, moved) / max(len(poses) - 1, 1)
 
 
-def _point_jacobian(points: Float[np.ndarray, "m 3"], size: int) -> Float[np.ndarray, "m 3 p"]:
-    """[I, -[p]x, 0] and, for eleven unknowns, the columns of the scales' logarithms."""
-    moved = np.zeros((len(points), 3, size))
-    moved[:, :, :3] = np.eye(3)
-    x, y, z = points.T
-    moved[:, 0, 4], moved[:, 0, 5] = z, -y
-    moved[:, 1, 3], moved[:, 1, 5] = -z, x
-    moved[:, 2, 3], moved[:, 2, 4] = y, -x
-    if size > 9:
-        moved[:, 0, 9], moved[:, 2, 10] = x, z
-    return moved
+def weight_of(criterion: Criterion, candidates: Candidates) -> Float[np.ndarray, "p p"] | None:
+    """W of a criterion over the candidates' region; None for D."""
+    if criterion == "d":
+        return None
+    if criterion == "tre":
+        return tre_weight(candidates.constraints.region.grid(), candidates.model)
+    return rp_weight(candidates.poses, candidates.model)
 
 
 def hypotheses(doubt: float) -> Float[np.ndarray, "k 3"]:

@@ -45,12 +45,14 @@ class Model:
         point: the target in the tracker's frame, mm.
         noise: SDs.
         scale: whether the two pixel scales are unknown, too.
+        face_offset_mm: range of pixel row 0, which pixel scales do not stretch.
     """
 
     image_to_probe: Float[Any, "4 4"] = field(default_factory=lambda: np.eye(4))
     point: Float[Any, " 3"] = field(default_factory=lambda: np.zeros(3))
     noise: Noise = field(default_factory=lambda: Noise.constant((0.5, 0.3, 1.0)))
     scale: bool = False
+    face_offset_mm: float = 0.0
 
     @property
     def size(self) -> int:
@@ -81,7 +83,7 @@ class Model:
             [zero, zero, -one, -y, x, zero],
             [zero, -one, zero, z, zero, -x],
         ]
-        scales = [[-x, zero], [zero, -z], [zero, zero]]
+        scales = [[-x, zero], [zero, self.face_offset_mm - z], [zero, zero]]
         rows = []
         for k, axis in enumerate((0, 2, 1)):
             columns = rigid[k] + [turned[..., axis, j] for j in range(3)]

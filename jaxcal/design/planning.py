@@ -14,8 +14,8 @@ from jaxcal.design.criteria import (
     Criterion,
     check_criterion,
     hypotheses,
-    rp_weight,
     tre_weight,
+    weight_of,
 )
 from jaxcal.design.exchange import exchange
 from jaxcal.design.greedy import Chosen, Rules, Search, choose, space_features
@@ -229,7 +229,7 @@ def with_effective_noise(prior: object, candidates: Candidates) -> Candidates:
     if not isinstance(prior, Calibration) or candidates.taken is None:
         return candidates
     model = candidates.model
-    weight = tre_weight(candidates.constraints.region.grid(), model.size)
+    weight = tre_weight(candidates.constraints.region.grid(), candidates.model)
     factor = effective_elevational(prior, model, candidates.taken, weight)
     coefficients = np.array(model.noise.coefficients)
     coefficients[2, 0] += np.log(factor)
@@ -265,18 +265,6 @@ def make_search(candidates: Candidates, known: Known, criterion: Criterion, rule
         taken_rotations=(taken[:, :3, :3] @ x).reshape(-1, 9),
         taken_places=model.targets(taken),
     )
-
-
-def weight_of(criterion: Criterion, candidates: Candidates) -> Float[np.ndarray, "p p"] | None:
-    """W of a criterion over the candidates' region; None for D."""
-    model = candidates.model
-    if criterion == "d":
-        return None
-    if criterion == "tre":
-        return tre_weight(candidates.constraints.region.grid(), model.size)
-    targets = model.targets(candidates.poses)
-    in_plane = targets * np.array([1.0, 0.0, 1.0])
-    return rp_weight(candidates.poses, in_plane, model.image_to_probe, model.size)
 
 
 def _taken_features(candidates: Candidates) -> Float[np.ndarray, "t 5"]:

@@ -46,13 +46,26 @@ def pose_of(
     return matrix_from_rotation(rotation, point - rotation @ place)
 
 
-@partial(jax.jit, static_argnames=("region", "scale"))
-def _scored(numbers, known, weight, factors, reference, x, point, coefficients, *, region, scale):
+@partial(jax.jit, static_argnames=("region", "scale", "face_offset_mm"))
+def _scored(
+    numbers,
+    known,
+    weight,
+    factors,
+    reference,
+    x,
+    point,
+    coefficients,
+    *,
+    region,
+    scale,
+    face_offset_mm,
+):
     """The score of a pose as in :func:`jaxcal.design.criteria.gains`, and its gradient."""
 
     def score(numbers: Float[Array, " 5"]) -> Float[Array, ""]:
         pose = pose_of(numbers, reference, x, point, region)
-        rows = Model(x, point, Noise(coefficients), scale).jacobian(pose)
+        rows = Model(x, point, Noise(coefficients), scale, face_offset_mm).jacobian(pose)
 
         def one(covariance: Float[Array, "p p"], factor: Float[Array, " 3"]) -> Float[Array, ""]:
             own = rows / factor[:, None]
@@ -121,6 +134,7 @@ def polish(
             np.asarray(model.noise.coefficients),
             region=bounds.region,
             scale=model.scale,
+            face_offset_mm=model.face_offset_mm,
         )
         return float(value), np.asarray(slope)
 

@@ -48,10 +48,9 @@ def curve(
     steps = np.einsum("nia,nib->nab", rows, rows)
     total = known.information + np.concatenate([np.zeros((1, *steps.shape[1:])), steps.cumsum(0)])
     covariance = covariance_of(total)
-    targets = model.targets(candidates.poses) * np.array([1.0, 0.0, 1.0])
     weights = (
-        tre_weight(candidates.constraints.region.grid(), model.size),
-        rp_weight(candidates.poses, targets, model.image_to_probe, model.size),
+        tre_weight(candidates.constraints.region.grid(), model),
+        rp_weight(candidates.poses, model),
     )
     factor = np.array([student_factor(known, k, model.size) for k in range(len(total))])
     tre, rp = (np.sqrt(factor * np.einsum("ab,nab->n", weight, covariance)) for weight in weights)

@@ -120,7 +120,7 @@ def simulate_errors(
         scale = np.asarray(found.scale_mm_per_px)[there]
     squares = _squared_errors(transforms, scale, model, candidates.constraints.region.grid())
     tests = candidates.poses[:: -(-len(candidates) // _TEST_POSES)]
-    places = model.targets(tests)[:, ::2] * scale[:, None]
+    places = _seen(model.targets(tests), scale, model)[..., ::2]
     precision = np.array(
         [reconstruction_precision(x, tests, p) for x, p in zip(transforms, places, strict=True)]
     )
@@ -171,14 +171,24 @@ def _recordings(
     moved[..., :3, 3] -= offsets[..., None] * elevational
     points = np.stack([seen[..., 0], np.hypot(seen[..., 1], seen[..., 2])], axis=-1)
     points += rng.normal(size=points.shape) * sd[..., :2]
+    points[..., 1] -= model.face_offset_mm
     arrays: dict[str, Any] = {
         "poses": moved,
         "measurements": points,
         "mask": np.ones((trials, count)),
         "spacing": np.ones((trials, 2)),
-        "face_offset": np.zeros(trials),
+        "face_offset": np.full(trials, model.face_offset_mm),
     }
     return Problem(**arrays, pixels=model.scale)
+
+
+def _seen(
+    points: Float[np.ndarray, "m 3"], scale: Float[np.ndarray, "trials 2"], model: Model
+) -> Float[np.ndarray, "trials m 3"]:
+    """Where image points are taken to be with the pixel scales of every trial, mm."""
+    face = np.array([0.0, 0.0, model.face_offset_mm])
+    factors = np.stack([scale[:, 0], np.ones(len(scale)), scale[:, 1]], axis=-1)
+    return (points - face) * factors[:, None] + face
 
 
 def _squared_errors(
@@ -188,7 +198,7 @@ def _squared_errors(
     points: Float[np.ndarray, "m 3"],
 ) -> Float[np.ndarray, " trials"]:
     """Mean squared TRE over image points of every trial, mm^2."""
-    found = points * np.stack([scale[:, 0], np.ones(len(scale)), scale[:, 1]], axis=-1)[:, None]
+    found = _seen(points, scale, model)
     placed = np.einsum("kij,kpj->kpi", transforms[:, :3, :3], found) + transforms[:, None, :3, 3]
     true = points @ model.image_to_probe[:3, :3].T + model.image_to_probe[:3, 3]
     return ((placed - true) ** 2).sum(axis=-1).mean(axis=1)

@@ -15,7 +15,7 @@ from jaxcal.calibration.calibrate import calibrate
 from jaxcal.calibration.options import Options
 from jaxcal.calibration.result import Calibration
 from jaxcal.data.problem import Problem
-from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.array_types import AnyArray, Float
 
 KEPT = 200
 """Number of iterations that are drawn."""
@@ -44,7 +44,7 @@ def own_curve(result: Calibration) -> Curve:
 def bounded_curves(
     problem: Problem,
     *,
-    max_elevation: float | None = None,
+    max_elevation: float | AnyArray | None = None,
     estimate: tuple[str, ...] = (),
     alternating: Calibration | None = None,
 ) -> list[Curve]:

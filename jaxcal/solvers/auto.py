@@ -286,7 +286,7 @@ def answers_under(model: Linearised, sites: Sites, shapes: tuple[Shape, ...]) ->
     size = len(mean)
     return Answers(
         jnp.where(good, mean, 0.0),
-        jnp.where(good, covariance, jnp.eye(size)[:, :, None, None]),
+        jnp.where(good, covariance, jnp.eye(size, dtype=mean.dtype)[:, :, None, None]),
         weight,
         jnp.where(good, belief.probability, 0.0),
         jnp.any(good & (found.change < LARGEST_CHANGE), axis=0),
@@ -306,7 +306,7 @@ def with_own_covariances(
     ratio = jnp.sqrt(mean / jnp.mean(mean, axis=0))
     by = jnp.stack([ratio[0] * ratio[0], ratio[0] * ratio[1], ratio[1] * ratio[1]])
     shape = jnp.where(
-        images.mask > 0, shape * by[..., None], jnp.asarray([1.0, 0, 1])[:, None, None]
+        images.mask > 0, shape * by[..., None], jnp.asarray([1, 0, 1], shape.dtype)[:, None, None]
     )
     scale = jnp.sqrt(0.5 * jnp.sum((sigma[:2] / ratio) ** 2, axis=0))
     tied = OwnCovariances(jnp.stack([scale, sigma[2]]), shape, jnp.ones_like(scale), tied=True)

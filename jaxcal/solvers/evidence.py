@@ -99,7 +99,7 @@ class System(eqx.Module):
     @classmethod
     def of(cls, sums: ComponentSums, mean: Array) -> System:
         """From the sums of a pass."""
-        only = np.eye(len(sums.squares))[-1][:, None]
+        only = np.eye(len(sums.squares), dtype=mean.dtype)[-1][:, None]
         along = row_of(sums.matrix[-1], V_Y)
         squares = mean * (2 * sums.gradient[-1, V_Y] + mean * along[V_Y])
         gradient = sums.gradient + only[:, None] * mean * along
@@ -135,12 +135,12 @@ class System(eqx.Module):
         """tr(A N_k) of every component, A symmetric."""
         last = matrix.shape[0] - 1
         rows, columns = (np.array(each) for each in zip(*pairs(last), strict=True))
-        twice = np.where(rows == columns, 1.0, 2.0)[:, None]
+        twice = np.where(rows == columns, 1, 2).astype(matrix.dtype)[:, None]
         flat = picked(matrix.reshape(-1, matrix.shape[-1]), (last + 1) * rows + columns)
         found = jnp.sum(barrier(twice * flat) * self.sums.matrix, axis=1)
         crossed = jnp.sum(2 * matrix[last, :last] * self.border[:last], axis=0)
         own = crossed + matrix[last, last] * self.border[last]
-        return found + np.eye(len(found))[-1][:, None] * own
+        return found + np.eye(len(found), dtype=matrix.dtype)[-1][:, None] * own
 
 
 def row_of(flat: Float[Array, "triangle lanes"], k: int) -> Float[Array, "p lanes"]:

@@ -137,7 +137,8 @@ class Marginal(eqx.Module):
 
     def lift(self) -> Lift:
         """How all unknowns, b last, follow from z."""
-        seen = jnp.broadcast_to(jnp.eye(len(SEEN))[..., None], (len(SEEN), *self.gradient.shape))
+        eye = jnp.eye(len(SEEN), dtype=self.gradient.dtype)[..., None]
+        seen = jnp.broadcast_to(eye, (len(SEEN), *self.gradient.shape))
         shift = jnp.concatenate([self.shift, jnp.zeros_like(self.gradient)])
         slope = jnp.concatenate([self.slope, seen])
         spread = jnp.pad(self.spread, [(0, len(SEEN)), (0, len(SEEN)), (0, 0)])
@@ -196,7 +197,7 @@ def marginal(
     is_mean = order == unknowns
     from_flat = np.where(is_mean, ELEVATION, order)
     places = square_places(unknowns)[np.ix_(from_flat, from_flat)]
-    sign = np.where(is_mean, -1.0, 1.0)
+    sign = np.where(is_mean, -1, 1).astype(information.dtype)
     last = is_mean[:, None, None] & is_mean[:, None]
     full = picked(information, places) * (sign[:, None] * sign)[..., None]
     full = full + jnp.where(last, precision, 0.0)

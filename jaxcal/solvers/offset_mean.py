@@ -33,10 +33,11 @@ Kuensch 1989 (jackknife of blocks).
 
 from __future__ import annotations
 
+from math import log
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal.model import unrolled
@@ -76,7 +77,7 @@ class MeanBelief(eqx.Module):
     @property
     def probability(self) -> Float[Array, "*lanes"]:
         """Probability that there is a mean other than zero."""
-        return jax.nn.sigmoid(self.log_odds + np.log(PROBABILITY / (1 - PROBABILITY)))
+        return jax.nn.sigmoid(self.log_odds + log(PROBABILITY / (1 - PROBABILITY)))
 
 
 def believed(mean: Array, variance: Array, offset_sd: Array, trust: Array) -> MeanBelief:
@@ -102,7 +103,7 @@ def believed(mean: Array, variance: Array, offset_sd: Array, trust: Array) -> Me
 
 def gained(belief: MeanBelief) -> Array:
     """Ln of the evidence over that under the assumption that there is a mean."""
-    return jnp.logaddexp(np.log(PROBABILITY), np.log(1 - PROBABILITY) - belief.log_odds)
+    return jnp.logaddexp(log(PROBABILITY), log(1 - PROBABILITY) - belief.log_odds)
 
 
 def influences(

@@ -86,7 +86,7 @@ def with_floor(sigma: Float[Array, " components ..."]) -> Float[Array, " compone
 
 def floored(sigma: Float[Array, " components ..."]) -> Bool[Array, " components ..."]:
     """Which SDs rest on their floor."""
-    return sigma <= 1.001 * RELATIVE_FLOOR * jnp.max(sigma, axis=0)
+    return sigma <= 1.001 * least_sigma(sigma)
 
 
 def helmert(

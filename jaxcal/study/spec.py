@@ -55,11 +55,12 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal
+from typing import Any, get_args
 
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.names import Method, PriorName
 from jaxcal.data.probe import LinearProbe
 from jaxcal.io.readable import quoted
 from jaxcal.io.toml import load_toml, parse_toml
@@ -161,8 +162,8 @@ class MethodSpec:
     """
 
     name: str
-    method: Literal["conventional", "alternating", "joint"]
-    prior: Literal["auto", "gaussian", "uniform", "bounded"] = "auto"
+    method: Method
+    prior: PriorName = "auto"
     max_elevation_mm: float | None = None
     max_elevation_factor: float | None = None
     tolerance_rad: float = 1e-3
@@ -481,15 +482,11 @@ def _method(table: dict[str, Any], where: str) -> MethodSpec:
     name, method = _required(table, "name", where), _required(table, "method", where)
     if not (isinstance(name, str) and 1 <= len(name) <= 100 and name.isprintable()):
         raise InputError(f"{where}name must be 1 to 100 printable characters")
-    if method not in ("conventional", "alternating", "joint"):
-        raise InputError(
-            f"{where}method must be conventional, alternating or joint, not {_shown(method)}"
-        )
     prior = table.get("prior", "auto")
-    if prior not in ("auto", "gaussian", "uniform", "bounded"):
-        raise InputError(
-            f"{where}prior must be auto, gaussian, uniform or bounded, not {_shown(prior)}"
-        )
+    for key, value, names in (("method", method, Method), ("prior", prior, PriorName)):
+        if value not in get_args(names):
+            listed = ", ".join(get_args(names))
+            raise InputError(f"{where}{key} must be one of {listed}, not {_shown(value)}")
     if method != "joint" and "prior" in table:
         raise InputError(f"{where}prior belongs to the joint method")
     bounded = method == "alternating" or prior == "bounded"
