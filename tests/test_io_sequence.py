@@ -45,13 +45,16 @@ NAMES = ["a.igs.mha", "a.igs.mhd", "a.igs.nrrd"]
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("compressed", [True, False])
-@pytest.mark.parametrize("kind", ["uint8", "int16", "colour", "tracking"])
+@pytest.mark.parametrize("kind", ["uint8", "int16", "colour", "colour of 16 bits", "tracking"])
 def test_round_trip(tmp_path, name, compressed, kind):
     rng = np.random.default_rng(0)
     images = {
         "uint8": rng.integers(0, 256, (5, 6, 4), dtype=np.uint8),
         "int16": rng.integers(-9000, 9000, (5, 6, 4), dtype=np.int16),
         "colour": np.repeat(rng.integers(0, 256, (5, 6, 4, 1), dtype=np.uint8), 3, axis=3),
+        "colour of 16 bits": np.repeat(
+            rng.integers(0, 9000, (5, 6, 4, 1), dtype=np.int16), 3, axis=3
+        ),
         "tracking": None,
     }[kind]
     transforms, valid, time, _ = written(tmp_path / name, images=images, compressed=compressed)
@@ -67,7 +70,7 @@ def test_round_trip(tmp_path, name, compressed, kind):
         with pytest.raises(FormatError, match="holds no pixels"):
             next(found.images())
         return
-    grey = images[..., 0] if kind == "colour" else images
+    grey = images[..., 0] if kind.startswith("colour") else images
     np.testing.assert_array_equal(np.array(list(found.images())), grey)
     np.testing.assert_array_equal(np.array(list(found.images([1, 4]))), grey[[1, 4]])
 

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from fastcrc import crc64
 
+from jaxcal.io.grey import grey_of
 from jaxcal.runtime.array_types import Float, Int16, UInt8
 
 HEADER_SIZE = 58
@@ -305,13 +306,6 @@ def _image(content: memoryview) -> Picture:
     pixels = grey_of(pixels).astype(_SCALARS[scalar], copy=False)
     pixels.setflags(write=False)
     return Picture(pixels, spacing)
-
-
-def grey_of(pixels: np.ndarray) -> np.ndarray:
-    """(rows, columns) of (rows, columns, 1 or 3); colour becomes grey by ITU-R BT.601's weights."""
-    if pixels.shape[2] == 1:
-        return pixels[:, :, 0]
-    return np.rint(pixels @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
 
 
 def _matrix(numbers: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:

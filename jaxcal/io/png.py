@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal import FormatError
+from jaxcal.io.grey import grey_of
 from jaxcal.io.readable import check_readable, one_line
 
 if TYPE_CHECKING:
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
 MOST_PIXELS = 2**24
 """Largest image that is read, px."""
 _MOST_BYTES = 2**28
-_WEIGHTS = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue in grey, by ITU-R BT.601."""
 
 
 def png_size(path: str | os.PathLike[str]) -> tuple[int, int]:
@@ -50,10 +49,9 @@ def read_png(path: str | os.PathLike[str]) -> np.ndarray:
                 return np.asarray(image, dtype=np.uint16)
             if image.mode in ("1", "L", "LA"):
                 return np.array(image.convert("L"))
-            colours = np.asarray(image.convert("RGB"), dtype=np.float64)
+            return grey_of(np.asarray(image.convert("RGB")))
         except (OSError, SyntaxError, ValueError, EOFError, zlib.error) as error:
             raise FormatError(f"{os.fspath(path)}: is damaged: {one_line(error)}") from None
-    return np.rint(colours @ _WEIGHTS).astype(np.uint8)
 
 
 def encode_png(frame: np.ndarray) -> bytes:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_poses, inverse_poses
 from jaxcal.io.frame_names import FramePair, path_between
+from jaxcal.io.grey import grey_of
 from jaxcal.io.pixel_stream import Packing, PixelStream
 from jaxcal.io.readable import quoted
 from jaxcal.runtime.array_types import Bool, Float
@@ -224,11 +225,7 @@ def _png_image(pixels: FolderPixels, number: int) -> np.ndarray:
 
 def _grey(content: bytes, pixels: Pixels) -> np.ndarray:
     frame = np.frombuffer(content, pixels.dtype)
-    frame = frame.reshape(pixels.rows, pixels.columns, pixels.channels)
-    if pixels.channels == 1:
-        return frame[:, :, 0]
-    grey = frame[:, :, :3].astype(np.float64) @ [0.299, 0.587, 0.114]
-    return grey.astype(frame.dtype) if frame.dtype.kind == "f" else np.rint(grey).astype(np.uint8)
+    return grey_of(frame.reshape(pixels.rows, pixels.columns, pixels.channels))
 
 
 def _oriented(frame: np.ndarray, stored: str) -> np.ndarray:

@@ -170,10 +170,12 @@ def compute_on_workers(
             yield result
     finally:
         ending.set()
-        for worker in list(workers.values()):
-            worker.process.kill()
         for thread in threads:
-            thread.join()
+            # Killed again and again, since the thread may just have started a worker.
+            while thread.is_alive():
+                for worker in list(workers.values()):
+                    worker.process.kill()
+                thread.join(_POLL_S)
         for worker in list(workers.values()):
             worker.end()
 
