@@ -64,32 +64,6 @@ def test_inverse_needs_pivots_and_has_a_derivative():
     np.testing.assert_allclose(gradient, by_hand, atol=1e-9 * np.abs(by_hand).max())
 
 
-@pytest.mark.parametrize("columns", [2, 9, 12])
-def test_singular_values(columns: int):
-    matrix = RANDOM.normal(size=(3, 40, columns))
-    matrix[1, :, -1] = matrix[1, :, 0]  # singular
-    matrix[2] *= np.logspace(0, -10, columns)
-    got = jax.jit(jax.vmap(dense.singular_values))(jnp.asarray(matrix))
-    wanted = np.linalg.svd(matrix, compute_uv=False)[:, ::-1]
-    np.testing.assert_allclose(got.values, wanted, rtol=1e-9, atol=1e-14)
-    np.testing.assert_allclose(got.scaled_left, matrix @ got.right, atol=1e-13)
-    eye = np.broadcast_to(np.eye(columns), (3, columns, columns))
-    np.testing.assert_allclose(got.right.swapaxes(1, 2) @ got.right, eye, atol=1e-13)
-
-
-def test_singular_values_end_on_nan():
-    assert np.isnan(dense.singular_values(jnp.full((4, 3), jnp.nan)).values).all()
-
-
-def test_triangularised_least_squares():
-    matrix, rhs = RANDOM.normal(size=(50, 12)), RANDOM.normal(size=(50, 1))
-    reduced = np.asarray(dense.triangularise(jnp.asarray(np.hstack([matrix, rhs])), 12))
-    assert reduced.shape == (12, 13)
-    np.testing.assert_allclose(np.tril(reduced[:, :12], -1), 0, atol=1e-13)
-    wanted = np.linalg.lstsq(matrix, rhs, rcond=None)[0]
-    np.testing.assert_allclose(np.linalg.solve(reduced[:, :12], reduced[:, 12:]), wanted)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",

@@ -14,7 +14,6 @@ from jaxcal.data.geometry import (
     nearest_rotations,
     rotation_angle,
     rotation_from_vector,
-    transform_points,
 )
 
 
@@ -74,13 +73,6 @@ def test_images_left_out_are_not_looked_at():
 def test_transposed_poses_are_called_so():
     with pytest.raises(InputError, match="transposed"):
         check_poses(random_poses(3).swapaxes(1, 2))
-
-
-def test_points_are_rotated_then_translated():
-    poses = random_poses(4)
-    point = np.array([1.0, 2.0, 3.0])
-    expected = np.stack([(p @ [*point, 1])[:3] for p in poses])
-    np.testing.assert_allclose(transform_points(poses, np.tile(point, (5, 1))), expected)
 
 
 ANGLES = (0.0, 1e-200, 1e-9, 1e-4, 0.0999, 0.1, 0.1001, 1.0, np.pi, 6.0)

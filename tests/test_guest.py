@@ -18,7 +18,6 @@ from conftest import experiment, problem
 
 import jaxcal
 from jaxcal import Options
-from jaxcal.runtime.deprecation import deprecated
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -316,16 +315,6 @@ def test_without_derivatives_the_answer_is_a_constant():
     assert not flag
     assert not np.any(gradient.measurements)
     assert jaxcal.calibrate(there, "conventional").differentiable
-
-
-def test_a_deprecated_name_works_and_says_what_replaces_it():
-    @deprecated("better", "0.3")
-    def worse(x: int) -> int:
-        return x + 1
-
-    with pytest.warns(DeprecationWarning, match=r"worse is deprecated .* 0\.3: use better") as seen:
-        assert worse(1) == 2
-    assert len(seen) == 1
 
 
 def test_public_names_are_there_and_listed():

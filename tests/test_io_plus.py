@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import re
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -284,8 +285,7 @@ def test_real_configurations(real_data, name):
     path = real_data / "plus" / name
     old = path.read_bytes()
     known = read_configuration(path)
-    assert len(known.wires) == 3
-    assert all(len(pattern) == 3 for pattern in known.wires)
+    assert known.transforms
     new, _ = patched_configuration(old, IMAGE, MATRIX)
     found = found_element(parse_xml(new))
     assert old.startswith(new[: found.start].rstrip())
@@ -331,21 +331,32 @@ def test_real_configurations_in_another_dress(real_data, dress):
 
 def test_fcal_result_reproduces_its_errors(real_data):
     """Each error of PLUS's report from wires, points and poses alone: fixes every convention."""
-    folder = real_data / "plus"
-    result = read_result(folder / "IPEA_OptimizationMethod_Calibration.results.xml")
-    known = read_configuration(folder / "PlusDeviceSet_IPEA_OptimizationMethod.xml")
-    image_to_probe = result.find("Image", "Probe").matrix
-    phantom = known.find("Phantom", "Reference").matrix
-    assert len(result.validation) == len(result.calibration) == 200
-    assert sum(frame.status == "OK" for frame in result.validation) == 73
-    assert sum(frame.status == "OK" for frame in result.calibration) == 75
+    result_path = real_data / "plus" / "IPEA_OptimizationMethod_Calibration.results.xml"
+    known_path = real_data / "plus" / "PlusDeviceSet_IPEA_OptimizationMethod.xml"
+    image_to_probe = read_result(result_path).find("Image", "Probe").matrix
+    phantom = read_configuration(known_path).find("Phantom", "Reference").matrix
+    result, known = ElementTree.parse(result_path), ElementTree.parse(known_path)
+    patterns = [
+        {wire.get("Name"): [numbers(wire, f"EndPoint{end}") for end in ("Front", "Back")]
+         for wire in pattern.iter("Wire")}
+        for pattern in known.iterfind("PhantomDefinition/Geometry/Pattern")
+    ]  # fmt: skip
+    assert [len(pattern) for pattern in patterns] == [3, 3, 3]
     errors = []
-    for frame in result.validation:
-        for middle, stated in frame.errors_mm.items():
-            pose = np.linalg.inv(frame.transforms["Reference", "Tracker"])
-            pose = pose @ frame.transforms["Probe", "Tracker"]
-            wires = next(p for p in known.wires if any(w.name in middle for w in p))
-            points = [next(v for k, v in frame.points.items() if k.endswith(w.name)) for w in wires]
+    for frame in result.iterfind("ErrorReport/ValidationData/Frame"):
+        tracked = {field.get("Name"): field for field in frame.iter("CustomFrameField")}
+        seen = {point.get("WireName", point.get("ID")): numbers(point, "Position")[:2]
+                for point in frame.iter("Point")}  # fmt: skip
+        for error in frame.iterfind("ReprojectionError3DList/ReprojectionError3D"):
+            stated = float(error.get("ErrorMm"))
+            reference, probe = (
+                numbers(tracked[f"{name}ToTrackerTransform"], "Value").reshape(4, 4)
+                for name in ("Reference", "Probe")
+            )
+            pose = np.linalg.inv(reference) @ probe
+            names = next(p for p in patterns if any(name in error.get("WireName") for name in p))
+            wires = list(names.values())
+            points = [next(v for k, v in seen.items() if k.endswith(name)) for name in names]
             in_phantom = middle_point(wires, points)
             there = np.linalg.inv(pose) @ phantom @ [*in_phantom, 1]
             here = image_to_probe @ [*points[1], 0, 1]
@@ -354,11 +365,16 @@ def test_fcal_result_reproduces_its_errors(real_data):
             errors.append(found)
     assert len(errors) == 219
     kept = np.sort(errors)[: round(0.95 * len(errors))]
-    assert abs(kept.mean() - result.validation_error_mm) < 2e-4
+    statistics = result.find("ErrorReport/ReprojectionError3DStatistics")
+    assert abs(kept.mean() - float(statistics.get("ValidationMeanMm"))) < 2e-4
+
+
+def numbers(element, name):
+    return np.array(element.get(name).split(), float)
 
 
 def middle_point(wires, points):
-    first, middle, third = ((w.front, w.back) for w in wires)
+    first, middle, third = wires
     alpha = np.linalg.norm(points[1] - points[0]) / np.linalg.norm(points[2] - points[0])
     crossing = [intersection(middle, first), intersection(middle, third)]
     return crossing[0] + alpha * (crossing[1] - crossing[0])

@@ -9,9 +9,13 @@ from hypothesis import strategies as st
 
 from jaxcal import FormatError, InputError
 from jaxcal.io import lines as text_files
-from jaxcal.io.text import read_crosswire, read_csv
+from jaxcal.io.text import read_crosswire, read_pose_table, recording_of
 
 CROSSWIRE = Path(__file__).parents[2] / "shared" / "data" / "crosswire"
+
+
+def read_csv(path, spacing_mm=None, **options):
+    return recording_of(read_pose_table(path, **options), spacing_mm)
 
 
 def header(rows=3):

@@ -26,14 +26,6 @@ _TERMS = 7
 """Terms of the series. The first one left out is below 1e-26, its second derivative below 1e-20."""
 
 
-def transform_points(
-    transform: Float[AnyArray, "*#batch 4 4"], points: Float[AnyArray, "*#batch 3"]
-) -> Float[Array, "*batch 3"]:
-    """Apply 4x4 rigid transforms to points (mm); leading axes broadcast."""
-    rotated = jnp.einsum("...ij,...j->...i", transform[..., :3, :3], points)
-    return rotated + transform[..., :3, 3]
-
-
 def matrix_from_rotation(
     rotation: Float[Array, "3 3"], translation: Float[Array, 3]
 ) -> Float[Array, "4 4"]:

@@ -63,7 +63,7 @@ def calibration_reproducibility(
 
     Args:
         transforms: X of k repeated calibrations of one set-up.
-        image_points: [lateral, axial] of the points to look at, mm; see :func:`image_corners`.
+        image_points: [lateral, axial] of the points to look at, mm.
 
     Returns:
         For each point, mean over the calibrations of |X_k p - mean_k X_k p|, mm.
@@ -76,23 +76,3 @@ def calibration_reproducibility(
     points = xp.stack([image_points[:, 0], zero, image_points[:, 1]], axis=1)
     images = _transformed(transforms[:, None], points[None])
     return xp.mean(xp.linalg.norm(images - xp.mean(images, axis=0), axis=-1), axis=0)
-
-
-@traceable
-def image_corners(width_mm: float, depth_mm: float) -> Float[AnyArray, "5 2"]:
-    """The four corners of a linear probe's image and its centre, [lateral, axial] mm."""
-    half = 0.5 * width_mm
-    return array_module(half, depth_mm).asarray(
-        [[-half, 0.0], [half, 0.0], [-half, depth_mm], [half, depth_mm], [0.0, 0.5 * depth_mm]]
-    )
-
-
-@traceable
-def root_mean_square(
-    residual: Float[AnyArray, "n 3"], mask: Float[AnyArray, " n"] | None = None
-) -> Float[AnyArray, ""]:
-    """Root mean square length of residual vectors (mm) over the used images."""
-    xp = array_module(residual, mask)
-    residual = xp.asarray(residual)
-    weight = xp.ones(residual.shape[0], residual.dtype) if mask is None else xp.asarray(mask)
-    return xp.asarray(xp.sqrt(xp.sum(weight[:, None] * residual**2) / xp.sum(weight)))

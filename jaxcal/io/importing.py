@@ -137,11 +137,6 @@ def import_files(
 _SEQUENCES = ("sequence", "tracker", "scan", "folder")
 
 
-def is_sequence(source: str | os.PathLike[str]) -> bool:
-    """Whether a source has frames or tracking: a sequence, a folder, a tracker's export."""
-    return _kind(source) in _SEQUENCES
-
-
 def _kind(source: str | os.PathLike[str]) -> str:
     name = os.fspath(source).lower()
     if Path(source).is_dir():

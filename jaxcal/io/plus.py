@@ -51,57 +51,19 @@ class PlusTransform:
 
 
 @dataclass(frozen=True)
-class Wire:
-    """A wire of an fCal phantom: its name and its ends in the phantom's frame, mm."""
-
-    name: str
-    front: Float[np.ndarray, 3]
-    back: Float[np.ndarray, 3]
-
-
-@dataclass(frozen=True)
 class PlusConfiguration:
     """What calibration needs of a device-set configuration.
 
     Attributes:
         transforms: of CoordinateDefinitions, in their order.
-        wires: of the phantom, pattern by pattern.
-        landmarks: (3,) positions in the phantom's frame, mm, by name.
-        local_time_offset_s: by device: global = local + offset.
     """
 
     transforms: tuple[PlusTransform, ...]
-    wires: tuple[tuple[Wire, ...], ...]
-    landmarks: dict[str, Float[np.ndarray, 3]]
-    local_time_offset_s: dict[str, float]
 
     def find(self, source: str, target: str) -> PlusTransform | None:
         """The transform between two frames as it is stated, or None."""
         wanted = capitalised(source), capitalised(target)
         return next((found for found in self.transforms if found.frames == wanted), None)
-
-
-@dataclass(frozen=True)
-class ResultFrame:
-    """A frame of an fCal result.
-
-    Attributes:
-        index: its number.
-        status: ``OK``, ``Failed``, ``InvalidPatterns`` or ``HasNotBeenRun``.
-        time: s; None where not stated.
-        transforms: (4, 4), mm, by their frames.
-        status_of: of each transform.
-        points: [u, v] of each segmented wire, px, MF orientation.
-        errors_mm: three-dimensional reprojection errors by wire.
-    """
-
-    index: int
-    status: str
-    time: float | None
-    transforms: dict[FramePair, Float[np.ndarray, "4 4"]]
-    status_of: dict[FramePair, str]
-    points: dict[str, Float[np.ndarray, 2]]
-    errors_mm: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -111,16 +73,10 @@ class PlusResult:
     Attributes:
         transforms: ``ImageToProbe`` and others, by their frames.
         calibration_error_mm: mean of the lowest 95 % of the calibration's errors, by PLUS.
-        validation_error_mm: the same for the validation's errors.
-        calibration: frames used for the calibration.
-        validation: frames used for the validation.
     """
 
     transforms: tuple[PlusTransform, ...]
     calibration_error_mm: float | None
-    validation_error_mm: float | None
-    calibration: tuple[ResultFrame, ...]
-    validation: tuple[ResultFrame, ...]
 
     def find(self, source: str, target: str) -> PlusTransform | None:
         """The transform between two frames, or None."""
@@ -139,7 +95,7 @@ def read_configuration(path: str | os.PathLike[str]) -> PlusConfiguration:
     name = os.fspath(path)
     try:
         if root.tag == "Transform":
-            return PlusConfiguration((_transform(root),), (), {}, {})
+            return PlusConfiguration((_transform(root),))
         if root.tag != _ROOT:
             raise FormatError(f"is not a configuration of PLUS: its root is {quoted(root.tag)}")
         return PlusConfiguration(
@@ -148,19 +104,6 @@ def read_configuration(path: str | os.PathLike[str]) -> PlusConfiguration:
                 for place in root.all(_COORDINATES)
                 for element in _transforms(place)
             ),
-            tuple(
-                tuple(_wire(wire) for wire in pattern.all("Wire"))
-                for pattern in root.all("PhantomDefinition/Geometry/Pattern")
-            ),
-            {
-                _attribute(mark, "Name"): _numbers(mark, "Position", 3)
-                for mark in root.all("PhantomDefinition/Geometry/Landmarks/Landmark")
-            },
-            {
-                _attribute(device, "Id"): float(_numbers(device, "LocalTimeOffsetSec", 1)[0])
-                for device in root.all("DataCollection/Device")
-                if "LocalTimeOffsetSec" in device.attributes
-            },
         )
     except FormatError as error:
         raise FormatError(f"{name}: {error}") from None
@@ -180,44 +123,9 @@ def read_result(path: str | os.PathLike[str]) -> PlusResult:
         return PlusResult(
             tuple(_transform(element) for element in root.all("CalibrationResults/Transform")),
             _optional_number(errors, "CalibrationMeanMm"),
-            _optional_number(errors, "ValidationMeanMm"),
-            tuple(map(_result_frame, root.all("ErrorReport/CalibrationData/Frame"))),
-            tuple(map(_result_frame, root.all("ErrorReport/ValidationData/Frame"))),
         )
     except FormatError as error:
         raise FormatError(f"{os.fspath(path)}: {error}") from None
-
-
-def _result_frame(frame: Element) -> ResultFrame:
-    tracked = frame.first("TrackedFrame")
-    points: dict[str, Float[np.ndarray, 2]] = {}
-    places = ("SegmentedPoints/Point", "TrackedFrame/Segmentation/SegmentedPoints/Point")
-    for place in places:
-        for point in frame.all(place):
-            key = "WireName" if "WireName" in point.attributes else "ID"
-            points[_attribute(point, key)] = _numbers(point, "Position", 3)[:2]
-    transforms: dict[FramePair, Float[np.ndarray, "4 4"]] = {}
-    status_of: dict[FramePair, str] = {}
-    for custom in [] if tracked is None else tracked.all("CustomFrameField"):
-        name = _attribute(custom, "Name")
-        if name.endswith("Transform") and (pair := split_name(name.removesuffix("Transform"))):
-            transforms[pair] = _numbers(custom, "Value", 16).reshape(4, 4)
-        elif name.endswith("TransformStatus"):
-            pair = split_name(name.removesuffix("TransformStatus"))
-            if pair:
-                status_of[pair] = _attribute(custom, "Value")
-    return ResultFrame(
-        index=int(_numbers(frame, "Index", 1)[0]),
-        status=_attribute(frame, "SegmentationStatus"),
-        time=_optional_number(tracked, "Timestamp"),
-        transforms=transforms,
-        status_of=status_of,
-        points=points,
-        errors_mm={
-            _attribute(error, "WireName"): float(_numbers(error, "ErrorMm", 1)[0])
-            for error in frame.all("ReprojectionError3DList/ReprojectionError3D")
-        },
-    )
 
 
 def _transforms(coordinates: Element) -> list[Element]:
@@ -240,14 +148,6 @@ def _transform(element: Element) -> PlusTransform:
 
 def _frames(element: Element) -> FramePair:
     return capitalised(_attribute(element, "From")), capitalised(_attribute(element, "To"))
-
-
-def _wire(element: Element) -> Wire:
-    return Wire(
-        _attribute(element, "Name"),
-        _numbers(element, "EndPointFront", 3),
-        _numbers(element, "EndPointBack", 3),
-    )
 
 
 def _attribute(element: Element, name: str) -> str:

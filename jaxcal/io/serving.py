@@ -74,11 +74,6 @@ class TransformServer:
         """Where it listens."""
         return int(self._listener.getsockname()[1])
 
-    @property
-    def clients(self) -> int:
-        """How many are connected."""
-        return len(self._clients)
-
     def serve(self, period_s: float, stopped: Callable[[], bool] = lambda: False) -> None:
         """Send until stopped.
 

@@ -128,41 +128,6 @@ def read_pose_table(
         )
 
 
-def read_csv(
-    path: str | os.PathLike[str],
-    *,
-    spacing_mm: np.ndarray | tuple[float, float] | None = None,
-    units: Literal["px", "mm"] | None = None,
-    quaternion: QuaternionOrder | None = None,
-    pose_units: LengthUnit | None = None,
-    skip_invalid: bool = False,
-) -> Recording:
-    """Read a table with pose and point in each row; see :func:`read_pose_table`.
-
-    Args:
-        path: of the table.
-        spacing_mm: [lateral, axial] mm per px, when known; pixels only.
-        units: of u and v: "px" (lateral and axial pixel, the default) or "mm" (lateral, range).
-        quaternion: where the scalar of a quaternion stands.
-        pose_units: of translations.
-        skip_invalid: leave out rows that are marked as invalid.
-
-    Returns:
-        Images of kind ``pixel`` or ``point`` with their times; rotations are projected to SO(3).
-
-    Raises:
-        FormatError: a file, a header or a row that cannot be read; file and line are named.
-        InputError: units other than these, or images that cannot be used (see
-            :func:`jaxcal.data.recording.make_images`).
-    """
-    if units not in (None, "px", "mm"):
-        raise InputError(f"units must be px or mm, not {quoted(str(units))}")
-    table = read_pose_table(
-        path, quaternion=quaternion, pose_units=pose_units, units=units, skip_invalid=skip_invalid
-    )
-    return recording_of(table, spacing_mm)
-
-
 def recording_of(
     table: PoseTable, spacing_mm: np.ndarray | tuple[float, float] | None = None
 ) -> Recording:

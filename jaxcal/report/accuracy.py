@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -48,8 +48,6 @@ from jaxcal.diagnostics.messages import DRIFT_SCORE
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.trees import map_arrays
 from jaxcal.solvers.closed_form.single import calibrate_closed_form
-
-Word = Literal["good", "fair", "uncertain"]
 
 GOOD_MM = 0.5
 """Largest error to expect at the image (root mean square) that is called good."""

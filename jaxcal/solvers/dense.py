@@ -7,7 +7,7 @@ studies on two cores (docs/developers/upstream/xla-cpu-lapack-deadlock.md). Thes
 operations cannot deadlock; they also vectorise over the batch and run unchanged on a GPU, which has
 no LAPACK.
 
-References: Golub and Van Loan, Matrix Computations, 4th ed., 3.4, 5.2, 8.6; Brent and Luk 1985.
+Reference: Golub and Van Loan, Matrix Computations, 4th ed., 3.4.
 """
 
 from __future__ import annotations
@@ -15,17 +15,12 @@ from __future__ import annotations
 from functools import reduce
 from operator import add, mul
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxcal.model import unrolled
-from jaxcal.runtime.precision import in_standard_promotion
-
-MAX_SWEEPS = 30
-"""Most sweeps of Jacobi's rotations."""
 
 BLOCK = 3
 """Most rows that are swept at once."""
@@ -115,163 +110,16 @@ def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
     return order @ work[:, size:]
 
 
-def triangularise(matrix: Float[Array, "m q"], columns: int) -> Float[Array, "r q"]:
-    """Householder QR of the first columns, applied to all: R, and Q'b for those that follow.
-
-    Args:
-        matrix: [A, b], m >= columns.
-        columns: of A.
-
-    Returns:
-        The first ``columns`` rows of Q'[A, b].
-    """
-    rows = jnp.arange(matrix.shape[0])
-
-    def reflect(k: Array, work: Float[Array, "m q"]) -> Float[Array, "m q"]:
-        column = jnp.where(rows >= k, _column(work, k), 0.0)
-        head = jnp.sum(jnp.where(rows == k, column, 0.0))
-        length = jnp.sqrt(jnp.sum(column**2))
-        mirror = column + jnp.where(rows == k, jnp.where(head < 0, -length, length), 0.0)
-        square = jnp.sum(mirror**2)
-        factor = jnp.where(square > 0, 2 / jnp.where(square > 0, square, 1.0), 0.0)
-        return work - factor * mirror[:, None] * (mirror @ work)
-
-    return jax.lax.fori_loop(0, columns, reflect, matrix)[:columns]
-
-
 def _column(matrix: Float[Array, "m q"], k: Array) -> Float[Array, " m"]:
     # A masked sum: a gather of one column a lane is many times slower.
     return jnp.sum(jnp.where(jnp.arange(matrix.shape[1]) == k, matrix, 0.0), axis=1)
-
-
-class SingularValues(eqx.Module):
-    """A = U diag(values) V', values ascending; a batch has its lanes last while it is computed.
-
-    Attributes:
-        scaled_left: (m, p) U diag(values).
-        values: (p,) singular values.
-        right: (p, p) V.
-    """
-
-    scaled_left: Float[Array, "m p *lanes"]
-    values: Float[Array, " p *lanes"]
-    right: Float[Array, "p p *lanes"]
-
-
-@jax.custom_batching.custom_vmap
-def singular_values(matrix: Float[Array, "m p"]) -> SingularValues:
-    """Singular value decomposition by one-sided Jacobi rotations.
-
-    Of a symmetric positive semidefinite matrix this is the eigenvalue decomposition. Not
-    differentiable in reverse mode. A batch is decomposed side by side, its axis innermost.
-    """
-    return jax.tree.map(lambda leaf: leaf[..., 0], _side_by_side(matrix[..., None]))
-
-
-@singular_values.def_vmap
-@in_standard_promotion
-def _singular_values_batch(size: int, batched: list, matrix: Array) -> tuple:
-    del size, batched
-    found = _side_by_side(jnp.moveaxis(matrix, 0, -1))
-    found = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), found)
-    return found, jax.tree.map(lambda _: True, found)
-
-
-def _side_by_side(matrix: Array) -> SingularValues:
-    """The decompositions of (m, p, lanes) matrices, lanes last throughout.
-
-    Columns meet in pairs as in a round-robin tournament: the first player stays and the others move
-    round by one seat. With s seats, all players are back in their seats after s - 1 rounds.
-    """
-    height, columns, lanes = matrix.shape
-    even = columns + columns % 2
-    work = jnp.pad(matrix, ((0, 0), (0, even - columns), (0, 0)))
-    eye = jnp.broadcast_to(jnp.eye(even, dtype=matrix.dtype)[..., None], (even, even, lanes))
-    together = jnp.concatenate([work, eye])
-    tolerance = 4 * jnp.finfo(matrix.dtype).eps
-
-    def one_round(_: Array, state: tuple) -> tuple:
-        first, second, largest = state
-        a, b = jnp.sum(first[:height] ** 2, axis=0), jnp.sum(second[:height] ** 2, axis=0)
-        mixed = jnp.sum(first[:height] * second[:height], axis=0)
-        length = jnp.sqrt(a) * jnp.sqrt(b)
-        cosine_between = jnp.abs(mixed) / jnp.where(length > 0, length, 1.0)
-        turn = cosine_between > tolerance
-        zeta = (b - a) / jnp.where(turn, 2 * mixed, 1.0)
-        tangent = jnp.where(zeta < 0, -1.0, 1.0) / (jnp.abs(zeta) + jnp.sqrt(1 + zeta**2))
-        tangent = jnp.where(turn, tangent, 0.0)
-        cosine = 1 / jnp.sqrt(1 + tangent**2)
-        sine = cosine * tangent
-        first, second = cosine * first - sine * second, sine * first + cosine * second
-        if even > 2:
-            first, second = (
-                jnp.concatenate([first[:, :1], second[:, :1], first[:, 1:-1]], axis=1),
-                jnp.concatenate([second[:, 1:], first[:, -1:]], axis=1),
-            )
-        return first, second, jnp.maximum(largest, jnp.max(cosine_between, axis=0))
-
-    def unfinished(state: tuple) -> Bool[Array, ""]:
-        _, _, largest, sweeps = state
-        return jnp.any(largest > tolerance) & (sweeps < MAX_SWEEPS)
-
-    def sweep(state: tuple) -> tuple:
-        first, second, _, sweeps = state
-        none = jnp.zeros(lanes, matrix.dtype)
-        first, second, largest = jax.lax.fori_loop(0, even - 1, one_round, (first, second, none))
-        return first, second, largest, sweeps + 1
-
-    start = (
-        together[:, 0::2],
-        together[:, 1::2],
-        jnp.ones(lanes, matrix.dtype),
-        jnp.zeros((), jnp.int32),
-    )
-    first, second, _, _ = jax.lax.while_loop(unfinished, sweep, start)
-    # After whole sweeps every column is back in its place, so the padding is the last one again.
-    together = jnp.stack([first, second], axis=2).reshape(together.shape)[:, :columns]
-    values = jnp.sqrt(jnp.sum(together[:height] ** 2, axis=0))
-    ascending = jnp.argsort(values, axis=0)
-    values = jnp.take_along_axis(values, ascending, axis=0)
-    together = jnp.take_along_axis(together, ascending[None], axis=1)
-    return SingularValues(together[:height], values, together[height : height + columns])
-
-
-def inverse_positive(matrix: Float[Array, "p p"]) -> tuple[Float[Array, "p p"], Float[Array, ""]]:
-    """Inverse and log determinant of a symmetric positive definite matrix, by Gauss-Jordan.
-
-    Args:
-        matrix: of any scale; it is brought to a unit diagonal first.
-
-    Returns:
-        The inverse and ln det; NaN where the matrix is not positive definite.
-    """
-    size = matrix.shape[0]
-    rows = jnp.arange(size)
-    scale = 1 / jnp.sqrt(jnp.diagonal(matrix))
-    scaled = matrix * scale[:, None] * scale[None, :]
-
-    def eliminate(k: Array, state: tuple) -> tuple:
-        work, log_determinant = state
-        here = (rows == k).astype(work.dtype)
-        column = _column(work, k)
-        pivot = column @ here
-        pivot = jnp.where(pivot > 0, pivot, jnp.nan)
-        # In place: the eliminated column makes room for the inverse's.
-        row = jnp.where(rows == k, 1.0, here @ work) / pivot
-        work = jnp.where(rows == k, 0.0, work) - column[:, None] * row
-        work = jnp.where(rows[:, None] == k, row, work)
-        return work, log_determinant + jnp.log(pivot)
-
-    zero = jnp.zeros((), matrix.dtype)
-    inverse, log_determinant = jax.lax.fori_loop(0, size, eliminate, (scaled, zero))
-    return inverse * scale[:, None] * scale[None, :], log_determinant - 2 * jnp.sum(jnp.log(scale))
 
 
 @jax.jit
 def inverse_lanes_last(
     matrix: Float[Array, "p p lanes"],
 ) -> tuple[Float[Array, "p p lanes"], Float[Array, " lanes"]]:
-    """:func:`inverse_positive` of many matrices, lanes last, by sweeping a few rows at a time.
+    """Inverses and log determinants of symmetric positive definite matrices, lanes last.
 
     With the leading block A = L L', W = L^-1 and the rows B beside it, one sweep makes
 

@@ -214,7 +214,7 @@ def _trials(value: Array) -> np.ndarray:
     return np.asarray(value).reshape(-1, *value.shape[2:])
 
 
-def compile_pieces(function: Any, devices: Devices, *, pieces: int, fast: bool = True) -> Any:
+def compile_pieces(function: Any, devices: Devices, *, pieces: int) -> Any:
     """Compile a function of one piece for many pieces, which several devices share.
 
     Args:
@@ -222,10 +222,9 @@ def compile_pieces(function: Any, devices: Devices, *, pieces: int, fast: bool =
         devices: one, or several that share the pieces.
         pieces: number of leading arguments that are given for every piece; further arguments are
             the same for all pieces.
-        fast: with the flags of :func:`jaxcal.runtime.compiler.fast_to_run`.
     """
     platform = devices[0].platform
-    options = (fast_to_run(platform) or {}) if fast else {}
+    options = fast_to_run(platform) or {}
     options = (options | single_threaded(platform)) or None
 
     def each(*given: Any) -> Any:
