@@ -10,7 +10,7 @@ Nothing here imports JAX, so that files can be read and converted without its st
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -25,6 +25,24 @@ QUATERNION_TOLERANCE = 1e-2
 
 QuaternionOrder = Literal["xyzw", "wxyz"]
 """Whether the scalar comes last (ROS, Motive, scipy) or first (NDI)."""
+
+
+def targets_in_images(
+    poses: Float[Any, "*n 4 4"], image_to_probe: Float[Any, "4 4"], point: Float[Any, " 3"]
+) -> Float[Any, "*n 3"]:
+    """Where a target at rest is in the images' frames, mm.
+
+    Args:
+        poses: probe -> tracker, mm; numpy or JAX.
+        image_to_probe: X.
+        point: the target in the tracker's frame, mm.
+
+    Returns:
+        q = X^-1 B^-1 c: lateral, elevational, axial.
+    """
+    away = (point - poses[..., :3, 3])[..., None, :]
+    in_probe = (away @ poses[..., :3, :3])[..., 0, :]
+    return (in_probe - image_to_probe[:3, 3]) @ image_to_probe[:3, :3]
 
 
 def nearest_rotations(

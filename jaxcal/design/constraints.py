@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.poses import rotations_from_vectors
+from jaxcal.data.poses import rotations_from_vectors, targets_in_images
 from jaxcal.data.probe import CurvilinearProbe, Probe
 from jaxcal.runtime.array_types import Bool, Float
 
@@ -188,8 +188,7 @@ class Constraints:
     ) -> Float[np.ndarray, "n 5"]:
         """The five numbers of poses; the elevational offset is not among them and is ignored."""
         image = poses[:, :3, :3] @ image_to_probe[:3, :3]
-        in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], point - poses[:, :3, 3])
-        target = (in_probe - image_to_probe[:3, 3]) @ image_to_probe[:3, :3]
+        target = targets_in_images(poses, image_to_probe, point)
         relative = self.reference.T @ image
         axial = relative[:, :, 2]
         sine = np.hypot(axial[:, 0], axial[:, 1])

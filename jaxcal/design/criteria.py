@@ -28,7 +28,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.information import Model
-from jaxcal.diagnostics.image_points import point_jacobian
+from jaxcal.diagnostics.image_points import mean_of_squares, point_jacobian
 from jaxcal.runtime.array_types import AnyArray, Array, Float
 
 Criterion = Literal["tre", "rp", "d"]
@@ -49,7 +49,7 @@ def check_criterion(criterion: str) -> None:
 def tre_weight(points: Float[np.ndarray, "m 3"], model: Model) -> Float[np.ndarray, "p p"]:
     """W of the mean squared TRE over image points [lateral, 0, axial], mm."""
     moved = point_jacobian(points[:, [0, 2]], model.blocks, model.face_offset_mm)
-    return np.einsum("mia,mib->ab", moved, moved) / len(points)
+    return mean_of_squares(moved)
 
 
 def rp_weight(poses: Float[np.ndarray, "m 4 4"], model: Model) -> Float[np.ndarray, "p p"]:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.data.poses import targets_in_images
 from jaxcal.design.noise import Noise
 from jaxcal.model.unknowns import RIGID, block_slice
 from jaxcal.runtime.array_types import Float
@@ -66,9 +67,7 @@ class Model:
 
     def targets(self, poses: Float[Any, "*n 4 4"]) -> Float[Any, "*n 3"]:
         """Where the target is in the images of a probe at these poses, mm (traceable)."""
-        rotation, x = poses[..., :3, :3], self.image_to_probe
-        in_probe = ((self.point - poses[..., :3, 3])[..., None, :] @ rotation)[..., 0, :]
-        return (in_probe - x[:3, 3]) @ x[:3, :3]
+        return targets_in_images(poses, self.image_to_probe, self.point)
 
     def jacobian(self, poses: Float[Any, "*n 4 4"]) -> Float[Any, "*n 3 p"]:
         """G of poses probe -> tracker (mm); numpy or JAX, traceable, differentiable in the pose."""

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.poses import nearest_rotations
+from jaxcal.data.poses import nearest_rotations, targets_in_images
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.runtime.array_types import Bool, Float, Int
 
@@ -424,6 +424,5 @@ def _errors(found: ClosedForm, data: Any) -> Float[np.ndarray, "m 3"]:
         points = points * found.scale_mm_per_px
     face = float(getattr(data, "face_offset_mm", getattr(data, "face_offset", 0.0)))
     transform = found.image_to_probe
-    in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], found.point_mm - poses[:, :3, 3])
-    q = (in_probe - transform[:3, 3]) @ transform[:3, :3]
+    q = targets_in_images(poses, transform, found.point_mm)
     return np.stack([q[:, 0] - points[:, 0], q[:, 2] - points[:, 1] - face, q[:, 1]], axis=1)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.array_types import AnyArray, Float
 
 if TYPE_CHECKING:
     from jaxcal.model.parameters import Blocks
@@ -53,3 +53,9 @@ def point_jacobian(
     }
     chosen = [xp.stack(column, axis=-1) for block in blocks for column in columns[block]]
     return xp.stack(chosen, axis=-1)
+
+
+def mean_of_squares(jacobian: Float[AnyArray, "*batch m 3 p"]) -> Float[np.ndarray, "*batch p p"]:
+    """W with tr(W S) the mean squared error over m image points, for a covariance S."""
+    jacobian = np.asarray(jacobian)
+    return np.einsum("...mia,...mib->...ab", jacobian, jacobian) / jacobian.shape[-3]

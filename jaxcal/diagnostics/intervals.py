@@ -34,7 +34,7 @@ from scipy import special
 from jaxcal import InputError
 from jaxcal.data.sound import WATER_M_S
 from jaxcal.diagnostics.arrays import array_module, traceable
-from jaxcal.diagnostics.image_points import point_jacobian
+from jaxcal.diagnostics.image_points import mean_of_squares, point_jacobian
 from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.model.unknowns import in_image, size
 from jaxcal.runtime.array_types import AnyArray, Float
@@ -257,7 +257,7 @@ def tre_over(
     answer = calibration.numpy()
     rows = in_image(answer.blocks)
     jacobian = image_jacobian(answer, np.asarray(points, float))[..., rows]
-    weight = np.einsum("...mia,...mib->...ab", jacobian, jacobian) / jacobian.shape[-3]
+    weight = mean_of_squares(jacobian)
     covariance = np.asarray(answer.unknowns_covariance, float)[..., rows[:, None], rows]
     values, vectors = np.linalg.eigh(weight)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]

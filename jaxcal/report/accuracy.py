@@ -25,11 +25,13 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.calibration.result import Calibration
+from jaxcal.data.poses import targets_in_images
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
 from jaxcal.diagnostics.image_errors import Unknowns
+from jaxcal.diagnostics.image_points import mean_of_squares
 from jaxcal.diagnostics.influence import (
     KINDS,
     Influence,
@@ -94,8 +96,7 @@ def accuracy_record(
         answer = answer.with_problem(Problem.from_recording(recording)).numpy()
     region = region_of(answer, recording)
     grid = region.grid()[:, [0, 2]]
-    jacobian = image_jacobian(answer, grid)
-    weight = np.einsum("mia,mib->ab", jacobian, jacobian) / len(grid)
+    weight = mean_of_squares(image_jacobian(answer, grid))
     found = influence_of(answer)
     tre = _tre(answer, region, wanted)
     influence = _influence(found, weight, np.asarray(answer.mask) > 0)
@@ -113,16 +114,8 @@ def accuracy_record(
 def region_of(answer: Calibration, recording: Recording) -> Region:
     """The part of the image that the target filled, and the face of the probe if it is known."""
     used = np.asarray(answer.mask) > 0
-    targets = _targets(answer, recording.calibration.poses)
+    targets = targets_in_images(recording.calibration.poses, answer.image_to_probe, answer.point)
     return seen_region(recording, targets[used])
-
-
-def _targets(answer: Calibration, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 3"]:
-    """The target in every image, mm."""
-    x = np.asarray(answer.image_to_probe)
-    away = np.asarray(answer.point) - poses[:, :3, 3]
-    in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], away)
-    return (in_probe - x[:3, 3]) @ x[:3, :3]
 
 
 def _tre(

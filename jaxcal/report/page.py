@@ -20,6 +20,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.calibration.result import Calibration
 from jaxcal.calibration.transform import SaveFormat, transform_from_record
+from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Recording
 from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.metrics import reconstruct
@@ -207,7 +208,8 @@ def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording)
     mapped = {name: np.array(tre["map"][name], float) for name in ("lateral_mm", "axial_mm")}
     error = tre["factor"] * np.array(tre["map"]["stated_mm"], float)
     used = np.asarray(answer.mask) > 0
-    seen = _targets(answer, recording)[used][:, [0, 2]]
+    poses = recording.calibration.poses[used]
+    seen = targets_in_images(poses, answer.image_to_probe, answer.point)[:, [0, 2]]
     drawn = svg.error_map(
         mapped["lateral_mm"],
         mapped["axial_mm"],
@@ -283,19 +285,12 @@ def _matrix(record: dict[str, Any]) -> str:
     return _section("The matrix", *parts)
 
 
-def _targets(answer: Calibration, recording: Recording) -> Float[np.ndarray, "n 3"]:
-    """The target in every image, mm."""
-    x, poses = np.asarray(answer.image_to_probe), recording.calibration.poses
-    in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], np.asarray(answer.point) - poses[:, :3, 3])
-    return (in_probe - x[:3, 3]) @ x[:3, :3]
-
-
 def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) -> str:
     used = np.flatnonzero(np.asarray(answer.mask) > 0)
     shown = used[:: max(-(-len(used) // MOST_POSES), 1)]
     x, point = np.asarray(answer.image_to_probe), np.asarray(answer.point)
-    images = recording.calibration.poses[shown] @ x
-    seen = _targets(answer, recording)[shown]
+    poses = recording.calibration.poses[shown]
+    images, seen = poses @ x, targets_in_images(poses, x, point)
     # The measured point is in the plane, at the measured lateral position and range.
     residual = np.asarray(answer.residual)[shown]
     measured = seen - residual

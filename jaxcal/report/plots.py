@@ -16,7 +16,9 @@ from matplotlib.figure import Figure
 
 from jaxcal import InputError
 from jaxcal.calibration.result import Calibration
+from jaxcal.data.poses import targets_in_images
 from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.image_points import mean_of_squares
 from jaxcal.diagnostics.influence import KINDS, in_image, influence_of
 from jaxcal.diagnostics.intervals import image_jacobian, tre_at
 from jaxcal.report.accuracy import region_of
@@ -73,7 +75,8 @@ def plot_tre(calibration: Calibration, points: int = 61) -> Figure:
         cells[..., 0], cells[..., 1], error, colors="white", linewidths=0.5, levels=5
     )
     axes.clabel(lines, fontsize=6, fmt="%.2f")
-    seen = _targets(answer, recording.calibration.poses)[np.asarray(answer.mask) > 0]
+    poses = recording.calibration.poses[np.asarray(answer.mask) > 0]
+    seen = targets_in_images(poses, answer.image_to_probe, answer.point)
     axes.plot(seen[:, 0], seen[:, 2], "o", ms=1.8, mfc="white", mec="black", mew=0.4)
     axes.set_aspect("equal")
     axes.invert_yaxis()
@@ -238,19 +241,11 @@ def plot_limits(calibration: Calibration) -> Figure:
 
 def _weight(answer: Calibration, recording: Any) -> Float[np.ndarray, "p p"]:
     grid = region_of(answer, recording).grid()[:, [0, 2]]
-    jacobian = image_jacobian(answer, grid)
-    return np.einsum("mia,mib->ab", jacobian, jacobian) / len(grid)
+    return mean_of_squares(image_jacobian(answer, grid))
 
 
 def _one(calibration: Calibration) -> tuple[Calibration, Any]:
     return calibration.numpy(), recording_of(calibration)
-
-
-def _targets(answer: Calibration, poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 3"]:
-    x = np.asarray(answer.image_to_probe)
-    away = np.asarray(answer.point) - poses[:, :3, 3]
-    in_probe = np.einsum("nji,nj->ni", poses[:, :3, :3], away)
-    return (in_probe - x[:3, 3]) @ x[:3, :3]
 
 
 def _scale_bar(axes: Axes, length: float) -> None:

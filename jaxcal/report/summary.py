@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxcal import CalibrationError
 from jaxcal.calibration.result import Calibration
+from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Images, Recording
 from jaxcal.report.record import calibration_record
 
@@ -108,14 +109,8 @@ def html_of(calibration: Calibration) -> str:
     if tre is not None and tre.get("factor") is not None:
         answer, mapped = calibration.numpy(), tre["map"]
         images = recording_of(calibration).calibration
-        x = np.asarray(answer.image_to_probe)
-        used = np.asarray(answer.mask) > 0
-        in_probe = np.einsum(
-            "nji,nj->ni",
-            images.poses[used, :3, :3],
-            np.asarray(answer.point) - images.poses[used, :3, 3],
-        )
-        seen = ((in_probe - x[:3, 3]) @ x[:3, :3])[:, [0, 2]]
+        used = images.poses[np.asarray(answer.mask) > 0]
+        seen = targets_in_images(used, answer.image_to_probe, answer.point)[:, [0, 2]]
         drawn = svg.error_map(
             np.array(mapped["lateral_mm"]),
             np.array(mapped["axial_mm"]),
