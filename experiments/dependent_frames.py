@@ -4,7 +4,7 @@ Holds: k poses with m frames each, 60 in all; every frame adds 0.05 mm of jitter
 errors and offset belong to the hold. Sweeps: 20 frames a second of a probe that moves slowly, with
 offsets (and a part of the other errors) that change over about a second. Each trial is calibrated
 twice: with every frame as an image of its own, and as ``jaxcal.calibrate`` does it, with one image
-for each different pose and, of a sweep, every so many (:mod:`jaxcal.diagnostics.dependence`).
+for each different pose and, of a sweep, every so many (:mod:`jaxcal.calibration.dependence`).
 
 The table has the coverage of the 95 % intervals of X's six parameters (the mean and the lowest),
 the root mean square errors of X and what was stated, the share of trials that would be called good
@@ -27,10 +27,10 @@ from common import arguments, machine, results_folder, write_table
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from jaxcal.calibration.dependence import independent
 from jaxcal.calibration.result import Calibration
 from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.data.recording import make_images
-from jaxcal.diagnostics.dependence import independent
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM
 
 SEED = 20261122

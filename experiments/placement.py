@@ -40,7 +40,7 @@ from hw.midplane.threshold_climb import threshold_climb
 from hw.poses import plan_poses
 from hw.rigid import rigid
 from jaxcal import Problem, Recording, calibrate_batch, make_images, reconstruction_precision, stack
-from jaxcal.data.geometry import rotation_angle
+from jaxcal.data.poses import rotation_angle
 from jaxcal.io.atomic import atomic_path
 
 IMAGES = 60

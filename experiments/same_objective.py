@@ -29,7 +29,7 @@ from jaxcal.backend import (
     circle_residual,
     retract,
 )
-from jaxcal.data.geometry import rotation_angle
+from jaxcal.data.poses import rotation_angle
 from jaxcal.diagnostics.uncertainty import mm_at_target, spectrum, threshold
 from jaxcal.io.atomic import atomic_path
 from jaxcal.model.observations import local_unknowns

@@ -17,7 +17,7 @@ from tank import PERSONS, Points, Tank, draw
 from tank_grid import Grid, padded_problems, precision
 
 from jaxcal import calibrate_batch
-from jaxcal.data.geometry import rotation_angle
+from jaxcal.data.poses import rotation_angle
 from jaxcal.study import ArraySpec, Chunk
 
 SETS = ("AE", "CW", "Auto-AE", "Auto-AE, shortest")

@@ -38,7 +38,7 @@ from jaxcal.model.observations import (
     Points,
     TrackedPoints,
 )
-from jaxcal.model.parameters import RIGID, Blocks, Parameters, retract, size
+from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import (
     channel_residual,
     circle_residual,
@@ -46,6 +46,7 @@ from jaxcal.model.residuals import (
     measurement_residual,
     target_in_image,
 )
+from jaxcal.model.unknowns import RIGID, Blocks, size
 from jaxcal.solvers.general import LevenbergMarquardt, arrow_least_squares
 from jaxcal.solvers.implicit import optimum as implicit_tangent
 from jaxcal.solvers.levenberg_marquardt import minimise

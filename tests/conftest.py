@@ -71,7 +71,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.data import geometry
+from jaxcal.data.poses import rotation_angle
 from jaxcal.runtime import executables
 
 # Many tests look at the insides, which compute in the caller's bits; test_guest.py is about callers
@@ -122,7 +122,7 @@ def select(problem: jaxcal.Problem, rows: object) -> jaxcal.Problem:
 
 
 def angle(first: np.ndarray, second: np.ndarray) -> float:
-    return geometry.rotation_angle(np.asarray(first), np.asarray(second))
+    return rotation_angle(np.asarray(first), np.asarray(second))
 
 
 LONGEST = (

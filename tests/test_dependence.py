@@ -14,16 +14,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal.data.problem import Channels
-from jaxcal.data.recording import make_images
-from jaxcal.diagnostics.dependence import (
+from jaxcal.calibration.dependence import (
     autocorrelation,
     correlation_time,
     displacement,
     independent,
     same_pose,
 )
-from jaxcal.diagnostics.serial_correlation import CHANCE, believed_correlation
+from jaxcal.calibration.serial_correlation import CHANCE, believed_correlation
+from jaxcal.data.problem import Channels
+from jaxcal.data.recording import make_images
 from jaxcal.report.accuracy import GOOD_MM
 
 

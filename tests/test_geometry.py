@@ -9,12 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxcal import InputError
-from jaxcal.data.geometry import (
-    check_poses,
-    nearest_rotations,
-    rotation_angle,
-    rotation_from_vector,
-)
+from jaxcal.data.geometry import rotation_from_vector
+from jaxcal.data.poses import check_poses, nearest_rotations, rotation_angle
 
 
 def random_poses(seed: int, count: int = 5) -> np.ndarray:

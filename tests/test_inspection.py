@@ -23,8 +23,9 @@ from jaxcal.diagnostics.residual_checks import (
 from jaxcal.diagnostics.uncertainty import inverses, quadratic
 from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import Points
-from jaxcal.model.parameters import RIGID, Parameters
+from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import target_in_image
+from jaxcal.model.unknowns import RIGID
 from jaxcal.solvers.levenberg_marquardt import minimise
 
 SIGMA = np.array([0.4, 0.3, 1.0])

@@ -13,8 +13,9 @@ from scipy.optimize import least_squares, minimize
 
 import jaxcal
 from jaxcal import Options
-from jaxcal.model.parameters import RIGID, Parameters, retract
+from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import circle_residual, measurement_residual
+from jaxcal.model.unknowns import RIGID
 
 SETTINGS = [(0.5, 0.05, 0.25), (1.0, 0.5, 1.0), (2.0, 2.0, 1.0), (3.0, 0.5, 2.0), (5.0, 4.0, 4.0),
             (2.0, 10.0, 2.0), (5.0, 0.05, 0.5), (1.0, 2.0, 4.0)]  # fmt: skip

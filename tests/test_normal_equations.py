@@ -32,7 +32,8 @@ from jaxcal.model.observations import (
     TrackedPoints,
     local_unknowns,
 )
-from jaxcal.model.parameters import EXTRA, RIGID, Parameters
+from jaxcal.model.parameters import Parameters
+from jaxcal.model.unknowns import EXTRA, RIGID
 from jaxcal.solvers.levenberg_marquardt import (
     Descent,
     Rounding,

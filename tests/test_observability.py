@@ -14,8 +14,9 @@ from test_geometry import random_poses
 import jaxcal
 from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import InPlane
-from jaxcal.model.parameters import RIGID, Parameters
+from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import target_in_image
+from jaxcal.model.unknowns import RIGID
 from jaxcal.solvers.levenberg_marquardt import minimise
 
 METHODS = [

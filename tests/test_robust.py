@@ -14,7 +14,7 @@ from conftest import problem
 import jaxcal
 from jaxcal.cli.main import main
 from jaxcal.diagnostics import messages
-from jaxcal.model.parameters import RIGID
+from jaxcal.model.unknowns import RIGID
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.study.contamination import OUTLIER_KINDS, contaminate
 

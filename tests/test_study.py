@@ -18,7 +18,6 @@ import pytest
 import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
-from jaxcal.data import geometry
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.study import load_spec, open_results, run_study
 from jaxcal.study.laws import OFFSET_LAWS
@@ -254,7 +253,7 @@ def test_a_trial_is_that_of_the_public_functions(finished):
     stored = data.sel(at)
     assert float(stored.rp) == pytest.approx(float(rp), rel=1e-6)
     found, true = np.asarray(result.image_to_probe), np.asarray(experiment.image_to_probe)
-    turned = geometry.rotation_angle(found, true)
+    turned = rotation_angle(found, true)
     assert float(stored.rotation_error) == pytest.approx(turned, rel=1e-5)
     moved = (found - true)[:3, 3]
     assert float(stored.translation_error) == pytest.approx(np.linalg.norm(moved), rel=1e-5)

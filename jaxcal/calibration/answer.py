@@ -32,9 +32,9 @@ from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.diagnostics.uncertainty import AT_BOUND, LARGEST_SD, mm_at_target, threshold
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, targets
 from jaxcal.model.distributions import OffsetLaw
-from jaxcal.model.parameters import Parameters, block_slice, size
+from jaxcal.model.parameters import Parameters
 from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
-from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, measured
+from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, block_slice, measured, size
 from jaxcal.solvers.dense import inverse_lanes_last
 from jaxcal.solvers.methods import nominal_sound_speed
 

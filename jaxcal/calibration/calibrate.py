@@ -18,6 +18,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.calibration.conventional import closed_form_answer
+from jaxcal.calibration.dependence import independent
 from jaxcal.calibration.inputs import as_batch, converting, unknown_names
 from jaxcal.calibration.options import (
     DELAY_SD_S,
@@ -34,10 +35,10 @@ from jaxcal.calibration.options import (
     with_bound,
 )
 from jaxcal.calibration.result import Calibration
-from jaxcal.data.problem import Problem, is_traced
+from jaxcal.calibration.serial_correlation import widened
+from jaxcal.data.problem import Problem
 from jaxcal.data.recording import Recording
-from jaxcal.diagnostics.dependence import independent
-from jaxcal.diagnostics.serial_correlation import widened
+from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.precision import (
     importing_jax,
     in_own_modes,
@@ -102,9 +103,9 @@ def calibrate(
 
     Returns:
         A :class:`Calibration`; read its ``status`` and ``warnings`` before using it. The frames of
-        one pose count as one image (:mod:`jaxcal.diagnostics.dependence`); the others are masked
+        one pose count as one image (:mod:`jaxcal.calibration.dependence`); the others are masked
         out in the answer and in its ``problem``. Errors that are alike in successive images widen
-        its covariance (:mod:`jaxcal.diagnostics.serial_correlation`). Both are done for one problem
+        its covariance (:mod:`jaxcal.calibration.serial_correlation`). Both are done for one problem
         with concrete arrays only; under jit, vmap or grad, and in batches, images are treated as
         independent.
 

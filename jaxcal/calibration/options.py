@@ -16,10 +16,10 @@ from jaxcal import InputError
 from jaxcal.calibration.names import Data, Method, PriorName, SolverName
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
-from jaxcal.diagnostics.arrays import array_module, is_traced
 from jaxcal.model.distributions import SHAPES, UNIFORM, Shape
 from jaxcal.model.unknowns import EXTRA, MEDIUM, RIGID, Blocks
 from jaxcal.runtime.array_types import AnyArray, Array, Float
+from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.trees import array_tree
 
 if TYPE_CHECKING:

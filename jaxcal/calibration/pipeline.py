@@ -21,7 +21,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, barrier
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.observations import BoundedOffsets, LocalUnknown, local_unknowns
-from jaxcal.model.parameters import Blocks
+from jaxcal.model.unknowns import Blocks
 from jaxcal.runtime.precision import in_standard_promotion
 from jaxcal.solvers import methods
 from jaxcal.solvers.consensus import find_consensus, rigid_model

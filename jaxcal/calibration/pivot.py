@@ -21,14 +21,15 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxcal import InputError
 from jaxcal.calibration.answer import covariance_and_observability
 from jaxcal.calibration.result import Status
-from jaxcal.data.geometry import check_poses
-from jaxcal.data.problem import Problem, is_traced
+from jaxcal.data.poses import check_poses
+from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
 from jaxcal.runtime import buckets, compiler, executables
+from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import (

@@ -22,13 +22,14 @@ from jaxtyping import Array, Float, Key
 
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import calibrate, calibrate_batch
+from jaxcal.calibration.dependence import independent
 from jaxcal.calibration.result import Calibration
-from jaxcal.data.problem import Problem, is_traced
+from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
-from jaxcal.diagnostics.dependence import independent
 from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points, measurement_residual
+from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.precision import in_own_modes
 from jaxcal.solvers import dense
 from jaxcal.solvers.methods import nominal_sound_speed

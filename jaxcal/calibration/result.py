@@ -13,10 +13,10 @@ import numpy as np
 from jaxcal import CalibrationError, InputError
 from jaxcal.calibration.transform import AppliedPoints, ImageTransform, SaveFormat
 from jaxcal.data.problem import Problem
-from jaxcal.diagnostics.arrays import array_module, is_traced
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.unknowns import TABLE, Blocks, in_image
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
+from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.trees import array_tree, map_arrays, static
 
 if TYPE_CHECKING:

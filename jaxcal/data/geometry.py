@@ -9,16 +9,7 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
-
-from jaxcal.data.poses import ROTATION_TOLERANCE as ROTATION_TOLERANCE
-from jaxcal.data.poses import check_poses as check_poses
-from jaxcal.data.poses import nearest_rotations as nearest_rotations
-from jaxcal.data.poses import rotation_angle as rotation_angle
-
-AnyArray = Array | np.ndarray
-"""Public functions of arrays take numpy's as well as JAX's."""
 
 _SMALL_ANGLE_SQUARED = 1e-2
 """rad^2. Below it a series is used: derivatives of quotients divide by powers of the angle."""
@@ -59,6 +50,18 @@ def _series(squared: Float[Array, ""], order: int) -> Float[Array, ""]:
     for power in reversed(range(_TERMS)):
         total = total * squared + (-1) ** power / math.factorial(2 * power + order)
     return total
+
+
+def orthonormal_pair(
+    a: Float[Array, "3 ..."], b: Float[Array, "3 ..."]
+) -> tuple[Float[Array, "3 ..."], Float[Array, "3 ..."]]:
+    """The orthonormal pair nearest to two unit vectors."""
+    # Its diagonals lie along a + b and a - b, which are orthogonal.
+    plus, minus = a + b, a - b
+    plus = plus / jnp.sqrt(jnp.sum(plus**2, axis=0))
+    minus = minus / jnp.sqrt(jnp.sum(minus**2, axis=0))
+    half = math.sqrt(0.5)
+    return half * (plus + minus), half * (plus - minus)
 
 
 def chord_angle(difference: Float[Array, "3 3 *lanes"]) -> Float[Array, "*lanes"]:

@@ -16,9 +16,8 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.probe import CurvilinearProbe
 from jaxcal.data.recording import Images, Kind, Recording, make_images
-from jaxcal.diagnostics.arrays import array_module
-from jaxcal.diagnostics.arrays import is_traced as is_traced
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
+from jaxcal.runtime.arrays import array_module
 from jaxcal.runtime.precision import importing_jax, in_own_modes
 from jaxcal.runtime.trees import array_tree, static
 

@@ -15,8 +15,8 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import Probe
-from jaxcal.diagnostics.arrays import is_traced
 from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.arrays import is_traced
 
 MINIMUM_IMAGES = 4
 """With fewer used images nothing can be solved: 3 residuals an image against 9 unknowns."""

@@ -6,7 +6,7 @@
     summary          all of these for a calibration or a batch
     messages         the same in words
     intervals        confidence intervals and target registration error
-    metrics          reconstruction precision, reproducibility, residual RMS
+    metrics          reconstruction precision, reproducibility
 
 A solve itself leaves X, target, offsets, SDs, covariance and status
 (:mod:`jaxcal.calibration.answer`).

@@ -19,7 +19,7 @@ import numpy as np
 from jaxcal.runtime.array_types import AnyArray, Float
 
 if TYPE_CHECKING:
-    from jaxcal.model.parameters import Blocks
+    from jaxcal.model.unknowns import Blocks
 
 
 def point_jacobian(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from jaxcal.diagnostics.arrays import array_module, traceable
 from jaxcal.runtime.array_types import AnyArray, Float
+from jaxcal.runtime.arrays import array_module, traceable
 
 
 @traceable

@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal.calibration.options import DEFAULT_MAX_ELEVATION_MM
-from jaxcal.diagnostics.arrays import array_module
 from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import TABLE, block_slice
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
+from jaxcal.runtime.arrays import array_module
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration

@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxcal.data.problem import Problem
 from jaxcal.model import unrolled
-from jaxcal.model.parameters import EXTRA, Blocks, Parameters, block_slice, size
-from jaxcal.model.unknowns import step_between, stepped
+from jaxcal.model.parameters import Parameters
+from jaxcal.model.unknowns import EXTRA, Blocks, block_slice, size, step_between, stepped
 from jaxcal.model.unrolled import Matrix, Vector
 
 _CROSS_PLACES = np.array([[0, 2, 1], [2, 0, 0], [1, 0, 0]])

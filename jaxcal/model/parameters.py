@@ -15,13 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.data.geometry import matrix_from_rotation, rotation_from_vector
-from jaxcal.model.unknowns import EXTRA as EXTRA
-from jaxcal.model.unknowns import MEDIUM as MEDIUM
-from jaxcal.model.unknowns import RIGID as RIGID
-from jaxcal.model.unknowns import TABLE, stepped
-from jaxcal.model.unknowns import Blocks as Blocks
-from jaxcal.model.unknowns import block_slice as block_slice
-from jaxcal.model.unknowns import size as size
+from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, block_slice, stepped
 
 
 class Parameters(eqx.Module):

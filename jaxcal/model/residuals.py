@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, Iterate, targets
 from jaxcal.model.observations import ChannelDistances, Further, Points, on_circle
-from jaxcal.model.parameters import EXTRA, RIGID, Parameters
+from jaxcal.model.parameters import Parameters
+from jaxcal.model.unknowns import EXTRA, RIGID
 
 
 def _one_lane(

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.dependence import independent
 from jaxcal.calibration.result import Calibration
 from jaxcal.data.recording import Images, Recording
-from jaxcal.diagnostics.dependence import independent
 from jaxcal.model.unknowns import EXTRA
 from jaxcal.solvers.closed_form.certificate import Certificate, certify
 from jaxcal.solvers.closed_form.single import calibrate_closed_form

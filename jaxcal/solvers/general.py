@@ -30,8 +30,8 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxcal.data.geometry import AnyArray
 from jaxcal.model import unrolled
+from jaxcal.runtime.array_types import AnyArray
 from jaxcal.solvers.levenberg_marquardt import (
     Descent,
     Rounding,

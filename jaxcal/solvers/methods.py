@@ -33,7 +33,7 @@ from jaxcal.model.observations import (
     unit_shape,
     variance_planes,
 )
-from jaxcal.model.parameters import MEDIUM
+from jaxcal.model.unknowns import MEDIUM
 from jaxcal.solvers import implicit
 from jaxcal.solvers.alternating import alternate, bounded
 from jaxcal.solvers.auto import average_over_laws

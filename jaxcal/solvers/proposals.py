@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxcal.data.geometry import orthonormal_pair
 from jaxcal.data.problem import Problem
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points
@@ -90,11 +91,7 @@ def linear_proposals(problem: Problem, subsets: Float[Array, "k n"], *, scaled: 
         columns = dense.solve_positive(matrix, system[:12, 12:])[:6, 0]
         first, third = columns[:3], columns[3:]
         sizes = jnp.stack([jnp.sqrt(jnp.sum(first**2)), jnp.sqrt(jnp.sum(third**2))])
-        a, b = first / sizes[0], third / sizes[1]
-        plus, minus = a + b, a - b
-        plus = plus / jnp.sqrt(jnp.sum(plus**2))
-        minus = minus / jnp.sqrt(jnp.sum(minus**2))
-        lateral, axial = (plus + minus) / jnp.sqrt(2.0), (plus - minus) / jnp.sqrt(2.0)
+        lateral, axial = orthonormal_pair(first / sizes[0], third / sizes[1])
         if scaled:
             lateral, axial = sizes[0] * lateral, sizes[1] * axial
         known = jnp.concatenate([lateral, axial])

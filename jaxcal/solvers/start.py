@@ -34,11 +34,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.calibration.conventional import Start
+from jaxcal.data.geometry import orthonormal_pair
 from jaxcal.model import unrolled
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose, total
 from jaxcal.model.observations import InPlane
-from jaxcal.model.parameters import EXTRA, Blocks, Parameters
-from jaxcal.model.unknowns import TABLE
+from jaxcal.model.parameters import Parameters
+from jaxcal.model.unknowns import EXTRA, TABLE, Blocks
 from jaxcal.solvers import dense
 from jaxcal.solvers.levenberg_marquardt import Descent, minimise
 
@@ -247,14 +248,9 @@ def closed_form(
         known = (size_of > 0.5) & (size_of < 2.0)
         sound = sound & ((size_of > 0) if "scale" in blocks else known)
     eye = jnp.eye(3, dtype=a.dtype)
-    # The diagonals of the orthonormal pair nearest to two unit vectors a, b lie along a + b and
-    # a - b, which are orthogonal.
     a = jnp.where(sound, a / long, eye[:, :1])
     b = jnp.where(sound, b / deep, eye[:, 1:2])
-    plus, minus = a + b, a - b
-    plus = plus / jnp.sqrt(jnp.sum(plus**2, axis=0))
-    minus = minus / jnp.sqrt(jnp.sum(minus**2, axis=0))
-    lateral, axial = (plus + minus) / jnp.sqrt(2.0), (plus - minus) / jnp.sqrt(2.0)
+    lateral, axial = orthonormal_pair(a, b)
     return sums.with_rotation(lateral, axial, blocks), sound, sums
 
 

@@ -29,7 +29,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.data.segmentation.deviations import fit_deviations
 from jaxcal.model import unrolled
 from jaxcal.model.batch import ImagePlanes, Iterate, targets, total
-from jaxcal.model.parameters import RIGID
+from jaxcal.model.unknowns import RIGID
 from jaxcal.solvers.start import ConventionalStart, conventional
 from jaxcal.study.simulation import Protocol, arrange, draw, draw_noise
 

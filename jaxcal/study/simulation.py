@@ -25,12 +25,13 @@ from jaxtyping import Array, Complex64, Float, Int, Key
 from jaxcal import InputError
 from jaxcal.data.geometry import matrix_from_rotation
 from jaxcal.data.probe import L14_5, CurvilinearProbe, Probe
-from jaxcal.data.problem import Channels, Problem, is_traced
+from jaxcal.data.problem import Channels, Problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, Truth, make_images
 from jaxcal.data.segmentation.deviations import fit_deviations, halves
 from jaxcal.data.segmentation.time_of_flight import fit_in_plane
 from jaxcal.model import unrolled
 from jaxcal.runtime import executables
+from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.compiler import ONE_PROBLEM, computed_once
 from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.study import draws

@@ -390,9 +390,19 @@ def flips(recorded: Arrays, found: Arrays) -> dict[str, np.ndarray]:
             differs = differs.reshape(len(differs), -1).any(axis=1)
             if name != "status_code":
                 differs &= answered
+            if name == "differentiable":
+                differs &= ~on_absolute_floor(recorded)
             if differs.any():
                 result[name] = np.flatnonzero(differs)
     return result
+
+
+def on_absolute_floor(recorded: Arrays) -> np.ndarray:
+    """Problems of exact data, whose tuned SDs all rest on their floor of 1e-6 mm.
+
+    The code of that day overlooked this floor and called them differentiable.
+    """
+    return (np.nan_to_num(recorded["sigma"], nan=np.inf) <= 1.001e-6).all(axis=-1)
 
 
 def differences(recorded: Arrays, found: Arrays) -> Arrays:

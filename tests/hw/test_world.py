@@ -12,7 +12,7 @@ from hw.midplane.pattern_injection import bar
 from hw.poses import plan_poses
 from hw.rigid import rigid, rotation_matrix
 from jaxcal import InputError
-from jaxcal.data.geometry import rotation_angle
+from jaxcal.data.poses import rotation_angle
 from jaxcal.data.segmentation.image import localise
 
 

@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxcal import InputError
-from jaxcal.data.geometry import AnyArray
 from jaxcal.data.probe import CurvilinearProbe, Probe
 from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording, make_images
 from jaxcal.data.segmentation.time_of_flight import (
@@ -26,6 +25,7 @@ from jaxcal.data.segmentation.time_of_flight import (
     shortest,
 )
 from jaxcal.runtime import buckets, executables
+from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.compiler import ONE_PROBLEM, batch_wishes, fast_to_run
 from jaxcal.runtime.precision import in_own_modes
 

@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxcal.data.geometry import AnyArray
+from jaxcal.runtime.array_types import AnyArray
 
 # Tukey's bisquare: 95 % efficiency for the position, half breakdown for the S-scale.
 _CUT, _CUT_SCALE = 4.685, 1.547645

@@ -30,9 +30,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal import InputError
-from jaxcal.data.problem import Problem, is_traced
+from jaxcal.data.geometry import orthonormal_pair
+from jaxcal.data.problem import Problem
 from jaxcal.model import unrolled
 from jaxcal.model.unrolled import Matrix, Vector
+from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.precision import in_standard_promotion, own_modes, require_float64, with_dtype
 from jaxcal.solvers.closed_form.certificate import NEARBY, SINGULAR, TOLERANCE
 from jaxcal.solvers.closed_form.reduced_objective import (
@@ -382,19 +384,14 @@ def _feasible(
     """The nearest orthonormal pair, with the scales that are free."""
     pair = x.reshape(2, 3, -1)
     lengths = jnp.sqrt(jnp.sum(pair**2, axis=1))
-    a, b = pair[0] / lengths[0], pair[1] / lengths[1]
-    # The diagonals of the nearest orthonormal pair lie along the sum and the difference.
-    plus, minus = a + b, a - b
-    plus = plus / jnp.sqrt(jnp.sum(plus**2, axis=0))
-    minus = minus / jnp.sqrt(jnp.sum(minus**2, axis=0))
-    half = np.sqrt(0.5)
+    lateral, axial = orthonormal_pair(pair[0] / lengths[0], pair[1] / lengths[1])
     one = jnp.ones_like(lengths[0])
     first, second = {
         (): (one, one),
         ("common",): (0.5 * (lengths[0] + lengths[1]),) * 2,
         ("axial",): (one, lengths[1]),
     }.get(constraints.free, (lengths[0], lengths[1]))
-    return jnp.concatenate([half * first * (plus + minus), half * second * (plus - minus)])
+    return jnp.concatenate([first * lateral, second * axial])
 
 
 def _gap(

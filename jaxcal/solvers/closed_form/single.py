@@ -35,8 +35,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.diagnostics.arrays import is_traced
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import is_traced
 from jaxcal.solvers.closed_form.certificate import Certificate, certify_point, tolerance
 from jaxcal.solvers.closed_form.reduced_objective import (
     ImageData,

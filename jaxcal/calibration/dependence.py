@@ -19,7 +19,7 @@ mean leaves of the errors *within* a hold. The other frames of a group are maske
 residuals of the conventional fit (closed form, :mod:`jaxcal.solvers.closed_form.single`) have an
 integrated autocorrelation time t, and n images are worth n / t independent ones. Where t reaches
 ``STREAM`` images and chance does not explain it, every t-th image is kept. For weaker correlation
-see :mod:`jaxcal.diagnostics.serial_correlation`.
+see :mod:`jaxcal.calibration.serial_correlation`.
 
 References: Wiles, Thompson and Frantz 2004 (accuracy of optical trackers); Sokal 1997,
 section 3 (integrated autocorrelation time); Liang and Zeger 1986 (clustered data).
