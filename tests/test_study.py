@@ -18,6 +18,7 @@ import pytest
 import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
+from jaxcal.data.poses import rotation_angle
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.study import load_spec, open_results, run_study
 from jaxcal.study.laws import OFFSET_LAWS

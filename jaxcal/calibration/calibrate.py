@@ -37,7 +37,7 @@ from jaxcal.calibration.options import (
 from jaxcal.calibration.result import Calibration
 from jaxcal.calibration.serial_correlation import widened
 from jaxcal.data.problem import Problem
-from jaxcal.data.recording import Recording
+from jaxcal.data.recording import MINIMUM_IMAGES, Recording
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.precision import (
     importing_jax,
@@ -46,7 +46,6 @@ from jaxcal.runtime.precision import (
     require_float64,
     with_dtype,
 )
-from jaxcal.solvers.closed_form.reduced_objective import FEWEST_IMAGES
 
 if TYPE_CHECKING:
     from jax import Array
@@ -141,10 +140,10 @@ def calibrate(
         return _solve_alone(problem, given, plan).with_problem(problem)
     joined, found = independent(problem, estimate)
     left = int(np.count_nonzero(np.asarray(joined.mask) > 0))
-    if left < FEWEST_IMAGES:
+    if left < MINIMUM_IMAGES:
         raise InputError(
             f"{found.words or 'too few images'}: {left} images are left, and at least "
-            f"{FEWEST_IMAGES} are needed"
+            f"{MINIMUM_IMAGES} are needed"
         )
     result = _solve_alone(joined, given, plan).with_problem(joined)
     result = replace(result, notes=() if found.words is None else (found.words,))

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 CHANCE = 2.1
 """SDs that the correlation of successive residuals must exceed to be believed."""
 
-FEWEST_IMAGES = 20
+FEWEST_SUCCESSIVE = 20
 """With fewer used images the correlation is not estimated."""
 
 LARGEST = 0.98
@@ -58,7 +58,7 @@ def widened(result: Calibration) -> Calibration:
     covariance = np.asarray(result.unknowns_covariance)
     # Counted by numpy, since JAX would compile the count anew for every number of images.
     used = int(np.sum(np.asarray(result.mask) > 0))
-    if not np.isfinite(covariance).all() or used < FEWEST_IMAGES:
+    if not np.isfinite(covariance).all() or used < FEWEST_SUCCESSIVE:
         return result
     errors, rows = _in_sds(result)
     found = _ratio(errors, rows)

@@ -14,6 +14,7 @@ from jaxcal.diagnostics.offset_fit import contradicted
 from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK, MISFITS
 from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.model.distributions import FAMILIES
+from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.model.unknowns import TABLE, block_slice
 from jaxcal.runtime.array_types import AnyArray
 
@@ -409,7 +410,11 @@ def warnings(result: Calibration) -> list[str]:
     if result.prior in TUNED and not result.sigma_tuned:
         found.append(
             "noise SDs were held fixed, not estimated"
-            + (f": {used} images are fewer than the 8 that it takes" if used < 8 else "")
+            + (
+                f": {used} images are fewer than the {MINIMUM_SELF_TUNING} that it takes"
+                if used < MINIMUM_SELF_TUNING
+                else ""
+            )
         )
     if np.any(result.sigma_floored):
         names = [

@@ -15,6 +15,7 @@ import numpy as np
 from h5py import h5d, h5t  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxcal import FormatError, InputError
+from jaxcal.data.poses import rotations_from_quaternions
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.lines import text_lines
 from jaxcal.io.readable import check_readable, naming, one_line, quoted
@@ -88,18 +89,11 @@ def _euler(angles: np.ndarray, fixed: np.ndarray) -> Float[np.ndarray, "3 3"]:
 
 
 def _versor(vector: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    x, y, z = vector
     squared = vector @ vector
     if squared > 1 + 1e-9:
         raise FormatError("a versor longer than 1")
-    w = np.sqrt(max(0.0, 1 - squared))
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    scalar = np.sqrt(max(0.0, 1 - squared))
+    return rotations_from_quaternions(np.array([[*vector, scalar]]), "xyzw")[0]
 
 
 def itk_text(matrix: Float[np.ndarray, "4 4"]) -> str:

@@ -32,6 +32,7 @@ from jaxtyping import Array, Bool, Float
 from jaxcal import InputError
 from jaxcal.data.geometry import orthonormal_pair
 from jaxcal.data.problem import Problem
+from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.model import unrolled
 from jaxcal.model.unrolled import Matrix, Vector
 from jaxcal.runtime.arrays import is_traced
@@ -39,7 +40,6 @@ from jaxcal.runtime.precision import in_standard_promotion, own_modes, require_f
 from jaxcal.solvers.closed_form.certificate import NEARBY, SINGULAR, TOLERANCE
 from jaxcal.solvers.closed_form.reduced_objective import (
     CONSTRAINTS,
-    FEWEST_IMAGES,
     ROUNDING,
     QuadraticConstraints,
     check_estimate,
@@ -52,7 +52,8 @@ LANES = 256
 NEWTON_STEPS = 30
 MET = 500
 """Constraints are met when they are off by less than this many roundings of |x|^2."""
-CUT = 0.25
+SHORTER = 0.25
+"""Factor on a step that was no better."""
 
 _FIELDS = tuple(ClosedForm.__dataclass_fields__)
 
@@ -202,7 +203,7 @@ def solve_lanes(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     corner = jnp.zeros((len(mask), 4, 4), x.dtype).at[:, 3, 3].set(1.0)
     transform = corner.at[:, :3, :3].set(jnp.moveaxis(rotation, -1, 0)).at[:, :3, 3].set(shift.T)
     rounding = ROUNDING * jnp.finfo(x.dtype).eps
-    certified = definite & (count >= FEWEST_IMAGES)
+    certified = definite & (count >= MINIMUM_IMAGES)
     certified = certified & (gap <= TOLERANCE * objective + rounding * size)
     # All that fits as well lies in a ball about the dual's minimiser (see ``certificate._alone``).
     ball = 4 * (gap + rounding * size)
@@ -324,7 +325,7 @@ def _optimum(
         better = new_off < off
         # Comparisons with NaN are false, so a trial outside is not better.
         outside_at_first = (index == 0) & ~better
-        step = jnp.where(better, new_step, CUT * step)
+        step = jnp.where(better, new_step, SHORTER * step)
         step = jnp.where(outside_at_first, inside - start, step)
         values = jnp.where(better, trial, values)
         values = jnp.where(outside_at_first, start, values)

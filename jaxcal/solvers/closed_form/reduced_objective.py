@@ -25,14 +25,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.runtime.array_types import Bool, Float
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
     from jaxcal.data.recording import Images, Recording
-
-FEWEST_IMAGES = 4
-"""Fewer images give fewer than 12 equations."""
 
 RANK_TOLERANCE = 1e-11
 """Singular values below this share of the largest possible one count as zero."""
@@ -201,10 +199,9 @@ def used_images(
     Raises:
         InputError: NaN, Inf, or fewer than 4 used images.
     """
-    if np.count_nonzero(mask) < FEWEST_IMAGES:
-        raise InputError(
-            f"{np.count_nonzero(mask)} used images are too few: at least {FEWEST_IMAGES} are needed"
-        )
+    count = np.count_nonzero(mask)
+    if count < MINIMUM_IMAGES:
+        raise InputError(f"{count} used images are too few: at least {MINIMUM_IMAGES} are needed")
     for name, values in (("poses", poses), ("measurements", measurements)):
         bad = mask & ~np.isfinite(values).reshape(len(mask), -1).all(axis=1)
         if bad.any():
