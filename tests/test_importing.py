@@ -252,6 +252,33 @@ def test_trackers_exports(tmp_path):
         read_tracker(tmp_path / "t.csv")
 
 
+def test_a_trackers_own_numbers_of_frames(tmp_path):
+    """Points name the numbers in the column Frame; where tools disagree there is none."""
+    head = "Tools,Port 1: Probe,Frame,Face,State,Q0,Qx,Qy,Qz,Tx,Ty,Tz,Error"
+    rows = [
+        f"1,Port 1: Probe,{10 + k},0,OK,"
+        + ",".join(f"{x:.12f}" for x in [*QUATERNIONS[k, [3, 0, 1, 2]], *TRANSLATIONS[k]])
+        + ",0.1"
+        for k in range(6)
+    ]
+    (tmp_path / "t.csv").write_text("\n".join([head, *rows]))
+    lines = table(["frame", "u", "v"], [[14, 11, 12, 13], PIXELS[[4, 1, 2, 3]]])
+    (tmp_path / "p.csv").write_text("\n".join(lines).replace(".0,", ",", 4))
+    images = import_files([tmp_path / "t.csv", tmp_path / "p.csv"])[0].calibration
+    np.testing.assert_allclose(images.poses, POSES[1:5], atol=1e-9)
+    np.testing.assert_allclose(images.measurements, PIXELS[1:5])
+    (tmp_path / "p.csv").write_text("frame,u,v\n1,2,3\n")
+    with pytest.raises(InputError, match=r"p\.csv:2: frame 1 is not .* has frames 10 to 15"):
+        import_files([tmp_path / "t.csv", tmp_path / "p.csv"])
+    (tmp_path / "t.csv").write_text("\n".join([head, *rows, rows[0]]))
+    (tmp_path / "p.csv").write_text("frame,u,v\n10,2,3\n")
+    with pytest.raises(InputError, match=r"p\.csv:2: several frames of .* have the number 10"):
+        import_files([tmp_path / "t.csv", tmp_path / "p.csv"])
+    for text, numbers in ((NDI, [-1, -1]), (OLD_NDI, [7]), (MOTIVE, [0, 1])):
+        (tmp_path / "t.csv").write_text(text)
+        np.testing.assert_array_equal(read_tracker(tmp_path / "t.csv").numbers, numbers)
+
+
 # Sequences with points from another file.
 
 

@@ -7,6 +7,7 @@ import os
 import struct
 import warnings
 import zlib
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
 import h5py
@@ -20,7 +21,9 @@ import jaxcal
 from jaxcal import FormatError, InputError, MissingExtraError
 from jaxcal.cli.main import main
 from jaxcal.io.dicom import read_pixel_size
+from jaxcal.io.folder import read_folder
 from jaxcal.io.importing import ImportOptions, import_files
+from jaxcal.io.picker.picks import Picks
 from jaxcal.io.png import encode_png, png_size, read_png
 from jaxcal.io.sequence_files import read_sequence, write_sequence
 
@@ -190,7 +193,12 @@ def test_images_without_a_pose_are_counted(tmp_path, folder):
     [
         ("file,", lambda k: "c1.png,", range(4), "p.csv:2: there is no image 'c1.png'"),
         ("file,", lambda k: "b3.png,", range(4), "two poses for 'b3.png'"),
-        ("frame,", lambda k: f"{k},", range(4), "p.csv:2: no image in"),
+        (
+            "frame,",
+            lambda k: f"{k},",
+            range(4),
+            "p.csv:2: frame 0 is not in the sequence, which has frames 2 to 10",
+        ),
         ("", lambda k: "", range(4), "4 poses, but"),
         ("u,v,", lambda k: "1,1,", range(COUNT), "holds points as well as poses"),
     ],
@@ -207,14 +215,68 @@ def test_a_folder_alone_asks_for_its_poses(tmp_path, folder, capsys):
     assert "name the file with its poses (--poses)" in capsys.readouterr().err
 
 
-def test_a_folder_and_points(tmp_path, folder):
-    """Frames count from 0 in the order of the files."""
-    table = pose_table(tmp_path / "p.csv", "", lambda k: "")
-    lines = [f"{k},{u!r},{v!r}" for k, (u, v) in enumerate(POINTS.tolist())]
-    (tmp_path / "uv.csv").write_text("\n".join(["frame,u,v", *lines]))
+@pytest.mark.parametrize("column", ["frame", "file"])
+def test_a_folder_and_points(tmp_path, folder, column):
+    """Both tables call an image by the number that ends its name, or by the name."""
+    table = pose_table(tmp_path / "p.csv", "frame,", lambda k: f"{k + 2},")
+    names = [str(k + 2) if column == "frame" else f"b{k + 2}.png" for k in range(COUNT)]
+    lines = [f"{name},{u!r},{v!r}" for name, (u, v) in zip(names, POINTS.tolist(), strict=True)]
+    (tmp_path / "uv.csv").write_text("\n".join([f"{column},u,v", *lines[5:], *lines[1:4]]))
     recording, _, frames = import_files([folder, tmp_path / "uv.csv"], ImportOptions(poses=table))
-    np.testing.assert_allclose(recording.calibration.measurements, POINTS)
+    used = [1, 2, 3, 5, 6, 7, 8]
+    np.testing.assert_allclose(recording.calibration.measurements, POINTS[used])
+    np.testing.assert_allclose(recording.calibration.poses, POSES[used], atol=1e-9)
     assert frames is None
+
+
+def test_picks_in_a_folder_name_the_images(tmp_path, folder):
+    """They are read again with the poses that a table gives to the numbers in the names."""
+    out = tmp_path / "picks.csv"
+    images = read_folder(folder)
+    for k in (0, 3, 4, 6):
+        # Opened anew each time: the points of before are kept.
+        picks = Picks(out, "images", (COLUMNS, ROWS), COUNT, range(COUNT), images.files)
+        picks.pick(k, *POINTS[k].tolist())
+    table = pose_table(tmp_path / "p.csv", "frame,", lambda k: f"{k + 2},")
+    recording, _, _ = import_files([folder, out], ImportOptions(poses=table))
+    np.testing.assert_allclose(recording.calibration.measurements, POINTS[[0, 3, 4, 6]])
+    np.testing.assert_allclose(recording.calibration.poses, POSES[[0, 3, 4, 6]], atol=1e-9)
+
+
+def test_names_without_numbers_are_not_counted(tmp_path, folder):
+    table = pose_table(tmp_path / "p.csv", "", lambda k: "")
+    for name in folder.glob("*.png"):
+        name.rename(folder / f"{name.stem}x.png")
+    (tmp_path / "uv.csv").write_text("frame,u,v\n0,1,1\n")
+    with pytest.raises(InputError, match=r"uv\.csv:2: frames of .* have no numbers"):
+        import_files([folder, tmp_path / "uv.csv"], ImportOptions(poses=table))
+
+
+def dated(path: Path, first: datetime, seconds, rest: str = "", rows=None) -> Path:
+    """A table whose first column is a date."""
+    stamps = [(first + timedelta(seconds=float(t))).isoformat() for t in seconds]
+    cells = [f"{stamp},{row}" for stamp, row in zip(stamps, rows or [], strict=True)]
+    path.write_text("\n".join([f"time,{rest}", *cells]))
+    return path
+
+
+def test_dates_are_matched_with_dates(tmp_path, folder):
+    """Tables that begin at different moments; a zone of their own changes nothing."""
+    first = datetime(2026, 11, 21, 21, 0, tzinfo=UTC)
+    quaternions = Rotation.from_matrix(POSES[:, :3, :3]).as_quat()
+    rows = [
+        ",".join(repr(float(x)) for x in [*POSES[k, :3, 3], *quaternions[k]]) for k in range(COUNT)
+    ]
+    poses = dated(tmp_path / "p.csv", first, np.arange(COUNT) / 10, "x,y,z,qx,qy,qz,qw", rows)
+    used = range(3, COUNT)
+    points = [f"{u!r},{v!r}" for u, v in POINTS[3:].tolist()]
+    elsewhere = first.astimezone(timezone(timedelta(hours=2)))
+    uv = dated(tmp_path / "uv.csv", elsewhere, np.array(used) / 10 + 0.01, "u,v", points)
+    images = import_files([folder, uv], ImportOptions(poses=poses))[0].calibration
+    np.testing.assert_allclose(images.poses, POSES[used], atol=1e-9)
+    uv = dated(tmp_path / "uv.csv", first.replace(tzinfo=None), np.array(used) / 10, "u,v", points)
+    with pytest.raises(InputError, match="give its dates a time zone"):
+        import_files([folder, uv], ImportOptions(poses=poses))
 
 
 # PNG files, which are not trusted.
@@ -331,6 +393,31 @@ def test_poses_by_time(tmp_path, kind, lag, capsys):
     for axis in range(3):
         places = np.interp(there, MOMENTS, whole[:, axis, 3])
         np.testing.assert_allclose(images.poses[:, axis, 3], places, atol=1e-9)
+
+
+@pytest.mark.parametrize("what", ["poses", "points"])
+def test_dates_are_not_matched_with_seconds(tmp_path, what, capsys):
+    """The table's first row is not the sequence's first frame."""
+    times = 10.0 + np.arange(COUNT) / 10
+    write_sequence(tmp_path / "i.igs.mha", {PAIR: POSES}, times)
+    first = datetime(2026, 11, 21, 21, 0)
+    points = [f"{u!r},{v!r}" for u, v in POINTS.tolist()]
+    if what == "points":
+        uv = dated(tmp_path / "t.csv", first, np.arange(3, COUNT) / 10, "u,v", points[3:])
+        arguments = []
+    else:
+        uv = tmp_path / "uv.csv"
+        uv.write_text("\n".join(["u,v", *points]))
+        rows = [",".join(repr(float(x)) for x in pose[:3].ravel()) for pose in moving(MOMENTS)]
+        names = ",".join(f"m{i}{j}" for i in range(1, 4) for j in range(1, 5))
+        log = dated(tmp_path / "t.csv", first, MOMENTS - 100.1, names, rows)
+        arguments = ["--poses", str(log)]
+    out = tmp_path / "o.h5"
+    assert main(["import", str(tmp_path / "i.igs.mha"), str(uv), str(out), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert "t.csv: its times are dates, those of" in error
+    assert error.count("\n") == 1
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(

@@ -41,8 +41,8 @@ from jaxcal.cli.sequence_options import search_options, tracking_options
 @click.option(
     "--points",
     type=click.Choice(["labels", "order"]),
-    help="How points of Slicer belong to frames: by the number that ends each label (frames count "
-    "from 0), or one for each frame.",
+    help="How points of Slicer belong to frames: by the number that ends each label, or one for "
+    "each frame.",
 )
 @search_options
 def import_(sources: tuple[str, ...], out: str, **options: Any) -> int:

@@ -48,7 +48,7 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
     shown, size, notes = frames_to_show(sequence, asked, every)
     name = Path(os.path.abspath(frames)).name
     out = str(Path(frames).parent / f"{name.split('.')[0]}-picks.csv") if picks is None else picks
-    placed = Picks(out, name, size, len(sequence), shown)
+    placed = Picks(out, name, size, len(sequence), shown, sequence.files)
     pictures = Frames(sequence, asked.orientation)
     # What cannot be shown is said here, not on the page.
     pictures.png(shown[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from jaxcal.io.png import png_size
 from jaxcal.io.readable import one_line, quoted
 from jaxcal.io.sequence import FolderPixels, TrackedSequence
 from jaxcal.io.text import PoseTable
+from jaxcal.runtime.array_types import Int
 
 MOST_IMAGES = 100_000
 PROBE_TO_TRACKER = ("Probe", "Tracker")
@@ -50,6 +52,8 @@ def read_folder(path: str | os.PathLike[str]) -> TrackedSequence:
                 f"{each}: has {other[0]} x {other[1]} px, {paths[0].name} has {size[0]} x {size[1]}"
             )
     count = len(paths)
+    # The number that ends a name is how tables call an image.
+    endings = [re.search(r"(\d{1,9})$", each.stem) for each in paths]
     return TrackedSequence(
         {},
         {},
@@ -57,6 +61,7 @@ def read_folder(path: str | os.PathLike[str]) -> TrackedSequence:
         np.ones(count, bool),
         FolderPixels(tuple(paths), *size),
         name,
+        np.array([-1 if found is None else int(found[1]) for found in endings]),
     )
 
 
@@ -83,7 +88,7 @@ def with_pose_table(images: TrackedSequence, table: PoseTable) -> tuple[TrackedS
         raise InputError(
             f"{table.name}: holds points as well as poses: import it by itself, without images"
         )
-    rows = _rows(images, images.pixels.paths, table)
+    rows = _rows(images, table)
     values, counts = np.unique(rows, return_counts=True)
     if (counts > 1).any():
         name = images.pixels.paths[int(values[counts > 1][0])].name
@@ -98,47 +103,42 @@ def with_pose_table(images: TrackedSequence, table: PoseTable) -> tuple[TrackedS
     missing = count - len(rows)
     if missing:
         notes.append(f"{missing} of {count} images have no pose in {table.name}")
-    return TrackedSequence(
-        {PROBE_TO_TRACKER: poses},
-        {PROBE_TO_TRACKER: valid},
-        time,
-        images.image_valid,
-        images.pixels,
-        images.source,
+    return replace(
+        images,
+        transforms={PROBE_TO_TRACKER: poses},
+        valid={PROBE_TO_TRACKER: valid},
+        time=time,
+        clock=table.clock,
     ), notes
 
 
-def _rows(images: TrackedSequence, paths: tuple[Path, ...], table: PoseTable) -> np.ndarray:
+def rows_by_file(images: TrackedSequence, table: PoseTable) -> Int[np.ndarray, " m"]:
+    """The image that each row of a table belongs to, by its column ``file``.
+
+    Raises:
+        InputError: a name that no image has; one line with file and line.
+    """
+    assert isinstance(images.pixels, FolderPixels)
+    assert table.file is not None
+    paths = images.pixels.paths
+    places = {path.name: index for index, path in enumerate(paths)}
+    places |= {path.stem: index for path, index in zip(paths, places.values(), strict=True)}
+    named = [re.split(r"[/\\]", text)[-1] for text in table.file]
+    unknown = [row for row, text in enumerate(named) if text not in places]
+    if unknown:
+        raise InputError(
+            f"{table.name}:{table.lines[unknown[0]]}: there is no image "
+            f"{quoted(named[unknown[0]])} in {images.source}"
+        )
+    return np.array([places[text] for text in named])
+
+
+def _rows(images: TrackedSequence, table: PoseTable) -> Int[np.ndarray, " m"]:
     """The image that each row of the table belongs to."""
     if table.file is not None:
-        places = {path.name: index for index, path in enumerate(paths)}
-        places |= {path.stem: index for path, index in zip(paths, places.values(), strict=True)}
-        named = [re.split(r"[/\\]", text)[-1] for text in table.file]
-        unknown = [row for row, text in enumerate(named) if text not in places]
-        if unknown:
-            raise InputError(
-                f"{table.name}:{table.lines[unknown[0]]}: there is no image "
-                f"{quoted(named[unknown[0]])} in {images.source}"
-            )
-        return np.array([places[text] for text in named])
+        return rows_by_file(images, table)
     if table.frame is not None:
-        numbers: dict[int, int] = {}
-        for index, path in enumerate(paths):
-            digits = re.search(r"(\d{1,9})$", path.stem)
-            if digits is None:
-                raise InputError(
-                    f"{path}: its name does not end in a number, by which {table.name} would "
-                    "name it: use a column file"
-                )
-            if numbers.setdefault(int(digits[1]), index) != index:
-                raise InputError(f"{path}: another image has the number {int(digits[1])} too")
-        unknown = [row for row, frame in enumerate(table.frame) if int(frame) not in numbers]
-        if unknown:
-            raise InputError(
-                f"{table.name}:{table.lines[unknown[0]]}: no image in {images.source} has the "
-                f"number {table.frame[unknown[0]]}"
-            )
-        return np.array([numbers[int(frame)] for frame in table.frame])
+        return images.rows_of(table.frame, [f"{table.name}:{line}" for line in table.lines])
     if len(table) != len(images):
         raise InputError(
             f"{table.name}: {len(table)} poses, but {images.source} has {len(images)} images: name "

@@ -9,6 +9,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.io.folder import rows_by_file
+from jaxcal.io.poses_by_time import times_of_table
 from jaxcal.io.readable import naming, quoted
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.slicer import pixels_from_markups, read_markups
@@ -17,7 +19,7 @@ from jaxcal.runtime.array_types import Float, Int
 
 Assignment = Literal["order", "labels"]
 """How points without a time or a frame's number are assigned to frames: one for each frame in
-order, or by the number at the end of each point's label, with frames counted from 0."""
+order, or by the frame's number at the end of each point's label."""
 
 _SLACK = 0.5
 """A point belongs to the frame nearest in time, within this part of the median interval."""
@@ -27,7 +29,7 @@ class FramePoints(NamedTuple):
     """Points and the frames that they are in.
 
     Attributes:
-        rows: (m,) numbers of the frames, none twice.
+        rows: (m,) places of the frames in the sequence, none twice.
         points: (m, 2): [u, v] px, or [lateral, range] mm.
         kind: of the points.
         notes: what was left out, in words.
@@ -53,7 +55,7 @@ def points_of_markups(
         pixels = pixels_from_markups(markups)
         rows = _rows_of_markups(markups.labels, sequence, assignment)
     notes = [f"{name}: {markups.unplaced} points were not placed"] if markups.unplaced else []
-    return FramePoints(_distinct(rows, name), pixels, "pixel", notes)
+    return FramePoints(_distinct(rows, sequence, name), pixels, "pixel", notes)
 
 
 def points_of_table(
@@ -69,23 +71,16 @@ def points_of_table(
     with naming(table.name):
         rows = _rows_of_table(table, sequence, assignment)
     notes = [f"{table.name}: {table.skipped} invalid rows left out"] if table.skipped else []
-    return FramePoints(_distinct(rows, table.name), table.points, table.kind, notes)
+    return FramePoints(_distinct(rows, sequence, table.name), table.points, table.kind, notes)
 
 
-def _distinct(rows: Int[np.ndarray, " m"], name: str) -> Int[np.ndarray, " m"]:
+def _distinct(
+    rows: Int[np.ndarray, " m"], sequence: TrackedSequence, name: str
+) -> Int[np.ndarray, " m"]:
     values, counts = np.unique(rows, return_counts=True)
     if (counts > 1).any():
-        raise InputError(f"{name}: frame {values[counts > 1][0]} has more than one point")
-    return rows
-
-
-def _in_range(rows: Int[np.ndarray, " m"], sequence: TrackedSequence) -> Int[np.ndarray, " m"]:
-    bad = np.flatnonzero((rows < 0) | (rows >= len(sequence)))
-    if len(bad):
-        raise InputError(
-            f"frame {rows[bad[0]]} is not in the sequence, which has frames 0 to "
-            f"{len(sequence) - 1}"
-        )
+        twice = sequence.frame_name(int(values[counts > 1][0]))
+        raise InputError(f"{name}: {twice} has more than one point")
     return rows
 
 
@@ -101,7 +96,7 @@ def _rows_of_markups(
     if assignment is None:
         raise InputError(
             "say how points belong to frames: --points labels (each label ends in a frame's "
-            "number, from 0) or --points order (one point for each frame)"
+            "number) or --points order (one point for each frame)"
         )
     if assignment == "order":
         return _in_order(len(labels), sequence)
@@ -113,17 +108,22 @@ def _rows_of_markups(
                 f"point {index + 1}: its label {quoted(label)} does not end in a frame's number"
             )
         rows.append(int(digits))
-    return _in_range(np.array(rows, dtype=np.int64), sequence)
+    places = [f"point {index + 1}" for index in range(len(rows))]
+    return sequence.rows_of(np.array(rows, dtype=np.int64), places)
 
 
 def _rows_of_table(
     table: PoseTable, sequence: TrackedSequence, assignment: Assignment | None
 ) -> Int[np.ndarray, " m"]:
+    if table.file is not None and sequence.files:
+        return rows_by_file(sequence, table)
     if table.frame is not None:
-        return _in_range(table.frame, sequence)
+        return sequence.rows_of(table.frame, [f"{table.name}:{line}" for line in table.lines])
+    if assignment == "order":
+        return _in_order(len(table), sequence)
     if table.time is not None and np.isfinite(sequence.time).all() and len(sequence) > 1:
         return _nearest_in_time(table, sequence)
-    if assignment == "order" or len(table) == len(sequence):
+    if len(table) == len(sequence):
         return _in_order(len(table), sequence)
     raise InputError(
         "has neither a column frame nor time stamps that the sequence has: which frames are the "
@@ -132,16 +132,16 @@ def _rows_of_table(
 
 
 def _nearest_in_time(table: PoseTable, sequence: TrackedSequence) -> Int[np.ndarray, " m"]:
-    assert table.time is not None
+    asked = times_of_table(table, sequence)
     order = np.argsort(sequence.time, kind="stable")
     time = sequence.time[order]
     slack = _SLACK * float(np.median(np.diff(time)))
-    after = np.clip(np.searchsorted(time, table.time), 1, len(time) - 1)
-    nearer = after - (table.time - time[after - 1] < time[after] - table.time)
-    far = np.flatnonzero(np.abs(time[nearer] - table.time) > slack)
+    after = np.clip(np.searchsorted(time, asked), 1, len(time) - 1)
+    nearer = after - (asked - time[after - 1] < time[after] - asked)
+    far = np.flatnonzero(np.abs(time[nearer] - asked) > slack)
     if len(far):
         raise InputError(
-            f"line {table.lines[int(far[0])]}: no frame was taken at {table.time[far[0]]:.6g} s "
+            f"line {table.lines[int(far[0])]}: no frame was taken at {asked[far[0]]:.6g} s "
             f"(the sequence lasts from {time[0]:.6g} to {time[-1]:.6g} s)"
         )
     return order[nearer]

@@ -19,10 +19,10 @@ import numpy as np
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import QuaternionOrder
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
-from jaxcal.io.folder import read_folder, with_pose_table
+from jaxcal.io.folder import PROBE_TO_TRACKER, read_folder, with_pose_table
 from jaxcal.io.frame_names import FramePair, capitalised
 from jaxcal.io.frame_points import Assignment, points_of_markups, points_of_table
-from jaxcal.io.poses_by_time import with_poses_by_time
+from jaxcal.io.poses_by_time import times_of_table, with_poses_by_time
 from jaxcal.io.readable import quoted
 from jaxcal.io.sequence import FolderPixels, TrackedSequence
 from jaxcal.io.sequence_files import EXTENSIONS, read_sequence
@@ -212,15 +212,18 @@ def _from_sequence(
         placed = points_of_markups(points, sequence, options.points)
     else:
         placed = points_of_table(_table(points, options), sequence, options.points)
-    used = valid[placed.rows]
+    # In the order of the frames, so that times do not go back.
+    order = np.argsort(placed.rows)
+    rows = placed.rows[order]
+    used = valid[rows]
     notes += placed.notes
     if (~used).any():
         notes.append(f"{int((~used).sum())} points left out: their frame's tracking was not OK")
-    rows = placed.rows[used]
+    rows = rows[used]
     time, said = _time(sequence, rows, options)
     images = make_images(
         poses[rows],
-        placed.points[used],
+        placed.points[order][used],
         placed.kind,
         time=time,
         spacing_mm=spacing,
@@ -256,7 +259,8 @@ def open_sequence(
         if table.poses is None or table.time is None:
             raise InputError(f"{table.name}: needs columns of times and of poses")
         found, valid = table.poses, np.ones(len(table), bool)
-        pair, time, said = ("Probe", "Tracker"), table.time, _skipped(table)
+        pair, time = PROBE_TO_TRACKER, times_of_table(table, sequence)
+        said = _skipped(table)
     else:
         tracking = _read_tracked(options.poses)
         start, end, said = _frames(tracking, options)
@@ -392,8 +396,9 @@ def _time(
         return time, []
     if options.ignore_time:
         return None, ["time stamps repeat or go back: not kept"]
+    name = sequence.frame_name(int(rows[order][back[0] + 1]))
     raise InputError(
-        f"{sequence.source}: frame {rows[order][back[0] + 1]}: the time stamp is not later than "
+        f"{sequence.source}: {name}: the time stamp is not later than "
         "the one before: two recordings in one? (--ignore-time imports without times)"
     )
 

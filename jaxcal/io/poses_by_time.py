@@ -10,10 +10,34 @@ from jaxcal import InputError
 from jaxcal.data.timing import can_interpolate, interpolate_poses
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.sequence import TrackedSequence
+from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Bool, Float
 
 LONGEST_GAP = 5.0
 """Longest time between two poses that is bridged, in median intervals."""
+
+
+def times_of_table(table: PoseTable, sequence: TrackedSequence) -> Float[np.ndarray, " m"]:
+    """Times of a table on the clock of a sequence, s.
+
+    Raises:
+        InputError: dates beside seconds, or with a time zone beside without: two clocks.
+    """
+    assert table.time is not None
+    if table.clock is None and sequence.clock is None:
+        return table.time
+    if table.clock is None or sequence.clock is None:
+        dated = ("seconds", "dates") if table.clock is None else ("dates", "seconds")
+        raise InputError(
+            f"{table.name}: its times are {dated[0]}, those of {sequence.source} {dated[1]}: "
+            "give them on the same clock"
+        )
+    if (table.clock.tzinfo is None) != (sequence.clock.tzinfo is None):
+        raise InputError(
+            f"{table.name}: give its dates a time zone if those of {sequence.source} have one, and "
+            "none if they have none"
+        )
+    return table.time + (table.clock - sequence.clock).total_seconds()
 
 
 def with_poses_by_time(

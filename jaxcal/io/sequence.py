@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +20,7 @@ from jaxcal.io.frame_names import FramePair, path_between
 from jaxcal.io.grey import grey_of
 from jaxcal.io.pixel_stream import Packing, PixelStream
 from jaxcal.io.readable import quoted
-from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.array_types import Bool, Float, Int
 
 Orientation = Literal["MF", "UF", "MN", "UN"]
 """Orientation of stored pixels. M or U: a row ends at the marked or the unmarked side. F or N: a
@@ -101,6 +102,9 @@ class TrackedSequence:
         image_valid: (n,) whether a frame's pixels are there and were not marked as invalid.
         pixels: where they are; None for tracking alone.
         source: the file.
+        numbers: (n,) by which other files name the frames, -1 for a frame without one; None: frames
+            count from 0.
+        clock: the date from which times count; None: they are seconds of a device's own clock.
     """
 
     transforms: Mapping[FramePair, Float[np.ndarray, "n 4 4"]]
@@ -109,9 +113,58 @@ class TrackedSequence:
     image_valid: Bool[np.ndarray, " n"]
     pixels: Pixels | Hdf5Pixels | FolderPixels | None = None
     source: str = field(default="memory", compare=False)
+    numbers: Int[np.ndarray, " n"] | None = None
+    clock: datetime | None = None
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of the images of a folder; empty for other sequences."""
+        found = self.pixels.paths if isinstance(self.pixels, FolderPixels) else ()
+        return tuple(path.name for path in found)
+
+    def frame_name(self, row: int) -> str:
+        """What a frame is called in other files, for messages."""
+        if self.files:
+            return quoted(self.files[row])
+        return f"frame {row if self.numbers is None else self.numbers[row]}"
+
+    def rows_of(
+        self, numbers: Int[np.ndarray, " m"], labels: Sequence[str]
+    ) -> Int[np.ndarray, " m"]:
+        """Places of frames in the sequence by the numbers that other files give them.
+
+        Args:
+            numbers: (m,) of frames.
+            labels: m texts that say where each stands, for messages.
+
+        Raises:
+            InputError: a number that no frame has, or that several have.
+        """
+        known = np.arange(len(self)) if self.numbers is None else self.numbers
+        order = np.argsort(known, kind="stable")
+        first, after = (
+            np.searchsorted(known, numbers, side=side, sorter=order) for side in ("left", "right")
+        )
+        bad = np.flatnonzero(after - first != 1)
+        if not len(bad):
+            return order[first]
+        where, number = labels[bad[0]], numbers[bad[0]]
+        if after[bad[0]] > first[bad[0]]:
+            raise InputError(f"{where}: several frames of {self.source} have the number {number}")
+        stated = known[known >= 0]
+        if not len(stated):
+            raise InputError(
+                f"{where}: frames of {self.source} have no numbers: name them by time, or images "
+                "by a column file"
+            )
+        own = "" if self.numbers is None else " (the numbers in its own files)"
+        raise InputError(
+            f"{where}: frame {number} is not in the sequence, which has frames {stated.min()} to "
+            f"{stated.max()}{own}"
+        )
 
     def frames(self) -> list[str]:
         """Names of all coordinate frames, in the order of the transforms."""

@@ -104,7 +104,7 @@ def search_target(
     rows = np.flatnonzero(fate == NOT_CREDIBLE)
     search: dict[str, Any] = {"region": region}
     for row, frame in zip(rows, sequence.images(rows, orientation=orientation), strict=True):
-        with naming(f"{sequence.source}: frame {row}"):
+        with naming(f"{sequence.source}: {sequence.frame_name(int(row))}"):
             located = localise(frame, target, **search)
         contrast[row], margin[row] = located.contrast_db[0], located.margin_db[0]
         reason[row] = located.reason[0]

@@ -56,6 +56,7 @@ class PoseTable:
         points: (n, 2): [u, v] px, or [lateral, range] mm.
         kind: of the points.
         time: (n,) s.
+        clock: the date from which times count; None where they are numbers.
         frame: (n,) number of the image.
         file: n names of images' files.
         skipped: rows that were left out as invalid.
@@ -67,6 +68,7 @@ class PoseTable:
     points: Float[np.ndarray, "n 2"] | None = None
     kind: Literal["pixel", "point"] = "pixel"
     time: Float[np.ndarray, " n"] | None = None
+    clock: datetime | None = None
     frame: Int[np.ndarray, " n"] | None = None
     file: tuple[str, ...] | None = None
     skipped: int = 0
@@ -109,6 +111,11 @@ def read_pose_table(
             points = table.numbers(columns.point, rows)
             if unit != "px":
                 points, kind = points * LENGTHS_MM[unit], "point"
+        time, clock = (
+            (None, None)
+            if columns.time is None
+            else _times(table, columns.time, columns.time_s, rows)
+        )
         frame = None
         if columns.frame is not None:
             frame = _whole_numbers(table, columns.frame, rows)
@@ -121,7 +128,8 @@ def read_pose_table(
             poses=_poses(table, columns, rows, pose_units),
             points=points,
             kind="pixel" if kind == "pixel" else "point",
-            time=None if columns.time is None else _times(table, columns, rows),
+            time=time,
+            clock=clock,
             frame=frame,
             file=file,
             skipped=skipped,
@@ -348,13 +356,13 @@ def _whole_numbers(table: Table, column: int, rows: list[int]) -> Int[np.ndarray
     return values.astype(np.int64)
 
 
-def _times(table: Table, columns: Columns, rows: list[int]) -> Float[np.ndarray, " n"]:
-    """Seconds; dates by ISO 8601 count from the first one."""
-    column = columns.time
-    assert column is not None
+def _times(
+    table: Table, column: int, unit_s: float, rows: list[int]
+) -> tuple[Float[np.ndarray, " n"], datetime | None]:
+    """Seconds, and for dates by ISO 8601 the first one, from which they count."""
     dates = [_date(table.rows[row][column]) for row in rows]
     if dates[0] is None:
-        return table.numbers((column,), rows)[:, 0] * columns.time_s
+        return table.numbers((column,), rows)[:, 0] * unit_s, None
     values = []
     for row, date in zip(rows, dates, strict=True):
         if date is None or (date.tzinfo is None) != (dates[0].tzinfo is None):
@@ -363,7 +371,7 @@ def _times(table: Table, columns: Columns, rows: list[int]) -> Float[np.ndarray,
                 f"{quoted(table.rows[row][column])}"
             )
         values.append((date - dates[0]).total_seconds())
-    return np.array(values)
+    return np.array(values), dates[0]
 
 
 def _date(text: str) -> datetime | None:

@@ -39,7 +39,8 @@ def read_tracker(path: str | os.PathLike[str]) -> TrackedSequence:
     """Read an export of NDI ToolBox or of Motive; the file is not trusted.
 
     Returns:
-        Transforms, mm, by (tool, ``Tracker``), valid where the tool was seen.
+        Transforms, mm, by (tool, ``Tracker``), valid where the tool was seen. Frames have the
+        numbers of the file's column Frame.
 
     Raises:
         FormatError: neither of the two, or a row that cannot be read; file and line are named.
@@ -71,7 +72,12 @@ class _Tool:
 
 
 def _sequence(
-    tools: dict[str, _Tool], time: list[float], lines: list[int], factor: float, name: str
+    tools: dict[str, _Tool],
+    time: list[float],
+    numbers: list[int],
+    lines: list[int],
+    factor: float,
+    name: str,
 ) -> TrackedSequence:
     if not time:
         raise FormatError("holds no rows")
@@ -88,7 +94,12 @@ def _sequence(
         poses[~good] = np.nan
         transforms[tool, TRACKER], valid[tool, TRACKER] = poses, good
     return TrackedSequence(
-        transforms, valid, np.array(time), np.zeros(len(time), bool), source=name
+        transforms,
+        valid,
+        np.array(time),
+        np.zeros(len(time), bool),
+        source=name,
+        numbers=np.array(numbers),
     )
 
 
@@ -106,6 +117,13 @@ def _numbers(cells: list[str], columns: list[int], line: int) -> list[float] | N
             return None
         values.append(value)
     return values
+
+
+def _frame_number(cells: list[str], columns: list[int]) -> int:
+    """The frame's number, where all these columns that hold one agree; else -1."""
+    found = {cells[column].strip() for column in columns if column < len(cells)} - {""}
+    text = found.pop() if len(found) == 1 else ""
+    return int(text) if re.fullmatch(r"\d{1,18}", text) else -1
 
 
 # NDI ToolBox: one row a frame; a group of columns for each tool, which begins with "Port ...".
@@ -131,11 +149,13 @@ def _read_ndi(
         tools[_tool_name(header[start], set(tools))] = tool
         groups.append((tool, columns))
     time: list[float] = []
+    numbers: list[int] = []
     lines: list[int] = []
     first = groups[0][1]
     for number, cells in rows:
         if len(time) >= MOST_ROWS:
             raise FormatError(f"line {number}: more than {MOST_ROWS} rows")
+        counters: list[int] = []
         for tool, columns in groups:
             state = columns["State"]
             seen = state < len(cells) and cells[state].strip() == "OK"
@@ -145,6 +165,10 @@ def _read_ndi(
                 _numbers(cells, quaternion, number) if seen else None,
                 _numbers(cells, position, number) if seen else None,
             )
+            # The counter of a tool that is not seen may stand still.
+            counters += [columns["Frame"]] if seen and "Frame" in columns else []
+        every = [columns["Frame"] for _, columns in groups if "Frame" in columns]
+        numbers.append(_frame_number(cells, counters or every))
         stamp = None
         if "Time [sec]" in first:
             stamp = _numbers(cells, [first["Time [sec]"]], number)
@@ -152,7 +176,7 @@ def _read_ndi(
             stamp = _numbers(cells, [header.index("Time [sec]")], number)
         time.append(math.nan if stamp is None else stamp[0])
         lines.append(number)
-    return _sequence(tools, time, lines, 1.0, name)
+    return _sequence(tools, time, numbers, lines, 1.0, name)
 
 
 def _tool_name(cell: str, taken: set[str]) -> str:
@@ -218,8 +242,10 @@ def _motive_rows(
     if not columns:
         raise FormatError(f"line {line}: names no rigid body")
     stamps = [index for index, cell in enumerate(axes) if cell.strip().startswith("Time (")]
+    counters = [index for index, cell in enumerate(axes) if cell.strip() == "Frame"]
     tools = {tool: _Tool() for tool in columns}
     time: list[float] = []
+    numbers: list[int] = []
     lines: list[int] = []
     for number, cells in rows:
         if len(time) >= MOST_ROWS:
@@ -227,7 +253,8 @@ def _motive_rows(
         for tool, found in columns.items():
             quaternion, position = ([found[key] for key in part] for part in wanted)
             tools[tool].add(_numbers(cells, quaternion, number), _numbers(cells, position, number))
+        numbers.append(_frame_number(cells, counters))
         stamp = _numbers(cells, stamps[:1], number) if stamps else None
         time.append(math.nan if stamp is None else stamp[0])
         lines.append(number)
-    return _sequence(tools, time, lines, factor, name)
+    return _sequence(tools, time, numbers, lines, factor, name)

@@ -1,9 +1,11 @@
-"""The file of points placed by hand: a table with frame, u and v, complete after every click.
+"""The file of points placed by hand: a table of frame, u and v, complete after every click.
 
     # jaxcal pick of sweep.igs.mha: 420 x 300 px, 16 frames
     # skipped: 3 9
     frame,u,v
     0,123.25,45.5
+
+For a folder of images the first column is ``file``, the image's name in quotes.
 
 ``jaxcal import`` reads it as any other table of points. The two comments make it possible to
 continue later: the first says which sequence the points belong to, the second which frames have no
@@ -38,7 +40,8 @@ class Picks:
         name: of the sequence.
         size: columns and rows of its frames, px.
         count: of its frames.
-        shown: numbers of the frames to place points in.
+        shown: numbers of the frames to place points in, from 0.
+        files: names of the images of a folder; empty for a sequence.
 
     Attributes:
         points: [u, v] by the number of the frame, px.
@@ -55,7 +58,9 @@ class Picks:
         size: tuple[int, int],
         count: int,
         shown: Sequence[int],
+        files: Sequence[str] = (),
     ) -> None:
+        self._files = tuple(files)
         self.path, self.shown, self.size = os.fspath(path), list(shown), size
         self._head = f"{_HEAD}{name}: {size[0]} x {size[1]} px, {count} frames"
         self.points: dict[int, Point] = {}
@@ -116,11 +121,18 @@ class Picks:
         if point is not None:
             points[frame] = point
         others = {k for k in self.skipped if k != frame} | ({frame} if skipped else set())
-        rows = [f"{k},{points[k][0]!r},{points[k][1]!r}" for k in sorted(points)]
+        rows = [f"{self._named(k)},{points[k][0]!r},{points[k][1]!r}" for k in sorted(points)]
         told = " ".join(map(str, sorted(others)))
-        head = [self._head, f"{_SKIPPED} {told}".rstrip(), "frame,u,v"]
+        column = "file" if self._files else "frame"
+        head = [self._head, f"{_SKIPPED} {told}".rstrip(), f"{column},u,v"]
         write_text(self.path, "\n".join([*head, *rows, ""]))
         self.points, self.skipped = points, others
+
+    def _named(self, frame: int) -> str:
+        if not self._files:
+            return str(frame)
+        doubled = self._files[frame].replace('"', '""')
+        return f'"{doubled}"'
 
     def _load(self, count: int) -> None:
         check_readable(self.path, maximum_bytes=_MOST_BYTES)
@@ -138,11 +150,16 @@ class Picks:
         self.skipped = {int(number) for number in told.split() if len(number) < 10}
         if len(lines) > 3:
             table = read_pose_table(self.path)
-            if table.frame is None or table.points is None:
-                raise FormatError(f"{self.path}: has no columns frame, u and v")
+            frames = table.file if self._files else table.frame
+            if frames is None or table.points is None:
+                column = "file" if self._files else "frame"
+                raise FormatError(f"{self.path}: has no columns {column}, u and v")
+            places = {name: k for k, name in enumerate(self._files)}
+            if self._files:
+                frames = [places.get(str(name), count) for name in frames]
             self.points = {
                 int(frame): (float(u), float(v))
-                for frame, (u, v) in zip(table.frame, table.points, strict=True)
+                for frame, (u, v) in zip(frames, table.points, strict=True)
             }
         if any(frame >= count for frame in [*self.points, *self.skipped]):
             raise FormatError(f"{self.path}: names a frame that the sequence has not")
