@@ -137,7 +137,7 @@ def test_the_poses_of_a_pair_may_be_in_metres(tmp_path):
         import_files(pair(1e-3))
     images = import_files(pair(1e-3), ImportOptions(pose_units="m"))[0].calibration
     np.testing.assert_allclose(images.poses, POSES, atol=1e-11)
-    with pytest.raises(InputError, match="holds no quaternions"):
+    with pytest.raises(InputError, match="--quaternion does not go with a pair"):
         import_files(pair(1.0), ImportOptions(quaternion="wxyz"))
 
 
@@ -365,6 +365,127 @@ def test_points_that_do_not_belong(tmp_path, sequence, name, text, message, caps
     assert message in error
     assert error.count("\n") == 1
     assert not out.exists()
+
+
+@pytest.mark.parametrize("kind", ["sequence", "poses", "ndi"])
+def test_poses_of_a_sequence_in_metres(tmp_path, kind):
+    """What the refusal advises works."""
+    poses = POSES.copy()
+    poses[:, :3, 3] /= 1e3
+    (tmp_path / "p.csv").write_text("\n".join(table(["u", "v"], [PIXELS])))
+    sources, asked = [tmp_path / "s.igs.mha", tmp_path / "p.csv"], {}
+    if kind == "ndi":
+        sources[0] = tmp_path / "t.csv"
+        cells = np.column_stack([QUATERNIONS[:, [3, 0, 1, 2]], poses[:, :3, 3]]).tolist()
+        rows = [f"1,Port 1,{k},0,OK,{','.join(map(repr, row))},0" for k, row in enumerate(cells)]
+        sources[0].write_text("\n".join([OLD_NDI.splitlines()[0], *rows]))
+    else:
+        write_sequence(sources[0], {PROBE: poses}, np.arange(6.0))
+    if kind == "poses":
+        asked = {"poses": tmp_path / "s.igs.mha"}
+        sources[0] = tmp_path / "i.igs.mha"
+        write_sequence(sources[0], {PROBE: POSES}, np.arange(6.0))
+    with pytest.raises(InputError, match=r"look like metres.*--pose-units m\)"):
+        import_files(sources, ImportOptions(**asked))
+    images = import_files(sources, ImportOptions(**asked, pose_units="m"))[0].calibration
+    np.testing.assert_allclose(images.poses, POSES, atol=1e-9)
+
+
+def test_a_stated_unit_is_not_advised_against(tmp_path):
+    lines = table([*NAMES[:2], "x [mm]", "y [mm]", "z [mm]", *NAMES[5:]], COLUMNS)
+    scaled = table(NAMES, [PIXELS, TRANSLATIONS / 1e3, QUATERNIONS])
+    (tmp_path / "t.csv").write_text("\n".join([lines[0], *scaled[1:]]))
+    with pytest.raises(InputError, match=r"look like metres; give them in mm$"):
+        import_files([tmp_path / "t.csv"])
+    (tmp_path / "m.csv").write_text(MOTIVE)
+    (tmp_path / "p.csv").write_text("u,v\n1,1\n1,1\n")
+    with pytest.raises(FormatError, match="its Length Units are meters, not mm"):
+        import_files([tmp_path / "m.csv", tmp_path / "p.csv"], ImportOptions(pose_units="mm"))
+
+
+POINTS_OF_SIX = "\n".join(table(["u", "v"], [PIXELS]))
+
+
+@pytest.mark.parametrize(
+    ("sources", "options", "message"),
+    [
+        ("s.mha", "--lag 0.3", "--lag needs --poses"),
+        ("s.mha p.csv", "--lag 0.3", "--lag needs --poses"),
+        ("s.mha p.csv", "--quaternion wxyz", "--quaternion is for tables with poses"),
+        ("s.mha p.csv", "--points labels", "--points labels is for points of Slicer"),
+        ("s.mha n.csv", "--points order", "leave --points order out"),
+        ("s.mha p.csv", "--target cross", "--target is for the search in frames"),
+        ("s.mha p.csv", "--region 1 2 3 4", "--region is for the search in frames"),
+        ("s.mha p.csv", "--orientation UF", "--orientation is for the search in frames"),
+        ("s.mha p.csv", "--poses t.csv --from Tool", "--from does not go with a table of poses"),
+        ("s.mha p.mrk.json", "--points order --units mm", "--units is for tables of points"),
+        ("s.mha", "--units px", "--units is for tables of points"),
+        ("s.mha", "--skip-invalid", "--skip-invalid is for tables"),
+        ("s.mha", "--quaternion wxyz", "--quaternion is for tables"),
+        ("s.mha", "--points order", "--points is for points of another file"),
+        ("s.mha", "--orientation UN", "are stored as MF, not UN: leave --orientation out"),
+        ("t.csv", "--from Foo", "--from does not go with a table of poses and points"),
+        ("t.csv", "--to Bar", "--to does not go with"),
+        ("t.csv", "--target echo", "--target does not go with"),
+        ("t.csv", "--region 1 2 3 4", "--region does not go with"),
+        ("t.csv", "--lag 0.1", "--lag does not go with"),
+        ("t.csv", "--points order", "--points does not go with"),
+        ("t.csv", "--orientation MF", "--orientation does not go with"),
+        ("m.csv", "--quaternion xyzw", "m.csv: its poses are matrices: leave --quaternion out"),
+        ("a.txt b.txt", "--skip-invalid", "--skip-invalid does not go with a pair"),
+    ],
+)
+def test_options_that_would_not_be_used(tmp_path, monkeypatch, sources, options, message, capsys):
+    monkeypatch.chdir(tmp_path)
+    frames = np.random.default_rng(0).integers(0, 90, (6, 60, 80)).astype(np.uint8)
+    write_sequence("s.mha", {PROBE: POSES}, np.arange(6.0), images=frames)
+    for name, text in (
+        ("p.csv", POINTS_OF_SIX),
+        ("n.csv", "\n".join(table(["frame", "u", "v"], [np.arange(6), PIXELS]))),
+        ("t.csv", "\n".join(table(["time", *NAMES], [np.arange(6.0), *COLUMNS]))),
+        ("m.csv", "\n".join(table([*MATRIX, "u", "v"], [POSES[:, :3].reshape(6, 12), PIXELS]))),
+        ("p.mrk.json", markups("LPS", 1, ["F"] * 6)),
+        ("a.txt", "\n".join(table(None, [POSES[:, :3].reshape(-1, 4)], " "))),
+        ("b.txt", "\n".join(table(None, [PIXELS], " "))),
+    ):
+        (tmp_path / name).write_text(text)
+    assert main(["import", *sources.split(), "o.h5", *options.split()]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "o.h5").exists()
+
+
+def test_points_of_images_that_were_not_ok(tmp_path):
+    frames = np.zeros((6, 60, 80), np.uint8)
+    path = tmp_path / "s.igs.mha"
+    write_sequence(path, {PROBE: POSES}, np.arange(6.0), images=frames)
+    old = b"Seq_Frame0003_ImageStatus = "
+    path.write_bytes(path.read_bytes().replace(old + b"OK", old + b"INVALID"))
+    (tmp_path / "p.csv").write_text(POINTS_OF_SIX)
+    recording, notes, _ = import_files([path, tmp_path / "p.csv"])
+    np.testing.assert_allclose(recording.calibration.poses, POSES[[0, 1, 2, 4, 5]], atol=1e-11)
+    assert "1 points left out: their frame's image was not OK" in notes
+
+
+@pytest.mark.parametrize(
+    ("orientation", "told"),
+    [("MF", None), ("UF", "(u = 79 - u)"), ("UN", "(u = 79 - u and v = 59 - v)")],
+)
+def test_points_beside_pixels_of_another_orientation(tmp_path, orientation, told):
+    frames = np.zeros((6, 60, 80), np.uint8)
+    path = tmp_path / "s.igs.mha"
+    write_sequence(path, {PROBE: POSES}, np.arange(6.0), images=frames, orientation=orientation)
+    (tmp_path / "p.csv").write_text(POINTS_OF_SIX)
+    notes = [note for note in import_files([path, tmp_path / "p.csv"])[1] if "mirrored" in note]
+    assert len(notes) == (told is not None)
+    assert all(f"is stored as {orientation}" in note and told in note for note in notes)
+
+
+def test_points_off_the_plane(tmp_path, sequence):
+    (tmp_path / "p.fcsv").write_text(fcsv(1).replace(",0,0,0,0,1,", ",3,0,0,0,1,", 2))
+    with pytest.raises(FormatError, match=r"p\.fcsv: point 'F-0' lies 3 mm off the image's plane"):
+        import_files([sequence, tmp_path / "p.fcsv"], ImportOptions(points="labels"))
 
 
 def test_label_without_a_number(tmp_path, sequence):

@@ -121,7 +121,7 @@ def refused(path, message, error=FormatError):
         load(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
-    assert type(caught.value) in (InputError, FormatError)
+    assert isinstance(caught.value, InputError)
     return str(caught.value)
 
 

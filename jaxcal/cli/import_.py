@@ -25,7 +25,7 @@ from jaxcal.cli.sequence_options import search_options, tracking_options
 @click.option(
     "--pose-units",
     type=click.Choice(["mm", "cm", "m"]),
-    help="Unit of translations in a table whose header does not say, and in POSES; mm by default.",
+    help="Unit of translations where the file of the poses does not say; mm by default.",
 )
 @click.option(
     "--quaternion",

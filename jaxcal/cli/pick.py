@@ -82,7 +82,6 @@ def _tell(placed: Any, source: str, out: str, options: dict[str, Any]) -> None:
                 ("poses", "poses"),
                 ("from", "source"),
                 ("to", "target"),
-                ("orientation", "orientation"),
             )
             if options[key]
         ]

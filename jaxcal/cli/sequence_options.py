@@ -47,9 +47,7 @@ _SEARCH = (
         "--target",
         "target_kind",
         type=click.Choice(["echo", "cross"]),
-        default="echo",
-        show_default=True,
-        help="What to look for in frames: one bright spot, or a crossing of wires.",
+        help="What to look for in frames: one bright spot (the default), or a crossing of wires.",
     ),
     click.option(
         "--region",

@@ -28,6 +28,10 @@ Kind = Literal["point", "pixel", "time_of_flight"]
 _UNIT = {"point": "mm", "pixel": "px", "time_of_flight": "s"}
 
 
+class PosesInMetresError(InputError):
+    """Poses that look like metres: whoever reads their file may know a way to convert them."""
+
+
 @dataclass(frozen=True)
 class Images:
     """One set of tracked images of the target.
@@ -374,10 +378,9 @@ def _check_units(images: Images) -> None:
     # A probe whose every position lies within 5 mm of the tracker's origin, and whose moves are
     # hundreds of times smaller than the target's path through the image, was recorded in metres.
     if 0 < spread < 0.02 * extent and reach < 5.0:
-        raise InputError(
+        raise PosesInMetresError(
             f"pose translations reach only {reach:.3g} mm while the target moves over about "
-            f"{extent:.0f} mm of the image: the poses look like metres; give them in mm (jaxcal "
-            "import converts them with --pose-units m)"
+            f"{extent:.0f} mm of the image: the poses look like metres; give them in mm"
         )
 
 

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Literal
 
 from jaxcal import FormatError
 from jaxcal.data.poses import QuaternionOrder
 from jaxcal.io.readable import quoted
 
-LENGTHS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+LengthUnit = Literal["mm", "cm", "m"]
+LENGTHS_MM: dict[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 TIMES_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
 _NAMES = {

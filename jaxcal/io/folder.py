@@ -109,6 +109,7 @@ def with_pose_table(images: TrackedSequence, table: PoseTable) -> tuple[TrackedS
         valid={PROBE_TO_TRACKER: valid},
         time=time,
         clock=table.clock,
+        length_stated=table.length_stated,
     ), notes
 
 

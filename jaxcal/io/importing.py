@@ -9,7 +9,8 @@ in words what was assumed.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -18,17 +19,18 @@ import numpy as np
 
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import QuaternionOrder
-from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
+from jaxcal.data.recording import MINIMUM_IMAGES, PosesInMetresError, Recording, make_images
+from jaxcal.io.columns import LengthUnit
 from jaxcal.io.folder import PROBE_TO_TRACKER, read_folder, with_pose_table
 from jaxcal.io.frame_names import FramePair, capitalised
-from jaxcal.io.frame_points import Assignment, points_of_markups, points_of_table
+from jaxcal.io.frame_points import Assignment, FramePoints, points_of_markups, points_of_table
 from jaxcal.io.poses_by_time import times_of_table, with_poses_by_time
 from jaxcal.io.readable import quoted
-from jaxcal.io.sequence import FolderPixels, TrackedSequence
+from jaxcal.io.sequence import FolderPixels, Pixels, TrackedSequence
 from jaxcal.io.sequence_files import EXTENSIONS, read_sequence
 from jaxcal.io.slicer import EXTENSIONS as MARKUPS
 from jaxcal.io.target_search import FrameResults, search_target
-from jaxcal.io.text import LengthUnit, PoseTable, read_crosswire, read_pose_table, recording_of
+from jaxcal.io.text import PoseTable, read_crosswire, read_pose_table, recording_of
 from jaxcal.io.trackers import is_tracker_export, read_tracker
 from jaxcal.runtime.array_types import Bool, Float, Int
 
@@ -44,12 +46,13 @@ class ImportOptions:
         spacing_mm: [lateral, axial] mm per px, when known.
         units: of u and v in tables.
         quaternion: where a quaternion's scalar stands.
-        pose_units: of translations in tables and in pairs of text files.
+        pose_units: of translations where the file of the poses does not say; mm by default.
         skip_invalid: leave out rows of tables that are marked as invalid, and count them.
         points: how points without time or number are assigned to frames.
-        target_kind: what to look for in frames where no points are given: ``echo`` or ``cross``.
+        target_kind: what to look for in frames where no points are given: ``echo``, the default,
+            or ``cross``.
         region: (first column, first row, columns, rows) to look in, px.
-        orientation: of the stored pixels, where the file does not say.
+        orientation: of the stored pixels of frames that are searched, where the file does not say.
         ignore_time: time stamps that repeat or go back are no error, and are not kept.
         poses: file with the poses of the frames: a table for a folder of images; a sequence, a
             tracker's export or a table with times for a sequence.
@@ -65,13 +68,35 @@ class ImportOptions:
     pose_units: LengthUnit | None = None
     skip_invalid: bool = False
     points: Assignment | None = None
-    target_kind: Literal["echo", "cross"] = "echo"
+    target_kind: Literal["echo", "cross"] | None = None
     region: tuple[int, int, int, int] | None = None
     orientation: Literal["MF", "UF", "MN", "UN"] | None = None
     ignore_time: bool = False
     poses: str | os.PathLike[str] | None = None
     lag_s: float = 0.0
     spacing_from: str | os.PathLike[str] | None = None
+
+
+_FLAGS = {
+    "source": "--from",
+    "target": "--to",
+    "units": "--units",
+    "quaternion": "--quaternion",
+    "skip_invalid": "--skip-invalid",
+    "points": "--points",
+    "target_kind": "--target",
+    "region": "--region",
+    "orientation": "--orientation",
+    "ignore_time": "--ignore-time",
+    "lag_s": "--lag",
+}
+
+
+def _refuse(options: ImportOptions, names: Sequence[str], why: str) -> None:
+    """Refuse options that were given and would not be used."""
+    for name in names:
+        if getattr(options, name) != getattr(ImportOptions, name):
+            raise InputError(f"{_FLAGS[name]} {why}")
 
 
 class Imported(NamedTuple):
@@ -113,15 +138,18 @@ def import_files(
         return _from_sequence(sources, tracked, options)
     if options.poses is not None:
         raise InputError("--poses goes with a sequence or a folder of PNG images")
+    unused = "source", "target", "lag_s", "points", "target_kind", "region", "orientation"
+    _refuse(options, unused, "does not go with a table of poses and points: it is for sequences")
     options = replace(options, spacing_mm=_spacing(None, options), spacing_from=None)
     if len(sources) == 2 and "markups" not in kinds:
         if options.units == "mm":
             raise InputError("a pair of text files holds pixels: --units mm does not go with it")
-        if options.quaternion is not None:
-            raise InputError("a pair of text files holds no quaternions: leave --quaternion out")
-        pair = read_crosswire(
-            *sources, spacing_mm=options.spacing_mm, pose_units=options.pose_units or "mm"
-        )
+        unused = "quaternion", "skip_invalid", "ignore_time"
+        _refuse(options, unused, "does not go with a pair of text files, poses and points")
+        with _hint_of_units(options.pose_units is not None):
+            pair = read_crosswire(
+                *sources, spacing_mm=options.spacing_mm, pose_units=options.pose_units or "mm"
+            )
         return Imported(pair, [])
     if len(sources) != 1 or kinds[0] != "table":
         raise InputError(
@@ -131,7 +159,19 @@ def import_files(
     table = _table(sources[0], options)
     notes = _skipped(table)
     table, said = _with_good_time(table, options)
-    return Imported(recording_of(table, options.spacing_mm), notes + said)
+    with _hint_of_units(options.pose_units is not None or table.length_stated):
+        return Imported(recording_of(table, options.spacing_mm), notes + said)
+
+
+@contextmanager
+def _hint_of_units(stated: bool) -> Iterator[None]:
+    """Tell how poses in metres are converted, where their unit was not stated."""
+    try:
+        yield
+    except PosesInMetresError as error:
+        if stated:
+            raise
+        raise InputError(f"{error} (jaxcal import converts them with --pose-units m)") from None
 
 
 _SEQUENCES = ("sequence", "tracker", "scan", "folder")
@@ -201,24 +241,55 @@ def _from_sequence(
             f"{', '.join(str(source) for source in sources)}: one sequence, and at most one file "
             "of points, make a recording (poses in another file: --poses)"
         )
+    points = next((source for source in sources if source not in tracked), None)
+    _refuse_unused(points, options)
     sequence, notes = open_sequence(tracked[0], options)
     poses, valid, said = tracked_poses(sequence, options)
     notes += said
     spacing = _spacing(sequence, options)
-    points = next((source for source in sources if source not in tracked), None)
+    with _hint_of_units(options.pose_units is not None or sequence.length_stated):
+        if points is None:
+            return _segmented(sequence, poses, valid, spacing, options, notes)
+        return _with_points(sequence, poses, valid, points, spacing, options, notes)
+
+
+def _refuse_unused(points: str | os.PathLike[str] | None, options: ImportOptions) -> None:
+    """Refuse options that a sequence with these points does not use."""
+    kinds = [None if source is None else _kind(source) for source in (points, options.poses)]
+    if "table" not in kinds:
+        _refuse(options, ("quaternion", "skip_invalid"), "is for tables, and none is read")
+    if kinds[0] != "table":
+        _refuse(options, ("units",), "is for tables of points, and none is read")
     if points is None:
-        return _segmented(sequence, poses, valid, spacing, options, notes)
-    if os.fspath(points).lower().endswith(MARKUPS):
-        placed = points_of_markups(points, sequence, options.points)
+        _refuse(options, ("points",), "is for points of another file, and none is named")
     else:
-        placed = points_of_table(_table(points, options), sequence, options.points)
+        why = f"is for the search in frames, and the points come from {os.fspath(points)}"
+        _refuse(options, ("target_kind", "region", "orientation"), why)
+
+
+def _with_points(
+    sequence: TrackedSequence,
+    poses: Float[np.ndarray, "n 4 4"],
+    valid: Bool[np.ndarray, " n"],
+    points: str | os.PathLike[str],
+    spacing: tuple[float, float] | None,
+    options: ImportOptions,
+    notes: list[str],
+) -> Imported:
+    """The target's points come from another file."""
+    placed = _points(points, sequence, options)
     # In the order of the frames, so that times do not go back.
     order = np.argsort(placed.rows)
     rows = placed.rows[order]
-    used = valid[rows]
+    tracked, shown = valid[rows], np.ones(len(rows), bool)
+    if sequence.pixels is not None:
+        shown = sequence.image_valid[rows]
     notes += placed.notes
-    if (~used).any():
-        notes.append(f"{int((~used).sum())} points left out: their frame's tracking was not OK")
+    for lost, what in ((~tracked, "tracking"), (tracked & ~shown, "image")):
+        if lost.any():
+            notes.append(f"{int(lost.sum())} points left out: their frame's {what} was not OK")
+    notes += _mirrored(sequence, points)
+    used = tracked & shown
     rows = rows[used]
     time, said = _time(sequence, rows, options)
     images = make_images(
@@ -230,6 +301,32 @@ def _from_sequence(
         where=sequence.source,
     )
     return Imported(Recording(images, source=sequence.source), notes + said)
+
+
+def _points(
+    source: str | os.PathLike[str], sequence: TrackedSequence, options: ImportOptions
+) -> FramePoints:
+    if _kind(source) == "markups":
+        return points_of_markups(source, sequence, options.points)
+    table = _table(source, options)
+    if table.poses is None and (options.poses is None or _kind(options.poses) != "table"):
+        _refuse(options, ("quaternion",), "is for tables with poses, and none is read")
+    return points_of_table(table, sequence, options.points)
+
+
+def _mirrored(sequence: TrackedSequence, points: str | os.PathLike[str]) -> list[str]:
+    """A note where points of the pixels as they are stored would be mirrored."""
+    pixels = sequence.pixels
+    stored = pixels.orientation if isinstance(pixels, Pixels) else None
+    if pixels is None or stored is None or stored == "MF":
+        return []
+    mirrored = {"U": f"u = {pixels.columns - 1} - u", "N": f"v = {pixels.rows - 1} - v"}
+    told = " and ".join(text for letter, text in mirrored.items() if letter in stored)
+    return [
+        f"u and v of {os.fspath(points)} are taken in the orientation MF, as jaxcal pick shows it; "
+        f"{sequence.source} is stored as {stored}: points of its stored pixels must be mirrored "
+        f"first ({told})"
+    ]
 
 
 def open_sequence(
@@ -244,31 +341,37 @@ def open_sequence(
     Raises:
         InputError: files that cannot be read or do not belong together; one line.
     """
-    sequence = _read_tracked(source)
     if options.poses is None:
-        return sequence, []
+        _refuse(options, ("lag_s",), "needs --poses: it is between images and poses of two files")
+        return _read_tracked(source, options.pose_units), []
+    sequence = _read_tracked(source)
+    of_table = _kind(options.poses) == "table"
+    if of_table:
+        why = f"does not go with a table of poses, {options.poses}: they are from probe to tracker"
+        _refuse(options, ("source", "target"), why)
     if isinstance(sequence.pixels, FolderPixels):
-        if _kind(options.poses) != "table":
+        if not of_table:
             raise InputError(
                 f"{options.poses}: the poses of a folder of images come from a table with columns "
                 "file or frame"
             )
+        _refuse(options, ("lag_s",), "is for poses that are matched by time, not to a folder")
         return with_pose_table(sequence, _table(options.poses, options))
-    if _kind(options.poses) == "table":
+    if of_table:
         table = _table(options.poses, options)
         if table.poses is None or table.time is None:
             raise InputError(f"{table.name}: needs columns of times and of poses")
         found, valid = table.poses, np.ones(len(table), bool)
         pair, time = PROBE_TO_TRACKER, times_of_table(table, sequence)
-        said = _skipped(table)
+        said, stated = _skipped(table), table.length_stated
     else:
-        tracking = _read_tracked(options.poses)
+        tracking = _read_tracked(options.poses, options.pose_units)
         start, end, said = _frames(tracking, options)
         found, valid = tracking.poses(start, end)
-        pair, time = (start, end), tracking.time
+        pair, time, stated = (start, end), tracking.time, tracking.length_stated
     name = os.fspath(options.poses)
     merged, more = with_poses_by_time(sequence, time, found, valid, pair, name, options.lag_s)
-    return merged, said + more
+    return replace(merged, length_stated=stated), said + more
 
 
 def tracked_poses(
@@ -321,17 +424,19 @@ def frames_to_show(
     return shown, (sequence.pixels.columns, sequence.pixels.rows), notes
 
 
-def _read_tracked(source: str | os.PathLike[str]) -> TrackedSequence:
+def _read_tracked(
+    source: str | os.PathLike[str], pose_units: LengthUnit | None = None
+) -> TrackedSequence:
     match _kind(source):
         case "tracker":
-            return read_tracker(source)
+            return read_tracker(source, pose_units)
         case "scan":
             from jaxcal.io.tus_rec import read_scan
 
-            return read_scan(source)
+            return read_scan(source).scaled(pose_units or "mm")
         case "folder":
             return read_folder(source)
-    return read_sequence(source)
+    return read_sequence(source).scaled(pose_units or "mm")
 
 
 def _spacing(
@@ -413,7 +518,11 @@ def _segmented(
 ) -> Imported:
     """Search for the target in every frame that was tracked."""
     results = search_target(
-        sequence, valid, options.target_kind, region=options.region, orientation=options.orientation
+        sequence,
+        valid,
+        options.target_kind or "echo",
+        region=options.region,
+        orientation=options.orientation,
     )
     counts, used = results.counts, results.found
     blank, hidden = counts["image not OK"], counts["not credible"]

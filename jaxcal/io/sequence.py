@@ -7,7 +7,7 @@ are asked for, and come frame by frame.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Literal
@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_poses, inverse_poses
+from jaxcal.io.columns import LENGTHS_MM, LengthUnit
 from jaxcal.io.frame_names import FramePair, path_between
 from jaxcal.io.grey import grey_of
 from jaxcal.io.pixel_stream import Packing, PixelStream
@@ -105,6 +106,7 @@ class TrackedSequence:
         numbers: (n,) by which other files name the frames, -1 for a frame without one; None: frames
             count from 0.
         clock: the date from which times count; None: they are seconds of a device's own clock.
+        length_stated: whether the file of the transforms states their unit of length.
     """
 
     transforms: Mapping[FramePair, Float[np.ndarray, "n 4 4"]]
@@ -115,9 +117,17 @@ class TrackedSequence:
     source: str = field(default="memory", compare=False)
     numbers: Int[np.ndarray, " n"] | None = None
     clock: datetime | None = None
+    length_stated: bool = False
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def scaled(self, unit: LengthUnit) -> TrackedSequence:
+        """The sequence of a file whose translations are in this unit."""
+        factors = np.ones((4, 4))
+        factors[:3, 3] = LENGTHS_MM[unit]
+        transforms = {pair: matrices * factors for pair, matrices in self.transforms.items()}
+        return replace(self, transforms=transforms)
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -211,7 +221,8 @@ class TrackedSequence:
 
         Args:
             wanted: increasing frame numbers; all by default. Others are not kept in memory.
-            orientation: of the stored pixels, where the file does not say.
+            orientation: of the stored pixels, where the file does not say; it must not contradict
+                the file.
 
         Yields:
             (rows, columns) arrays. Colour becomes grey by ITU-R BT.601's weights.
@@ -230,7 +241,12 @@ class TrackedSequence:
             for number in numbers:
                 yield _oriented(_png_image(pixels, number), orientation or "MF")
             return
-        stored = pixels.orientation if orientation is None else orientation
+        stored = pixels.orientation or orientation
+        if orientation not in (None, stored):
+            raise FormatError(
+                f"{self.source}: says that its pixels are stored as {stored}, not {orientation}: "
+                "leave --orientation out"
+            )
         if pixels.kind != "BRIGHTNESS":
             raise FormatError(f"{self.source}: holds {quoted(pixels.kind)} data, not B-mode images")
         if stored not in ("MF", "UF", "MN", "UN"):

@@ -137,13 +137,20 @@ def pixels_from_markups(markups: Markups) -> Float[np.ndarray, "n 2"]:
     """[u, v] px of points that were placed on the image itself: spacing 1, origin 0, no transform.
 
     Whether x and y are u and v or their negatives depends on how the image got into Slicer
-    (OpenIGTLink: RAS; a file: LPS). Pixels are not negative, so the signs tell.
+    (OpenIGTLink: RAS; a file: LPS). Pixels are not negative, so the signs tell. z is 0.
 
     Raises:
         FormatError: points off the image's plane, or with coordinates of both signs.
     """
-    plane = markups.positions[:, :2]
+    plane, height = markups.positions[:, :2], markups.positions[:, 2]
     half = 0.5
+    off = np.flatnonzero(np.abs(height) > half)
+    if len(off):
+        raise FormatError(
+            f"point {quoted(markups.labels[off[0]])} lies {height[off[0]]:.4g} mm off the image's "
+            "plane: place points on the image alone, at z = 0, with no transform above it, and not "
+            "on slices of a volume"
+        )
     if (plane > -half).all():
         return plane + 0.0
     if (plane < half).all():

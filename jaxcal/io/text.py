@@ -16,12 +16,10 @@ import numpy as np
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quaternions
 from jaxcal.data.recording import Recording, make_images
-from jaxcal.io.columns import LENGTHS_MM, Columns, columns_of_header
+from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
 from jaxcal.io.readable import naming, quoted
 from jaxcal.io.table import Table, read_table
 from jaxcal.runtime.array_types import Float, Int
-
-LengthUnit = Literal["mm", "cm", "m"]
 
 _TRUE = frozenset(("1", "1.0", "true", "yes", "ok", "valid", "good", "tracked"))
 _FALSE = frozenset(
@@ -60,6 +58,7 @@ class PoseTable:
         frame: (n,) number of the image.
         file: n names of images' files.
         skipped: rows that were left out as invalid.
+        length_stated: whether the header states the unit of translations.
     """
 
     name: str
@@ -72,6 +71,7 @@ class PoseTable:
     frame: Int[np.ndarray, " n"] | None = None
     file: tuple[str, ...] | None = None
     skipped: int = 0
+    length_stated: bool = False
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -104,6 +104,8 @@ def read_pose_table(
     table = read_table(path)
     with naming(path):
         columns = _columns(table, quaternion)
+        if quaternion is not None and columns.matrix is not None:
+            raise FormatError("its poses are matrices: leave --quaternion out")
         rows, skipped = _used_rows(table, columns, skip_invalid)
         unit = _agreed(units, columns.point_unit)
         points, kind = None, "pixel"
@@ -111,11 +113,7 @@ def read_pose_table(
             points = table.numbers(columns.point, rows)
             if unit != "px":
                 points, kind = points * LENGTHS_MM[unit], "point"
-        time, clock = (
-            (None, None)
-            if columns.time is None
-            else _times(table, columns.time, columns.time_s, rows)
-        )
+        time, clock = _times(table, columns, rows)
         frame = None
         if columns.frame is not None:
             frame = _whole_numbers(table, columns.frame, rows)
@@ -133,6 +131,7 @@ def read_pose_table(
             frame=frame,
             file=file,
             skipped=skipped,
+            length_stated=columns.length_mm is not None,
         )
 
 
@@ -357,12 +356,15 @@ def _whole_numbers(table: Table, column: int, rows: list[int]) -> Int[np.ndarray
 
 
 def _times(
-    table: Table, column: int, unit_s: float, rows: list[int]
-) -> tuple[Float[np.ndarray, " n"], datetime | None]:
+    table: Table, columns: Columns, rows: list[int]
+) -> tuple[Float[np.ndarray, " n"] | None, datetime | None]:
     """Seconds, and for dates by ISO 8601 the first one, from which they count."""
+    column = columns.time
+    if column is None:
+        return None, None
     dates = [_date(table.rows[row][column]) for row in rows]
     if dates[0] is None:
-        return table.numbers((column,), rows)[:, 0] * unit_s, None
+        return table.numbers((column,), rows)[:, 0] * columns.time_s, None
     values = []
     for row, date in zip(rows, dates, strict=True):
         if date is None or (date.tzinfo is None) != (dates[0].tzinfo is None):

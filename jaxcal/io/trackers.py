@@ -11,11 +11,13 @@ import math
 import os
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from jaxcal import FormatError
 from jaxcal.data.poses import rotations_from_quaternions
+from jaxcal.io.columns import LENGTHS_MM, LengthUnit
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.lines import text_lines
 from jaxcal.io.readable import naming, quoted
@@ -35,24 +37,32 @@ def is_tracker_export(path: str | os.PathLike[str]) -> bool:
     return first.startswith(("Tools,", "Format Version,"))
 
 
-def read_tracker(path: str | os.PathLike[str]) -> TrackedSequence:
+def read_tracker(
+    path: str | os.PathLike[str], pose_units: LengthUnit | None = None
+) -> TrackedSequence:
     """Read an export of NDI ToolBox or of Motive; the file is not trusted.
+
+    Args:
+        path: of the file.
+        pose_units: of translations; NDI's file does not state them, and mm is the default.
 
     Returns:
         Transforms, mm, by (tool, ``Tracker``), valid where the tool was seen. Frames have the
         numbers of the file's column Frame.
 
     Raises:
-        FormatError: neither of the two, or a row that cannot be read; file and line are named.
+        FormatError: neither of the two, a row that cannot be read, or another unit than the file
+            states; file and line are named.
     """
     name = os.fspath(path)
     rows = ((line, next(csv.reader([content]))) for line, content in text_lines(path))
     with naming(path):
         line, first = next(rows, (1, [""]))
         if first[0].strip() == "Tools":
-            return _read_ndi(line, [cell.strip() for cell in first], rows, name)
+            found = _read_ndi(line, [cell.strip() for cell in first], rows, name)
+            return found.scaled(pose_units or "mm")
         if first[0].strip() == "Format Version":
-            return _read_motive(first, rows, name)
+            return replace(_read_motive(first, rows, name, pose_units), length_stated=True)
         raise FormatError("is no export of NDI ToolBox or Motive")
 
 
@@ -191,7 +201,10 @@ def _tool_name(cell: str, taken: set[str]) -> str:
 
 
 def _read_motive(
-    first: list[str], rows: Iterator[tuple[int, list[str]]], name: str
+    first: list[str],
+    rows: Iterator[tuple[int, list[str]]],
+    name: str,
+    pose_units: LengthUnit | None,
 ) -> TrackedSequence:
     cells = [cell.strip() for cell in first]
     stated = dict(zip(cells[::2], cells[1::2], strict=False))
@@ -203,6 +216,8 @@ def _read_motive(
     unit = stated.get("Length Units", "").lower()
     if unit not in _METRES:
         raise FormatError(f"Length Units {quoted(unit)} are not known")
+    if pose_units is not None and LENGTHS_MM[pose_units] != _METRES[unit]:
+        raise FormatError(f"its Length Units are {unit}, not {pose_units}: leave --pose-units out")
     names: list[str] = []
     types: list[str] = []
     what: list[str] = []
