@@ -241,7 +241,7 @@ def test_calibrate_writes_the_whole_report(calibrated):
 
 
 def test_calibrate_speaks_to_a_person(calibrated, simulated, jaxcal_process):
-    done = jaxcal_process("calibrate", simulated, "--test", simulated)
+    done = jaxcal_process("calibrate", simulated)
     assert (done.returncode, done.stderr) == (0, "")
     assert "image_plane_to_probe (mm)" in done.stdout
     assert "the target stays within" in done.stdout

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
 from jaxcal.io.plus import (
@@ -105,6 +106,22 @@ def test_only_the_element_changes(name, tmp_path):
         assert b"\n" not in new.replace(b"\r\n", b"")
     # Done again, nothing changes.
     assert patched_configuration(new, IMAGE, MATRIX, error_mm=0.5, date=DATE)[0] == new
+
+
+@pytest.mark.parametrize("mark", ['Status="INVALID"', 'Valid="false"', 'Status="MISSING"'])
+def test_a_transform_that_is_not_valid(tmp_path, mark, capsys):
+    path = tmp_path / "c.xml"
+    path.write_bytes(configuration(OLD.replace("/>", f" {mark}/>")))
+    assert main(["export", str(path), "--slicer", str(tmp_path / "x.tfm")]) == 2
+    error = capsys.readouterr().err
+    assert f"is marked as '{mark.split(chr(34))[1]}'" in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "x.tfm").exists()
+    # Another transform's status is no matter; the marks of a good one are none.
+    path.write_bytes(configuration(OTHER.replace("/>", f" {mark}/>"), OLD))
+    assert jaxcal.load_calibration(path).scale_mm_per_px is not None
+    path.write_bytes(configuration(OLD.replace("/>", ' Status="OK" Valid="TRUE"/>')))
+    assert jaxcal.load_calibration(path).scale_mm_per_px is not None
 
 
 def transforms(content):

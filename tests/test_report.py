@@ -165,9 +165,10 @@ def test_an_estimated_scale_replaces_the_written_one(result, recording, record):
         ),
     )
     test = pixels(recording.test, (0.1, 0.2), 0.0)
+    measured = pixels(recording.calibration, (0.1, 0.2), 0.0)
     for written in (None, np.array([5.0, 5.0])):
         other = Recording(dataclasses.replace(test, spacing_mm=written))
-        calibrated = dataclasses.replace(recording, calibration=test)
+        calibrated = dataclasses.replace(recording, calibration=measured)
         precision = calibration_record(scaled, calibrated, other)["reconstruction_precision_mm"]
         assert precision == pytest.approx(record["reconstruction_precision_mm"], rel=1e-9)
 
@@ -180,6 +181,17 @@ def test_test_images_that_cannot_be_used_are_refused(recording):
     with pytest.raises(InputError, match="not times of flight"):
         check_test_images(recording, Recording(times))
     assert check_test_images(dataclasses.replace(recording, test=None)) is None
+
+
+def test_test_images_that_are_calibrated_with_are_refused(recording):
+    images = recording.calibration
+    with pytest.raises(InputError, match=r"r\.h5: 19 of 19 test images are among the images to"):
+        check_test_images(recording, Recording(images, source="r.h5"))
+    half = dataclasses.replace(images, mask=np.arange(20) < 5)
+    others = dataclasses.replace(images, mask=np.arange(20) > LEFT_OUT)
+    assert check_test_images(Recording(half), Recording(others)) is others
+    with pytest.raises(InputError, match="14 of 14 test images"):
+        check_test_images(Recording(images, test=others))
 
 
 def test_truth_error(result, recording, record):

@@ -41,6 +41,7 @@ class PlusTransform:
         error_mm: as stated, or None.
         date: as stated, or None.
         line: where it stands.
+        status: ``OK``, or the status that the file states instead.
     """
 
     frames: FramePair
@@ -48,6 +49,7 @@ class PlusTransform:
     error_mm: float | None
     date: str | None
     line: int
+    status: str = "OK"
 
 
 @dataclass(frozen=True)
@@ -61,9 +63,12 @@ class PlusConfiguration:
     transforms: tuple[PlusTransform, ...]
 
     def find(self, source: str, target: str) -> PlusTransform | None:
-        """The transform between two frames as it is stated, or None."""
-        wanted = capitalised(source), capitalised(target)
-        return next((found for found in self.transforms if found.frames == wanted), None)
+        """The transform between two frames as it is stated, or None.
+
+        Raises:
+            FormatError: it is marked as not valid.
+        """
+        return _find(self.transforms, source, target)
 
 
 @dataclass(frozen=True)
@@ -79,9 +84,23 @@ class PlusResult:
     calibration_error_mm: float | None
 
     def find(self, source: str, target: str) -> PlusTransform | None:
-        """The transform between two frames, or None."""
-        wanted = capitalised(source), capitalised(target)
-        return next((found for found in self.transforms if found.frames == wanted), None)
+        """The transform between two frames, or None.
+
+        Raises:
+            FormatError: it is marked as not valid.
+        """
+        return _find(self.transforms, source, target)
+
+
+def _find(transforms: tuple[PlusTransform, ...], source: str, target: str) -> PlusTransform | None:
+    wanted = capitalised(source), capitalised(target)
+    found = next((each for each in transforms if each.frames == wanted), None)
+    if found is not None and found.status != "OK":
+        raise FormatError(
+            f"line {found.line}: the transform from {wanted[0]} to {wanted[1]} is marked as "
+            f"{quoted(found.status)}: calibrate again, or mark it as OK if it is right"
+        )
+    return found
 
 
 def read_configuration(path: str | os.PathLike[str]) -> PlusConfiguration:
@@ -143,7 +162,16 @@ def _transform(element: Element) -> PlusTransform:
         _optional_number(element, "Error"),
         element.attributes.get("Date"),
         element.line,
+        _status(element),
     )
+
+
+def _status(element: Element) -> str:
+    """PLUS reads ``Status``, and writes the same as ``Valid``."""
+    stated = (
+        element.attributes[name] for name in ("Status", "Valid") if name in element.attributes
+    )
+    return next((text for text in stated if text.upper() not in ("OK", "TRUE")), "OK")
 
 
 def _frames(element: Element) -> FramePair:

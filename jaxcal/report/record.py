@@ -164,7 +164,8 @@ def check_test_images(recording: Recording, test: Recording | None = None) -> Im
             recording's own test set is used.
 
     Raises:
-        InputError: times of flight, or pixels without a spacing beside points in mm.
+        InputError: times of flight, pixels without a spacing beside points in mm, or images that
+            are among those to calibrate with.
     """
     images = recording.test if test is None else test.calibration
     source = recording.source if test is None else test.source
@@ -177,7 +178,19 @@ def check_test_images(recording: Recording, test: Recording | None = None) -> Im
         raise InputError(
             f"{source}: test images are pixels without spacing_mm: their mm are unknown"
         )
+    shared = len(_poses_and_measurements(images) & _poses_and_measurements(recording.calibration))
+    if shared:
+        raise InputError(
+            f"{source}: {shared} of {int(images.mask.sum())} test images are among the images to "
+            "calibrate with: a test set is independent, recorded apart"
+        )
     return images
+
+
+def _poses_and_measurements(images: Images) -> set[tuple[str, bytes]]:
+    """What tells an image from every other: the numbers of those that are used."""
+    rows = np.column_stack([images.poses.reshape(len(images), -1), images.measurements])
+    return {(images.kind, row.tobytes()) for row in rows[images.mask]}
 
 
 def plain(value: Any) -> Any:
