@@ -503,6 +503,30 @@ def test_markups_are_ras(tmp_path):
     assert (found.labels, found.unplaced) == (tuple("012345"), 1)
 
 
+@pytest.mark.parametrize(
+    ("stored", "told"),
+    [
+        ({("Tracker", "Probe"): POSES}, "Probe to Tracker, inverted from Tracker to Probe"),
+        ({("Tracker", "Wand"): POSES}, "Wand to Tracker, inverted from Tracker to Wand"),
+        ({("Reference", "Probe"): POSES}, "Probe to Reference, inverted from Reference to Probe"),
+        (
+            {("Tracker", "Probe"): POSES, ("Tracker", "Reference"): np.tile(np.eye(4), (6, 1, 1))},
+            "Probe to Reference (",
+        ),
+        (
+            {("Image", "Probe"): np.tile(np.eye(4), (6, 1, 1)), ("Tracker", "Probe"): POSES},
+            "Probe to Tracker, inverted",
+        ),
+    ],
+)
+def test_poses_that_are_stored_from_the_tracker(tmp_path, stored, told):
+    write_sequence(tmp_path / "s.igs.mha", stored, np.arange(6.0))
+    (tmp_path / "p.csv").write_text(POINTS_OF_SIX)
+    recording, notes, _ = import_files([tmp_path / "s.igs.mha", tmp_path / "p.csv"])
+    np.testing.assert_allclose(recording.calibration.poses, np.linalg.inv(POSES), atol=1e-10)
+    assert f"poses from {told}" in notes[0]
+
+
 def test_stylus_tip_as_target(tmp_path, capsys):
     """Pose = probe to stylus; the target is the tip, which rests in the stylus' frame."""
     references = random_poses(6, 9)

@@ -468,7 +468,10 @@ def _frames(sequence: TrackedSequence, options: ImportOptions) -> tuple[str, str
             f"{sequence.source}: holds no transforms: name the file with its poses (--poses)"
         )
     names = sequence.frames()
-    tools = list(dict.fromkeys(source for source, _ in pairs if source != "Reference"))
+    resting = "Tracker", "Reference"
+    # The pose of the tracker in the frame of a tool tells the same, inverted.
+    moving = (target if source in resting else source for source, target in pairs)
+    tools = list(dict.fromkeys(name for name in moving if name not in resting))
     start = options.source
     if start is None:
         start = "Probe" if "Probe" in tools else tools[0] if len(tools) == 1 else None
@@ -481,12 +484,16 @@ def _frames(sequence: TrackedSequence, options: ImportOptions) -> tuple[str, str
     if options.target is not None:
         end = options.target if options.target in names else capitalised(options.target)
         return start, end, []
-    reference = ("Reference", "Tracker")
-    if reference in sequence.valid and sequence.valid[reference].any() and start != "Reference":
+    tracked = [pair for pair in pairs if set(pair) == set(resting) and sequence.valid[pair].any()]
+    if tracked and start != "Reference":
         end = "Reference"
     else:
-        end = next((target for source, target in pairs if source == start), "Tracker")
-    return start, end, [f"poses from {start} to {end} (--from and --to choose others)"]
+        ends = [target for source, target in pairs if source == start]
+        ends += [source for source, target in pairs if target == start and source in resting]
+        end = next(iter(ends), "Tracker")
+    inverted = (end, start) in pairs and (start, end) not in pairs
+    how = f", inverted from {end} to {start}" if inverted else ""
+    return start, end, [f"poses from {start} to {end}{how} (--from and --to choose others)"]
 
 
 def _time(
