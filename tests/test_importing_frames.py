@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import struct
 import warnings
 import zlib
@@ -436,6 +437,88 @@ def test_poses_of_other_times(tmp_path, times, message):
     images = read_sequence(tmp_path / "i.mha")
     with pytest.raises(InputError, match=message):
         with_poses_by_time(images, times, moving(MOMENTS), np.ones(200, bool), PAIR, "t.mha")
+
+
+def to_and_fro(t: np.ndarray) -> np.ndarray:
+    """An irregular motion, -1 to 1."""
+    return (15 * np.sin(1.95 * t) + 7 * np.sin(5.2 * t + 1) + 3 * np.sin(10.7 * t)) / 25
+
+
+def swept(t: np.ndarray) -> np.ndarray:
+    """Poses of a probe that goes to and fro by 40 mm and turns a little."""
+    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    turns = 0.02 * np.stack([np.sin(t), np.cos(1.3 * t), np.sin(0.7 * t)], axis=1)
+    poses[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+    poses[:, :3, 3] = [100, 50, 20] + 20 * to_and_fro(t)[:, None] * [0.6, -0.48, 0.64]
+    return poses
+
+
+@pytest.fixture
+def lagging(tmp_path):
+    """Images that show where the probe was 80 ms before their stamps, and the tracker's log."""
+    log = np.arange(0, 7, 0.01)
+    write_sequence(tmp_path / "t.igs.mha", {PAIR: swept(log)}, log)
+    times = np.arange(0.3, 6.7, 0.1)
+    points = [75, 55] + to_and_fro(times - 0.08)[:, None] * [15.0, -35.0]
+    points += np.random.default_rng(5).normal(0, 0.5, points.shape)
+    write_sequence(tmp_path / "i.igs.mha", {}, times)
+    lines = [
+        f"{t!r},{u!r},{v!r}" for t, (u, v) in zip(times.tolist(), points.tolist(), strict=True)
+    ]
+    (tmp_path / "p.csv").write_text("\n".join(["time,u,v", *lines[::-1]]))
+    return times, points
+
+
+def test_a_lag_is_estimated_from_points(tmp_path, lagging, capsys):
+    times, points = lagging
+    sources = [str(tmp_path / name) for name in ("i.igs.mha", "p.csv", "o.h5")]
+    tracking = ["--poses", str(tmp_path / "t.igs.mha"), "--lag"]
+    assert main(["import", *sources, *tracking, "auto"]) == 0
+    said = capsys.readouterr().out
+    found = re.search(r"images lag by (\S+) s behind poses \(SD (\S+) s\), estimated from 64", said)
+    lag, sd = float(found[1]), float(found[2])
+    assert abs(lag - 0.08) < 4 * sd < 0.02
+    images = jaxcal.load(sources[2]).calibration
+    np.testing.assert_allclose(images.poses, swept(times - 0.08), atol=0.15)
+    np.testing.assert_allclose(images.measurements, points)
+    assert main(["import", *sources, *tracking, "nan"]) == 2
+    assert "neither a number of seconds nor auto" in capsys.readouterr().err
+
+
+def test_a_lag_is_estimated_from_frames(tmp_path, lagging):
+    times, points = lagging[0][::2], lagging[1][::2]
+    frames = [speckle(RNG, *point) for point in points]
+    write_sequence(tmp_path / "f.igs.mha", {}, times, images=frames)
+    options = ImportOptions(poses=tmp_path / "t.igs.mha", lag_s="auto")
+    recording, notes, results = import_files([tmp_path / "f.igs.mha"], options)
+    assert float(re.search(r"images lag by (\S+) s", "".join(notes))[1]) == pytest.approx(
+        0.08, abs=0.004
+    )
+    found = results.found
+    assert len(found) > 28
+    np.testing.assert_allclose(recording.calibration.poses, swept(times[found] - 0.08), atol=0.3)
+
+
+def test_lags_that_cannot_be_estimated(tmp_path, lagging, folder, capsys):
+    tracking = str(tmp_path / "t.igs.mha")
+    images, points, out = (str(tmp_path / name) for name in ("i.igs.mha", "p.csv", "o.h5"))
+    table = str(pose_table(tmp_path / "poses.csv", "", lambda k: ""))
+    still = str(tmp_path / "still.igs.mha")
+    log = np.arange(0, 7, 0.01)
+    write_sequence(still, {PAIR: np.tile(POSES[0], (len(log), 1, 1))}, log)
+    for arguments, message in (
+        ([images, points, out, "--poses", still], "--lag auto: the probe moved by"),
+        ([images, points, out], "--lag needs --poses"),
+        ([points, out], "--lag does not go with a table of poses and points"),
+        ([str(folder), out, "--poses", table], "--lag is for poses that are matched by time"),
+    ):
+        assert main(["import", *arguments, "--lag", "auto"]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+    assert main(["pick", images, "--poses", tracking, "--lag", "auto"]) == 2
+    assert "it is an option of jaxcal import" in capsys.readouterr().err
+    assert not (tmp_path / "o.h5").exists()
 
 
 def test_real_images_and_tracking_in_two_files(tmp_path, real_data):

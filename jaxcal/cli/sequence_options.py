@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,26 @@ import click
 from jaxcal.cli.common import POSITIVE
 
 Command = Callable[..., Any]
+
+
+class _Lag(click.ParamType):
+    """Finite seconds, or ``auto``."""
+
+    name = "seconds"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | str:
+        if value == "auto":
+            return value
+        try:
+            seconds = float(value)
+        except ValueError:
+            seconds = math.nan
+        if not math.isfinite(seconds):
+            self.fail(f"{value!r} is neither a number of seconds nor auto", param, ctx)
+        return seconds
+
 
 _TRACKING = (
     click.option(
@@ -31,10 +52,11 @@ _TRACKING = (
     click.option(
         "--lag",
         "lag_s",
-        type=float,
+        type=_Lag(),
         default=0.0,
         metavar="SECONDS",
-        help="With --poses: an image stamped t shows what was at t - SECONDS.",
+        help="With --poses: an image stamped t shows what was at t - SECONDS; auto: estimated from "
+        "the target's motion in the images (not for jaxcal pick).",
     ),
     click.option(
         "--orientation",

@@ -226,7 +226,11 @@ def motion_along_main_axis(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarra
 
     The sign of the direction is arbitrary.
     """
-    positions = np.asarray(poses, dtype=np.float64)[:, :3, 3]
+    return along_main_axis(np.asarray(poses, dtype=np.float64)[:, :3, 3])
+
+
+def along_main_axis(positions: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+    """Positions along the direction in which they differ most; its sign is arbitrary."""
     centred = positions - positions.mean(axis=0)
     return centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
 

@@ -24,7 +24,7 @@ from jaxcal.io.columns import LengthUnit
 from jaxcal.io.folder import PROBE_TO_TRACKER, read_folder, with_pose_table
 from jaxcal.io.frame_names import FramePair, capitalised
 from jaxcal.io.frame_points import Assignment, FramePoints, points_of_markups, points_of_table
-from jaxcal.io.poses_by_time import times_of_table, with_poses_by_time
+from jaxcal.io.poses_by_time import lag_of_points, times_of_table, with_poses_by_time
 from jaxcal.io.readable import quoted
 from jaxcal.io.sequence import FolderPixels, Pixels, TrackedSequence
 from jaxcal.io.sequence_files import EXTENSIONS, read_sequence
@@ -56,7 +56,8 @@ class ImportOptions:
         ignore_time: time stamps that repeat or go back are no error, and are not kept.
         poses: file with the poses of the frames: a table for a folder of images; a sequence, a
             tracker's export or a table with times for a sequence.
-        lag_s: with ``poses``: an image stamped t shows what was at t - lag.
+        lag_s: with ``poses``: an image stamped t shows what was at t - lag; ``auto``: estimated
+            from the motion of the points in the images.
         spacing_from: DICOM clip that states the pixel size.
     """
 
@@ -73,7 +74,7 @@ class ImportOptions:
     orientation: Literal["MF", "UF", "MN", "UN"] | None = None
     ignore_time: bool = False
     poses: str | os.PathLike[str] | None = None
-    lag_s: float = 0.0
+    lag_s: float | Literal["auto"] = 0.0
     spacing_from: str | os.PathLike[str] | None = None
 
 
@@ -243,14 +244,41 @@ def _from_sequence(
         )
     points = next((source for source in sources if source not in tracked), None)
     _refuse_unused(points, options)
-    sequence, notes = open_sequence(tracked[0], options)
+    sequence, tracking, notes = _opened(tracked[0], options)
+    placed = None if points is None else _points(points, sequence, options)
+    results, lag_s = None, options.lag_s
+    if tracking is not None:
+        if lag_s == "auto":
+            lag_s, note, results = _estimated_lag(sequence, placed, tracking, options)
+            notes.append(note)
+        sequence, said = _merged(sequence, tracking, lag_s)
+        notes += said
     poses, valid, said = tracked_poses(sequence, options)
     notes += said
     spacing = _spacing(sequence, options)
     with _hint_of_units(options.pose_units is not None or sequence.length_stated):
-        if points is None:
-            return _segmented(sequence, poses, valid, spacing, options, notes)
-        return _with_points(sequence, poses, valid, points, spacing, options, notes)
+        if placed is None or points is None:
+            return _segmented(sequence, poses, valid, spacing, options, notes, results)
+        notes += placed.notes + _mirrored(sequence, points)
+        return _with_points(sequence, poses, valid, placed, spacing, options, notes)
+
+
+def _estimated_lag(
+    sequence: TrackedSequence,
+    placed: FramePoints | None,
+    tracking: _Tracking,
+    options: ImportOptions,
+) -> tuple[float, str, FrameResults | None]:
+    """The lag and a note, and the target in all frames if it had to be looked for."""
+    results = None
+    if placed is None:
+        results = _search(sequence, np.ones(len(sequence), bool), options)
+        rows, points = results.found, results.position[results.found]
+    else:
+        shown = _shown(sequence, placed.rows)
+        rows, points = placed.rows[shown], placed.points[shown]
+    time, poses, valid, _, source, _ = tracking
+    return *lag_of_points(sequence, rows, points, time, poses, valid, source), results
 
 
 def _refuse_unused(points: str | os.PathLike[str] | None, options: ImportOptions) -> None:
@@ -271,24 +299,19 @@ def _with_points(
     sequence: TrackedSequence,
     poses: Float[np.ndarray, "n 4 4"],
     valid: Bool[np.ndarray, " n"],
-    points: str | os.PathLike[str],
+    placed: FramePoints,
     spacing: tuple[float, float] | None,
     options: ImportOptions,
     notes: list[str],
 ) -> Imported:
     """The target's points come from another file."""
-    placed = _points(points, sequence, options)
     # In the order of the frames, so that times do not go back.
     order = np.argsort(placed.rows)
     rows = placed.rows[order]
-    tracked, shown = valid[rows], np.ones(len(rows), bool)
-    if sequence.pixels is not None:
-        shown = sequence.image_valid[rows]
-    notes += placed.notes
+    tracked, shown = valid[rows], _shown(sequence, rows)
     for lost, what in ((~tracked, "tracking"), (tracked & ~shown, "image")):
         if lost.any():
             notes.append(f"{int(lost.sum())} points left out: their frame's {what} was not OK")
-    notes += _mirrored(sequence, points)
     used = tracked & shown
     rows = rows[used]
     time, said = _time(sequence, rows, options)
@@ -314,6 +337,11 @@ def _points(
     return points_of_table(table, sequence, options.points)
 
 
+def _shown(sequence: TrackedSequence, rows: Int[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+    """Whether frames' images were OK; all are where the file holds tracking alone."""
+    return sequence.image_valid[rows] | (sequence.pixels is None)
+
+
 def _mirrored(sequence: TrackedSequence, points: str | os.PathLike[str]) -> list[str]:
     """A note where points of the pixels as they are stored would be mirrored."""
     pixels = sequence.pixels
@@ -329,6 +357,17 @@ def _mirrored(sequence: TrackedSequence, points: str | os.PathLike[str]) -> list
     ]
 
 
+class _Tracking(NamedTuple):
+    """Poses that are to be matched to images by time."""
+
+    time: Float[np.ndarray, " m"]
+    poses: Float[np.ndarray, "m 4 4"]
+    valid: Bool[np.ndarray, " m"]
+    pair: FramePair
+    source: str
+    length_stated: bool
+
+
 def open_sequence(
     source: str | os.PathLike[str], options: ImportOptions
 ) -> tuple[TrackedSequence, list[str]]:
@@ -341,9 +380,29 @@ def open_sequence(
     Raises:
         InputError: files that cannot be read or do not belong together; one line.
     """
+    sequence, tracking, notes = _opened(source, options)
+    if tracking is None:
+        return sequence, notes
+    if options.lag_s == "auto":
+        raise InputError("--lag auto is estimated from points: it is an option of jaxcal import")
+    merged, said = _merged(sequence, tracking, options.lag_s)
+    return merged, notes + said
+
+
+def _merged(
+    sequence: TrackedSequence, tracking: _Tracking, lag_s: float
+) -> tuple[TrackedSequence, list[str]]:
+    merged, notes = with_poses_by_time(sequence, *tracking[:-1], lag_s)
+    return replace(merged, length_stated=tracking.length_stated), notes
+
+
+def _opened(
+    source: str | os.PathLike[str], options: ImportOptions
+) -> tuple[TrackedSequence, _Tracking | None, list[str]]:
+    """A sequence, and the poses that are to be matched to it by time, if there are such."""
     if options.poses is None:
         _refuse(options, ("lag_s",), "needs --poses: it is between images and poses of two files")
-        return _read_tracked(source, options.pose_units), []
+        return _read_tracked(source, options.pose_units), None, []
     sequence = _read_tracked(source)
     of_table = _kind(options.poses) == "table"
     if of_table:
@@ -356,22 +415,23 @@ def open_sequence(
                 "file or frame"
             )
         _refuse(options, ("lag_s",), "is for poses that are matched by time, not to a folder")
-        return with_pose_table(sequence, _table(options.poses, options))
+        merged, notes = with_pose_table(sequence, _table(options.poses, options))
+        return merged, None, notes
     if of_table:
         table = _table(options.poses, options)
         if table.poses is None or table.time is None:
             raise InputError(f"{table.name}: needs columns of times and of poses")
-        found, valid = table.poses, np.ones(len(table), bool)
-        pair, time = PROBE_TO_TRACKER, times_of_table(table, sequence)
-        said, stated = _skipped(table), table.length_stated
-    else:
-        tracking = _read_tracked(options.poses, options.pose_units)
-        start, end, said = _frames(tracking, options)
-        found, valid = tracking.poses(start, end)
-        pair, time, stated = (start, end), tracking.time, tracking.length_stated
-    name = os.fspath(options.poses)
-    merged, more = with_poses_by_time(sequence, time, found, valid, pair, name, options.lag_s)
-    return replace(merged, length_stated=stated), said + more
+        time, valid = times_of_table(table, sequence), np.ones(len(table), bool)
+        found = _Tracking(
+            time, table.poses, valid, PROBE_TO_TRACKER, table.name, table.length_stated
+        )
+        return sequence, found, _skipped(table)
+    tracking = _read_tracked(options.poses, options.pose_units)
+    start, end, said = _frames(tracking, options)
+    poses, valid = tracking.poses(start, end)
+    pair, name = (start, end), os.fspath(options.poses)
+    found = _Tracking(tracking.time, poses, valid, pair, name, tracking.length_stated)
+    return sequence, found, said
 
 
 def tracked_poses(
@@ -515,6 +575,18 @@ def _time(
     )
 
 
+def _search(
+    sequence: TrackedSequence, tracked: Bool[np.ndarray, " n"], options: ImportOptions
+) -> FrameResults:
+    return search_target(
+        sequence,
+        tracked,
+        options.target_kind or "echo",
+        region=options.region,
+        orientation=options.orientation,
+    )
+
+
 def _segmented(
     sequence: TrackedSequence,
     poses: Float[np.ndarray, "n 4 4"],
@@ -522,15 +594,10 @@ def _segmented(
     spacing: tuple[float, float] | None,
     options: ImportOptions,
     notes: list[str],
+    results: FrameResults | None,
 ) -> Imported:
-    """Search for the target in every frame that was tracked."""
-    results = search_target(
-        sequence,
-        valid,
-        options.target_kind or "echo",
-        region=options.region,
-        orientation=options.orientation,
-    )
+    """The target as it is found in every frame that was tracked, if it was not yet looked for."""
+    results = _search(sequence, valid, options) if results is None else results.of_tracked(valid)
     counts, used = results.counts, results.found
     blank, hidden = counts["image not OK"], counts["not credible"]
     if blank:

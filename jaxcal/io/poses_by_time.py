@@ -7,11 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.timing import can_interpolate, interpolate_poses
+from jaxcal.data.timing import (
+    along_main_axis,
+    can_interpolate,
+    estimate_latency,
+    interpolate_poses,
+    motion_along_main_axis,
+)
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.text import PoseTable
-from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.array_types import Bool, Float, Int
 
 LONGEST_GAP = 5.0
 """Longest time between two poses that is bridged, in median intervals."""
@@ -70,21 +76,8 @@ def with_poses_by_time(
         raise InputError(
             f"{images.source}: states no times, by which poses of {source} would be found"
         )
-    known = np.isfinite(time)
-    if known.sum() < 2:
-        raise InputError(f"{source}: states no times: its poses cannot be matched to the images")
-    time, poses, valid = time[known], poses[known], valid[known]
-    back = np.flatnonzero(np.diff(time) < 0)
-    if len(back):
-        raise InputError(
-            f"{source}: the time stamp of pose {back[0] + 1} is before the one before it: two "
-            "recordings in one?"
-        )
-    # A tracker that was asked faster than it measures gives the same pose twice.
-    first = np.concatenate([[True], np.diff(time) > 0])
-    time, poses, valid = time[first], poses[first], valid[first]
-    if len(time) < 2:
-        raise InputError(f"{source}: all its poses have one time stamp")
+    kept = _increasing(time, source)
+    time, poses, valid = time[kept], poses[kept], valid[kept]
     gap = LONGEST_GAP * float(np.median(np.diff(time)))
     asked = images.time - lag_s
     between = can_interpolate(time, asked, max_gap_s=gap, valid=valid)
@@ -104,3 +97,70 @@ def with_poses_by_time(
             f"{gap:.3g} s are bridged)"
         )
     return replace(images, transforms={pair: found}, valid={pair: between}), notes
+
+
+def _increasing(time: Float[np.ndarray, " m"], source: str) -> Int[np.ndarray, " k"]:
+    """The poses whose times are stated and later than the one before."""
+    known = np.flatnonzero(np.isfinite(time))
+    if len(known) < 2:
+        raise InputError(f"{source}: states no times: its poses cannot be matched to the images")
+    steps = np.diff(time[known])
+    back = np.flatnonzero(steps < 0)
+    if len(back):
+        raise InputError(
+            f"{source}: the time stamp of pose {back[0] + 1} is before the one before it: two "
+            "recordings in one?"
+        )
+    # A tracker that was asked faster than it measures gives the same pose twice.
+    kept = known[np.concatenate([[True], steps > 0])]
+    if len(kept) < 2:
+        raise InputError(f"{source}: all its poses have one time stamp")
+    return kept
+
+
+def lag_of_points(
+    images: TrackedSequence,
+    rows: Int[np.ndarray, " n"],
+    points: Float[np.ndarray, "n 2"],
+    time: Float[np.ndarray, " m"],
+    poses: Float[np.ndarray, "m 4 4"],
+    valid: Bool[np.ndarray, " m"],
+    source: str,
+) -> tuple[float, str]:
+    """By how much images lag behind poses, from the motion of a target at rest in the images.
+
+    Args:
+        images: with times.
+        rows: (n,) frames in which the target was found.
+        points: (n, 2) the target in them, px or mm.
+        time: (m,) of the poses, s, on the same clock.
+        poses: (m, 4, 4), mm.
+        valid: (m,) which of them can be used.
+        source: file of the poses, for messages.
+
+    Returns:
+        The lag, s, and a note for the user.
+
+    Raises:
+        InputError: times missing, too little motion, or motions that do not agree; see
+            :func:`jaxcal.data.timing.estimate_latency`.
+    """
+    kept = _increasing(time, source)
+    kept = kept[valid[kept]]
+    order = np.argsort(rows)
+    try:
+        if not len(kept) or not len(rows):
+            raise InputError("there are no poses, or no points")
+        found = estimate_latency(
+            images.time[rows[order]],
+            along_main_axis(points[order]),
+            time[kept],
+            motion_along_main_axis(poses[kept]),
+        )
+    except InputError as error:
+        raise InputError(f"--lag auto: {error} (or state the lag: --lag SECONDS)") from None
+    return found.lag_s, (
+        f"images lag by {found.lag_s:.4f} s behind poses (SD {found.sd_s:.2g} s), estimated from "
+        f"{len(rows)} points: their motion has a correlation of {abs(found.correlation):.2f} with "
+        "the probe's"
+    )

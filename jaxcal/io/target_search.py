@@ -9,7 +9,7 @@ so.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -52,6 +52,12 @@ class FrameResults:
     def found(self) -> Int[np.ndarray, " m"]:
         """Numbers of the frames in which the target was found."""
         return np.flatnonzero(self.fate == FOUND)
+
+    def of_tracked(self, tracked: Bool[np.ndarray, " n"]) -> FrameResults:
+        """The results where only these frames can be used."""
+        fate = np.where(tracked, self.fate, NOT_TRACKED)
+        reason = tuple(why if kept else "" for why, kept in zip(self.reason, tracked, strict=True))
+        return replace(self, fate=fate, reason=reason)
 
     @property
     def counts(self) -> dict[str, int]:
