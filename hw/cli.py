@@ -20,6 +20,7 @@ from jaxcal.cli.run import run
 if TYPE_CHECKING:
     from hw.acquire import AcquisitionRequest, Confirm, Outcome
     from hw.bench.run import Bench
+    from hw.extras import Extra
     from hw.keys import Keyboard
     from hw.midplane.pattern_injection import Operator
     from hw.midplane.terminal_image import Screen
@@ -183,11 +184,13 @@ def acquire(
         bench_seed = _recorded_bench(recorded, bench)
         phantom = _recorded_phantom(recorded)
         operator = _recorded_operator(recorded)
+    needed: dict[str, Extra] = {"rtde_control": "robot"} if bench or move else {}
     if bench and phantom in (None, PHANTOMS[0]):
-        # Before a file is made: without them not a single line of the active echo is received.
-        for module in ("cobs", "serial"):
-            if (cure := missing(module, extra="serial")) is not None:
-                raise InputError(cure)
+        needed |= {"cobs": "serial", "serial": "serial"}
+    for module, extra in needed.items():
+        # Before a file is made, and before anybody is asked to confirm a plan.
+        if (cure := missing(module, extra=extra)) is not None:
+            raise InputError(cure)
     path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
     from jaxcal.cli.cache import enable_compilation_cache
 
@@ -578,7 +581,11 @@ def _confirming(setup: Setup, emulated: bool, unattended: str | None) -> Confirm
             f"{challenge.code} to let it move.",
             err=True,
         )
-        return confirm(challenge, click.prompt("code", err=True), clock=setup.clock)
+        try:
+            code = click.prompt("code", err=True)
+        except click.Abort:
+            raise KeyboardInterrupt from None
+        return confirm(challenge, code, clock=setup.clock)
 
     return ask
 

@@ -95,7 +95,8 @@ def calibrate_and_print(path: str, outcome: Outcome, speed: float) -> dict[str, 
     ]
     if outcome.given_up:
         rows = ", ".join(str(row + 1) for row in outcome.given_up)
-        lines.append(f"without an image: poses {rows} (no mid-plane found, or skipped)")
+        again = "" if outcome.resume is None else f"; again: {outcome.resume}"
+        lines.append(f"without an image: poses {rows} (no mid-plane found, or skipped){again}")
     share = share_inside(path)
     if share is not None:
         lines.append(f"true offsets inside their brackets: {share[0]} of {share[1]}")

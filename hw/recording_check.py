@@ -48,15 +48,15 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
     were at its end. Text that the writer may touch is read, so that its heaps are checked too.
 
     Raises:
-        FormatError: missing, not a recording, complete, of another layout, with links or data
-            outside of it. One line that starts with the path.
+        FormatError: missing, not a recording, complete with all images, of another layout, with
+            links or data outside of it. One line that starts with the path.
     """
     check_readable(path)
     try:
         with open_root(path, length=stored_length(path)) as root:
             if text(root, "format") != FORMAT or number(root, "version") != VERSION:
                 raise FormatError("is not a recording of this version")
-            if flag(root, "complete") is not False:
+            if flag(root, "complete") is not False and not _lacks_images(root):
                 raise FormatError("is complete: there is nothing to resume")
             for name, columns in LAYOUT.items():
                 node = group(root, name)
@@ -80,6 +80,12 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
         raise FormatError(f"{path}: {error}") from None
 
 
+def _lacks_images(root: Node) -> bool:
+    """Whether poses of the plan were skipped or given up when the run came to its end."""
+    plan = group(root, "plan")
+    return plan is not None and (number(plan, "without_image") or 0) > 0
+
+
 @dataclass(frozen=True)
 class Progress:
     """What the recording of an interrupted acquisition holds, checked.
@@ -94,6 +100,7 @@ class Progress:
         true_elevation: (k,) mm, NaN on a real bench.
         last_s: latest host time in the file.
         probe: numbers of /probe: elements, pitch_mm, sound_speed_m_s, delay_s.
+        ended: whether a run came to its end before, with poses skipped or given up.
     """
 
     settings: dict[str, object]
@@ -105,6 +112,7 @@ class Progress:
     true_elevation: np.ndarray
     last_s: float
     probe: dict[str, float]
+    ended: bool
 
 
 def read_progress(path: str | os.PathLike[str]) -> Progress:
@@ -135,6 +143,7 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
                 true_elevation=_read(root, "placement", "true_elevation", (images,)),
                 last_s=max(last),
                 probe=_probe(root),
+                ended=_lacks_images(root),
             )
     except InputError as error:
         raise FormatError(f"{path}: {error}") from None

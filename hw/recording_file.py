@@ -131,6 +131,9 @@ class RecordingWriter:
         except Exception as error:
             file.close()
             raise FormatError(f"{path}: is truncated or damaged: {one_line(error)}") from None
+        # It may have come to its end without all images: its digest no longer holds.
+        file.attrs["complete"] = False
+        _sidecar(Path(path)).unlink(missing_ok=True)
         return cls(Path(path), file)
 
     def append(self, name: str, columns: Mapping[str, np.ndarray]) -> None:
@@ -358,7 +361,7 @@ class RecordingWriter:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         self._check_place()
         self._forget()
-        write_text(self.path.with_name(self.path.name + ".sha256"), f"{digest}  {self.path.name}\n")
+        write_text(_sidecar(self.path), f"{digest}  {self.path.name}\n")
         return digest
 
     def _prepare(self, name: str, columns: Mapping[str, np.ndarray]) -> dict[str, h5py.Dataset]:
@@ -372,6 +375,10 @@ class RecordingWriter:
             sizes = {"height": shape[1], "width": shape[2], "frame": dtype.name}
             _make_columns(target, LAYOUT["us"], sizes)
         return _columns(self._file, name)
+
+
+def _sidecar(path: Path) -> Path:
+    return path.with_name(path.name + ".sha256")
 
 
 def utc_now() -> str:
