@@ -168,8 +168,7 @@ def bounded(
     Returns:
         The fits; their iterations count those from all starts, and the warm-up.
     """
-    still = [jnp.zeros_like(images.mask[:, :1])] * start.extras.shape[0]
-    further = Further.of(start, still)
+    further = Further.at(start)
     bound = jnp.sum(images.mask * observation.limit(further, images), axis=1)
     turn = bound / jnp.sum(images.mask * further.points(images)[1], axis=1)
     zero = jnp.zeros_like(turn)
