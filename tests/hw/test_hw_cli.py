@@ -57,20 +57,7 @@ def test_wrong_usage_is_one_line(tmp_path, monkeypatch, capsys, arguments, what)
 def test_a_dry_run_shows_the_plan_and_makes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "bench.toml"
-    limits = """
-box_min_mm = [200, -400, 40]
-box_max_mm = [500, -100, 260]
-cone_axis = [0, 0, -1]
-cone_deg = 60
-max_step_mm = 250
-max_turn_deg = 120
-max_speed_mm_s = 50
-search_mm = 25
-search_deg = 0.5
-"""
-    good = GOOD.replace("cone_deg = 30", limits).replace(
-        "box_mm = [[0, 0, 0], [100, 100, 100]]", ""
-    )
+    good = GOOD.replace("box_mm = [[0, 0, 0], [100, 100, 100]]", "")
     path.write_text(good)
     arguments = ["acquire", "out.h5", "--setup", str(path), "--images", "6"]
     assert main([*arguments, "--preview", "plan.png"]) == 0
