@@ -67,6 +67,11 @@ def test_a_dry_run_shows_the_plan_and_makes_nothing(tmp_path, monkeypatch, capsy
     assert "TCP offset: not known before the controller is asked" in out
     assert (tmp_path / "plan.png").stat().st_size > 1000
     assert not (tmp_path / "out.h5").exists()
+    assert main([*arguments, "--preview", str(path)]) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert "no figure can be written as .toml; these endings work: " in told.err
+    assert path.read_text() == good
     armed = good.replace("settle_s = 1", 'model = "ur5"\ntcp_offset = [0, 0, 0.12, 0, 0, 0]')
     path.write_text(armed)
     assert main(arguments) == 0
