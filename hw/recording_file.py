@@ -93,7 +93,9 @@ class RecordingWriter:
         """
         final = Path(path)
         if final.exists():
-            raise OutputError(f"{final}: exists already: resume it, or give another name")
+            raise _existing(final)
+        if not final.parent.is_dir():
+            raise OutputError(f"{final}: there is no folder {final.parent}")
         temporary = final.parent / f".partial-{secrets.token_hex(8)}{final.suffix}"
         try:
             with h5py.File(temporary, "w") as file:
@@ -101,7 +103,7 @@ class RecordingWriter:
             # Not os.replace: somebody may have made the file in the meantime.
             os.link(temporary, final)
         except FileExistsError:
-            raise OutputError(f"{final}: exists already: resume it, or give another name") from None
+            raise _existing(final) from None
         except OSError as error:
             raise OutputError(f"{final}: cannot be written: {one_line(error)}") from None
         finally:
@@ -386,6 +388,17 @@ def utc_now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
+def _existing(path: Path) -> OutputError:
+    """The error for a path that something has already, with what to do."""
+    if path.is_dir():
+        return OutputError(f"{path}: is a directory, not a file")
+    try:
+        check_resumable(path)
+    except FormatError:
+        return OutputError(f"{path}: exists already: give another name")
+    return OutputError(f"{path}: exists already: resume it, or give another name")
+
+
 def _write_skeleton(file: h5py.File, header: RecordingHeader) -> None:
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
     file.attrs["complete"] = False
@@ -480,13 +493,21 @@ def _cut_back(datasets: list[h5py.Dataset]) -> None:
 
 
 def _fitting(name: str, key: str, values: np.ndarray, dataset: h5py.Dataset) -> np.ndarray:
+    if key == "frames" and (values.shape[1:], values.dtype) != (dataset.shape[1:], dataset.dtype):
+        raise FormatError(
+            f"an ultrasound frame of {_frame_words(values)} does not fit this recording, whose "
+            f"frames have {_frame_words(dataset)}: set the machine as before"
+        )
     if values.shape[1:] != dataset.shape[1:]:
         raise FormatError(
             f"/{name}/{key}: a row of shape {values.shape[1:]} does not fit {dataset.shape[1:]}"
         )
-    if key == "frames" and values.dtype != dataset.dtype:
-        raise FormatError(f"/us/frames: {values.dtype} does not fit {dataset.dtype}")
     return values.astype(dataset.dtype)
+
+
+def _frame_words(frames: np.ndarray | h5py.Dataset) -> str:
+    _, rows, columns = frames.shape
+    return f"{columns} x {rows} px of {frames.dtype}"
 
 
 def _plain(value: object) -> Any:
