@@ -25,7 +25,13 @@ LARGEST = 1e7
 """Largest coordinate accepted, in mm or px, and largest variance of one: ten kilometres."""
 
 Kind = Literal["point", "pixel", "time_of_flight"]
+_EXTENT_MM = 50.0
+"""Of a target's path through the image where nothing better is known."""
 _UNIT = {"point": "mm", "pixel": "px", "time_of_flight": "s"}
+
+
+class MetresError(InputError):
+    """Translations of poses look like metres, not millimetres."""
 
 
 @dataclass(frozen=True)
@@ -346,9 +352,8 @@ def _check_units(images: Images) -> None:
     used = images.mask
     if not used.any():
         return
-    translation = images.poses[used, :3, 3]
-    spread = float(np.linalg.norm(translation - translation.mean(axis=0), axis=1).max())
-    reach = float(np.linalg.norm(translation, axis=1).max())
+    translations = images.poses[used, :3, 3]
+    spread, _ = _spread_and_reach(translations)
     if images.kind == "point":
         extent = float(np.abs(images.measurements[used]).max())
         if extent < 0.5 and spread > 1.0:
@@ -370,15 +375,37 @@ def _check_units(images: Images) -> None:
         spacing = 0.1 if images.spacing_mm is None else float(images.spacing_mm.max())
         extent = float(np.ptp(images.measurements[used], axis=0).max()) * spacing
     else:
-        extent = 50.0
-    # A probe whose every position lies within 5 mm of the tracker's origin, and whose moves are
-    # hundreds of times smaller than the target's path through the image, was recorded in metres.
-    if 0 < spread < 0.02 * extent and reach < 5.0:
-        raise InputError(
+        extent = _EXTENT_MM
+    check_pose_units(translations, extent)
+
+
+def check_pose_units(translations: Float[np.ndarray, "n 3"], extent_mm: float = _EXTENT_MM) -> None:
+    """Refuse poses of different images whose translations are in metres in place of millimetres.
+
+    A probe whose every position lies within 5 mm of the tracker's origin, and whose moves are
+    hundreds of times smaller than the target's path through the image, was recorded in metres.
+
+    Args:
+        translations: of the images' poses, as if in mm.
+        extent_mm: length of the target's path through the image, roughly.
+
+    Raises:
+        MetresError: they look like metres.
+    """
+    spread, reach = _spread_and_reach(translations)
+    if 0 < spread < 0.02 * extent_mm and reach < 5.0:
+        raise MetresError(
             f"pose translations reach only {reach:.3g} mm while the target moves over about "
-            f"{extent:.0f} mm of the image: the poses look like metres; give them in mm (jaxcal "
-            "import converts them with --pose-units m)"
+            f"{extent_mm:.0f} mm of the image: the poses look like metres; give them in mm"
         )
+
+
+def _spread_and_reach(translations: Float[np.ndarray, "n 3"]) -> tuple[float, float]:
+    """Largest distance from the mean, and from the origin."""
+    away = translations - translations.mean(axis=0)
+    return float(np.linalg.norm(away, axis=1).max()), float(
+        np.linalg.norm(translations, axis=1).max()
+    )
 
 
 def unit_of(kind: Kind) -> str:
