@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from hw.choices import HAND_PLACEMENTS, OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
 from hw.interrupts import as_interrupts
@@ -164,10 +166,8 @@ def acquire(
         )
         if value is not None
     ]
-    if resume and given:
-        raise InputError(f"{given[0]} does not go with --resume: the recording knows")
-    if resume and recording is None:
-        raise InputError("--resume needs the RECORDING to go on with")
+    if resume:
+        _check_resumed(recording, given)
     if operator is not None and not resume and placement != "pattern-injection":
         raise InputError("--operator needs --placement pattern-injection")
     if until_tre is not None and plan != "optimal" and not resume:
@@ -298,12 +298,21 @@ def free_hand(
     longest, and accept with Enter. RECORDING is the file to make (by default one named after the
     time); afterwards it is calibrated, as jaxcal calibrate would.
     """
-    from hw.freehand.acquire import FreeHand, acquire_free_hand
+    from hw.freehand.acquire import acquire_free_hand
     from hw.freehand.guide import Rules
+    from hw.freehand.request import FreeHand
     from hw.freehand.terminal import INJECTION_KEYS, KEYS, TerminalPerson
 
-    if resume and recording is None:
-        raise InputError("--resume needs the RECORDING to go on with")
+    if resume:
+        context = click.get_current_context()
+        given = [
+            option.opts[0]
+            for option in context.command.params
+            if isinstance(option, click.Option)
+            and option.name not in ("resume", "placement", "setup_path")
+            and context.get_parameter_source(str(option.name)) is ParameterSource.COMMANDLINE
+        ]
+        _check_resumed(recording, given)
     injected = placement == "pattern-injection"
     if injected != (setup_path is not None):
         raise InputError("--placement pattern-injection and --setup TOML go together")
@@ -334,6 +343,14 @@ def free_hand(
     return _calibrated(path)
 
 
+def _check_resumed(recording: str | None, given: Sequence[str]) -> None:
+    """Refuse --resume without a recording, or with options that the recording knows."""
+    if recording is None:
+        raise InputError("--resume needs the RECORDING to go on with")
+    if given:
+        raise InputError(f"{given[0]} does not go with --resume: the recording knows")
+
+
 def _calibrated(path: str) -> int:
     """Calibrate from a finished free-hand recording and print the result."""
     from jaxcal.calibration.calibrate import calibrate
@@ -353,8 +370,10 @@ def _calibrated(path: str) -> int:
     scale = ("scale",) if images.kind == "pixel" and images.spacing_mm is None else ()
     record = calibration_record(calibrate(data, estimate=scale), data)
     hint = " --estimate scale" if scale else ""
-    again = f"{path}: again, with a report: jaxcal calibrate {path}{hint} --report report.html"
-    print_page(calibration_table(record), *verdict(record), "", again)
+    again = f"jaxcal calibrate {shlex.quote(path)}{hint} --report report.html"
+    print_page(
+        calibration_table(record), *verdict(record), "", f"{path}: again, with a report: {again}"
+    )
     return exit_code([record])
 
 
@@ -392,7 +411,7 @@ def setup_(out: str | None) -> int:
     if Path(out).exists():
         raise InputError(f"{out}: exists; name another file")
     write_text(out, text)
-    click.echo(f"{out}: written; fill it in, then jaxcal-hw check --setup {out}")
+    click.echo(f"{out}: written; fill it in, then jaxcal-hw check --setup {shlex.quote(out)}")
     return ExitCode.CONVERGED
 
 

@@ -367,16 +367,29 @@ def _check_units(images: Images) -> None:
                 "like metres; give both in mm"
             )
     elif images.kind == "pixel":
-        if images.spacing_mm is not None and images.spacing_mm.max() < 1e-3:
-            raise InputError(
-                f"the spacing is only {images.spacing_mm.max():.3g} mm per pixel: it looks like "
-                "metres; give it, and the poses, in mm"
-            )
+        if images.spacing_mm is not None:
+            check_spacing_unit(images.spacing_mm)
         spacing = 0.1 if images.spacing_mm is None else float(images.spacing_mm.max())
         extent = float(np.ptp(images.measurements[used], axis=0).max()) * spacing
     else:
         extent = _EXTENT_MM
     check_pose_units(translations, extent)
+
+
+def check_spacing_unit(spacing_mm: Float[np.ndarray, 2]) -> None:
+    """Refuse a pixel's size in metres in place of millimetres.
+
+    Args:
+        spacing_mm: [lateral, axial] per px, as if in mm.
+
+    Raises:
+        InputError: it looks like metres.
+    """
+    if spacing_mm.max() < 1e-3:
+        raise InputError(
+            f"the spacing is only {spacing_mm.max():.3g} mm per pixel: it looks like metres; give "
+            "it, and the poses, in mm"
+        )
 
 
 def check_pose_units(translations: Float[np.ndarray, "n 3"], extent_mm: float = _EXTENT_MM) -> None:
