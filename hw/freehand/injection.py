@@ -45,7 +45,7 @@ from hw.shapes import Float
 from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.poses import inverse_poses
-from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
 from jaxcal.data.timing import interpolate_poses
 from jaxcal.io.readable import naming
 
@@ -76,11 +76,13 @@ class Sample:
         t: arrival, s.
         offset_mm: the probe's offset along the elevational axis at the target.
         peak: amplitude, counts; 0 where the element was not heard.
+        translation: (3,) of the pose, mm.
     """
 
     t: float
     offset_mm: float
     peak: float
+    translation: Float[np.ndarray, 3]
 
 
 def acquire_by_injection(
@@ -296,7 +298,7 @@ class _Run:
         if self._origin is None:
             return
         offset = self._offset(pose)
-        self._samples.append(Sample(frame.t_host, offset, echoes.peak))
+        self._samples.append(Sample(frame.t_host, offset, echoes.peak, pose[:3, 3]))
         while self._samples[-1].t - self._samples[0].t > _KEPT_S:
             self._samples.popleft()
         self._held.append((frame.t_host, pose, frame))
@@ -361,9 +363,21 @@ class _Run:
         rows = [f"{title}: {describe(view, 0.0).rpartition(',')[0]}", *profile(view)]
         if self._hurried:
             rows.append(f"too fast: at most {_FASTEST_MM_S:g} mm a second")
+        elif self._in_metres(view):
+            rows.append("the poses look like metres: let the server send them in mm")
         elif self._message:
             rows.append(self._message)
         self._person.show(frame, "\n".join(rows), hand_advice(view, self._peak()))
+
+    def _in_metres(self, view: View) -> bool:
+        """Whether the bar shrinks while the probe, by its poses, stays where it is."""
+        if min(length for _, length in view.seen) > view.longest // 2:
+            return False
+        try:
+            check_pose_units(np.array([sample.translation for sample in self._samples]))
+        except MetresError:
+            return True
+        return False
 
     def _accept(self) -> str:
         """Take the image if possible; returns what is missing otherwise, else an empty string."""

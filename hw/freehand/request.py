@@ -88,6 +88,10 @@ def recorded_request(
     try:
         if not isinstance(told, dict):
             raise TypeError
+        if not all(isinstance(told[name], str) for name in ("source", "target_frame")):
+            raise TypeError
+        if not isinstance(told["device"], str | None):
+            raise TypeError
         spacing = told["spacing_mm"]
         return FreeHand(
             asked.host,
@@ -100,7 +104,7 @@ def recorded_request(
             None if spacing is None else (float(spacing[0]), float(spacing[1])),
             Rules(**{**told["rules"], "region": _four(told["rules"]["region"])}),
         ), told
-    except (TypeError, KeyError, ValueError, IndexError):
+    except (TypeError, KeyError, ValueError, IndexError, OverflowError):
         raise InputError(f"{path}: has no settings of a {kind} run: begun otherwise?") from None
 
 

@@ -68,7 +68,7 @@ class Bench:
     """Element, machine and tracker, which see one hand."""
 
     def __init__(self) -> None:
-        self.hand = Hand()
+        self.hand, self.unit_mm = Hand(), 1.0
         rng, camera = np.random.default_rng(1), Camera(WORLD, seed=0)
 
         def hear(t: float, threshold: int):
@@ -89,8 +89,13 @@ class Bench:
 
         self.images = ImageServer(
             see, clock=REAL, rate_hz=25.0, spacing_mm=camera.spacing_mm,
-            transforms=lambda t: {"ProbeToTracker": self.hand.pose(t)},
+            transforms=self.transforms,
         )  # fmt: skip
+
+    def transforms(self, t: float) -> dict[str, np.ndarray]:
+        pose = self.hand.pose(t)
+        pose[:3, 3] /= self.unit_mm
+        return {"ProbeToTracker": pose}
 
     @property
     def setup(self) -> HandHeldSetup:
@@ -230,6 +235,18 @@ def test_enter_is_refused_until_both_sides_were_seen(tmp_path, bench):
     Recorder(tmp_path / "o.h5", RecordingHeader("pixel", {}, 0, None, "{}")).close()
     with pytest.raises(InputError, match="has no settings of a pattern-injection run"):
         acquire_by_injection(tmp_path / "o.h5", bench.asked, bench.setup, person, resume=True)
+
+
+def test_poses_in_metres_are_told_of(tmp_path, bench):
+    class Sweeping(Person):
+        def show(self, frame: np.ndarray, words: str, advice: str) -> None:
+            super().show(frame, words, "nothing heard: to and fro")
+            if "look like metres: let the server send them in mm" in words:
+                self._keys.append("q")
+
+    bench.unit_mm = 1000.0
+    with pytest.raises(FreeHandStopped, match="0 images are too few"):
+        acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, Sweeping(bench.hand))
 
 
 def test_an_element_that_falls_silent_ends_the_run(tmp_path, bench, monkeypatch):
