@@ -91,11 +91,7 @@ class RecordingWriter:
         Raises:
             OutputError: the file is there already, or cannot be written.
         """
-        final = Path(path)
-        if final.exists():
-            raise _existing(final)
-        if not final.parent.is_dir():
-            raise OutputError(f"{final}: there is no folder {final.parent}")
+        final = check_new(path)
         temporary = final.parent / f".partial-{secrets.token_hex(8)}{final.suffix}"
         try:
             with h5py.File(temporary, "w") as file:
@@ -397,6 +393,20 @@ def _existing(path: Path) -> OutputError:
     except FormatError:
         return OutputError(f"{path}: exists already: give another name")
     return OutputError(f"{path}: exists already: resume it, or give another name")
+
+
+def check_new(path: str | os.PathLike[str]) -> Path:
+    """The path of a recording that can be made.
+
+    Raises:
+        OutputError: it is there already, or its folder is missing.
+    """
+    final = Path(path)
+    if final.exists():
+        raise _existing(final)
+    if not final.parent.is_dir():
+        raise OutputError(f"{final}: there is no folder {final.parent}")
+    return final
 
 
 def _write_skeleton(file: h5py.File, header: RecordingHeader) -> None:

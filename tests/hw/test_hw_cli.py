@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -72,6 +73,14 @@ def test_a_dry_run_shows_the_plan_and_makes_nothing(tmp_path, monkeypatch, capsy
     assert told.out == ""
     assert "no figure can be written as .toml; these endings work: " in told.err
     assert path.read_text() == good
+    # What --move would refuse.
+    path.write_text(re.sub(r"\[ultrasound\][^\[]*", "", good))
+    assert main([*arguments, "--phantom", "cross-wire"]) == 2
+    assert "needs the images: add [ultrasound]" in capsys.readouterr().err
+    path.write_text(good)
+    for name, said in (("bench.toml", "exists already"), ("no/out.h5", "there is no folder")):
+        assert main([arguments[0], name, *arguments[2:]]) != 0
+        assert said in capsys.readouterr().err
     armed = good.replace("settle_s = 1", 'model = "ur5"\ntcp_offset = [0, 0, 0.12, 0, 0, 0]')
     path.write_text(armed)
     assert main(arguments) == 0
