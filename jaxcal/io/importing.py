@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import QuaternionOrder
-from jaxcal.data.recording import MINIMUM_IMAGES, PosesInMetresError, Recording, make_images
+from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, Recording, make_images
 from jaxcal.io.columns import LengthUnit
 from jaxcal.io.folder import PROBE_TO_TRACKER, read_folder, with_pose_table
 from jaxcal.io.frame_names import FramePair, capitalised
@@ -147,7 +147,7 @@ def import_files(
             raise InputError("a pair of text files holds pixels: --units mm does not go with it")
         unused = "quaternion", "skip_invalid", "ignore_time"
         _refuse(options, unused, "does not go with a pair of text files, poses and points")
-        with _hint_of_units(options.pose_units is not None):
+        with _naming_pose_units(options):
             pair = read_crosswire(
                 *sources, spacing_mm=options.spacing_mm, pose_units=options.pose_units or "mm"
             )
@@ -160,17 +160,17 @@ def import_files(
     table = _table(sources[0], options)
     notes = _skipped(table)
     table, said = _with_good_time(table, options)
-    with _hint_of_units(options.pose_units is not None or table.length_stated):
+    with _naming_pose_units(options, table.length_stated):
         return Imported(recording_of(table, options.spacing_mm), notes + said)
 
 
 @contextmanager
-def _hint_of_units(stated: bool) -> Iterator[None]:
-    """Tell how poses in metres are converted, where their unit was not stated."""
+def _naming_pose_units(options: ImportOptions, stated: bool = False) -> Iterator[None]:
+    """Name the option that converts poses that look like metres, if no unit was ``stated``."""
     try:
         yield
-    except PosesInMetresError as error:
-        if stated:
+    except MetresError as error:
+        if stated or options.pose_units is not None:
             raise
         raise InputError(f"{error} (jaxcal import converts them with --pose-units m)") from None
 
@@ -256,7 +256,7 @@ def _from_sequence(
     poses, valid, said = tracked_poses(sequence, options)
     notes += said
     spacing = _spacing(sequence, options)
-    with _hint_of_units(options.pose_units is not None or sequence.length_stated):
+    with _naming_pose_units(options, sequence.length_stated):
         if placed is None or points is None:
             return _segmented(sequence, poses, valid, spacing, options, notes, results)
         notes += placed.notes + _mirrored(sequence, points)
