@@ -465,9 +465,9 @@ def _differences(recorded: Arrays, found: Arrays) -> Arrays:
         floor = LEAST_MM**2 if name == "cost" else LEAST_MM
         result[name] = np.abs(apart(name)) / np.maximum(np.abs(recorded[name]), floor)
     if "scale_mm_per_px" in recorded:
-        result["scale"] = largest(apart("scale_mm_per_px") / recorded["scale_mm_per_px"]) / (
-            LEAST_RAD
-        )
+        # No SD of the scale is recorded: what it moves at a depth of 100 mm, in SDs of X.
+        off = 100.0 * apart("scale_mm_per_px") / recorded["scale_mm_per_px"]
+        result["scale"] = largest(off) / unit[:, :3].min(axis=1)
     for name in ("sound_speed", "delay"):
         key = f"{name}_m_s" if name == "sound_speed" else f"{name}_s"
         sd_key = f"{name}_sd_m_s" if name == "sound_speed" else f"{name}_sd_s"
