@@ -429,7 +429,7 @@ class Calibration:
             face_offset_mm=float(origin),
             covariance=np.asarray(answer.covariance) if known else None,
             error_mm=float(answer.rms),
-            converged=bool(self.converged),
+            converged=bool(self.converged) and self.wrong_frames is None,
             source="the calibration",
             range_factor=float(factor),
             unknowns=tuple(name for name in answer.blocks if TABLE[name].in_image),
@@ -477,7 +477,8 @@ class Calibration:
                 ``json`` holds the whole record of the calibration.
 
         Raises:
-            InputError: an extension without a format, an unknown pixel size, or a batch.
+            InputError: an extension without a format, an unknown pixel size, a batch, or a
+                calibration that must not be used, in any format but ``json``.
             OutputError: the file could not be written and is unchanged.
         """
         if format == "json" or (format is None and os.fspath(path).lower().endswith(".json")):

@@ -38,7 +38,17 @@ FORMAT = "jaxcal-calibration"
 VERSION = 1
 MAXIMUM_BYTES = 64 * 2**20
 
-_NPZ = ("image_plane_to_probe", "scale_mm_per_px", "covariance", "face_offset_mm", "range_factor")
+_NPZ = (
+    "image_plane_to_probe",
+    "scale_mm_per_px",
+    "face_offset_mm",
+    "range_factor",
+    "covariance",
+    "image_unknowns",
+    "image_covariance",
+    "rms_mm",
+    "converged",
+)
 _NPZ_BYTES = 65536
 """Largest size of an ``.npz``, also unpacked."""
 
@@ -78,6 +88,10 @@ class ImageTransform:
         error_mm: root mean square residual of the calibration, mm; None if unknown.
         converged: whether the calibration can be used; None if unknown.
         source: the file, for messages.
+
+    Raises:
+        InputError: wrong shapes or ``unknowns``; and, unless ``converged`` is False, NaN or Inf, a
+            matrix that is not rigid, sizes or a factor that are not positive, negative variances.
     """
 
     image_plane_to_probe: Float[np.ndarray, "4 4"]
@@ -90,6 +104,47 @@ class ImageTransform:
     range_factor: float = 1.0
     unknowns: tuple[str, ...] = ("translation", "rotation")
     image_covariance: Float[np.ndarray, "q q"] | None = None
+
+    def __post_init__(self) -> None:
+        moving = [name for name in TABLE if TABLE[name].in_image]
+        blocks = tuple(self.unknowns)
+        if blocks[:2] != ("translation", "rotation") or not set(blocks) <= set(moving):
+            raise InputError(f"unknowns must be translation, rotation and others of {moving}")
+        size = len(tangent_names(blocks))
+        shapes = {
+            "image_plane_to_probe": (4, 4),
+            "scale_mm_per_px": (2,),
+            "face_offset_mm": (),
+            "range_factor": (),
+            "covariance": (6, 6),
+            "image_covariance": (size, size),
+            "error_mm": (),
+        }
+        given = {name: getattr(self, name) for name in shapes}
+        checked = {
+            name: _numbers(value, name, shapes[name])
+            for name, value in given.items()
+            if value is not None
+        }
+        if self.converged is not False:
+            checked["image_plane_to_probe"] = _checked(checked)
+        for name, array in checked.items():
+            object.__setattr__(self, name, array if shapes[name] else float(array))
+        object.__setattr__(self, "unknowns", blocks)
+        if self.error_mm is not None and not math.isfinite(self.error_mm):
+            object.__setattr__(self, "error_mm", None)
+
+    def check_usable(self) -> None:
+        """Refuse to hand on a calibration that must not be used.
+
+        Raises:
+            InputError: ``converged`` is False.
+        """
+        if self.converged is False:
+            raise InputError(
+                f"{self.source}: must not be used: it did not converge, its images do not "
+                "determine it, or their frames or units are wrong (its verdict says which)"
+            )
 
     def plus_matrix(self) -> Float[np.ndarray, "4 4"]:
         """PLUS's ImageToProbe: (u, v, 0, 1), px, to the probe, mm.
@@ -231,11 +286,14 @@ class ImageTransform:
             frames: names of the image's and the probe's frame.
 
         Raises:
-            InputError: an extension without a format, or an unknown pixel size.
+            InputError: an extension without a format, an unknown pixel size, or a calibration that
+                must not be used, in any format but ``json``, which says so.
             OutputError: the file could not be written and is unchanged.
         """
         name = os.fspath(path)
         chosen = _format_of(name) if format is None else format
+        if chosen != "json":
+            self.check_usable()
         if chosen in ("slicer", "itk"):
             from jaxcal.io.itk import write_itk
 
@@ -243,7 +301,10 @@ class ImageTransform:
         elif chosen == "numpy":
             with atomic_path(path) as temporary, temporary.open("wb") as file:
                 if name.lower().endswith(".npz"):
-                    np.savez(file, **self._arrays())
+                    known = {key: value for key, value in self._record().items() if key in _NPZ}
+                    matrix = None if self.scale_mm_per_px is None else self.plus_matrix()
+                    known["plus_image_to_probe"] = matrix
+                    np.savez(file, **{k: v for k, v in known.items() if v is not None})
                 else:
                     np.save(file, self.plus_matrix())
         else:
@@ -256,7 +317,11 @@ class ImageTransform:
             InputError: an unknown format, or an unknown pixel size.
         """
         if format == "json":
-            return json.dumps(self._record(), indent=2, allow_nan=False) + "\n"
+            try:
+                return json.dumps(self._record(), indent=2, allow_nan=False) + "\n"
+            except ValueError:
+                failed = f"{self.source}: the solve had failed: there is no transform to write"
+                raise InputError(failed) from None
         if format == "plus":
             from jaxcal.io.plus import transform_element
 
@@ -281,14 +346,6 @@ class ImageTransform:
             return np.array2string(self.plus_matrix(), separator=", ", floatmode="unique") + "\n"
         raise InputError(f"{quoted(str(format))} is no format that is written")
 
-    def _arrays(self) -> dict[str, Any]:
-        arrays: dict[str, Any] = {"image_plane_to_probe": self.image_plane_to_probe}
-        if self.scale_mm_per_px is not None:
-            arrays |= {"plus_image_to_probe": self.plus_matrix(), "scale_mm_per_px": self._scale()}
-        if self.covariance is not None:
-            arrays["covariance"] = self.covariance
-        return arrays | {"face_offset_mm": self.face_offset_mm, "range_factor": self.range_factor}
-
     def _record(self) -> dict[str, Any]:
         scale, covariance, full = self.scale_mm_per_px, self.covariance, self.image_covariance
         return {
@@ -305,6 +362,31 @@ class ImageTransform:
             "image_covariance": None if full is None else full.tolist(),
             "rms_mm": self.error_mm,
         }
+
+
+def _numbers(value: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be numbers of shape {shape}") from None
+    if array.shape != shape:
+        raise InputError(f"{name} must have shape {shape}, it has {array.shape}")
+    return array
+
+
+def _checked(values: dict[str, np.ndarray]) -> Float[np.ndarray, "4 4"]:
+    """Check the numbers of a calibration that is to be used; its matrix, which is then rigid."""
+    for name, array in values.items():
+        if name not in ("image_plane_to_probe", "error_mm") and not np.isfinite(array).all():
+            raise InputError(f"{name} holds NaN or Inf")
+        if name in ("scale_mm_per_px", "range_factor") and not (array > 0).all():
+            raise InputError(f"{name} must be positive")
+        if name in ("covariance", "image_covariance") and (np.diag(array) < 0).any():
+            raise InputError(f"{name} holds a negative variance")
+    matrix = values["image_plane_to_probe"]
+    rigid = check_poses(matrix[None], what="the matrix", labels=["image_plane_to_probe"])[0]
+    # What was rigid keeps every digit.
+    return matrix if np.abs(rigid - matrix).max() < _ROUNDING else rigid
 
 
 def _cross(vector: np.ndarray) -> Float[np.ndarray, "3 3"]:
@@ -441,15 +523,14 @@ def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
-    """What :meth:`ImageTransform.save` writes; the covariance is X's alone."""
+    """What :meth:`ImageTransform.save` writes; older files have fewer names."""
     check_readable(path, maximum_bytes=_NPZ_BYTES)
     try:
         with ZipFile(path) as archive:
             if sum(member.file_size for member in archive.infolist()) > _NPZ_BYTES:
                 raise FormatError("holds more than a calibration")
         with np.load(path, allow_pickle=False) as file:
-            names = [name for name in _NPZ if name in file.files]
-            record = {name: np.asarray(file[name], dtype=np.float64).tolist() for name in names}
+            record = {name: file[name].tolist() for name in _NPZ if name in file.files}
     except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise FormatError(f"holds no arrays of numbers: {one_line(error)}") from None
     return transform_from_record({"version": VERSION} | record, source=os.fspath(path))
@@ -470,7 +551,8 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     """The calibration in an object of ``jaxcal calibrate --json``, of this or an older version.
 
     Raises:
-        FormatError: another format, a newer version, or a field that is missing or invalid.
+        FormatError: another format, a newer version, or a field that is missing or no array.
+        InputError: numbers that :class:`ImageTransform` refuses.
     """
     if record.get("format", FORMAT) != FORMAT:
         raise FormatError(f"is not a calibration: its format is {quoted(str(record['format']))}")
@@ -485,27 +567,21 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     matrix = _array(record, key, (4, 4))
     if matrix is None:
         raise FormatError(f"is not a calibration: {key} is missing, or the solve had failed")
-    transform = check_poses(matrix[None], what=key)[0]
-    if np.abs(transform - matrix).max() < _ROUNDING:
-        transform = matrix  # keeps every digit of the file
     scale = _array(record, "scale_mm_per_px", (2,))
-    if scale is not None and not (scale > 0).all():
-        raise FormatError("scale_mm_per_px must be positive")
     offset = _array(record, "face_offset_mm", ())
     factor = _array(record, "range_factor", ())
-    if factor is not None and not factor > 0:
-        raise FormatError("range_factor must be positive")
     error = _array(record, "rms_mm", ())
-    converged = record.get("converged")
+    usable = record.get("converged")
+    usable = usable and not record.get("wrong_frames") if isinstance(usable, bool) else None
     unknowns = _unknowns(record)
     size = len(tangent_names(unknowns))
     return ImageTransform(
-        transform,
+        matrix,
         scale,
         0.0 if offset is None else float(offset),
         _array(record, "covariance", (6, 6)),
         None if error is None else float(error),
-        converged if isinstance(converged, bool) else None,
+        usable,
         source,
         1.0 if factor is None else float(factor),
         unknowns,

@@ -64,13 +64,12 @@ def apply(
     import numpy as np
 
     from jaxcal.calibration.transform import load_calibration
-    from jaxcal.cli.export import check_usable
     from jaxcal.io.atomic import write_text
 
     if (source is None) == (not pixel):
         raise click.UsageError("name SOURCE, or points by --pixel U V")
     transform = load_calibration(calibration)
-    check_usable(transform)
+    transform.check_usable()
     points, poses = np.array(pixel), None
     if source is not None:
         points, poses, kind = _read(source, quaternion, pose_units)

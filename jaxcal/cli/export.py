@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from jaxcal import InputError
 from jaxcal.cli.common import POSITIVE, ExitCode
 
 if TYPE_CHECKING:
@@ -99,7 +98,7 @@ def export(
     from jaxcal.calibration.transform import load_calibration
 
     transform = load_calibration(calibration)
-    check_usable(transform)
+    transform.check_usable()
     if pixel_size is not None:
         transform = transform.with_pixels(pixel_size, origin or (0.0, 0.0))
     frames = image_frame, probe_frame
@@ -114,19 +113,6 @@ def export(
     elif format is not None:
         click.echo(transform.text(format, frames=frames), nl=False)
     return ExitCode.CONVERGED
-
-
-def check_usable(transform: ImageTransform) -> None:
-    """Refuse to hand on a calibration that did not converge.
-
-    Raises:
-        InputError: with what to do.
-    """
-    if transform.converged is False:
-        raise InputError(
-            f"{transform.source}: did not converge or is not determined by its images; its "
-            "transform must not be used"
-        )
 
 
 def patched(
