@@ -142,6 +142,7 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path, record, resu
     path = tmp_path / "cal.html"
     write_page(path, record, result, recording)
     assert path.read_text().startswith("<!DOCTYPE html>")
+    write_page(path, record, result, recording)  # its own page is replaced
     with pytest.raises(jaxcal.OutputError):
         write_page(tmp_path / "no" / "cal.html", record, result, recording)
     assert [entry.name for entry in tmp_path.iterdir()] == ["cal.html"]

@@ -18,6 +18,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -30,6 +31,7 @@ from jaxcal.data.poses import check_poses
 from jaxcal.diagnostics.image_points import point_jacobian
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair
+from jaxcal.io.outputs import check_output
 from jaxcal.io.readable import check_readable, naming, one_line, quoted
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.runtime.array_types import Float
@@ -55,6 +57,8 @@ _NPZ_BYTES = 65536
 SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
 
 _ROUNDING = 1e-13
+_LARGEST = 1e9
+"""Largest pixel; beyond it nothing is an image, and squares overflow."""
 _SKEWED = 1e-3
 """Largest cosine between two columns of a matrix that count as orthogonal."""
 
@@ -214,12 +218,21 @@ class ImageTransform:
             estimated pixel sizes, sound speed and delay) and the points' own, but not the pose's.
 
         Raises:
-            InputError: shapes that do not agree, NaN or Inf, or a pose that is not rigid.
+            InputError: shapes that do not agree, NaN or numbers over 1e9, a negative SD, or a pose
+                that is not rigid.
         """
         measured = np.asarray(pixels, dtype=np.float64)
         measured = measured[None] if measured.ndim == 1 else measured
-        if measured.ndim != 2 or measured.shape[1] != 2 or not np.isfinite(measured).all():
-            raise InputError(f"pixels must be finite and have shape (n, 2), not {measured.shape}")
+        if measured.ndim != 2 or measured.shape[1] != 2:
+            raise InputError(f"pixels must have shape (n, 2), not {measured.shape}")
+        own = np.asarray(pixel_sd_px, dtype=np.float64)
+        if own.shape not in ((), (2,)):
+            raise InputError(f"pixel_sd_px must be one number or two, not of shape {own.shape}")
+        # Written so that NaN is refused, too.
+        if not (np.abs(measured) <= _LARGEST).all():
+            raise InputError(f"pixels must be numbers up to {_LARGEST:g}, not NaN or Inf")
+        if not ((own >= 0) & (own <= _LARGEST)).all():
+            raise InputError(f"pixel_sd_px must be from 0 to {_LARGEST:g}")
         count = len(measured)
         scale = np.ones(2) if self.scale_mm_per_px is None else self.scale_mm_per_px
         plane = np.zeros((count, 3))
@@ -228,7 +241,7 @@ class ImageTransform:
         plane[:, 2] = scale[1] * measured[:, 1] + self.face_offset_mm
         rotation = self.image_plane_to_probe[:3, :3]
         points = plane @ rotation.T + self.image_plane_to_probe[:3, 3]
-        covariance = self._covariance(plane, rotation, scale, pixel_sd_px)
+        covariance = self._covariance(plane, rotation, scale, own)
         if pose is None:
             return AppliedPoints(points, covariance)
         given = np.asarray(pose, dtype=np.float64)
@@ -245,7 +258,7 @@ class ImageTransform:
         plane: Float[np.ndarray, "n 3"],
         rotation: Float[np.ndarray, "3 3"],
         scale: Float[np.ndarray, 2],
-        pixel_sd_px: float | tuple[float, float],
+        pixel_sd: Float[np.ndarray, "*two"],
     ) -> Float[np.ndarray, "n 3 3"]:
         """R (J C J' + S) R', in the probe's frame; J is :mod:`jaxcal.diagnostics.image_points`'."""
         covariance, blocks = self.image_covariance, self.unknowns
@@ -255,7 +268,7 @@ class ImageTransform:
             return np.full((len(plane), 3, 3), np.nan)
         jacobian = point_jacobian(plane[:, [0, 2]], blocks, self.face_offset_mm, self.range_factor)
         own = np.zeros(3)
-        own[[0, 2]] = np.broadcast_to(np.asarray(pixel_sd_px, dtype=np.float64), 2) * scale
+        own[[0, 2]] = pixel_sd * scale
         inner = jacobian @ covariance @ jacobian.swapaxes(1, 2) + np.diag(own**2)
         return rotation @ inner @ rotation.T
 
@@ -278,7 +291,7 @@ class ImageTransform:
         """Write the calibration, complete or not at all.
 
         Args:
-            path: the file to make or replace.
+            path: the file to make; only a calibration in the same format is replaced.
             format: ``json`` (ours), ``plus`` (a ``<Transform>`` to paste), ``slicer`` or ``itk``
                 (``.tfm``, ``.txt`` or ``.h5``), ``ros`` (YAML, metres), ``tusrec``
                 (``calib_matrix.csv``) or ``numpy`` (``.npy``: PLUS's matrix; ``.npz``: all). By
@@ -286,12 +299,12 @@ class ImageTransform:
             frames: names of the image's and the probe's frame.
 
         Raises:
-            InputError: an extension without a format, an unknown pixel size, or a calibration that
-                must not be used, in any format but ``json``, which says so.
+            InputError: an extension of another or no format, an existing file of another kind, an
+                unknown pixel size, or a calibration that must not be used, in any format but
+                ``json``, which says so.
             OutputError: the file could not be written and is unchanged.
         """
-        name = os.fspath(path)
-        chosen = _format_of(name) if format is None else format
+        chosen = check_target(path, format)
         if chosen != "json":
             self.check_usable()
         if chosen in ("slicer", "itk"):
@@ -300,7 +313,7 @@ class ImageTransform:
             write_itk(path, self.plus_matrix())
         elif chosen == "numpy":
             with atomic_path(path) as temporary, temporary.open("wb") as file:
-                if name.lower().endswith(".npz"):
+                if os.fspath(path).lower().endswith(".npz"):
                     known = {key: value for key, value in self._record().items() if key in _NPZ}
                     matrix = None if self.scale_mm_per_px is None else self.plus_matrix()
                     known["plus_image_to_probe"] = matrix
@@ -394,24 +407,71 @@ def _cross(vector: np.ndarray) -> Float[np.ndarray, "3 3"]:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+_EXTENSIONS: dict[SaveFormat, tuple[str, ...]] = {
+    "json": (".json",),
+    "plus": (".xml",),
+    "slicer": (".tfm", ".txt", ".h5"),
+    "itk": (".tfm", ".txt", ".h5"),
+    "ros": (".yaml", ".yml"),
+    "tusrec": (".csv",),
+    "numpy": (".npy", ".npz"),
+}
+
+
 def _format_of(name: str) -> SaveFormat:
-    lower = name.lower()
-    formats: dict[str, SaveFormat] = {
-        ".json": "json",
-        ".xml": "plus",
-        ".tfm": "slicer",
-        ".txt": "slicer",
-        ".h5": "itk",
-        ".yaml": "ros",
-        ".yml": "ros",
-        ".csv": "tusrec",
-        ".npy": "numpy",
-        ".npz": "numpy",
-    }
-    for extension, chosen in formats.items():
-        if lower.endswith(extension):
+    for chosen, extensions in _EXTENSIONS.items():
+        if name.lower().endswith(extensions):
             return chosen
-    raise InputError(f"{name}: its extension tells no format (there are {', '.join(formats)})")
+    known = dict.fromkeys(each for extensions in _EXTENSIONS.values() for each in extensions)
+    raise FormatError(f"{name}: its extension tells no format (there are {', '.join(known)})")
+
+
+def check_target(
+    path: str | os.PathLike[str],
+    format: SaveFormat | None = None,
+    inputs: Sequence[str | os.PathLike[str]] = (),
+) -> SaveFormat:
+    """The format in which :meth:`ImageTransform.save` writes a file, if it may be written.
+
+    Args:
+        path: the file to make or replace.
+        format: by default that of the extension.
+        inputs: files that must not be replaced.
+
+    Raises:
+        InputError: an extension by which the file could not be read again, one of the inputs, or
+            an existing file that is no calibration in this format.
+    """
+    name = os.fspath(path)
+    chosen = _format_of(name) if format is None else format
+    extensions = _EXTENSIONS.get(chosen)
+    if extensions is None:
+        raise InputError(f"{quoted(str(chosen))} is no format that is written")
+    if not name.lower().endswith(extensions):
+        raise InputError(f"{name}: a file of format {chosen} is named {' or '.join(extensions)}")
+    check_output(path, f"a calibration (format {chosen})", lambda _: _is_one(path, chosen), inputs)
+    return chosen
+
+
+def _is_one(path: str | os.PathLike[str], format: SaveFormat) -> bool:
+    if format == "json":
+        return is_calibration_record(path)
+    load_calibration(path)
+    if format != "plus":
+        return True
+    from jaxcal.io.xml import read_xml
+
+    # A whole configuration is more than we write.
+    return read_xml(path)[0].tag == "Transform"
+
+
+def is_calibration_record(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is the JSON of a calibration, also of one that failed.
+
+    Raises:
+        FormatError: it is no JSON object.
+    """
+    return _json_object(path).get("format") == FORMAT
 
 
 def transform_from_plus_matrix(
@@ -493,7 +553,7 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
             return transform_from_plus_matrix(_load_npy(path), source=name)
         if lower.endswith(".npz"):
             return _load_npz(path)
-        return _load_json(path)
+        return transform_from_record(_json_object(path), source=name)
 
 
 def _load_plus(path: str | os.PathLike[str]) -> ImageTransform:
@@ -536,15 +596,20 @@ def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
     return transform_from_record({"version": VERSION} | record, source=os.fspath(path))
 
 
-def _load_json(path: str | os.PathLike[str]) -> ImageTransform:
+def _json_object(path: str | os.PathLike[str]) -> dict[str, Any]:
     check_readable(path, maximum_bytes=MAXIMUM_BYTES)
     try:
-        record = json.loads(Path(path).read_bytes())
+        content = Path(path).read_bytes()
+        if not content.lstrip().startswith(b"{"):
+            _format_of(os.fspath(path))
+        record = json.loads(content)
     except (OSError, ValueError, RecursionError) as error:
+        if isinstance(error, FormatError):
+            raise
         raise FormatError(f"is not JSON: {one_line(error)}") from None
     if not isinstance(record, dict):
         raise FormatError("is not a calibration: a JSON object is needed")
-    return transform_from_record(record, source=os.fspath(path))
+    return record
 
 
 def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> ImageTransform:

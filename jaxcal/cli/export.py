@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime
+import os
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import click
@@ -95,8 +97,12 @@ def export(
         raise click.UsageError("--plus-server writes no file: leave OUT out")
     if origin is not None and pixel_size is None:
         raise click.BadParameter("needs --pixel-size", param_hint="--origin")
-    from jaxcal.calibration.transform import load_calibration
+    from jaxcal.calibration.transform import check_target, load_calibration
 
+    if plus_config is not None:
+        check_configuration(plus_config if out is None else out, [calibration])
+    elif out is not None:
+        check_target(out, format, [calibration])
     transform = load_calibration(calibration)
     transform.check_usable()
     if pixel_size is not None:
@@ -113,6 +119,21 @@ def export(
     elif format is not None:
         click.echo(transform.text(format, frames=frames), nl=False)
     return ExitCode.CONVERGED
+
+
+def check_configuration(path: str, inputs: Sequence[str]) -> None:
+    """Check that a configuration of PLUS can be written; another one may be there.
+
+    Raises:
+        InputError: it is one of the inputs, or no configuration.
+    """
+    from jaxcal.io.outputs import check_output
+    from jaxcal.io.xml import read_xml
+
+    def is_one(path: str | os.PathLike[str]) -> bool:
+        return read_xml(path)[0].tag == "PlusConfiguration"
+
+    check_output(path, "a configuration of PLUS", is_one, inputs)
 
 
 def patched(

@@ -79,6 +79,20 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         temporary.write_bytes(content)
 
 
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Check that a file can be made or replaced, before other work begins.
+
+    Raises:
+        OutputError: it cannot be made or replaced.
+    """
+    with suppress(_Unwritten), atomic_path(path):
+        raise _Unwritten
+
+
+class _Unwritten(Exception):
+    """Ends a check before anything is written."""
+
+
 def _existing_mode(final: Path) -> int | None:
     """The permissions of the file to be replaced, or None where there is none."""
     try:

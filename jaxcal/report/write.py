@@ -74,20 +74,6 @@ def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
-def check_writable(path: str | os.PathLike[str]) -> None:
-    """Check that a file can be made or replaced, before other work begins.
-
-    Raises:
-        OutputError: it cannot be made or replaced.
-    """
-    with suppress(_Unwritten), atomic_path(path):
-        raise _Unwritten
-
-
-class _Unwritten(Exception):
-    """Ends a check before anything is written."""
-
-
 def write_report(
     folder: Path,
     record: dict[str, Any],
