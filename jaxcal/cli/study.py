@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jaxcal.study.run import Watcher
 
 
-@click.group()
+@click.group(no_args_is_help=False)
 def study() -> None:
     """Monte-Carlo studies: a grid of conditions x methods x trials, from a TOML spec."""
 
