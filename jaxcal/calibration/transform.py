@@ -346,7 +346,8 @@ class ImageTransform:
         if format == "ros":
             from jaxcal.io.ros import ros_yaml
 
-            return ros_yaml(self.image_plane_to_probe, frames[1].lower(), frames[0].lower())
+            parent, child = frames[1].lower(), frames[0].lower()
+            return ros_yaml(self.image_plane_to_probe, parent, child, self.left_out(format))
         if format == "tusrec":
             from jaxcal.io.tus_rec import calib_matrix
 
@@ -358,6 +359,14 @@ class ImageTransform:
         if format == "numpy":
             return np.array2string(self.plus_matrix(), separator=", ", floatmode="unique") + "\n"
         raise InputError(f"{quoted(str(format))} is no format that is written")
+
+    def left_out(self, format: SaveFormat) -> str | None:
+        """What a format cannot hold and its user must do, in words; None where nothing is."""
+        if format != "ros":
+            return None
+        from jaxcal.io.ros import range_note
+
+        return range_note(self.range_factor, self.face_offset_mm)
 
     def _record(self) -> dict[str, Any]:
         scale, covariance, full = self.scale_mm_per_px, self.covariance, self.image_covariance

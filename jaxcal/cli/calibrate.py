@@ -283,7 +283,7 @@ def _export(
     if not targets:
         return []
     from jaxcal.calibration.transform import transform_from_record
-    from jaxcal.cli.export import patched
+    from jaxcal.cli.export import patched, written
 
     if not record["converged"] or record["wrong_frames"]:
         return ["exported: nothing, since the calibration is not to be used"]
@@ -293,8 +293,7 @@ def _export(
         if format == "plus":
             said += patched(transform, path, None, ("Image", "Probe"))
         else:
-            transform.save(path, format)
-            said.append(f"{path}: written")
+            said += written(transform, path, format)
     return said
 
 

@@ -102,7 +102,7 @@ def export(
     if plus_config is not None:
         check_configuration(plus_config if out is None else out, [calibration])
     elif out is not None:
-        check_target(out, format, [calibration])
+        format = check_target(out, format, [calibration])
     transform = load_calibration(calibration)
     transform.check_usable()
     if pixel_size is not None:
@@ -114,8 +114,8 @@ def export(
     elif plus_server is not None:
         click.echo(sent(transform, plus_server, frames))
     elif out is not None:
-        transform.save(out, format, frames=frames)
-        click.echo(f"{out}: written")
+        for line in written(transform, out, format, frames):
+            click.echo(line)
     elif format is not None:
         click.echo(transform.text(format, frames=frames), nl=False)
     return ExitCode.CONVERGED
@@ -134,6 +134,18 @@ def check_configuration(path: str, inputs: Sequence[str]) -> None:
         return read_xml(path)[0].tag == "PlusConfiguration"
 
     check_output(path, "a configuration of PLUS", is_one, inputs)
+
+
+def written(
+    transform: ImageTransform,
+    path: str,
+    format: SaveFormat | None,
+    frames: tuple[str, str] = ("Image", "Probe"),
+) -> list[str]:
+    """Write a transform; what was done and what should be known."""
+    transform.save(path, format, frames=frames)
+    note = None if format is None else transform.left_out(format)
+    return [f"{path}: written", *([] if note is None else [f"- {note}"])]
 
 
 def patched(
