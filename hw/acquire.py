@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from typing import Protocol, runtime_checkable
@@ -19,7 +20,7 @@ import numpy as np
 
 from hw.acquire_live import Estimator
 from hw.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
-from hw.errors import DeviceError, RefusedError
+from hw.errors import DeviceError, LostError, RefusedError, StaleError
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
 from hw.midplane.image_scan import image_scan
@@ -40,7 +41,8 @@ from hw.recording_file import RecordingWriter
 from hw.recording_layout import RecordingHeader
 from hw.resuming import compare, described
 from hw.robot.motion import Motion
-from hw.robot.safety import Confirmation, MotionPlan, check_plan
+from hw.robot.safety import Confirmation, MotionPlan, check_plan, check_sample
+from hw.robot.stream import offset_changed
 from hw.session import Session, Watch, median_times
 from hw.setup import Setup, controller_arm
 from hw.stage import ProbeStage
@@ -182,12 +184,15 @@ class Outcome:
         given_up: rows of the plan for which no mid-plane was found, or that were skipped.
         sha256: of the finished file.
         seconds: bench seconds that this run took.
+        resume: what to type to be asked for the poses in ``given_up`` again; None if there are none
+            or other poses took their place.
     """
 
     images: int
     given_up: tuple[int, ...]
     sha256: str
     seconds: float
+    resume: str | None = None
 
 
 @dataclass(frozen=True)
@@ -254,8 +259,6 @@ def acquire(
         OutputError: the recording cannot be made; nothing moved.
     """
     job = _prepare(setup, path, request)
-    if job.request.by_image and setup.ultrasound is None:
-        raise InputError(f"a {job.request.phantom} needs the images: add [ultrasound] to the setup")
     estimator = Estimator(job.images, setup, job.progress, job.request.kind)
     pool = "" if job.images == len(job.targets) else f" from a pool of {len(job.targets)}"
     say(f"plan: {job.images} poses{pool}, {job.to_take} to go; compiling the estimate")
@@ -276,22 +279,32 @@ def acquire(
                 Nobody() if view is None else view,
             )
         except KeyboardInterrupt:
-            reason, interrupted = "interrupted", True
+            reason, interrupted, by_itself = "interrupted", True, False
         except (DeviceError, CalibrationError) as error:
             reason, interrupted = str(error), False
+            # A stream that hesitated or a watchdog that tripped: a person would only try again.
+            by_itself = isinstance(error, StaleError | LostError)
         # Motion has ended by now: no process of ours moves the robot any more.
         with suppress(CalibrationError):
             recorder.add_event("stopped", reason, setup.clock.now())
+            if job.progress is not None and job.progress.ended:
+                # It was complete before this run, and stays so.
+                _finish(recorder, job.images - estimator.count)
     if recorder.error is not None and not interrupted:
         # The recorder's failure is the cause of what went wrong.
         reason = str(recorder.error)
-    where = "--setup TOML" if job.request.bench is None else "--bench"
     raise AcquisitionStopped(
         f"{reason}; {estimator.count} of {job.images} images are in {recorder.kept}; put it "
-        f"right, then: jaxcal-hw acquire --resume {recorder.kept} {where}",
+        f"right, then: {resume_command(recorder.kept, job.request)}",
         interrupted=interrupted,
-        by_itself=recorder.error is None,
+        by_itself=by_itself and recorder.error is None,
     )
+
+
+def resume_command(path: str | os.PathLike[str], request: AcquisitionRequest) -> str:
+    """What to type to go on with a recording."""
+    where = "--bench" if request.bench is not None else "--setup TOML --move"
+    return f"jaxcal-hw acquire {shlex.quote(os.fspath(path))} --resume {where}"
 
 
 @contextmanager
@@ -308,8 +321,10 @@ def planned(setup: Setup, request: AcquisitionRequest) -> PosePlan:
     """The poses of a request: a plan in the order of travel, or the pool of an optimal one.
 
     Raises:
-        InputError: box, reach and limits leave too few poses.
+        InputError: box, reach and limits leave too few poses, or the setup lacks a device.
     """
+    if request.by_image and setup.ultrasound is None:
+        raise InputError(f"a {request.phantom} needs the images: add [ultrasound] to the setup")
     if request.plan == "sobol":
         return plan_poses(request.images, setup.scene, setup.extent, request.seed)
     allowed = allowed_by(setup.motion_limits(), setup.tcp_offset)
@@ -389,9 +404,11 @@ def _run(
     skipped: list[int] = []
     with session, watched(view, session):
         plan = _motion_plan(job, session, recorder)
+        check_sample(session.poses.latest(), plan.limits, clock)
         course = check_plan(plan)
         note("arm", NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}")
-        view.plan(setup, plan, [row for row in range(len(job.targets)) if row not in job.missing])
+        done = [row for row in range(len(job.targets)) if row not in job.missing]
+        view.plan(setup, plan, job.targets, done)
         confirmation = confirm(plan)
         by = "unattended: nobody was asked" if confirmation.unattended else "by the operator"
         note("confirmed", f"{by}; plan {plan.digest[:16]} for robot {plan.serial}, {plan.pendant}")
@@ -445,10 +462,23 @@ def _run(
     if oracle is not None:
         _write_truth(recorder, oracle)
     note("finished", f"{estimator.count} images")
-    digest = recorder.finish()
+    without = tuple(sorted(given_up + skipped))
+    # A pool has other poses for those without an image.
+    again = without if job.request.plan == "sobol" else ()
+    digest = _finish(recorder, len(again))
     return Outcome(
-        estimator.count, tuple(sorted(given_up + skipped)), digest, clock.now() - started
+        estimator.count,
+        without,
+        digest,
+        clock.now() - started,
+        resume_command(recorder.kept, job.request) if again else None,
     )
+
+
+def _finish(recorder: Recorder, without_image: int) -> str:
+    """Mark the recording complete; poses without an image may still be asked for again."""
+    recorder.attributes("plan", {"without_image": without_image})
+    return recorder.finish()
 
 
 def _rows(
@@ -483,13 +513,7 @@ def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
         )
     known = {"serial_number": identity.name, "tcp_offset": list(offset)}
     if job.progress is not None:
-        before = job.progress.settings.get("robot")
-        if before is not None and json.loads(json.dumps(known)) != before:
-            raise RefusedError(
-                f"the recording was begun with robot {before}, this one is {known}: its images "
-                "would not fit together",
-                device="robot",
-            )
+        _check_same_robot(job.progress.settings.get("robot"), identity.name, offset)
     bench = described(job.setup, job.targets)
     settings = {"request": asdict(job.request), "robot": known, "bench": bench}
     recorder.put("plan", "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8), "1")
@@ -501,7 +525,31 @@ def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
         raise RefusedError("the controller does not tell its speed slider", device="robot")
     limits = job.setup.motion_limits(controller_arm(identity.model, identity.version))
     joints = session.poses.latest().joints
-    return MotionPlan(job.targets, limits, offset, identity.name, joints, pendant)
+    to_go = job.targets[job.missing]
+    return MotionPlan(to_go, limits, offset, identity.name, joints, pendant)
+
+
+def _check_same_robot(before: object, serial: str, tcp_offset: Sequence[float]) -> None:
+    """Refuse a robot, or a TCP offset, other than those of the images taken so far."""
+    if before is None:
+        return
+    try:
+        known, numbers = before["serial_number"], before["tcp_offset"]  # pyright: ignore[reportIndexIssue]
+        offset = np.array(numbers, dtype=np.float64).reshape(6)
+    except (TypeError, KeyError, ValueError):
+        raise RefusedError(
+            "the recording does not say with which robot it began", device="robot"
+        ) from None
+    if known != serial:
+        what = f"the recording was begun with robot {known}, this one is {serial}"
+    elif offset_changed(offset.tolist(), tcp_offset):
+        what = (
+            f"the recording was begun with the TCP offset {offset.tolist()} (m, rad), it is "
+            f"{list(tcp_offset)} now"
+        )
+    else:
+        return
+    raise RefusedError(f"{what}: its images would not fit together", device="robot")
 
 
 def _place(

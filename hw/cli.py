@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from hw.choices import HAND_PLACEMENTS, OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
 from hw.interrupts import as_interrupts
@@ -20,6 +22,7 @@ from jaxcal.cli.run import run
 if TYPE_CHECKING:
     from hw.acquire import AcquisitionRequest, Confirm, Outcome
     from hw.bench.run import Bench
+    from hw.extras import Extra
     from hw.keys import Keyboard
     from hw.midplane.pattern_injection import Operator
     from hw.midplane.terminal_image import Screen
@@ -163,10 +166,8 @@ def acquire(
         )
         if value is not None
     ]
-    if resume and given:
-        raise InputError(f"{given[0]} does not go with --resume: the recording knows")
-    if resume and recording is None:
-        raise InputError("--resume needs the RECORDING to go on with")
+    if resume:
+        _check_resumed(recording, given)
     if operator is not None and not resume and placement != "pattern-injection":
         raise InputError("--operator needs --placement pattern-injection")
     if until_tre is not None and plan != "optimal" and not resume:
@@ -183,11 +184,13 @@ def acquire(
         bench_seed = _recorded_bench(recorded, bench)
         phantom = _recorded_phantom(recorded)
         operator = _recorded_operator(recorded)
+    needed: dict[str, Extra] = {"rtde_control": "robot"} if bench or move else {}
     if bench and phantom in (None, PHANTOMS[0]):
-        # Before a file is made: without them not a single line of the active echo is received.
-        for module in ("cobs", "serial"):
-            if (cure := missing(module, extra="serial")) is not None:
-                raise InputError(cure)
+        needed |= {"cobs": "serial", "serial": "serial"}
+    for module, extra in needed.items():
+        # Before a file is made, and before anybody is asked to confirm a plan.
+        if (cure := missing(module, extra=extra)) is not None:
+            raise InputError(cure)
     path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
     from jaxcal.cli.cache import enable_compilation_cache
 
@@ -295,12 +298,21 @@ def free_hand(
     longest, and accept with Enter. RECORDING is the file to make (by default one named after the
     time); afterwards it is calibrated, as jaxcal calibrate would.
     """
-    from hw.freehand.acquire import FreeHand, acquire_free_hand
+    from hw.freehand.acquire import acquire_free_hand
     from hw.freehand.guide import Rules
+    from hw.freehand.request import FreeHand
     from hw.freehand.terminal import INJECTION_KEYS, KEYS, TerminalPerson
 
-    if resume and recording is None:
-        raise InputError("--resume needs the RECORDING to go on with")
+    if resume:
+        context = click.get_current_context()
+        given = [
+            option.opts[0]
+            for option in context.command.params
+            if isinstance(option, click.Option)
+            and option.name not in ("resume", "placement", "setup_path")
+            and context.get_parameter_source(str(option.name)) is ParameterSource.COMMANDLINE
+        ]
+        _check_resumed(recording, given)
     injected = placement == "pattern-injection"
     if injected != (setup_path is not None):
         raise InputError("--placement pattern-injection and --setup TOML go together")
@@ -331,6 +343,14 @@ def free_hand(
     return _calibrated(path)
 
 
+def _check_resumed(recording: str | None, given: Sequence[str]) -> None:
+    """Refuse --resume without a recording, or with options that the recording knows."""
+    if recording is None:
+        raise InputError("--resume needs the RECORDING to go on with")
+    if given:
+        raise InputError(f"{given[0]} does not go with --resume: the recording knows")
+
+
 def _calibrated(path: str) -> int:
     """Calibrate from a finished free-hand recording and print the result."""
     from jaxcal.calibration.calibrate import calibrate
@@ -350,8 +370,10 @@ def _calibrated(path: str) -> int:
     scale = ("scale",) if images.kind == "pixel" and images.spacing_mm is None else ()
     record = calibration_record(calibrate(data, estimate=scale), data)
     hint = " --estimate scale" if scale else ""
-    again = f"{path}: again, with a report: jaxcal calibrate {path}{hint} --report report.html"
-    print_page(calibration_table(record), *verdict(record), "", again)
+    again = f"jaxcal calibrate {shlex.quote(path)}{hint} --report report.html"
+    print_page(
+        calibration_table(record), *verdict(record), "", f"{path}: again, with a report: {again}"
+    )
     return exit_code([record])
 
 
@@ -389,7 +411,7 @@ def setup_(out: str | None) -> int:
     if Path(out).exists():
         raise InputError(f"{out}: exists; name another file")
     write_text(out, text)
-    click.echo(f"{out}: written; fill it in, then jaxcal-hw check --setup {out}")
+    click.echo(f"{out}: written; fill it in, then jaxcal-hw check --setup {shlex.quote(out)}")
     return ExitCode.CONVERGED
 
 
@@ -578,7 +600,11 @@ def _confirming(setup: Setup, emulated: bool, unattended: str | None) -> Confirm
             f"{challenge.code} to let it move.",
             err=True,
         )
-        return confirm(challenge, click.prompt("code", err=True), clock=setup.clock)
+        try:
+            code = click.prompt("code", err=True)
+        except click.Abort:
+            raise KeyboardInterrupt from None
+        return confirm(challenge, code, clock=setup.clock)
 
     return ask
 

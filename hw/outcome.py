@@ -11,6 +11,7 @@ import numpy as np
 
 from hw.acquire import AcquisitionRequest, Outcome, planned
 from hw.poses import preview
+from hw.recording_file import check_new
 from hw.robot.limits import Limits
 from hw.robot.safety import MotionPlan, check_plan, plan_lines
 from hw.setup import Setup
@@ -24,10 +25,12 @@ def dry_run(
 
     Raises:
         InputError: a plan that cannot be made.
+        OutputError: a recording that cannot be made.
         RefusedError: a plan that the limits do not allow; it names the first pose or way.
     """
     if request is None:
         raise InputError("--resume needs --move: a dry run has nothing to resume")
+    check_new(path)
     plan = planned(setup, request)
     motion = MotionPlan(plan.poses, _dry_limits(setup), setup.tcp_offset or (0.0,) * 6, "dry run")
     course = check_plan(motion)
@@ -95,7 +98,8 @@ def calibrate_and_print(path: str, outcome: Outcome, speed: float) -> dict[str, 
     ]
     if outcome.given_up:
         rows = ", ".join(str(row + 1) for row in outcome.given_up)
-        lines.append(f"without an image: poses {rows} (no mid-plane found, or skipped)")
+        again = "" if outcome.resume is None else f"; again: {outcome.resume}"
+        lines.append(f"without an image: poses {rows} (no mid-plane found, or skipped){again}")
     share = share_inside(path)
     if share is not None:
         lines.append(f"true offsets inside their brackets: {share[0]} of {share[1]}")

@@ -26,7 +26,7 @@ from hw.scene import Scene
 from hw.shapes import Float
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
-from jaxcal.io.atomic import atomic_path
+from jaxcal.io.atomic import save_figure
 
 MOST_POSES = 10_000
 # A turn of one degree takes the arm about as long as this many mm.
@@ -190,7 +190,12 @@ def _two_opt(tour: np.ndarray, cost: np.ndarray, rounds: int = 20) -> np.ndarray
 
 
 def preview(plan: PosePlan, path: Path) -> None:
-    """Write a figure of the plan: tips and axes in the base frame, cone, target over the image."""
+    """Write a figure of the plan: tips and axes in the base frame, cone, target over the image.
+
+    Raises:
+        InputError: ``path`` ends in the name of no format of figures.
+        OutputError: it cannot be written.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 4), layout="constrained")
@@ -219,5 +224,4 @@ def preview(plan: PosePlan, path: Path) -> None:
         xlabel="lateral (mm)", ylabel="range (mm)", title="target in the image", aspect="equal"
     )
     image.invert_yaxis()
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=130, format=path.suffix.lstrip(".") or "png")
+    save_figure(figure, path, dpi=130.0)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import h5py
@@ -22,7 +24,7 @@ from hw.recording_layout import (
 )
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_poses
-from jaxcal.io.readable import check_readable
+from jaxcal.io.readable import check_readable, naming
 from jaxcal.io.untrusted import (
     Node,
     UpTo,
@@ -48,15 +50,15 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
     were at its end. Text that the writer may touch is read, so that its heaps are checked too.
 
     Raises:
-        FormatError: missing, not a recording, complete, of another layout, with links or data
-            outside of it. One line that starts with the path.
+        FormatError: missing, not a recording, complete with all images, of another layout, with
+            links or data outside of it. One line that starts with the path.
     """
     check_readable(path)
     try:
         with open_root(path, length=stored_length(path)) as root:
             if text(root, "format") != FORMAT or number(root, "version") != VERSION:
                 raise FormatError("is not a recording of this version")
-            if flag(root, "complete") is not False:
+            if flag(root, "complete") is not False and not _lacks_images(root):
                 raise FormatError("is complete: there is nothing to resume")
             for name, columns in LAYOUT.items():
                 node = group(root, name)
@@ -80,6 +82,12 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
         raise FormatError(f"{path}: {error}") from None
 
 
+def _lacks_images(root: Node) -> bool:
+    """Whether poses of the plan were skipped or given up when the run came to its end."""
+    plan = group(root, "plan")
+    return plan is not None and (number(plan, "without_image") or 0) > 0
+
+
 @dataclass(frozen=True)
 class Progress:
     """What the recording of an interrupted acquisition holds, checked.
@@ -94,6 +102,7 @@ class Progress:
         true_elevation: (k,) mm, NaN on a real bench.
         last_s: latest host time in the file.
         probe: numbers of /probe: elements, pitch_mm, sound_speed_m_s, delay_s.
+        ended: whether a run came to its end before, with poses skipped or given up.
     """
 
     settings: dict[str, object]
@@ -105,6 +114,7 @@ class Progress:
     true_elevation: np.ndarray
     last_s: float
     probe: dict[str, float]
+    ended: bool
 
 
 def read_progress(path: str | os.PathLike[str]) -> Progress:
@@ -117,24 +127,25 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
     try:
         with open_root(path, length=stored_length(path)) as root:
             images = UpTo(100_000, "images")
-            taken = _read(root, "calibration", "target", (images,), "i")
+            taken = read_column(root, "calibration", "target", (images,), "i")
             last = [0.0]
             for name in ("tracker", "ae", "events"):
-                times = _read(root, name, "t_host", (UpTo(2**27, "rows"),))
+                times = read_column(root, name, "t_host", (UpTo(2**27, "rows"),))
                 last.append(float(np.nanmax(times, initial=0.0)))
-            targets = _read(root, "plan", "targets", (images, 4, 4))
+            targets = read_column(root, "plan", "targets", (images, 4, 4))
             # Checked but not changed in any digit: the plan's digest must be the same again.
             check_poses(targets)
             progress = Progress(
                 settings=_settings(root),
                 targets=targets,
-                poses=_read(root, "calibration", "pose", (images, 4, 4)),
+                poses=read_column(root, "calibration", "pose", (images, 4, 4)),
                 measurements=_measurements(root, images),
-                max_elevation=_read(root, "calibration", "max_elevation", (images,)),
+                max_elevation=read_column(root, "calibration", "max_elevation", (images,)),
                 taken=taken,
-                true_elevation=_read(root, "placement", "true_elevation", (images,)),
+                true_elevation=read_column(root, "placement", "true_elevation", (images,)),
                 last_s=max(last),
                 probe=_probe(root),
+                ended=_lacks_images(root),
             )
     except InputError as error:
         raise FormatError(f"{path}: {error}") from None
@@ -149,12 +160,33 @@ def settings_of(path: str | os.PathLike[str]) -> dict[str, object]:
     Raises:
         FormatError: not an acquisition's recording, or settings that are not a JSON object.
     """
+    with opened(path) as root:
+        return _settings(root)
+
+
+def probe_of(path: str | os.PathLike[str]) -> dict[str, float]:
+    """Numbers of a recording's /probe, as in :class:`Progress`; the file is not trusted.
+
+    Raises:
+        FormatError: not an acquisition's recording.
+    """
+    with opened(path) as root:
+        return _probe(root)
+
+
+@contextmanager
+def opened(path: str | os.PathLike[str]) -> Iterator[Node]:
+    """Open a recording to read it, also one whose writer ended early; the file is not trusted.
+
+    Yields:
+        The root, within which errors get the path in front.
+
+    Raises:
+        FormatError: not a file of HDF5.
+    """
     check_readable(path)
-    try:
-        with open_root(path, length=stored_length(path)) as root:
-            return _settings(root)
-    except FormatError as error:
-        raise FormatError(f"{path}: {error}") from None
+    with naming(path), open_root(path, length=stored_length(path)) as root:
+        yield root
 
 
 def _probe(root: Node) -> dict[str, float]:
@@ -167,7 +199,7 @@ def _probe(root: Node) -> dict[str, float]:
 
 
 def _settings(root: Node) -> dict[str, object]:
-    values = _read(root, "plan", "settings", (UpTo(LARGEST_SETTINGS, "bytes"),), "u")
+    values = read_column(root, "plan", "settings", (UpTo(LARGEST_SETTINGS, "bytes"),), "u")
     try:
         found = json.loads(values.astype(np.uint8).tobytes().decode())
     except (ValueError, RecursionError):
@@ -181,13 +213,25 @@ def _measurements(root: Node, images: UpTo) -> np.ndarray:
     """Points where the recording has them, else times of flight."""
     node = group(root, "calibration")
     if node is not None and child(node, "point") is not None:
-        return _read(root, "calibration", "point", (images, 2))
-    return _read(root, "calibration", "time_of_flight", (images, UpTo(4096, "elements")))
+        return read_column(root, "calibration", "point", (images, 2))
+    return read_column(root, "calibration", "time_of_flight", (images, UpTo(4096, "elements")))
 
 
-def _read(
+def read_column(
     root: Node, name: str, key: str, shape: tuple[int | UpTo, ...], kinds: str = "iuf"
 ) -> np.ndarray:
+    """One whole column of a recording; the file is not trusted.
+
+    Args:
+        root: of the file (:func:`opened`).
+        name: of the group.
+        key: of the dataset.
+        shape: see :func:`jaxcal.io.untrusted.array`.
+        kinds: of numpy's dtypes that it may have.
+
+    Raises:
+        FormatError: it is not there, or has another shape or type.
+    """
     node = group(root, name)
     dataset = None if node is None else child(node, key)
     if dataset is None:

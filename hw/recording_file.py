@@ -91,9 +91,7 @@ class RecordingWriter:
         Raises:
             OutputError: the file is there already, or cannot be written.
         """
-        final = Path(path)
-        if final.exists():
-            raise OutputError(f"{final}: exists already: resume it, or give another name")
+        final = check_new(path)
         temporary = final.parent / f".partial-{secrets.token_hex(8)}{final.suffix}"
         try:
             with h5py.File(temporary, "w") as file:
@@ -101,7 +99,7 @@ class RecordingWriter:
             # Not os.replace: somebody may have made the file in the meantime.
             os.link(temporary, final)
         except FileExistsError:
-            raise OutputError(f"{final}: exists already: resume it, or give another name") from None
+            raise _existing(final) from None
         except OSError as error:
             raise OutputError(f"{final}: cannot be written: {one_line(error)}") from None
         finally:
@@ -131,6 +129,9 @@ class RecordingWriter:
         except Exception as error:
             file.close()
             raise FormatError(f"{path}: is truncated or damaged: {one_line(error)}") from None
+        # It may have come to its end without all images: its digest no longer holds.
+        file.attrs["complete"] = False
+        _sidecar(Path(path)).unlink(missing_ok=True)
         return cls(Path(path), file)
 
     def append(self, name: str, columns: Mapping[str, np.ndarray]) -> None:
@@ -358,7 +359,7 @@ class RecordingWriter:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         self._check_place()
         self._forget()
-        write_text(self.path.with_name(self.path.name + ".sha256"), f"{digest}  {self.path.name}\n")
+        write_text(_sidecar(self.path), f"{digest}  {self.path.name}\n")
         return digest
 
     def _prepare(self, name: str, columns: Mapping[str, np.ndarray]) -> dict[str, h5py.Dataset]:
@@ -374,9 +375,38 @@ class RecordingWriter:
         return _columns(self._file, name)
 
 
+def _sidecar(path: Path) -> Path:
+    return path.with_name(path.name + ".sha256")
+
+
 def utc_now() -> str:
     """The time of day for a file's reader: ISO 8601, UTC, milliseconds."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def _existing(path: Path) -> OutputError:
+    """The error for a path that something has already, with what to do."""
+    if path.is_dir():
+        return OutputError(f"{path}: is a directory, not a file")
+    try:
+        check_resumable(path)
+    except FormatError:
+        return OutputError(f"{path}: exists already: give another name")
+    return OutputError(f"{path}: exists already: resume it, or give another name")
+
+
+def check_new(path: str | os.PathLike[str]) -> Path:
+    """The path of a recording that can be made.
+
+    Raises:
+        OutputError: it is there already, or its folder is missing.
+    """
+    final = Path(path)
+    if final.exists():
+        raise _existing(final)
+    if not final.parent.is_dir():
+        raise OutputError(f"{final}: there is no folder {final.parent}")
+    return final
 
 
 def _write_skeleton(file: h5py.File, header: RecordingHeader) -> None:
@@ -473,13 +503,21 @@ def _cut_back(datasets: list[h5py.Dataset]) -> None:
 
 
 def _fitting(name: str, key: str, values: np.ndarray, dataset: h5py.Dataset) -> np.ndarray:
+    if key == "frames" and (values.shape[1:], values.dtype) != (dataset.shape[1:], dataset.dtype):
+        raise FormatError(
+            f"an ultrasound frame of {_frame_words(values)} does not fit this recording, whose "
+            f"frames have {_frame_words(dataset)}: set the machine as before"
+        )
     if values.shape[1:] != dataset.shape[1:]:
         raise FormatError(
             f"/{name}/{key}: a row of shape {values.shape[1:]} does not fit {dataset.shape[1:]}"
         )
-    if key == "frames" and values.dtype != dataset.dtype:
-        raise FormatError(f"/us/frames: {values.dtype} does not fit {dataset.dtype}")
     return values.astype(dataset.dtype)
+
+
+def _frame_words(frames: np.ndarray | h5py.Dataset) -> str:
+    _, rows, columns = frames.shape
+    return f"{columns} x {rows} px of {frames.dtype}"
 
 
 def _plain(value: object) -> Any:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from hw.recording_check import Progress
 from hw.setup import Setup
 from jaxcal import InputError
+from jaxcal.data.probe import LinearProbe
 from jaxcal.io.readable import quoted
 
 _SAME = 1e-9
@@ -24,14 +26,9 @@ _SAME = 1e-9
 
 def described(setup: Setup, targets: np.ndarray) -> dict[str, Any]:
     """What a recording keeps of its bench, ready for JSON: probe, scene, limits, plan."""
-    probe, scene = setup.probe, setup.scene
+    scene = setup.scene
     content = {
-        "probe": {
-            "elements": probe.elements,
-            "pitch_mm": probe.pitch_mm,
-            "sound_speed_m_s": probe.sound_speed_m_s,
-            "delay_s": probe.delay_s,
-        },
+        "probe": described_probe(setup.probe),
         "scene": {
             "image_to_probe": scene.image_to_probe.tolist(),
             "point_mm": scene.point_mm.tolist(),
@@ -41,6 +38,35 @@ def described(setup: Setup, targets: np.ndarray) -> dict[str, Any]:
         "plan_sha256": hashlib.sha256(np.ascontiguousarray(targets, float).tobytes()).hexdigest(),
     }
     return json.loads(json.dumps(content))
+
+
+def described_probe(probe: LinearProbe) -> dict[str, int | float]:
+    """Numbers of a probe, as in a recording's /probe and a setup's [probe]."""
+    return {
+        "elements": probe.elements,
+        "pitch_mm": probe.pitch_mm,
+        "sound_speed_m_s": probe.sound_speed_m_s,
+        "delay_s": probe.delay_s,
+    }
+
+
+def check_same(table: str, kept: object, now: Mapping[str, Any]) -> None:
+    """Refuse a bench after which the images would not fit together.
+
+    Args:
+        table: of the setup.
+        kept: what the recording has of it; what it lacks is not compared.
+        now: what the bench has.
+
+    Raises:
+        InputError: a value differs; table and key are named.
+    """
+    for name, value in now.items():
+        if isinstance(kept, dict) and name in kept and not _same(kept[name], value):
+            raise InputError(
+                f"was recorded with [{table}] {name} = {_shown(kept[name])}, this bench has "
+                f"{_shown(value)}: the images would not fit together"
+            )
 
 
 def compare(progress: Progress, setup: Setup) -> list[str]:
@@ -64,12 +90,7 @@ def compare(progress: Progress, setup: Setup) -> list[str]:
         ("probe", progress.probe),
         *((t, before.get(t)) for t in ("probe", "scene")),
     ):
-        for name, value in now[table].items():
-            if isinstance(kept, dict) and name in kept and not _same(kept[name], value):
-                raise InputError(
-                    f"was recorded with [{table}] {name} = {_shown(kept[name])}, this bench has "
-                    f"{_shown(value)}: the images would not fit together"
-                )
+        check_same(table, kept, now[table])
     changes = []
     limits = before.get("limits")
     if isinstance(limits, dict):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,16 +16,18 @@ import numpy as np
 
 from hw.clock import REAL, Clock
 from hw.errors import RefusedError
+from hw.hosts import check_host
 from hw.midplane.search import Settings
 from hw.poses import Extent
 from hw.robot.kinematics import model_named
 from hw.robot.limits import FURTHEST_TIP_MM, Limits, hull_of, numbers
 from hw.scene import Scene
 from hw.shapes import Float
+from hw.ultrasound.receiver import PORT
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import LinearProbe
-from jaxcal.io.readable import quoted
+from jaxcal.io.readable import naming, quoted
 from jaxcal.io.toml import load_toml
 
 _LARGEST_BYTES = 2**18
@@ -97,7 +100,7 @@ class Setup:
             numbers(given, 3, "tip_mm"), tip, rtol=0.0, atol=_TIP_TOLERANCE_MM
         ):
             raise RefusedError(
-                f"[limits] tip_mm {given} contradicts [scene] image_to_probe, whose tip is "
+                f"tip_mm {given} contradicts [scene] image_to_probe, whose tip is "
                 f"{np.round(tip, 3).tolist()} mm: leave tip_mm out",
                 device="robot",
             )
@@ -143,7 +146,7 @@ def load_hand_held(path: str | os.PathLike[str]) -> HandHeldSetup:
     """
     tables = load_toml(path, maximum_bytes=_LARGEST_BYTES)
     names = ("active_echo", "probe", "scene", "search")
-    try:
+    with naming(path):
         for name in tables:
             if name not in names:
                 raise InputError(f"[{quoted(name)}] is not known; there are {', '.join(names)}")
@@ -153,13 +156,15 @@ def load_hand_held(path: str | os.PathLike[str]) -> HandHeldSetup:
         if "image_to_probe" not in found["scene"]:
             raise InputError("[scene] needs image_to_probe")
         found["probe"].pop("housing_mm", None)
-        drawn = _numbers("image_to_probe", found["scene"]["image_to_probe"], (4, 4))
-        drawn = check_poses(drawn[None], what="[scene] image_to_probe")[0]
+        drawn = _drawn(found["scene"]["image_to_probe"])
         probe = LinearProbe(**found["probe"])
         _check_width(probe)
-        return HandHeldSetup(found["active_echo"]["url"], drawn, probe, Settings(**found["search"]))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        return HandHeldSetup(
+            found["active_echo"]["url"],
+            check_poses(drawn[None])[0],
+            probe,
+            Settings(**found["search"]),
+        )
 
 
 def controller_arm(model: str, version: str) -> str | None:
@@ -184,14 +189,20 @@ def load_setup(path: str | os.PathLike[str]) -> Setup:
 
     Raises:
         FormatError: no such file, or not TOML; one line that starts with the path.
-        InputError: unknown or missing keys, or invalid numbers; one line that starts with the path.
+        InputError: unknown or missing keys, invalid numbers, or limits that do not bound every
+            motion; one line that starts with the path.
     """
     tables = load_toml(path, maximum_bytes=_LARGEST_BYTES)
-    try:
-        return _setup(tables)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    with naming(path):
+        setup = _setup(tables)
+        try:
+            setup.motion_limits()
+        except RefusedError as error:
+            raise InputError(f"[limits] {error.args[0]}") from None
+    return setup
 
+
+_PLAN_SHAPES = {"depth_mm": (2,), "reach_mm": (2,), "box_mm": (2, 3)}
 
 _TABLES = {
     "robot": {
@@ -212,10 +223,7 @@ _TABLES = {
     },
     "scene": {"image_to_probe": list, "point_mm": list, "looking": list, "tip_at_tcp": bool},
     "limits": None,
-    "plan": {
-        f.name: list if f.name.endswith("_mm") and f.name != "lateral_mm" else float
-        for f in dataclasses.fields(Extent)
-    },
+    "plan": {f.name: list if f.name in _PLAN_SHAPES else float for f in dataclasses.fields(Extent)},
     "search": {
         f.name: int if isinstance(f.default, int) else float for f in dataclasses.fields(Settings)
     },
@@ -238,9 +246,13 @@ def _setup(tables: dict[str, Any]) -> Setup:
     if found["ultrasound"]:
         if "host" not in found["ultrasound"]:
             raise InputError("[ultrasound] needs host")
-        ultrasound = (found["ultrasound"]["host"], found["ultrasound"].get("port", 18944))
+        ultrasound = (found["ultrasound"]["host"], found["ultrasound"].get("port", PORT))
+        check_host(ultrasound[0], "[ultrasound] host")
+        if not 1 <= ultrasound[1] <= 65535:
+            raise InputError("[ultrasound] port must be 1 to 65535")
     if not found["limits"]:
         raise InputError("[limits] is missing: without it nothing may move")
+    check_host(found["robot"]["host"], "[robot] host")
     robot = {{"host": "robot_host"}.get(key, key): value for key, value in found["robot"].items()}
     for key in ("settle_s", "frequency_hz"):
         if key in robot and not (np.isfinite(robot[key]) and robot[key] > 0):
@@ -263,13 +275,18 @@ def _setup(tables: dict[str, Any]) -> Setup:
     echo = found["active_echo"]
     if not 1 <= echo.get("frames", 9) <= 1000:
         raise InputError("[active_echo] frames must be 1 to 1000")
-    plan: dict[str, Any] = {key: _tuples(key, value) for key, value in found["plan"].items()}
+    plan = {
+        key: _as_tuple(_numbers(key, value, _PLAN_SHAPES[key], "plan").tolist())
+        if key in _PLAN_SHAPES
+        else value
+        for key, value in found["plan"].items()
+    }
     setup = Setup(
         active_echo_url=echo["url"],
         frames=echo.get("frames", 9),
         ultrasound=ultrasound,
         scene=Scene(
-            _numbers("image_to_probe", scene["image_to_probe"], (4, 4)),
+            _drawn(scene["image_to_probe"]),
             _numbers("point_mm", scene["point_mm"], (3,)),
             _numbers("looking", scene["looking"], (3,)),
         ),
@@ -352,23 +369,36 @@ def _table(tables: dict[str, Any], name: str) -> dict[str, Any]:
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...], table: str = "scene") -> np.ndarray:
     try:
+        if not all(_is_number(leaf) for leaf in _leaves(value)):
+            raise TypeError
         array = np.asarray(value, float)
     except (ValueError, TypeError, OverflowError):
         array = np.empty(0)
     if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"[{table}] {name} must be numbers of shape {shape}")
+        size = " x ".join(map(str, shape))
+        raise InputError(f"[{table}] {name} must be {size} numbers")
     return array
 
 
-def _tuples(name: str, value: Any) -> Any:
-    """Lists of numbers as tuples of floats, at most two deep."""
-    if not isinstance(value, list):
-        return value
-    rows = [_tuples(name, row) if isinstance(row, list) else row for row in value]
-    numbers = [row for row in rows if not isinstance(row, tuple)]
-    if any(isinstance(row, bool) or not isinstance(row, int | float) for row in numbers):
-        raise InputError(f"[plan] {name} must be numbers")
-    lengths = {"depth_mm": 2, "reach_mm": 2, "box_mm": 2}
-    if len(rows) not in (lengths.get(name, 0), 3):
-        raise InputError(f"[plan] {name} has {len(rows)} values")
-    return tuple(row if isinstance(row, tuple) else float(row) for row in rows)
+def _leaves(value: Any) -> Iterator[object]:
+    """What nested lists hold."""
+    if isinstance(value, list):
+        for item in value:
+            yield from _leaves(item)
+    else:
+        yield value
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(_as_tuple(item) for item in value) if isinstance(value, list) else value
+
+
+def _drawn(value: Any) -> np.ndarray:
+    """X as it stands in the file: (4, 4) mm, rigid up to rounding."""
+    drawn = _numbers("image_to_probe", value, (4, 4))
+    check_poses(drawn[None], what="[scene]", labels=["image_to_probe"])
+    return drawn

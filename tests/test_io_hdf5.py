@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.data.probe import LinearProbe
-from jaxcal.data.recording import Images, Recording, Truth, make_images
+from jaxcal.data.recording import Images, MetresError, Recording, Truth, make_images
 from jaxcal.io import hdf5, untrusted
 from jaxcal.io.hdf5 import load, save
 
@@ -121,7 +121,7 @@ def refused(path, message, error=FormatError):
         load(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
-    assert type(caught.value) in (InputError, FormatError)
+    assert type(caught.value) in (InputError, FormatError, MetresError)
     return str(caught.value)
 
 
@@ -478,7 +478,7 @@ def test_unusable_values(path, name, change, message):
 def test_poses_in_metres(path):
     with h5py.File(path, "r+") as file:
         file["calibration/pose"][:, :3, 3] *= 1e-3
-    refused(path, "poses look like metres", InputError)
+    refused(path, r"poses look like metres; give them in mm$", InputError)
 
 
 @pytest.mark.parametrize(

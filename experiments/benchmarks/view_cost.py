@@ -91,7 +91,7 @@ def measure(pages: int, seconds: float) -> list[object]:
                 guard=session.trouble,
             )
         )
-        view.plan(setup, plan, [])
+        view.plan(setup, plan, plan.targets, [])
         done = threading.Event()
         for _ in range(pages):
             threading.Thread(target=read, args=(view.url, done), daemon=True).start()

@@ -63,6 +63,8 @@ class PtyLink:
 
     def read(self) -> bytes:
         """See :class:`Link`."""
+        # The other end may have just emptied its buffer: what waits comes before any answer.
+        self._flush()
         try:
             return os.read(self._master, 4096)
         except OSError as error:

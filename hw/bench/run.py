@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import queue
 import subprocess
 import sys
@@ -198,13 +199,18 @@ def _first_line(process: subprocess.Popen) -> bytes:
         return b""
 
 
-def serve(options: BenchOptions) -> None:
-    """Run a bench here: print its addresses, serve until standard input ends or a client asks."""
-    # Ctrl-C interrupts the wait below; the end of the parent ends standard input, and so the wait.
+def serve(options: BenchOptions, *, of_parent: bool = False) -> None:
+    """Run a bench here: print its addresses, serve until Ctrl-C or a client asks for the end.
+
+    Args:
+        options: of the bench.
+        of_parent: end with standard input, too, which ends with the parent.
+    """
     assembly = Assembly(options)
     try:
         print(json.dumps(assembly.start()), flush=True)
-        threading.Thread(target=_until_parent_ends, args=(assembly,), daemon=True).start()
+        if of_parent:
+            threading.Thread(target=_until_parent_ends, args=(assembly,), daemon=True).start()
         with contextlib.suppress(KeyboardInterrupt):
             assembly.wait()
     finally:
@@ -212,7 +218,8 @@ def serve(options: BenchOptions) -> None:
 
 
 def _until_parent_ends(assembly: Assembly) -> None:
-    while sys.stdin.buffer.read(1024):
+    # Not by sys.stdin, whose lock a thread must not hold when Python ends.
+    while os.read(0, 1024):
         pass
     assembly.end()
 
@@ -231,7 +238,7 @@ def main(arguments: list[str] | None = None) -> int:
             options = BenchOptions(**json.loads(given.json))
         else:
             options = BenchOptions(speed=given.speed, seed=given.seed)
-        serve(options)
+        serve(options, of_parent=True)
     except (InputError, TypeError, json.JSONDecodeError) as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         return 2

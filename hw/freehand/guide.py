@@ -79,7 +79,7 @@ class Look:
 
     Attributes:
         words: what the person is told.
-        taken: the image, if it was taken.
+        taken: the image, if it is to be taken.
         pixel: where the target was seen, px.
     """
 
@@ -104,7 +104,7 @@ class Guide:
     _words: str = ""
 
     def look(self, posed: PosedImage) -> Look:
-        """Judge an image, and take it if it keeps all rules."""
+        """Judge an image; one that keeps all rules is to be kept (:meth:`keep`)."""
         rules, moment = self.rules, self._moment
         if posed.pose is None:
             moment.clear()
@@ -130,6 +130,11 @@ class Guide:
         self._words = look.words
         return look
 
+    def keep(self, taken: Taken) -> None:
+        """Count an image that is on the disk, and begin a new moment."""
+        self.taken.append(taken)
+        self.forget()
+
     def forget(self) -> None:
         """Begin a new moment: after an image was taken or taken back."""
         self._moment.clear()
@@ -150,9 +155,7 @@ class Guide:
                 pixel=where,
             )
         taken = Taken(pose, pixel, located.covariance[0], middle.time, middle)
-        self.taken.append(taken)
-        self.forget()
-        return Look(f"taken: {len(self.taken)}", taken, where)
+        return Look(f"taken: {len(self.taken) + 1}", taken, where)
 
     def _like(self, pose: np.ndarray, pixel: np.ndarray, shape: tuple[int, ...]) -> int | None:
         """The image that this one does not differ from."""

@@ -20,31 +20,36 @@ import time
 from collections import deque
 from dataclasses import asdict, dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from hw.active_echo.device import ActiveEcho, EchoFrame
 from hw.errors import DeviceError, StaleError
-from hw.freehand.acquire import FreeHand, FreeHandStopped, Person
 from hw.freehand.guide import mean_pose, spread_of
+from hw.freehand.kept import KeptImages, read_images
 from hw.freehand.posed import PosedImage, PosedImages
+from hw.freehand.request import FreeHand, FreeHandStopped, Person, recorded_request
 from hw.midplane.amplitude_scan import fit_peak
 from hw.midplane.bracket import Bracket, widened
 from hw.midplane.live_view import describe, profile
 from hw.midplane.pattern_injection import View, bar, bar_length, sides_seen
 from hw.midplane.search import Echoes, PlacementError, Settings
 from hw.recorder import Recorder
-from hw.recording_check import settings_of
+from hw.recording_check import probe_of
 from hw.recording_layout import RecordingHeader
+from hw.resuming import check_same, described_probe
 from hw.session import median_times
 from hw.setup import HandHeldSetup
 from hw.shapes import Float
 from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.poses import inverse_poses
-from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
 from jaxcal.data.timing import interpolate_poses
+from jaxcal.io.readable import naming
 
+_KIND = "pattern-injection"
 _SILENCE_S = 3.0
 _DELAY_TICKS = 400
 _PATTERN_PERIOD_S = 0.1
@@ -71,11 +76,13 @@ class Sample:
         t: arrival, s.
         offset_mm: the probe's offset along the elevational axis at the target.
         peak: amplitude, counts; 0 where the element was not heard.
+        translation: (3,) of the pose, mm.
     """
 
     t: float
     offset_mm: float
     peak: float
+    translation: Float[np.ndarray, 3]
 
 
 def acquire_by_injection(
@@ -94,7 +101,7 @@ def acquire_by_injection(
         setup: element, probe, and X as drawn.
         person: shown what goes on; ``enter`` accepts, ``s`` begins the sweep anew, ``u`` takes the
             last image back, ``q`` ends.
-        resume: go on with ``path``.
+        resume: go on with ``path``; images and frames are those of the recording.
 
     Returns:
         Number of images; the file is complete then.
@@ -102,11 +109,16 @@ def acquire_by_injection(
     Raises:
         FreeHandStopped: interrupted, a device was lost, or too few images; it can be resumed.
         DeviceError: a device that is not there, or a stream that cannot be used.
+        InputError: a recording that cannot be resumed, or was begun with another probe or drawing.
         OutputError: the recording cannot be made.
     """
-    if resume and "injection" not in settings_of(path):
-        raise InputError(f"{path}: was not begun with pattern injection by hand")
-    probe = setup.probe
+    kept, probe = KeptImages(), setup.probe
+    if resume:
+        asked, told = recorded_request(path, _KIND, asked)
+        with naming(path):
+            check_same("probe", probe_of(path), described_probe(probe))
+            check_same("scene", told.get("scene"), _scene(setup))
+        kept = KeptImages(read_images(path))
     with contextlib.ExitStack() as stack:
         stream = stack.enter_context(UltrasoundStream(asked.host, asked.port, device=asked.device))
         posed = PosedImages(stream, asked.source, asked.target_frame, asked.lag_s)
@@ -116,19 +128,21 @@ def acquire_by_injection(
         echo.set_threshold(setup.search.low_threshold)
         echo.stream(True)
         recorder = _recorder(path, asked, setup, posed, echo, resume)
-        run = _Run(asked, setup, person, posed, echo, recorder)
         try:
             with recorder:
-                return run.go()
+                return _Run(asked, setup, person, posed, echo, recorder, kept).go()
         except KeyboardInterrupt:
             reason, interrupted = "interrupted", True
         except (DeviceError, CalibrationError) as error:
             reason, interrupted = str(error), False
+    options = ("--placement", _KIND, "--setup", "TOML")
     raise FreeHandStopped(
-        f"{reason}; {run.count} of {asked.images} images are in {recorder.kept}; go on with the "
-        "same command and --resume",
-        interrupted=interrupted,
+        reason, len(kept), asked, recorder.kept, *options, interrupted=interrupted
     )
+
+
+def _scene(setup: HandHeldSetup) -> dict[str, Any]:
+    return {"image_to_probe": setup.image_to_probe.tolist()}
 
 
 def _recorder(
@@ -142,19 +156,13 @@ def _recorder(
     if resume:
         return Recorder(path)
     probe = setup.probe
-    known = {"pair": posed.pair, "images": asked.images, "scene": setup.image_to_probe.tolist()}
+    known = {**asked.settings(posed.pair), "scene": _scene(setup), "search": asdict(setup.search)}
     header = RecordingHeader(
         kind="time_of_flight",
-        probe={
-            "kind": probe.kind,
-            "elements": probe.elements,
-            "pitch_mm": probe.pitch_mm,
-            "sound_speed_m_s": probe.sound_speed_m_s,
-            "delay_s": probe.delay_s,
-        },
+        probe={"kind": probe.kind, **described_probe(probe)},
         lines=probe.elements,
         attributes={"ae": {"clock_hz": echo.clock_hz()}},
-        settings=json.dumps({"injection": {**known, "search": asdict(setup.search)}}),
+        settings=json.dumps({_KIND: known}),
     )
     return Recorder(path, header)
 
@@ -176,11 +184,10 @@ class _Run:
         posed: PosedImages,
         echo: ActiveEcho,
         recorder: Recorder,
+        kept: KeptImages,
     ) -> None:
         self._asked, self._setup, self._person = asked, setup, person
-        self._posed, self._echo, self._recorder = posed, echo, recorder
-        self._next_row = recorder.rows.get("calibration", 0)
-        self._rows = list(range(self._next_row))
+        self._posed, self._echo, self._recorder, self._kept = posed, echo, recorder, kept
         self._images: deque[PosedImage] = deque(maxlen=_RECENT)
         self._waiting: list[EchoFrame] = []
         self._held: deque[tuple[float, np.ndarray, EchoFrame]] = deque()
@@ -192,7 +199,7 @@ class _Run:
     @property
     def count(self) -> int:
         """Images that count."""
-        return len(self._rows)
+        return len(self._kept)
 
     def go(self) -> int:
         """Run until enough images are accepted, or the person ends it."""
@@ -291,7 +298,7 @@ class _Run:
         if self._origin is None:
             return
         offset = self._offset(pose)
-        self._samples.append(Sample(frame.t_host, offset, echoes.peak))
+        self._samples.append(Sample(frame.t_host, offset, echoes.peak, pose[:3, 3]))
         while self._samples[-1].t - self._samples[0].t > _KEPT_S:
             self._samples.popleft()
         self._held.append((frame.t_host, pose, frame))
@@ -356,9 +363,21 @@ class _Run:
         rows = [f"{title}: {describe(view, 0.0).rpartition(',')[0]}", *profile(view)]
         if self._hurried:
             rows.append(f"too fast: at most {_FASTEST_MM_S:g} mm a second")
+        elif self._in_metres(view):
+            rows.append("the poses look like metres: let the server send them in mm")
         elif self._message:
             rows.append(self._message)
         self._person.show(frame, "\n".join(rows), hand_advice(view, self._peak()))
+
+    def _in_metres(self, view: View) -> bool:
+        """Whether the bar shrinks while the probe, by its poses, stays where it is."""
+        if min(length for _, length in view.seen) > view.longest // 2:
+            return False
+        try:
+            check_pose_units(np.array([sample.translation for sample in self._samples]))
+        except MetresError:
+            return True
+        return False
 
     def _accept(self) -> str:
         """Take the image if possible; returns what is missing otherwise, else an empty string."""
@@ -412,20 +431,21 @@ class _Run:
         self, poses: np.ndarray, frames: list[EchoFrame], bracket: Bracket, where: float
     ) -> None:
         times, amplitude = median_times(frames)
+        pose = mean_pose(poses)
+        self._kept.check_unit(pose, self._recorder)
         self._recorder.add_images([self._images[-1].image])
         self._recorder.add_selected(
-            mean_pose(poses),
+            pose,
             times,
             kind="time_of_flight",
             max_elevation=bracket.max_elevation_mm,
             amplitude=amplitude,
             t_host=frames[-1].t_host,
-            target=self._next_row,
+            target=self._kept.next_row,
             bracket=(bracket.centre_mm, bracket.low_mm, bracket.high_mm, bracket.sd_mm),
             offset=where,
         )
-        self._rows.append(self._next_row)
-        self._next_row += 1
+        self._kept.add(pose)
         self._person.say(
             f"image {self.count}/{self._asked.images}: offset {bracket.centre_mm:+.2f} in "
             f"[{bracket.low_mm:+.2f}, {bracket.high_mm:+.2f}] mm"
@@ -433,9 +453,9 @@ class _Run:
         self._begin()
 
     def _take_back(self) -> None:
-        if not self._rows:
+        if not self._kept:
             return
-        self._recorder.leave_out(self._rows.pop())
+        self._kept.take_back(self._recorder)
         self._note("taken back", f"the last image; {self.count} are left")
 
     def _note(self, kind: str, text: str) -> None:

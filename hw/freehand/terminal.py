@@ -18,7 +18,7 @@ _OTHER_ROWS = 8
 
 
 class TerminalPerson:
-    """See :class:`hw.freehand.acquire.Person`.
+    """See :class:`hw.freehand.request.Person`.
 
     Args:
         screen: where to show it.

@@ -92,12 +92,13 @@ class Screen:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Columns and lines."""
+        """Columns and lines; 80 and 24 for a terminal that does not tell."""
         try:
             number = self._stream.fileno()  # pyright: ignore[reportAttributeAccessIssue]
-            return os.get_terminal_size(number)
+            columns, lines = os.get_terminal_size(number)
         except (AttributeError, OSError, ValueError):
-            return shutil.get_terminal_size()
+            columns, lines = shutil.get_terminal_size()
+        return columns or 80, lines or 24
 
     def say(self, line: str) -> None:
         """One line that stays."""

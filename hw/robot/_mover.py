@@ -41,6 +41,7 @@ import json
 import math
 import os
 import select
+import signal
 import sys
 from collections import deque
 from dataclasses import dataclass, replace
@@ -78,6 +79,10 @@ _STOPPED_MM_S, _STOPPED_RAD_S = 1.0, 0.01
 _REST_SEEN_S = 0.03
 """A stop is done when the poses have shown rest for so long after stopL (4 poses at 125 Hz)."""
 _STOP_PATIENCE_S = 2.0
+_END_S = 5.0
+"""Longest time for the end of the script and of the connection."""
+_CAUSE_S = 0.1
+"""The poses tell of a safety stop by so much later than the controller's program ends."""
 _ARRIVED_MM, _ARRIVED_DEG = 0.2, 0.1
 _REST_MM_S = 0.2
 _LEAST_PATIENCE_S = 3.0
@@ -212,6 +217,7 @@ class Mover:
 
     def close(self) -> None:
         """Stop, end the script in order (its watchdog must not trip), then disconnect."""
+        _end_within(2 * _STOP_PATIENCE_S + _END_S)
         self._brake()
         if self._control is not None and self._usable():
             self._end_script()
@@ -220,6 +226,9 @@ class Mover:
 
     def _end_script(self) -> None:
         self._log("kickWatchdog", times=self._kicks)
+        # Calls to a controller that is gone may hang, and nobody kills this process if the caller
+        # is gone, too. The robot rests by now.
+        _end_within(_END_S)
         self._command("stopScript")
 
     # The loop
@@ -355,7 +364,7 @@ class Mover:
             self._kicked = now
             self._kicks += 1
             if not self._call("kickWatchdog"):
-                raise _Ended(self._lost("the controller's program stopped"))
+                raise _Ended(self._program_stopped())
 
     # Motion
 
@@ -456,12 +465,11 @@ class Mover:
         packet, sample = self._packet, self._sample
         if packet is None or sample is None or self._control is None:
             return None
-        problem = safety_text(packet.safety_bits)
-        if problem:
-            text = f"{problem}: release it at the robot, then confirm the plan again"
-            return StoppedError(text, device="robot"), True
+        stopped = _safety_stop(packet)
+        if stopped is not None:
+            return stopped, True
         if not packet.status_bits & _PROGRAM_RUNS:
-            return self._lost("the controller's program stopped"), True
+            return self._program_stopped(), True
         if not self._control.isConnected():
             return self._lost("the control connection is gone"), True
         if self._moving is None:
@@ -561,6 +569,16 @@ class Mover:
             and not safety_text(packet.safety_bits)
         )
 
+    def _program_stopped(self, what: str = "the controller's program stopped") -> DeviceError:
+        """Why the controller takes no commands: a safety stop if one is told of, else ``what``."""
+        give_up = self._clock.now() + self._clock.patience(_CAUSE_S)
+        while self._clock.now() < give_up:
+            self._read(self._clock.wall(_CAUSE_S / 10))
+            stopped = None if self._packet is None else _safety_stop(self._packet)
+            if stopped is not None:
+                return stopped
+        return self._lost(what)
+
     def _lost(self, what: str) -> LostError:
         reason = "; the robot's own watchdog stops it. Motion needs a new confirmation"
         return LostError(what + reason, device="robot")
@@ -580,6 +598,8 @@ class Mover:
             be_prompt(0)
         try:
             return getattr(self._control, name)(*values)
+        except RuntimeError as error:
+            raise _Ended(self._program_stopped(f"ur_rtde: {error}")) from None
         finally:
             be_prompt(ASKS)
 
@@ -602,6 +622,20 @@ class Mover:
         except BrokenPipeError:
             # Nobody listens any more; the robot must be stopped all the same.
             self._closing = True
+
+
+def _safety_stop(packet: Packet) -> StoppedError | None:
+    problem = safety_text(packet.safety_bits)
+    if not problem:
+        return None
+    text = f"{problem}: release it at the robot, then confirm the plan again"
+    return StoppedError(text, device="robot")
+
+
+def _end_within(seconds: float) -> None:
+    """Let the system end this process after so long, whatever it hangs in."""
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
 def _plain(sample: PoseSample) -> list:

@@ -233,7 +233,11 @@ def follow_all(
             furthest, failure = stage, outcome
     assert failure is not None
     if joints is not None:
-        raise failure
+        stands = ", ".join(f"{angle:.0f}" for angle in np.degrees(reference))
+        raise _refuse(
+            f"{failure.args[0]}; that is from where the arm stands now (joints at {stands} deg): "
+            "turn a joint that is wound up back by hand, or take other poses (--seed)"
+        )
     raise _refuse(f"{failure.args[0]}; no other branch of the arm's joints gets further")
 
 

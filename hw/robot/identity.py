@@ -82,7 +82,7 @@ def read_identity(host: str, *, timeout_s: float = 3.0) -> Identity:
             model = stream.ask("get robot model")
     except TimeoutError:
         raise LostError(f"the dashboard of {host} does not answer", device="robot") from None
-    except OSError as error:
+    except (OSError, UnicodeError) as error:
         text = f"no connection to the dashboard of {host}: {error}"
         raise LostError(text, device="robot") from error
     number = re.search(r"\d+\.\d+\.\d+(\.\d+)?", version)

@@ -194,7 +194,7 @@ class PacketReader:
         self._pendant = PendantSettings()
         try:
             self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
             raise LostError(f"no connection to {host}:{PORT}: {error}", device="robot") from error
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -29,6 +29,7 @@ from jaxcal.io.openigtlink import (
     Tracked,
     TrackedFrame,
 )
+from jaxcal.io.readable import one_line
 
 DEVICE: Device = "ultrasound"
 PORT = 18944
@@ -178,9 +179,9 @@ class UltrasoundStream:
             raise DeviceError(f"{self.address} was started before", device=DEVICE)
         try:
             self._socket = socket.create_connection((self.host, self.port), _CONNECT_TIMEOUT_S)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
             raise DeviceError(
-                f"no OpenIGTLink server at {self.address} ({error.strerror or error})",
+                f"no OpenIGTLink server at {self.address} ({one_line(error)})",
                 device=DEVICE,
             ) from None
         self._socket.settimeout(_POLL_S)

@@ -28,6 +28,7 @@ from hw.session import Session
 from hw.setup import Setup
 from jaxcal import InputError
 from jaxcal.calibration.result import Calibration
+from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.isolated import python_command
 
 RATE_HZ = 10.0
@@ -40,8 +41,10 @@ _LINES = 5
 class Audience(Protocol):
     """Receives the progress of an acquisition; see :class:`LiveView`."""
 
-    def plan(self, setup: Setup, plan: MotionPlan, done: list[int]) -> None:
-        """What shall be acquired; ``done`` are the rows that a resumed recording has."""
+    def plan(
+        self, setup: Setup, plan: MotionPlan, targets: Float[np.ndarray, "n 4 4"], done: list[int]
+    ) -> None:
+        """What shall be acquired: all poses, and the rows that a resumed recording has."""
         ...
 
     def watch(self, session: Session | None) -> None:
@@ -68,7 +71,9 @@ class Audience(Protocol):
 class Nobody:
     """An audience that ignores everything."""
 
-    def plan(self, setup: Setup, plan: MotionPlan, done: list[int]) -> None:
+    def plan(
+        self, setup: Setup, plan: MotionPlan, targets: Float[np.ndarray, "n 4 4"], done: list[int]
+    ) -> None:
         """Nothing."""
 
     def watch(self, session: Session | None) -> None:
@@ -172,11 +177,13 @@ class LiveView:
 
     # What the acquisition tells
 
-    def plan(self, setup: Setup, plan: MotionPlan, done: list[int]) -> None:
-        """What shall be acquired; ``done`` are the rows that a resumed recording has."""
+    def plan(
+        self, setup: Setup, plan: MotionPlan, targets: Float[np.ndarray, "n 4 4"], done: list[int]
+    ) -> None:
+        """What shall be acquired: all poses, and the rows that a resumed recording has."""
         scene, limits = setup.scene, plan.limits
         self._tell(
-            plan=np.asarray(plan.targets, float)[:, :3].reshape(-1, 12).tolist(),
+            plan=np.asarray(targets, float)[:, :3].reshape(-1, 12).tolist(),
             box=[list(limits.box_min_mm), list(limits.box_max_mm)],
             tcp_offset=list(plan.tcp_offset),
             arm=limits.arm_model or "UR5",

@@ -18,8 +18,6 @@ pivots of A - c 1 show whether the smallest eigenvalue of a matrix A exceeds a n
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -70,24 +68,18 @@ class Solved(eqx.Module):
     convergence: Convergence
 
 
-@runtime_checkable
-class Average(Protocol):
-    """An average over distributions of the offsets."""
+class Average(eqx.Module):
+    """The average over the offsets' laws, problems first.
 
-    @property
-    def covariance(self) -> Float[Array, "*batch p p"]:
-        """Covariance of the shared unknowns."""
-        ...
+    Attributes:
+        covariance: of the unknowns.
+        elevation_sd: SDs of the offsets, mm.
+        law: the result about the distribution of the offsets.
+    """
 
-    @property
-    def elevation_sd(self) -> Float[Array, "*batch n"]:
-        """SDs of the offsets, mm."""
-        ...
-
-    @property
-    def law(self) -> OffsetLaw:
-        """The result about the distribution."""
-        ...
+    covariance: Float[Array, "lanes p p"]
+    elevation_sd: Float[Array, "lanes n"]
+    law: OffsetLaw
 
 
 def assemble(

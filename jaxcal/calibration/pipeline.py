@@ -9,17 +9,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxcal.calibration.answer import Solved, assemble
+from jaxcal.calibration.answer import Average, Solved, assemble
 from jaxcal.calibration.options import Given, SolvePlan
 from jaxcal.calibration.result import Calibration, Convergence
 from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, barrier
-from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.observations import BoundedOffsets, LocalUnknown, local_unknowns
 from jaxcal.model.unknowns import Blocks
 from jaxcal.runtime.precision import in_standard_promotion
@@ -79,20 +77,6 @@ def agreed_images(problem: Problem, blocks: Blocks) -> Float[Array, " n"]:
     return find_consensus(jax.lax.stop_gradient(problem), rigid_model(blocks)).keep
 
 
-class AveragedAnswer(eqx.Module):
-    """The average over the offsets' laws, problems first.
-
-    Attributes:
-        covariance: of the unknowns.
-        elevation_sd: SDs of the offsets, mm.
-        law: the result about the distribution of the offsets.
-    """
-
-    covariance: Float[Array, "lanes p p"]
-    elevation_sd: Float[Array, "lanes n"]
-    law: OffsetLaw
-
-
 def _alone(problem: Problem, plan: SolvePlan) -> tuple[Problem, ImagePlanes]:
     """A batch of one."""
     batch = jax.tree.map(lambda leaf: leaf[None], problem)
@@ -105,7 +89,7 @@ def _solved(
     given: Given,
     plan: SolvePlan,
     begun: ConventionalStart | GivenStart | None = None,
-) -> tuple[Solved, AveragedAnswer | None]:
+) -> tuple[Solved, Average | None]:
     """The method's solution with its normal matrices, problems first."""
     found = methods.solve(problems, images, given, plan, begun)
     observation = found.observation
@@ -126,7 +110,7 @@ def _solved(
     if found.covariance is None or found.elevation_sd is None or found.law is None:
         return solved, None
     covariance = jnp.moveaxis(found.covariance, -1, 0)
-    return solved, AveragedAnswer(covariance, found.elevation_sd, found.law)
+    return solved, Average(covariance, found.elevation_sd, found.law)
 
 
 def _normal_matrices(

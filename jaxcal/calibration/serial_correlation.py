@@ -94,10 +94,7 @@ def _in_sds(result: Calibration) -> tuple[Float[np.ndarray, "m 3"], Float[np.nda
     unknowns = Unknowns.of(answer)
     seen = ImageErrors.of(unknowns, problem, answer.blocks)
     if answer.prior in TUNED:
-        if answer.linearisation.tracker_sd is not None:
-            shift = np.where(answer.mask > 0, answer.elevation - seen.q[..., 1], 0.0)
-            seen = ImageErrors.of(unknowns, problem, answer.blocks, shift)
-        whitened = Whitened.of(answer, seen, problem)
+        whitened = Whitened.of(answer, seen.shifted(answer, unknowns, problem), problem)
         errors, rows = whitened.errors, whitened.rows
     else:
         in_plane = np.zeros_like(seen.mask)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -240,14 +239,9 @@ def _from_recording(
 
 def _draw(found: Plan, wanted: float | None, path: str) -> None:
     from jaxcal.design import plan_figure
-    from jaxcal.io.atomic import atomic_path
+    from jaxcal.io.atomic import save_figure
 
-    with atomic_path(path) as temporary:
-        kind = Path(path).suffix.lstrip(".") or "png"
-        try:
-            plan_figure(found, wanted).savefig(temporary, format=kind)
-        except ValueError as error:
-            raise InputError(f"{path}: {error}") from None
+    save_figure(plan_figure(found, wanted), path)
 
 
 def _record(found: Plan, recording: str | None) -> dict[str, Any]:

@@ -25,7 +25,13 @@ LARGEST = 1e7
 """Largest coordinate accepted, in mm or px, and largest variance of one: ten kilometres."""
 
 Kind = Literal["point", "pixel", "time_of_flight"]
+_EXTENT_MM = 50.0
+"""Of a target's path through the image where nothing better is known."""
 _UNIT = {"point": "mm", "pixel": "px", "time_of_flight": "s"}
+
+
+class MetresError(InputError):
+    """Translations of poses look like metres, not millimetres."""
 
 
 @dataclass(frozen=True)
@@ -346,9 +352,8 @@ def _check_units(images: Images) -> None:
     used = images.mask
     if not used.any():
         return
-    translation = images.poses[used, :3, 3]
-    spread = float(np.linalg.norm(translation - translation.mean(axis=0), axis=1).max())
-    reach = float(np.linalg.norm(translation, axis=1).max())
+    translations = images.poses[used, :3, 3]
+    spread, _ = _spread_and_reach(translations)
     if images.kind == "point":
         extent = float(np.abs(images.measurements[used]).max())
         if extent < 0.5 and spread > 1.0:
@@ -362,23 +367,58 @@ def _check_units(images: Images) -> None:
                 "like metres; give both in mm"
             )
     elif images.kind == "pixel":
-        if images.spacing_mm is not None and images.spacing_mm.max() < 1e-3:
-            raise InputError(
-                f"the spacing is only {images.spacing_mm.max():.3g} mm per pixel: it looks like "
-                "metres; give it, and the poses, in mm"
-            )
+        if images.spacing_mm is not None:
+            check_spacing_unit(images.spacing_mm)
         spacing = 0.1 if images.spacing_mm is None else float(images.spacing_mm.max())
         extent = float(np.ptp(images.measurements[used], axis=0).max()) * spacing
     else:
-        extent = 50.0
-    # A probe whose every position lies within 5 mm of the tracker's origin, and whose moves are
-    # hundreds of times smaller than the target's path through the image, was recorded in metres.
-    if 0 < spread < 0.02 * extent and reach < 5.0:
+        extent = _EXTENT_MM
+    check_pose_units(translations, extent)
+
+
+def check_spacing_unit(spacing_mm: Float[np.ndarray, 2]) -> None:
+    """Refuse a pixel's size in metres in place of millimetres.
+
+    Args:
+        spacing_mm: [lateral, axial] per px, as if in mm.
+
+    Raises:
+        InputError: it looks like metres.
+    """
+    if spacing_mm.max() < 1e-3:
         raise InputError(
-            f"pose translations reach only {reach:.3g} mm while the target moves over about "
-            f"{extent:.0f} mm of the image: the poses look like metres; give them in mm (jaxcal "
-            "import converts them with --pose-units m)"
+            f"the spacing is only {spacing_mm.max():.3g} mm per pixel: it looks like metres; give "
+            "it, and the poses, in mm"
         )
+
+
+def check_pose_units(translations: Float[np.ndarray, "n 3"], extent_mm: float = _EXTENT_MM) -> None:
+    """Refuse poses of different images whose translations are in metres in place of millimetres.
+
+    A probe whose every position lies within 5 mm of the tracker's origin, and whose moves are
+    hundreds of times smaller than the target's path through the image, was recorded in metres.
+
+    Args:
+        translations: of the images' poses, as if in mm.
+        extent_mm: length of the target's path through the image, roughly.
+
+    Raises:
+        MetresError: they look like metres.
+    """
+    spread, reach = _spread_and_reach(translations)
+    if 0 < spread < 0.02 * extent_mm and reach < 5.0:
+        raise MetresError(
+            f"pose translations reach only {reach:.3g} mm while the target moves over about "
+            f"{extent_mm:.0f} mm of the image: the poses look like metres; give them in mm"
+        )
+
+
+def _spread_and_reach(translations: Float[np.ndarray, "n 3"]) -> tuple[float, float]:
+    """Largest distance from the mean, and from the origin."""
+    away = translations - translations.mean(axis=0)
+    return float(np.linalg.norm(away, axis=1).max()), float(
+        np.linalg.norm(translations, axis=1).max()
+    )
 
 
 def unit_of(kind: Kind) -> str:

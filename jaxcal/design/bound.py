@@ -30,7 +30,7 @@ from jaxcal.design.planning import (
     known_before,
     with_effective_noise,
 )
-from jaxcal.design.predict import student_factor
+from jaxcal.design.predict import tuned_factor
 
 NEAR = 1e-3
 """The steps end when the bound is nearer than this share of the squared error."""
@@ -88,4 +88,4 @@ def least_error(
             break
         share = share * np.sqrt(gains)
         share = share / share.sum()
-    return math.sqrt(student_factor(known, n, size) * best)
+    return math.sqrt(float(tuned_factor(known, np.array(n), size)) * best)

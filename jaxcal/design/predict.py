@@ -17,7 +17,8 @@ from jaxcal import InputError
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import rp_weight, tre_weight
 from jaxcal.design.information import covariance_of
-from jaxcal.runtime.array_types import Float
+from jaxcal.diagnostics.intervals import student_variance
+from jaxcal.runtime.array_types import Float, Int
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
@@ -28,15 +29,10 @@ _ENOUGH = 1000
 """Number of candidates for counting images; more of them change the count by less than 1 %."""
 
 
-def student_factor(known: Known, more: int, size: int = 9) -> float:
-    """By how much squared errors with so many more images exceed the bound.
-
-    It is the variance of Student's distribution if the SDs were tuned to images, at most 3, else 1.
-    """
-    if not known.tuned:
-        return 1.0
-    left = max(known.images + more - size / 3, 3.0)
-    return left / (left - 2.0)
+def tuned_factor(known: Known, more: Int[np.ndarray, "*n"], size: int) -> Float[np.ndarray, "*n"]:
+    """By how much squared errors with so many more images exceed the bound: 1 for given SDs."""
+    left = known.images + more - size / 3
+    return np.asarray(student_variance(left if known.tuned else np.full_like(left, np.inf)))
 
 
 def curve(
@@ -52,7 +48,7 @@ def curve(
         tre_weight(candidates.constraints.region.grid(), model),
         rp_weight(candidates.poses, model),
     )
-    factor = np.array([student_factor(known, k, model.size) for k in range(len(total))])
+    factor = tuned_factor(known, np.arange(len(total)), model.size)
     tre, rp = (np.sqrt(factor * np.einsum("ab,nab->n", weight, covariance)) for weight in weights)
     return tre, rp
 

@@ -129,6 +129,13 @@ class ImageErrors:
         rows *= mask[..., None, None]
         return cls(q, turned, lateral, distance, mask[..., None] * errors, rows, mask)
 
+    def shifted(self, answer: Calibration, unknowns: Unknowns, problem: Problem) -> ImageErrors:
+        """These errors with the target moved by the estimated error of the tracker, if any."""
+        if answer.linearisation.tracker_sd is None:
+            return self
+        shift = np.where(answer.mask > 0, answer.elevation - self.q[..., 1], 0.0)
+        return ImageErrors.of(unknowns, problem, answer.blocks, shift)
+
     def lever(self, mask: Float[Array, "k n"]) -> Float[Array, " k"]:
         """Root mean square distance of the measured points from the image origin, mm."""
         squares = np.where(mask > 0, self.lateral**2 + self.distance**2, 0.0)

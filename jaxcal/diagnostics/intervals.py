@@ -74,6 +74,14 @@ def degrees_of_freedom(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     return xp.where(calibration.sigma_tuned, xp.maximum(left, 1.0), np.inf)
 
 
+def student_variance(left: Float[AnyArray, "*#b"]) -> Float[AnyArray, "*b"]:
+    """Variance of Student's distribution by its degrees of freedom; 3 for fewer than 3 of them."""
+    xp = array_module(left)
+    # Given SDs have infinitely many: inf / inf would be NaN.
+    finite = xp.maximum(xp.where(xp.isfinite(left), left, 4.0), 3.0)
+    return xp.where(xp.isfinite(left), finite / (finite - 2), 1.0)
+
+
 @traceable
 def variance_factor(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     """The factor by which mean square errors exceed what the covariance says (traceable).
@@ -87,9 +95,7 @@ def variance_factor(calibration: Calibration) -> Float[AnyArray, "*batch"]:
     left = degrees_of_freedom(calibration)
     if calibration.prior not in TUNED:
         return xp.ones_like(left)
-    # Given SDs have infinite degrees of freedom: inf / inf would be NaN.
-    finite = xp.where(xp.isfinite(left), left, 4.0)
-    return xp.where(xp.isfinite(left), finite / xp.maximum(finite - 2, 1.0), 1.0)
+    return student_variance(left)
 
 
 def transform_intervals(

@@ -92,11 +92,7 @@ def _piece(answer: Calibration, eps: float) -> dict[str, Array]:
     assert problem is not None
     unknowns = Unknowns.of(answer)
     seen = ImageErrors.of(unknowns, problem, answer.blocks)
-    shifted = seen
-    if answer.linearisation.tracker_sd is not None:
-        # The estimated error of the tracker moves the target's elevation.
-        shift = np.where(answer.mask > 0, answer.elevation - seen.q[..., 1], 0.0)
-        shifted = ImageErrors.of(unknowns, problem, answer.blocks, shift)
+    shifted = seen.shifted(answer, unknowns, problem)
     uncertainty = assess(answer, shifted, unknowns, problem, eps)
     inspection = inspect(answer, seen, shifted, unknowns, problem, uncertainty, eps)
     residual, _ = seen.from_circle(np.zeros_like(seen.mask))

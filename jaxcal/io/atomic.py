@@ -15,8 +15,12 @@ import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-from jaxcal import CalibrationError, OutputError
+from jaxcal import CalibrationError, InputError, OutputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @contextmanager
@@ -140,6 +144,31 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 class _Unwritten(Exception):
     """Ends a check before anything is written."""
+
+
+def save_figure(
+    figure: Figure, path: str | os.PathLike[str], *, dpi: float | Literal["figure"] = "figure"
+) -> None:
+    """Write a figure, complete or not at all, in the format that the file's name ends in.
+
+    Args:
+        figure: of matplotlib.
+        path: the file to make or replace; a name without an ending gets PNG content.
+        dpi: of formats that consist of pixels; by default the figure's own.
+
+    Raises:
+        InputError: no figure can be written in this format.
+        OutputError: it could not be written; the file is as it was.
+    """
+    kind = Path(path).suffix.lstrip(".").lower() or "png"
+    known = figure.canvas.get_supported_filetypes()
+    if kind not in known:
+        endings = ", ".join(f".{each}" for each in sorted(known))
+        raise InputError(
+            f"{os.fspath(path)}: no figure can be written as .{kind}; these endings work: {endings}"
+        )
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=dpi, format=kind)
 
 
 def _existing_mode(final: Path) -> int | None:

@@ -9,7 +9,8 @@ in words what was assumed.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -18,7 +19,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import QuaternionOrder
-from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
+from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, Recording, make_images
 from jaxcal.io.folder import read_folder, with_pose_table
 from jaxcal.io.frame_names import FramePair, capitalised
 from jaxcal.io.frame_points import Assignment, points_of_markups, points_of_table
@@ -110,7 +111,8 @@ def import_files(
     kinds = [_kind(source) for source in sources]
     tracked = [source for source, kind in zip(sources, kinds, strict=True) if kind in _SEQUENCES]
     if tracked:
-        return _from_sequence(sources, tracked, options)
+        with _naming_pose_units(options.poses is not None):
+            return _from_sequence(sources, tracked, options)
     if options.poses is not None:
         raise InputError("--poses goes with a sequence or a folder of PNG images")
     options = replace(options, spacing_mm=_spacing(None, options), spacing_from=None)
@@ -119,9 +121,10 @@ def import_files(
             raise InputError("a pair of text files holds pixels: --units mm does not go with it")
         if options.quaternion is not None:
             raise InputError("a pair of text files holds no quaternions: leave --quaternion out")
-        pair = read_crosswire(
-            *sources, spacing_mm=options.spacing_mm, pose_units=options.pose_units or "mm"
-        )
+        with _naming_pose_units():
+            pair = read_crosswire(
+                *sources, spacing_mm=options.spacing_mm, pose_units=options.pose_units or "mm"
+            )
         return Imported(pair, [])
     if len(sources) != 1 or kinds[0] != "table":
         raise InputError(
@@ -131,7 +134,19 @@ def import_files(
     table = _table(sources[0], options)
     notes = _skipped(table)
     table, said = _with_good_time(table, options)
-    return Imported(recording_of(table, options.spacing_mm), notes + said)
+    with _naming_pose_units():
+        return Imported(recording_of(table, options.spacing_mm), notes + said)
+
+
+@contextmanager
+def _naming_pose_units(converts: bool = True) -> Iterator[None]:
+    """Name the option that converts poses that look like metres, where it ``converts`` them."""
+    try:
+        yield
+    except MetresError as error:
+        if not converts:
+            raise
+        raise InputError(f"{error} (--pose-units m converts them)") from None
 
 
 _SEQUENCES = ("sequence", "tracker", "scan", "folder")

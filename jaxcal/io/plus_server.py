@@ -70,7 +70,7 @@ def update_transform(
             reply = _reply(link, f"ACK_{number}", due)
     except TimeoutError:
         raise InputError(f"{where}: no reply within {timeout_s:g} s") from None
-    except OSError as error:
+    except (OSError, UnicodeError) as error:
         raise InputError(f"{where}: {one_line(error)}") from None
     except InputError as error:
         raise InputError(f"{where}: {error}") from None

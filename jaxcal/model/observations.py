@@ -79,6 +79,12 @@ class Further(eqx.Module):
                 ]
         return cls(values, axes)
 
+    @classmethod
+    def at(cls, iterate: Iterate, axes: Matrix | None = None) -> Further:
+        """The iterate's further unknowns as they are."""
+        still = jnp.zeros_like(iterate.point[0])[:, None]
+        return cls.of(iterate, [still] * iterate.extras.shape[0], axes)
+
     def points(self, images: ImagePlanes) -> tuple[Array, Array]:
         """Lateral position and range of every image, mm."""
         return measured(images.lateral, images.axial, images.face[:, None], self.values)
@@ -182,6 +188,13 @@ def errors(q: Vector, further: Further, images: ImagePlanes) -> tuple[Array, Arr
     return q[0] - lateral, square * jax.lax.rsqrt(square) - distance
 
 
+def factor_of(shape: Float[Array, "3 lanes n"]) -> tuple[Array, Array, Array]:
+    """Cholesky factors of 2x2 matrices: first, off-diagonal and last entry."""
+    first = jnp.sqrt(shape[0])
+    mixed = shape[1] / first
+    return first, mixed, jnp.sqrt(shape[2] - mixed * mixed)
+
+
 class OwnCovariances(Observation):
     """Points whose errors have a covariance of their own in every image.
 
@@ -199,15 +212,9 @@ class OwnCovariances(Observation):
     ratio: Float[Array, " lanes"]
     tied: bool = eqx.field(static=True, default=False)
 
-    def _factor(self) -> tuple[Array, Array, Array]:
-        """The Cholesky factor of every image's 2x2 shape: first, off-diagonal and last entry."""
-        first = jnp.sqrt(self.shape[0])
-        mixed = self.shape[1] / first
-        return first, mixed, jnp.sqrt(self.shape[2] - mixed * mixed)
-
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         lateral, distance = errors(q, further, images)
-        first, mixed, second = self._factor()
+        first, mixed, second = factor_of(self.shape)
         one = lateral / first
         # A mm of lateral error counts as ``ratio`` mm of range error.
         other = (distance - self.ratio[:, None] * mixed * one) / second
@@ -236,7 +243,7 @@ class OwnCovariances(Observation):
         if self.tied:
             return 0.0
         # The second residual contains at most this share of the first; then Cauchy-Schwarz.
-        _, mixed, second = self._factor()
+        _, mixed, second = factor_of(self.shape)
         part = jnp.max(jnp.abs(mixed) / second, axis=1)
         change = jnp.abs(jnp.log(now[1] / now[0]) - jnp.log(before[1] / before[0]))
         # Before the first pass SDs are infinite: nothing can be compared.
@@ -385,8 +392,7 @@ def local_unknowns(
 ) -> Float[Array, "lanes n"]:
     """Every image's own unknown at its best; 0 for images left out."""
     q, axes = targets(iterate, images)
-    still = [jnp.zeros_like(images.mask[:, :1])] * iterate.extras.shape[0]
-    return images.mask * observation.local(q, Further.of(iterate, still, axes), images)[0]
+    return images.mask * observation.local(q, Further.at(iterate, axes), images)[0]
 
 
 class BoundedOffsets(LocalUnknown):
@@ -462,10 +468,9 @@ class TrackedPoints(LocalUnknown):
         wide = [jnp.hypot(sigma[0], tau), jnp.hypot(sigma[1], tau)]
         one, other = lateral / wide[0], distance / wide[1]
         if self.shape is not None:
-            first = jnp.sqrt(self.shape[0])
-            mixed = self.shape[1] / first
+            first, mixed, last = factor_of(self.shape)
             one = one / first
-            other = (other - mixed * one) / jnp.sqrt(self.shape[2] - mixed * mixed)
+            other = (other - mixed * one) / last
         return [
             Component([one * sigma[0]]),
             Component([other * sigma[1]]),

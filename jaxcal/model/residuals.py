@@ -25,8 +25,7 @@ def _one_lane(
     alone = jax.tree.map(lambda leaf: leaf[None], (parameters, problem))
     images = ImagePlanes.of(alone[1], channels=channels)
     iterate = Iterate.of(alone[0], RIGID + EXTRA)
-    still = [jnp.zeros((1, 1), problem.mask.dtype)] * iterate.extras.shape[0]
-    return images, Further.of(iterate, still), targets(iterate, images)[0]
+    return images, Further.at(iterate), targets(iterate, images)[0]
 
 
 def measured_points(parameters: Parameters, problem: Problem) -> Float[Array, "n 2"]:

@@ -113,17 +113,6 @@ def solve(matrix: Matrix, vector: Vector) -> Vector:
     return backward(factor, inverse, forward(factor, inverse, vector))
 
 
-def symmetric(flat: Vector) -> Matrix:
-    """A full matrix from its upper triangle, row by row."""
-    size = int((2 * len(flat)) ** 0.5)
-    full: Matrix = [[0] * size for _ in range(size)]
-    entries = iter(flat)
-    for i in range(size):
-        for j in range(i, size):
-            full[i][j] = full[j][i] = next(entries)
-    return full
-
-
 def upper(matrix: Matrix) -> Vector:
     """The upper triangle, row by row."""
     return [matrix[i][j] for i in range(len(matrix)) for j in range(i, len(matrix))]

@@ -22,9 +22,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal.data.geometry import chord_angle
-from jaxcal.model import unrolled
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import BoundedOffsets, Further, HeldOffsets, local_unknowns
+from jaxcal.solvers import dense
 from jaxcal.solvers.levenberg_marquardt import Descent, Rounding, gradient_cosine, minimise
 from jaxcal.solvers.normal_equations import accumulate
 
@@ -96,11 +96,9 @@ def alternate(
     def gauss_newton(_: Array, carry: tuple) -> tuple:
         place, held = carry
         normal = barrier(accumulate(place, held, images, None))
-        matrix = normal.matrix()
-        for k in range(len(matrix)):
-            matrix[k][k] = matrix[k][k] * (1 + 16 * eps)
-        move = unrolled.solve(matrix, [-value for value in unrolled.rows_of(normal.gradient)])
-        return barrier(place.moved(barrier(jnp.stack(move)))), held
+        eye = jnp.eye(len(normal.gradient), dtype=normal.gradient.dtype)[..., None]
+        matrix, gradient = barrier((normal.stacked() * (1 + 16 * eps * eye), normal.gradient))
+        return barrier(place.moved(barrier(dense.solve_lanes_last(matrix, -gradient)))), held
 
     def one_round(state: _State) -> _State:
         held = HeldOffsets.of(barrier(local_unknowns(state.place, observation, images)), images)
@@ -168,8 +166,7 @@ def bounded(
     Returns:
         The fits; their iterations count those from all starts, and the warm-up.
     """
-    still = [jnp.zeros_like(images.mask[:, :1])] * start.extras.shape[0]
-    further = Further.of(start, still)
+    further = Further.at(start)
     bound = jnp.sum(images.mask * observation.limit(further, images), axis=1)
     turn = bound / jnp.sum(images.mask * further.points(images)[1], axis=1)
     zero = jnp.zeros_like(turn)

@@ -39,8 +39,7 @@ class SteepestDescent(optx.AbstractGradientDescent):
 
 def reconstructed(place: Iterate, images: ImagePlanes) -> Float[Array, "3 lanes n"]:
     """B_i X p_i, the target as reconstructed from every image, in the tracker's frame, mm."""
-    still = [jnp.zeros_like(images.mask[:, :1])] * place.extras.shape[0]
-    lateral, distance = Further.of(place, still).points(images)
+    lateral, distance = Further.at(place).points(images)
     in_probe = place.rotation[:, 0, :, None] * lateral + place.rotation[:, 2, :, None] * distance
     in_probe = in_probe + place.translation[..., None]
     poses = images.rotation.reshape(3, 3, *images.mask.shape)

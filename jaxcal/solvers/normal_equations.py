@@ -347,10 +347,6 @@ class Normal(eqx.Module):
     cost: Float[Array, " lanes"]
     squares: Float[Array, "p lanes"] | None = None
 
-    def matrix(self) -> Matrix:
-        """The full matrix, as rows of lanes."""
-        return unrolled.symmetric(unrolled.rows_of(self.curvature))
-
     def stacked(self) -> Float[Array, "p p lanes"]:
         """The full matrix as one array."""
         return stacked(self.curvature)

@@ -49,9 +49,8 @@ def whitened_residuals(
 ) -> Float[Array, "residuals lanes"]:
     """All residuals of every lane in SDs, zeros where an image is left out; lanes last."""
     q, axes = targets(place, images)
-    still = [jnp.zeros_like(images.mask[:, :1])] * place.extras.shape[0]
     parts = []
-    found = observation.components(q, Further.of(place, still, axes), images)
+    found = observation.components(q, Further.at(place, axes), images)
     for component, sd in zip(found, observation.sigma, strict=True):
         for error in component.errors:
             present = images.mask if error.ndim == 2 else images.mask[..., None]

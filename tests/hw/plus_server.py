@@ -112,10 +112,21 @@ def stream(asked: dict):
 
 
 def messages(asked: dict):
-    """The stream as bytes, frame by frame."""
+    """The stream as bytes, frame by frame.
+
+    Args:
+        asked: as of :func:`stream`; ``mode``: ``tracked`` or ``separate`` messages; ``metres``:
+            send translations in m; ``cut_after``: number of the frame from which on frames are
+            smaller.
+    """
     number = 0
     for stamp, array, transforms in stream(asked):
         number += 1
+        if number > asked.get("cut_after", number):
+            array = array[:100, :140]
+        if asked.get("metres"):
+            for each in transforms:
+                each.matrix[:3, 3] *= 1e-3
         if asked.get("mode") == "tracked":
             content = TrackedFrame(Picture(array, (1.0, 1.0)), transforms)
             yield encode(Message("TRACKEDFRAME", "TrackedFrame", stamp, content, number))

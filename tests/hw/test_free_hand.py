@@ -19,9 +19,12 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from hw.cli import main
 from hw.errors import DeviceError
-from hw.freehand.acquire import FreeHand, FreeHandStopped, acquire_free_hand
+from hw.freehand.acquire import acquire_free_hand
 from hw.freehand.guide import Guide, Rules, Taken, orientation_sds
 from hw.freehand.posed import PosedImage, PosedImages
+from hw.freehand.request import FreeHand, FreeHandStopped
+from hw.robot.identity import read_identity
+from hw.robot.rtde import PacketReader
 from hw.ultrasound.receiver import Image, UltrasoundStream
 from jaxcal import FormatError, InputError
 
@@ -53,7 +56,7 @@ class Scripted:
         self._presses, self._pending = presses, []
 
     def show(self, frame: np.ndarray, words: str, advice: str) -> None:
-        assert frame.shape == (ROWS, COLUMNS)
+        assert frame.shape in ((ROWS, COLUMNS), (100, 140))
         self.words.add(re.sub(r"[\d.]+", "#", words))
         self.advice.add(advice)
 
@@ -174,6 +177,78 @@ def test_too_few_images_stay_resumable(tmp_path):
         asked = FreeHand("127.0.0.1", port, images=9)
         with pytest.raises(FreeHandStopped, match="1 images are too few: 4 are needed"):
             acquire_free_hand(tmp_path / "r.h5", asked, Scripted(image_1="q"))
+
+
+def test_poses_in_metres_are_noticed_at_the_second_image(tmp_path):
+    path = tmp_path / "r.h5"
+    with plus_server(mode="tracked", metres=True) as port:
+        asked = FreeHand("127.0.0.1", port, images=4)
+        with pytest.raises(FreeHandStopped, match="look like metres; give them in mm; 0 of 4 im"):
+            acquire_free_hand(path, asked, Scripted())
+    with h5py.File(path) as file:
+        assert not file.attrs["complete"]
+        assert file["calibration/mask"][()].tolist() == [False]
+    # Once the server sends mm, it goes on.
+    with plus_server(mode="tracked") as port:
+        assert acquire_free_hand(path, FreeHand("127.0.0.1", port), Scripted(), resume=True) == 4
+    check(path, [0, 1, 2, 3])
+    with pytest.raises(InputError, match=r"only 0\.0002 mm per pixel: it looks like m"):
+        FreeHand("127.0.0.1", spacing_mm=(0.0002, 0.0002))
+
+
+def test_an_image_that_was_not_written_is_not_counted(tmp_path):
+    path = tmp_path / "my rec.h5"
+    with plus_server(mode="tracked", cut_after=70) as port:
+        asked = FreeHand("127.0.0.1", port, images=7)
+        with pytest.raises(FreeHandStopped) as stopped:
+            acquire_free_hand(path, asked, Scripted())
+    with h5py.File(path) as file:
+        count = len(file["calibration/mask"])
+        assert file["us/frames"].shape == (count, ROWS, COLUMNS)
+    assert count in (2, 3)
+    assert str(stopped.value) == (
+        "an ultrasound frame of 140 x 100 px of uint8 does not fit this recording, whose frames "
+        f"have 160 x 120 px of uint8: set the machine as before; {count} of 7 images are in {path}"
+        f"; go on with: jaxcal-hw free-hand 127.0.0.1:{port} '{path}' --resume"
+    )
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        ("--images", "30"),
+        ("--lag", "0.5"),
+        ("--target", "cross"),
+        ("--from", "Stylus"),
+        ("--to", "Tracker"),
+        ("--device", "Image"),
+        ("--region", "0", "0", "9", "9"),
+        ("--spacing", "0.2", "0.2"),
+    ],
+)
+def test_options_that_the_recording_knows(capsys, option):
+    assert main(["free-hand", "localhost", "r.h5", "--resume", *option]) == 2
+    error = capsys.readouterr().err
+    assert f"{option[0]} does not go with --resume: the recording knows" in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("host", ["a..b", "a" * 300, "a b"])
+def test_hosts_that_cannot_be(capsys, host):
+    assert main(["free-hand", host]) == 2
+    error = capsys.readouterr().err
+    assert "is not the name or address of a computer" in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("host", ["a..b", "a" * 300])
+def test_clients_refuse_such_a_host_too(host):
+    with pytest.raises(DeviceError, match="no OpenIGTLink server at "):
+        UltrasoundStream(host).start()
+    with pytest.raises(DeviceError, match="no connection to "):
+        PacketReader(host)
+    with pytest.raises(DeviceError, match="no connection to the dashboard"):
+        read_identity(host)
 
 
 def test_ctrl_c_at_a_terminal(tmp_path):

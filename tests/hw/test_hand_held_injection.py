@@ -6,6 +6,7 @@ import re
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -21,8 +22,8 @@ from hw.bench.ultrasound import ImageServer
 from hw.bench.world import make_world
 from hw.cli import main
 from hw.clock import REAL
-from hw.freehand.acquire import FreeHand, FreeHandStopped
 from hw.freehand.injection import acquire_by_injection, hand_advice
+from hw.freehand.request import FreeHand, FreeHandStopped
 from hw.midplane.pattern_injection import View
 from hw.poses import Extent, plan_poses
 from hw.recorder import Recorder
@@ -67,7 +68,7 @@ class Bench:
     """Element, machine and tracker, which see one hand."""
 
     def __init__(self) -> None:
-        self.hand = Hand()
+        self.hand, self.unit_mm = Hand(), 1.0
         rng, camera = np.random.default_rng(1), Camera(WORLD, seed=0)
 
         def hear(t: float, threshold: int):
@@ -88,8 +89,13 @@ class Bench:
 
         self.images = ImageServer(
             see, clock=REAL, rate_hz=25.0, spacing_mm=camera.spacing_mm,
-            transforms=lambda t: {"ProbeToTracker": self.hand.pose(t)},
+            transforms=self.transforms,
         )  # fmt: skip
+
+    def transforms(self, t: float) -> dict[str, np.ndarray]:
+        pose = self.hand.pose(t)
+        pose[:3, 3] /= self.unit_mm
+        return {"ProbeToTracker": pose}
 
     @property
     def setup(self) -> HandHeldSetup:
@@ -164,12 +170,26 @@ class Person:
 
 def test_a_person_follows_the_bar_by_hand(tmp_path, bench):
     path, person = tmp_path / "r.h5", Person(bench.hand, image_3="u")
-    stopping = Person(bench.hand, image_2="ctrl-c")
-    with pytest.raises(FreeHandStopped, match="interrupted; 2 of 4 images") as stopped:
+    stopping = Person(bench.hand, image_2="u", taken_back="ctrl-c")
+    with pytest.raises(FreeHandStopped, match="interrupted; 1 of 4 images") as stopped:
         acquire_by_injection(path, bench.asked, bench.setup, stopping)
     assert stopped.value.exit_code == 130
+    assert str(stopped.value).endswith(
+        f"{path} --placement pattern-injection --setup TOML --resume"
+    )
+    turned = bench.setup.image_to_probe.copy()
+    turned[:3, 3] += 1.0
+    for other, told in (
+        ({"probe": replace(WORLD.probe, sound_speed_m_s=1540.0)}, "sound_speed_m_s = "),
+        ({"image_to_probe": turned}, "image_to_probe = "),
+    ):
+        with pytest.raises(InputError, match=rf"r\.h5: was recorded with \[\w+\] {told}"):
+            acquire_by_injection(
+                path, bench.asked, replace(bench.setup, **other), person, resume=True
+            )
     assert acquire_by_injection(path, bench.asked, bench.setup, person, resume=True) == 4
-    assert any(line.startswith("taken back: the last image; ") for line in person.lines)
+    assert "started: 3 images to take" in person.lines
+    assert "taken back: the last image; 2 are left" in person.lines
     assert not bench.echo.injection.on
     assert "#" * 25 in person.words
     assert any("slide it slowly up" in advice for advice in person.advice)
@@ -178,19 +198,19 @@ def test_a_person_follows_the_bar_by_hand(tmp_path, bench):
         poses = np.asarray(file["calibration/pose"])
         low, high, centre = (np.asarray(file[f"placement/{k}"]) for k in ("low", "high", "centre"))
         bound = np.asarray(file["calibration/max_elevation"])
-        assert file["us/frames"].shape[0] == len(mask) == 5
+        assert file["us/frames"].shape[0] == len(mask) == 6
         assert file.attrs["complete"]
         assert len(file["ae/tof_ticks"]) > 100
-    assert mask.sum() == 4
+    assert mask.tolist() == [True, False, True, False, True, True]
     # What the drawing of the probe does not know (it is off by degrees) moves all of them alike.
     true = np.array([WORLD.truth(pose).elevation_mm for pose in poses])
-    assert ((low <= true) & (true <= high)).mean() >= 4 / 5
+    assert ((low <= true) & (true <= high)).mean() >= 5 / 6
     assert (high - low < 4).all()
     assert (np.abs(centre) < 1).all()
     np.testing.assert_allclose(bound, np.maximum(np.abs(low), np.abs(high)))
     assert np.abs(true).max() < 1.5
     recording = jaxcal.load(path)
-    assert (recording.calibration.kind, len(recording)) == ("time_of_flight", 5)
+    assert (recording.calibration.kind, len(recording)) == ("time_of_flight", 6)
     assert recording.probe is not None
     times = recording.calibration.measurements[mask]
     shortest = np.nanmin(recording.probe.one_way_range_mm(times), axis=1)
@@ -213,8 +233,20 @@ def test_enter_is_refused_until_both_sides_were_seen(tmp_path, bench):
     with pytest.raises(FreeHandStopped, match="0 images are too few"):
         acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, person)
     Recorder(tmp_path / "o.h5", RecordingHeader("pixel", {}, 0, None, "{}")).close()
-    with pytest.raises(InputError, match="was not begun with pattern injection"):
+    with pytest.raises(InputError, match="has no settings of a pattern-injection run"):
         acquire_by_injection(tmp_path / "o.h5", bench.asked, bench.setup, person, resume=True)
+
+
+def test_poses_in_metres_are_told_of(tmp_path, bench):
+    class Sweeping(Person):
+        def show(self, frame: np.ndarray, words: str, advice: str) -> None:
+            super().show(frame, words, "nothing heard: to and fro")
+            if "look like metres: let the server send them in mm" in words:
+                self._keys.append("q")
+
+    bench.unit_mm = 1000.0
+    with pytest.raises(FreeHandStopped, match="0 images are too few"):
+        acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, Sweeping(bench.hand))
 
 
 def test_an_element_that_falls_silent_ends_the_run(tmp_path, bench, monkeypatch):

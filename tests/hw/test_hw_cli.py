@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
+import signal
 import subprocess
 import sys
 
@@ -11,7 +13,9 @@ import numpy as np
 import pytest
 from test_setup import GOOD
 
+import jaxcal
 from hw.cli import _plan_page, main
+from hw.recording_check import read_progress
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import RecordingHeader
 from hw.robot.limits import Limits
@@ -54,20 +58,7 @@ def test_wrong_usage_is_one_line(tmp_path, monkeypatch, capsys, arguments, what)
 def test_a_dry_run_shows_the_plan_and_makes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "bench.toml"
-    limits = """
-box_min_mm = [200, -400, 40]
-box_max_mm = [500, -100, 260]
-cone_axis = [0, 0, -1]
-cone_deg = 60
-max_step_mm = 250
-max_turn_deg = 120
-max_speed_mm_s = 50
-search_mm = 25
-search_deg = 0.5
-"""
-    good = GOOD.replace("cone_deg = 30", limits).replace(
-        "box_mm = [[0, 0, 0], [100, 100, 100]]", ""
-    )
+    good = GOOD.replace("box_mm = [[0, 0, 0], [100, 100, 100]]", "")
     path.write_text(good)
     arguments = ["acquire", "out.h5", "--setup", str(path), "--images", "6"]
     assert main([*arguments, "--preview", "plan.png"]) == 0
@@ -77,6 +68,19 @@ search_deg = 0.5
     assert "TCP offset: not known before the controller is asked" in out
     assert (tmp_path / "plan.png").stat().st_size > 1000
     assert not (tmp_path / "out.h5").exists()
+    assert main([*arguments, "--preview", str(path)]) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert "no figure can be written as .toml; these endings work: " in told.err
+    assert path.read_text() == good
+    # What --move would refuse.
+    path.write_text(re.sub(r"\[ultrasound\][^\[]*", "", good))
+    assert main([*arguments, "--phantom", "cross-wire"]) == 2
+    assert "needs the images: add [ultrasound]" in capsys.readouterr().err
+    path.write_text(good)
+    for name, said in (("bench.toml", "exists already"), ("no/out.h5", "there is no folder")):
+        assert main([arguments[0], name, *arguments[2:]]) != 0
+        assert said in capsys.readouterr().err
     armed = good.replace("settle_s = 1", 'model = "ur5"\ntcp_offset = [0, 0, 0.12, 0, 0, 0]')
     path.write_text(armed)
     assert main(arguments) == 0
@@ -112,6 +116,52 @@ def test_a_recording_of_the_bench_is_resumed_on_the_bench(tmp_path, capsys):
     RecordingWriter.resume(path).finish()
     assert main(["acquire", str(path), "--bench", "--resume"]) == 2
     assert "is complete" in capsys.readouterr().err
+
+
+def test_a_recording_that_lacks_images_can_be_resumed_after_its_end(tmp_path):
+    path, digest = tmp_path / "rec.h5", tmp_path / "rec.h5.sha256"
+    probe = {"kind": "linear", "elements": 8, "pitch_mm": 1.0, "sound_speed_m_s": 1490.0}
+    writer = RecordingWriter.create(path, RecordingHeader("time_of_flight", probe, 8, None, "{}"))
+    writer.put("plan", "targets", np.tile(np.eye(4), (5, 1, 1)), "mm")
+    writer.attributes("plan", {"without_image": 2})
+    writer.finish()
+    assert digest.exists()
+    assert read_progress(path).ended
+    again = RecordingWriter.resume(path)
+    assert not digest.exists()
+    again.attributes("plan", {"without_image": 0})
+    again.finish()
+    assert digest.exists()
+    with pytest.raises(jaxcal.FormatError, match="nothing to resume"):
+        RecordingWriter.resume(path)
+
+
+@pytest.mark.parametrize("given", [subprocess.PIPE, subprocess.DEVNULL])
+def test_a_bench_serves_until_ctrl_c_whatever_its_standard_input_is(given):
+    process = subprocess.Popen(
+        [sys.executable, "-c", "import sys; from hw.cli import main; sys.exit(main(['bench']))"],
+        stdin=given, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert "robot_host" in process.stdout.readline()
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(0.3)
+    process.send_signal(signal.SIGINT)
+    _, complaints = process.communicate(timeout=20)
+    assert (process.returncode, complaints) == (0, "")
+
+
+def test_without_ur_rtde_no_file_is_made_and_nobody_is_asked(tmp_path):
+    code = (
+        "import sys; sys.modules['rtde_control'] = None; from hw.cli import main; "
+        "sys.exit(main(['acquire', 'rec.h5', '--bench']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("rtde_control is not installed") == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_help_needs_no_jax_and_no_drivers():

@@ -104,6 +104,17 @@ def test_a_place_looked_at_twice_is_not_two_looks_on_that_side():
     assert sides_seen([*once, (1.25, 4)]) == (True, True)
 
 
+def test_a_terminal_that_tells_no_size_counts_as_80_by_24(tmp_path):
+    pytest.importorskip("pty", reason="there are no pseudo-terminals here")
+    from terminal import Terminal
+
+    code = "import sys; from hw.midplane.terminal_image import Screen; "
+    code += "Screen(sys.stdout).show(['word ' * 8])"
+    with Terminal(["-c", code], tmp_path, size=(0, 0)) as person:
+        assert person.finish(60) == 0
+        assert "word word word" in person.shown
+
+
 @pytest.mark.parametrize("size", [(64, 20), (30, 6)])
 def test_the_picture_keeps_a_thin_bar(size):
     frame = np.zeros((480, 640), np.uint8)

@@ -393,12 +393,25 @@ def test_killing_the_caller_stops_the_robot(version):
                 assert caller.poll() is None
                 time.sleep(0.002)
             before = robot.state()["t"]
+            children = Path(f"/proc/{caller.pid}/task/{caller.pid}/children").read_text().split()
             caller.kill()
         deadline = time.monotonic() + 5.0
         while (state := robot.state())["rest_since"] is None and time.monotonic() < deadline:
             time.sleep(0.01)
         assert state["rest_since"] - before <= STOP_WITHIN_S
         assert state["raw"][0] < START[0] + 0.049
+        # Nobody is left to end the process that moves the robot: it ends by itself.
+        assert len(children) >= 1
+        while any(map(is_mover, children)) and time.monotonic() < deadline + 10.0:
+            time.sleep(0.05)
+        assert not any(map(is_mover, children))
+
+
+def is_mover(process: str) -> bool:
+    try:
+        return b"hw.robot._mover" in Path(f"/proc/{process}/cmdline").read_bytes()
+    except OSError:
+        return False
 
 
 def test_a_stop_before_the_start_or_at_rest_is_kept():

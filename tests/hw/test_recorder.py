@@ -287,10 +287,18 @@ def test_files_that_are_not_resumed(tmp_path):
     RecordingWriter.create(path, HEADER).finish()
     with pytest.raises(jaxcal.FormatError, match="is complete"):
         Recorder(path)
-    with pytest.raises(jaxcal.OutputError, match="exists already"):
-        Recorder(path, HEADER)
-    with pytest.raises(jaxcal.OutputError, match="cannot be written"):
-        Recorder(tmp_path / "no" / "rec.h5", HEADER)
+    for name, told in (
+        ("rec.h5", "exists already: give another name"),
+        ("begun.h5", "exists already: resume it, or give another name"),
+        (".", "is a directory, not a file"),
+        ("no/rec.h5", f"there is no folder {tmp_path / 'no'}"),
+        ("n" * 300 + ".h5", "cannot be written: File name too long"),
+    ):
+        if name == "begun.h5":
+            RecordingWriter.create(tmp_path / name, HEADER).close()
+        with pytest.raises(jaxcal.OutputError) as caught:
+            Recorder(tmp_path / name, HEADER)
+        assert str(caught.value) == f"{tmp_path / name}: {told}"
 
     def spoil(change) -> None:
         path.unlink()
@@ -341,9 +349,9 @@ def test_rows_fit_the_layout_or_are_refused_whole(tmp_path):
         writer.append("plan", {"t_host": np.zeros(1)})
     good = {"t_host": np.zeros(1), "t_device": np.zeros(1), "frame_id": np.zeros(1)}
     writer.append("us", {**good, "frames": np.zeros((1, 4, 5), np.int16)})
-    with pytest.raises(jaxcal.FormatError, match="does not fit"):
+    with pytest.raises(jaxcal.FormatError, match="frame of 5 x 5 px of int16 does not fit this re"):
         writer.append("us", {**good, "frames": np.zeros((1, 5, 5), np.int16)})
-    with pytest.raises(jaxcal.FormatError, match="does not fit"):
+    with pytest.raises(jaxcal.FormatError, match="whose frames have 5 x 4 px of int16: set the"):
         writer.append("us", {**good, "frames": np.zeros((1, 4, 5), np.uint8)})
     assert writer.rows["us"] == 1
     writer.close()

@@ -29,7 +29,15 @@ image_to_probe = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 60], [0, 0, 0, 1]]
 point_mm = [350, -250, 80]
 looking = [0, 0, -1]
 [limits]
-cone_deg = 30
+box_min_mm = [200, -400, 40]
+box_max_mm = [500, -100, 260]
+cone_axis = [0, 0, -1]
+cone_deg = 60
+max_step_mm = 250
+max_turn_deg = 120
+max_speed_mm_s = 50
+search_mm = 25
+search_deg = 0.5
 [plan]
 cone_deg = 20
 depth_mm = [20, 60]
@@ -38,6 +46,8 @@ box_mm = [[0, 0, 0], [100, 100, 100]]
 fine_mm = 0.2
 frames = 5
 """
+
+LIMITS = GOOD[GOOD.index("[limits]") : GOOD.index("[plan]")]
 
 
 def test_a_description_is_read(tmp_path):
@@ -51,7 +61,7 @@ def test_a_description_is_read(tmp_path):
     assert setup.extent.depth_mm == (20, 60)
     assert setup.extent.box_mm == ((0, 0, 0), (100, 100, 100))
     assert (setup.search.fine_mm, setup.search.frames) == (0.2, 5)
-    assert setup.limits == {"cone_deg": 30}
+    assert setup.limits["cone_deg"] == 60
     np.testing.assert_array_equal(setup.scene.tip_mm, [0, 0, 60])
 
 
@@ -65,9 +75,22 @@ def test_a_description_is_read(tmp_path):
         ("settle_s = 1", "settle = 1", "has no 'settle'"),
         ("elements = 64", "elements = 64.5", "whole number"),
         ("elements = 64", "elements = 1", "elements"),
-        ("point_mm = [350, -250, 80]", "point_mm = [350, nan, 80]", "point_mm must be numbers"),
+        ("point_mm = [350, -250, 80]", "point_mm = [350, nan, 80]", "point_mm must be 3 numbers"),
         ("looking = [0, 0, -1]", "", "needs looking"),
-        ("[limits]\ncone_deg = 30", "", "nothing may move"),
+        (LIMITS, "", "nothing may move"),
+        ("cone_deg = 60", "cone_degrees = 60", r"\[limits\] unknown limit cone_degrees"),
+        ("box_min_mm = [200, -400, 40]", "", r"\[limits\] the limit box_min_mm is missing"),
+        ("max_step_mm = 250", "max_step_mm = 1000", r"\[limits\] max_step_mm must be above 0"),
+        ("[[1, 0, 0, 0]", "[[-1, 0, 0, 0]", r"\[scene\] image_to_probe is a reflection"),
+        ("[[1, 0, 0, 0]", "[[2, 0, 0, 0]", r"\[scene\] image_to_probe is not a rotation"),
+        ("[350, -250, 80]", '["350", -250, 80]', "point_mm must be 3 numbers"),
+        ("depth_mm = [20, 60]", "depth_mm = [[1, 2, 3], [1, 2, 3]]", "depth_mm must be 2 numbers"),
+        ("depth_mm = [20, 60]", "depth_mm = [true, 60]", "depth_mm must be 2 numbers"),
+        ("[100, 100, 100]]", "4]", r"\[plan\] box_mm must be 2 x 3 numbers"),
+        ('"192.168.1.20"', '"a..b"', r"\[ultrasound\] host 'a\.\.b' is not the name or address"),
+        ('"192.168.1.20"', f'"{"a" * 300}"', r"\[ultrasound\] host 'a+\.\.\.' is not the name"),
+        ('"192.168.1.20"', '"machine"\nport = 70000', r"\[ultrasound\] port must be 1 to 65535"),
+        ('"192.168.1.10"', '"a..b"', r"\[robot\] host 'a\.\.b' is not the name or address"),
         ("[search]", "[serach]", "is not known"),
         ("fine_mm = 0.2", "fine_mm = -0.2", "fine_mm"),
         ("cone_deg = 20", "cone_deg = 200", "cone_deg"),

@@ -177,7 +177,7 @@ def test_a_browser_sees_the_bench_move_and_killing_the_view_changes_nothing(benc
         browsing(tmp_path / "profile") as browser,
     ):
         plan = a_plan(setup, session.poses.identity().name)
-        view.plan(setup, plan, [])
+        view.plan(setup, plan, plan.targets, [])
         browser.get(view.url)
         addresses(browser)  # those of the browser's own first page
         browser.refresh()

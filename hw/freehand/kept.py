@@ -1,0 +1,93 @@
+"""The images of a free-hand recording that count, also after it was resumed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+import numpy as np
+
+from hw.recorder import Recorder
+from hw.recording_check import opened, read_column
+from hw.recording_file import RecordingWriter
+from hw.shapes import Float
+from jaxcal.data.recording import MetresError, check_pose_units
+from jaxcal.io.untrusted import UpTo
+
+_IMAGES = UpTo(100_000, "images")
+
+
+class KeptImages:
+    """Rows and poses of the images that count; an image taken back keeps its row, masked.
+
+    Args:
+        columns: of /calibration, ``pose`` and ``mask`` among them; None: there are no images yet.
+    """
+
+    def __init__(self, columns: Mapping[str, np.ndarray] | None = None) -> None:
+        mask = np.empty(0, bool) if columns is None else columns["mask"]
+        self.rows: list[int] = np.flatnonzero(mask).tolist()
+        """Of the images that count, in the order in which they were taken."""
+        self._poses = [] if columns is None else list(columns["pose"][self.rows])
+        self.next_row = len(mask)
+        """Of the next image."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def check_unit(self, pose: Float[np.ndarray, "4 4"], recorder: Recorder) -> None:
+        """Refuse the pose of a further image if with it the poses look like metres.
+
+        The images before have such poses, too: they are masked.
+
+        Raises:
+            MetresError: they look like metres.
+        """
+        try:
+            check_pose_units(np.array([*self._poses, pose])[:, :3, 3])
+        except MetresError:
+            while self.rows:
+                self.take_back(recorder)
+            raise
+
+    def add(self, pose: Float[np.ndarray, "4 4"]) -> None:
+        """Count an image that is on the disk."""
+        self.rows.append(self.next_row)
+        self._poses.append(pose)
+        self.next_row += 1
+
+    def take_back(self, recorder: Recorder) -> None:
+        """Mask the last image that counts."""
+        recorder.leave_out(self.rows[-1])
+        self.rows.pop()
+        self._poses.pop()
+
+
+def read_images(
+    path: str | os.PathLike[str], shapes: Mapping[str, tuple[int, ...]] | None = None
+) -> dict[str, np.ndarray]:
+    """Columns of /calibration of a recording that ended early; the file is not trusted.
+
+    The file is cut back to its last whole rows first, as by resuming it.
+
+    Args:
+        path: of the recording.
+        shapes: of further columns of numbers, without their rows.
+
+    Returns:
+        ``pose`` (n, 4, 4), mm, ``mask`` (n,), and the further columns.
+
+    Raises:
+        FormatError: not a recording that can be resumed.
+        OutputError: it cannot be opened for writing.
+    """
+    RecordingWriter.resume(path).close()
+    wanted = {"pose": (4, 4), **(shapes or {})}
+    with opened(path) as root:
+        mask = read_column(root, "calibration", "mask", (_IMAGES,), "b")
+        columns = {
+            name: read_column(root, "calibration", name, (_IMAGES, *shape), "f")
+            for name, shape in wanted.items()
+        }
+    rows = min(map(len, [mask, *columns.values()]))
+    return {name: values[:rows] for name, values in {"mask": mask, **columns}.items()}
