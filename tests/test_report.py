@@ -338,7 +338,9 @@ def test_a_report_takes_the_place_of_another(tmp_path, record, result, failed, r
         pass
     lost = calibration_record(failed, recording)
     files = write_report(tmp_path, lost, failed, recording, [])
-    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in files} | {"mine.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in files} | {
+        "mine.png"
+    }
     assert {path.stem for path in files if path.suffix == ".svg"} == {"residuals", "offsets"}
     with prepare_folder(tmp_path):
         pass  # a report of a failed solve is one, too

@@ -118,7 +118,8 @@ def cross_validate(
         arguments: as for :func:`jaxcal.calibrate`.
 
     Raises:
-        InputError: too few images, folds that are not from 2 to the number of images, or options that contradict each other.
+        InputError: too few images, folds that are not from 2 to the number of images, or options
+            that contradict each other.
     """
     problem = _one_problem(problem, arguments)
     count = problem.images

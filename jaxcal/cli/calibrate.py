@@ -264,7 +264,8 @@ def _export_target(text: str, inputs: list[str]) -> tuple[SaveFormat, str]:
     from jaxcal.cli.export import check_configuration
 
     name, colon, path = text.partition(":")
-    format = next((known for known in EXPORTS if known == name), None)
+    known: dict[str, SaveFormat] = {each: each for each in EXPORTS}
+    format = known.get(name)
     if not colon or not path or format is None:
         raise InputError(f"--export {text}: FORMAT:PATH is needed, of {', '.join(EXPORTS)}")
     if format != "plus":

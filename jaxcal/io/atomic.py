@@ -123,7 +123,7 @@ def replace_files(
             raise
         for name in known:
             (target / name).unlink(missing_ok=True)
-        for name in reversed(files):
+        for name in reversed(list(files)):
             os.replace(staged / name, target / name)
         staged.rmdir()
     except (OSError, ValueError) as error:

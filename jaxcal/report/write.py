@@ -1,4 +1,4 @@
-"""The report folder: calibration.json, residuals.csv and the figures, of one calibration or none."""
+"""The report folder: calibration.json, residuals.csv and figures, of one calibration or none."""
 
 from __future__ import annotations
 

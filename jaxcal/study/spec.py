@@ -433,9 +433,7 @@ def _axes(
 def _condition_value(name: str, label: str, value: object) -> float | int | str:
     if name == "elevation_distribution":
         if value not in OFFSET_LAWS:
-            raise InputError(
-                f"{label} must be one of {', '.join(OFFSET_LAWS)}, not {shown(value)}"
-            )
+            raise InputError(f"{label} must be one of {', '.join(OFFSET_LAWS)}, not {shown(value)}")
         return str(value)
     if name in _COUNTS:
         return whole_number(label, value, *_COUNTS[name])
