@@ -322,6 +322,8 @@ def test_a_degenerate_set_is_solved_but_not_observable(degenerate, jaxcal_proces
     ("arguments", "said"),
     [
         ([], "Missing command"),
+        (["study"], "Missing command. (see 'jaxcal study --help')"),
+        (["cache"], "Missing command. (see 'jaxcal cache --help')"),
         (["nonsense"], "No such command 'nonsense'"),
         (["--nonsense"], "--nonsense"),
         (["calibrate"], "Missing argument 'REC'"),

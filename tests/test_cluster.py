@@ -1,10 +1,14 @@
 """Studies on real Dask workers on loopback, one of which dies; no test here mocks a cluster."""
 
+import contextlib
+import gc
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -208,16 +212,37 @@ def test_local_workers_open_no_port_and_run_no_file_of_the_current_folder(tmp_pa
         study.communicate()
 
 
-def test_no_scheduler(tmp_path, capsys, monkeypatch):
+@pytest.fixture
+def junk():
+    """The address of a server that answers, but is no scheduler."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer():
+            with contextlib.suppress(OSError):
+                while True:
+                    with server.accept()[0] as caller:
+                        caller.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n" * 9)
+
+        threading.Thread(target=answer, daemon=True).start()
+        yield f"127.0.0.1:{server.getsockname()[1]}"
+
+
+def test_no_scheduler(tmp_path, capfd, monkeypatch, junk):
+    """Said in one line, and nothing is made, so that the right command may follow."""
     monkeypatch.setattr("jaxcal.study.cluster.CONNECT_SECONDS", 1)
     spec = tmp_path / "spec.toml"
     spec.write_text(SPEC)
-    for address in ("tcp://127.0.0.1:9", "nonsense://x"):
-        run = ["study", "run", str(spec), "--out", str(tmp_path / "out"), "--resume"]
+    unreachable = "tcp://127.0.0.1:9", "nonsense://x", junk
+    no_address = "foo", "tcp://foo", "tcp://foo:", "foo:bar", ""
+    for address in (*unreachable, *no_address):
+        run = ["study", "run", str(spec), "--out", str(tmp_path / "out")]
         assert main([*run, "--dask", address]) == 2
-        line = capsys.readouterr().err
-        assert "no Dask scheduler answers" in line
+        gc.collect()
+        line = capfd.readouterr().err
+        said = "no Dask scheduler answers" if address in unreachable else "HOST:PORT is needed"
+        assert said in line
         assert line.count("\n") == 1
+        assert not (tmp_path / "out").exists()
 
 
 def test_cores_are_shared_out():

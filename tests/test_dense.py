@@ -7,6 +7,7 @@ import pytest
 from conftest import problem
 
 import jaxcal
+from jaxcal import Options
 from jaxcal.solvers import dense
 
 RANDOM = np.random.default_rng(5)
@@ -77,9 +78,10 @@ def test_inverse_needs_pivots_and_has_a_derivative():
 def test_no_solver_calls_lapack(arguments: tuple):
     """Batched LAPACK calls can deadlock XLA's thread pool; see jaxcal.solvers.dense."""
     method, prior = arguments
+    options = Options(tolerance_mm=1e-8, tolerance_rad=1e-10)
 
     def image_to_probe(problem: jaxcal.Problem):
-        return jaxcal.calibrate_batch(problem, method, prior).image_to_probe
+        return jaxcal.calibrate_batch(problem, method, prior, options=options).image_to_probe
 
     batch = jaxcal.stack([problem(0, images=8), problem(1, images=8)])
     program = jax.jit(image_to_probe).lower(batch).as_text()

@@ -66,12 +66,14 @@ def test_residuals_that_no_beam_explains_are_named(slips):
         assert any("larger than a beam is thick" in text for text in result.warnings) == wrong
 
 
-def test_whoever_has_wrong_frames_is_not_sent_for_more_poses(slips):
+def test_whoever_has_wrong_frames_gets_neither_poses_nor_files(slips, tmp_path):
     make, _ = slips.SLIPS["inverse poses"]
     recording = jaxcal.Recording(make(slips.recorded(0, "mm")).images())
     result = jaxcal.calibrate(recording, "conventional")
     assert result.wrong_frames is not None
     assert next_poses_record(result, recording) is None
+    with pytest.raises(jaxcal.InputError, match="must not be used"):
+        result.save(tmp_path / "cal.npz")
 
 
 def test_noise_outliers_and_few_images_are_no_slips(slips):

@@ -317,6 +317,21 @@ def test_without_derivatives_the_answer_is_a_constant():
     assert jaxcal.calibrate(there, "conventional").differentiable
 
 
+def test_an_alternation_that_stops_short_has_no_derivative():
+    """It returned NaN, or a wrong number; values, also of batches inside jit, are not affected."""
+    there = problem(3, images=12)
+    batch = jaxcal.stack([there, there])
+
+    def rms(p, options):
+        return jnp.sum(jaxcal.calibrate_batch(p, "alternating", options=options).rms)
+
+    for options in (Options(), Options(tolerance_mm=1e-8)):
+        with pytest.raises(jaxcal.InputError, match='method="joint" with prior="bounded"'):
+            jax.grad(rms)(batch, options)
+    assert np.isfinite(jax.jit(rms, static_argnums=1)(batch, Options()))
+    assert not np.any(jax.grad(rms)(batch, Options(differentiate=False)).measurements)
+
+
 def test_public_names_are_there_and_listed():
     import jaxcal.backend
     import jaxcal.study

@@ -118,7 +118,7 @@ def test_where_nothing_is_credible_the_way_on_is_named(tmp_path, capsys):
         (["--method", "shortest"], "--method is an option for times of flight"),
         (["--no-robust"], "is an option for times of flight"),
         (["--region", "140", "0", "40", "40"], "leaves the 150 x 110 px frame"),
-        (["--out", "f.igs.mha"], "exists and is not a recording"),
+        (["--out", "f.igs.mha"], "is read by this command"),
         (["--from", "Stylus"], "no transforms lead from 'Stylus'"),
     ],
 )

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from jaxcal import OutputError
-from jaxcal.io.atomic import atomic_path, write_text
+from jaxcal.io.atomic import atomic_path, replace_files, write_text
 
 ROOT = Path(__file__).parents[1]
 
@@ -208,3 +208,59 @@ def test_killed_writer_leaves_the_target_as_it_was(tmp_path, old):
     assert old is None or target.read_text() == old
     write_text(target, "new")
     assert target.read_text() == "new"
+
+
+def test_a_set_of_files_is_never_a_mix(tmp_path):
+    """Killed at every step of the change, and then done: the first file says that all are new."""
+    code = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "from jaxcal.io.atomic import replace_files\n"
+        "names = ['whole', 'a', 'b', 'stale']\n"
+        "old, new = ({k: v for k in names} for v in (b'old', b'new'))\n"
+        "del new['stale']\n"
+        "steps, last = 0, None\n"
+        "def hook(event, _):\n"
+        "    global steps\n"
+        "    if last is not None and event in ('os.remove', 'os.rename', 'os.mkdir', 'os.rmdir'):\n"
+        "        if steps == last:\n"
+        "            os.kill(os.getpid(), signal.SIGKILL)\n"
+        "        steps += 1\n"
+        "sys.addaudithook(hook)\n"
+        "killed = 0\n"
+        "for k in range(100):\n"
+        "    folder = Path(sys.argv[1]) / str(k)\n"
+        "    folder.mkdir()\n"
+        "    (folder / 'mine').write_bytes(b'mine')\n"
+        "    replace_files(folder, old, names)\n"
+        "    child = os.fork()\n"
+        "    if child == 0:\n"
+        "        last = k\n"
+        "        replace_files(folder, new, names)\n"
+        "        os._exit(0)\n"
+        "    done = os.waitpid(child, 0)[1]\n"
+        "    left = {f.name: f.read_bytes() for f in folder.iterdir() if f.is_file()}\n"
+        "    assert left.pop('mine') == b'mine'\n"
+        "    assert len(set(left.values())) <= 1, left\n"
+        "    assert 'whole' not in left or left in (old, new), left\n"
+        "    replace_files(folder, new, names)\n"
+        "    assert {f.name for f in folder.iterdir()} == {*new, 'mine'}\n"
+        "    if done == 0:\n"
+        "        break\n"
+        "print(k)\n"
+    )
+    with run_python(code, tmp_path) as process:
+        said, _ = process.communicate()
+    assert process.returncode == 0
+    assert int(said) > 5
+
+
+def test_a_set_that_cannot_be_written_is_as_it_was(tmp_path):
+    replace_files(tmp_path, {"a": b"old", "b": b"old"}, [])
+    with pytest.raises(OutputError, match="cannot be written"):
+        replace_files(tmp_path, {"a": b"new", "no/b": b"new"}, ["b"])
+    (tmp_path / "c").mkdir()
+    with pytest.raises(OutputError, match="is a directory"):
+        replace_files(tmp_path, {"a": b"new"}, ["b", "c"])
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "b", "c"}
+    assert (tmp_path / "a").read_bytes() == b"old"

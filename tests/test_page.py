@@ -142,6 +142,11 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path, record, resu
     path = tmp_path / "cal.html"
     write_page(path, record, result, recording)
     assert path.read_text().startswith("<!DOCTYPE html>")
+    write_page(path, record, result, recording)  # its own page is replaced, and nothing else
+    (tmp_path / "mine.html").write_text("<!DOCTYPE html><title>Notes</title>")
+    with pytest.raises(jaxcal.InputError, match="exists and is not a page of jaxcal"):
+        write_page(tmp_path / "mine.html", record, result, recording)
+    (tmp_path / "mine.html").unlink()
     with pytest.raises(jaxcal.OutputError):
         write_page(tmp_path / "no" / "cal.html", record, result, recording)
     assert [entry.name for entry in tmp_path.iterdir()] == ["cal.html"]

@@ -138,22 +138,58 @@ def test_lists_and_single_names(recording):
 
 
 def test_calls_as_users_make_them():
-    """Without the type checks of these tests."""
+    """Without the type checks of these tests: an InputError, in a line, for whatever is given."""
     code = """
+import warnings
+import numpy as np
 import jaxcal
-for call, given in ((jaxcal.calibrate, "rec.h5"), (jaxcal.calibrate, {}),
-                    (jaxcal.calibrate_batch, "rec.h5"), (jaxcal.calibrate_batch, [1])):
+warnings.simplefilter("error")
+draws = np.random.default_rng(0)
+poses = np.tile(np.eye(4), (9, 1, 1))
+poses[:, :3, 3] = draws.uniform(-50, 50, (9, 3))
+points = draws.uniform(10, 50, (9, 2))
+problem = jaxcal.Problem.from_arrays(poses, points)
+result = jaxcal.calibrate(problem, "conventional")
+assert jaxcal.predicted_tre(result, [0.0, 50.0]).shape == ()
+for call, *given in (
+    (jaxcal.calibrate, "rec.h5"), (jaxcal.calibrate, {}),
+    (jaxcal.calibrate_batch, "rec.h5"), (jaxcal.calibrate_batch, [1]),
+    (jaxcal.predicted_tre, result, [[0.0, 50.0, 1.0]]), (jaxcal.predicted_tre, result, 1.0),
+    (jaxcal.predicted_tre, result, [np.nan, 1.0]), (jaxcal.predicted_tre, result, ["a", "b"]),
+    (jaxcal.predicted_tre, result, [1j, 1.0]),
+    (jaxcal.stack, []), (jaxcal.stack, [1]), (jaxcal.stack, problem),
+    (jaxcal.calibrate_pivot, np.eye(4)), (jaxcal.calibrate_pivot, 3), (jaxcal.calibrate_pivot, []),
+    (jaxcal.calibrate_pivot, poses, np.ones(4)),
+    (lambda folds: jaxcal.cross_validate(problem, folds=folds), "4"),
+    (lambda folds: jaxcal.cross_validate(problem, folds=folds), 1),
+    (jaxcal.bootstrap, problem, 2.5), (jaxcal.bootstrap, problem, 4, "a"),
+    (jaxcal.simulate_recording, jaxcal.Protocol(), "a"),
+    (jaxcal.simulate_recording, jaxcal.Protocol(), -1),
+    (lambda depth: jaxcal.Protocol(depth_mm=depth), (90, 10)),
+    (lambda depth: jaxcal.Protocol(depth_mm=depth), 10),
+    (lambda depth: jaxcal.Protocol(depth_mm=depth), (-1, 10)),
+    (lambda noise: jaxcal.Protocol(noise_mm=noise), "a"),
+    (lambda images: jaxcal.Protocol(images=images), 8.5),
+    (jaxcal.Problem.from_arrays, poses + 0j, points),
+    (jaxcal.Problem.from_arrays, poses, points.tolist()[:-1] + [[1.0]]),
+):
     try:
-        call(given)
+        call(*given)
     except jaxcal.InputError as error:
         print(error)
+    else:
+        raise AssertionError(given)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 4
+    assert len(lines) == 29
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
+    assert lines[4] == "points must have shape (..., 2), not (1, 3)"
+    assert lines[16] == "folds must be a whole number, not '4'"
+    assert lines[22] == "depth_mm must be nearest, then farthest, not (90, 10)"
+    assert lines[27] == "poses must be an array of real numbers"
 
 
 def test_drawing_is_not_imported_before_it_is_asked_for():

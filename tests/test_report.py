@@ -341,6 +341,36 @@ def test_report_of_a_failed_solve(tmp_path, failed, recording):
     assert "nan" not in (tmp_path / "residuals.csv").read_text().lower()
 
 
+def test_a_report_takes_the_place_of_another(tmp_path, record, result, failed, recording):
+    """Nothing of the old one stays; files that no report writes do."""
+    (tmp_path / "mine.png").write_text("x")
+    write_report(tmp_path, record, result, recording, CURVES, {"joint": record})
+    assert (tmp_path / "comparison.json").exists()
+    with prepare_folder(tmp_path):
+        pass
+    lost = calibration_record(failed, recording)
+    files = write_report(tmp_path, lost, failed, recording, [])
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in files} | {
+        "mine.png"
+    }
+    assert {path.stem for path in files if path.suffix == ".svg"} == {"residuals", "offsets"}
+    with prepare_folder(tmp_path):
+        pass  # a report of a failed solve is one, too
+
+
+def test_what_is_not_a_report_is_not_replaced(tmp_path):
+    (tmp_path / "offsets.png").write_text("a picture of mine")
+    for content in (None, "{}", "x"):
+        if content is not None:
+            (tmp_path / "calibration.json").write_text(content)
+        with pytest.raises(InputError, match="no report of jaxcal"), prepare_folder(tmp_path):
+            pass
+    # Killed in the moment in which the files took their names.
+    (tmp_path / ".partial-report").mkdir()
+    with prepare_folder(tmp_path):
+        pass
+
+
 def test_prepare_folder(tmp_path):
     with prepare_folder(tmp_path / "a" / "b") as folder:
         assert folder.is_dir()

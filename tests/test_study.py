@@ -632,3 +632,6 @@ def test_load_spec_names_the_file(tmp_path):
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(FormatError, match=re.escape(str(path))):
         load_spec(path)
+    # Windows' editors put a byte order mark first.
+    path.write_bytes(b"\xef\xbb\xbf" + (MINIMAL + METHOD).encode())
+    assert load_spec(path).sha256 == parse_spec(MINIMAL + METHOD).sha256

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -82,8 +83,80 @@ def test_saved_and_loaded(tmp_path, extension):
     if extension == "json":
         assert (found.error_mm, found.converged) == (0.7, True)
     if extension == "xml":
+        path.unlink()
         known.save(path)  # the element alone
         np.testing.assert_array_equal(load_calibration(path).plus_matrix(), found.plus_matrix())
+
+
+def test_npz_keeps_what_the_uncertainty_needs(tmp_path):
+    """Estimated pixel sizes and sound speed included; older files have fewer names."""
+    unknowns = ("translation", "rotation", "scale", "sound-speed")
+    root = np.random.default_rng(1).normal(size=(9, 9)) * [*[0.2] * 3, *[0.01] * 3, *[0.004] * 3]
+    known = replace(
+        random_transform(), unknowns=unknowns, image_covariance=root.T @ root, range_factor=0.99
+    )
+    for name in ("cal.npz", "cal.json"):
+        known.save(tmp_path / name)
+        found = load_calibration(tmp_path / name)
+        expected, applied = (
+            known.apply(np.array([400.0, 300.0])),
+            found.apply(np.array([400.0, 300.0])),
+        )
+        np.testing.assert_array_equal(applied.points, expected.points)
+        np.testing.assert_array_equal(applied.covariance, expected.covariance)
+        assert (found.unknowns, found.converged, found.error_mm) == (unknowns, True, 0.7)
+    old = ("image_plane_to_probe", "scale_mm_per_px", "covariance", "face_offset_mm")
+    with np.load(tmp_path / "cal.npz") as file:
+        np.savez(tmp_path / "old.npz", **{name: file[name] for name in old})
+    found = load_calibration(tmp_path / "old.npz")
+    np.testing.assert_array_equal(found.covariance, known.covariance)
+    assert (found.image_covariance, found.converged) == (None, None)
+
+
+@pytest.mark.parametrize("name", ["a.tfm", "a.npz", "a.npy", "a.xml", "a.yaml", "a.csv", "a.h5"])
+def test_what_must_not_be_used_is_not_saved_for_others(tmp_path, name):
+    lost = replace(random_transform(), converged=False)
+    with pytest.raises(InputError, match="must not be used"):
+        lost.save(tmp_path / name)
+    assert not list(tmp_path.iterdir())
+    lost.save(tmp_path / "cal.json")
+    assert load_calibration(tmp_path / "cal.json").converged is False
+
+
+def test_wrong_frames_are_not_handed_on(saved, tmp_path, capsys):
+    saved.write_text(json.dumps(good_record() | {"wrong_frames": "the poses are inverted"}))
+    assert main(["export", str(saved), str(tmp_path / "a.tfm"), "--slicer"]) == 2
+    assert "must not be used" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scale_mm_per_px": (0.1, -0.1)}, "scale_mm_per_px must be positive"),
+        ({"scale_mm_per_px": 0.1}, r"must have shape \(2,\), it has \(\)"),
+        ({"scale_mm_per_px": ("a", 1)}, "scale_mm_per_px must be numbers"),
+        ({"image_plane_to_probe": np.diag([1.0, 1, -1, 1])}, "is a reflection"),
+        ({"image_plane_to_probe": np.diag([2.0, 1, 1, 1])}, "not a rotation"),
+        ({"image_plane_to_probe": np.full((4, 4), np.nan)}, "holds NaN"),
+        ({"covariance": np.full((6, 6), np.nan)}, "covariance holds NaN"),
+        ({"covariance": -np.eye(6)}, "negative variance"),
+        ({"range_factor": 0.0}, "range_factor must be positive"),
+        ({"face_offset_mm": np.inf}, "face_offset_mm holds NaN or Inf"),
+        ({"unknowns": ("translation", "rotation", "nonsense")}, "unknowns must be"),
+        ({"image_covariance": np.eye(5)}, r"must have shape \(6, 6\)"),
+    ],
+)
+def test_transforms_that_cannot_be(change, message):
+    with pytest.raises(InputError, match=message):
+        replace(random_transform(), **change)
+
+
+def test_a_pair_of_sizes_will_do_and_a_failed_one_is_not_written(tmp_path):
+    made = ImageTransform(np.eye(4), (0.1, 0.2))
+    assert made.plus_matrix()[2, 1] == 0.2
+    lost = ImageTransform(np.full((4, 4), np.nan), converged=False, error_mm=np.nan)
+    with pytest.raises(InputError, match="the solve had failed"):
+        lost.save(tmp_path / "cal.json")
 
 
 def test_npz_that_lies(tmp_path):
@@ -128,6 +201,22 @@ def test_ros_is_rigid_and_in_metres(tmp_path):
     # No pixels are needed, unlike everywhere else.
     with pytest.raises(InputError, match="--pixel-size"):
         tiny.plus_matrix()
+
+
+def test_ros_says_what_a_rigid_transform_cannot_hold(tmp_path, capsys):
+    known = replace(random_transform(), range_factor=0.9991)
+    known.save(tmp_path / "cal.json")
+    assert main(["export", str(tmp_path / "cal.json"), str(tmp_path / "a.yaml"), "--ros"]) == 0
+    note = "multiply ranges by 0.9991 (the estimated sound speed), then add 0.0015 m"
+    assert f"- not in this rigid transform: {note}" in capsys.readouterr().out
+    assert f"# not in this rigid transform: {note}" in (tmp_path / "a.yaml").read_text()
+    # With that, and the pixel size, both agree.
+    pixel = np.array([300.0, 400.0])
+    lateral, deep = known.scale_mm_per_px * pixel
+    rigid = read_ros_yaml(tmp_path / "a.yaml")
+    found = rigid @ [lateral, 0.0, 0.9991 * deep + 1.5, 1.0]
+    np.testing.assert_allclose(found[:3], known.apply(pixel).points[0], atol=1e-9)
+    assert "not in" not in random_transform(offset=0.0).text("ros")
 
 
 def test_tus_rec_counts_from_one(tmp_path):
@@ -273,7 +362,7 @@ def test_pixels_for_a_calibration_in_mm():
     ("pixels", "pose", "message"),
     [
         ([[1.0, 2, 3]], None, "shape"),
-        ([[np.nan, 2]], None, "finite"),
+        ([[np.nan, 2]], None, "not NaN"),
         ([[1.0, 2]], np.eye(4)[None].repeat(2, 0), "1 pixels but 2 poses"),
         ([[1.0, 2]], np.diag([1.0, 1, -1, 1]), "is a reflection"),
     ],

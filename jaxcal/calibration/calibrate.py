@@ -73,7 +73,8 @@ def calibrate(
     Args:
         problem: one problem (a batch is handed to :func:`calibrate_batch`), or a recording.
         method: ``joint`` (X, c and every offset together), ``alternating`` (the paper's Fig. 4) or
-            ``conventional`` (Eq. 7, every target in the plane).
+            ``conventional`` (Eq. 7, every target in the plane). All can be differentiated, but the
+            alternation only with tolerances so small that it reaches the minimum.
         prior: of the joint method. ``auto``: errors have self-tuned SDs, and the data weigh the
             offsets' laws, their mean and the noise models (:mod:`jaxcal.solvers.auto`).
             ``uniform``: the same with offsets that are uniform between unknown edges.
@@ -111,7 +112,8 @@ def calibrate(
     Raises:
         InputError: options that contradict each other or the problem; with concrete arrays also
             NaN, Inf and fewer than 4 different poses. Under jit, vmap or grad values cannot be
-            checked, and such problems get the status ``failed``.
+            checked, and such problems get the status ``failed``. Also where an alternation is
+            differentiated that stops before the minimum.
     """
     assert isinstance(problem, Problem)  # converted
     estimate = unknown_names(estimate)

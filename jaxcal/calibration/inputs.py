@@ -7,9 +7,12 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
+
 from jaxcal import InputError
 from jaxcal.data.problem import Problem, stack
 from jaxcal.data.recording import Images, Recording
+from jaxcal.io.readable import quoted
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -18,6 +21,26 @@ _HOW = (
     "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "
     "a recording"
 )
+
+LARGEST_SEED = 2**63 - 1
+
+
+def shown(value: object) -> str:
+    """What a caller gave, short, for a message."""
+    return quoted(value) if isinstance(value, str) else quoted(repr(value)).strip("'")
+
+
+def whole_number(name: str, value: object, least: int, most: int) -> int:
+    """A whole number that a caller gave.
+
+    Raises:
+        InputError: something else, or a number out of these bounds.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise InputError(f"{name} must be a whole number, not {shown(value)}")
+    if not least <= value <= most:
+        raise InputError(f"{name} must be between {least} and {most}, not {value}")
+    return int(value)
 
 
 def as_problem(value: Any, name: str) -> Problem:

@@ -142,8 +142,14 @@ def calibrate_pivot(
             wrong, and leave the others out.
 
     Raises:
-        InputError: concrete poses that are not rigid transforms, or fewer than 4 used ones.
+        InputError: poses or a mask of another shape, concrete poses that are not rigid transforms,
+            or fewer than 4 used ones.
     """
+    shape = np.shape(poses)
+    if len(shape) < 3 or shape[-2:] not in ((4, 4), (3, 4)):
+        raise InputError(f"poses must have shape (n, 4, 4), not {shape}")
+    if mask is not None and np.shape(mask) not in (shape[:-2], shape[-3:-2]):
+        raise InputError(f"mask must have shape {shape[:-2]}, not {np.shape(mask)}")
     if not is_traced(poses) and np.ndim(poses) == 3:
         used = np.ones(len(poses), bool) if mask is None else np.asarray(mask) > 0
         poses = check_poses(np.asarray(poses, dtype=np.float64), used)

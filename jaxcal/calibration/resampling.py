@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Key
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import calibrate, calibrate_batch
 from jaxcal.calibration.dependence import independent
+from jaxcal.calibration.inputs import LARGEST_SEED, whole_number
 from jaxcal.calibration.result import Calibration
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
@@ -117,13 +118,12 @@ def cross_validate(
         arguments: as for :func:`jaxcal.calibrate`.
 
     Raises:
-        InputError: too few images or folds, or options that contradict each other.
+        InputError: too few images, folds that are not from 2 to the number of images, or options
+            that contradict each other.
     """
     problem = _one_problem(problem, arguments)
     count = problem.images
-    folds = count if folds is None else folds
-    if not 2 <= folds <= count:
-        raise InputError(f"folds must be between 2 and the number of images {count}, not {folds}")
+    folds = count if folds is None else whole_number("folds", folds, 2, count)
     result = calibrate(problem, **arguments) if result is None else result
     problem = replace(problem, mask=jnp.asarray(result.mask, problem.mask.dtype))
     fold = np.arange(count) % folds
@@ -185,9 +185,10 @@ def bootstrap(
         InputError: fewer than 2 resamples, or options that contradict each other.
     """
     problem = _one_problem(problem, arguments)
-    if not 2 <= resamples <= LARGEST_RESAMPLES:
-        raise InputError(f"resamples must be between 2 and {LARGEST_RESAMPLES}, not {resamples}")
-    root = jax.random.key(int(key)) if isinstance(key, int | np.integer) else key
+    resamples = whole_number("resamples", resamples, 2, LARGEST_RESAMPLES)
+    root = key
+    if not isinstance(key, jax.Array):
+        root = jax.random.key(whole_number("key", key, 0, LARGEST_SEED))
     result = calibrate(problem, **arguments) if result is None else result
     mask = jnp.asarray(result.mask, problem.mask.dtype)
     problem = replace(problem, mask=mask)

@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import CalibrationError, InputError
-from jaxcal.calibration.transform import AppliedPoints, ImageTransform, SaveFormat
+from jaxcal.calibration.transform import (
+    AppliedPoints,
+    ImageTransform,
+    SaveFormat,
+    check_target,
+)
 from jaxcal.data.problem import Problem
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.unknowns import TABLE, Blocks, in_image
@@ -429,7 +434,7 @@ class Calibration:
             face_offset_mm=float(origin),
             covariance=np.asarray(answer.covariance) if known else None,
             error_mm=float(answer.rms),
-            converged=bool(self.converged),
+            converged=bool(self.converged) and self.wrong_frames is None,
             source="the calibration",
             range_factor=float(factor),
             unknowns=tuple(name for name in answer.blocks if TABLE[name].in_image),
@@ -472,15 +477,17 @@ class Calibration:
         """Write the calibration, complete or not at all; :func:`jaxcal.load_calibration` reads it.
 
         Args:
-            path: the file to make or replace.
+            path: the file to make; only a calibration in the same format is replaced.
             format: as for :meth:`jaxcal.ImageTransform.save`; by default that of the extension.
                 ``json`` holds the whole record of the calibration.
 
         Raises:
-            InputError: an extension without a format, an unknown pixel size, or a batch.
+            InputError: an extension of another or no format, an existing file of another kind, an
+                unknown pixel size, a batch, or a calibration that must not be used, in any format
+                but ``json``.
             OutputError: the file could not be written and is unchanged.
         """
-        if format == "json" or (format is None and os.fspath(path).lower().endswith(".json")):
+        if check_target(path, format) == "json":
             from jaxcal.report.write import write_json
 
             write_json(path, self.record())
@@ -488,7 +495,12 @@ class Calibration:
             self.image_transform().save(path, format)
 
     def report(self, path: str | os.PathLike[str]) -> None:
-        """Write one page for a browser, as ``jaxcal calibrate --report`` does."""
+        """Write one page for a browser, as ``jaxcal calibrate --report`` does.
+
+        Raises:
+            InputError: the file exists and is no such page.
+            OutputError: it could not be written and is unchanged.
+        """
         from jaxcal.report.page import write_page
         from jaxcal.report.summary import recording_of
 

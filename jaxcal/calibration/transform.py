@@ -18,6 +18,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -30,6 +31,7 @@ from jaxcal.data.poses import check_poses
 from jaxcal.diagnostics.image_points import point_jacobian
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair
+from jaxcal.io.outputs import check_output
 from jaxcal.io.readable import check_readable, naming, one_line, quoted
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.runtime.array_types import Float
@@ -38,13 +40,25 @@ FORMAT = "jaxcal-calibration"
 VERSION = 1
 MAXIMUM_BYTES = 64 * 2**20
 
-_NPZ = ("image_plane_to_probe", "scale_mm_per_px", "covariance", "face_offset_mm", "range_factor")
+_NPZ = (
+    "image_plane_to_probe",
+    "scale_mm_per_px",
+    "face_offset_mm",
+    "range_factor",
+    "covariance",
+    "image_unknowns",
+    "image_covariance",
+    "rms_mm",
+    "converged",
+)
 _NPZ_BYTES = 65536
 """Largest size of an ``.npz``, also unpacked."""
 
 SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
 
 _ROUNDING = 1e-13
+_LARGEST = 1e9
+"""Largest pixel; beyond it nothing is an image, and squares overflow."""
 _SKEWED = 1e-3
 """Largest cosine between two columns of a matrix that count as orthogonal."""
 
@@ -78,6 +92,10 @@ class ImageTransform:
         error_mm: root mean square residual of the calibration, mm; None if unknown.
         converged: whether the calibration can be used; None if unknown.
         source: the file, for messages.
+
+    Raises:
+        InputError: wrong shapes or ``unknowns``; and, unless ``converged`` is False, NaN or Inf, a
+            matrix that is not rigid, sizes or a factor that are not positive, negative variances.
     """
 
     image_plane_to_probe: Float[np.ndarray, "4 4"]
@@ -90,6 +108,47 @@ class ImageTransform:
     range_factor: float = 1.0
     unknowns: tuple[str, ...] = ("translation", "rotation")
     image_covariance: Float[np.ndarray, "q q"] | None = None
+
+    def __post_init__(self) -> None:
+        moving = [name for name in TABLE if TABLE[name].in_image]
+        blocks = tuple(self.unknowns)
+        if blocks[:2] != ("translation", "rotation") or not set(blocks) <= set(moving):
+            raise InputError(f"unknowns must be translation, rotation and others of {moving}")
+        size = len(tangent_names(blocks))
+        shapes = {
+            "image_plane_to_probe": (4, 4),
+            "scale_mm_per_px": (2,),
+            "face_offset_mm": (),
+            "range_factor": (),
+            "covariance": (6, 6),
+            "image_covariance": (size, size),
+            "error_mm": (),
+        }
+        given = {name: getattr(self, name) for name in shapes}
+        checked = {
+            name: _numbers(value, name, shapes[name])
+            for name, value in given.items()
+            if value is not None
+        }
+        if self.converged is not False:
+            checked["image_plane_to_probe"] = _checked(checked)
+        for name, array in checked.items():
+            object.__setattr__(self, name, array if shapes[name] else float(array))
+        object.__setattr__(self, "unknowns", blocks)
+        if self.error_mm is not None and not math.isfinite(self.error_mm):
+            object.__setattr__(self, "error_mm", None)
+
+    def check_usable(self) -> None:
+        """Refuse to hand on a calibration that must not be used.
+
+        Raises:
+            InputError: ``converged`` is False.
+        """
+        if self.converged is False:
+            raise InputError(
+                f"{self.source}: must not be used: it did not converge, its images do not "
+                "determine it, or their frames or units are wrong (its verdict says which)"
+            )
 
     def plus_matrix(self) -> Float[np.ndarray, "4 4"]:
         """PLUS's ImageToProbe: (u, v, 0, 1), px, to the probe, mm.
@@ -159,12 +218,21 @@ class ImageTransform:
             estimated pixel sizes, sound speed and delay) and the points' own, but not the pose's.
 
         Raises:
-            InputError: shapes that do not agree, NaN or Inf, or a pose that is not rigid.
+            InputError: shapes that do not agree, NaN or numbers over 1e9, a negative SD, or a pose
+                that is not rigid.
         """
         measured = np.asarray(pixels, dtype=np.float64)
         measured = measured[None] if measured.ndim == 1 else measured
-        if measured.ndim != 2 or measured.shape[1] != 2 or not np.isfinite(measured).all():
-            raise InputError(f"pixels must be finite and have shape (n, 2), not {measured.shape}")
+        if measured.ndim != 2 or measured.shape[1] != 2:
+            raise InputError(f"pixels must have shape (n, 2), not {measured.shape}")
+        own = np.asarray(pixel_sd_px, dtype=np.float64)
+        if own.shape not in ((), (2,)):
+            raise InputError(f"pixel_sd_px must be one number or two, not of shape {own.shape}")
+        # Written so that NaN is refused, too.
+        if not (np.abs(measured) <= _LARGEST).all():
+            raise InputError(f"pixels must be numbers up to {_LARGEST:g}, not NaN or Inf")
+        if not ((own >= 0) & (own <= _LARGEST)).all():
+            raise InputError(f"pixel_sd_px must be from 0 to {_LARGEST:g}")
         count = len(measured)
         scale = np.ones(2) if self.scale_mm_per_px is None else self.scale_mm_per_px
         plane = np.zeros((count, 3))
@@ -173,7 +241,7 @@ class ImageTransform:
         plane[:, 2] = scale[1] * measured[:, 1] + self.face_offset_mm
         rotation = self.image_plane_to_probe[:3, :3]
         points = plane @ rotation.T + self.image_plane_to_probe[:3, 3]
-        covariance = self._covariance(plane, rotation, scale, pixel_sd_px)
+        covariance = self._covariance(plane, rotation, scale, own)
         if pose is None:
             return AppliedPoints(points, covariance)
         given = np.asarray(pose, dtype=np.float64)
@@ -190,7 +258,7 @@ class ImageTransform:
         plane: Float[np.ndarray, "n 3"],
         rotation: Float[np.ndarray, "3 3"],
         scale: Float[np.ndarray, 2],
-        pixel_sd_px: float | tuple[float, float],
+        pixel_sd: Float[np.ndarray, "*two"],
     ) -> Float[np.ndarray, "n 3 3"]:
         """R (J C J' + S) R', in the probe's frame; J is :mod:`jaxcal.diagnostics.image_points`'."""
         covariance, blocks = self.image_covariance, self.unknowns
@@ -200,7 +268,7 @@ class ImageTransform:
             return np.full((len(plane), 3, 3), np.nan)
         jacobian = point_jacobian(plane[:, [0, 2]], blocks, self.face_offset_mm, self.range_factor)
         own = np.zeros(3)
-        own[[0, 2]] = np.broadcast_to(np.asarray(pixel_sd_px, dtype=np.float64), 2) * scale
+        own[[0, 2]] = pixel_sd * scale
         inner = jacobian @ covariance @ jacobian.swapaxes(1, 2) + np.diag(own**2)
         return rotation @ inner @ rotation.T
 
@@ -223,7 +291,7 @@ class ImageTransform:
         """Write the calibration, complete or not at all.
 
         Args:
-            path: the file to make or replace.
+            path: the file to make; only a calibration in the same format is replaced.
             format: ``json`` (ours), ``plus`` (a ``<Transform>`` to paste), ``slicer`` or ``itk``
                 (``.tfm``, ``.txt`` or ``.h5``), ``ros`` (YAML, metres), ``tusrec``
                 (``calib_matrix.csv``) or ``numpy`` (``.npy``: PLUS's matrix; ``.npz``: all). By
@@ -231,19 +299,25 @@ class ImageTransform:
             frames: names of the image's and the probe's frame.
 
         Raises:
-            InputError: an extension without a format, or an unknown pixel size.
+            InputError: an extension of another or no format, an existing file of another kind, an
+                unknown pixel size, or a calibration that must not be used, in any format but
+                ``json``, which says so.
             OutputError: the file could not be written and is unchanged.
         """
-        name = os.fspath(path)
-        chosen = _format_of(name) if format is None else format
+        chosen = check_target(path, format)
+        if chosen != "json":
+            self.check_usable()
         if chosen in ("slicer", "itk"):
             from jaxcal.io.itk import write_itk
 
             write_itk(path, self.plus_matrix())
         elif chosen == "numpy":
             with atomic_path(path) as temporary, temporary.open("wb") as file:
-                if name.lower().endswith(".npz"):
-                    np.savez(file, **self._arrays())
+                if os.fspath(path).lower().endswith(".npz"):
+                    known = {key: value for key, value in self._record().items() if key in _NPZ}
+                    matrix = None if self.scale_mm_per_px is None else self.plus_matrix()
+                    known["plus_image_to_probe"] = matrix
+                    np.savez(file, **{k: v for k, v in known.items() if v is not None})
                 else:
                     np.save(file, self.plus_matrix())
         else:
@@ -256,7 +330,11 @@ class ImageTransform:
             InputError: an unknown format, or an unknown pixel size.
         """
         if format == "json":
-            return json.dumps(self._record(), indent=2, allow_nan=False) + "\n"
+            try:
+                return json.dumps(self._record(), indent=2, allow_nan=False) + "\n"
+            except ValueError:
+                failed = f"{self.source}: the solve had failed: there is no transform to write"
+                raise InputError(failed) from None
         if format == "plus":
             from jaxcal.io.plus import transform_element
 
@@ -268,7 +346,8 @@ class ImageTransform:
         if format == "ros":
             from jaxcal.io.ros import ros_yaml
 
-            return ros_yaml(self.image_plane_to_probe, frames[1].lower(), frames[0].lower())
+            parent, child = frames[1].lower(), frames[0].lower()
+            return ros_yaml(self.image_plane_to_probe, parent, child, self.left_out(format))
         if format == "tusrec":
             from jaxcal.io.tus_rec import calib_matrix
 
@@ -281,13 +360,13 @@ class ImageTransform:
             return np.array2string(self.plus_matrix(), separator=", ", floatmode="unique") + "\n"
         raise InputError(f"{quoted(str(format))} is no format that is written")
 
-    def _arrays(self) -> dict[str, Any]:
-        arrays: dict[str, Any] = {"image_plane_to_probe": self.image_plane_to_probe}
-        if self.scale_mm_per_px is not None:
-            arrays |= {"plus_image_to_probe": self.plus_matrix(), "scale_mm_per_px": self._scale()}
-        if self.covariance is not None:
-            arrays["covariance"] = self.covariance
-        return arrays | {"face_offset_mm": self.face_offset_mm, "range_factor": self.range_factor}
+    def left_out(self, format: SaveFormat) -> str | None:
+        """What a format cannot hold and its user must do, in words; None where nothing is."""
+        if format != "ros":
+            return None
+        from jaxcal.io.ros import range_note
+
+        return range_note(self.range_factor, self.face_offset_mm)
 
     def _record(self) -> dict[str, Any]:
         scale, covariance, full = self.scale_mm_per_px, self.covariance, self.image_covariance
@@ -307,29 +386,101 @@ class ImageTransform:
         }
 
 
+def _numbers(value: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be numbers of shape {shape}") from None
+    if array.shape != shape:
+        raise InputError(f"{name} must have shape {shape}, it has {array.shape}")
+    return array
+
+
+def _checked(values: dict[str, np.ndarray]) -> Float[np.ndarray, "4 4"]:
+    """Check the numbers of a calibration that is to be used; its matrix, which is then rigid."""
+    for name, array in values.items():
+        if name not in ("image_plane_to_probe", "error_mm") and not np.isfinite(array).all():
+            raise InputError(f"{name} holds NaN or Inf")
+        if name in ("scale_mm_per_px", "range_factor") and not (array > 0).all():
+            raise InputError(f"{name} must be positive")
+        if name in ("covariance", "image_covariance") and (np.diag(array) < 0).any():
+            raise InputError(f"{name} holds a negative variance")
+    matrix = values["image_plane_to_probe"]
+    rigid = check_poses(matrix[None], what="the matrix", labels=["image_plane_to_probe"])[0]
+    # What was rigid keeps every digit.
+    return matrix if np.abs(rigid - matrix).max() < _ROUNDING else rigid
+
+
 def _cross(vector: np.ndarray) -> Float[np.ndarray, "3 3"]:
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+_EXTENSIONS: dict[SaveFormat, tuple[str, ...]] = {
+    "json": (".json",),
+    "plus": (".xml",),
+    "slicer": (".tfm", ".txt", ".h5"),
+    "itk": (".tfm", ".txt", ".h5"),
+    "ros": (".yaml", ".yml"),
+    "tusrec": (".csv",),
+    "numpy": (".npy", ".npz"),
+}
+
+
 def _format_of(name: str) -> SaveFormat:
-    lower = name.lower()
-    formats: dict[str, SaveFormat] = {
-        ".json": "json",
-        ".xml": "plus",
-        ".tfm": "slicer",
-        ".txt": "slicer",
-        ".h5": "itk",
-        ".yaml": "ros",
-        ".yml": "ros",
-        ".csv": "tusrec",
-        ".npy": "numpy",
-        ".npz": "numpy",
-    }
-    for extension, chosen in formats.items():
-        if lower.endswith(extension):
+    for chosen, extensions in _EXTENSIONS.items():
+        if name.lower().endswith(extensions):
             return chosen
-    raise InputError(f"{name}: its extension tells no format (there are {', '.join(formats)})")
+    known = dict.fromkeys(each for extensions in _EXTENSIONS.values() for each in extensions)
+    raise FormatError(f"{name}: its extension tells no format (there are {', '.join(known)})")
+
+
+def check_target(
+    path: str | os.PathLike[str],
+    format: SaveFormat | None = None,
+    inputs: Sequence[str | os.PathLike[str]] = (),
+) -> SaveFormat:
+    """The format in which :meth:`ImageTransform.save` writes a file, if it may be written.
+
+    Args:
+        path: the file to make or replace.
+        format: by default that of the extension.
+        inputs: files that must not be replaced.
+
+    Raises:
+        InputError: an extension by which the file could not be read again, one of the inputs, or
+            an existing file that is no calibration in this format.
+    """
+    name = os.fspath(path)
+    chosen = _format_of(name) if format is None else format
+    extensions = _EXTENSIONS.get(chosen)
+    if extensions is None:
+        raise InputError(f"{quoted(str(chosen))} is no format that is written")
+    if not name.lower().endswith(extensions):
+        raise InputError(f"{name}: a file of format {chosen} is named {' or '.join(extensions)}")
+    check_output(path, f"a calibration (format {chosen})", lambda _: _is_one(path, chosen), inputs)
+    return chosen
+
+
+def _is_one(path: str | os.PathLike[str], format: SaveFormat) -> bool:
+    if format == "json":
+        return is_calibration_record(path)
+    load_calibration(path)
+    if format != "plus":
+        return True
+    from jaxcal.io.xml import read_xml
+
+    # A whole configuration is more than we write.
+    return read_xml(path)[0].tag == "Transform"
+
+
+def is_calibration_record(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is the JSON of a calibration, also of one that failed.
+
+    Raises:
+        FormatError: it is no JSON object.
+    """
+    return _json_object(path).get("format") == FORMAT
 
 
 def transform_from_plus_matrix(
@@ -411,7 +562,7 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
             return transform_from_plus_matrix(_load_npy(path), source=name)
         if lower.endswith(".npz"):
             return _load_npz(path)
-        return _load_json(path)
+        return transform_from_record(_json_object(path), source=name)
 
 
 def _load_plus(path: str | os.PathLike[str]) -> ImageTransform:
@@ -441,36 +592,41 @@ def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
-    """What :meth:`ImageTransform.save` writes; the covariance is X's alone."""
+    """What :meth:`ImageTransform.save` writes; older files have fewer names."""
     check_readable(path, maximum_bytes=_NPZ_BYTES)
     try:
         with ZipFile(path) as archive:
             if sum(member.file_size for member in archive.infolist()) > _NPZ_BYTES:
                 raise FormatError("holds more than a calibration")
         with np.load(path, allow_pickle=False) as file:
-            names = [name for name in _NPZ if name in file.files]
-            record = {name: np.asarray(file[name], dtype=np.float64).tolist() for name in names}
+            record = {name: file[name].tolist() for name in _NPZ if name in file.files}
     except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise FormatError(f"holds no arrays of numbers: {one_line(error)}") from None
     return transform_from_record({"version": VERSION} | record, source=os.fspath(path))
 
 
-def _load_json(path: str | os.PathLike[str]) -> ImageTransform:
+def _json_object(path: str | os.PathLike[str]) -> dict[str, Any]:
     check_readable(path, maximum_bytes=MAXIMUM_BYTES)
     try:
-        record = json.loads(Path(path).read_bytes())
+        content = Path(path).read_bytes()
+        if not content.lstrip().startswith(b"{"):
+            _format_of(os.fspath(path))
+        record = json.loads(content)
     except (OSError, ValueError, RecursionError) as error:
+        if isinstance(error, FormatError):
+            raise
         raise FormatError(f"is not JSON: {one_line(error)}") from None
     if not isinstance(record, dict):
         raise FormatError("is not a calibration: a JSON object is needed")
-    return transform_from_record(record, source=os.fspath(path))
+    return record
 
 
 def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> ImageTransform:
     """The calibration in an object of ``jaxcal calibrate --json``, of this or an older version.
 
     Raises:
-        FormatError: another format, a newer version, or a field that is missing or invalid.
+        FormatError: another format, a newer version, or a field that is missing or no array.
+        InputError: numbers that :class:`ImageTransform` refuses.
     """
     if record.get("format", FORMAT) != FORMAT:
         raise FormatError(f"is not a calibration: its format is {quoted(str(record['format']))}")
@@ -485,27 +641,21 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     matrix = _array(record, key, (4, 4))
     if matrix is None:
         raise FormatError(f"is not a calibration: {key} is missing, or the solve had failed")
-    transform = check_poses(matrix[None], what=key)[0]
-    if np.abs(transform - matrix).max() < _ROUNDING:
-        transform = matrix  # keeps every digit of the file
     scale = _array(record, "scale_mm_per_px", (2,))
-    if scale is not None and not (scale > 0).all():
-        raise FormatError("scale_mm_per_px must be positive")
     offset = _array(record, "face_offset_mm", ())
     factor = _array(record, "range_factor", ())
-    if factor is not None and not factor > 0:
-        raise FormatError("range_factor must be positive")
     error = _array(record, "rms_mm", ())
-    converged = record.get("converged")
+    usable = record.get("converged")
+    usable = usable and not record.get("wrong_frames") if isinstance(usable, bool) else None
     unknowns = _unknowns(record)
     size = len(tangent_names(unknowns))
     return ImageTransform(
-        transform,
+        matrix,
         scale,
         0.0 if offset is None else float(offset),
         _array(record, "covariance", (6, 6)),
         None if error is None else float(error),
-        converged if isinstance(converged, bool) else None,
+        usable,
         source,
         1.0 if factor is None else float(factor),
         unknowns,

@@ -41,6 +41,12 @@ _COLUMNS = (
 )
 @click.option("--pose-units", type=click.Choice(["mm", "cm", "m"]), help="Unit of translations.")
 @click.option(
+    "--skip-invalid",
+    is_flag=True,
+    help="Leave out rows of a table that are marked as invalid or have gaps; a last column, line, "
+    "then says which row is which.",
+)
+@click.option(
     "--out",
     type=click.Path(),
     metavar="OUT.csv",
@@ -53,27 +59,32 @@ def apply(
     pixel_sd: float,
     quaternion,
     pose_units,
+    skip_invalid: bool,
     out: str | None,
 ) -> int:
     """Take image points through the calibration CAL, as a table with standard deviations.
 
     SOURCE is a table with columns u and v, and a pose (probe to tracker) if points in the tracker's
     frame are wanted; or a recording (.h5). Standard deviations and covariances are those of the
-    calibration (estimated pixel sizes included) and of --pixel-sd; not of the pose.
+    calibration (estimated pixel sizes included) and of --pixel-sd; not of the pose. Images of a
+    recording that are masked out are left out; a last column, image, has the numbers of the others.
     """
     import numpy as np
 
     from jaxcal.calibration.transform import load_calibration
-    from jaxcal.cli.export import check_usable
     from jaxcal.io.atomic import write_text
+    from jaxcal.io.outputs import begins_with, check_output
 
     if (source is None) == (not pixel):
         raise click.UsageError("name SOURCE, or points by --pixel U V")
+    if out is not None:
+        inputs = [calibration] if source is None else [calibration, source]
+        check_output(out, "such a table", begins_with(",".join(_COLUMNS).encode()), inputs)
     transform = load_calibration(calibration)
-    check_usable(transform)
-    points, poses = np.array(pixel), None
+    transform.check_usable()
+    points, poses, numbers = np.array(pixel), None, None
     if source is not None:
-        points, poses, kind = _read(source, quaternion, pose_units)
+        points, poses, kind, numbers = _read(source, quaternion, pose_units, skip_invalid)
         _check_kind(kind, transform.scale_mm_per_px is not None, source)
     elif transform.scale_mm_per_px is None:
         click.echo(
@@ -83,10 +94,12 @@ def apply(
     applied = transform.apply(points, poses, pixel_sd_px=pixel_sd)
     table = io.StringIO()
     rows = csv.writer(table, lineterminator="\n")
-    rows.writerow(_COLUMNS)
-    for point, covariance in zip(applied.points, applied.covariance, strict=True):
-        numbers = [*point, *np.sqrt(np.diag(covariance)), *covariance[[0, 0, 1], [1, 2, 2]]]
-        rows.writerow([repr(float(value)) if np.isfinite(value) else "" for value in numbers])
+    name, which = numbers or ("", [])
+    rows.writerow([*_COLUMNS, name] if which else _COLUMNS)
+    for k, (point, covariance) in enumerate(zip(applied.points, applied.covariance, strict=True)):
+        values = [*point, *np.sqrt(np.diag(covariance)), *covariance[[0, 0, 1], [1, 2, 2]]]
+        cells = [repr(float(value)) if np.isfinite(value) else "" for value in values]
+        rows.writerow([*cells, which[k]] if which else cells)
     if out is None:
         click.echo(table.getvalue(), nl=False)
     else:
@@ -96,19 +109,23 @@ def apply(
     return ExitCode.CONVERGED
 
 
-def _read(source: str, quaternion, pose_units):
-    """Points, poses or None, and the points' kind."""
+def _read(source: str, quaternion, pose_units, skip_invalid: bool):
+    """Points, poses or None, the points' kind, and the images or lines that they are of."""
     if source.lower().endswith((".h5", ".hdf5")):
         from jaxcal.io.hdf5 import load
 
         images = load(source).calibration
-        return images.measurements[images.mask], images.poses[images.mask], images.kind
+        used = images.mask
+        which = "image", used.nonzero()[0].tolist()
+        return images.measurements[used], images.poses[used], images.kind, which
     from jaxcal.io.text import read_pose_table
 
-    table = read_pose_table(source, quaternion=quaternion, pose_units=pose_units)
+    table = read_pose_table(
+        source, quaternion=quaternion, pose_units=pose_units, skip_invalid=skip_invalid
+    )
     if table.points is None:
         raise InputError(f"{source}: holds no points (columns u and v)")
-    return table.points, table.poses, table.kind
+    return table.points, table.poses, table.kind, ("line", table.lines) if skip_invalid else None
 
 
 def _check_kind(kind: str, pixels: bool, source: str) -> None:

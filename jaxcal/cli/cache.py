@@ -32,7 +32,7 @@ WARMED_IMAGES = (16, 32, 64)
 """Numbers of images that ``warm`` prepares for, unless it is told others."""
 
 
-@click.group()
+@click.group(no_args_is_help=False)
 def cache() -> None:
     """Show, prepare or remove the compiled programs that are kept between runs."""
 

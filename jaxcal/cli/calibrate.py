@@ -25,13 +25,14 @@ from jaxcal.cli.common import (
 if TYPE_CHECKING:
     from jaxcal.calibration.options import Request
     from jaxcal.calibration.result import Calibration
+    from jaxcal.calibration.transform import SaveFormat
     from jaxcal.data.recording import Recording
     from jaxcal.report.convergence import Curve
 
 MOST_FOLDS = 100
 """With more images than this, cross-validation holds out several at a time."""
 
-EXPORTS = ("plus", "slicer", "itk", "ros", "tusrec", "numpy")
+EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "numpy")
 
 
 @click.command()
@@ -181,7 +182,8 @@ def calibrate(
     as_json: bool,
 ) -> int:
     """Calibrate from the recording REC; nobody has to supply a starting guess."""
-    targets = [_export_target(export) for export in exports]
+    inputs = [recording] if test is None else [recording, test]
+    targets = [_export_target(export, inputs) for export in exports]
     import_engine()
     from jaxcal.calibration.inputs import unknown_names
     from jaxcal.calibration.options import Options, Request, check_request
@@ -217,9 +219,9 @@ def calibrate(
     check_test_images(measured, test_data)
     enable_compilation_cache()
     if report is not None:
-        from jaxcal.report.write import check_writable
+        from jaxcal.report.page import check_page
 
-        check_writable(report)
+        check_page(report, inputs)
     with nullcontext() if out is None else _prepared(out) as folder:
         with progress(f"calibrating ({method})") as show:
             traced = folder is not None and method == "conventional"
@@ -257,21 +259,32 @@ def _prepared(out: str) -> AbstractContextManager[Path]:
     return prepare_folder(out)
 
 
-def _export_target(text: str) -> tuple[str, str]:
-    format, colon, path = text.partition(":")
-    if not colon or not path or format not in EXPORTS:
+def _export_target(text: str, inputs: list[str]) -> tuple[SaveFormat, str]:
+    from jaxcal.calibration.transform import check_target
+    from jaxcal.cli.export import check_configuration
+
+    name, colon, path = text.partition(":")
+    known: dict[str, SaveFormat] = {each: each for each in EXPORTS}
+    format = known.get(name)
+    if not colon or not path or format is None:
         raise InputError(f"--export {text}: FORMAT:PATH is needed, of {', '.join(EXPORTS)}")
-    if format == "plus" and not Path(path).is_file():
+    if format != "plus":
+        check_target(path, format, inputs)
+    elif not Path(path).is_file():
         raise InputError(f"--export {text}: there is no such configuration")
+    else:
+        check_configuration(path, inputs)
     return format, path
 
 
-def _export(record: dict[str, Any], recording: str, targets: list[tuple[str, str]]) -> list[str]:
+def _export(
+    record: dict[str, Any], recording: str, targets: list[tuple[SaveFormat, str]]
+) -> list[str]:
     """Write the transform for other programs; nothing of a calibration that did not converge."""
     if not targets:
         return []
     from jaxcal.calibration.transform import transform_from_record
-    from jaxcal.cli.export import patched
+    from jaxcal.cli.export import patched, written
 
     if not record["converged"] or record["wrong_frames"]:
         return ["exported: nothing, since the calibration is not to be used"]
@@ -281,8 +294,7 @@ def _export(record: dict[str, Any], recording: str, targets: list[tuple[str, str
         if format == "plus":
             said += patched(transform, path, None, ("Image", "Probe"))
         else:
-            transform.save(path, format)  # pyright: ignore[reportArgumentType]
-            said.append(f"{path}: written")
+            said += written(transform, path, format)
     return said
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _METHODS: tuple[Method, ...] = ("conventional", "alternating", "joint")
 IMAGES, ELEVATION_MM, NOISE_MM = 50, 2.0, 0.5
+RECORDING = "recording.h5"
 
 
 @click.command()
@@ -42,11 +43,14 @@ def demo(out: str | None, seed: int, as_json: bool) -> int:
     """
     import_engine()
     from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.io.outputs import check_output, is_simulated
     from jaxcal.report.record import calibration_record
     from jaxcal.report.write import prepare_folder
     from jaxcal.study.simulation import Protocol, simulate_recording
 
     with nullcontext() if out is None else prepare_folder(out) as folder:
+        if folder is not None:
+            check_output(folder / RECORDING, "a simulated recording", is_simulated)
         enable_compilation_cache()
         with progress("simulating"):
             protocol = Protocol(images=IMAGES, elevation_mm=ELEVATION_MM, noise_mm=NOISE_MM)
@@ -102,12 +106,11 @@ def _write(
     from jaxcal.data.problem import Problem
     from jaxcal.io.hdf5 import save
     from jaxcal.report.convergence import bounded_curves
-    from jaxcal.report.write import write_json, write_report
+    from jaxcal.report.write import write_report
 
     curves = bounded_curves(Problem.from_recording(recording), alternating=results["alternating"])
-    save(recording, folder / "recording.h5")
-    write_json(folder / "comparison.json", {**records})
-    write_report(folder, records["joint"], results["joint"], recording, curves)
+    save(recording, folder / RECORDING)
+    write_report(folder, records["joint"], results["joint"], recording, curves, {**records})
 
 
 def _print(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import datetime
+import os
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import click
 
-from jaxcal import InputError
 from jaxcal.cli.common import POSITIVE, ExitCode
 
 if TYPE_CHECKING:
@@ -96,10 +97,14 @@ def export(
         raise click.UsageError("--plus-server writes no file: leave OUT out")
     if origin is not None and pixel_size is None:
         raise click.BadParameter("needs --pixel-size", param_hint="--origin")
-    from jaxcal.calibration.transform import load_calibration
+    from jaxcal.calibration.transform import check_target, load_calibration
 
+    if plus_config is not None:
+        check_configuration(plus_config if out is None else out, [calibration])
+    elif out is not None:
+        format = check_target(out, format, [calibration])
     transform = load_calibration(calibration)
-    check_usable(transform)
+    transform.check_usable()
     if pixel_size is not None:
         transform = transform.with_pixels(pixel_size, origin or (0.0, 0.0))
     frames = image_frame, probe_frame
@@ -109,24 +114,38 @@ def export(
     elif plus_server is not None:
         click.echo(sent(transform, plus_server, frames))
     elif out is not None:
-        transform.save(out, format, frames=frames)
-        click.echo(f"{out}: written")
+        for line in written(transform, out, format, frames):
+            click.echo(line)
     elif format is not None:
         click.echo(transform.text(format, frames=frames), nl=False)
     return ExitCode.CONVERGED
 
 
-def check_usable(transform: ImageTransform) -> None:
-    """Refuse to hand on a calibration that did not converge.
+def check_configuration(path: str, inputs: Sequence[str]) -> None:
+    """Check that a configuration of PLUS can be written; another one may be there.
 
     Raises:
-        InputError: with what to do.
+        InputError: it is one of the inputs, or no configuration.
     """
-    if transform.converged is False:
-        raise InputError(
-            f"{transform.source}: did not converge or is not determined by its images; its "
-            "transform must not be used"
-        )
+    from jaxcal.io.outputs import check_output
+    from jaxcal.io.xml import read_xml
+
+    def is_one(path: str | os.PathLike[str]) -> bool:
+        return read_xml(path)[0].tag == "PlusConfiguration"
+
+    check_output(path, "a configuration of PLUS", is_one, inputs)
+
+
+def written(
+    transform: ImageTransform,
+    path: str,
+    format: SaveFormat | None,
+    frames: tuple[str, str] = ("Image", "Probe"),
+) -> list[str]:
+    """Write a transform; what was done and what should be known."""
+    transform.save(path, format, frames=frames)
+    note = None if format is None else transform.left_out(format)
+    return [f"{path}: written", *([] if note is None else [f"- {note}"])]
 
 
 def patched(

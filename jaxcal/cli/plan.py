@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 _COUNTED = (0.5, 0.3, 0.2, 0.1)
 """Errors (mm) for which the images are counted, where none is asked for."""
 
+_PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"%PDF", b"%!PS", b"<?xml", b"RIFF", b"II*", b"MM")
+"""How files begin that matplotlib draws."""
+
 
 @click.command()
 @click.argument("recording", type=click.Path(), metavar="[REC]", required=False)
@@ -136,8 +139,11 @@ def plan(
     from jaxcal import design
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.design.predict import MOST_IMAGES
+    from jaxcal.io.outputs import begins_with, check_output
 
     enable_compilation_cache()
+    if figure is not None:
+        check_output(figure, "a picture", begins_with(*_PICTURES), [recording] if recording else ())
     region = None if depth is None and lateral is None else _region(probe, depth, lateral)
     result = None
     if recording is None:

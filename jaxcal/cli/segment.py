@@ -114,7 +114,11 @@ def segment(
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.data.segmentation.segment import segment_recording
     from jaxcal.io.hdf5 import load, save
+    from jaxcal.io.outputs import check_output, is_recording
 
+    target = _default_out(recording) if out is None else out
+    # REC itself may be replaced: all of it is in the output.
+    check_output(target, "a recording", is_recording)
     data = load(recording)
     probe = _probe(data, sound_speed, temperature)
     enable_compilation_cache()
@@ -124,7 +128,6 @@ def segment(
             segmented, found = segment_recording(data, probe, interpolate=interpolate, **options)
         except InputError as error:
             raise type(error)(f"{recording}: {error}") from None
-    target = _default_out(recording) if out is None else out
     save(segmented, target, found)
     record = _record(found, target)
     if as_json:
@@ -160,13 +163,13 @@ def _default_out(source: str) -> str:
 
 def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[str, Any]) -> int:
     """A sequence's frames; what became of each is counted and said."""
-    from jaxcal.cli.import_ import check_out
     from jaxcal.io.hdf5 import save
     from jaxcal.io.importing import ImportOptions, import_files
+    from jaxcal.io.outputs import check_output, is_recording
     from jaxcal.io.target_search import FATES
 
     target = _default_out(source) if out is None else out
-    check_out([source], target)
+    check_output(target, "a recording", is_recording, [source])
     with progress("segmenting"):
         recording, notes, found = import_files([source], ImportOptions(**options))
     assert found is not None

@@ -27,11 +27,10 @@ def serve(calibration: str, host: str, port: int, rate: float, name: str) -> int
     ImageToProbe, with the pixel size in it: leave the image's own spacing at 1.
     """
     from jaxcal.calibration.transform import load_calibration
-    from jaxcal.cli.export import check_usable
     from jaxcal.io.serving import TransformServer
 
     transform = load_calibration(calibration)
-    check_usable(transform)
+    transform.check_usable()
     with TransformServer(name, transform.plus_matrix(), host, port) as server:
         click.echo(f"{name} at {host}:{server.port}, {rate:g} times a second; Ctrl-C ends")
         server.serve(1 / rate)

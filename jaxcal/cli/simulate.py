@@ -75,6 +75,9 @@ def simulate(
     raw = raw or probe == "curvilinear"
     if clock_mhz is not None and not raw:
         raise InputError("--clock-mhz rounds times of flight: it needs --raw")
+    from jaxcal.io.outputs import check_output, is_simulated
+
+    check_output(out, "a simulated recording", is_simulated)
     import_engine()
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.data.probe import PRESETS

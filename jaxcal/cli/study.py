@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jaxcal.study.run import Watcher
 
 
-@click.group()
+@click.group(no_args_is_help=False)
 def study() -> None:
     """Monte-Carlo studies: a grid of conditions x methods x trials, from a TOML spec."""
 
@@ -78,13 +78,16 @@ def run(spec: str, out: str, resume: bool, workers: int | None, dask: str | None
 def show(folder: str, as_json: bool, csv_file: str | None) -> int:
     """Print mean, SD, 95 % interval, failures and paired differences of the study in DIR."""
     from jaxcal.io.atomic import write_text
+    from jaxcal.io.outputs import begins_with, check_output
     from jaxcal.study import show as tables
     from jaxcal.study.store import Store
 
     store = Store.open(folder)
     cells = tables.summarise(store)
     if csv_file is not None:
-        write_text(csv_file, tables.as_csv(store.spec, cells))
+        text = tables.as_csv(store.spec, cells)
+        check_output(csv_file, "such a table", begins_with(text.partition("\n")[0].encode()))
+        write_text(csv_file, text)
     if as_json:
         print_json(tables.as_record(store, cells))
         return ExitCode.CONVERGED

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import special
@@ -37,7 +37,7 @@ from jaxcal.diagnostics.image_points import mean_of_squares, point_jacobian
 from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.model.unknowns import in_image, size
 from jaxcal.runtime.array_types import AnyArray, Float
-from jaxcal.runtime.arrays import array_module, traceable
+from jaxcal.runtime.arrays import array_module, is_traced, traceable
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
@@ -182,14 +182,33 @@ def predicted_tre(
 
     Returns:
         (*batch, *points) mm; NaN where X is not observable.
+
+    Raises:
+        InputError: points of another shape, or (if they are not traced) NaN or Inf.
     """
     xp = array_module(calibration, points)
-    points = xp.asarray(points)
+    points = _image_points(points)
     covariance = error_covariance(calibration, points.reshape(-1, 2))
     found = xp.sqrt(
         variance_factor(calibration)[..., None] * xp.trace(covariance, axis1=-2, axis2=-1)
     )
-    return found.reshape(*found.shape[:-1], *points.shape[:-1])
+    return found.reshape((*found.shape[:-1], *points.shape[:-1]))
+
+
+def _image_points(points: Any) -> Any:
+    """Points [lateral, axial], checked as far as they have values."""
+    if is_traced(points):
+        points = array_module(points).asarray(points)
+    else:
+        try:
+            points = np.asarray(points).astype(float, casting="same_kind")
+        except (TypeError, ValueError):
+            raise InputError("points must be numbers [lateral, axial], mm") from None
+        if not np.isfinite(points).all():
+            raise InputError("points must be finite")
+    if points.ndim == 0 or points.shape[-1] != 2:
+        raise InputError(f"points must have shape (..., 2), not {points.shape}")
+    return points
 
 
 @traceable
@@ -236,9 +255,9 @@ def tre_at(
         Arrays of shape (*batch, *points); NaN where X is not observable.
 
     Raises:
-        InputError: a level that is not between 0 and 1.
+        InputError: a level that is not between 0 and 1, or points of another shape, NaN or Inf.
     """
-    points = np.asarray(points, float)
+    points = _image_points(points)
     covariance = np.asarray(error_covariance(calibration.numpy(), points.reshape(-1, 2)))
     left = np.asarray(degrees_of_freedom(calibration), float)[..., None]
     factor = np.asarray(variance_factor(calibration))[..., None]

@@ -10,8 +10,9 @@ from __future__ import annotations
 import errno
 import os
 import secrets
+import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -81,6 +82,68 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     content = text.encode("utf-8", errors="backslashreplace")
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
+
+
+STAGED = ".partial-report"
+"""Folder inside a folder of files in which its next content is gathered."""
+
+
+def replace_files(
+    folder: str | os.PathLike[str], files: Mapping[str, bytes], names: Iterable[str]
+) -> None:
+    """Replace a set of files that belong together: at no moment are old and new ones mixed.
+
+    The new files are gathered in the folder :data:`STAGED` first; then the old ones are removed,
+    and then the new ones take their names, the first of them last. Who is killed in between leaves
+    a folder without that file; the next call puts it right.
+
+    Args:
+        folder: an existing folder; other files in it are left alone.
+        files: name and content; the first one says that the set is whole.
+        names: of all files that such a set may have: those that it has not now are removed.
+
+    Raises:
+        OutputError: they cannot be written. Old files are as they were, unless the disk failed in
+            the very moment of the change.
+    """
+    target = Path(folder)
+    staged = target / STAGED
+    known = [*files, *(name for name in names if name not in files)]
+    try:
+        for name in known:
+            _existing_mode(target / name)
+        shutil.rmtree(staged, ignore_errors=True)
+        staged.mkdir()
+        try:
+            for name, content in files.items():
+                (staged / name).write_bytes(content)
+                _flush(staged / name, os.O_RDWR)
+        except BaseException:
+            shutil.rmtree(staged, ignore_errors=True)
+            raise
+        for name in known:
+            (target / name).unlink(missing_ok=True)
+        for name in reversed(list(files)):
+            os.replace(staged / name, target / name)
+        staged.rmdir()
+    except (OSError, ValueError) as error:
+        raise _output_error(os.fspath(folder), error) from error
+    with suppress(OSError):
+        _flush(target, os.O_RDONLY)
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Check that a file can be made or replaced, before other work begins.
+
+    Raises:
+        OutputError: it cannot be made or replaced.
+    """
+    with suppress(_Unwritten), atomic_path(path):
+        raise _Unwritten
+
+
+class _Unwritten(Exception):
+    """Ends a check before anything is written."""
 
 
 def save_figure(

@@ -63,8 +63,26 @@ def static_transform_command(
     )
 
 
+def range_note(range_factor: float, face_offset_mm: float) -> str | None:
+    """What a rigid transform leaves to its user, in words; None where z is the measured range.
+
+    Args:
+        range_factor: the estimated sound speed over the nominal one.
+        face_offset_mm: z of a measured range of 0, mm.
+    """
+    steps = []
+    if range_factor != 1:
+        steps.append(f"multiply ranges by {range_factor:.9g} (the estimated sound speed)")
+    if face_offset_mm != 0:
+        steps.append(f"add {face_offset_mm / 1e3:.9g} m (the range of row 0)")
+    return f"not in this rigid transform: {', then '.join(steps)}" if steps else None
+
+
 def ros_yaml(
-    matrix: Float[np.ndarray, "4 4"], parent: str = "probe", child: str = "us_image"
+    matrix: Float[np.ndarray, "4 4"],
+    parent: str = "probe",
+    child: str = "us_image",
+    note: str | None = None,
 ) -> str:
     """The YAML of easy_handeye2, with the command of tf2 as a comment above it.
 
@@ -72,13 +90,16 @@ def ros_yaml(
         matrix: rigid, mm, child -> parent.
         parent: frame; easy_handeye2's ``robot_effector_frame``.
         child: frame; easy_handeye2's ``tracking_base_frame``.
+        note: a further line of comment, as of :func:`range_note`.
 
     Raises:
         InputError: a matrix that is not rigid, or names that ROS does not take.
     """
     numbers = "".join(f"  {key}: {value}\n" for key, value in _seven(matrix).items())
+    noted = "" if note is None else f"# {note}\n"
     return (
         f"# {child} in {parent}: metres, unit quaternion with the scalar last.\n"
+        f"{noted}"
         f"# {static_transform_command(matrix, parent, child)}\n"
         "parameters:\n"
         "  eye_on_hand: true\n"

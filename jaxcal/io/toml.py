@@ -64,7 +64,8 @@ def load_toml(
     if len(content) > maximum_bytes:
         raise FormatError(f"{path}: is too large (at most {maximum_bytes} bytes are read)")
     try:
-        text = content.decode("utf-8")
+        # With the byte order mark of Windows' editors, or without.
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise FormatError(f"{path}: is not UTF-8 text") from None
     try:

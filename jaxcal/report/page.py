@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Sequence
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -24,7 +25,8 @@ from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Recording
 from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.metrics import reconstruct
-from jaxcal.io.atomic import write_text
+from jaxcal.io.atomic import check_writable, write_text
+from jaxcal.io.outputs import check_output
 from jaxcal.report import svg
 from jaxcal.report.certified import certificate_words
 from jaxcal.report.next_poses import next_poses_sentences
@@ -45,6 +47,7 @@ MOST_POSES, MOST_PLANES = 300, 60
 LONGEST_LIST = 3000
 """Longer lists are left out of the page's record."""
 
+_DOCTYPE, _TITLE = "<!DOCTYPE html>", "<title>Calibration of "
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 _KINDS = (
     ("lateral", "sideways", svg.BLUE),
@@ -67,15 +70,34 @@ def write_page(
     """Write the page, complete or not at all.
 
     Args:
-        path: the file to make or replace.
+        path: the file to make; only another page is replaced.
         record: of :func:`jaxcal.report.record.calibration_record`, settled.
         result: the calibration.
         recording: what was calibrated.
 
     Raises:
+        InputError: the file exists and is no page.
         OutputError: it could not be written; the file is as it was.
     """
+    check_page(path)
     write_text(path, page(record, result, recording))
+
+
+def check_page(path: str | os.PathLike[str], inputs: Sequence[str] = ()) -> None:
+    """Check that a page can be written, before other work begins.
+
+    Raises:
+        InputError: the file is one of the inputs, or exists and is no page.
+        OutputError: it cannot be made or replaced.
+    """
+    check_output(path, "a page of jaxcal", _is_page, inputs)
+    check_writable(path)
+
+
+def _is_page(path: str | os.PathLike[str]) -> bool:
+    with open(path, "rb") as file:
+        start = file.read(2048)
+    return start.startswith(_DOCTYPE.encode()) and _TITLE.encode() in start
 
 
 def page(record: dict[str, Any], result: Calibration, recording: Recording) -> str:
@@ -100,11 +122,11 @@ def page(record: dict[str, Any], result: Calibration, recording: Recording) -> s
     style = (files / "page.css").read_text("utf-8")
     script = (files / "page.js").read_text("utf-8")
     return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
+        f'{_DOCTYPE}\n<html lang="en"><head><meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<link rel="icon" href="data:,">\n'
-        f"<title>Calibration of {name}</title>\n<style>\n{style}</style></head>\n<body>\n"
+        f"{_TITLE}{name}</title>\n<style>\n{style}</style></head>\n<body>\n"
         + "\n".join(sections)
         + f"\n{_embedded('record', _shortened(record))}\n<script>\n{script}</script>\n"
         "</body></html>\n"

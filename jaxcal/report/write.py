@@ -1,4 +1,4 @@
-"""The report folder: calibration.json, residuals.csv and the figures, each complete or absent."""
+"""The report folder: calibration.json, residuals.csv and figures, of one calibration or none."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal import OutputError
+from jaxcal import CalibrationError, FormatError, InputError, OutputError
 from jaxcal.calibration.result import Calibration
+from jaxcal.calibration.transform import is_calibration_record
 from jaxcal.data.recording import Recording
-from jaxcal.io.atomic import atomic_path, write_text
+from jaxcal.io.atomic import STAGED, replace_files, write_text
 from jaxcal.io.readable import one_line
 from jaxcal.report.convergence import Curve
 from jaxcal.report.verdict import verdict
@@ -34,10 +35,20 @@ COLUMNS = (
 )
 """Columns of residuals.csv: the residual from the image plane, then the estimated offset."""
 
+FIGURES = ("residuals", "offsets", "accuracy", "influence", "limits", "convergence")
+NAMES = (
+    "calibration.json",
+    "verdict.txt",
+    "residuals.csv",
+    "comparison.json",
+    *(f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")),
+)
+"""Files that a report may have."""
+
 
 @contextmanager
 def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Make a folder, and check that files can be written to it, before other work begins.
+    """Make a folder, and check that a report can be written to it, before other work begins.
 
     Args:
         path: the folder; missing parents are made.
@@ -47,6 +58,7 @@ def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         are removed again.
 
     Raises:
+        InputError: files of a report's names are there, but no report.
         OutputError: it cannot be made or written to.
     """
     folder = Path(path)
@@ -61,7 +73,8 @@ def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
                 raise OutputError(f"{path}: is a file, not a folder")
             with tempfile.TemporaryFile(dir=folder):
                 pass
-        except OutputError:
+            _check_report(folder)
+        except CalibrationError:
             raise
         except (OSError, ValueError) as error:
             reason = one_line(error)
@@ -74,18 +87,15 @@ def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
-def check_writable(path: str | os.PathLike[str]) -> None:
-    """Check that a file can be made or replaced, before other work begins.
-
-    Raises:
-        OutputError: it cannot be made or replaced.
-    """
-    with suppress(_Unwritten), atomic_path(path):
-        raise _Unwritten
-
-
-class _Unwritten(Exception):
-    """Ends a check before anything is written."""
+def _check_report(folder: Path) -> None:
+    """See that files of a report's names are those of a report, which may be replaced."""
+    found = [name for name in NAMES if (folder / name).exists()]
+    if not found or (folder / STAGED).is_dir():
+        return
+    with suppress(FormatError):
+        if is_calibration_record(folder / NAMES[0]):
+            return
+    raise InputError(f"{folder}: holds {found[0]}, but no report of jaxcal: name another folder")
 
 
 def write_report(
@@ -94,15 +104,17 @@ def write_report(
     result: Calibration,
     recording: Recording,
     curves: list[Curve],
+    comparison: dict[str, Any] | None = None,
 ) -> list[Path]:
     """Write the report of one calibration.
 
     Args:
-        folder: an existing folder; files of the same names are replaced.
+        folder: an existing folder; an earlier report in it is replaced as a whole.
         record: of :func:`jaxcal.report.record.calibration_record`.
         result: the calibration.
         recording: what was calibrated.
         curves: of the method's objective, for the figure convergence; empty: no such figure.
+        comparison: records of several methods, for comparison.json.
 
     Returns:
         The files: calibration.json, verdict.txt, residuals.csv, and each figure as .png and .svg:
@@ -110,7 +122,7 @@ def write_report(
         convergence.
 
     Raises:
-        OutputError: a file could not be written and is unchanged.
+        OutputError: the report could not be written; an earlier one is unchanged.
     """
     # Matplotlib takes half a second to import, so it is imported only here, to draw.
     from jaxcal.report import plots
@@ -129,16 +141,26 @@ def write_report(
         }
     if curves:
         figures["convergence"] = convergence_figure(curves)
-    write_json(folder / "calibration.json", record)
-    write_text(folder / "verdict.txt", "\n".join(verdict(record)) + "\n")
-    write_text(folder / "residuals.csv", _residual_table(result))
-    names = ["calibration.json", "verdict.txt", "residuals.csv"]
+    texts = {
+        "calibration.json": _json(record),
+        "verdict.txt": "\n".join(verdict(record)) + "\n",
+        "residuals.csv": _residual_table(result),
+    }
+    if comparison is not None:
+        texts["comparison.json"] = _json(comparison)
+    # File names that are not UTF-8 are lone surrogates in the texts.
+    files = {name: text.encode("utf-8", "backslashreplace") for name, text in texts.items()}
     for name, figure in figures.items():
         for kind in ("png", "svg"):
-            with atomic_path(folder / f"{name}.{kind}") as temporary:
-                figure.savefig(temporary, format=kind)
-            names.append(f"{name}.{kind}")
-    return [folder / name for name in names]
+            drawn = io.BytesIO()
+            figure.savefig(drawn, format=kind)
+            files[f"{name}.{kind}"] = drawn.getvalue()
+    replace_files(folder, files, NAMES)
+    return [folder / name for name in files]
+
+
+def _json(record: dict[str, Any]) -> str:
+    return json.dumps(record, indent=2, allow_nan=False) + "\n"
 
 
 def write_json(path: str | os.PathLike[str], record: dict[str, Any]) -> None:
@@ -147,7 +169,7 @@ def write_json(path: str | os.PathLike[str], record: dict[str, Any]) -> None:
     Raises:
         OutputError: it could not be written.
     """
-    write_text(path, json.dumps(record, indent=2, allow_nan=False) + "\n")
+    write_text(path, _json(record))
 
 
 def _residual_table(result: Calibration) -> str:

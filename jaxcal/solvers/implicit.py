@@ -20,11 +20,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxcal import InputError
 from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import MediumPrior, Observation
 from jaxcal.runtime.precision import in_standard_promotion
 from jaxcal.solvers import dense, reml
 from jaxcal.solvers.normal_equations import accumulate
+
+STILL_MM, STILL_RAD = 1e-6, 1e-8
+"""Largest tolerances of an alternation that ends near enough to the minimum."""
 
 
 @jax.custom_jvp
@@ -112,6 +116,29 @@ def _self_tuned_jvp(primals: tuple, tangents: tuple) -> tuple:
     inverse = jax.vmap(dense.inverse, in_axes=-1, out_axes=-1)(scale[:, None] * matrix)
     step = -dense.product_lanes_last(inverse, scale * moved)
     return self_tuned_optimum(*primals), (step[:count], sigma * step[count:])
+
+
+@jax.custom_jvp
+def stopped_short(
+    place: Iterate, observation: Observation, images: ImagePlanes
+) -> Float[Array, "p lanes"]:
+    """:func:`optimum` of a method that stopped before the minimum: to differentiate it is an error.
+
+    Raises:
+        InputError: where it is differentiated, with what to do.
+    """
+    del observation, images
+    return _no_step(place)
+
+
+@stopped_short.defjvp
+def _stopped_short_jvp(primals: tuple, tangents: tuple) -> tuple:
+    raise InputError(
+        "the alternation stops before the minimum, where its answer has no derivative: "
+        'differentiate method="joint" with prior="bounded", which has the same objective, or the '
+        f"alternation with tolerance_mm <= {STILL_MM:g} and tolerance_rad <= {STILL_RAD:g}; "
+        "Options(differentiate=False) makes the answer a constant"
+    )
 
 
 def _no_step(place: Iterate) -> Float[Array, "p lanes"]:

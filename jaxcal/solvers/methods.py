@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.calibration.options import DEFAULT_MAX_ELEVATION_MM, Given, SolvePlan
+from jaxcal.calibration.options import DEFAULT_MAX_ELEVATION_MM, Given, Options, SolvePlan
 from jaxcal.data.problem import Problem
 from jaxcal.data.sound import WATER_M_S
 from jaxcal.model.batch import ImagePlanes, Iterate
@@ -284,6 +284,8 @@ def _attached(
             found.place, found.observation.sigma, observation, images, medium
         )
         observation = observation.with_sigma(sigma)
+    elif plan.method == "alternating" and not _ends_still(plan.options):
+        step = implicit.stopped_short(found.place, observation, images)
     else:
         step = implicit.optimum(found.place, observation, images, medium)
     place = found.place.moved(step)
@@ -291,6 +293,11 @@ def _attached(
     if isinstance(observation, BoundedOffsets):
         offset = local_unknowns(place, observation, images)
     return replace(found, place=place, observation=observation, medium=medium, offset=offset)
+
+
+def _ends_still(options: Options) -> bool:
+    near = options.tolerance_mm <= implicit.STILL_MM
+    return near and options.tolerance_rad <= implicit.STILL_RAD
 
 
 def _averaged(found: Solution, images: ImagePlanes, problems: Problem, plan: SolvePlan) -> Solution:

@@ -12,6 +12,7 @@ need no scheduler (:mod:`jaxcal.study.workers`).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, cast
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from jaxcal import CalibrationError, InputError, MissingExtraError
-from jaxcal.io.readable import one_line
+from jaxcal.io.readable import one_line, quoted
 from jaxcal.study.own import Study, study_from, where_defined
 from jaxcal.study.spec import Chunk
 
@@ -31,38 +32,39 @@ CHUNKS_AHEAD = 2
 
 CONNECT_SECONDS = 30
 
+# Others than these, such as inproc://, are Dask's own affair.
+_ADDRESS = re.compile(r"((tcp|tls|wss?|ucx)://)?\S+:\d{1,5}|(?!(tcp|tls|wss?|ucx):)\w+://\S+")
 
-def compute_on_cluster(
-    spec: Study, chunks: list[Chunk], scheduler: Any
-) -> Iterator[tuple[Chunk, dict[str, np.ndarray], str]]:
-    """Compute chunks on worker processes; yields them as they are done.
+
+def connected(scheduler: Any) -> Client:
+    """A client of a scheduler, to be used as a context manager.
 
     Args:
-        spec: the study.
-        chunks: what to compute.
         scheduler: address of a running scheduler, e.g. ``tls://host:8786``, or a Dask cluster.
 
     Raises:
         MissingExtraError: Dask is not installed.
-        InputError: the scheduler cannot be reached.
-        CalibrationError: a chunk could not be computed, or the scheduler was lost.
+        InputError: an address without a port, or one at which no scheduler answers.
     """
+    if isinstance(scheduler, str) and not _ADDRESS.fullmatch(scheduler):
+        raise InputError(
+            f"{quoted(scheduler)} is no address of a Dask scheduler: HOST:PORT is needed, e.g. "
+            "tcp://127.0.0.1:8786"
+        )
     try:
-        import distributed  # noqa: F401
+        from distributed import Client
     except ImportError:
         raise MissingExtraError("a cluster needs Dask: pip install 'jaxcal[cluster]'") from None
 
-    with _connect(scheduler) as client:
-        yield from _distribute(client, spec, chunks)
-
-
-def _connect(scheduler: Any) -> Client:
-    from distributed import Client
-
+    client = Client.__new__(Client)
     try:
-        return Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
+        client.__init__(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
+    # Whatever else listens there may answer anything.
+    except Exception as error:
+        # Else it closes itself when it is deleted: seconds, and a traceback.
+        client.status = "closed"
         raise InputError(f"no Dask scheduler answers at {scheduler}: {one_line(error)}") from None
+    return client
 
 
 def compute_from_text(
@@ -85,9 +87,19 @@ def _threads(client: Client) -> dict[str, int]:
     return cast("dict[str, int]", client.nthreads())
 
 
-def _distribute(
+def compute_on_cluster(
     client: Client, spec: Study, chunks: list[Chunk]
 ) -> Iterator[tuple[Chunk, dict[str, np.ndarray], str]]:
+    """Compute chunks on worker processes; yields them as they are done.
+
+    Args:
+        client: of :func:`connected`.
+        spec: the study.
+        chunks: what to compute.
+
+    Raises:
+        CalibrationError: a chunk could not be computed, or the scheduler was lost.
+    """
     from distributed import as_completed
 
     canonical, waiting = spec.canonical(), list(reversed(chunks))

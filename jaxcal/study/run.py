@@ -5,17 +5,21 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Generator, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from jaxcal import FormatError, InputError
+from jaxcal.study.cluster import compute_on_cluster, connected
 from jaxcal.study.own import Study
 from jaxcal.study.spec import Chunk
 from jaxcal.study.store import Store
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 try:
     import fcntl
@@ -95,7 +99,8 @@ def run_study(
         watcher: is told about the progress.
 
     Raises:
-        InputError: another spec's results are there, or the folder is in use.
+        InputError: another spec's results are there, the folder is in use, or no scheduler answers,
+            in which case nothing was written.
         OutputError: the folder or a file cannot be written; what was written before stays.
         MissingExtraError: Dask is needed and not installed.
         CalibrationError: the cluster was lost; ``resume`` continues.
@@ -104,17 +109,19 @@ def run_study(
         raise InputError("workers must not be negative, nor be given beside a scheduler")
     watcher = Silence() if watcher is None else watcher
     begun = time.monotonic()
-    store = Store.create(folder, spec, resume=resume)
-    with _locked(store.folder):
-        store.sweep()
-        missing, done = _missing(store, watcher)
-        watcher.begin(spec.condition_count * spec.trials, done)
-        trials = 0
-        with closing(_computed(spec, missing, workers, scheduler)) as results:
-            for chunk, arrays, device in results:
-                store.write(chunk, arrays, device)
-                trials += chunk.stop - chunk.start
-                watcher.advance(chunk.stop - chunk.start)
+    # First of all, so that no folder is made where nothing can be computed.
+    with nullcontext() if scheduler is None else connected(scheduler) as client:
+        store = Store.create(folder, spec, resume=resume)
+        with _locked(store.folder):
+            store.sweep()
+            missing, done = _missing(store, watcher)
+            watcher.begin(spec.condition_count * spec.trials, done)
+            trials = 0
+            with closing(_computed(spec, missing, workers, client)) as results:
+                for chunk, arrays, device in results:
+                    store.write(chunk, arrays, device)
+                    trials += chunk.stop - chunk.start
+                    watcher.advance(chunk.stop - chunk.start)
     return RunSummary(spec.chunk_count, len(missing), trials, time.monotonic() - begun)
 
 
@@ -141,14 +148,12 @@ def _missing(store: Store, watcher: Watcher) -> tuple[list[Chunk], int]:
 
 
 def _computed(
-    spec: Study, missing: list[Chunk], workers: int, scheduler: Any
+    spec: Study, missing: list[Chunk], workers: int, client: Client | None
 ) -> Generator[Computed]:
     if not missing:
         return
-    if scheduler is not None:
-        from jaxcal.study.cluster import compute_on_cluster
-
-        yield from compute_on_cluster(spec, missing, scheduler)
+    if client is not None:
+        yield from compute_on_cluster(client, spec, missing)
     elif workers:
         from jaxcal.study.workers import compute_on_workers, core_groups
 

@@ -15,6 +15,7 @@ fit, which is what an image would show.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Complex64, Float, Int, Key
 
 from jaxcal import InputError
+from jaxcal.calibration.inputs import LARGEST_SEED, whole_number
 from jaxcal.data.geometry import matrix_from_rotation
 from jaxcal.data.probe import L14_5, CurvilinearProbe, Probe
 from jaxcal.data.problem import Channels, Problem
@@ -83,18 +85,36 @@ class Protocol:
     tracker_rad: Scalar = 0.0
 
     def __post_init__(self) -> None:
-        if not MINIMUM_IMAGES <= self.images <= 100_000:
-            raise InputError(f"images must be between {MINIMUM_IMAGES} and 100000")
-        for name, largest, unit in (
-            ("elevation_mm", 1000, "mm"),
-            ("noise_mm", 1000, "mm"),
-            ("tracker_mm", 1000, "mm"),
-            ("tracker_rad", 1, "rad"),
+        whole_number("images", self.images, MINIMUM_IMAGES, 100_000)
+        whole_number("test_images", self.test_images, 0, 100_000)
+        try:
+            shallow, deep = self.depth_mm
+        except (TypeError, ValueError):
+            raise InputError("depth_mm must be two numbers: nearest and farthest") from None
+        for name, value, largest, unit in (
+            ("elevation_mm", self.elevation_mm, 1000, " mm"),
+            ("noise_mm", self.noise_mm, 1000, " mm"),
+            ("lateral_mm", self.lateral_mm, 1000, " mm"),
+            ("depth_mm", shallow, 1000, " mm"),
+            ("depth_mm", deep, 1000, " mm"),
+            ("rotation_rad", self.rotation_rad, 4, " rad"),
+            ("test_fraction", self.test_fraction, 10, ""),
+            ("sector", self.sector, 1, ""),
+            ("tracker_mm", self.tracker_mm, 1000, " mm"),
+            ("tracker_rad", self.tracker_rad, 1, " rad"),
         ):
-            value = getattr(self, name)
-            if not (is_traced(value) or (np.isfinite(value) and 0 <= value <= largest)):
-                raise InputError(f"{name} must be between 0 and {largest} {unit}, not {value}")
+            if not is_traced(value) and not _is_within(value, largest):
+                raise InputError(f"{name} must be between 0 and {largest}{unit}, not {value}")
+        if not is_traced(self.depth_mm) and shallow > deep:
+            raise InputError(f"depth_mm must be nearest, then farthest, not {self.depth_mm}")
         check_law(self.elevation_distribution)
+
+
+def _is_within(value: Any, largest: int) -> bool:
+    try:
+        return 0 <= float(value) <= largest
+    except (TypeError, ValueError):
+        return False
 
 
 class Experiment(eqx.Module):
@@ -457,7 +477,11 @@ def simulate_recording(
             images hold times of flight, otherwise points. Test images always hold points.
         seed: of the draws.
         clock_hz: times of flight are rounded to this clock.
+
+    Raises:
+        InputError: a seed that is no whole number from 0 to 2^63 - 1, or a clock without times.
     """
+    seed = whole_number("seed", seed, 0, LARGEST_SEED)
     curved = isinstance(protocol.probe, CurvilinearProbe)
     if clock_hz is not None and not (protocol.raw or curved):
         raise InputError("a clock rounds times of flight: it needs a raw simulation")

@@ -60,6 +60,7 @@ from typing import Any, get_args
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.inputs import shown, whole_number
 from jaxcal.calibration.names import Method, PriorName
 from jaxcal.data.probe import LinearProbe
 from jaxcal.io.readable import quoted
@@ -327,9 +328,9 @@ def _spec(content: dict[str, Any]) -> Spec:
     name = _required(content, "name")
     if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z0-9_-]{1,100}", name)):
         raise InputError("name must be 1 to 100 letters, digits, - and _")
-    seed = _integer("seed", _required(content, "seed"), 0, 2**63 - 1)
-    trials = _integer("trials", _required(content, "trials"), 1, MAXIMUM_EXPERIMENTS)
-    chunk = _integer("chunk_trials", content.get("chunk_trials", 512), 1, 2**20)
+    seed = whole_number("seed", _required(content, "seed"), 0, 2**63 - 1)
+    trials = whole_number("trials", _required(content, "trials"), 1, MAXIMUM_EXPERIMENTS)
+    chunk = whole_number("chunk_trials", content.get("chunk_trials", 512), 1, 2**20)
     axes, listed = _axes(_table(content, "conditions"))
     probe = _probe(_table(content, "probe"))
     spec = Spec(name, seed, trials, min(chunk, trials), axes, listed, probe, _methods(content))
@@ -391,30 +392,18 @@ def _table(content: dict[str, Any], key: str) -> dict[str, Any]:
     return table
 
 
-def _integer(name: str, value: object, least: int, most: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise InputError(f"{name} must be a whole number, not {_shown(value)}")
-    if not least <= value <= most:
-        raise InputError(f"{name} must be between {least} and {most}, not {value}")
-    return value
-
-
 def _number(name: str, value: object, least: float, most: float, *, above: bool = False) -> float:
     if isinstance(value, str):
         raise InputError(
-            f"{name} must be a plain number (its unit is in its name), not {_shown(value)}"
+            f"{name} must be a plain number (its unit is in its name), not {shown(value)}"
         )
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{name} must be a number, not {_shown(value)}")
+        raise InputError(f"{name} must be a number, not {shown(value)}")
     number = float(value) if abs(value) < 2**1000 else math.inf
     if not least <= number <= most or (above and number == least):
         span = f"more than {least:g} and at most" if above else f"between {least:g} and"
-        raise InputError(f"{name} must be {span} {most:g}, not {_shown(value)}")
+        raise InputError(f"{name} must be {span} {most:g}, not {shown(value)}")
     return number + 0.0  # -0.0 and 0 are one condition
-
-
-def _shown(value: object) -> str:
-    return quoted(str(value)) if isinstance(value, str) else quoted(repr(value)).strip("'")
 
 
 def _axes(
@@ -444,12 +433,10 @@ def _axes(
 def _condition_value(name: str, label: str, value: object) -> float | int | str:
     if name == "elevation_distribution":
         if value not in OFFSET_LAWS:
-            raise InputError(
-                f"{label} must be one of {', '.join(OFFSET_LAWS)}, not {_shown(value)}"
-            )
+            raise InputError(f"{label} must be one of {', '.join(OFFSET_LAWS)}, not {shown(value)}")
         return str(value)
     if name in _COUNTS:
-        return _integer(label, value, *_COUNTS[name])
+        return whole_number(label, value, *_COUNTS[name])
     above = name in ("depth_min_mm", "depth_max_mm")
     return _number(label, value, *_LIMITS[name], above=above)
 
@@ -457,7 +444,7 @@ def _condition_value(name: str, label: str, value: object) -> float | int | str:
 def _probe(table: dict[str, Any]) -> LinearProbe:
     _known(table, {"elements", "pitch_mm"}, "probe.")
     default = LinearProbe()
-    elements = _integer("probe.elements", table.get("elements", default.elements), 2, 4096)
+    elements = whole_number("probe.elements", table.get("elements", default.elements), 2, 4096)
     pitch = _number(
         "probe.pitch_mm", table.get("pitch_mm", default.pitch_mm), 0.0, 99.0, above=True
     )
@@ -486,7 +473,7 @@ def _method(table: dict[str, Any], where: str) -> MethodSpec:
     for key, value, names in (("method", method, Method), ("prior", prior, PriorName)):
         if value not in get_args(names):
             listed = ", ".join(get_args(names))
-            raise InputError(f"{where}{key} must be one of {listed}, not {_shown(value)}")
+            raise InputError(f"{where}{key} must be one of {listed}, not {shown(value)}")
     if method != "joint" and "prior" in table:
         raise InputError(f"{where}prior belongs to the joint method")
     bounded = method == "alternating" or prior == "bounded"
@@ -510,7 +497,7 @@ def _method(table: dict[str, Any], where: str) -> MethodSpec:
             values[key] = _number(where + key, table[key], 0.0, most, above=True)
     for key in ("max_rounds", "inner_steps", "max_iterations"):
         if key in table:
-            values[key] = _integer(where + key, table[key], 1, 10**7)
+            values[key] = whole_number(where + key, table[key], 1, 10**7)
     return MethodSpec(name=name, method=method, prior=prior, **values)
 
 

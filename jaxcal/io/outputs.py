@@ -1,0 +1,80 @@
+"""What may be replaced: no file that is read, and only a file of the kind that is written.
+
+So a command may be run again over its own earlier output, and a name in the wrong place destroys
+nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable, Iterable
+
+from jaxcal import CalibrationError, InputError
+
+Path = str | os.PathLike[str]
+
+
+def check_output(
+    path: Path, what: str, is_one: Callable[[Path], bool], inputs: Iterable[Path] = ()
+) -> None:
+    """See that writing a file replaces nothing but an earlier one of its kind.
+
+    Args:
+        path: the file to write. Where there is none yet, an empty one or no ordinary file, nothing
+            is checked: whoever writes it says what is wrong.
+        what: the kind in words, for messages.
+        is_one: whether a file is of this kind; an error of jaxcal's means no.
+        inputs: files that are read, which must not be replaced whatever they are.
+
+    Raises:
+        InputError: it is one of the inputs, or of another kind.
+    """
+    name = os.fspath(path)
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError):
+        return
+    if any(_same(status, each) for each in inputs):
+        raise InputError(f"{name}: is read by this command and not replaced: name another output")
+    if not stat.S_ISREG(status.st_mode) or status.st_size == 0:
+        return
+    try:
+        replaceable = is_one(path)
+    except (CalibrationError, OSError):
+        replaceable = False
+    if not replaceable:
+        raise InputError(f"{name}: exists and is not {what}: name another file, or remove it first")
+
+
+def begins_with(*starts: bytes) -> Callable[[Path], bool]:
+    """Whether a file begins with one of these bytes."""
+
+    def is_one(path: Path) -> bool:
+        with open(path, "rb") as file:
+            return file.read(max(map(len, starts))).startswith(starts)
+
+    return is_one
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file is one of our recordings, be it complete or not."""
+    from jaxcal.io.hdf5 import FORMAT
+    from jaxcal.io.untrusted import open_root, text
+
+    with open_root(path) as root:
+        return text(root, "format") == FORMAT
+
+
+def is_simulated(path: Path) -> bool:
+    """Whether a file is a recording that holds the truth, as simulations do."""
+    from jaxcal.io.hdf5 import load
+
+    return load(path).truth is not None
+
+
+def _same(status: os.stat_result, other: Path) -> bool:
+    try:
+        return os.path.samestat(status, os.stat(other))
+    except (OSError, ValueError):
+        return False

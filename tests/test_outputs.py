@@ -1,0 +1,174 @@
+"""No command replaces what it reads, or a file of another kind than it writes; its own it does."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_transform import random_transform
+
+import jaxcal
+from jaxcal import InputError
+from jaxcal.cli.main import main
+from jaxcal.data.recording import Recording, Truth, make_images
+from jaxcal.io.atomic import write_text
+from jaxcal.io.outputs import begins_with, check_output
+
+TABLE = "u,v\n300,12.5\n"
+CONFIGURATION = (
+    '<PlusConfiguration version="2.9"><CoordinateDefinitions><Transform From="Image" To="Probe" '
+    'Matrix="0.1 0 0 0 0 0.1 0 0 0 0 0.1 0 0 0 0 1" /></CoordinateDefinitions>'
+    "</PlusConfiguration>"
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with what a user has: a recording, a calibration, tables, a sequence, notes."""
+    monkeypatch.chdir(tmp_path)
+    generator = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, 3] = generator.uniform(-50, 50, (6, 3))
+    images = make_images(poses, generator.uniform(10, 500, (6, 2)), "pixel", spacing_mm=(0.1, 0.1))
+    mask = np.array([True, True, False, True, True, True])
+    jaxcal.save(Recording(replace(images, mask=mask)), "rec.h5")
+    random_transform().save("cal.json")
+    for name in ("rec.csv", "points.txt"):
+        (tmp_path / name).write_text(TABLE)
+    (tmp_path / "sweep.igs.mha").write_bytes(b"ObjectType = Image\n")
+    (tmp_path / "notes.json").write_text('{"mine": 1}')
+    (tmp_path / "config.xml").write_text(CONFIGURATION)
+    np.save("points.npy", np.ones((4, 4)))
+    shutil.copy("cal.json", "copy.json")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "calibrate rec.h5 --report rec.h5",
+        "calibrate rec.h5 --test cal.json --report cal.json",
+        "calibrate rec.h5 --report sweep.igs.mha",
+        "calibrate rec.h5 --report ./config.xml",
+        "calibrate rec.h5 --export itk:rec.h5",
+        "calibrate rec.h5 --export numpy:rec.h5",
+        "calibrate rec.h5 --export numpy:points.txt",
+        "calibrate rec.h5 --export numpy:points.npy",
+        "calibrate rec.h5 --export slicer:points.txt",
+        "calibrate rec.h5 --export tusrec:rec.csv",
+        "calibrate rec.h5 --export plus:rec.csv",
+        "apply cal.json rec.csv --out rec.csv",
+        "apply cal.json points.txt --out rec.csv",
+        "apply cal.json rec.csv --out rec.h5",
+        "apply cal.json rec.csv --out cal.json",
+        "export cal.json cal.json --plus",
+        "export cal.json ./copy.json --plus",
+        "export cal.json rec.h5 --itk",
+        "export cal.json config.xml --plus",
+        "export cal.json sweep.igs.mha --ros",
+        "export cal.json rec.csv --plus-config config.xml",
+        "export config.xml --plus-config config.xml",
+        "simulate rec.h5",
+        "simulate rec.csv",
+        "segment rec.h5 --out rec.csv",
+        "plan rec.h5 --figure rec.h5",
+        "plan --figure rec.csv",
+    ],
+)
+def test_nothing_of_another_kind_is_replaced(folder, arguments, capsys):
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert main(arguments.split()) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "apply cal.json rec.csv --out out.csv",
+        "apply cal.json rec.h5 --out out.csv",
+        "export cal.json a.xml --plus",
+        "export cal.json a.h5 --itk",
+        "export cal.json a.txt --slicer",
+        "export cal.json a.yaml --ros",
+        "export cal.json a.csv --tusrec",
+        "export cal.json a.npz --numpy",
+        "export cal.json a.npy --numpy",
+        "export cal.json b.xml --plus-config config.xml",
+        "export cal.json --plus-config config.xml",
+    ],
+)
+def test_the_same_command_may_be_run_again(folder, arguments, capsys):
+    assert main(arguments.split()) == main(arguments.split()) == 0
+
+
+def test_a_simulation_replaces_a_simulation(folder, monkeypatch, capsys):
+    known = jaxcal.load("rec.h5")
+    truth = Truth(np.eye(4), np.zeros(3), np.zeros(6))
+    jaxcal.save(replace(known, truth=truth), "simulated.h5")
+    assert main(["simulate", "simulated.h5", "--images", "8"]) == 0
+    assert len(jaxcal.load("simulated.h5").calibration) == 8
+
+
+def test_saved_from_python(folder):
+    transform = random_transform()
+    for name in ("rec.csv", "rec.h5", "notes.json", "points.npy", "points.txt", "config.xml"):
+        before = (folder / name).read_bytes()
+        with pytest.raises(InputError, match="exists and is not a calibration"):
+            transform.save(name)
+        assert (folder / name).read_bytes() == before
+    transform.save("copy.json")
+
+
+def test_links_and_what_is_no_file(folder, tmp_path):
+    (tmp_path / "link").hardlink_to(tmp_path / "points.txt")
+    with pytest.raises(InputError, match="is read by this command"):
+        check_output("link", "a table", begins_with(b"u,v"), ["points.txt"])
+    check_output("link", "a table", begins_with(b"u,v"), ["rec.h5", "nowhere"])
+    write_text("empty", "")
+    for name in ("empty", "/dev/null", "nowhere/at/all", "nul\0byte"):
+        check_output(name, "a table", begins_with(b"u,v"))
+
+
+@pytest.mark.parametrize(
+    ("format", "name"),
+    [("--ros", "a.tfm"), ("--plus", "b.foo"), ("--numpy", "c.csv"), ("--tusrec", "d")],
+)
+def test_a_name_says_the_format(folder, format, name, capsys):
+    assert main(["export", "cal.json", name, format]) == 2
+    assert "is named ." in capsys.readouterr().err
+    assert not (folder / name).exists()
+
+
+@pytest.mark.parametrize("name", ["scene.mrml", "config.xml.orig", "cal"])
+def test_an_extension_without_a_format(folder, name, capsys):
+    (folder / name).write_text("<x/>")
+    assert main(["export", name, "--plus"]) == 2
+    assert f"{name}: its extension tells no format (there are .json," in capsys.readouterr().err
+    shutil.copy("cal.json", name)  # the JSON is understood without one
+    assert main(["export", name, "--plus"]) == 0
+
+
+def test_images_and_lines_keep_their_numbers(folder, capsys):
+    assert main(["apply", "cal.json", "rec.h5"]) == 0
+    rows = [line.split(",")[-1] for line in capsys.readouterr().out.splitlines()]
+    assert rows == ["image", "0", "1", "3", "4", "5"]
+    (folder / "gaps.csv").write_text("u,v,status\n1,2,OK\n3,4,MISSING\n5,6,OK\n")
+    assert main(["apply", "cal.json", "gaps.csv"]) == 2
+    assert "--skip-invalid" in capsys.readouterr().err
+    assert main(["apply", "cal.json", "gaps.csv", "--skip-invalid"]) == 0
+    rows = [line.split(",")[-1] for line in capsys.readouterr().out.splitlines()]
+    assert rows == ["line", "2", "4"]
+
+
+@pytest.mark.parametrize("pixel", ["nan", "inf", "1e300"])
+def test_points_that_are_none(folder, pixel, capfd):
+    assert main(["apply", "cal.json", "--pixel", pixel, "3"]) == 2
+    err = capfd.readouterr().err
+    assert "pixels must be numbers up to 1e+09" in err
+    assert err.count("\n") == 1
+    assert main(["apply", "cal.json", "--pixel", "1", "3", "--pixel-sd", "1e300"]) == 2
+    assert "pixel_sd_px must be from 0" in capfd.readouterr().err
