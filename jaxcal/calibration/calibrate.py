@@ -144,8 +144,8 @@ def calibrate(
     left = int(np.count_nonzero(np.asarray(joined.mask) > 0))
     if left < MINIMUM_IMAGES:
         raise InputError(
-            f"{found.words or 'too few images'}: {left} images are left, and at least "
-            f"{MINIMUM_IMAGES} are needed"
+            f"{found.words or 'too few images'}; at least {MINIMUM_IMAGES} that are independent "
+            "are needed: hold the probe still at different poses"
         )
     result = _solve_alone(joined, given, plan).with_problem(joined)
     result = replace(result, notes=() if found.words is None else (found.words,))

@@ -104,7 +104,8 @@ class Independent:
             worth = self.frames / self.images
             return (
                 f"{self.frames} frames of a moving probe, whose errors stay alike for about "
-                f"{worth:.0f} frames: they count as {self.images} images"
+                f"{worth:.0f} frames (is there a lag between images and poses?): they count as "
+                f"{self.images} image{'s' * (self.images != 1)}"
             )
         return (
             f"{self.frames} frames, {self.poses} different poses: the frames of each pose (within "

@@ -3,6 +3,7 @@
     image_errors     every image's errors and their derivatives; the rest is computed from these
     uncertainty      offsets' SDs, weakest direction, what is known from the prior alone
     residual_checks  images that stand out, the fit of the noise model, which poses to add
+    unmodelled       errors that the model leaves out and that the residuals show
     summary          all of these for a calibration or a batch
     messages         the same in words
     intervals        confidence intervals and target registration error

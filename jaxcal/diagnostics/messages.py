@@ -236,6 +236,12 @@ def misfits(result: Calibration) -> list[str]:
                 f"the {name} have heavier tails than the noise model's (kurtosis "
                 f"{kurtosis[k]:.1f}, Gaussian 3)"
             )
+        # Offsets may have edges of their own.
+        if k < 2 and tails < -MISFIT_SCORE:
+            found.append(
+                f"the {name} come in two groups (kurtosis {kurtosis[k]:.1f}, Gaussian 3): two "
+                "targets, or a second echo?"
+            )
         if abs(skewness) > MISFIT_SCORE:
             found.append(f"the {name} lean to one side")
         if depth > MISFIT_SCORE:

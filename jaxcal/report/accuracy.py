@@ -46,7 +46,8 @@ from jaxcal.diagnostics.intervals import (
     tre_at,
     tre_over,
 )
-from jaxcal.diagnostics.messages import DRIFT_SCORE
+from jaxcal.diagnostics.messages import DRIFT_SCORE, MISFIT_SCORE
+from jaxcal.diagnostics.unmodelled import unmodelled
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.trees import map_arrays
 from jaxcal.solvers.closed_form.single import calibrate_closed_form
@@ -64,6 +65,9 @@ share of the error, and by more than so many times the expected move."""
 TEST_TIMES = 3.0
 """Test images contradict the stated error if they scatter by more than so many times what the
 calibration's own errors and uncertainty explain."""
+FEWEST_LEFT_OUT, AGREEING_TIMES = 6, 2.0
+"""So many images that were left out agree among themselves if they scatter by at most so many times
+as much as those in use."""
 SCATTER_TIMES = 1.3
 """Resampled calibrations may scatter by up to so many times the stated error."""
 
@@ -103,6 +107,8 @@ def accuracy_record(
     ratio, chance = excess(found, weight)
     tre["residuals_over_stated"] = math.sqrt(ratio) if ratio > 0 else None
     tre["chance"] = chance
+    tre["unmodelled"] = _unmodelled(answer, weight)
+    tre["left_out"] = _left_out(answer, recording, grid)
     return {
         "tre": tre,
         "limits": _limits(answer, found, weight),
@@ -224,6 +230,48 @@ def _limits(
     }
 
 
+def _unmodelled(answer: Calibration, weight: Float[np.ndarray, "p p"]) -> dict[str, Any] | None:
+    """The clearest error that the model leaves out, and how far it moves the image."""
+    found = unmodelled(answer)
+    if not found:
+        return None
+    # One imitates another: only the clearest is told.
+    first = found[0]
+    return {
+        "kind": first.kind,
+        "values": first.values,
+        "statistic": first.statistic,
+        "moved_mm": math.sqrt(max(float(first.step @ weight @ first.step), 0.0)),
+    }
+
+
+def _left_out(
+    answer: Calibration, recording: Recording, grid: Float[np.ndarray, "m 2"]
+) -> dict[str, Any] | None:
+    """Images that were left out and agree among themselves on another calibration."""
+    images, kept = recording.calibration, np.asarray(answer.mask) > 0
+    left = images.mask & ~kept
+    if not answer.robust or left.sum() < FEWEST_LEFT_OUT or images.kind == "time_of_flight":
+        return None
+    estimate = ("scale",) if "scale" in answer.blocks else ()
+    try:
+        own, other = (
+            calibrate_closed_form(replace(images, mask=mask), estimate=estimate)
+            for mask in (kept, left)
+        )
+    except InputError:
+        return None
+    if not other.rms_mm <= AGREEING_TIMES * own.rms_mm:
+        return None
+    places = np.stack([grid[:, 0], 0 * grid[:, 0], grid[:, 1], np.ones(len(grid))])
+    apart = ((np.asarray(own.image_to_probe) - np.asarray(other.image_to_probe)) @ places)[:3]
+    return {
+        "images": int(left.sum()),
+        "rms_mm": float(other.rms_mm),
+        "apart_mm": math.sqrt(float(np.mean(np.sum(apart**2, axis=0)))),
+    }
+
+
 def _comparison(
     answer: Calibration, recording: Recording, found: Influence, grid: Float[np.ndarray, "m 2"]
 ) -> dict[str, Any] | None:
@@ -297,7 +345,8 @@ def settle(record: dict[str, Any]) -> None:
     if tre is None or tre["stated_mm"] is None:
         return
     told = [*_from_residuals(record), *_from_images(record), *_from_resampling(record)]
-    told += [*_from_test_images(record), *_from_slow_changes(record)]
+    told += [*_from_test_images(record), *_from_slow_changes(record), *_from_unmodelled(record)]
+    told += [*_from_groups(record), *_from_left_out(record)]
     factor = max([1.0, *(times for times, _ in told)])
     tre["factor"] = factor
     tre["contradictions"] = [words for _, words in told]
@@ -375,6 +424,58 @@ def _from_slow_changes(record: dict[str, Any]) -> list[tuple[float, str]]:
         if slow > stated:
             found.append((math.hypot(1.0, slow / stated), words))
     return found
+
+
+def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """An error that the model leaves out, and that the residuals show."""
+    found, stated = record["tre"]["unmodelled"], record["tre"]["stated_mm"]
+    if found is None or not stated:
+        return []
+    values, moved = found["values"], found["moved_mm"]
+    words = {
+        "scale": lambda: (
+            f"lateral positions that differ by {100 * values[0]:+.1f} % and ranges by "
+            f"{100 * values[1]:+.1f} % would explain the errors far better: check pixel size, "
+            "sound speed and the tracker's unit, or estimate the scale"
+        ),
+        "slip": lambda: (
+            f"an image that moves by {2 * moved:.1f} mm on the probe from the first image to the "
+            "last would explain the errors far better: a slipping mount, or a moving target?"
+        ),
+        "skew": lambda: (
+            f"lateral positions that are off by {100 * values[0]:+.1f} % of the depth would "
+            "explain the errors far better: a steered beam, or clicks beside the target?"
+        ),
+        "beside": lambda: (
+            f"a target {values[0]:.1f} mm beside the image plane in all images would explain the "
+            "errors far better: take images from both sides of it"
+        ),
+    }
+    return [(math.hypot(1.0, moved / stated), words[found["kind"]]())]
+
+
+def _from_groups(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Errors within the image that come in two groups."""
+    stated, scores = record["tre"]["stated_mm"], record["noise_model"]["scores"]["tails"]
+    found: list[tuple[float, str]] = []
+    for k, (kind, name) in enumerate(_WAYS.items()):
+        size = record[f"sigma_{kind}_mm"]
+        if stated and size and scores[k] is not None and scores[k] < -MISFIT_SCORE:
+            words = f"the points lie in two groups, about {2 * size:.1f} mm apart {name}"
+            found.append((math.hypot(1.0, size / stated), words))
+    return found
+
+
+def _from_left_out(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Images left out that agree among themselves as well as those in use do."""
+    found, stated = record["tre"]["left_out"], record["tre"]["stated_mm"]
+    if found is None or not stated or found["apart_mm"] <= stated:
+        return []
+    words = (
+        f"the {found['images']} images left out agree among themselves as well, on a calibration "
+        f"{found['apart_mm']:.1f} mm away: which of the two is right?"
+    )
+    return [(math.hypot(1.0, found["apart_mm"] / stated), words)]
 
 
 def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:

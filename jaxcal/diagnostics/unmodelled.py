@@ -1,0 +1,161 @@
+"""Would an error that the model leaves out explain the residuals better?
+
+Four are looked for, each with a few parameters theta, linearised at the answer:
+
+    scale   the pixels' sizes or the sound speed: x and r are off by a share of themselves
+    slip    X moves steadily in the course of the recording (all six parameters)
+    skew    the lateral position is off by a share of the depth: a steered beam, clicks beside it
+    beside  the target lies beside the image plane by m in all images, so ranges are too long by
+            m^2 / (2 r), which hardly any other error imitates; theta = m^2
+
+With e the whitened errors, J their derivatives by the unknowns and K those by theta, the fit of
+e + J d + K theta, q parameters in all, gives the likelihood ratio LR. The SDs of the three kinds of
+errors are tuned again, as they were for the answer: 2 ln LR is the sum over the kinds of
+(n - q / 3) ln(before / after). By Wilks it is chi squared if theta is zero. It must exceed what
+chance exceeds once in a thousand recordings.
+
+Reference: Wilks 1938.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.uncertainty import TUNED, Whitened
+from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.trees import map_arrays
+
+if TYPE_CHECKING:
+    from jaxcal.calibration.result import Calibration
+    from jaxcal.model.unknowns import Blocks
+
+Array = np.ndarray
+
+CHANCE = {1: 10.8, 2: 13.8, 6: 22.5}
+"""Chi squared that chance exceeds once in a thousand times, by its degrees of freedom."""
+
+FEWEST = 12
+"""With fewer images in use nothing is looked for."""
+
+_FREEDOM = {"scale": 2, "slip": 6, "skew": 1, "beside": 1}
+_ROUNDS = 8
+"""Rounds of tuning the SDs with the further parameters."""
+_X = 6
+"""Parameters of X, the first of the unknowns."""
+
+
+@dataclass(frozen=True)
+class Unmodelled:
+    """An error that the model leaves out, and that the residuals show.
+
+    Attributes:
+        kind: ``scale``, ``slip``, ``skew`` or ``beside``.
+        values: its parameters: shares of the lateral position and the range; motion of X from the
+            first image to the last (mm, rad); share of the depth; the distance m in mm.
+        statistic: 2 ln LR.
+        step: by how much the unknowns are off because of it.
+    """
+
+    kind: str
+    values: Float[Array, " k"]
+    statistic: float
+    step: Float[Array, " p"]
+
+
+def unmodelled(calibration: Calibration) -> list[Unmodelled]:
+    """What the residuals of one calibration show, the clearest first.
+
+    Only the joint method's fits of points with SDs are looked at.
+
+    Args:
+        calibration: of one problem, with concrete values.
+    """
+    used = np.asarray(calibration.mask) > 0
+    fits = calibration.method == "joint" and calibration.prior in TUNED
+    if calibration.problem is None or not fits or calibration.data != "points":
+        return []
+    if used.sum() < FEWEST:
+        return []
+    answer = map_arrays(lambda leaf: np.asarray(leaf)[None], calibration.numpy())
+    problem = answer.problem
+    assert problem is not None
+    unknowns = Unknowns.of(answer)
+    seen = ImageErrors.of(unknowns, problem, answer.blocks).shifted(answer, unknowns, problem)
+    if answer.offset_law is not None:
+        mean = float(np.asarray(answer.offset_law.mean)[0])
+        centred = seen.errors - mean * seen.mask[..., None] * [0.0, 0.0, 1.0]
+        seen = replace(seen, errors=centred)
+    face = float(np.asarray(problem.face_offset)[0])
+    found = []
+    with np.errstate(all="ignore"):
+        for kind, columns in _columns(seen, used, face, answer.blocks).items():
+            rows = np.concatenate([seen.rows, columns[None]], axis=-1)
+            whitened = Whitened.of(answer, replace(seen, rows=rows), problem)
+            each = _fit(kind, whitened.errors[0][used], whitened.rows[0][used])
+            if each is not None:
+                found.append(each)
+    return sorted(found, key=lambda each: -each.statistic / CHANCE[_FREEDOM[each.kind]])
+
+
+def _columns(
+    seen: ImageErrors, used: Bool[Array, " n"], face: float, blocks: Blocks
+) -> dict[str, Float[Array, "n 3 k"]]:
+    """Derivatives of every image's three errors (prediction less measurement) by theta."""
+    lateral, distance = seen.lateral[0], seen.distance[0]
+    zero = np.zeros_like(lateral)
+    order = (np.cumsum(used) - 1) / (used.sum() - 1) - 0.5
+    found = {
+        "slip": order[:, None, None] * seen.rows[0][..., :_X],
+        "skew": np.stack([-distance, zero, zero], axis=-1)[..., None],
+        "beside": np.stack([zero, 0.5 / distance, zero], axis=-1)[..., None],
+    }
+    if not {"scale", "sound-speed"} & set(blocks):
+        along = (
+            np.stack([-lateral, zero, zero], axis=-1),
+            np.stack([zero, face - distance, zero], -1),
+        )
+        found["scale"] = np.stack(along, axis=-1)
+    return {kind: np.where(used[:, None, None], value, 0.0) for kind, value in found.items()}
+
+
+def _fit(kind: str, errors: Float[Array, "m 3"], rows: Float[Array, "m 3 q"]) -> Unmodelled | None:
+    """The further parameters, the last of the columns, if the residuals show them."""
+    unknowns = rows.shape[-1] - _FREEDOM[kind]
+    before, _ = _tuned(errors, rows[..., :unknowns])
+    after, step = _tuned(errors, rows)
+    freedom = len(errors) - rows.shape[-1] / 3
+    statistic = freedom * float(np.sum(np.log(before / after)))
+    if not statistic > CHANCE[_FREEDOM[kind]]:
+        return None
+    values, step = step[unknowns:], step[:unknowns].copy()
+    if kind == "beside":
+        if not values[0] > 0:
+            return None
+        values = np.sqrt(values)
+        # X lies this far beside the plane as well.
+        step[1] += values[0]
+    if kind == "slip":
+        # At the end of the recording.
+        step[:_X] += 0.5 * values
+    return Unmodelled(kind, values, statistic, step)
+
+
+def _tuned(
+    errors: Float[Array, "m 3"], rows: Float[Array, "m 3 q"]
+) -> tuple[Float[Array, " 3"], Float[Array, " q"]]:
+    """Mean squared errors of each kind after the fit with tuned SDs, and the step."""
+    scale = 1 / np.sqrt(np.maximum(np.sum(rows**2, axis=(0, 1)), 1e-300))
+    variance = np.ones(3)
+    step = np.zeros(rows.shape[-1])
+    left = errors
+    for _ in range(_ROUNDS):
+        weight = 1 / np.sqrt(variance)[:, None]
+        design = (rows * scale * weight).reshape(-1, rows.shape[-1])
+        step = -scale * np.linalg.lstsq(design, (errors * weight[:, 0]).ravel(), rcond=1e-12)[0]
+        left = errors + rows @ step
+        variance = np.maximum(np.mean(left**2, axis=0), 1e-12)
+    return variance, step

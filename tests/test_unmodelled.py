@@ -1,0 +1,134 @@
+"""Errors that the model leaves out: found where they are, with their size, and hardly elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import experiment
+from scipy.spatial.transform import Rotation
+
+import jaxcal
+from jaxcal.data.poses import targets_in_images
+from jaxcal.data.recording import Recording, make_images
+from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.unmodelled import unmodelled
+from jaxcal.report.record import calibration_record
+
+IMAGES = 30
+
+
+def clean(seed: int, images: int = IMAGES) -> Recording:
+    found = experiment(seed, images=images, elevation_mm=1.0, noise_mm=1.0)
+    return replace(found, test=None)
+
+
+def with_points(recording: Recording, points: np.ndarray) -> Recording:
+    images = recording.calibration
+    return replace(recording, calibration=make_images(images.poses, points))
+
+
+def wrong_scale(recording: Recording) -> Recording:
+    return with_points(recording, recording.calibration.measurements * [1.0, 1.04])
+
+
+def skewed(recording: Recording) -> Recording:
+    points = recording.calibration.measurements.copy()
+    points[:, 0] += 0.05 * points[:, 1]
+    return with_points(recording, points)
+
+
+def beside(recording: Recording) -> Recording:
+    """The poses are shifted so that every target lies 8 mm farther from the plane."""
+    images, truth = recording.calibration, recording.truth
+    points, poses = images.measurements.copy(), images.poses.copy()
+    x, point = truth.image_to_probe, truth.point
+    offsets = targets_in_images(poses, x, point)[:, 1]
+    poses[:, :3, 3] -= 8.0 * (poses[:, :3, :3] @ x[:3, 1])
+    points[:, 1] = np.sqrt(points[:, 1] ** 2 - offsets**2 + (offsets + 8.0) ** 2)
+    return replace(recording, calibration=make_images(poses, points))
+
+
+def slipped(recording: Recording) -> Recording:
+    """The probe moves by 3 mm and 3 degrees beneath its marker."""
+    images, x = recording.calibration, recording.truth.image_to_probe
+    poses = images.poses.copy()
+    for row, part in enumerate(np.linspace(0.0, 1.0, len(images))):
+        slip = np.eye(4)
+        slip[:3, :3] = Rotation.from_rotvec(np.radians(3.0) * part * np.eye(3)[1]).as_matrix()
+        slip[:3, 3] = [3.0 * part, 0.0, 0.0]
+        poses[row] = poses[row] @ x @ np.linalg.inv(slip) @ np.linalg.inv(x)
+    return replace(recording, calibration=make_images(poses, images.measurements))
+
+
+FAULTS = {"scale": wrong_scale, "skew": skewed, "beside": beside, "slip": slipped}
+WORDS = {
+    "scale": "check pixel size",
+    "skew": "of the depth",
+    "beside": "beside the image plane in all images",
+    "slip": "from the first image to the last",
+}
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_what_the_model_leaves_out_is_found_and_lowers_the_verdict(kind):
+    found, values = 0, []
+    for seed in range(4):
+        recording = FAULTS[kind](clean(seed))
+        result = jaxcal.calibrate(recording)
+        tre = calibration_record(result, recording)["tre"]
+        if tre["unmodelled"] is not None and tre["unmodelled"]["kind"] == kind:
+            found += 1
+            values.append(tre["unmodelled"]["values"])
+            assert any(WORDS[kind] in words for words in tre["contradictions"])
+            assert tre["rms_mm"] > 1.2 * tre["stated_mm"]
+    assert found >= 3
+    middle = np.median(values, axis=0)
+    if kind == "scale":
+        np.testing.assert_allclose(middle, [0.0, -0.04], atol=0.012)
+    if kind == "skew":
+        np.testing.assert_allclose(middle, [-0.05], atol=0.015)
+    if kind == "beside":
+        np.testing.assert_allclose(middle, [8.0], atol=2.0)
+
+
+@pytest.mark.parametrize("images", [12, 30])
+def test_hardly_anything_is_found_in_clean_recordings(images):
+    """Of 3 or 4 tests that chance passes once in a thousand times each."""
+    problems = jaxcal.stack(
+        [jaxcal.Problem.from_recording(clean(seed, images)) for seed in range(100, 160)]
+    )
+    results = jaxcal.calibrate_batch(problems).numpy()
+    assert sum(bool(unmodelled(results[k])) for k in range(60)) <= 2
+
+
+def test_a_second_echo_in_forty_per_cent_of_the_images_is_told_of():
+    recording = clean(1, 40)
+    points = recording.calibration.measurements.copy()
+    points[np.random.default_rng(0).permutation(40)[:16], 1] += 8.0
+    for robust in (False, True):
+        spoilt = with_points(recording, points)
+        result = jaxcal.calibrate(spoilt, robust=robust)
+        record = calibration_record(result, spoilt)
+        assert record["verdict"] == "uncertain"
+        assert any("two groups" in words for words in record["tre"]["contradictions"])
+        assert any("come in two groups" in words for words in messages.misfits(result))
+
+
+def test_images_left_out_that_agree_among_themselves_are_told_of():
+    recording = clean(2, 40)
+    points = recording.calibration.measurements.copy()
+    points[::2, 0] *= -1
+    spoilt = with_points(recording, points)
+    result = jaxcal.calibrate(spoilt, robust=True)
+    record = calibration_record(result, spoilt)
+    left = record["tre"]["left_out"]
+    assert left["images"] >= 15
+    assert left["apart_mm"] > 5.0
+    assert record["verdict"] == "uncertain"
+    assert any("agree among themselves" in words for words in record["tre"]["contradictions"])
+    points = recording.calibration.measurements.copy()
+    points[::4] += np.random.default_rng(0).uniform(-9, 9, (10, 2))
+    wild = with_points(recording, points)
+    assert calibration_record(jaxcal.calibrate(wild, robust=True), wild)["tre"]["left_out"] is None
