@@ -31,6 +31,14 @@ from jaxcal.solvers.levenberg_marquardt import minimise
 SIGMA = np.array([0.4, 0.3, 1.0])
 
 
+@pytest.mark.parametrize("count", [20.0, 60.0, 300.0])
+def test_two_groups_have_light_tails_and_not_heavy_ones(count):
+    """Beyond the range of the transformation its sign would turn."""
+    scores = kurtosis_score(np.array([1.0, 1.2, 2.9, 6.0]), np.full(4, count))
+    assert (scores[:2] < -4).all()
+    assert scores[3] > 2 > scores[2]
+
+
 @pytest.mark.parametrize("count", [20, 54, 300])
 def test_scores_are_those_of_scipy(count):
     values = np.random.default_rng(count).standard_t(5, (4, count))
