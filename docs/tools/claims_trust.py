@@ -184,6 +184,38 @@ claim(
 )
 
 
+# Errors that the model leaves out.
+FAULTS = ("scale", "skew", "beside", "slip", "second echo")
+
+
+def _left_out(of: str, *images: str) -> tuple[float, float]:
+    return span(percent(column("unmodelled", of, fault=FAULTS, images=images)))
+
+
+claim(
+    ACCURACY,
+    "clean recordings {:.1f} to {:.1f} % are told that an error is left out.",
+    lambda: span(percent(column("unmodelled", "told_of", fault="none"))),
+)
+claim(
+    ACCURACY,
+    "The fault is named in {:.1f} to {:.1f} % of the recordings with 30 and 60 images, in {:.1f} "
+    "to {:.1f} % of those with 12.",
+    lambda: (*_left_out("right", "30", "60"), *_left_out("right", "12")),
+)
+claim(
+    ACCURACY,
+    "end of its 95 % interval in {:.1f} to {:.1f} % with 30 and 60 images (by the covariance "
+    "alone: {:.1f} to {:.1f} %), in {:.1f} to {:.1f} % with 12 ({:.1f} to {:.1f} %).",
+    lambda: (
+        *_left_out("good_and_wrong", "30", "60"),
+        *_left_out("stated_good_and_wrong", "30", "60"),
+        *_left_out("good_and_wrong", "12"),
+        *_left_out("stated_good_and_wrong", "12"),
+    ),
+)
+
+
 # The bench.
 def _bench(poses: str, *columns: str) -> list[float]:
     return [only("pose_design_benches", name, poses=poses) for name in columns]
