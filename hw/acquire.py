@@ -36,7 +36,7 @@ from hw.planner import Planner
 from hw.pool import allowed_by, plan_pool
 from hw.poses import PosePlan, plan_poses
 from hw.recorder import Recorder
-from hw.recording_check import Progress, read_progress
+from hw.recording_check import Progress, is_complete, read_progress
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import RecordingHeader
 from hw.resuming import compare, described
@@ -289,6 +289,8 @@ def acquire(
             recorder.add_event("stopped", reason, setup.clock.now())
             if job.progress is not None and job.progress.ended:
                 # It was complete before this run, and stays so.
+                if oracle is not None:
+                    _write_truth(recorder, oracle)
                 _finish(recorder, job.images - estimator.count)
     if recorder.error is not None and not interrupted:
         # The recorder's failure is the cause of what went wrong.
@@ -336,8 +338,9 @@ def _prepare(
 ) -> _Job:
     if request is not None:
         return _Job(setup, request, planned(setup, request).poses, None)
-    # Cut the file back to whole rows first, so that only these are read.
-    RecordingWriter.resume(path).close()
+    if not is_complete(path):
+        # Cut the file back to whole rows first, so that only these are read.
+        RecordingWriter.resume(path).close()
     progress = read_progress(path)
     asked = progress.settings.get("request")
     try:
@@ -525,7 +528,8 @@ def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
         raise RefusedError("the controller does not tell its speed slider", device="robot")
     limits = job.setup.motion_limits(controller_arm(identity.model, identity.version))
     joints = session.poses.latest().joints
-    to_go = job.targets[job.missing]
+    # Where every image was taken, only the end of the file is missing: any plan will do.
+    to_go = job.targets[job.missing or slice(None)]
     return MotionPlan(to_go, limits, offset, identity.name, joints, pendant)
 
 

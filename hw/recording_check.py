@@ -82,6 +82,17 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
         raise FormatError(f"{path}: {error}") from None
 
 
+def is_complete(path: str | os.PathLike[str]) -> bool:
+    """Whether a recording that can be resumed (:func:`check_resumable`) came to its end before.
+
+    Raises:
+        FormatError: it cannot be resumed.
+    """
+    check_resumable(path)
+    with open_root(path, length=stored_length(path)) as root:
+        return flag(root, "complete") is True
+
+
 def _lacks_images(root: Node) -> bool:
     """Whether poses of the plan were skipped or given up when the run came to its end."""
     plan = group(root, "plan")

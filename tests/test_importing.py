@@ -647,3 +647,22 @@ def test_import_calibrate_export(tmp_path, capsys):
     applied = found.apply(pixels)
     sd = np.sqrt(np.trace(applied.covariance[0]))
     assert np.linalg.norm(applied.points - truth.apply(pixels).points) < 4 * sd < 4
+
+
+def test_only_recordings_are_replaced(tmp_path, capsys):
+    """Another program's HDF5 file is not, and nor is a file that is read beside the sources."""
+    import h5py
+
+    table = tmp_path / "table.csv"
+    pose = "1,0,0,0,0,1,0,0,0,0,1,0"
+    head = ",".join(f"m{i}{j}" for i in range(3) for j in range(4))
+    table.write_text(f"{head},u,v\n" + "".join(f"{pose},{k},{k + 1}\n" for k in range(4)))
+    other = tmp_path / "other.h5"
+    with h5py.File(other, "w") as file:
+        file["TransformGroup"] = [1.0]
+    before = other.read_bytes()
+    assert main(["import", str(table), str(other)]) == 2
+    assert "is not a recording" in capsys.readouterr().err
+    assert other.read_bytes() == before
+    assert main(["import", str(table), str(tmp_path / "own.h5")]) == 0
+    assert main(["import", str(table), str(tmp_path / "own.h5")]) == 0

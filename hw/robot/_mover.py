@@ -509,7 +509,9 @@ class Mover:
                 self._brake()
             except _Ended as ended:
                 text = f"{told.error.args[0]}; {ended.cause.args[0]}"
-                raise _Ended(type(ended.cause)(text, device="robot")) from None
+                # A real stop stays one, whatever comes after it.
+                kind = StoppedError if isinstance(told.error, StoppedError) else type(ended.cause)
+                raise _Ended(kind(text, device="robot")) from None
         assert told is not None
         if told.for_good:
             if self._usable():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import click
@@ -11,6 +9,7 @@ import click
 from jaxcal import InputError
 from jaxcal.cli.common import ExitCode, progress
 from jaxcal.cli.sequence_options import search_options, tracking_options
+from jaxcal.io.outputs import check_output, is_recording
 
 
 @click.command("import")
@@ -79,28 +78,9 @@ def _check(sources: tuple[str, ...], out: str, options: dict[str, Any]) -> None:
         )
     if options["spacing_mm"] is not None and options["units"] == "mm":
         raise click.BadParameter("points in mm have no pixel size", param_hint="--spacing")
-    check_out(sources, out)
-
-
-def check_out(sources: Sequence[str], out: str) -> None:
-    """See that nothing but a recording is replaced: whoever forgets OUT.h5 names a source last.
-
-    Raises:
-        InputError: something else is there, or it is one of the sources.
-    """
+    read = [*sources, options["poses"], options["spacing_from"]]
     try:
-        with Path(out).open("rb") as existing:
-            start = existing.read(8)
-    except (OSError, ValueError):
-        return
-    if start and start != b"\x89HDF\r\n\x1a\n":
-        raise InputError(f"{out}: exists and is not a recording; name the output file last")
-    if any(_same(source, out) for source in sources):
-        raise InputError(f"{out}: is one of the sources; name the output file last")
-
-
-def _same(first: str, second: str) -> bool:
-    try:
-        return Path(first).samefile(second)
-    except OSError:
-        return False
+        check_output(out, "a recording", is_recording, [each for each in read if each is not None])
+    except InputError as error:
+        # Whoever forgets OUT.h5 names a source last.
+        raise InputError(f"{error} (name the output file last)") from None

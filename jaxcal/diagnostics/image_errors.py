@@ -13,7 +13,7 @@ and the offset q_y.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -135,6 +135,13 @@ class ImageErrors:
             return self
         shift = np.where(answer.mask > 0, answer.elevation - self.q[..., 1], 0.0)
         return ImageErrors.of(unknowns, problem, answer.blocks, shift)
+
+    def centred(self, answer: Calibration) -> ImageErrors:
+        """These errors of one calibration, the offsets about the mean that it found for them."""
+        if answer.offset_law is None:
+            return self
+        mean = float(np.asarray(answer.offset_law.mean)[0])
+        return replace(self, errors=self.errors - mean * self.mask[..., None] * [0.0, 0.0, 1.0])
 
     def lever(self, mask: Float[Array, "k n"]) -> Float[Array, " k"]:
         """Root mean square distance of the measured points from the image origin, mm."""

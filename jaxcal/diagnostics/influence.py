@@ -23,7 +23,7 @@ References: Cook 1977 (leaving out); MacKinnon and White 1985 (the residuals' co
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -192,12 +192,9 @@ def _whitened(answer: Calibration, problem: Problem | None) -> _Errors:
 def _on_points(
     answer: Calibration, seen: ImageErrors, unknowns: Unknowns, problem: Problem, used: Array
 ) -> _Errors:
-    tau, mean = answer.linearisation.tracker_sd, 0.0
-    seen = seen.shifted(answer, unknowns, problem)
-    if answer.offset_law is not None:
-        mean = float(np.asarray(answer.offset_law.mean)[0])
-    centred = seen.errors - mean * seen.mask[..., None] * [0.0, 0.0, 1.0]
-    whitened = Whitened.of(answer, replace(seen, errors=centred), problem)
+    tau = answer.linearisation.tracker_sd
+    seen = seen.shifted(answer, unknowns, problem).centred(answer)
+    whitened = Whitened.of(answer, seen, problem)
     errors, rows = whitened.errors[0][used], whitened.rows[0][used]
     log_sd, shape = np.zeros(len(rows)), own_covariance(answer, problem)
     if shape is not None:

@@ -2,17 +2,19 @@
 
 Four are looked for, each with a few parameters theta, linearised at the answer:
 
-    scale   the pixels' sizes or the sound speed: x and r are off by a share of themselves
-    slip    X moves steadily in the course of the recording (all six parameters)
-    skew    the lateral position is off by a share of the depth: a steered beam, clicks beside it
+    scale   the pixels' sizes or the sound speed: x and r are too long by a share of themselves
+    slip    X moves within the image plane, steadily in the course of the recording (elevational
+            offsets may drift for other reasons, and do not count)
+    skew    the lateral position is too large by a share of the depth: a steered beam, or clicks
+            beside the target
     beside  the target lies beside the image plane by m in all images, so ranges are too long by
             m^2 / (2 r), which hardly any other error imitates; theta = m^2
 
 With e the whitened errors, J their derivatives by the unknowns and K those by theta, the fit of
-e + J d + K theta, q parameters in all, gives the likelihood ratio LR. The SDs of the three kinds of
-errors are tuned again, as they were for the answer: 2 ln LR is the sum over the kinds of
-(n - q / 3) ln(before / after). By Wilks it is chi squared if theta is zero. It must exceed what
-chance exceeds once in a thousand recordings.
+e + J d + K theta gives the likelihood ratio LR. The SDs of the three kinds of errors are tuned
+again, as they were for the answer: 2 ln LR is the sum over the kinds of f ln(before / after), with
+f the kind's degrees of freedom after the fit. By Wilks it is chi squared if theta is zero. It must
+exceed what chance exceeds once in a thousand recordings.
 
 Reference: Wilks 1938.
 """
@@ -35,17 +37,17 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-CHANCE = {1: 10.8, 2: 13.8, 6: 22.5}
+CHANCE = {1: 10.8, 2: 13.8, 3: 16.3}
 """Chi squared that chance exceeds once in a thousand times, by its degrees of freedom."""
 
 FEWEST = 12
 """With fewer images in use nothing is looked for."""
 
-_FREEDOM = {"scale": 2, "slip": 6, "skew": 1, "beside": 1}
+_FREEDOM = {"scale": 2, "slip": 3, "skew": 1, "beside": 1}
 _ROUNDS = 8
 """Rounds of tuning the SDs with the further parameters."""
-_X = 6
-"""Parameters of X, the first of the unknowns."""
+_WITHIN = (0, 2, 4)
+"""Parameters of X that move the image within its plane: laterally, axially, and about y."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +56,11 @@ class Unmodelled:
 
     Attributes:
         kind: ``scale``, ``slip``, ``skew`` or ``beside``.
-        values: its parameters: shares of the lateral position and the range; motion of X from the
-            first image to the last (mm, rad); share of the depth; the distance m in mm.
+        values: its parameters: by which shares lateral positions and ranges are too long; motion of
+            X from the first image to the last (lateral and axial, mm; about y, rad); by which share
+            of the depth lateral positions are too large; the distance m in mm.
         statistic: 2 ln LR.
-        step: by how much the unknowns are off because of it.
+        step: by how much the unknowns would change if it were corrected.
     """
 
     kind: str
@@ -65,11 +68,37 @@ class Unmodelled:
     statistic: float
     step: Float[Array, " p"]
 
+    def moved(
+        self, points: Float[Array, "m 2"], jacobian: Float[Array, "m 3 p"], face_mm: float
+    ) -> tuple[float, float]:
+        """Root mean square motion of image points, mm: if it is corrected, and of a slip.
+
+        Args:
+            points: [lateral, axial], mm.
+            jacobian: their derivatives by the unknowns.
+            face_mm: range of pixel row 0.
+        """
+        by = jacobian @ self.step
+        if self.kind == "scale":
+            by[:, 0] -= self.values[0] * points[:, 0]
+            by[:, 2] -= self.values[1] * (points[:, 1] - face_mm)
+        if self.kind == "skew":
+            by[:, 0] -= self.values[0] * points[:, 1]
+        if self.kind == "beside":
+            by[:, 1] += self.values[0]
+        slip = np.zeros_like(by)
+        if self.kind == "slip":
+            slip = jacobian[..., _WITHIN] @ self.values
+            # At the end of the recording.
+            by = by + 0.5 * slip
+        size = [float(np.sqrt(np.mean(np.sum(each**2, axis=-1)))) for each in (by, slip)]
+        return size[0], size[1]
+
 
 def unmodelled(calibration: Calibration) -> list[Unmodelled]:
     """What the residuals of one calibration show, the clearest first.
 
-    Only the joint method's fits of points with SDs are looked at.
+    Only the joint method's fits of points with SDs and without a tracker's are looked at.
 
     Args:
         calibration: of one problem, with concrete values.
@@ -78,17 +107,13 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
     fits = calibration.method == "joint" and calibration.prior in TUNED
     if calibration.problem is None or not fits or calibration.data != "points":
         return []
-    if used.sum() < FEWEST:
+    if used.sum() < FEWEST or calibration.linearisation.tracker_sd is not None:
         return []
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], calibration.numpy())
     problem = answer.problem
     assert problem is not None
     unknowns = Unknowns.of(answer)
-    seen = ImageErrors.of(unknowns, problem, answer.blocks).shifted(answer, unknowns, problem)
-    if answer.offset_law is not None:
-        mean = float(np.asarray(answer.offset_law.mean)[0])
-        centred = seen.errors - mean * seen.mask[..., None] * [0.0, 0.0, 1.0]
-        seen = replace(seen, errors=centred)
+    seen = ImageErrors.of(unknowns, problem, answer.blocks).centred(answer)
     face = float(np.asarray(problem.face_offset)[0])
     found = []
     with np.errstate(all="ignore"):
@@ -109,7 +134,7 @@ def _columns(
     zero = np.zeros_like(lateral)
     order = (np.cumsum(used) - 1) / (used.sum() - 1) - 0.5
     found = {
-        "slip": order[:, None, None] * seen.rows[0][..., :_X],
+        "slip": order[:, None, None] * seen.rows[0][..., _WITHIN] * [[1.0], [1.0], [0.0]],
         "skew": np.stack([-distance, zero, zero], axis=-1)[..., None],
         "beside": np.stack([zero, 0.5 / distance, zero], axis=-1)[..., None],
     }
@@ -127,20 +152,20 @@ def _fit(kind: str, errors: Float[Array, "m 3"], rows: Float[Array, "m 3 q"]) ->
     unknowns = rows.shape[-1] - _FREEDOM[kind]
     before, _ = _tuned(errors, rows[..., :unknowns])
     after, step = _tuned(errors, rows)
-    freedom = len(errors) - rows.shape[-1] / 3
-    statistic = freedom * float(np.sum(np.log(before / after)))
+    # Every kind gives a third of the unknowns' degrees of freedom, and its part of theta's.
+    touched = np.any(rows[..., unknowns:] != 0, axis=(0, 2))
+    freedom = len(errors) - unknowns / 3 - touched * (_FREEDOM[kind] / touched.sum())
+    statistic = float(np.sum(freedom * np.log(before / after)))
     if not statistic > CHANCE[_FREEDOM[kind]]:
         return None
-    values, step = step[unknowns:], step[:unknowns].copy()
+    values, step = step[unknowns:], step[:unknowns]
     if kind == "beside":
         if not values[0] > 0:
             return None
         values = np.sqrt(values)
-        # X lies this far beside the plane as well.
-        step[1] += values[0]
-    if kind == "slip":
-        # At the end of the recording.
-        step[:_X] += 0.5 * values
+    if kind in ("scale", "skew"):
+        # What has to be added is what is missing.
+        values = -values
     return Unmodelled(kind, values, statistic, step)
 
 

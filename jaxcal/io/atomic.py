@@ -109,9 +109,12 @@ def replace_files(
     target = Path(folder)
     staged = target / STAGED
     known = [*files, *(name for name in names if name not in files)]
-    try:
-        for name in known:
+    for name in known:
+        try:
             _existing_mode(target / name)
+        except (OSError, ValueError) as error:
+            raise _output_error(os.fspath(target / name), error) from error
+    try:
         shutil.rmtree(staged, ignore_errors=True)
         staged.mkdir()
         try:

@@ -70,8 +70,9 @@ def points_of_table(
         raise InputError(f"{table.name}: holds no points (columns u and v, or lateral and range)")
     if assignment == "labels":
         raise InputError(f"{table.name}: holds no labels: --points labels is for points of Slicer")
-    if assignment == "order" and table.frame is not None:
-        raise InputError(f"{table.name}: has a column frame: leave --points order out")
+    named = "frame" if table.frame is not None else "file" if sequence.files and table.file else ""
+    if assignment == "order" and named:
+        raise InputError(f"{table.name}: has a column {named}: leave --points order out")
     with naming(table.name):
         rows = _rows_of_table(table, sequence, assignment)
     notes = [f"{table.name}: {table.skipped} invalid rows left out"] if table.skipped else []

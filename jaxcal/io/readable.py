@@ -48,9 +48,10 @@ def one_line(error: Exception) -> str:
     """An exception's own words on one line."""
     text = str(error)
     if isinstance(error, OSError) and error.strerror:
-        # HDF5's errors carry the system's number too, in a text of several lines.
-        number = error.errno or 0
-        text = os.strerror(number) if number > 0 else error.strerror
+        text = error.strerror
+        if "errno = " in text and error.errno:
+            # HDF5 repeats the system's words among many of its own.
+            text = os.strerror(error.errno)
     elif isinstance(error, KeyError) and error.args:
         text = str(error.args[0])  # a KeyError's str is quoted
     return " ".join(text.split()) or type(error).__name__

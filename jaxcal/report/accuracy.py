@@ -46,11 +46,11 @@ from jaxcal.diagnostics.intervals import (
     tre_at,
     tre_over,
 )
-from jaxcal.diagnostics.messages import DRIFT_SCORE, MISFIT_SCORE
+from jaxcal.diagnostics.messages import DRIFT_SCORE, in_two_groups
 from jaxcal.diagnostics.unmodelled import unmodelled
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.trees import map_arrays
-from jaxcal.solvers.closed_form.single import calibrate_closed_form
+from jaxcal.solvers.closed_form.single import ClosedForm, calibrate_closed_form
 
 GOOD_MM = 0.5
 """Largest error to expect at the image (root mean square) that is called good."""
@@ -65,9 +65,10 @@ share of the error, and by more than so many times the expected move."""
 TEST_TIMES = 3.0
 """Test images contradict the stated error if they scatter by more than so many times what the
 calibration's own errors and uncertainty explain."""
-FEWEST_LEFT_OUT, AGREEING_TIMES = 6, 2.0
-"""So many images that were left out agree among themselves if they scatter by at most so many times
-as much as those in use."""
+FEWEST_LEFT_OUT, LEAST_SHARE_LEFT_OUT, AGREEING_TIMES, APART_TIMES = 8, 0.2, 2.0, 3.0
+"""So many images that were left out, and at least this share of those in use, agree among
+themselves if their errors within the image are at most so many times as large as those of the
+others, and the two fits are farther apart than so many times what is stated of both."""
 SCATTER_TIMES = 1.3
 """Resampled calibrations may scatter by up to so many times the stated error."""
 
@@ -107,8 +108,8 @@ def accuracy_record(
     ratio, chance = excess(found, weight)
     tre["residuals_over_stated"] = math.sqrt(ratio) if ratio > 0 else None
     tre["chance"] = chance
-    tre["unmodelled"] = _unmodelled(answer, weight)
-    tre["left_out"] = _left_out(answer, recording, grid)
+    tre["unmodelled"] = _unmodelled(answer, grid)
+    tre["left_out"] = _left_out(answer, float(tre["stated_mm"]), grid)
     return {
         "tre": tre,
         "limits": _limits(answer, found, weight),
@@ -230,46 +231,90 @@ def _limits(
     }
 
 
-def _unmodelled(answer: Calibration, weight: Float[np.ndarray, "p p"]) -> dict[str, Any] | None:
+def _unmodelled(answer: Calibration, grid: Float[np.ndarray, "m 2"]) -> dict[str, Any] | None:
     """The clearest error that the model leaves out, and how far it moves the image."""
     found = unmodelled(answer)
     if not found:
         return None
     # One imitates another: only the clearest is told.
-    first = found[0]
+    first, problem = found[0], answer.problem
+    assert problem is not None
+    jacobian = np.asarray(image_jacobian(answer, grid))
+    moved, slip = first.moved(grid, jacobian, float(np.asarray(problem.face_offset)))
     return {
         "kind": first.kind,
         "values": first.values,
         "statistic": first.statistic,
-        "moved_mm": math.sqrt(max(float(first.step @ weight @ first.step), 0.0)),
+        "moved_mm": moved,
+        "slip_mm": slip if first.kind == "slip" else None,
     }
 
 
 def _left_out(
-    answer: Calibration, recording: Recording, grid: Float[np.ndarray, "m 2"]
+    answer: Calibration, stated: float, grid: Float[np.ndarray, "m 2"]
 ) -> dict[str, Any] | None:
-    """Images that were left out and agree among themselves on another calibration."""
-    images, kept = recording.calibration, np.asarray(answer.mask) > 0
-    left = images.mask & ~kept
-    if not answer.robust or left.sum() < FEWEST_LEFT_OUT or images.kind == "time_of_flight":
+    """Images that were left out as outliers and agree among themselves on another calibration."""
+    problem, kept = answer.problem, np.asarray(answer.mask) > 0
+    if not answer.robust or problem is None or answer.data != "points":
+        return None
+    # Frames of a pose that is held are masked in the answer's problem already.
+    left = (np.asarray(problem.mask) > 0) & ~kept
+    if left.sum() < max(FEWEST_LEFT_OUT, LEAST_SHARE_LEFT_OUT * kept.sum()):
         return None
     estimate = ("scale",) if "scale" in answer.blocks else ()
     try:
         own, other = (
-            calibrate_closed_form(replace(images, mask=mask), estimate=estimate)
+            calibrate_closed_form(replace(problem, mask=mask.astype(float)), estimate=estimate)
             for mask in (kept, left)
         )
     except InputError:
         return None
-    if not other.rms_mm <= AGREEING_TIMES * own.rms_mm:
+    if not _within(other, problem, left) <= AGREEING_TIMES * _within(own, problem, kept):
         return None
-    places = np.stack([grid[:, 0], 0 * grid[:, 0], grid[:, 1], np.ones(len(grid))])
-    apart = ((np.asarray(own.image_to_probe) - np.asarray(other.image_to_probe)) @ places)[:3]
-    return {
-        "images": int(left.sum()),
-        "rms_mm": float(other.rms_mm),
-        "apart_mm": math.sqrt(float(np.mean(np.sum(apart**2, axis=0)))),
-    }
+    apart = _apart(own, other, problem, grid)
+    if apart <= APART_TIMES * stated * math.sqrt(1 + kept.sum() / left.sum()):
+        return None
+    return {"images": int(left.sum()), "apart_mm": apart}
+
+
+def _within(found: ClosedForm, problem: Problem, used: np.ndarray) -> float:
+    """SD of the errors within the image of a conventional fit, mm."""
+    size = _pixel_size(found, problem)
+    measured = np.asarray(problem.measurements, float)[used] * size
+    measured[:, 1] += float(np.asarray(problem.face_offset))
+    poses = np.asarray(problem.poses, float)[used]
+    q = targets_in_images(poses, found.image_to_probe, found.point_mm)
+    off = np.stack([q[:, 0], np.hypot(q[:, 1], q[:, 2])], axis=1) - measured
+    freedom = max(2 * len(off) - 6, 1)
+    return math.sqrt(float(np.sum(off**2)) / freedom)
+
+
+def _pixel_size(found: ClosedForm, problem: Problem) -> Float[np.ndarray, " 2"]:
+    spacing = np.asarray(problem.spacing, float)
+    return spacing if found.scale_mm_per_px is None else np.asarray(found.scale_mm_per_px)
+
+
+def _apart(
+    first: ClosedForm, second: ClosedForm, problem: Problem, grid: Float[np.ndarray, "m 2"]
+) -> float:
+    """How far apart two fits put the image's pixels on the probe, root mean square, mm."""
+    stretch = _pixel_size(second, problem) / _pixel_size(first, problem)
+    return _distance(
+        np.asarray(first.image_to_probe), np.asarray(second.image_to_probe), stretch, grid
+    )
+
+
+def _distance(
+    first: Float[np.ndarray, "4 4"],
+    second: Float[np.ndarray, "4 4"],
+    stretch: Float[np.ndarray, " 2"],
+    grid: Float[np.ndarray, "m 2"],
+) -> float:
+    """Of image points under two X, the second with pixels so many times as large, mm."""
+    there = np.stack([grid[:, 0], 0 * grid[:, 0], grid[:, 1], np.ones(len(grid))])
+    larger = np.array([stretch[0], 1.0, stretch[1], 1.0])[:, None]
+    moved = (second @ (larger * there) - first @ there)[:3]
+    return math.sqrt(float(np.mean(np.sum(moved**2, axis=0))))
 
 
 def _comparison(
@@ -307,15 +352,13 @@ def _comparison(
     mine = np.ones(2)
     if answer.scale_mm_per_px is not None:
         mine = np.asarray(answer.scale_mm_per_px) / spacing
-    there = np.stack([grid[:, 0], 0 * grid[:, 0], grid[:, 1], np.ones(len(grid))])
-    stretch = np.array([scale[0] / mine[0], 1.0, scale[1] / mine[1], 1.0])
-    moved = ((x @ (stretch[:, None] * there)) - np.asarray(answer.image_to_probe) @ there)[:3]
+    apart = _distance(np.asarray(answer.image_to_probe), x, scale / mine, grid)
     density = found.log_density - fit.log_density
     count = int(used.sum())
     return {
         "conventional_rms_mm": float(other.rms_mm),
         "rms_mm": float(answer.rms),
-        "apart_mm": math.sqrt(float(np.mean(np.sum(moved**2, axis=0)))),
+        "apart_mm": apart,
         "conventional_tre_mm": math.sqrt(error) if error > 0 else None,
         "tre_mm": math.sqrt(gaussian) if gaussian > 0 else None,
         "log_density_gain": float(density.sum()),
@@ -434,16 +477,16 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
     values, moved = found["values"], found["moved_mm"]
     words = {
         "scale": lambda: (
-            f"lateral positions that differ by {100 * values[0]:+.1f} % and ranges by "
-            f"{100 * values[1]:+.1f} % would explain the errors far better: check pixel size, "
+            f"lateral positions that are too long by {100 * values[0]:.1f} % and ranges by "
+            f"{100 * values[1]:.1f} % would explain the errors far better: check pixel size, "
             "sound speed and the tracker's unit, or estimate the scale"
         ),
         "slip": lambda: (
-            f"an image that moves by {2 * moved:.1f} mm on the probe from the first image to the "
-            "last would explain the errors far better: a slipping mount, or a moving target?"
+            f"an image that moves by {found['slip_mm']:.1f} mm on the probe from the first image "
+            "to the last would explain the errors far better: a slipping mount, or a moving target?"
         ),
         "skew": lambda: (
-            f"lateral positions that are off by {100 * values[0]:+.1f} % of the depth would "
+            f"lateral positions that are too large by {100 * values[0]:.1f} % of the depth would "
             "explain the errors far better: a steered beam, or clicks beside the target?"
         ),
         "beside": lambda: (
@@ -456,11 +499,12 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
 
 def _from_groups(record: dict[str, Any]) -> list[tuple[float, str]]:
     """Errors within the image that come in two groups."""
-    stated, scores = record["tre"]["stated_mm"], record["noise_model"]["scores"]["tails"]
+    stated, model = record["tre"]["stated_mm"], record["noise_model"]
+    scores, kurtosis = model["scores"]["tails"], model["kurtosis"]
     found: list[tuple[float, str]] = []
     for k, (kind, name) in enumerate(_WAYS.items()):
         size = record[f"sigma_{kind}_mm"]
-        if stated and size and scores[k] is not None and scores[k] < -MISFIT_SCORE:
+        if stated and size and in_two_groups(scores[k], kurtosis[k]):
             words = f"the points lie in two groups, about {2 * size:.1f} mm apart {name}"
             found.append((math.hypot(1.0, size / stated), words))
     return found
@@ -469,7 +513,7 @@ def _from_groups(record: dict[str, Any]) -> list[tuple[float, str]]:
 def _from_left_out(record: dict[str, Any]) -> list[tuple[float, str]]:
     """Images left out that agree among themselves as well as those in use do."""
     found, stated = record["tre"]["left_out"], record["tre"]["stated_mm"]
-    if found is None or not stated or found["apart_mm"] <= stated:
+    if found is None or not stated:
         return []
     words = (
         f"the {found['images']} images left out agree among themselves as well, on a calibration "

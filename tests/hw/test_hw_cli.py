@@ -136,6 +136,23 @@ def test_a_recording_that_lacks_images_can_be_resumed_after_its_end(tmp_path):
         RecordingWriter.resume(path)
 
 
+def test_a_refused_resume_leaves_a_complete_recording_as_it_is(tmp_path, capsys):
+    path = tmp_path / "rec.h5"
+    probe = {"kind": "linear", "elements": 8, "pitch_mm": 1.0, "sound_speed_m_s": 1490.0}
+    settings = json.dumps({"request": {"bench": 0, "of another version": 1}})
+    writer = RecordingWriter.create(
+        path, RecordingHeader("time_of_flight", probe, 8, None, settings)
+    )
+    writer.put("plan", "targets", np.tile(np.eye(4), (5, 1, 1)), "mm")
+    writer.attributes("plan", {"without_image": 2})
+    writer.finish()
+    before = path.read_bytes()
+    assert main(["acquire", str(path), "--bench", "--resume"]) == 2
+    assert "has no settings of an acquisition" in capsys.readouterr().err
+    assert path.read_bytes() == before
+    assert (tmp_path / "rec.h5.sha256").exists()
+
+
 @pytest.mark.parametrize("given", [subprocess.PIPE, subprocess.DEVNULL])
 def test_a_bench_serves_until_ctrl_c_whatever_its_standard_input_is(given):
     process = subprocess.Popen(
