@@ -137,6 +137,7 @@ def test_a_recording_that_lacks_images_can_be_resumed_after_its_end(tmp_path):
 
 
 def test_a_refused_resume_leaves_a_complete_recording_as_it_is(tmp_path, capsys):
+    pytest.importorskip("rtde_control", reason="ur_rtde is not installed (jaxcal[robot])")
     path = tmp_path / "rec.h5"
     probe = {"kind": "linear", "elements": 8, "pitch_mm": 1.0, "sound_speed_m_s": 1490.0}
     settings = json.dumps({"request": {"bench": 0, "of another version": 1}})
