@@ -12,6 +12,7 @@ needs the covariance of all these unknowns, not of X alone.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,3 +60,23 @@ def mean_of_squares(jacobian: Float[AnyArray, "*batch m 3 p"]) -> Float[np.ndarr
     """W with tr(W S) the mean squared error over m image points, for a covariance S."""
     jacobian = np.asarray(jacobian)
     return np.einsum("...mia,...mib->...ab", jacobian, jacobian) / jacobian.shape[-3]
+
+
+def distance(
+    first: Float[np.ndarray, "4 4"],
+    second: Float[np.ndarray, "4 4"],
+    stretch: Float[np.ndarray, " 2"],
+    grid: Float[np.ndarray, "m 2"],
+) -> float:
+    """How far apart two X put image points, root mean square, mm.
+
+    Args:
+        first: image to probe.
+        second: another one.
+        stretch: size of the second image's pixels over that of the first's, [lateral, axial].
+        grid: [lateral, axial] of the points in the first image, mm.
+    """
+    there = np.stack([grid[:, 0], 0 * grid[:, 0], grid[:, 1], np.ones(len(grid))])
+    larger = np.array([stretch[0], 1.0, stretch[1], 1.0])[:, None]
+    moved = (second @ (larger * there) - first @ there)[:3]
+    return math.sqrt(float(np.mean(np.sum(moved**2, axis=0))))

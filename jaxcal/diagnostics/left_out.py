@@ -1,0 +1,91 @@
+"""Do the images that were left out as outliers agree among themselves on another calibration?
+
+Then it is not said which of the two groups is right: a probe that was mounted anew, or a second
+echo. Each group is fitted conventionally, and the two fits are compared where they put the image.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.data.poses import targets_in_images
+from jaxcal.data.problem import Problem
+from jaxcal.diagnostics.image_points import distance
+from jaxcal.runtime.array_types import Float
+from jaxcal.solvers.closed_form.single import ClosedForm, calibrate_closed_form
+
+if TYPE_CHECKING:
+    from jaxcal.calibration.result import Calibration
+
+FEWEST, LEAST_SHARE, AGREEING_TIMES, APART_TIMES = 8, 0.2, 2.0, 3.0
+"""So many images that were left out, and at least this share of those in use, agree among
+themselves if their errors within the image are at most so many times as large as those of the
+others, and the two fits are farther apart than so many times what is stated of both."""
+
+
+def left_out(
+    answer: Calibration, stated: float, grid: Float[np.ndarray, "m 2"]
+) -> tuple[int, float] | None:
+    """Number of images left out that agree among themselves, and how far apart the fits are, mm.
+
+    Args:
+        answer: of one problem, on numpy arrays.
+        stated: the error that the answer states, mm.
+        grid: points of the image, [lateral, axial], mm, over which the distance is taken.
+
+    Returns:
+        None where no images were left out, where they are few, or where they do not agree.
+    """
+    problem, kept = answer.problem, np.asarray(answer.mask) > 0
+    if not answer.robust or problem is None or answer.data != "points":
+        return None
+    # Frames of a pose that is held are masked in the answer's problem already.
+    left = (np.asarray(problem.mask) > 0) & ~kept
+    if left.sum() < max(FEWEST, LEAST_SHARE * kept.sum()):
+        return None
+    estimate = ("scale",) if "scale" in answer.blocks else ()
+    try:
+        own, other = (
+            calibrate_closed_form(replace(problem, mask=mask.astype(float)), estimate=estimate)
+            for mask in (kept, left)
+        )
+    except InputError:
+        return None
+    if not _within(other, problem, left) <= AGREEING_TIMES * _within(own, problem, kept):
+        return None
+    apart = _apart(own, other, problem, grid)
+    if apart <= APART_TIMES * stated * math.sqrt(1 + kept.sum() / left.sum()):
+        return None
+    return int(left.sum()), apart
+
+
+def _within(found: ClosedForm, problem: Problem, used: np.ndarray) -> float:
+    """SD of the errors within the image of a conventional fit, mm."""
+    size = _pixel_size(found, problem)
+    measured = np.asarray(problem.measurements, float)[used] * size
+    measured[:, 1] += float(np.asarray(problem.face_offset))
+    poses = np.asarray(problem.poses, float)[used]
+    q = targets_in_images(poses, found.image_to_probe, found.point_mm)
+    off = np.stack([q[:, 0], np.hypot(q[:, 1], q[:, 2])], axis=1) - measured
+    freedom = max(2 * len(off) - 6, 1)
+    return math.sqrt(float(np.sum(off**2)) / freedom)
+
+
+def _pixel_size(found: ClosedForm, problem: Problem) -> Float[np.ndarray, " 2"]:
+    spacing = np.asarray(problem.spacing, float)
+    return spacing if found.scale_mm_per_px is None else np.asarray(found.scale_mm_per_px)
+
+
+def _apart(
+    first: ClosedForm, second: ClosedForm, problem: Problem, grid: Float[np.ndarray, "m 2"]
+) -> float:
+    """How far apart two fits put the image's pixels on the probe, root mean square, mm."""
+    stretch = _pixel_size(second, problem) / _pixel_size(first, problem)
+    return distance(
+        np.asarray(first.image_to_probe), np.asarray(second.image_to_probe), stretch, grid
+    )

@@ -1,0 +1,207 @@
+"""What contradicts the stated error of a calibration, and how large it makes the error, in words.
+
+The covariance assumes that the noise model holds. It is contradicted if
+
+- the residuals make the error larger than stated by more than three SDs of chance;
+- leaving one image out moves image points by more than half the stated error and by more than four
+  times the expected move (by one step from the normal equations, or by cross-validation if this was
+  requested);
+- the scatter in cross-validation or bootstrap is more than 1.3 times the stated error;
+- test images scatter far more than the calibration explains;
+- the errors within the image drift, come in two groups, or would be explained by an error that the
+  model leaves out (:mod:`jaxcal.diagnostics.unmodelled`);
+- images that were left out as outliers agree among themselves on another calibration
+  (:mod:`jaxcal.diagnostics.left_out`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from jaxcal.diagnostics.messages import DRIFT_SCORE, in_two_groups
+
+CHANCE = 3.0
+"""SDs of chance beyond which the residuals contradict the stated error."""
+MOVED_SHARE, MOVED_TIMES = 0.5, 4.0
+"""An image contradicts the stated error if leaving it out moves image points by more than this
+share of the error, and by more than so many times the expected move."""
+TEST_TIMES = 3.0
+"""Test images contradict the stated error if they scatter by more than so many times what the
+calibration's own errors and uncertainty explain."""
+SCATTER_TIMES = 1.3
+"""Resampled calibrations may scatter by up to so many times the stated error."""
+
+_WAYS = {"lateral": "sideways", "range": "in depth"}
+"""Errors within the image, in the order of the residuals, and in words."""
+
+
+def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """How many times as large as stated each contradiction makes the error, and its words.
+
+    Args:
+        record: of :func:`jaxcal.report.record.calibration_record`, of a calibration that states an
+            error, with cross-validation and bootstrap if they were requested.
+    """
+    checks = (
+        _from_residuals,
+        _from_images,
+        _from_resampling,
+        _from_test_images,
+        _from_slow_changes,
+        _from_unmodelled,
+        _from_groups,
+        _from_left_out,
+    )
+    return [found for check in checks for found in check(record)]
+
+
+def _from_residuals(record: dict[str, Any]) -> list[tuple[float, str]]:
+    tre = record["tre"]
+    ratio, chance = tre["residuals_over_stated"], tre["chance"]
+    if ratio is None or chance is None or ratio**2 <= 1 + CHANCE * chance:
+        return []
+    return [(ratio, f"the residuals make the error {ratio:.1f} times as large as the covariance")]
+
+
+def _from_images(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """The image that moves the answer most, if too much; by cross-validation if there is one."""
+    stated, influence = record["tre"]["stated_mm"], record["influence"]
+    held = record.get("cross_validation")
+    moved, how = influence["moved_mm"], "to first order"
+    if held is not None and held["folds"] == len(moved):
+        moved, how = held["image_moved_mm"], "calibrated anew without it"
+    worst, size = None, 0.0
+    for image, (by, should) in enumerate(zip(moved, influence["expected_mm"], strict=True)):
+        if by is None or should is None or by <= max(MOVED_SHARE * stated, MOVED_TIMES * should):
+            continue
+        if by > size:
+            worst, size = image, by
+    if worst is None:
+        return []
+    words = f"image {worst} alone moves the image by {size:.2f} mm ({how})"
+    return [(math.hypot(1.0, size / stated), words)]
+
+
+def _from_test_images(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Independent images among which the target scatters by far more than it may."""
+    found, stated = record["reconstruction_precision_mm"], record["tre"]["stated_mm"]
+    if record["reconstruction_precision_set"] != "test" or found is None or not stated:
+        return []
+    names = ("sigma_lateral_mm", "sigma_range_mm", "sigma_elevation_mm")
+    errors = [record[name] or 0.0 for name in names]
+    # Poses that turn the image see its error twice as large.
+    expected = math.hypot(*errors, 2 * stated)
+    if found <= TEST_TIMES * expected:
+        return []
+    words = (
+        f"the test images scatter by {found:.2f} mm, where {expected:.2f} mm is expected (is it "
+        "the same probe, depth and mount?)"
+    )
+    return [(math.sqrt(found**2 - math.hypot(*errors) ** 2) / stated, words)]
+
+
+def _from_slow_changes(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Points that move in the image in the course of the recording, as after a slip of the mount.
+
+    Slow elevational errors do not count: they come from the placement, not from the image.
+    """
+    stated, scores = record["tre"]["stated_mm"], record["noise_model"]["scores"]["drift"]
+    found: list[tuple[float, str]] = []
+    for score, (kind, name) in zip(scores[:2], _WAYS.items(), strict=True):
+        size = record[f"sigma_{kind}_mm"]
+        if score is None or not size or not stated or score <= DRIFT_SCORE:
+            continue
+        slow = size * math.sqrt(min(score / math.sqrt(record["images_used"] - 1), 1.0))
+        words = (
+            f"the points move {name} by {slow:.2f} mm (SD) in the course of the recording, so that "
+            "the image is elsewhere at its end than at its start"
+        )
+        if slow > stated:
+            found.append((math.hypot(1.0, slow / stated), words))
+    return found
+
+
+def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """An error that the model leaves out, and that the residuals show."""
+    found, stated = record["tre"]["unmodelled"], record["tre"]["stated_mm"]
+    if found is None or not stated:
+        return []
+    values, moved = found["values"], found["moved_mm"]
+    words = {
+        "scale": lambda: (
+            f"lateral positions that are too long by {100 * values[0]:.1f} % and ranges by "
+            f"{100 * values[1]:.1f} % would explain the errors far better: check pixel size, "
+            "sound speed and the tracker's unit, or estimate the scale"
+        ),
+        "slip": lambda: (
+            f"an image that moves by {found['slip_mm']:.1f} mm on the probe from the first image "
+            "to the last would explain the errors far better: a slipping mount, or a moving target?"
+        ),
+        "skew": lambda: (
+            f"lateral positions that are too large by {100 * values[0]:.1f} % of the depth would "
+            "explain the errors far better: a steered beam, or clicks beside the target?"
+        ),
+        "beside": lambda: (
+            f"a target {values[0]:.1f} mm beside the image plane in all images would explain the "
+            "errors far better: take images from both sides of it"
+        ),
+    }
+    return [(math.hypot(1.0, moved / stated), words[found["kind"]]())]
+
+
+def _from_groups(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Errors within the image that come in two groups."""
+    stated, model = record["tre"]["stated_mm"], record["noise_model"]
+    scores, kurtosis = model["scores"]["tails"], model["kurtosis"]
+    found: list[tuple[float, str]] = []
+    for k, (kind, name) in enumerate(_WAYS.items()):
+        size = record[f"sigma_{kind}_mm"]
+        if stated and size and in_two_groups(scores[k], kurtosis[k]):
+            words = f"the points lie in two groups, about {2 * size:.1f} mm apart {name}"
+            found.append((math.hypot(1.0, size / stated), words))
+    return found
+
+
+def _from_left_out(record: dict[str, Any]) -> list[tuple[float, str]]:
+    """Images left out that agree among themselves as well as those in use do."""
+    found, stated = record["tre"]["left_out"], record["tre"]["stated_mm"]
+    if found is None or not stated:
+        return []
+    words = (
+        f"the {found['images']} images left out agree among themselves as well, on a calibration "
+        f"{found['apart_mm']:.1f} mm away: which of the two is right?"
+    )
+    return [(math.hypot(1.0, found["apart_mm"] / stated), words)]
+
+
+def _from_resampling(record: dict[str, Any]) -> list[tuple[float, str]]:
+    found: list[tuple[float, str]] = []
+    held, drawn = record.get("cross_validation"), record.get("bootstrap")
+    if held is not None and held["folds"] == held["folds_converged"]:
+        moved = [by for by in held["image_moved_mm"] if by is not None]
+        folds, stated = held["folds"], held["stated_mm"]
+        # The jackknife: every image was held out once, together with its fold.
+        each = len(moved) / folds
+        scatter = math.sqrt((folds - 1) / folds * sum(by**2 for by in moved) / each)
+        if stated and scatter > SCATTER_TIMES * stated:
+            found.append(
+                (
+                    scatter / stated,
+                    f"calibrations without some of the images scatter by {scatter:.2f} mm, "
+                    f"{scatter / stated:.1f} times what is stated",
+                )
+            )
+    if drawn is not None and drawn["stated_mm"]:
+        known = [value for value in drawn["reproducibility_mm"] if value is not None]
+        scatter = math.sqrt(sum(value**2 for value in known) / max(len(known), 1))
+        if scatter > SCATTER_TIMES * drawn["stated_mm"]:
+            times = scatter / drawn["stated_mm"]
+            found.append(
+                (
+                    times,
+                    f"calibrations from images drawn anew scatter by {scatter:.2f} mm, {times:.1f} "
+                    "times what is stated",
+                )
+            )
+    return found
