@@ -419,7 +419,7 @@ def test_limits_in_words(record):
     changed["next_poses"] = {"tre_now_mm": 0.4, "tre_then_mm": 0.3, "poses": [{}, {}, {}]}
     settle(changed)
     said = " ".join(limits(changed))
-    assert "targets out of the image plane (70 %), then errors of their depth (25 %)" in said
+    assert "Targets out of the image plane (70 %), then errors of their depth (25 %)" in said
     assert "3 well chosen images help as much as 19 more" in said
 
 

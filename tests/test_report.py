@@ -18,6 +18,7 @@ from jaxcal.calibration.result import Status
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.report.convergence import KEPT, Curve, bounded_curves
 from jaxcal.report.figures import convergence_figure
+from jaxcal.report.paragraphs import laid_out, listed
 from jaxcal.report.plots import plot_offsets, plot_residuals
 from jaxcal.report.record import calibration_record, check_test_images, plain, truth_error
 from jaxcal.report.tables import calibration_table, comparison_table
@@ -242,6 +243,20 @@ def test_verdict_on_what_must_not_be_used(result, recording, status):
     assert "What to do:" in lines
     assert record["warnings"]
     assert all(f"- {text}" in lines for text in record["warnings"])
+
+
+def test_lists_have_headings_with_room_before_them():
+    assert listed("Look", []) == []
+    lines = ["Good: as it is.", *listed("Look", ["a long point " * 3, "short"]), "An end:"]
+    assert laid_out(lines, 30).splitlines() == [
+        "Good: as it is.",
+        "",
+        "Look:",
+        "- a long point a long point a",
+        "  long point",
+        "- short",
+        "An end:",
+    ]
 
 
 def test_verdict_names_outliers_and_out_of_plane_errors(record):

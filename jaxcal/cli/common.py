@@ -9,10 +9,10 @@ import math
 import os
 import signal
 import sys
-import textwrap
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -92,16 +92,18 @@ def print_page(*parts: RenderableType) -> None:
     """Print tables, and sentences wrapped to the page, on standard output."""
     from rich.console import Console
 
+    from jaxcal.report.paragraphs import laid_out
+
     # What goes to a file or a pipe must not be cut to the width of no terminal.
     width = None if sys.stdout is not None and sys.stdout.isatty() else 100
     # Nothing in a message or a file's name is to be taken for markup.
     page = Console(markup=False, highlight=False, emoji=False, width=width)
     with page.capture() as captured:
-        for part in parts:
-            if isinstance(part, str):
-                indent = "  " if part.startswith("- ") else ""
-                part = textwrap.fill(part, page.width, subsequent_indent=indent)
-            page.print(part)
+        for words, group in groupby(parts, key=lambda part: isinstance(part, str)):
+            if words:
+                page.print(laid_out([str(part) for part in group], page.width))
+            else:
+                page.print(*group)
     # Not straight from rich, which leaves the process when the pipe is closed early.
     click.echo(captured.get(), nl=False)
 

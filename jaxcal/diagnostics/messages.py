@@ -112,7 +112,8 @@ def _block_in_words(block: str, part: np.ndarray) -> str:
     largest = int(np.argmax(np.abs(unit)))
     if abs(unit[largest]) > 0.9:
         return row.words.format(row.axes[largest])
-    unit = unit * np.sign(unit[largest])
+    # Rounded before it is formatted, and without the sign of a zero.
+    unit = np.round(unit * np.sign(unit[largest]), 2) + 0.0
     return row.oblique.format(*unit)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxcal import InputError, design
 from jaxcal.calibration.result import Calibration
 from jaxcal.data.recording import Recording
+from jaxcal.report.paragraphs import listed
 
 COUNT = 3
 _CANDIDATES = 2000
@@ -71,12 +72,12 @@ def next_poses_sentences(record: dict[str, Any]) -> list[str]:
     if found is None:
         return []
     now, then = found["tre_now_mm"], found["tre_then_mm"]
-    lines = [
+    lines = listed(
         f"What would help most: {len(found['poses'])} images that bring the predicted error over "
-        f"the image from {now:.2g} to {then:.2g} mm. From the middle orientation, marker to your "
-        "right:",
-        *(f"- {pose['words']}" for pose in found["poses"]),
-    ]
+        f"the image from {now:.2f} to {then:.2f} mm; from the middle orientation, marker to your "
+        "right",
+        [pose["words"] for pose in found["poses"]],
+    )
     if found["images_to_half"] is not None:
         lines.append(
             f"Halving the error takes {found['images_to_half']} more images, chosen like these."

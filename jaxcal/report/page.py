@@ -30,6 +30,7 @@ from jaxcal.io.outputs import check_output
 from jaxcal.report import svg
 from jaxcal.report.certified import certificate_words
 from jaxcal.report.next_poses import next_poses_sentences
+from jaxcal.report.paragraphs import BULLET, listed
 from jaxcal.report.resampled import resampled_sentences
 from jaxcal.report.verdict import (
     advice,
@@ -38,6 +39,7 @@ from jaxcal.report.verdict import (
     contradictions,
     headline,
     limits,
+    scatter,
     where,
 )
 from jaxcal.runtime.array_types import Float
@@ -166,11 +168,11 @@ def _number(record: dict[str, Any], path: str, form: str, unit: str = "") -> str
 
 
 def _paragraphs(lines: list[str]) -> str:
-    """Sentences, and lists of those that start with "- "."""
+    """Sentences and lists (:mod:`jaxcal.report.paragraphs`)."""
     parts, items = [], []
     for text in [*lines, ""]:
-        if text.startswith("- "):
-            items.append(f"<li>{escape(text[2:])}</li>")
+        if text.startswith(BULLET):
+            items.append(f"<li>{escape(text[len(BULLET) :])}</li>")
             continue
         if items:
             parts.append(f"<ul>{''.join(items)}</ul>")
@@ -199,7 +201,8 @@ def _head(record: dict[str, Any]) -> str:
     prior = "" if record["prior"] == "none" else f", prior {record['prior']}"
     said = [headline(record)]
     if _usable(record):
-        said += [*contradictions(record), *where(record), *limits(record)]
+        said += [*contradictions(record), *where(record)]
+        said += [*listed("What limits it", limits(record)), *scatter(record)]
     return (
         f"<header><h1>Calibration of {escape(Path(record['source']).name)}</h1>"
         f'<p class="soft">{escape(record["source"])}: {record["images_used"]} images used of '
@@ -215,10 +218,10 @@ def _findings(record: dict[str, Any]) -> str:
     found = [str(text) for text in [*record.get("findings", ()), *record["warnings"]]]
     parts = []
     if found:
-        parts += ["<h3>Look at this</h3>", _paragraphs([f"- {text}" for text in found])]
+        parts += ["<h3>Look at this</h3>", _paragraphs([BULLET + text for text in found])]
     todo = advice(record)
     if todo:
-        parts += ["<h3>What to do</h3>", _paragraphs([f"- {text}" for text in todo])]
+        parts += ["<h3>What to do</h3>", _paragraphs([BULLET + text for text in todo])]
     more = next_poses_sentences(record)
     if more:
         parts += ["<h3>Which images to add</h3>", _paragraphs(more)]

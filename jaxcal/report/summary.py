@@ -63,10 +63,9 @@ def record_of(
 
 def text_of(calibration: Calibration, width: int = 100) -> str:
     """Table and verdict, as a terminal shows them."""
-    import textwrap
-
     from rich.console import Console
 
+    from jaxcal.report.paragraphs import laid_out
     from jaxcal.report.tables import calibration_table
     from jaxcal.report.verdict import verdict
 
@@ -81,12 +80,8 @@ def text_of(calibration: Calibration, width: int = 100) -> str:
     )
     with console.capture() as captured:
         console.print(calibration_table(record))
-    lines = [
-        textwrap.fill(line, width, subsequent_indent="  " if line.startswith("- ") else "")
-        for line in verdict(record)
-    ]
     table = "\n".join(line.rstrip() for line in captured.get().splitlines())
-    return table + "\n" + "\n".join(lines)
+    return table + "\n" + laid_out(verdict(record), width)
 
 
 def batch_text(calibration: Calibration) -> str:

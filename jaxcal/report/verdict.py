@@ -11,7 +11,7 @@ from typing import Any
 
 from jaxcal.diagnostics import messages
 from jaxcal.report.accuracy import FAIR_MM
-from jaxcal.report.certified import certificate_words
+from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
 
 FEW_IMAGES = 20
@@ -38,23 +38,18 @@ def verdict(record: dict[str, Any]) -> list[str]:
         record: of :func:`jaxcal.report.record.calibration_record`.
 
     Returns:
-        Paragraphs without line breaks; bullet points start with "- ".
+        Paragraphs (:mod:`jaxcal.report.paragraphs`).
     """
     lines = [headline(record)]
     usable = record["status"] in ("converged", "max_iterations")
     if usable and not record.get("wrong_frames"):
-        lines += [*contradictions(record), *where(record), *limits(record), *believe(record)]
-        lines += [*certainty(record), *resampled_sentences(record)]
-        proved = certificate_words(record)
-        if proved is not None:
-            lines.append(f"{proved[0].upper()}{proved[1:]}.")
+        lines += [*contradictions(record), *where(record)]
+        lines += listed("What limits it", limits(record))
+        lines += listed("How certain it is", [*certainty(record), *resampled_sentences(record)])
+        lines += listed("How the images agree with it", [*scatter(record), *believe(record)])
     further = [text for text in record["warnings"] if text not in lines[0]]
-    if further:
-        lines += ["Look at this:", *(f"- {text}" for text in further)]
-    todo = advice(record)
-    if todo:
-        lines += ["What to do:", *(f"- {text}" for text in todo)]
-    return lines
+    lines += listed("Look at this", further)
+    return lines + listed("What to do", advice(record))
 
 
 def headline(record: dict[str, Any]) -> str:
@@ -140,11 +135,7 @@ def limits(record: dict[str, Any]) -> list[str]:
     if shares:
         ranked = sorted(shares.items(), key=lambda item: -item[1])
         named = [f"{_KINDS[kind]} ({100 * share:.0f} %)" for kind, share in ranked if share >= 0.1]
-        lines.append(
-            f"What limits it: {', then '.join(named)} make its mean square error; the weakest "
-            f"direction is {record['observability']['weakest_direction']}."
-        )
-    lines.append(_scatter(record))
+        lines.append(f"{', then '.join(named).capitalize()} make its mean square error.")
     poses = _poses(record)
     if poses:
         lines.append(poses)
@@ -161,9 +152,11 @@ def limits(record: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _scatter(record: dict[str, Any]) -> str:
+def scatter(record: dict[str, Any]) -> list[str]:
     """Why the target scatters; this scatter is not the error of the calibration."""
-    found = record["limits"]
+    found = record.get("limits")
+    if found is None or record.get("tre") is None:
+        return []
     precision = record["reconstruction_precision_mm"]
     shown = (
         ""
@@ -174,15 +167,18 @@ def _scatter(record: dict[str, Any]) -> str:
     )
     ranked = sorted(found["scatter_share"].items(), key=lambda item: -(item[1] or 0.0))
     told = [f"{_KINDS[kind]} {100 * share:.0f} %" for kind, share in ranked if share is not None]
-    return (
-        f"Seen through it, the target stays within {_mm(record['rms_mm'])} of one place{shown}: "
-        f"{', '.join(told)} of the mean square. That is how the images were taken and read, which "
-        "no calibration removes; the calibration's own error is the smaller number above."
-        if (record["tre"]["rms_mm"] or 0.0) < (record["rms_mm"] or 0.0)
-        else f"Seen through it, the target stays within {_mm(record['rms_mm'])} of one place"
-        f"{shown}: {', '.join(told)} of the mean square. The images agree with each other better "
-        "than the calibration is known: what is missing are other poses."
+    smaller = (record["tre"]["rms_mm"] or 0.0) < (record["rms_mm"] or 0.0)
+    means = (
+        "That is how the images were taken and read, which no calibration removes; the "
+        "calibration's own error is the smaller number above."
+        if smaller
+        else "The images agree with each other better than the calibration is known: what is "
+        "missing are other poses."
     )
+    return [
+        f"Seen through it, the target stays within {_mm(record['rms_mm'])} of one place{shown}: "
+        f"{', '.join(told)} of the mean square. {means}"
+    ]
 
 
 def _poses(record: dict[str, Any]) -> str | None:
@@ -195,8 +191,7 @@ def _poses(record: dict[str, Any]) -> str | None:
     if alike < 2 * count:
         return "The poses are well chosen: further images help only by their number."
     return (
-        f"The poses limit it: {count} well chosen images help as much as {alike:.0f} more of the "
-        "same kind."
+        f"Its poses: {count} well chosen images help as much as {alike:.0f} more of the same kind."
     )
 
 
