@@ -16,7 +16,7 @@ from click.core import ParameterSource
 from hw.choices import HAND_PLACEMENTS, OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
 from hw.interrupts import as_interrupts
 from jaxcal import InputError, __version__
-from jaxcal.cli.common import POSITIVE, ExitCode, exit_code
+from jaxcal.cli.common import POSITIVE, Commands, ExitCode, exit_code
 from jaxcal.cli.run import run
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ _POSE_HZ = {"cb": 125, "e": 500}
 
 
 @click.group(
+    cls=Commands,
     no_args_is_help=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog="Exit status: 0 done; 2 bad usage or input, with one line that says what; 3 done, but "
@@ -224,7 +225,7 @@ def acquire(
         return _acquire(setup, path, request, emulated, unattended, operator, view)
 
 
-@commands.command("free-hand")
+@commands.command("free-hand", short_help="Acquire with a hand-held probe, and calibrate.")
 @click.argument("server", metavar="HOST[:PORT]")
 @click.argument("recording", type=click.Path(), required=False)
 @click.option(
@@ -377,7 +378,7 @@ def _calibrated(path: str) -> int:
     return exit_code([record])
 
 
-@commands.command()
+@commands.command(short_help="Serve an emulated bench until Ctrl-C.")
 @_speed
 @_controller
 @click.option(
@@ -396,7 +397,7 @@ def bench(speed: float | None, controller: str | None, seed: int) -> int:
     return ExitCode.CONVERGED
 
 
-@commands.command("setup")
+@commands.command("setup", short_help="Write a commented description of a bench, to fill in.")
 @click.argument("out", type=click.Path(), metavar="[OUT.toml]", required=False)
 def setup_(out: str | None) -> int:
     """Write a commented description of a bench, to fill in, to OUT.toml or to standard output."""

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import jaxcal
+from hw.cli import commands as bench_commands
 from jaxcal.cli import cache, common, demo
 from jaxcal.cli.main import commands, main
 from jaxcal.data.recording import Recording, make_images
@@ -150,6 +151,15 @@ def test_help_and_version_import_nothing_heavy():
     assert (done.returncode, done.stderr) == (0, "")
     assert f"jaxcal, version {jaxcal.__version__}" in done.stdout
     assert all(name in done.stdout for name in commands.commands)
+
+
+@pytest.mark.parametrize("group", [commands, commands.commands["study"], bench_commands])
+def test_every_command_is_listed_in_a_whole_line_in_the_order_of_the_work(group):
+    text = group.get_help(click.Context(group, info_name="jaxcal", terminal_width=80))
+    lines = [line.split(maxsplit=1) for line in text.partition("Commands:\n")[2].splitlines()]
+    listed = [line for line in lines if line and line[0] in group.commands]
+    assert [name for name, _ in listed] == list(group.commands)
+    assert all(words.endswith(".") and "..." not in words for _, words in listed)
 
 
 @pytest.mark.parametrize(("module", "name"), [("jaxcal", "jaxcal"), ("hw", "jaxcal-hw")])

@@ -23,7 +23,7 @@ _COLUMNS = (
 )
 
 
-@click.command()
+@click.command(short_help="Take image points through a calibration, with their SDs.")
 @click.argument("calibration", type=click.Path(), metavar="CAL")
 @click.argument("source", type=click.Path(), metavar="[SOURCE]", required=False)
 @click.option("--pixel", type=float, nargs=2, multiple=True, metavar="U V", help="A single point.")

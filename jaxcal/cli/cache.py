@@ -18,7 +18,7 @@ import click
 
 from jaxcal import InputError, OutputError
 from jaxcal.calibration.names import Method
-from jaxcal.cli.common import ExitCode, print_json, print_page, progress
+from jaxcal.cli.common import Commands, ExitCode, print_json, print_page, progress
 from jaxcal.runtime import program_cache
 from jaxcal.runtime.when_jax import when_jax_is_imported
 
@@ -32,12 +32,14 @@ WARMED_IMAGES = (16, 32, 64)
 """Numbers of images that ``warm`` prepares for, unless it is told others."""
 
 
-@click.group(no_args_is_help=False)
+@click.group(
+    cls=Commands, no_args_is_help=False, short_help="Show, prepare or remove the compiled programs."
+)
 def cache() -> None:
     """Show, prepare or remove the compiled programs that are kept between runs."""
 
 
-@cache.command()
+@cache.command(short_help="List the programs that are kept.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def show(as_json: bool) -> int:
     """List the programs: plan, number of images, size, time to compile, last use."""

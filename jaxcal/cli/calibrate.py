@@ -35,7 +35,7 @@ MOST_FOLDS = 100
 EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "numpy")
 
 
-@click.command()
+@click.command(short_help="Calibrate from a recording: transform, verdict, report.")
 @click.argument("recording", type=click.Path(), metavar="REC")
 @click.option(
     "--method",

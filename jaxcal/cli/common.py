@@ -83,6 +83,14 @@ def verdict_code(record: dict[str, Any], required: str) -> ExitCode:
     return ExitCode.UNCERTAIN
 
 
+class Commands(click.Group):
+    """Commands that are listed in the order in which they were added: that of the work."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """The names of the commands."""
+        return list(self.commands)
+
+
 def print_json(record: dict[str, Any]) -> None:
     """One JSON object on one line of standard output."""
     click.echo(json.dumps(record, allow_nan=False))

@@ -23,7 +23,7 @@ IMAGES, ELEVATION_MM, NOISE_MM = 50, 2.0, 0.5
 RECORDING = "recording.h5"
 
 
-@click.command()
+@click.command(short_help="Try it: simulate an experiment and calibrate it three ways.")
 @click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")
 @click.option(
     "--seed",

@@ -41,7 +41,7 @@ def _one_format(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -
     return given[0] if given else None
 
 
-@click.command()
+@click.command(short_help="Write a calibration for PLUS, Slicer, ITK, ROS or numpy.")
 @click.argument("calibration", type=click.Path(), metavar="CAL")
 @click.argument("out", type=click.Path(), metavar="[OUT]", required=False)
 @_formats

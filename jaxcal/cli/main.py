@@ -11,6 +11,7 @@ from jaxcal import __version__
 from jaxcal.cli.apply import apply
 from jaxcal.cli.cache import cache
 from jaxcal.cli.calibrate import calibrate
+from jaxcal.cli.common import Commands
 from jaxcal.cli.demo import demo
 from jaxcal.cli.export import export
 from jaxcal.cli.import_ import import_
@@ -25,6 +26,7 @@ from jaxcal.cli.study import study
 
 
 @click.group(
+    cls=Commands,
     no_args_is_help=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog="Exit status: 0 converged; 2 bad usage or input, with one line that says what; "

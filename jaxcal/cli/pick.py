@@ -12,7 +12,7 @@ from jaxcal.cli.common import ExitCode
 from jaxcal.cli.sequence_options import tracking_options
 
 
-@click.command()
+@click.command(short_help="Place the target's point in each frame by a click.")
 @click.argument("frames", type=click.Path(), metavar="SOURCE")
 @click.argument("picks", type=click.Path(), metavar="[PICKS.csv]", required=False)
 @tracking_options

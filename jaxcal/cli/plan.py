@@ -32,7 +32,7 @@ _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"%PDF", b"%!PS", b"<?xml", b"RIFF", b
 """How files begin that matplotlib draws."""
 
 
-@click.command()
+@click.command(short_help="Plan which poses to take images from.")
 @click.argument("recording", type=click.Path(), metavar="[REC]", required=False)
 @click.option(
     "--images", type=click.IntRange(1, 2000), metavar="N", help="Poses.  [default: 30; with REC 10]"

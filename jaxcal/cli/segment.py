@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from jaxcal.data.segmentation.segment import Segmentation
 
 
-@click.command()
+@click.command(short_help="Find the target in times of flight or in images.")
 @click.argument("recording", type=click.Path(), metavar="REC")
 @click.option(
     "--method",

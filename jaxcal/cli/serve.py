@@ -7,7 +7,7 @@ import click
 from jaxcal.cli.common import POSITIVE, ExitCode
 
 
-@click.command()
+@click.command(short_help="Serve a calibration over OpenIGTLink.")
 @click.argument("calibration", type=click.Path(), metavar="CAL")
 @click.option(
     "--host",

@@ -8,7 +8,7 @@ from jaxcal import InputError
 from jaxcal.cli.common import NOT_NEGATIVE, POSITIVE, ExitCode, import_engine, progress
 
 
-@click.command()
+@click.command(short_help="Simulate an experiment and write its recording.")
 @click.argument("out", type=click.Path(), metavar="OUT.h5")
 @click.option("--images", type=int, default=50, show_default=True, help="Calibration images.")
 @click.option(

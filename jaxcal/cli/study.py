@@ -11,13 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from jaxcal.cli.common import ExitCode, print_json, print_page
+from jaxcal.cli.common import Commands, ExitCode, print_json, print_page
 
 if TYPE_CHECKING:
     from jaxcal.study.run import Watcher
 
 
-@click.group(no_args_is_help=False)
+@click.group(
+    cls=Commands,
+    no_args_is_help=False,
+    short_help="Monte-Carlo studies of conditions, methods and trials.",
+)
 def study() -> None:
     """Monte-Carlo studies: a grid of conditions x methods x trials, from a TOML spec."""
 
@@ -71,7 +75,7 @@ def run(spec: str, out: str, resume: bool, workers: int | None, dask: str | None
     return ExitCode.CONVERGED
 
 
-@study.command()
+@study.command(short_help="Print a study's means, SDs, intervals and failures.")
 @click.argument("folder", type=click.Path(), metavar="DIR")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on standard output.")
 @click.option("--csv", "csv_file", type=click.Path(), metavar="FILE", help="Write the table here.")
