@@ -15,7 +15,8 @@ import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
 from jaxcal.io.columns import columns_of_header
-from jaxcal.io.importing import ImportOptions, import_files
+from jaxcal.io.import_options import ImportOptions
+from jaxcal.io.importing import import_files
 from jaxcal.io.sequence_files import read_sequence, write_sequence
 from jaxcal.io.slicer import read_markups
 from jaxcal.io.trackers import read_tracker

@@ -56,7 +56,8 @@ def import_(sources: tuple[str, ...], out: str, **options: Any) -> int:
     """
     _check(sources, out, options)
     from jaxcal.io.hdf5 import save
-    from jaxcal.io.importing import ImportOptions, import_files
+    from jaxcal.io.import_options import ImportOptions
+    from jaxcal.io.importing import import_files
 
     with progress("importing"):
         recording, notes, frames = import_files(sources, ImportOptions(**options))

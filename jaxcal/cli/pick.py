@@ -38,7 +38,8 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
     open. Every click is saved at once; the same command goes on where it was ended. By default
     PICKS.csv is beside SOURCE and has its name.
     """
-    from jaxcal.io.importing import ImportOptions, frames_to_show, open_sequence
+    from jaxcal.io.frame_poses import frames_to_show, open_sequence
+    from jaxcal.io.import_options import ImportOptions
     from jaxcal.io.picker.frames import Frames
     from jaxcal.io.picker.picks import Picks
     from jaxcal.io.picker.server import Picker

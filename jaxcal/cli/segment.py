@@ -164,7 +164,8 @@ def _default_out(source: str) -> str:
 def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[str, Any]) -> int:
     """A sequence's frames; what became of each is counted and said."""
     from jaxcal.io.hdf5 import save
-    from jaxcal.io.importing import ImportOptions, import_files
+    from jaxcal.io.import_options import ImportOptions
+    from jaxcal.io.importing import import_files
     from jaxcal.io.outputs import check_output, is_recording
     from jaxcal.io.target_search import FATES
 

@@ -99,7 +99,7 @@ def with_pose_table(images: TrackedSequence, table: PoseTable) -> tuple[TrackedS
     time = np.full(count, np.nan)
     if table.time is not None:
         time[rows] = table.time
-    notes = [f"{table.name}: {table.skipped} invalid rows left out"] if table.skipped else []
+    notes = table.notes
     missing = count - len(rows)
     if missing:
         notes.append(f"{missing} of {count} images have no pose in {table.name}")

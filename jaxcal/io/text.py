@@ -76,6 +76,11 @@ class PoseTable:
     def __len__(self) -> int:
         return len(self.lines)
 
+    @property
+    def notes(self) -> list[str]:
+        """What was left out, in words."""
+        return [f"{self.name}: {self.skipped} invalid rows left out"] if self.skipped else []
+
 
 def read_pose_table(
     path: str | os.PathLike[str],
