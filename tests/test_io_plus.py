@@ -225,7 +225,7 @@ def test_configuration_that_lies(content, message, tmp_path):
     [
         (MATRIX @ np.diag([1, 1, -1, 1.0]), "is a reflection"),
         (np.full((4, 4), np.nan), "4 x 4 and finite"),
-        (MATRIX.T, "last row must be 0 0 0 1"),
+        (MATRIX.T, "last row is not 0 0 0 1"),
     ],
 )
 def test_matrices_that_plus_would_not_take(matrix, message):

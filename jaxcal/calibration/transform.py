@@ -27,7 +27,7 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 
 from jaxcal import FormatError, InputError
-from jaxcal.data.poses import check_poses
+from jaxcal.data.poses import check_affine, check_poses
 from jaxcal.diagnostics.image_points import point_jacobian
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair
@@ -498,16 +498,11 @@ def transform_from_plus_matrix(
             columns that are not orthogonal to 1e-3, which a rigid transform with a pixel size
             cannot have.
     """
-    matrix = np.asarray(matrix, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError(f"{source}: the matrix must be 4 x 4 and finite")
-    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
-        raise InputError(f"{source}: the matrix's last row is not 0 0 0 1")
+    with naming(source):
+        matrix = check_affine(matrix)
     scale = np.linalg.norm(matrix[:3, :2], axis=0)
     if not (scale > 1e-9).all():
         raise InputError(f"{source}: a column of the matrix is zero: the pixels have no size")
-    if np.linalg.det(matrix[:3, :3]) <= 0:
-        raise InputError(f"{source}: the matrix is a reflection, or flat")
     lateral, axial = (matrix[:3, :2] / scale).T
     if abs(lateral @ axial) > _SKEWED:
         raise InputError(

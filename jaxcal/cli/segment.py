@@ -115,6 +115,7 @@ def segment(
     from jaxcal.data.segmentation.segment import segment_recording
     from jaxcal.io.hdf5 import load, save
     from jaxcal.io.outputs import check_output, is_recording
+    from jaxcal.io.readable import naming
 
     target = _default_out(recording) if out is None else out
     # REC itself may be replaced: all of it is in the output.
@@ -123,11 +124,8 @@ def segment(
     probe = _probe(data, sound_speed, temperature)
     enable_compilation_cache()
     options: dict[str, Any] = {"method": method, "robust": robust, "scale": scale}
-    with progress("segmenting"):
-        try:
-            segmented, found = segment_recording(data, probe, interpolate=interpolate, **options)
-        except InputError as error:
-            raise type(error)(f"{recording}: {error}") from None
+    with progress("segmenting"), naming(recording):
+        segmented, found = segment_recording(data, probe, interpolate=interpolate, **options)
     save(segmented, target, found)
     record = _record(found, target)
     if as_json:
