@@ -323,6 +323,8 @@ def fcsv(sign):
         ("p.mrk.json", markups("LPS", -1, ["?"] * 6), "order"),
         ("p.fcsv", fcsv(1), "labels"),
         ("p.fcsv", fcsv(-1), "order"),
+        ("p.fcsv", fcsv(1).replace("F-", '"wire, ').replace(",,", '",,'), "labels"),
+        ("p.json", markups("LPS", 1, [f"F-{k}" for k in range(6)]), "labels"),
         ("p.csv", "\n".join(table(["frame", "v", "u"], [np.arange(6), PIXELS[:, ::-1]])), None),
         ("p.csv", "\n".join(table(["time", "u", "v"], [10.01 + np.arange(6) / 10, PIXELS])), None),
         ("p.csv", "\n".join(table(["u", "v"], [PIXELS])), None),

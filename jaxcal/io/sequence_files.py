@@ -11,7 +11,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.frame_names import FramePair
-from jaxcal.io.metaimage import metaimage_header, read_metaimage
+from jaxcal.io.metaimage import check_data_name, metaimage_header, read_metaimage
 from jaxcal.io.nrrd import nrrd_header, read_nrrd
 from jaxcal.io.readable import check_readable, naming
 from jaxcal.io.sequence import Orientation, TrackedSequence
@@ -91,6 +91,7 @@ def write_sequence(
         _put(path, "\n".join([*head, *lines, "ElementDataFile = LOCAL", ""]).encode() + packed)
         return
     data = Path(name).with_suffix(".zraw" if compressed else ".raw")
+    check_data_name(data.name)
     # The pixels first: a header without them would be half a recording.
     _put(data, packed)
     _put(path, "\n".join([*head, *lines, f"ElementDataFile = {data.name}", ""]).encode())
