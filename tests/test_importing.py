@@ -59,6 +59,10 @@ MATRIX = [f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)]
         table(["v", "u", *NAMES[2:]], [PIXELS[:, ::-1], TRANSLATIONS, QUATERNIONS]),
         table(NAMES, COLUMNS, ";", comma=True),
         table(NAMES, COLUMNS, "\t"),
+        ["sep=;", *table(NAMES, COLUMNS, ";", comma=True)],
+        ['"sep=;"', *table(NAMES, COLUMNS, ";")],
+        [f"{line};;" for line in table(NAMES, COLUMNS, ";")],
+        [line + "," * (k > 0) for k, line in enumerate(table(NAMES, COLUMNS))],
         table(NAMES, COLUMNS, " "),
         table(["U [px]", "V [px]", "Tx (mm)", "Ty (mm)", "Tz (mm)", *NAMES[5:]], COLUMNS),
         table(["u_px", "v_px", "tx_m", "ty_m", "tz_m", *NAMES[5:]],
@@ -86,6 +90,7 @@ def test_headers_are_read(tmp_path, lines):
 def test_times_of_every_kind(tmp_path):
     for name, stamps, expected in (
         ("time [ms]", [0.5, 1, 2, 4, 8, 9], np.array([0.5, 1, 2, 4, 8, 9]) / 1e3),
+        ("stamp_ns", [10**18 + 10**9 * k for k in range(6)], 1e9 + np.arange(6)),
         ("Timestamp", [f"2026-11-21T21:00:0{k}.5" for k in range(6)], np.arange(6.0)),
     ):
         lines = table(NAMES, COLUMNS)
@@ -179,7 +184,9 @@ def test_headers_that_are_refused(names, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda row: row.replace(",", ",nan,", 1).rsplit(",", 1)[0], ":4: column 2"),
+        (lambda row: row.replace(",", ",nan,", 1).rsplit(",", 1)[0],
+         ":4: column 2 ('v') is nan: leave such rows out with --skip-invalid"),
+        (lambda row: row[row.index(",") :], ":4: column 1 ('u') is empty: leave such rows out"),
         (lambda row: row + ",1", ":4: 10 columns, the header has 9"),
         (lambda row: row.rsplit(",", 1)[0] + ",0.5e9", ": quaternion in line 4 has length"),
         (lambda row: row.replace(",", ",x", 1), ":4: column 2 ('v') is not a number"),
@@ -202,6 +209,13 @@ def test_times_that_go_back(tmp_path):
     recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
     assert recording.calibration.time is None
     assert "not kept" in notes[0]
+
+
+def test_times_in_another_unit_than_seconds(tmp_path):
+    lines = table(["time", *NAMES], [1.7e18 + 1e9 * np.arange(6), *COLUMNS])
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    with pytest.raises(FormatError, match=r"t\.csv:2: column 1 \('time'\) is 1\.7e\+18 s.*\[ns\]"):
+        import_files([tmp_path / "t.csv"])
 
 
 # Trackers' exports. The lines are those of real files, shortened.
@@ -248,6 +262,10 @@ def test_trackers_exports(tmp_path):
     (tmp_path / "t.csv").write_text(MOTIVE.replace("Meters", "Furlongs"))
     with pytest.raises(FormatError, match="Length Units 'furlongs' are not known"):
         read_tracker(tmp_path / "t.csv")
+    for text in (MOTIVE, OLD_NDI):
+        (tmp_path / "t.csv").write_text(text.replace(",", ";"))
+        with pytest.raises(FormatError, match="import the file that the tracker's program wrote"):
+            import_files([tmp_path / "t.csv"])
     (tmp_path / "t.csv").write_text(NDI.replace("0.5973400", "0.59x"))
     with pytest.raises(FormatError, match=r"line 2: column 7 is not a number: '0\.59x'"):
         read_tracker(tmp_path / "t.csv")

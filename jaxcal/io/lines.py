@@ -36,10 +36,10 @@ def text_lines(
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
-        raise FormatError(f"{name}:{line}: is not text (UTF-8)") from None
+        raise FormatError(f"{name}:{line}: is not text in UTF-8: save it as UTF-8") from None
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
-        raise FormatError(f"{name}:{line}: is not text (UTF-8): it holds a zero byte")
+        raise FormatError(f"{name}:{line}: is not text in UTF-8: it holds a zero byte")
     del content
     # Not splitlines: it also breaks at form feeds and the like, where editors count no new line.
     for number, line in enumerate(io.StringIO(text, newline=None), start=1):

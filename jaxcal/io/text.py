@@ -21,6 +21,8 @@ from jaxcal.io.readable import naming, quoted
 from jaxcal.io.table import Table, read_table
 from jaxcal.runtime.array_types import Float, Int
 
+_LATEST_S = 1e11
+"""Latest time, s after any beginning: three thousand years. Stamps in ms or ns are beyond it."""
 _TRUE = frozenset(("1", "1.0", "true", "yes", "ok", "valid", "good", "tracked"))
 _FALSE = frozenset(
     (
@@ -294,14 +296,16 @@ def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list
     ]
     kept: list[int] = []
     for row, cells in enumerate(table.rows):
-        valid = columns.valid is None or _is_valid(table, row, columns.valid)
-        if valid and not (skip_invalid and any(_missing(cells[k]) for k in needed)):
+        missing = next((k for k in needed if _missing(cells[k])), None)
+        if columns.valid is not None and not _is_valid(table, row, columns.valid):
+            why = f"the row is marked as invalid ({quoted(cells[columns.valid])})"
+        elif missing is not None:
+            why = f"{table.column(missing)} is {cells[missing] or 'empty'}"
+        else:
             kept.append(row)
-        elif not skip_invalid:
-            raise FormatError(
-                f"{table.row(row)}: the row is marked as invalid "
-                f"({quoted(cells[columns.valid or 0])}): leave such rows out with --skip-invalid"
-            )
+            continue
+        if not skip_invalid:
+            raise FormatError(f"{table.row(row)}: {why}: leave such rows out with --skip-invalid")
     if not kept:
         raise FormatError(f"all {len(table.rows)} rows are marked as invalid")
     return kept, len(table.rows) - len(kept)
@@ -369,7 +373,14 @@ def _times(
         return None, None
     dates = [_date(table.rows[row][column]) for row in rows]
     if dates[0] is None:
-        return table.numbers((column,), rows)[:, 0] * columns.time_s, None
+        time = table.numbers((column,), rows)[:, 0] * columns.time_s
+        late = np.flatnonzero(np.abs(time) > _LATEST_S)
+        if len(late):
+            raise FormatError(
+                f"{table.row(rows[late[0]])}: {table.column(column)} is {time[late[0]]:.3g} s, in "
+                "the distant future: state its unit in the header: time [ms], [us] or [ns]"
+            )
+        return time, None
     values = []
     for row, date in zip(rows, dates, strict=True):
         if date is None or (date.tzinfo is None) != (dates[0].tzinfo is None):

@@ -25,6 +25,7 @@ from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.table import parse_number
 
 TRACKER = "Tracker"
+_BEGINNING = re.compile(r"(Tools|Format Version)\s*[,;\t]")
 MOST_ROWS = 1_000_000
 _ABSENT = -1e20
 """A number below this is missing: NDI writes -3.697314E28 in its place."""
@@ -34,7 +35,7 @@ _METRES = {"meters": 1e3, "centimeters": 10.0, "millimeters": 1.0}
 def is_tracker_export(path: str | os.PathLike[str]) -> bool:
     """Whether a text file begins like an export of NDI ToolBox or Motive."""
     _, first = next(text_lines(path), (0, ""))
-    return first.startswith(("Tools,", "Format Version,"))
+    return _BEGINNING.match(first) is not None
 
 
 def read_tracker(
@@ -63,7 +64,10 @@ def read_tracker(
             return found.scaled(pose_units or "mm")
         if first[0].strip() == "Format Version":
             return replace(_read_motive(first, rows, name, pose_units), length_stated=True)
-        raise FormatError("is no export of NDI ToolBox or Motive")
+        raise FormatError(
+            "is no export of NDI ToolBox or Motive with commas between cells: if a spreadsheet "
+            "has saved it anew, import the file that the tracker's program wrote"
+        )
 
 
 class _Tool:
