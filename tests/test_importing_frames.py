@@ -142,6 +142,8 @@ def folder(tmp_path):
     for number, frame in enumerate(FRAMES):
         (path / f"b{number + 2}.png").write_bytes(encode_png(frame))
     (path / "notes.txt").write_text("not an image")
+    # What a Mac leaves beside a file that it copies.
+    (path / "._b2.png").write_bytes(b"\0\5\x16\7Mac OS X")
     return path
 
 
