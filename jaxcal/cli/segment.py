@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -204,7 +205,7 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     if counts["not credible"] > counts["found"]:
         lines.append(
             f"- few show a credible target: look at --region and --target, or place the points by "
-            f"hand: jaxcal pick {source}"
+            f"hand: jaxcal pick {shlex.quote(source)}"
         )
     print_page(*lines, *(f"- {note}" for note in notes if "left out" not in note))
     return ExitCode.CONVERGED
