@@ -412,6 +412,13 @@ def test_poses_of_a_sequence_in_metres(tmp_path, kind):
     np.testing.assert_allclose(images.poses, POSES, atol=1e-9)
 
 
+def test_a_probe_at_rest_is_not_taken_for_metres(tmp_path):
+    """Poses between two frames on one body differ by rounding."""
+    lines = table(NAMES, [PIXELS, 1e-15 * TRANSLATIONS, QUATERNIONS])
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    assert len(import_files([tmp_path / "t.csv"])[0].calibration) == 6
+
+
 def test_a_stated_unit_is_not_advised_against(tmp_path):
     lines = table([*NAMES[:2], "x [mm]", "y [mm]", "z [mm]", *NAMES[5:]], COLUMNS)
     scaled = table(NAMES, [PIXELS, TRANSLATIONS / 1e3, QUATERNIONS])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 from jaxcal import FormatError
 from jaxcal.io.columns import LengthUnit
@@ -25,7 +24,7 @@ def kind_of(source: str | os.PathLike[str]) -> str:
         FormatError: a text file that cannot be read, or a kind that cannot be imported.
     """
     name = os.fspath(source).lower()
-    if Path(source).is_dir():
+    if os.path.isdir(source):
         return "folder"
     if name.endswith(EXTENSIONS):
         return "sequence"
