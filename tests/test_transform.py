@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -195,6 +196,13 @@ def test_ros_is_rigid_and_in_metres(tmp_path):
     x = float(re.search(r"--x (\S+) ", text)[1])
     assert x == pytest.approx(known.image_plane_to_probe[0, 3] / 1000)
     assert "--frame-id probe --child-frame-id image" in text
+    # ROS tells upper case from lower.
+    named = known.text("ros", frames=("US_Image", "tool0_Flange"))
+    assert "--frame-id tool0_Flange --child-frame-id US_Image" in named
+    assert "robot_effector_frame: tool0_Flange\n  tracking_base_frame: US_Image\n" in named
+    for format, twice in (("ros", ("a", "a")), ("plus", ("image", "Image"))):
+        with pytest.raises(InputError, match="leads from one frame to another"):
+            known.text(format, frames=twice)
     # A number without a point would be text in YAML 1.1.
     tiny = ImageTransform(np.eye(4) + np.pad([[1e-2]], ((0, 3), (3, 0))))
     assert "x: 1.0e-05\n" in tiny.text("ros")
@@ -487,6 +495,8 @@ def test_export_to_files(saved, tmp_path, capsys):
     capsys.readouterr()
     assert main(["export", str(saved)]) == 2
     assert "name one format" in capsys.readouterr().err
+    assert main(["export", str(saved), "--numpy", "--probe-frame", "tool0"]) == 2
+    assert "--numpy names no frames" in capsys.readouterr().err
 
 
 def test_what_did_not_converge_is_not_handed_on(saved, capsys):
@@ -575,9 +585,25 @@ def test_no_plus_server(saved, capsys):
     assert "Connection refused" in capsys.readouterr().err
 
 
+def test_served_once_in_ages():
+    """Whoever connects gets the matrix at once, however rarely it is sent again."""
+    asked = iter([False, False, True])
+    with (
+        TransformServer("ImageToProbe", np.eye(4), port=0) as server,
+        socket.create_connection(("127.0.0.1", server.port), timeout=10) as client,
+    ):
+        # Ends the wait for the next time.
+        client.sendall(b"?")
+        server.serve(1e300, lambda: next(asked))
+        assert client.recv(106)[2:34] == b"TRANSFORM".ljust(12, b"\0") + b"ImageToProbe".ljust(
+            20, b"\0"
+        )
+
+
 def test_server_refuses():
-    with pytest.raises(InputError, match="1 to 20 bytes"):
-        TransformServer("TransducerOriginPixelsToProbe", np.eye(4), port=0)
+    for name in ("TransducerOriginPixelsToProbe", "Image\nToProbe", ""):
+        with pytest.raises(InputError, match="1 to 20 bytes"):
+            TransformServer(name, np.eye(4), port=0)
     with (
         TransformServer("ImageToProbe", np.eye(4), port=0) as server,
         pytest.raises(InputError, match="cannot listen at"),

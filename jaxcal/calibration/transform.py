@@ -346,7 +346,8 @@ class ImageTransform:
         if format == "ros":
             from jaxcal.io.ros import ros_yaml
 
-            parent, child = frames[1].lower(), frames[0].lower()
+            # ROS's own frames are in lower case; the user's are written as they are.
+            child, parent = (n.lower() if n in ("Image", "Probe") else n for n in frames)
             return ros_yaml(self.image_plane_to_probe, parent, child, self.left_out(format))
         if format == "tusrec":
             from jaxcal.io.tus_rec import calib_matrix

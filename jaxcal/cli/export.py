@@ -23,6 +23,9 @@ _TEXTS = {
     "numpy": "PLUS's matrix (OUT.npy), or all that is known (OUT.npz).",
 }
 
+_NAMELESS = ("slicer", "itk", "tusrec", "numpy")
+"""Formats without names of frames."""
+
 
 def _formats(command):
     for name, text in reversed(_TEXTS.items()):
@@ -97,6 +100,10 @@ def export(
         raise click.UsageError("--plus-server writes no file: leave OUT out")
     if origin is not None and pixel_size is None:
         raise click.BadParameter("needs --pixel-size", param_hint="--origin")
+    if (image_frame, probe_frame) != ("Image", "Probe") and format in _NAMELESS:
+        raise click.UsageError(
+            f"--{format} names no frames: leave --image-frame, --probe-frame out"
+        )
     from jaxcal.calibration.transform import check_target, load_calibration
 
     if plus_config is not None:

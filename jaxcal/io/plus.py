@@ -20,7 +20,7 @@ import numpy as np
 from jaxcal import FormatError
 from jaxcal.data.poses import check_affine
 from jaxcal.io.atomic import atomic_path
-from jaxcal.io.frame_names import FramePair, capitalised, check_frame, path_between, split_name
+from jaxcal.io.frame_names import FramePair, capitalised, check_frames, path_between, split_name
 from jaxcal.io.readable import naming, quoted
 from jaxcal.io.xml import Element, parse_xml, read_xml
 from jaxcal.runtime.array_types import Float
@@ -232,7 +232,7 @@ def transform_element(
         InputError: a matrix or names that PLUS would not accept.
     """
     matrix = check_affine(matrix)
-    source, target = check_frame(frames[0]), check_frame(frames[1])
+    source, target = check_frames(frames)
     # Minus zero would be written as -0.0.
     rows = [" ".join(repr(value + 0.0) for value in row) for row in matrix.tolist()]
     lines = [f'<Transform From="{source}" To="{target}"', f'  Matrix="{rows[0]}']
@@ -454,7 +454,7 @@ def update_transform_command(
 
     Source: PlusLib, vtkPlusUpdateTransformCommand.
     """
-    source, target = check_frame(frames[0]), check_frame(frames[1])
+    source, target = check_frames(frames)
     numbers = " ".join(repr(value) for value in np.asarray(matrix, float).ravel().tolist())
     stated = "" if not error_mm else f' TransformError="{error_mm:.6g}"'
     if date is not None:

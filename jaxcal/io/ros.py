@@ -56,6 +56,8 @@ def static_transform_command(
     Raises:
         InputError: a matrix that is not rigid, or names that ROS does not take.
     """
+    if parent == child:
+        raise InputError(f"a transform leads from one frame to another, not from {parent} to it")
     stated = " ".join(f"--{key} {value}" for key, value in _seven(matrix).items())
     return (
         f"ros2 run tf2_ros static_transform_publisher {stated} "
