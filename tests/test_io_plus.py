@@ -409,3 +409,7 @@ def test_command_line_leaves_a_refused_configuration(tmp_path, capsys):
     assert main(["export", str(tmp_path / "m.npy"), "--plus-config", str(tmp_path / "c.xml")]) == 2
     assert "2 transforms between" in capsys.readouterr().err
     assert (tmp_path / "c.xml").read_bytes() == configuration(OLD, OLD)
+    # Nobody is told to remove a configuration that cannot be read.
+    (tmp_path / "c.xml").write_bytes(configuration(OLD).decode().encode("utf-16"))
+    assert main(["export", str(tmp_path / "m.npy"), "--plus-config", str(tmp_path / "c.xml")]) == 2
+    assert "c.xml: is UTF-16 or UTF-32; save it as UTF-8" in capsys.readouterr().err

@@ -206,6 +206,9 @@ def test_ros_is_rigid_and_in_metres(tmp_path):
     # A number without a point would be text in YAML 1.1.
     tiny = ImageTransform(np.eye(4) + np.pad([[1e-2]], ((0, 3), (3, 0))))
     assert "x: 1.0e-05\n" in tiny.text("ros")
+    edited = tiny.text("ros").replace("qw: 1.0", "qw: 1.0  # the scalar")
+    (tmp_path / "cal.yaml").write_text(edited)
+    np.testing.assert_array_equal(read_ros_yaml(tmp_path / "cal.yaml")[:3, 0], [1, 0, 0])
     # No pixels are needed, unlike everywhere else.
     with pytest.raises(InputError, match="--pixel-size"):
         tiny.plus_matrix()
@@ -450,6 +453,9 @@ def test_json_bombs(tmp_path):
         load_calibration(tmp_path / "c.json")
     (tmp_path / "c.npy").write_bytes(b"\x80\x04cos\nsystem\n")
     with pytest.raises(FormatError, match="is not an array of numbers"):
+        load_calibration(tmp_path / "c.npy")
+    np.save(tmp_path / "c.npy", (0.1 + 1j) * np.eye(4))
+    with pytest.raises(FormatError, match="is not an array of real numbers"):
         load_calibration(tmp_path / "c.npy")
 
 

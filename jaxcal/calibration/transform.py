@@ -582,9 +582,13 @@ def _load_plus(path: str | os.PathLike[str]) -> ImageTransform:
 def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
     check_readable(path, maximum_bytes=4096)
     try:
-        return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+        with open(path, "rb") as file:
+            found = np.lib.format.read_array(file, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise FormatError(f"is not an array of numbers: {one_line(error)}") from None
+    if found.dtype.kind not in "fiu":
+        raise FormatError("is not an array of real numbers")
+    return found.astype(np.float64)
 
 
 def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:

@@ -273,7 +273,7 @@ def _export_target(text: str, inputs: list[str]) -> tuple[SaveFormat, str]:
     elif not Path(path).is_file():
         raise InputError(f"--export {text}: there is no such configuration")
     else:
-        check_configuration(path, inputs)
+        check_configuration(path, None, inputs)
     return format, path
 
 

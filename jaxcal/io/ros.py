@@ -123,7 +123,7 @@ def read_ros_yaml(path: str | os.PathLike[str]) -> Float[np.ndarray, "4 4"]:
     name = os.fspath(path)
     found: dict[str, float] = {}
     for line, content in text_lines(path):
-        match = re.fullmatch(r"\s*(x|y|z|qx|qy|qz|qw):\s*(\S+)\s*", content)
+        match = re.fullmatch(r"\s*(x|y|z|qx|qy|qz|qw):\s*([^\s#]+)\s*(?:\s#.*)?", content)
         if match is None:
             continue
         key, text = match.groups()
