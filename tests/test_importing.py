@@ -510,6 +510,13 @@ def test_points_beside_pixels_of_another_orientation(tmp_path, orientation, told
     assert all(f"is stored as {orientation}" in note and told in note for note in notes)
 
 
+def test_points_that_cannot_be_used_name_their_file(tmp_path, sequence):
+    lines = table(["frame", "u", "v"], [np.arange(6), PIXELS * [1, -1]])
+    (tmp_path / "p.csv").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"s\.igs\.mha with .*p\.csv: pixel 0 has row"):
+        import_files([sequence, tmp_path / "p.csv"])
+
+
 def test_points_off_the_plane(tmp_path, sequence):
     (tmp_path / "p.fcsv").write_text(fcsv(1).replace(",0,0,0,0,1,", ",3,0,0,0,1,", 2))
     with pytest.raises(FormatError, match=r"p\.fcsv: point 'F-0' lies 3 mm off the image's plane"):

@@ -454,6 +454,20 @@ def test_json_bombs(tmp_path):
     (tmp_path / "c.npy").write_bytes(b"\x80\x04cos\nsystem\n")
     with pytest.raises(FormatError, match="is not an array of numbers"):
         load_calibration(tmp_path / "c.npy")
+    np.save(tmp_path / "c.npy", np.eye(4))
+    content = (tmp_path / "c.npy").read_bytes()
+    (tmp_path / "c.npy").write_bytes(content.replace(b"(4, 4)", b"((4, 4"))
+    with pytest.raises(FormatError, match="is not an array of numbers"):
+        load_calibration(tmp_path / "c.npy")
+    np.savez(tmp_path / "c.npz", image_plane_to_probe=np.eye(4))
+    content = (tmp_path / "c.npz").read_bytes()
+    # A method of packing that nobody knows, in both of the archive's lists.
+    for start, place in ((b"PK\3\4", 8), (b"PK\1\2", 10)):
+        at = content.index(start) + place
+        content = content[:at] + b"\x63\0" + content[at + 2 :]
+    (tmp_path / "c.npz").write_bytes(content)
+    with pytest.raises(FormatError, match="holds no arrays of numbers"):
+        load_calibration(tmp_path / "c.npz")
     np.save(tmp_path / "c.npy", (0.1 + 1j) * np.eye(4))
     with pytest.raises(FormatError, match="is not an array of real numbers"):
         load_calibration(tmp_path / "c.npy")

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile, ZipFile
+from zipfile import ZipFile
 
 import numpy as np
 
@@ -584,7 +584,8 @@ def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
     try:
         with open(path, "rb") as file:
             found = np.lib.format.read_array(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:
+        # numpy hands on whatever its parser of headers stumbles over.
         raise FormatError(f"is not an array of numbers: {one_line(error)}") from None
     if found.dtype.kind not in "fiu":
         raise FormatError("is not an array of real numbers")
@@ -600,7 +601,10 @@ def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
                 raise FormatError("holds more than a calibration")
         with np.load(path, allow_pickle=False) as file:
             record = {name: file[name].tolist() for name in _NPZ if name in file.files}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
+    except FormatError:
+        raise
+    except Exception as error:
+        # zipfile, too, has errors of many kinds.
         raise FormatError(f"holds no arrays of numbers: {one_line(error)}") from None
     return transform_from_record({"version": VERSION} | record, source=os.fspath(path))
 

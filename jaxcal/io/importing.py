@@ -154,7 +154,8 @@ def _from_sequence(
         if placed is None or points is None:
             return _segmented(sequence, poses, valid, spacing, options, notes, results)
         notes += placed.notes + _mirrored(sequence, points)
-        return _with_points(sequence, poses, valid, placed, spacing, options, notes)
+        where = f"{sequence.source} with {os.fspath(points)}"
+        return _with_points(sequence, poses, valid, placed, spacing, options, notes, where)
 
 
 def _estimated_lag(
@@ -196,6 +197,7 @@ def _with_points(
     spacing: tuple[float, float] | None,
     options: ImportOptions,
     notes: list[str],
+    where: str,
 ) -> Imported:
     """The target's points come from another file."""
     # In the order of the frames, so that times do not go back.
@@ -214,7 +216,7 @@ def _with_points(
         placed.kind,
         time=time,
         spacing_mm=spacing,
-        where=sequence.source,
+        where=where,
     )
     return Imported(Recording(images, source=sequence.source), notes + said)
 
