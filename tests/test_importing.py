@@ -262,6 +262,8 @@ def test_trackers_exports(tmp_path):
     (tmp_path / "t.csv").write_text(MOTIVE.replace("Meters", "Furlongs"))
     with pytest.raises(FormatError, match="Length Units 'furlongs' are not known"):
         read_tracker(tmp_path / "t.csv")
+    (tmp_path / "t.csv").write_text(MOTIVE.replace("Name,t,", "Name,left, slowly,", 1))
+    assert len(read_tracker(tmp_path / "t.csv")) == 2
     for text in (MOTIVE, OLD_NDI):
         (tmp_path / "t.csv").write_text(text.replace(",", ";"))
         with pytest.raises(FormatError, match="import the file that the tracker's program wrote"):

@@ -7,6 +7,7 @@ from the tool to ``Tracker``.
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import os
 import re
@@ -211,7 +212,8 @@ def _read_motive(
     pose_units: LengthUnit | None,
 ) -> TrackedSequence:
     cells = [cell.strip() for cell in first]
-    stated = dict(zip(cells[::2], cells[1::2], strict=False))
+    # Not by pairs of cells: the take's name may have commas.
+    stated = dict(itertools.pairwise(cells))
     rotation = stated.get("Rotation Type", "Quaternion")
     if rotation != "Quaternion":
         raise FormatError(
