@@ -92,6 +92,11 @@ def load(path: str | os.PathLike[str]) -> Recording:
             Either is one line that starts with the path.
     """
     check_readable(path)
+    if not h5py.is_hdf5(path):
+        raise FormatError(
+            f"{os.fspath(path)}: is not an HDF5 file (jaxcal import makes one of other programs' "
+            "files)"
+        )
     return _read(path, os.fspath(path))
 
 
