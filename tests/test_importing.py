@@ -149,13 +149,15 @@ def test_the_poses_of_a_pair_may_be_in_metres(tmp_path):
 
 def test_invalid_rows_are_counted(tmp_path):
     lines = table([*NAMES, "status"], [*COLUMNS, np.ones(6)])
-    more = [lines[1].replace(",1.0", ",OUT_OF_VIEW"), "nan" + lines[2][lines[2].index(",") :]]
+    more = [lines[1].replace(",1.0", ",OUT_OF_VIEW"), "# a comment, not a row"]
+    # The last two are what spreadsheets leave of a formula that failed.
+    more += [cell + lines[2][lines[2].index(",") :] for cell in ("nan", "#N/A", "#WERT!")]
     (tmp_path / "t.csv").write_text("\n".join([*lines, *more]))
     with pytest.raises(FormatError, match=r"t\.csv:8: the row is marked as invalid"):
         import_files([tmp_path / "t.csv"])
     recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True))
     assert len(recording) == 6
-    assert notes == [f"{tmp_path / 't.csv'}: 2 invalid rows left out"]
+    assert notes == [f"{tmp_path / 't.csv'}: 4 invalid rows left out"]
 
 
 @pytest.mark.parametrize(

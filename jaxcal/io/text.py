@@ -23,6 +23,7 @@ from jaxcal.runtime.array_types import Float, Int
 
 _LATEST_S = 1e11
 """Latest time, s after any beginning: three thousand years. Stamps in ms or ns are beyond it."""
+_MISSING = frozenset(("", "nan", "inf", "infinity", "na", "n/a", "null", "none"))
 _TRUE = frozenset(("1", "1.0", "true", "yes", "ok", "valid", "good", "tracked"))
 _FALSE = frozenset(
     (
@@ -312,7 +313,7 @@ def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list
 
 
 def _missing(cell: str) -> bool:
-    return cell.lower().lstrip("+-") in ("", "nan", "inf", "infinity", "na", "n/a", "null", "none")
+    return cell.startswith("#") or cell.lower().lstrip("+-") in _MISSING
 
 
 def _is_valid(table: Table, row: int, column: int) -> bool:
