@@ -42,7 +42,7 @@ from jaxcal.data.recording import (
     unit_of,
 )
 from jaxcal.io.atomic import atomic_path
-from jaxcal.io.readable import check_readable, quoted
+from jaxcal.io.readable import check_readable, naming, quoted
 from jaxcal.io.target_search import FATES, FrameResults
 from jaxcal.io.untrusted import (
     Node,
@@ -131,11 +131,8 @@ def save(
 
 
 def _read(source: str | os.PathLike[str] | io.BytesIO, name: str) -> Recording:
-    try:
-        with open_root(source) as root:
-            return _read_root(root, name)
-    except InputError as error:
-        raise type(error)(f"{name}: {error}") from None
+    with naming(name), open_root(source) as root:
+        return _read_root(root, name)
 
 
 def _read_root(root: Node, name: str) -> Recording:
