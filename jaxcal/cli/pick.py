@@ -47,10 +47,10 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
     from jaxcal.io.picker.server import Picker
 
     asked = ImportOptions(**options)
-    sequence, _ = open_sequence(frames, asked)
-    shown, size, notes = frames_to_show(sequence, asked, every)
     name = Path(os.path.abspath(frames)).name
     out = str(Path(frames).parent / f"{name.split('.')[0]}-picks.csv") if picks is None else picks
+    sequence, _ = open_sequence(frames, asked)
+    shown, size, notes = frames_to_show(sequence, asked, every)
     check_writable(out)
     placed = Picks(out, name, size, len(sequence), shown, sequence.files)
     pictures = Frames(sequence, asked.orientation)

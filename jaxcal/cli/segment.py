@@ -114,6 +114,7 @@ def segment(
     import_engine()
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.data.segmentation.segment import segment_recording
+    from jaxcal.io.atomic import check_writable
     from jaxcal.io.hdf5 import load, save
     from jaxcal.io.outputs import check_output, is_recording
     from jaxcal.io.readable import naming
@@ -122,6 +123,7 @@ def segment(
     # REC itself may be replaced: all of it is in the output.
     check_output(target, "a recording", is_recording)
     data = load(recording)
+    check_writable(target)
     probe = _probe(data, sound_speed, temperature)
     enable_compilation_cache()
     options: dict[str, Any] = {"method": method, "robust": robust, "scale": scale}
@@ -162,6 +164,7 @@ def _default_out(source: str) -> str:
 
 def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[str, Any]) -> int:
     """A sequence's frames; what became of each is counted and said."""
+    from jaxcal.io.atomic import check_writable
     from jaxcal.io.hdf5 import save
     from jaxcal.io.import_options import ImportOptions
     from jaxcal.io.importing import import_files
@@ -170,6 +173,9 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
 
     target = _default_out(source) if out is None else out
     check_output(target, "a recording", is_recording, [source])
+    # Of a source that is not there nothing is said about the output beside it.
+    if os.path.exists(source):
+        check_writable(target)
     with progress("segmenting"):
         recording, notes, found = import_files([source], ImportOptions(**options))
     assert found is not None
