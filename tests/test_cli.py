@@ -413,7 +413,8 @@ def test_bad_recordings_are_refused(capfd, recording, tmp_path):
         file["calibration/pose"][2, 0, 0] = np.nan
     assert "pose 2 holds NaN" in refused(capfd, "calibrate", recording)
     (tmp_path / "text.h5").write_text("not a recording")
-    assert "is not an HDF5 file" in refused(capfd, "calibrate", tmp_path / "text.h5")
+    said = refused(capfd, "calibrate", tmp_path / "text.h5")
+    assert "is not an HDF5 file (jaxcal import makes one" in said
 
 
 def test_pixels_without_a_spacing_are_refused(capfd, recording, tmp_path):

@@ -15,7 +15,8 @@ import jaxcal
 from jaxcal import FormatError, InputError
 from jaxcal.cli.main import main
 from jaxcal.io.columns import columns_of_header
-from jaxcal.io.importing import ImportOptions, import_files
+from jaxcal.io.import_options import ImportOptions
+from jaxcal.io.importing import import_files
 from jaxcal.io.sequence_files import read_sequence, write_sequence
 from jaxcal.io.slicer import read_markups
 from jaxcal.io.trackers import read_tracker
@@ -58,6 +59,10 @@ MATRIX = [f"m{i}{j}" for i in range(1, 4) for j in range(1, 5)]
         table(["v", "u", *NAMES[2:]], [PIXELS[:, ::-1], TRANSLATIONS, QUATERNIONS]),
         table(NAMES, COLUMNS, ";", comma=True),
         table(NAMES, COLUMNS, "\t"),
+        ["sep=;", *table(NAMES, COLUMNS, ";", comma=True)],
+        ['"sep=;"', *table(NAMES, COLUMNS, ";")],
+        [f"{line};;" for line in table(NAMES, COLUMNS, ";")],
+        [line + "," * (k > 0) for k, line in enumerate(table(NAMES, COLUMNS))],
         table(NAMES, COLUMNS, " "),
         table(["U [px]", "V [px]", "Tx (mm)", "Ty (mm)", "Tz (mm)", *NAMES[5:]], COLUMNS),
         table(["u_px", "v_px", "tx_m", "ty_m", "tz_m", *NAMES[5:]],
@@ -85,6 +90,7 @@ def test_headers_are_read(tmp_path, lines):
 def test_times_of_every_kind(tmp_path):
     for name, stamps, expected in (
         ("time [ms]", [0.5, 1, 2, 4, 8, 9], np.array([0.5, 1, 2, 4, 8, 9]) / 1e3),
+        ("stamp_ns", [10**18 + 10**9 * k for k in range(6)], 1e9 + np.arange(6)),
         ("Timestamp", [f"2026-11-21T21:00:0{k}.5" for k in range(6)], np.arange(6.0)),
     ):
         lines = table(NAMES, COLUMNS)
@@ -143,13 +149,15 @@ def test_the_poses_of_a_pair_may_be_in_metres(tmp_path):
 
 def test_invalid_rows_are_counted(tmp_path):
     lines = table([*NAMES, "status"], [*COLUMNS, np.ones(6)])
-    more = [lines[1].replace(",1.0", ",OUT_OF_VIEW"), "nan" + lines[2][lines[2].index(",") :]]
+    more = [lines[1].replace(",1.0", ",OUT_OF_VIEW"), "# a comment, not a row"]
+    # The last two are what spreadsheets leave of a formula that failed.
+    more += [cell + lines[2][lines[2].index(",") :] for cell in ("nan", "#N/A", "#WERT!")]
     (tmp_path / "t.csv").write_text("\n".join([*lines, *more]))
     with pytest.raises(FormatError, match=r"t\.csv:8: the row is marked as invalid"):
         import_files([tmp_path / "t.csv"])
     recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True))
     assert len(recording) == 6
-    assert notes == [f"{tmp_path / 't.csv'}: 2 invalid rows left out"]
+    assert notes == [f"{tmp_path / 't.csv'}: 4 invalid rows left out"]
 
 
 @pytest.mark.parametrize(
@@ -178,7 +186,9 @@ def test_headers_that_are_refused(names, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda row: row.replace(",", ",nan,", 1).rsplit(",", 1)[0], ":4: column 2"),
+        (lambda row: row.replace(",", ",nan,", 1).rsplit(",", 1)[0],
+         ":4: column 2 ('v') is nan: leave such rows out with --skip-invalid"),
+        (lambda row: row[row.index(",") :], ":4: column 1 ('u') is empty: leave such rows out"),
         (lambda row: row + ",1", ":4: 10 columns, the header has 9"),
         (lambda row: row.rsplit(",", 1)[0] + ",0.5e9", ": quaternion in line 4 has length"),
         (lambda row: row.replace(",", ",x", 1), ":4: column 2 ('v') is not a number"),
@@ -201,6 +211,13 @@ def test_times_that_go_back(tmp_path):
     recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
     assert recording.calibration.time is None
     assert "not kept" in notes[0]
+
+
+def test_times_in_another_unit_than_seconds(tmp_path):
+    lines = table(["time", *NAMES], [1.7e18 + 1e9 * np.arange(6), *COLUMNS])
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    with pytest.raises(FormatError, match=r"t\.csv:2: column 1 \('time'\) is 1\.7e\+18 s.*\[ns\]"):
+        import_files([tmp_path / "t.csv"])
 
 
 # Trackers' exports. The lines are those of real files, shortened.
@@ -247,6 +264,12 @@ def test_trackers_exports(tmp_path):
     (tmp_path / "t.csv").write_text(MOTIVE.replace("Meters", "Furlongs"))
     with pytest.raises(FormatError, match="Length Units 'furlongs' are not known"):
         read_tracker(tmp_path / "t.csv")
+    (tmp_path / "t.csv").write_text(MOTIVE.replace("Name,t,", "Name,left, slowly,", 1))
+    assert len(read_tracker(tmp_path / "t.csv")) == 2
+    for text in (MOTIVE, OLD_NDI):
+        (tmp_path / "t.csv").write_text(text.replace(",", ";"))
+        with pytest.raises(FormatError, match="import the file that the tracker's program wrote"):
+            import_files([tmp_path / "t.csv"])
     (tmp_path / "t.csv").write_text(NDI.replace("0.5973400", "0.59x"))
     with pytest.raises(FormatError, match=r"line 2: column 7 is not a number: '0\.59x'"):
         read_tracker(tmp_path / "t.csv")
@@ -322,6 +345,8 @@ def fcsv(sign):
         ("p.mrk.json", markups("LPS", -1, ["?"] * 6), "order"),
         ("p.fcsv", fcsv(1), "labels"),
         ("p.fcsv", fcsv(-1), "order"),
+        ("p.fcsv", fcsv(1).replace("F-", '"wire, ').replace(",,", '",,'), "labels"),
+        ("p.json", markups("LPS", 1, [f"F-{k}" for k in range(6)]), "labels"),
         ("p.csv", "\n".join(table(["frame", "v", "u"], [np.arange(6), PIXELS[:, ::-1]])), None),
         ("p.csv", "\n".join(table(["time", "u", "v"], [10.01 + np.arange(6) / 10, PIXELS])), None),
         ("p.csv", "\n".join(table(["u", "v"], [PIXELS])), None),
@@ -389,6 +414,13 @@ def test_poses_of_a_sequence_in_metres(tmp_path, kind):
         import_files(sources, ImportOptions(**asked))
     images = import_files(sources, ImportOptions(**asked, pose_units="m"))[0].calibration
     np.testing.assert_allclose(images.poses, POSES, atol=1e-9)
+
+
+def test_a_probe_at_rest_is_not_taken_for_metres(tmp_path):
+    """Poses between two frames on one body differ by rounding."""
+    lines = table(NAMES, [PIXELS, 1e-15 * TRANSLATIONS, QUATERNIONS])
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    assert len(import_files([tmp_path / "t.csv"])[0].calibration) == 6
 
 
 def test_a_stated_unit_is_not_advised_against(tmp_path):
@@ -480,6 +512,13 @@ def test_points_beside_pixels_of_another_orientation(tmp_path, orientation, told
     notes = [note for note in import_files([path, tmp_path / "p.csv"])[1] if "mirrored" in note]
     assert len(notes) == (told is not None)
     assert all(f"is stored as {orientation}" in note and told in note for note in notes)
+
+
+def test_points_that_cannot_be_used_name_their_file(tmp_path, sequence):
+    lines = table(["frame", "u", "v"], [np.arange(6), PIXELS * [1, -1]])
+    (tmp_path / "p.csv").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"s\.igs\.mha with .*p\.csv: pixel 0 has row"):
+        import_files([sequence, tmp_path / "p.csv"])
 
 
 def test_points_off_the_plane(tmp_path, sequence):

@@ -23,7 +23,8 @@ from jaxcal import FormatError, InputError, MissingExtraError
 from jaxcal.cli.main import main
 from jaxcal.io.dicom import read_pixel_size
 from jaxcal.io.folder import read_folder
-from jaxcal.io.importing import ImportOptions, import_files
+from jaxcal.io.import_options import ImportOptions
+from jaxcal.io.importing import import_files
 from jaxcal.io.picker.picks import Picks
 from jaxcal.io.png import encode_png, png_size, read_png
 from jaxcal.io.sequence_files import read_sequence, write_sequence
@@ -141,6 +142,8 @@ def folder(tmp_path):
     for number, frame in enumerate(FRAMES):
         (path / f"b{number + 2}.png").write_bytes(encode_png(frame))
     (path / "notes.txt").write_text("not an image")
+    # What a Mac leaves beside a file that it copies.
+    (path / "._b2.png").write_bytes(b"\0\5\x16\7Mac OS X")
     return path
 
 
@@ -431,12 +434,13 @@ def test_dates_are_not_matched_with_seconds(tmp_path, what, capsys):
     ],
 )
 def test_poses_of_other_times(tmp_path, times, message):
-    from jaxcal.io.poses_by_time import with_poses_by_time
+    from jaxcal.io.poses_by_time import Tracking, with_poses_by_time
 
     write_sequence(tmp_path / "i.mha", {}, 100.3 + np.arange(COUNT) * 0.37, images=FRAMES)
     images = read_sequence(tmp_path / "i.mha")
+    tracking = Tracking(times, moving(MOMENTS), np.ones(200, bool), PAIR, "t.mha")
     with pytest.raises(InputError, match=message):
-        with_poses_by_time(images, times, moving(MOMENTS), np.ones(200, bool), PAIR, "t.mha")
+        with_poses_by_time(images, tracking)
 
 
 def to_and_fro(t: np.ndarray) -> np.ndarray:

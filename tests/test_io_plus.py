@@ -225,7 +225,7 @@ def test_configuration_that_lies(content, message, tmp_path):
     [
         (MATRIX @ np.diag([1, 1, -1, 1.0]), "is a reflection"),
         (np.full((4, 4), np.nan), "4 x 4 and finite"),
-        (MATRIX.T, "last row must be 0 0 0 1"),
+        (MATRIX.T, "last row is not 0 0 0 1"),
     ],
 )
 def test_matrices_that_plus_would_not_take(matrix, message):
@@ -409,3 +409,7 @@ def test_command_line_leaves_a_refused_configuration(tmp_path, capsys):
     assert main(["export", str(tmp_path / "m.npy"), "--plus-config", str(tmp_path / "c.xml")]) == 2
     assert "2 transforms between" in capsys.readouterr().err
     assert (tmp_path / "c.xml").read_bytes() == configuration(OLD, OLD)
+    # Nobody is told to remove a configuration that cannot be read.
+    (tmp_path / "c.xml").write_bytes(configuration(OLD).decode().encode("utf-16"))
+    assert main(["export", str(tmp_path / "m.npy"), "--plus-config", str(tmp_path / "c.xml")]) == 2
+    assert "c.xml: is UTF-16 or UTF-32; save it as UTF-8" in capsys.readouterr().err

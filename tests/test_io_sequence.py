@@ -40,7 +40,7 @@ def written(path, count=5, **options):
     return transforms, valid, time, images
 
 
-NAMES = ["a.igs.mha", "a.igs.mhd", "a.igs.nrrd"]
+NAMES = ["a.igs.mha", "Übung 1.igs.mhd", "a.igs.nrrd"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -224,6 +224,7 @@ FIRST_NUMBER = rb"(Seq_Frame0001_\w+Transform = )\S+ "
         (rb"ElementDataFile = LOCAL", b"ElementDataFile = /etc/passwd", "only LOCAL, or"),
         (rb"ElementDataFile = LOCAL", b"ElementDataFile = ../x.raw", "only LOCAL, or"),
         (rb"ElementDataFile = LOCAL", b"ElementDataFile = LIST", "only LOCAL, or"),
+        (rb"ElementDataFile = LOCAL", b"ElementDataFile = LIST 2D", "only LOCAL, or"),
         (rb"ElementDataFile = LOCAL", b"ElementDataFile = x%03d.raw 1 9 1", "only LOCAL, or"),
         (rb"ElementDataFile = LOCAL", b"ElementDataFile = none.raw", "none.raw: no such file"),
         (rb"DimSize = 4 6 5", b"DimSize = 100000 100000 1000", "larger than 67108864 bytes"),
@@ -344,6 +345,7 @@ def test_a_bomb_takes_the_memory_of_one_frame(tmp_path):
         ({"transforms": {PROBE: random_poses(2)}}, r"shape \(2, 4, 4\)"),
         ({"images": np.zeros((3, 4, 4))}, "uint8 or int16"),
         ({"path": "a.raw"}, "ends in .mha"),
+        ({"path": "50%.mhd"}, "only LOCAL, or a file beside the header"),
         ({"transforms": {PROBE: np.full((3, 4, 4), np.nan)}}, "holds NaN"),
     ],
 )

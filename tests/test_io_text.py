@@ -144,7 +144,7 @@ def edited(line, column, value):
     return ",".join(fields)
 
 
-@pytest.mark.parametrize("value", ["x", "", "1_000", "0x10", "1.5.", "--1", "1 2"])
+@pytest.mark.parametrize("value", ["x", "1_000", "0x10", "1.5.", "--1", "1 2"])
 def test_csv_slip_names_line_and_column(tmp_path, value):
     lines = csv_lines()[0]
     lines[2] = edited(lines[2], 4, value)

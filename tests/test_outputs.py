@@ -105,6 +105,21 @@ def test_the_same_command_may_be_run_again(folder, arguments, capsys):
     assert main(arguments.split()) == main(arguments.split()) == 0
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "calibrate missing.h5 --export itk:none/out.h5",
+        "import missing.csv none/out.h5",
+        "segment rec.h5 --out none/out.h5",
+        "segment sweep.igs.mha --out none/out.h5",
+    ],
+)
+def test_where_nothing_can_be_written_no_work_begins(folder, arguments, capsys):
+    """What is wrong with the sources, which cannot be used either, is not found out."""
+    assert main(arguments.split()) == 2
+    assert "none/out.h5: cannot be written: its folder does not exist" in capsys.readouterr().err
+
+
 def test_a_simulation_replaces_a_simulation(folder, monkeypatch, capsys):
     known = jaxcal.load("rec.h5")
     truth = Truth(np.eye(4), np.zeros(3), np.zeros(6))

@@ -6,6 +6,7 @@ import http.client
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -178,6 +179,23 @@ def test_ctrl_c_keeps_what_was_picked(sequence):
         said, _ = process.communicate(timeout=30)
     assert process.returncode == 0
     assert "no points" in said
+
+
+def test_the_next_command_can_be_copied(tmp_path, sequence):
+    """Whatever blanks are in the names."""
+    renamed = sequence.rename(tmp_path / "Sonde 1.igs.mha")
+    out = tmp_path / "Sonde 1-picks.csv"
+    Picks(out, renamed.name, (COLUMNS, ROWS), len(FRAMES), range(len(FRAMES))).pick(0, 1.0, 2.0)
+    with picking(renamed) as (process, _):
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=30)
+    command = said.partition("next: ")[2].strip()
+    assert shlex.split(command) == ["jaxcal", "import", str(renamed), str(out), "OUT.h5"]
+
+
+def test_a_place_that_cannot_be_written_is_said_before_the_page(sequence, capsys):
+    assert main(["pick", str(sequence), str(sequence.parent / "none" / "p.csv")]) == 2
+    assert "p.csv: cannot be written: its folder does not exist" in capsys.readouterr().err
 
 
 # Everybody else.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -195,9 +196,19 @@ def test_ros_is_rigid_and_in_metres(tmp_path):
     x = float(re.search(r"--x (\S+) ", text)[1])
     assert x == pytest.approx(known.image_plane_to_probe[0, 3] / 1000)
     assert "--frame-id probe --child-frame-id image" in text
+    # ROS tells upper case from lower.
+    named = known.text("ros", frames=("US_Image", "tool0_Flange"))
+    assert "--frame-id tool0_Flange --child-frame-id US_Image" in named
+    assert "robot_effector_frame: tool0_Flange\n  tracking_base_frame: US_Image\n" in named
+    for format, twice in (("ros", ("a", "a")), ("plus", ("image", "Image"))):
+        with pytest.raises(InputError, match="leads from one frame to another"):
+            known.text(format, frames=twice)
     # A number without a point would be text in YAML 1.1.
     tiny = ImageTransform(np.eye(4) + np.pad([[1e-2]], ((0, 3), (3, 0))))
     assert "x: 1.0e-05\n" in tiny.text("ros")
+    edited = tiny.text("ros").replace("qw: 1.0", "qw: 1.0  # the scalar")
+    (tmp_path / "cal.yaml").write_text(edited)
+    np.testing.assert_array_equal(read_ros_yaml(tmp_path / "cal.yaml")[:3, 0], [1, 0, 0])
     # No pixels are needed, unlike everywhere else.
     with pytest.raises(InputError, match="--pixel-size"):
         tiny.plus_matrix()
@@ -248,6 +259,10 @@ def test_tus_rec_scan(tmp_path):
         file["x"] = 1
     with pytest.raises(FormatError, match=r"other\.h5: is no scan of TUS-REC"):
         read_scan(tmp_path / "other.h5")
+    with h5py.File(tmp_path / "none.h5", "w") as file:
+        file["tforms"] = transforms[:0]
+    with pytest.raises(FormatError, match=r"none\.h5: holds no frames"):
+        read_scan(tmp_path / "none.h5")
 
 
 # ITK and Slicer.
@@ -420,7 +435,8 @@ def test_json_that_lies(tmp_path, change, message):
     ("matrix", "message"),
     [
         (np.diag([0.1, -0.1, 0.1, 1]), "is a reflection"),
-        (np.diag([0.1, 0, 0.1, 1]), "pixels have no size"),
+        (np.diag([0.1, 0, 0.1, 1]), "flat"),
+        (np.diag([0.1, 1e-10, 0.1, 1]), "pixels have no size"),
         (np.diag([0.1, np.nan, 0.1, 1]), "finite"),
         (np.diag([0.1, 0.1, 0.1, 2]), "last row"),
         (np.eye(4) + np.pad([[0.1]], ((0, 3), (1, 2))), "degrees apart: fCal fitted"),
@@ -437,6 +453,23 @@ def test_json_bombs(tmp_path):
         load_calibration(tmp_path / "c.json")
     (tmp_path / "c.npy").write_bytes(b"\x80\x04cos\nsystem\n")
     with pytest.raises(FormatError, match="is not an array of numbers"):
+        load_calibration(tmp_path / "c.npy")
+    np.save(tmp_path / "c.npy", np.eye(4))
+    content = (tmp_path / "c.npy").read_bytes()
+    (tmp_path / "c.npy").write_bytes(content.replace(b"(4, 4)", b"((4, 4"))
+    with pytest.raises(FormatError, match="is not an array of numbers"):
+        load_calibration(tmp_path / "c.npy")
+    np.savez(tmp_path / "c.npz", image_plane_to_probe=np.eye(4))
+    content = (tmp_path / "c.npz").read_bytes()
+    # A method of packing that nobody knows, in both of the archive's lists.
+    for start, place in ((b"PK\3\4", 8), (b"PK\1\2", 10)):
+        at = content.index(start) + place
+        content = content[:at] + b"\x63\0" + content[at + 2 :]
+    (tmp_path / "c.npz").write_bytes(content)
+    with pytest.raises(FormatError, match="holds no arrays of numbers"):
+        load_calibration(tmp_path / "c.npz")
+    np.save(tmp_path / "c.npy", (0.1 + 1j) * np.eye(4))
+    with pytest.raises(FormatError, match="is not an array of real numbers"):
         load_calibration(tmp_path / "c.npy")
 
 
@@ -482,6 +515,8 @@ def test_export_to_files(saved, tmp_path, capsys):
     capsys.readouterr()
     assert main(["export", str(saved)]) == 2
     assert "name one format" in capsys.readouterr().err
+    assert main(["export", str(saved), "--numpy", "--probe-frame", "tool0"]) == 2
+    assert "--numpy names no frames" in capsys.readouterr().err
 
 
 def test_what_did_not_converge_is_not_handed_on(saved, capsys):
@@ -570,9 +605,25 @@ def test_no_plus_server(saved, capsys):
     assert "Connection refused" in capsys.readouterr().err
 
 
+def test_served_once_in_ages():
+    """Whoever connects gets the matrix at once, however rarely it is sent again."""
+    asked = iter([False, False, True])
+    with (
+        TransformServer("ImageToProbe", np.eye(4), port=0) as server,
+        socket.create_connection(("127.0.0.1", server.port), timeout=10) as client,
+    ):
+        # Ends the wait for the next time.
+        client.sendall(b"?")
+        server.serve(1e300, lambda: next(asked))
+        assert client.recv(106)[2:34] == b"TRANSFORM".ljust(12, b"\0") + b"ImageToProbe".ljust(
+            20, b"\0"
+        )
+
+
 def test_server_refuses():
-    with pytest.raises(InputError, match="1 to 20 bytes"):
-        TransformServer("TransducerOriginPixelsToProbe", np.eye(4), port=0)
+    for name in ("TransducerOriginPixelsToProbe", "Image\nToProbe", ""):
+        with pytest.raises(InputError, match="1 to 20 bytes"):
+            TransformServer(name, np.eye(4), port=0)
     with (
         TransformServer("ImageToProbe", np.eye(4), port=0) as server,
         pytest.raises(InputError, match="cannot listen at"),

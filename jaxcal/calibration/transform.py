@@ -22,12 +22,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile, ZipFile
+from zipfile import ZipFile
 
 import numpy as np
 
 from jaxcal import FormatError, InputError
-from jaxcal.data.poses import check_poses
+from jaxcal.data.poses import check_affine, check_poses
 from jaxcal.diagnostics.image_points import point_jacobian
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair
@@ -346,7 +346,8 @@ class ImageTransform:
         if format == "ros":
             from jaxcal.io.ros import ros_yaml
 
-            parent, child = frames[1].lower(), frames[0].lower()
+            # ROS's own frames are in lower case; the user's are written as they are.
+            child, parent = (n.lower() if n in ("Image", "Probe") else n for n in frames)
             return ros_yaml(self.image_plane_to_probe, parent, child, self.left_out(format))
         if format == "tusrec":
             from jaxcal.io.tus_rec import calib_matrix
@@ -498,16 +499,11 @@ def transform_from_plus_matrix(
             columns that are not orthogonal to 1e-3, which a rigid transform with a pixel size
             cannot have.
     """
-    matrix = np.asarray(matrix, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError(f"{source}: the matrix must be 4 x 4 and finite")
-    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
-        raise InputError(f"{source}: the matrix's last row is not 0 0 0 1")
+    with naming(source):
+        matrix = check_affine(matrix)
     scale = np.linalg.norm(matrix[:3, :2], axis=0)
     if not (scale > 1e-9).all():
         raise InputError(f"{source}: a column of the matrix is zero: the pixels have no size")
-    if np.linalg.det(matrix[:3, :3]) <= 0:
-        raise InputError(f"{source}: the matrix is a reflection, or flat")
     lateral, axial = (matrix[:3, :2] / scale).T
     if abs(lateral @ axial) > _SKEWED:
         raise InputError(
@@ -586,9 +582,14 @@ def _load_plus(path: str | os.PathLike[str]) -> ImageTransform:
 def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
     check_readable(path, maximum_bytes=4096)
     try:
-        return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
-    except (OSError, ValueError, EOFError) as error:
+        with open(path, "rb") as file:
+            found = np.lib.format.read_array(file, allow_pickle=False)
+    except Exception as error:
+        # numpy hands on whatever its parser of headers stumbles over.
         raise FormatError(f"is not an array of numbers: {one_line(error)}") from None
+    if found.dtype.kind not in "fiu":
+        raise FormatError("is not an array of real numbers")
+    return found.astype(np.float64)
 
 
 def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
@@ -600,7 +601,10 @@ def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
                 raise FormatError("holds more than a calibration")
         with np.load(path, allow_pickle=False) as file:
             record = {name: file[name].tolist() for name in _NPZ if name in file.files}
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
+    except FormatError:
+        raise
+    except Exception as error:
+        # zipfile, too, has errors of many kinds.
         raise FormatError(f"holds no arrays of numbers: {one_line(error)}") from None
     return transform_from_record({"version": VERSION} | record, source=os.fspath(path))
 

@@ -262,6 +262,7 @@ def _prepared(out: str) -> AbstractContextManager[Path]:
 def _export_target(text: str, inputs: list[str]) -> tuple[SaveFormat, str]:
     from jaxcal.calibration.transform import check_target
     from jaxcal.cli.export import check_configuration
+    from jaxcal.io.atomic import check_writable
 
     name, colon, path = text.partition(":")
     known: dict[str, SaveFormat] = {each: each for each in EXPORTS}
@@ -273,7 +274,8 @@ def _export_target(text: str, inputs: list[str]) -> tuple[SaveFormat, str]:
     elif not Path(path).is_file():
         raise InputError(f"--export {text}: there is no such configuration")
     else:
-        check_configuration(path, inputs)
+        check_configuration(path, None, inputs)
+    check_writable(path)
     return format, path
 
 

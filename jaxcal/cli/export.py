@@ -23,6 +23,9 @@ _TEXTS = {
     "numpy": "PLUS's matrix (OUT.npy), or all that is known (OUT.npz).",
 }
 
+_NAMELESS = ("slicer", "itk", "tusrec", "numpy")
+"""Formats without names of frames."""
+
 
 def _formats(command):
     for name, text in reversed(_TEXTS.items()):
@@ -97,10 +100,14 @@ def export(
         raise click.UsageError("--plus-server writes no file: leave OUT out")
     if origin is not None and pixel_size is None:
         raise click.BadParameter("needs --pixel-size", param_hint="--origin")
+    if (image_frame, probe_frame) != ("Image", "Probe") and format in _NAMELESS:
+        raise click.UsageError(
+            f"--{format} names no frames: leave --image-frame, --probe-frame out"
+        )
     from jaxcal.calibration.transform import check_target, load_calibration
 
     if plus_config is not None:
-        check_configuration(plus_config if out is None else out, [calibration])
+        check_configuration(plus_config, out, [calibration], (image_frame, probe_frame))
     elif out is not None:
         format = check_target(out, format, [calibration])
     transform = load_calibration(calibration)
@@ -121,19 +128,33 @@ def export(
     return ExitCode.CONVERGED
 
 
-def check_configuration(path: str, inputs: Sequence[str]) -> None:
-    """Check that a configuration of PLUS can be written; another one may be there.
+def check_configuration(
+    path: str,
+    out: str | None,
+    inputs: Sequence[str],
+    frames: tuple[str, str] = ("Image", "Probe"),
+) -> None:
+    """Check that a transform can be put into a configuration of PLUS, in place or in a copy.
 
     Raises:
-        InputError: it is one of the inputs, or no configuration.
+        InputError: the configuration cannot take it, or what would be replaced is one of the
+            inputs, or no configuration.
     """
+    import numpy as np
+
     from jaxcal.io.outputs import check_output
+    from jaxcal.io.plus import patched_configuration
+    from jaxcal.io.readable import naming
     from jaxcal.io.xml import read_xml
 
     def is_one(path: str | os.PathLike[str]) -> bool:
-        return read_xml(path)[0].tag == "PlusConfiguration"
+        # What is wrong with the configuration itself is said below.
+        return out is None or read_xml(path)[0].tag == "PlusConfiguration"
 
-    check_output(path, "a configuration of PLUS", is_one, inputs)
+    check_output(path if out is None else out, "a configuration of PLUS", is_one, inputs)
+    _, content = read_xml(path)
+    with naming(path):
+        patched_configuration(content, frames, np.eye(4))
 
 
 def written(

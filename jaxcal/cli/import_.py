@@ -6,9 +6,10 @@ from typing import Any
 
 import click
 
-from jaxcal import InputError
+from jaxcal import InputError, OutputError
 from jaxcal.cli.common import ExitCode, progress
 from jaxcal.cli.sequence_options import search_options, tracking_options
+from jaxcal.io.atomic import check_writable
 from jaxcal.io.outputs import check_output, is_recording
 
 
@@ -56,7 +57,8 @@ def import_(sources: tuple[str, ...], out: str, **options: Any) -> int:
     """
     _check(sources, out, options)
     from jaxcal.io.hdf5 import save
-    from jaxcal.io.importing import ImportOptions, import_files
+    from jaxcal.io.import_options import ImportOptions
+    from jaxcal.io.importing import import_files
 
     with progress("importing"):
         recording, notes, frames = import_files(sources, ImportOptions(**options))
@@ -81,6 +83,7 @@ def _check(sources: tuple[str, ...], out: str, options: dict[str, Any]) -> None:
     read = [*sources, options["poses"], options["spacing_from"]]
     try:
         check_output(out, "a recording", is_recording, [each for each in read if each is not None])
-    except InputError as error:
+        check_writable(out)
+    except (InputError, OutputError) as error:
         # Whoever forgets OUT.h5 names a source last.
-        raise InputError(f"{error} (name the output file last)") from None
+        raise type(error)(f"{error} (name the output file last)") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -38,16 +39,19 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
     open. Every click is saved at once; the same command goes on where it was ended. By default
     PICKS.csv is beside SOURCE and has its name.
     """
-    from jaxcal.io.importing import ImportOptions, frames_to_show, open_sequence
+    from jaxcal.io.atomic import check_writable
+    from jaxcal.io.frame_poses import frames_to_show, open_sequence
+    from jaxcal.io.import_options import ImportOptions
     from jaxcal.io.picker.frames import Frames
     from jaxcal.io.picker.picks import Picks
     from jaxcal.io.picker.server import Picker
 
     asked = ImportOptions(**options)
-    sequence, _ = open_sequence(frames, asked)
-    shown, size, notes = frames_to_show(sequence, asked, every)
     name = Path(os.path.abspath(frames)).name
     out = str(Path(frames).parent / f"{name.split('.')[0]}-picks.csv") if picks is None else picks
+    sequence, _ = open_sequence(frames, asked)
+    shown, size, notes = frames_to_show(sequence, asked, every)
+    check_writable(out)
     placed = Picks(out, name, size, len(sequence), shown, sequence.files)
     pictures = Frames(sequence, asked.orientation)
     # What cannot be shown is said here, not on the page.
@@ -77,12 +81,13 @@ def _tell(placed: Any, source: str, out: str, options: dict[str, Any]) -> None:
     )
     if count:
         given = [
-            f"--{name} {options[key]}"
+            part
             for name, key in (
                 ("poses", "poses"),
                 ("from", "source"),
                 ("to", "target"),
             )
             if options[key]
+            for part in (f"--{name}", options[key])
         ]
-        click.echo(" ".join(["next: jaxcal import", source, out, "OUT.h5", *given]))
+        click.echo(f"next: {shlex.join(['jaxcal', 'import', source, out, 'OUT.h5', *given])}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -113,21 +114,21 @@ def segment(
     import_engine()
     from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.data.segmentation.segment import segment_recording
+    from jaxcal.io.atomic import check_writable
     from jaxcal.io.hdf5 import load, save
     from jaxcal.io.outputs import check_output, is_recording
+    from jaxcal.io.readable import naming
 
     target = _default_out(recording) if out is None else out
     # REC itself may be replaced: all of it is in the output.
     check_output(target, "a recording", is_recording)
     data = load(recording)
+    check_writable(target)
     probe = _probe(data, sound_speed, temperature)
     enable_compilation_cache()
     options: dict[str, Any] = {"method": method, "robust": robust, "scale": scale}
-    with progress("segmenting"):
-        try:
-            segmented, found = segment_recording(data, probe, interpolate=interpolate, **options)
-        except InputError as error:
-            raise type(error)(f"{recording}: {error}") from None
+    with progress("segmenting"), naming(recording):
+        segmented, found = segment_recording(data, probe, interpolate=interpolate, **options)
     save(segmented, target, found)
     record = _record(found, target)
     if as_json:
@@ -163,13 +164,18 @@ def _default_out(source: str) -> str:
 
 def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[str, Any]) -> int:
     """A sequence's frames; what became of each is counted and said."""
+    from jaxcal.io.atomic import check_writable
     from jaxcal.io.hdf5 import save
-    from jaxcal.io.importing import ImportOptions, import_files
+    from jaxcal.io.import_options import ImportOptions
+    from jaxcal.io.importing import import_files
     from jaxcal.io.outputs import check_output, is_recording
     from jaxcal.io.target_search import FATES
 
     target = _default_out(source) if out is None else out
     check_output(target, "a recording", is_recording, [source])
+    # Of a source that is not there nothing is said about the output beside it.
+    if os.path.exists(source):
+        check_writable(target)
     with progress("segmenting"):
         recording, notes, found = import_files([source], ImportOptions(**options))
     assert found is not None
@@ -205,7 +211,7 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     if counts["not credible"] > counts["found"]:
         lines.append(
             f"- few show a credible target: look at --region and --target, or place the points by "
-            f"hand: jaxcal pick {source}"
+            f"hand: jaxcal pick {shlex.quote(source)}"
         )
     print_page(*lines, *(f"- {note}" for note in notes if "left out" not in note))
     return ExitCode.CONVERGED

@@ -23,6 +23,9 @@ ROTATION_TOLERANCE = 1e-2
 QUATERNION_TOLERANCE = 1e-2
 """Largest distance of a quaternion's length from 1 that counts as rounding."""
 
+_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
+_LAST_ROW_TOLERANCE = 1e-6
+
 QuaternionOrder = Literal["xyzw", "wxyz"]
 """Whether the scalar comes last (ROS, Motive, scipy) or first (NDI)."""
 
@@ -103,7 +106,7 @@ def check_poses(
     bad = ~np.isfinite(full).all(axis=(1, 2))
     if bad.any():
         raise InputError(f"{name(int(np.flatnonzero(bad)[0]))} holds NaN or Inf")
-    bad = np.abs(full[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > 1e-6
+    bad = np.abs(full[:, 3] - _LAST_ROW).max(axis=1) > _LAST_ROW_TOLERANCE
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         raise InputError(
@@ -124,8 +127,25 @@ def check_poses(
             f"the nearest one (at most {ROTATION_TOLERANCE:g} is taken for rounding)"
         )
     full[:, :3, :3] = rotations
-    full[:, 3] = [0.0, 0.0, 0.0, 1.0]
+    full[:, 3] = _LAST_ROW
     return full
+
+
+def check_affine(matrix: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    """Check a 4x4 matrix that may hold scales: finite, last row 0 0 0 1, no reflection.
+
+    Raises:
+        InputError: it is none; one line.
+    """
+    matrix = np.array(matrix, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError("the matrix must be 4 x 4 and finite")
+    if np.abs(matrix[3] - _LAST_ROW).max() > _LAST_ROW_TOLERANCE:
+        raise InputError("the matrix's last row is not 0 0 0 1 (a transposed matrix?)")
+    if np.linalg.det(matrix[:3, :3]) <= 0:
+        raise InputError("the matrix is a reflection, or flat: its determinant is not positive")
+    matrix[3] = _LAST_ROW
+    return matrix
 
 
 def rotation_angle(first: np.ndarray, second: np.ndarray) -> float:

@@ -27,6 +27,7 @@ LARGEST = 1e7
 Kind = Literal["point", "pixel", "time_of_flight"]
 _EXTENT_MM = 50.0
 """Of a target's path through the image where nothing better is known."""
+_AT_REST_MM = 1e-6
 _UNIT = {"point": "mm", "pixel": "px", "time_of_flight": "s"}
 
 
@@ -406,7 +407,8 @@ def check_pose_units(translations: Float[np.ndarray, "n 3"], extent_mm: float = 
         MetresError: they look like metres.
     """
     spread, reach = _spread_and_reach(translations)
-    if 0 < spread < 0.02 * extent_mm and reach < 5.0:
+    # A probe that does not move has no unit; what is left of its moves is rounding.
+    if _AT_REST_MM < spread < 0.02 * extent_mm and reach < 5.0:
         raise MetresError(
             f"pose translations reach only {reach:.3g} mm while the target moves over about "
             f"{extent_mm:.0f} mm of the image: the poses look like metres; give them in mm"

@@ -16,7 +16,7 @@ from jaxcal.io.readable import quoted
 
 LengthUnit = Literal["mm", "cm", "m"]
 LENGTHS_MM: dict[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-TIMES_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+TIMES_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 _NAMES = {
     "time": ("time", "t", "timestamp", "timestamps", "stamp", "seconds"),
@@ -37,7 +37,9 @@ _NAMES = {
     "qw": ("qw", "qs", "quaternionw", "rotationw", "w"),
 }
 _ROLE = {name: role for role, names in _NAMES.items() for name in names}
-_UNIT = re.compile(r"^(.*?)(?:\s*[\[(]\s*([^\])]*?)\s*[\])]|[_\s](mm|cm|m|px|pixels?|s|ms|us))?$")
+_UNIT = re.compile(
+    r"^(.*?)(?:\s*[\[(]\s*([^\])]*?)\s*[\])]|[_\s](mm|cm|m|px|pixels?|s|ms|us|ns))?$"
+)
 _CELL = re.compile(r"([a-z]*?)_?([0-4])[_,]?([0-4])")
 _NUMBERED = re.compile(r"([a-z]*?)_?(\d{1,2})")
 _UNITS = {
@@ -61,6 +63,7 @@ _UNITS = {
     "ms": "ms",
     "us": "us",
     "µs": "us",
+    "ns": "ns",
 }
 
 
@@ -146,7 +149,7 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
     lengths = translation or (matrix[3:12:4] if matrix else ())
     time_unit = None if "time" not in roles else units[roles["time"]]
     if time_unit not in (None, *TIMES_S):
-        raise FormatError(f"time in {quoted(str(time_unit))} is not known: s, ms or us")
+        raise FormatError(f"time in {quoted(str(time_unit))} is not known: s, ms, us or ns")
     return Columns(
         width=len(names),
         matrix=matrix,

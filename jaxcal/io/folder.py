@@ -24,7 +24,8 @@ def read_folder(path: str | os.PathLike[str]) -> TrackedSequence:
     """The PNG images of a folder in the order of their numbers; no poses, no times.
 
     Args:
-        path: of the folder. ``b2.png`` comes before ``b10.png``; other files are passed over.
+        path: of the folder. ``b2.png`` comes before ``b10.png``; other files, hidden ones too, are
+            passed over.
 
     Raises:
         FormatError: no such folder, no PNG in it, images of different sizes, a link to another
@@ -32,7 +33,12 @@ def read_folder(path: str | os.PathLike[str]) -> TrackedSequence:
     """
     folder, name = Path(path), os.fspath(path)
     try:
-        paths = [entry for entry in folder.iterdir() if entry.suffix.lower() == ".png"]
+        # Macs leave a hidden ``._a.png``, which is no image, beside each ``a.png``.
+        paths = [
+            entry
+            for entry in folder.iterdir()
+            if entry.suffix.lower() == ".png" and not entry.name.startswith(".")
+        ]
     except OSError as error:
         raise FormatError(f"{name}: cannot be read: {one_line(error)}") from None
     if not paths:
@@ -99,7 +105,7 @@ def with_pose_table(images: TrackedSequence, table: PoseTable) -> tuple[TrackedS
     time = np.full(count, np.nan)
     if table.time is not None:
         time[rows] = table.time
-    notes = [f"{table.name}: {table.skipped} invalid rows left out"] if table.skipped else []
+    notes = table.notes
     missing = count - len(rows)
     if missing:
         notes.append(f"{missing} of {count} images have no pose in {table.name}")
@@ -122,8 +128,9 @@ def rows_by_file(images: TrackedSequence, table: PoseTable) -> Int[np.ndarray, "
     assert isinstance(images.pixels, FolderPixels)
     assert table.file is not None
     paths = images.pixels.paths
-    places = {path.name: index for index, path in enumerate(paths)}
-    places |= {path.stem: index for path, index in zip(paths, places.values(), strict=True)}
+    places = {path.stem: index for index, path in enumerate(paths)}
+    # A whole name counts before another's without its ending.
+    places |= {path.name: index for index, path in enumerate(paths)}
     named = [re.split(r"[/\\]", text)[-1] for text in table.file]
     unknown = [row for row, text in enumerate(named) if text not in places]
     if unknown:

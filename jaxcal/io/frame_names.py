@@ -42,6 +42,18 @@ def check_frame(name: str) -> str:
     return capital
 
 
+def check_frames(frames: FramePair) -> FramePair:
+    """Two different frames' names that PLUS and Slicer accept, capitalised.
+
+    Raises:
+        FormatError: see :func:`check_frame`; or one frame twice.
+    """
+    source, target = check_frame(frames[0]), check_frame(frames[1])
+    if source == target:
+        raise FormatError(f"a transform leads from one frame to another, not from {source} to it")
+    return source, target
+
+
 def path_between(pairs: list[FramePair], start: str, end: str) -> list[tuple[int, bool]] | None:
     """The shortest way from one frame to another along transforms and their inverses.
 

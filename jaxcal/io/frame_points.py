@@ -75,8 +75,8 @@ def points_of_table(
         raise InputError(f"{table.name}: has a column {named}: leave --points order out")
     with naming(table.name):
         rows = _rows_of_table(table, sequence, assignment)
-    notes = [f"{table.name}: {table.skipped} invalid rows left out"] if table.skipped else []
-    return FramePoints(_distinct(rows, sequence, table.name), table.points, table.kind, notes)
+    rows = _distinct(rows, sequence, table.name)
+    return FramePoints(rows, table.points, table.kind, table.notes)
 
 
 def _distinct(

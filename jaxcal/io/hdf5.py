@@ -42,7 +42,7 @@ from jaxcal.data.recording import (
     unit_of,
 )
 from jaxcal.io.atomic import atomic_path
-from jaxcal.io.readable import check_readable, quoted
+from jaxcal.io.readable import check_readable, naming, quoted
 from jaxcal.io.target_search import FATES, FrameResults
 from jaxcal.io.untrusted import (
     Node,
@@ -92,6 +92,11 @@ def load(path: str | os.PathLike[str]) -> Recording:
             Either is one line that starts with the path.
     """
     check_readable(path)
+    if not h5py.is_hdf5(path):
+        raise FormatError(
+            f"{os.fspath(path)}: is not an HDF5 file (jaxcal import makes one of other programs' "
+            "files)"
+        )
     return _read(path, os.fspath(path))
 
 
@@ -126,11 +131,8 @@ def save(
 
 
 def _read(source: str | os.PathLike[str] | io.BytesIO, name: str) -> Recording:
-    try:
-        with open_root(source) as root:
-            return _read_root(root, name)
-    except InputError as error:
-        raise type(error)(f"{name}: {error}") from None
+    with naming(name), open_root(source) as root:
+        return _read_root(root, name)
 
 
 def _read_root(root: Node, name: str) -> Recording:

@@ -11,93 +11,22 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Literal, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxcal import FormatError, InputError
-from jaxcal.data.poses import QuaternionOrder
+from jaxcal import InputError
 from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, Recording, make_images
-from jaxcal.io.columns import LengthUnit
-from jaxcal.io.folder import PROBE_TO_TRACKER, read_folder, with_pose_table
-from jaxcal.io.frame_names import FramePair, capitalised
-from jaxcal.io.frame_points import Assignment, FramePoints, points_of_markups, points_of_table
-from jaxcal.io.poses_by_time import lag_of_points, times_of_table, with_poses_by_time
-from jaxcal.io.readable import quoted
-from jaxcal.io.sequence import FolderPixels, Pixels, TrackedSequence
-from jaxcal.io.sequence_files import EXTENSIONS, read_sequence
-from jaxcal.io.slicer import EXTENSIONS as MARKUPS
+from jaxcal.io.frame_points import FramePoints, points_of_markups, points_of_table
+from jaxcal.io.frame_poses import opened, tracked_poses
+from jaxcal.io.import_options import ImportOptions, refuse
+from jaxcal.io.poses_by_time import Tracking, lag_of_points, with_poses_by_time
+from jaxcal.io.sequence import Pixels, TrackedSequence
+from jaxcal.io.sources import SEQUENCES, kind_of, read_rows
 from jaxcal.io.target_search import FrameResults, search_target
-from jaxcal.io.text import PoseTable, read_crosswire, read_pose_table, recording_of
-from jaxcal.io.trackers import is_tracker_export, read_tracker
+from jaxcal.io.text import PoseTable, read_crosswire, recording_of
 from jaxcal.runtime.array_types import Bool, Float, Int
-
-
-@dataclass(frozen=True)
-class ImportOptions:
-    """The options of an import.
-
-    Attributes:
-        source: tracked frame on the probe; the sequence's only one, or ``Probe``, by default.
-        target: frame that the target rests in; ``Reference`` where it was tracked, else
-            ``Tracker``, by default.
-        spacing_mm: [lateral, axial] mm per px, when known.
-        units: of u and v in tables.
-        quaternion: where a quaternion's scalar stands.
-        pose_units: of translations where the file of the poses does not say; mm by default.
-        skip_invalid: leave out rows of tables that are marked as invalid, and count them.
-        points: how points without time or number are assigned to frames.
-        target_kind: what to look for in frames where no points are given: ``echo``, the default,
-            or ``cross``.
-        region: (first column, first row, columns, rows) to look in, px.
-        orientation: of the stored pixels of frames that are searched, where the file does not say.
-        ignore_time: time stamps that repeat or go back are no error, and are not kept.
-        poses: file with the poses of the frames: a table for a folder of images; a sequence, a
-            tracker's export or a table with times for a sequence.
-        lag_s: with ``poses``: an image stamped t shows what was at t - lag; ``auto``: estimated
-            from the motion of the points in the images.
-        spacing_from: DICOM clip that states the pixel size.
-    """
-
-    source: str | None = None
-    target: str | None = None
-    spacing_mm: tuple[float, float] | None = None
-    units: Literal["px", "mm"] | None = None
-    quaternion: QuaternionOrder | None = None
-    pose_units: LengthUnit | None = None
-    skip_invalid: bool = False
-    points: Assignment | None = None
-    target_kind: Literal["echo", "cross"] | None = None
-    region: tuple[int, int, int, int] | None = None
-    orientation: Literal["MF", "UF", "MN", "UN"] | None = None
-    ignore_time: bool = False
-    poses: str | os.PathLike[str] | None = None
-    lag_s: float | Literal["auto"] = 0.0
-    spacing_from: str | os.PathLike[str] | None = None
-
-
-_FLAGS = {
-    "source": "--from",
-    "target": "--to",
-    "units": "--units",
-    "quaternion": "--quaternion",
-    "skip_invalid": "--skip-invalid",
-    "points": "--points",
-    "target_kind": "--target",
-    "region": "--region",
-    "orientation": "--orientation",
-    "ignore_time": "--ignore-time",
-    "lag_s": "--lag",
-}
-
-
-def _refuse(options: ImportOptions, names: Sequence[str], why: str) -> None:
-    """Refuse options that were given and would not be used."""
-    for name in names:
-        if getattr(options, name) != getattr(ImportOptions, name):
-            raise InputError(f"{_FLAGS[name]} {why}")
 
 
 class Imported(NamedTuple):
@@ -133,20 +62,20 @@ def import_files(
             file, and where possible the line.
     """
     options = options or ImportOptions()
-    kinds = [_kind(source) for source in sources]
-    tracked = [source for source, kind in zip(sources, kinds, strict=True) if kind in _SEQUENCES]
+    kinds = [kind_of(source) for source in sources]
+    tracked = [source for source, kind in zip(sources, kinds, strict=True) if kind in SEQUENCES]
     if tracked:
         return _from_sequence(sources, tracked, options)
     if options.poses is not None:
         raise InputError("--poses goes with a sequence or a folder of PNG images")
     unused = "source", "target", "lag_s", "points", "target_kind", "region", "orientation"
-    _refuse(options, unused, "does not go with a table of poses and points: it is for sequences")
+    refuse(options, unused, "does not go with a table of poses and points: it is for sequences")
     options = replace(options, spacing_mm=_spacing(None, options), spacing_from=None)
     if len(sources) == 2 and "markups" not in kinds:
         if options.units == "mm":
             raise InputError("a pair of text files holds pixels: --units mm does not go with it")
         unused = "quaternion", "skip_invalid", "ignore_time"
-        _refuse(options, unused, "does not go with a pair of text files, poses and points")
+        refuse(options, unused, "does not go with a pair of text files, poses and points")
         with _naming_pose_units(options):
             pair = read_crosswire(
                 *sources, spacing_mm=options.spacing_mm, pose_units=options.pose_units or "mm"
@@ -157,8 +86,8 @@ def import_files(
             f"{os.fspath(sources[0])}: holds no poses: a sequence, a tracker's export or a table "
             "with poses is needed"
         )
-    table = _table(sources[0], options)
-    notes = _skipped(table)
+    table = read_rows(sources[0], options)
+    notes = table.notes
     table, said = _with_good_time(table, options)
     with _naming_pose_units(options, table.length_stated):
         return Imported(recording_of(table, options.spacing_mm), notes + said)
@@ -173,41 +102,6 @@ def _naming_pose_units(options: ImportOptions, stated: bool = False) -> Iterator
         if stated or options.pose_units is not None:
             raise
         raise InputError(f"{error} (jaxcal import converts them with --pose-units m)") from None
-
-
-_SEQUENCES = ("sequence", "tracker", "scan", "folder")
-
-
-def _kind(source: str | os.PathLike[str]) -> str:
-    name = os.fspath(source).lower()
-    if Path(source).is_dir():
-        return "folder"
-    if name.endswith(EXTENSIONS):
-        return "sequence"
-    if name.endswith(MARKUPS):
-        return "markups"
-    if name.endswith((".h5", ".hdf5")):
-        return "scan"
-    if name.endswith((".xml", ".png", ".dcm", ".vtk", ".seq.mrb", ".mrb")):
-        raise FormatError(
-            f"{os.fspath(source)}: is not a recording that can be imported (PNG images: name their "
-            "folder)"
-        )
-    return "tracker" if is_tracker_export(source) else "table"
-
-
-def _table(source: str | os.PathLike[str], options: ImportOptions) -> PoseTable:
-    return read_pose_table(
-        source,
-        quaternion=options.quaternion,
-        pose_units=options.pose_units,
-        units=options.units,
-        skip_invalid=options.skip_invalid,
-    )
-
-
-def _skipped(table: PoseTable) -> list[str]:
-    return [f"{table.name}: {table.skipped} invalid rows left out"] if table.skipped else []
 
 
 def _with_good_time(table: PoseTable, options: ImportOptions) -> tuple[PoseTable, list[str]]:
@@ -244,14 +138,14 @@ def _from_sequence(
         )
     points = next((source for source in sources if source not in tracked), None)
     _refuse_unused(points, options)
-    sequence, tracking, notes = _opened(tracked[0], options)
+    sequence, tracking, notes = opened(tracked[0], options)
     placed = None if points is None else _points(points, sequence, options)
     results, lag_s = None, options.lag_s
     if tracking is not None:
         if lag_s == "auto":
             lag_s, note, results = _estimated_lag(sequence, placed, tracking, options)
             notes.append(note)
-        sequence, said = _merged(sequence, tracking, lag_s)
+        sequence, said = with_poses_by_time(sequence, tracking, lag_s)
         notes += said
     poses, valid, said = tracked_poses(sequence, options)
     notes += said
@@ -260,13 +154,14 @@ def _from_sequence(
         if placed is None or points is None:
             return _segmented(sequence, poses, valid, spacing, options, notes, results)
         notes += placed.notes + _mirrored(sequence, points)
-        return _with_points(sequence, poses, valid, placed, spacing, options, notes)
+        where = f"{sequence.source} with {os.fspath(points)}"
+        return _with_points(sequence, poses, valid, placed, spacing, options, notes, where)
 
 
 def _estimated_lag(
     sequence: TrackedSequence,
     placed: FramePoints | None,
-    tracking: _Tracking,
+    tracking: Tracking,
     options: ImportOptions,
 ) -> tuple[float, str, FrameResults | None]:
     """The lag and a note, and the target in all frames if it had to be looked for."""
@@ -277,22 +172,21 @@ def _estimated_lag(
     else:
         shown = _shown(sequence, placed.rows)
         rows, points = placed.rows[shown], placed.points[shown]
-    time, poses, valid, _, source, _ = tracking
-    return *lag_of_points(sequence, rows, points, time, poses, valid, source), results
+    return *lag_of_points(sequence, rows, points, tracking), results
 
 
 def _refuse_unused(points: str | os.PathLike[str] | None, options: ImportOptions) -> None:
     """Refuse options that a sequence with these points does not use."""
-    kinds = [None if source is None else _kind(source) for source in (points, options.poses)]
+    kinds = [None if source is None else kind_of(source) for source in (points, options.poses)]
     if "table" not in kinds:
-        _refuse(options, ("quaternion", "skip_invalid"), "is for tables, and none is read")
+        refuse(options, ("quaternion", "skip_invalid"), "is for tables, and none is read")
     if kinds[0] != "table":
-        _refuse(options, ("units",), "is for tables of points, and none is read")
+        refuse(options, ("units",), "is for tables of points, and none is read")
     if points is None:
-        _refuse(options, ("points",), "is for points of another file, and none is named")
+        refuse(options, ("points",), "is for points of another file, and none is named")
     else:
         why = f"is for the search in frames, and the points come from {os.fspath(points)}"
-        _refuse(options, ("target_kind", "region", "orientation"), why)
+        refuse(options, ("target_kind", "region", "orientation"), why)
 
 
 def _with_points(
@@ -303,6 +197,7 @@ def _with_points(
     spacing: tuple[float, float] | None,
     options: ImportOptions,
     notes: list[str],
+    where: str,
 ) -> Imported:
     """The target's points come from another file."""
     # In the order of the frames, so that times do not go back.
@@ -321,7 +216,7 @@ def _with_points(
         placed.kind,
         time=time,
         spacing_mm=spacing,
-        where=sequence.source,
+        where=where,
     )
     return Imported(Recording(images, source=sequence.source), notes + said)
 
@@ -329,11 +224,11 @@ def _with_points(
 def _points(
     source: str | os.PathLike[str], sequence: TrackedSequence, options: ImportOptions
 ) -> FramePoints:
-    if _kind(source) == "markups":
+    if kind_of(source) == "markups":
         return points_of_markups(source, sequence, options.points)
-    table = _table(source, options)
-    if table.poses is None and (options.poses is None or _kind(options.poses) != "table"):
-        _refuse(options, ("quaternion",), "is for tables with poses, and none is read")
+    table = read_rows(source, options)
+    if table.poses is None and (options.poses is None or kind_of(options.poses) != "table"):
+        refuse(options, ("quaternion",), "is for tables with poses, and none is read")
     return points_of_table(table, sequence, options.points)
 
 
@@ -357,148 +252,6 @@ def _mirrored(sequence: TrackedSequence, points: str | os.PathLike[str]) -> list
     ]
 
 
-class _Tracking(NamedTuple):
-    """Poses that are to be matched to images by time."""
-
-    time: Float[np.ndarray, " m"]
-    poses: Float[np.ndarray, "m 4 4"]
-    valid: Bool[np.ndarray, " m"]
-    pair: FramePair
-    source: str
-    length_stated: bool
-
-
-def open_sequence(
-    source: str | os.PathLike[str], options: ImportOptions
-) -> tuple[TrackedSequence, list[str]]:
-    """A sequence of any kind with the poses that belong to it, and notes for the user.
-
-    Args:
-        source: a sequence, a folder of PNG, a tracker's export or a TUS-REC scan.
-        options: ``poses`` names the file of the poses where they are not in ``source``.
-
-    Raises:
-        InputError: files that cannot be read or do not belong together; one line.
-    """
-    sequence, tracking, notes = _opened(source, options)
-    if tracking is None:
-        return sequence, notes
-    if options.lag_s == "auto":
-        raise InputError("--lag auto is estimated from points: it is an option of jaxcal import")
-    merged, said = _merged(sequence, tracking, options.lag_s)
-    return merged, notes + said
-
-
-def _merged(
-    sequence: TrackedSequence, tracking: _Tracking, lag_s: float
-) -> tuple[TrackedSequence, list[str]]:
-    merged, notes = with_poses_by_time(sequence, *tracking[:-1], lag_s)
-    return replace(merged, length_stated=tracking.length_stated), notes
-
-
-def _opened(
-    source: str | os.PathLike[str], options: ImportOptions
-) -> tuple[TrackedSequence, _Tracking | None, list[str]]:
-    """A sequence, and the poses that are to be matched to it by time, if there are such."""
-    if options.poses is None:
-        _refuse(options, ("lag_s",), "needs --poses: it is between images and poses of two files")
-        return _read_tracked(source, options.pose_units), None, []
-    sequence = _read_tracked(source)
-    of_table = _kind(options.poses) == "table"
-    if of_table:
-        why = f"does not go with a table of poses, {options.poses}: they are from probe to tracker"
-        _refuse(options, ("source", "target"), why)
-    if isinstance(sequence.pixels, FolderPixels):
-        if not of_table:
-            raise InputError(
-                f"{options.poses}: the poses of a folder of images come from a table with columns "
-                "file or frame"
-            )
-        _refuse(options, ("lag_s",), "is for poses that are matched by time, not to a folder")
-        merged, notes = with_pose_table(sequence, _table(options.poses, options))
-        return merged, None, notes
-    if of_table:
-        table = _table(options.poses, options)
-        if table.poses is None or table.time is None:
-            raise InputError(f"{table.name}: needs columns of times and of poses")
-        time, valid = times_of_table(table, sequence), np.ones(len(table), bool)
-        found = _Tracking(
-            time, table.poses, valid, PROBE_TO_TRACKER, table.name, table.length_stated
-        )
-        return sequence, found, _skipped(table)
-    tracking = _read_tracked(options.poses, options.pose_units)
-    start, end, said = _frames(tracking, options)
-    poses, valid = tracking.poses(start, end)
-    pair, name = (start, end), os.fspath(options.poses)
-    found = _Tracking(tracking.time, poses, valid, pair, name, tracking.length_stated)
-    return sequence, found, said
-
-
-def tracked_poses(
-    sequence: TrackedSequence, options: ImportOptions
-) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"], list[str]]:
-    """Poses of a sequence, where they can be used, and what was assumed and left out.
-
-    Raises:
-        InputError: no way between the frames, or no frame with tracking.
-    """
-    if options.poses is None:
-        start, end, notes = _frames(sequence, options)
-    else:
-        # The assumptions were noted when the poses were matched.
-        (start, end), notes = next(iter(sequence.transforms)), []
-    poses, valid = sequence.poses(start, end)
-    lost = len(sequence) - int(valid.sum())
-    if lost and options.poses is None:
-        notes.append(f"{lost} of {len(sequence)} frames left out: their tracking was not OK")
-    if not valid.any():
-        raise InputError(f"{sequence.source}: no frame has tracking from {start} to {end}")
-    return poses, valid, notes
-
-
-def frames_to_show(
-    sequence: TrackedSequence, options: ImportOptions, every: int = 1
-) -> tuple[list[int], tuple[int, int], list[str]]:
-    """Frames in which a person is to place points.
-
-    Args:
-        sequence: with pixels; without any transforms every image is shown.
-        options: which poses are needed.
-        every: of the frames that can be used, every n-th.
-
-    Returns:
-        Numbers of the frames, their columns and rows, and what was left out, in words.
-
-    Raises:
-        InputError: no pixels, or no frame that can be used.
-    """
-    if sequence.pixels is None:
-        raise InputError(f"{sequence.source}: holds no pixels, only transforms")
-    usable, notes = sequence.image_valid, []
-    if sequence.transforms:
-        _, valid, notes = tracked_poses(sequence, options)
-        usable = usable & valid
-    if not usable.any():
-        raise InputError(f"{sequence.source}: no frame can be used")
-    shown = [int(number) for number in np.flatnonzero(usable)[::every]]
-    return shown, (sequence.pixels.columns, sequence.pixels.rows), notes
-
-
-def _read_tracked(
-    source: str | os.PathLike[str], pose_units: LengthUnit | None = None
-) -> TrackedSequence:
-    match _kind(source):
-        case "tracker":
-            return read_tracker(source, pose_units)
-        case "scan":
-            from jaxcal.io.tus_rec import read_scan
-
-            return read_scan(source).scaled(pose_units or "mm")
-        case "folder":
-            return read_folder(source)
-    return read_sequence(source).scaled(pose_units or "mm")
-
-
 def _spacing(
     sequence: TrackedSequence | None, options: ImportOptions
 ) -> tuple[float, float] | None:
@@ -518,42 +271,6 @@ def _spacing(
             "(--spacing states it)"
         )
     return stated.spacing_mm
-
-
-def _frames(sequence: TrackedSequence, options: ImportOptions) -> tuple[str, str, list[str]]:
-    """The frames of the poses, and what was assumed about them."""
-    pairs: list[FramePair] = list(sequence.transforms)
-    if not pairs:
-        raise InputError(
-            f"{sequence.source}: holds no transforms: name the file with its poses (--poses)"
-        )
-    names = sequence.frames()
-    resting = "Tracker", "Reference"
-    # The pose of the tracker in the frame of a tool tells the same, inverted.
-    moving = (target if source in resting else source for source, target in pairs)
-    tools = list(dict.fromkeys(name for name in moving if name not in resting))
-    start = options.source
-    if start is None:
-        start = "Probe" if "Probe" in tools else tools[0] if len(tools) == 1 else None
-    if start is None:
-        raise InputError(
-            f"{sequence.source}: name the tracked frame on the probe (--from); there are "
-            f"{', '.join(map(quoted, tools))}"
-        )
-    start = start if start in names else capitalised(start)
-    if options.target is not None:
-        end = options.target if options.target in names else capitalised(options.target)
-        return start, end, []
-    tracked = [pair for pair in pairs if set(pair) == set(resting) and sequence.valid[pair].any()]
-    if tracked and start != "Reference":
-        end = "Reference"
-    else:
-        ends = [target for source, target in pairs if source == start]
-        ends += [source for source, target in pairs if target == start and source in resting]
-        end = next(iter(ends), "Tracker")
-    inverted = (end, start) in pairs and (start, end) not in pairs
-    how = f", inverted from {end} to {start}" if inverted else ""
-    return start, end, [f"poses from {start} to {end}{how} (--from and --to choose others)"]
 
 
 def _time(

@@ -15,7 +15,7 @@ import numpy as np
 from h5py import h5d, h5t  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxcal import FormatError, InputError
-from jaxcal.data.poses import rotations_from_quaternions
+from jaxcal.data.poses import check_affine, rotations_from_quaternions
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.lines import text_lines
 from jaxcal.io.readable import check_readable, naming, one_line, quoted
@@ -30,13 +30,8 @@ _AFFINE = ("AffineTransform", "MatrixOffsetTransformBase", "ScaleSkewVersor3DTra
 
 def itk_from_matrix(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 12"]:
     """ITK's parameters of a matrix: A row by row, then the translation."""
-    matrix = np.asarray(matrix, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError("the matrix must be 4 x 4 and finite")
-    if np.linalg.det(matrix[:3, :3]) <= 0:
-        raise InputError("the matrix is a reflection or singular")
     # Adding zero makes 0 of -0.
-    stored = _LPS @ np.linalg.inv(matrix) @ _LPS + 0.0
+    stored = _LPS @ np.linalg.inv(check_affine(matrix)) @ _LPS + 0.0
     return np.concatenate([stored[:3, :3].ravel(), stored[:3, 3]])
 
 

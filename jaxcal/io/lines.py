@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import io
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 from jaxcal import FormatError
 from jaxcal.io.readable import check_readable, one_line
+
+# In English and German; everything else that begins with # is a comment.
+_COMMENT = re.compile(r"\s*#(?!(?:N/A|NV|DIV/0!|VALUE!|WERT!|REF!|BEZUG!|NUM!|ZAHL!)[,;\t])")
 
 MAXIMUM_BYTES = 64 * 2**20
 """Largest text file that is read."""
@@ -21,7 +25,8 @@ def text_lines(
 
     Args:
         path: the file.
-        comments: yield lines that begin with ``#``, too.
+        comments: yield lines that begin with ``#``, too. What spreadsheets write in a cell whose
+            formula failed (``#N/A``) begins no comment.
 
     Raises:
         FormatError: cannot be read, too large, not text; one line with path and line.
@@ -36,12 +41,12 @@ def text_lines(
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
-        raise FormatError(f"{name}:{line}: is not text (UTF-8)") from None
+        raise FormatError(f"{name}:{line}: is not text in UTF-8: save it as UTF-8") from None
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
-        raise FormatError(f"{name}:{line}: is not text (UTF-8): it holds a zero byte")
+        raise FormatError(f"{name}:{line}: is not text in UTF-8: it holds a zero byte")
     del content
     # Not splitlines: it also breaks at form feeds and the like, where editors count no new line.
     for number, line in enumerate(io.StringIO(text, newline=None), start=1):
-        if line.strip() and (comments or not line.lstrip().startswith("#")):
+        if line.strip() and (comments or not _COMMENT.match(line)):
             yield number, line.rstrip("\n")

@@ -55,7 +55,7 @@ def read_metaimage(path: Path, name: str) -> TrackedSequence:
         raise FormatError("is not a MetaImage sequence: DimSize or ElementDataFile is missing")
     columns, rows, count = _metaimage_size(fields)
     check_count(count, header)
-    _check_data_name(fields["ElementDataFile"])
+    check_data_name(fields["ElementDataFile"])
     kind = fields.get("ElementType", "")
     pixels = None
     # Tracking alone has three forms: 0 0 N with either type, or 1 1 N with a dummy pixel a frame.
@@ -103,8 +103,9 @@ def _metaimage_pixels(
     )
 
 
-def _check_data_name(data: str) -> None:
-    if not data or data in ("LIST", ".", "..") or re.search(r"[/\\%:\0]", data) or " " in data:
+def check_data_name(data: str) -> None:
+    """Refuse a name of another folder, a list of files (``LIST 2D``) and a pattern (``f%03d``)."""
+    if data.split()[:1] in ([], ["LIST"], ["."], [".."]) or re.search(r"[/\\%:\0\n\r]", data):
         raise FormatError(
             f"ElementDataFile = {quoted(data)}: only LOCAL, or a file beside the header, is read"
         )

@@ -17,10 +17,11 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from jaxcal import FormatError, InputError
+from jaxcal import FormatError
+from jaxcal.data.poses import check_affine
 from jaxcal.io.atomic import atomic_path
-from jaxcal.io.frame_names import FramePair, capitalised, check_frame, path_between, split_name
-from jaxcal.io.readable import quoted
+from jaxcal.io.frame_names import FramePair, capitalised, check_frames, path_between, split_name
+from jaxcal.io.readable import naming, quoted
 from jaxcal.io.xml import Element, parse_xml, read_xml
 from jaxcal.runtime.array_types import Float
 
@@ -111,8 +112,7 @@ def read_configuration(path: str | os.PathLike[str]) -> PlusConfiguration:
             with path and line.
     """
     root, _ = read_xml(path)
-    name = os.fspath(path)
-    try:
+    with naming(path):
         if root.tag == "Transform":
             return PlusConfiguration((_transform(root),))
         if root.tag != _ROOT:
@@ -124,8 +124,6 @@ def read_configuration(path: str | os.PathLike[str]) -> PlusConfiguration:
                 for element in _transforms(place)
             ),
         )
-    except FormatError as error:
-        raise FormatError(f"{name}: {error}") from None
 
 
 def read_result(path: str | os.PathLike[str]) -> PlusResult:
@@ -135,7 +133,7 @@ def read_result(path: str | os.PathLike[str]) -> PlusResult:
         FormatError: not such a file or not as it should be; one line with path and line.
     """
     root, _ = read_xml(path)
-    try:
+    with naming(path):
         if root.tag != "ProbeCalibrationResult":
             raise FormatError(f"is not a result of fCal: its root is {quoted(root.tag)}")
         errors = root.first("ErrorReport/ReprojectionError3DStatistics")
@@ -143,8 +141,6 @@ def read_result(path: str | os.PathLike[str]) -> PlusResult:
             tuple(_transform(element) for element in root.all("CalibrationResults/Transform")),
             _optional_number(errors, "CalibrationMeanMm"),
         )
-    except FormatError as error:
-        raise FormatError(f"{os.fspath(path)}: {error}") from None
 
 
 def _transforms(coordinates: Element) -> list[Element]:
@@ -235,14 +231,8 @@ def transform_element(
     Raises:
         InputError: a matrix or names that PLUS would not accept.
     """
-    matrix = np.asarray(matrix, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError("the matrix must be 4 x 4 and finite")
-    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-12:
-        raise InputError("the matrix's last row must be 0 0 0 1")
-    if np.linalg.det(matrix[:3, :3]) <= 0:
-        raise InputError("the matrix is a reflection: its determinant is not positive")
-    source, target = check_frame(frames[0]), check_frame(frames[1])
+    matrix = check_affine(matrix)
+    source, target = check_frames(frames)
     # Minus zero would be written as -0.0.
     rows = [" ".join(repr(value + 0.0) for value in row) for row in matrix.tolist()]
     lines = [f'<Transform From="{source}" To="{target}"', f'  Matrix="{rows[0]}']
@@ -372,10 +362,8 @@ def patch_configuration(
         OutputError: the file could not be written; it is as it was.
     """
     _, content = read_xml(path)
-    try:
+    with naming(path):
         new, notes = patched_configuration(content, frames, matrix, error_mm=error_mm, date=date)
-    except FormatError as error:
-        raise FormatError(f"{os.fspath(path)}: {error}") from None
     with atomic_path(path if out is None else out) as temporary:
         temporary.write_bytes(new)
     return notes
@@ -466,7 +454,7 @@ def update_transform_command(
 
     Source: PlusLib, vtkPlusUpdateTransformCommand.
     """
-    source, target = check_frame(frames[0]), check_frame(frames[1])
+    source, target = check_frames(frames)
     numbers = " ".join(repr(value) for value in np.asarray(matrix, float).ravel().tolist())
     stated = "" if not error_mm else f' TransformError="{error_mm:.6g}"'
     if date is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,26 @@ from jaxcal.runtime.array_types import Bool, Float, Int
 
 LONGEST_GAP = 5.0
 """Longest time between two poses that is bridged, in median intervals."""
+
+
+class Tracking(NamedTuple):
+    """Poses that are to be matched to images by time.
+
+    Attributes:
+        time: (m,) s.
+        poses: (m, 4, 4), mm.
+        valid: (m,) which of them can be used.
+        pair: frames (from, to) of the poses.
+        source: the file, for messages.
+        length_stated: whether the file states the unit of translations.
+    """
+
+    time: Float[np.ndarray, " m"]
+    poses: Float[np.ndarray, "m 4 4"]
+    valid: Bool[np.ndarray, " m"]
+    pair: FramePair
+    source: str
+    length_stated: bool = False
 
 
 def times_of_table(table: PoseTable, sequence: TrackedSequence) -> Float[np.ndarray, " m"]:
@@ -47,23 +68,13 @@ def times_of_table(table: PoseTable, sequence: TrackedSequence) -> Float[np.ndar
 
 
 def with_poses_by_time(
-    images: TrackedSequence,
-    time: Float[np.ndarray, " m"],
-    poses: Float[np.ndarray, "m 4 4"],
-    valid: Bool[np.ndarray, " m"],
-    pair: FramePair,
-    source: str,
-    lag_s: float = 0.0,
+    images: TrackedSequence, tracking: Tracking, lag_s: float = 0.0
 ) -> tuple[TrackedSequence, list[str]]:
     """A sequence's frames with poses interpolated at their times.
 
     Args:
         images: with times; transforms of its own are dropped.
-        time: (m,) of the poses, s, on the same clock.
-        poses: (m, 4, 4), mm.
-        valid: (m,) which of them can be used.
-        pair: frames (from, to) of the poses.
-        source: file of the poses, for messages.
+        tracking: with times on the same clock.
         lag_s: an image stamped t shows what was at t - lag.
 
     Returns:
@@ -72,6 +83,7 @@ def with_poses_by_time(
     Raises:
         InputError: images or poses without times, times that go back, or no image between poses.
     """
+    time, poses, valid, pair, source, length_stated = tracking
     if not np.isfinite(images.time).all():
         raise InputError(
             f"{images.source}: states no times, by which poses of {source} would be found"
@@ -96,7 +108,9 @@ def with_poses_by_time(
             f"{lost} of {len(images)} images have no pose near their time (gaps of up to "
             f"{gap:.3g} s are bridged)"
         )
-    return replace(images, transforms={pair: found}, valid={pair: between}), notes
+    return replace(
+        images, transforms={pair: found}, valid={pair: between}, length_stated=length_stated
+    ), notes
 
 
 def _increasing(time: Float[np.ndarray, " m"], source: str) -> Int[np.ndarray, " k"]:
@@ -122,10 +136,7 @@ def lag_of_points(
     images: TrackedSequence,
     rows: Int[np.ndarray, " n"],
     points: Float[np.ndarray, "n 2"],
-    time: Float[np.ndarray, " m"],
-    poses: Float[np.ndarray, "m 4 4"],
-    valid: Bool[np.ndarray, " m"],
-    source: str,
+    tracking: Tracking,
 ) -> tuple[float, str]:
     """By how much images lag behind poses, from the motion of a target at rest in the images.
 
@@ -133,10 +144,7 @@ def lag_of_points(
         images: with times.
         rows: (n,) frames in which the target was found.
         points: (n, 2) the target in them, px or mm.
-        time: (m,) of the poses, s, on the same clock.
-        poses: (m, 4, 4), mm.
-        valid: (m,) which of them can be used.
-        source: file of the poses, for messages.
+        tracking: with times on the same clock.
 
     Returns:
         The lag, s, and a note for the user.
@@ -145,7 +153,8 @@ def lag_of_points(
         InputError: times missing, too little motion, or motions that do not agree; see
             :func:`jaxcal.data.timing.estimate_latency`.
     """
-    kept = _increasing(time, source)
+    time, poses, valid, *_ = tracking
+    kept = _increasing(time, tracking.source)
     kept = kept[valid[kept]]
     order = np.argsort(rows)
     try:

@@ -70,4 +70,5 @@ def naming(path: str | os.PathLike[str]) -> Iterator[None]:
         yield
     except InputError as error:
         text = str(error)
-        raise type(error)(text if text.startswith(name) else f"{name}: {text}") from None
+        named = text.startswith((f"{name}:", f"{name} with "))
+        raise type(error)(text if named else f"{name}: {text}") from None

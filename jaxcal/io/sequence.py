@@ -20,7 +20,7 @@ from jaxcal.io.columns import LENGTHS_MM, LengthUnit
 from jaxcal.io.frame_names import FramePair, path_between
 from jaxcal.io.grey import grey_of
 from jaxcal.io.pixel_stream import Packing, PixelStream
-from jaxcal.io.readable import quoted
+from jaxcal.io.readable import naming, quoted
 from jaxcal.runtime.array_types import Bool, Float, Int
 
 Orientation = Literal["MF", "UF", "MN", "UN"]
@@ -255,14 +255,14 @@ class TrackedSequence:
                 "UN), as UltrasoundImageOrientation would"
             )
         size = pixels.frame_bytes
-        try:
-            with PixelStream(pixels.path, pixels.start, pixels.packing, size * len(self)) as stream:
-                for number in numbers:
-                    content = stream.read_at(number * size, size)
-                    yield _oriented(_grey(content, pixels), stored)
-                stream.check_end()
-        except FormatError as error:
-            raise FormatError(f"{self.source}: {error}") from None
+        with (
+            naming(self.source),
+            PixelStream(pixels.path, pixels.start, pixels.packing, size * len(self)) as stream,
+        ):
+            for number in numbers:
+                content = stream.read_at(number * size, size)
+                yield _oriented(_grey(content, pixels), stored)
+            stream.check_end()
 
 
 def _hdf5_images(
@@ -271,15 +271,12 @@ def _hdf5_images(
     # h5py takes a fifth of a second to import, and other sequences do not need it.
     from jaxcal.io.untrusted import child, open_root, row
 
-    try:
-        with open_root(pixels.path) as root:
-            node = child(root, pixels.dataset)
-            for number in numbers:
-                if node is None:
-                    raise FormatError(f"/{pixels.dataset} is missing")
-                yield _oriented(row(node, number), orientation)
-    except FormatError as error:
-        raise FormatError(f"{source}: {error}") from None
+    with naming(source), open_root(pixels.path) as root:
+        node = child(root, pixels.dataset)
+        for number in numbers:
+            if node is None:
+                raise FormatError(f"/{pixels.dataset} is missing")
+            yield _oriented(row(node, number), orientation)
 
 
 def _png_image(pixels: FolderPixels, number: int) -> np.ndarray:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxcal import FormatError, InputError
+from jaxcal import InputError
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.frame_names import FramePair
-from jaxcal.io.metaimage import metaimage_header, read_metaimage
+from jaxcal.io.metaimage import check_data_name, metaimage_header, read_metaimage
 from jaxcal.io.nrrd import nrrd_header, read_nrrd
-from jaxcal.io.readable import check_readable
+from jaxcal.io.readable import check_readable, naming
 from jaxcal.io.sequence import Orientation, TrackedSequence
 from jaxcal.io.sequence_header import check_written, frame_fields, packed_pixels, stacked
 
@@ -33,12 +33,10 @@ def read_sequence(path: str | os.PathLike[str]) -> TrackedSequence:
     """
     check_readable(path)
     name = os.fspath(path)
-    try:
+    with naming(path):
         if name.lower().endswith((".nrrd", ".nhdr")):
             return read_nrrd(Path(path), name)
         return read_metaimage(Path(path), name)
-    except FormatError as error:
-        raise FormatError(f"{name}: {error}") from None
 
 
 def write_sequence(
@@ -93,6 +91,7 @@ def write_sequence(
         _put(path, "\n".join([*head, *lines, "ElementDataFile = LOCAL", ""]).encode() + packed)
         return
     data = Path(name).with_suffix(".zraw" if compressed else ".raw")
+    check_data_name(data.name)
     # The pixels first: a header without them would be half a recording.
     _put(data, packed)
     _put(path, "\n".join([*head, *lines, f"ElementDataFile = {data.name}", ""]).encode())

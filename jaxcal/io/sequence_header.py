@@ -20,7 +20,7 @@ from typing import cast
 import numpy as np
 
 from jaxcal import FormatError, InputError
-from jaxcal.io.frame_names import FramePair, check_frame, split_name
+from jaxcal.io.frame_names import FramePair, check_frames, split_name
 from jaxcal.io.pixel_stream import Packing, PixelStream
 from jaxcal.io.readable import one_line, quoted
 from jaxcal.io.sequence import Orientation, Pixels, TrackedSequence
@@ -199,8 +199,7 @@ def check_written(transforms: Mapping[FramePair, np.ndarray], time: np.ndarray) 
             "would keep one of them"
         )
     for (source, target), matrices in transforms.items():
-        check_frame(source)
-        check_frame(target)
+        check_frames((source, target))
         if np.shape(matrices) != (len(time), 4, 4):
             raise InputError(
                 f"{source}To{target} has shape {np.shape(matrices)}, ({len(time)}, 4, 4) is needed"

@@ -19,6 +19,8 @@ PORT = 18945
 
 MOST_CLIENTS = 32
 _LONGEST_NAME = 20
+_LONGEST_WAIT_S = 60.0
+"""Longer periods are waited for in parts; the system refuses to wait for years."""
 
 
 class TransformServer:
@@ -41,8 +43,8 @@ class TransformServer:
     def __init__(
         self, name: str, matrix: Float[np.ndarray, "4 4"], host: str = "127.0.0.1", port: int = PORT
     ) -> None:
-        if not 0 < len(name.encode()) <= _LONGEST_NAME:
-            raise InputError(f"{name!r}: a device's name has 1 to {_LONGEST_NAME} bytes")
+        if not 0 < len(name.encode(errors="replace")) <= _LONGEST_NAME or not name.isprintable():
+            raise InputError(f"{name!r}: a device's name has 1 to {_LONGEST_NAME} bytes of text")
         if not np.isfinite(matrix).all():
             raise InputError("the matrix holds NaN or Inf")
         self._name, self._matrix = name, np.asarray(matrix, dtype=np.float64)
@@ -79,11 +81,12 @@ class TransformServer:
 
         Args:
             period_s: time between messages, s.
-            stopped: asked at least once a period.
+            stopped: asked at least once a period, and once a minute.
         """
         due = time.monotonic()
         while not stopped():
-            for key, _ in self._selector.select(max(0.0, due - time.monotonic())):
+            left = min(max(0.0, due - time.monotonic()), _LONGEST_WAIT_S)
+            for key, _ in self._selector.select(left):
                 if key.fileobj is self._listener:
                     self._accept()
                 else:

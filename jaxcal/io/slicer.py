@@ -6,6 +6,7 @@ with x and y negated.
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
@@ -23,7 +24,8 @@ from jaxcal.runtime.array_types import Float
 MAXIMUM_BYTES = 16 * 2**20
 MOST_POINTS = 100_000
 
-EXTENSIONS = (".mrk.json", ".fcsv")
+EXTENSIONS = (".json", ".fcsv")
+"""Slicer writes points as ``.mrk.json`` or ``.json``, and as ``.fcsv``."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,8 @@ def _read_fcsv(path: str | os.PathLike[str]) -> Markups:
             elif key.strip() == "columns":
                 names = [name.strip() for name in value.split(",")]
             continue
-        cells = [cell.strip() for cell in content.split(",")]
+        # Slicer puts a label that has a comma in quotes.
+        cells = [cell.strip() for cell in next(csv.reader([content]))]
         if len(cells) < 4 or not {"x", "y", "z"} <= set(names[: len(cells)]):
             raise FormatError(f"line {line}: {len(cells)} columns are no point of Slicer")
         row = dict(zip(names, cells, strict=False))

@@ -19,6 +19,7 @@ _NUMBER = re.compile(
     r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.I
 )
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+_STATED_SEPARATOR = re.compile(r'"?sep=([;,\t])"?[;,\t]*', re.I)
 _SEPARATED = {",": "commas", ";": "semicolons", "\t": "tabs", "": "white space"}
 
 
@@ -54,8 +55,7 @@ class Table:
         value = parse_number(text, decimal_comma=self.separator != ",")
         if value is None:
             raise FormatError(
-                f"{self.row(row)}: column {column + 1}{self._named(column)} is not a number: "
-                f"{quoted(text)}"
+                f"{self.row(row)}: {self.column(column)} is not a number: {quoted(text)}"
             )
         return value
 
@@ -74,14 +74,15 @@ class Table:
                 value = self.number(row, column)
                 if not math.isfinite(value):
                     raise FormatError(
-                        f"{self.row(row)}: column {column + 1}{self._named(column)} is "
-                        f"{self.rows[row][column]}"
+                        f"{self.row(row)}: {self.column(column)} is {self.rows[row][column]}"
                     )
                 values[place, position] = value
         return values
 
-    def _named(self, column: int) -> str:
-        return "" if self.header is None else f" ({quoted(self.header[column])})"
+    def column(self, column: int) -> str:
+        """A column by its number and name, for a message."""
+        name = "" if self.header is None else f" ({quoted(self.header[column])})"
+        return f"column {column + 1}{name}"
 
 
 def parse_number(text: str, *, decimal_comma: bool = False) -> float | None:
@@ -111,13 +112,20 @@ def read_table(
     rows: list[list[str]] = []
     lines: list[int] = []
     for line, content in text_lines(path):
+        # What spreadsheets are told in the first line.
+        stated = _STATED_SEPARATOR.fullmatch(content.strip("\r\n"))
+        if stated and separator is None:
+            separator = stated[1]
+            continue
         if separator is None:
             separator = next((mark for mark in (";", "\t", ",") if mark in content.strip()), "")
         cells = _cells(content, separator)
         if header and not rows and names is None and _is_header(cells, separator):
-            names = cells
+            # Some programs end every line, the header's too, with a separator.
+            names = _without_blank_end(cells, 0)
             continue
         width = len(names or rows[0]) if names or rows else len(cells)
+        cells = _without_blank_end(cells, width)
         if len(cells) != width:
             before = "the header has" if names else "the rows before have"
             raise FormatError(
@@ -137,6 +145,14 @@ def _cells(content: str, separator: str) -> list[str]:
     if '"' not in content:
         return [cell.strip() for cell in content.split(separator)]
     return [cell.strip() for cell in next(csv.reader([content], delimiter=separator))]
+
+
+def _without_blank_end(cells: list[str], width: int) -> list[str]:
+    """The cells without empty ones at the end, but at least ``width``."""
+    end = len(cells)
+    while end > width and not cells[end - 1]:
+        end -= 1
+    return cells[:end]
 
 
 def _is_header(cells: list[str], separator: str) -> bool:

@@ -21,6 +21,9 @@ from jaxcal.io.readable import naming, quoted
 from jaxcal.io.table import Table, read_table
 from jaxcal.runtime.array_types import Float, Int
 
+_LATEST_S = 1e11
+"""Latest time, s after any beginning: three thousand years. Stamps in ms or ns are beyond it."""
+_MISSING = frozenset(("", "nan", "inf", "infinity", "na", "n/a", "null", "none"))
 _TRUE = frozenset(("1", "1.0", "true", "yes", "ok", "valid", "good", "tracked"))
 _FALSE = frozenset(
     (
@@ -75,6 +78,11 @@ class PoseTable:
 
     def __len__(self) -> int:
         return len(self.lines)
+
+    @property
+    def notes(self) -> list[str]:
+        """What was left out, in words."""
+        return [f"{self.name}: {self.skipped} invalid rows left out"] if self.skipped else []
 
 
 def read_pose_table(
@@ -289,21 +297,23 @@ def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list
     ]
     kept: list[int] = []
     for row, cells in enumerate(table.rows):
-        valid = columns.valid is None or _is_valid(table, row, columns.valid)
-        if valid and not (skip_invalid and any(_missing(cells[k]) for k in needed)):
+        missing = next((k for k in needed if _missing(cells[k])), None)
+        if columns.valid is not None and not _is_valid(table, row, columns.valid):
+            why = f"the row is marked as invalid ({quoted(cells[columns.valid])})"
+        elif missing is not None:
+            why = f"{table.column(missing)} is {cells[missing] or 'empty'}"
+        else:
             kept.append(row)
-        elif not skip_invalid:
-            raise FormatError(
-                f"{table.row(row)}: the row is marked as invalid "
-                f"({quoted(cells[columns.valid or 0])}): leave such rows out with --skip-invalid"
-            )
+            continue
+        if not skip_invalid:
+            raise FormatError(f"{table.row(row)}: {why}: leave such rows out with --skip-invalid")
     if not kept:
         raise FormatError(f"all {len(table.rows)} rows are marked as invalid")
     return kept, len(table.rows) - len(kept)
 
 
 def _missing(cell: str) -> bool:
-    return cell.lower().lstrip("+-") in ("", "nan", "inf", "infinity", "na", "n/a", "null", "none")
+    return cell.startswith("#") or cell.lower().lstrip("+-") in _MISSING
 
 
 def _is_valid(table: Table, row: int, column: int) -> bool:
@@ -364,7 +374,14 @@ def _times(
         return None, None
     dates = [_date(table.rows[row][column]) for row in rows]
     if dates[0] is None:
-        return table.numbers((column,), rows)[:, 0] * columns.time_s, None
+        time = table.numbers((column,), rows)[:, 0] * columns.time_s
+        late = np.flatnonzero(np.abs(time) > _LATEST_S)
+        if len(late):
+            raise FormatError(
+                f"{table.row(rows[late[0]])}: {table.column(column)} is {time[late[0]]:.3g} s, in "
+                "the distant future: state its unit in the header: time [ms], [us] or [ns]"
+            )
+        return time, None
     values = []
     for row, date in zip(rows, dates, strict=True):
         if date is None or (date.tzinfo is None) != (dates[0].tzinfo is None):

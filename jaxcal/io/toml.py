@@ -13,7 +13,7 @@ import tomllib
 from typing import Any
 
 from jaxcal import FormatError
-from jaxcal.io.readable import check_readable, one_line
+from jaxcal.io.readable import check_readable, naming, one_line
 
 MAXIMUM_BYTES = 2**20
 """Largest file that is read."""
@@ -68,10 +68,8 @@ def load_toml(
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise FormatError(f"{path}: is not UTF-8 text") from None
-    try:
+    with naming(path):
         return parse_toml(text)
-    except FormatError as error:
-        raise FormatError(f"{path}: {error}") from None
 
 
 def parse_toml(text: str) -> dict[str, Any]:

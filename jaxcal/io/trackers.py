@@ -7,6 +7,7 @@ from the tool to ``Tracker``.
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import os
 import re
@@ -25,6 +26,7 @@ from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.table import parse_number
 
 TRACKER = "Tracker"
+_BEGINNING = re.compile(r"(Tools|Format Version)\s*[,;\t]")
 MOST_ROWS = 1_000_000
 _ABSENT = -1e20
 """A number below this is missing: NDI writes -3.697314E28 in its place."""
@@ -34,7 +36,7 @@ _METRES = {"meters": 1e3, "centimeters": 10.0, "millimeters": 1.0}
 def is_tracker_export(path: str | os.PathLike[str]) -> bool:
     """Whether a text file begins like an export of NDI ToolBox or Motive."""
     _, first = next(text_lines(path), (0, ""))
-    return first.startswith(("Tools,", "Format Version,"))
+    return _BEGINNING.match(first) is not None
 
 
 def read_tracker(
@@ -63,7 +65,10 @@ def read_tracker(
             return found.scaled(pose_units or "mm")
         if first[0].strip() == "Format Version":
             return replace(_read_motive(first, rows, name, pose_units), length_stated=True)
-        raise FormatError("is no export of NDI ToolBox or Motive")
+        raise FormatError(
+            "is no export of NDI ToolBox or Motive with commas between cells: if a spreadsheet "
+            "has saved it anew, import the file that the tracker's program wrote"
+        )
 
 
 class _Tool:
@@ -207,7 +212,8 @@ def _read_motive(
     pose_units: LengthUnit | None,
 ) -> TrackedSequence:
     cells = [cell.strip() for cell in first]
-    stated = dict(zip(cells[::2], cells[1::2], strict=False))
+    # Not by pairs of cells: the take's name may have commas.
+    stated = dict(itertools.pairwise(cells))
     rotation = stated.get("Rotation Type", "Quaternion")
     if rotation != "Quaternion":
         raise FormatError(

@@ -48,6 +48,8 @@ def read_scan(path: str | os.PathLike[str]) -> TrackedSequence:
             hint = "" if child(root, "calibration") is None else ours
             raise FormatError(f"is no scan of TUS-REC: /tforms is missing{hint}")
         poses = array(transforms, (UpTo(MOST_FRAMES, "frames"), 4, 4))
+        if not len(poses):
+            raise FormatError("holds no frames")
         frames = child(root, "frames")
         pixels = None
         if frames is not None:

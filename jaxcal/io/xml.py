@@ -15,7 +15,7 @@ from pathlib import Path
 from xml.parsers import expat
 
 from jaxcal import FormatError
-from jaxcal.io.readable import check_readable, one_line, quoted
+from jaxcal.io.readable import check_readable, naming, one_line, quoted
 
 MAXIMUM_BYTES = 8 * 2**20
 """Largest file that is read; a configuration of PLUS has some 10 kB, a result of fCal 1 MB."""
@@ -70,10 +70,8 @@ def read_xml(path: str | os.PathLike[str]) -> tuple[Element, bytes]:
         content = Path(path).read_bytes()
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {one_line(error)}") from None
-    try:
+    with naming(path):
         return parse_xml(content), content
-    except FormatError as error:
-        raise FormatError(f"{os.fspath(path)}: {error}") from None
 
 
 def parse_xml(content: bytes) -> Element:

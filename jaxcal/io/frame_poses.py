@@ -1,0 +1,162 @@
+"""Poses of a sequence's frames: from its own file or from another, and between which frames."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.io.folder import PROBE_TO_TRACKER, with_pose_table
+from jaxcal.io.frame_names import FramePair, capitalised
+from jaxcal.io.import_options import ImportOptions, refuse
+from jaxcal.io.poses_by_time import Tracking, times_of_table, with_poses_by_time
+from jaxcal.io.readable import quoted
+from jaxcal.io.sequence import FolderPixels, TrackedSequence
+from jaxcal.io.sources import kind_of, read_rows, read_tracked
+from jaxcal.runtime.array_types import Bool, Float
+
+
+def open_sequence(
+    source: str | os.PathLike[str], options: ImportOptions
+) -> tuple[TrackedSequence, list[str]]:
+    """A sequence of any kind with the poses that belong to it, and notes for the user.
+
+    Args:
+        source: a sequence, a folder of PNG, a tracker's export or a TUS-REC scan.
+        options: ``poses`` names the file of the poses where they are not in ``source``.
+
+    Raises:
+        InputError: files that cannot be read or do not belong together; one line.
+    """
+    sequence, tracking, notes = opened(source, options)
+    if tracking is None:
+        return sequence, notes
+    if options.lag_s == "auto":
+        raise InputError("--lag auto is estimated from points: it is an option of jaxcal import")
+    merged, said = with_poses_by_time(sequence, tracking, options.lag_s)
+    return merged, notes + said
+
+
+def opened(
+    source: str | os.PathLike[str], options: ImportOptions
+) -> tuple[TrackedSequence, Tracking | None, list[str]]:
+    """A sequence, and the poses that are to be matched to it by time, if there are such."""
+    if options.poses is None:
+        refuse(options, ("lag_s",), "needs --poses: it is between images and poses of two files")
+        return read_tracked(source, options.pose_units), None, []
+    sequence = read_tracked(source)
+    of_table = kind_of(options.poses) == "table"
+    if of_table:
+        why = f"does not go with a table of poses, {options.poses}: they are from probe to tracker"
+        refuse(options, ("source", "target"), why)
+    if isinstance(sequence.pixels, FolderPixels):
+        if not of_table:
+            raise InputError(
+                f"{options.poses}: the poses of a folder of images come from a table with columns "
+                "file or frame"
+            )
+        refuse(options, ("lag_s",), "is for poses that are matched by time, not to a folder")
+        merged, notes = with_pose_table(sequence, read_rows(options.poses, options))
+        return merged, None, notes
+    if of_table:
+        table = read_rows(options.poses, options)
+        if table.poses is None or table.time is None:
+            raise InputError(f"{table.name}: needs columns of times and of poses")
+        time, valid = times_of_table(table, sequence), np.ones(len(table), bool)
+        found = Tracking(
+            time, table.poses, valid, PROBE_TO_TRACKER, table.name, table.length_stated
+        )
+        return sequence, found, table.notes
+    tracking = read_tracked(options.poses, options.pose_units)
+    start, end, said = _frames(tracking, options)
+    poses, valid = tracking.poses(start, end)
+    pair, name = (start, end), os.fspath(options.poses)
+    found = Tracking(tracking.time, poses, valid, pair, name, tracking.length_stated)
+    return sequence, found, said
+
+
+def tracked_poses(
+    sequence: TrackedSequence, options: ImportOptions
+) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"], list[str]]:
+    """Poses of a sequence, where they can be used, and what was assumed and left out.
+
+    Raises:
+        InputError: no way between the frames, or no frame with tracking.
+    """
+    if options.poses is None:
+        start, end, notes = _frames(sequence, options)
+    else:
+        # The assumptions were noted when the poses were matched.
+        (start, end), notes = next(iter(sequence.transforms)), []
+    poses, valid = sequence.poses(start, end)
+    lost = len(sequence) - int(valid.sum())
+    if lost and options.poses is None:
+        notes.append(f"{lost} of {len(sequence)} frames left out: their tracking was not OK")
+    if not valid.any():
+        raise InputError(f"{sequence.source}: no frame has tracking from {start} to {end}")
+    return poses, valid, notes
+
+
+def frames_to_show(
+    sequence: TrackedSequence, options: ImportOptions, every: int = 1
+) -> tuple[list[int], tuple[int, int], list[str]]:
+    """Frames in which a person is to place points.
+
+    Args:
+        sequence: with pixels; without any transforms every image is shown.
+        options: which poses are needed.
+        every: of the frames that can be used, every n-th.
+
+    Returns:
+        Numbers of the frames, their columns and rows, and what was left out, in words.
+
+    Raises:
+        InputError: no pixels, or no frame that can be used.
+    """
+    if sequence.pixels is None:
+        raise InputError(f"{sequence.source}: holds no pixels, only transforms")
+    usable, notes = sequence.image_valid, []
+    if sequence.transforms:
+        _, valid, notes = tracked_poses(sequence, options)
+        usable = usable & valid
+    if not usable.any():
+        raise InputError(f"{sequence.source}: no frame can be used")
+    shown = [int(number) for number in np.flatnonzero(usable)[::every]]
+    return shown, (sequence.pixels.columns, sequence.pixels.rows), notes
+
+
+def _frames(sequence: TrackedSequence, options: ImportOptions) -> tuple[str, str, list[str]]:
+    """The frames of the poses, and what was assumed about them."""
+    pairs: list[FramePair] = list(sequence.transforms)
+    if not pairs:
+        raise InputError(
+            f"{sequence.source}: holds no transforms: name the file with its poses (--poses)"
+        )
+    names = sequence.frames()
+    resting = "Tracker", "Reference"
+    # The pose of the tracker in the frame of a tool tells the same, inverted.
+    moving = (target if source in resting else source for source, target in pairs)
+    tools = list(dict.fromkeys(name for name in moving if name not in resting))
+    start = options.source
+    if start is None:
+        start = "Probe" if "Probe" in tools else tools[0] if len(tools) == 1 else None
+    if start is None:
+        raise InputError(
+            f"{sequence.source}: name the tracked frame on the probe (--from); there are "
+            f"{', '.join(map(quoted, tools))}"
+        )
+    start = start if start in names else capitalised(start)
+    if options.target is not None:
+        end = options.target if options.target in names else capitalised(options.target)
+        return start, end, []
+    tracked = [pair for pair in pairs if set(pair) == set(resting) and sequence.valid[pair].any()]
+    if tracked and start != "Reference":
+        end = "Reference"
+    else:
+        ends = [target for source, target in pairs if source == start]
+        ends += [source for source, target in pairs if target == start and source in resting]
+        end = next(iter(ends), "Tracker")
+    inverted = (end, start) in pairs and (start, end) not in pairs
+    how = f", inverted from {end} to {start}" if inverted else ""
+    return start, end, [f"poses from {start} to {end}{how} (--from and --to choose others)"]
