@@ -23,18 +23,14 @@ pytest.importorskip("serial", reason="pyserial is not installed (jaxcal[serial])
 from test_recorder import wait_until_closed
 
 import jaxcal
-from hw.acquire import (
-    AcquisitionRequest,
-    AcquisitionStopped,
-    Outcome,
-    Pause,
-    _check_same_robot,
-    acquire,
-)
+from hw.acquire import AcquisitionStopped, Outcome, acquire
 from hw.bench.run import Bench
 from hw.emulated import BenchOracle, setup_of, start
 from hw.errors import RefusedError
+from hw.keys import Pause
 from hw.outcome import share_inside
+from hw.request import AcquisitionRequest
+from hw.resuming import check_same_robot
 from hw.robot.safety import MotionPlan, confirm_unattended
 from jaxcal.cli.main import main
 
@@ -309,13 +305,13 @@ def test_a_protective_stop_is_told_before_anybody_is_asked(tmp_path):
 def test_a_resumed_run_needs_the_same_robot():
     offset = [0.0, 0.0, 0.12, 0.0, 0.0, 0.0]
     before = {"serial_number": "a", "tcp_offset": offset}
-    _check_same_robot(before, "a", [*offset[:2], 0.1200000001, *offset[3:]])
+    check_same_robot(before, "a", [*offset[:2], 0.1200000001, *offset[3:]])
     with pytest.raises(RefusedError, match="begun with robot a, this one is b"):
-        _check_same_robot(before, "b", offset)
+        check_same_robot(before, "b", offset)
     with pytest.raises(RefusedError, match="TCP offset"):
-        _check_same_robot(before, "a", [*offset[:2], 0.121, *offset[3:]])
+        check_same_robot(before, "a", [*offset[:2], 0.121, *offset[3:]])
     with pytest.raises(RefusedError, match="does not say"):
-        _check_same_robot({"serial_number": "a", "tcp_offset": [0.0]}, "a", offset)
+        check_same_robot({"serial_number": "a", "tcp_offset": [0.0]}, "a", offset)
 
 
 def viewers(parent: int) -> list[int]:
