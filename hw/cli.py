@@ -175,6 +175,8 @@ def acquire(
         raise InputError("--until-tre needs --plan optimal")
     if unattended is not None and not move:
         raise InputError("--unattended needs --move")
+    if view and not (bench or move):
+        raise InputError("--view needs --move: a dry run has nothing to show")
     from hw.extras import missing
     from hw.recording_check import check_resumable
     from hw.request import AcquisitionRequest, recorded_request
@@ -318,6 +320,15 @@ def free_hand(
     injected = placement == "pattern-injection"
     if injected != (setup_path is not None):
         raise InputError("--placement pattern-injection and --setup TOML go together")
+    if injected:
+        unused = {
+            "--target": target != "echo",
+            "--region": region is not None,
+            "--spacing": options["spacing_mm"] is not None,
+        }
+        for name, given in unused.items():
+            if given:
+                raise InputError(f"{name} is for segmented images: not with pattern-injection")
     host, _, port = server.partition(":")
     if not host or not ((port.isdecimal() and 0 < int(port) < 65536) or not port):
         raise click.BadParameter(f"{server!r} is not HOST or HOST:PORT", param_hint="HOST[:PORT]")
