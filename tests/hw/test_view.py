@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from http.client import HTTPConnection
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ pytest.importorskip("viser", reason="viser is not installed (jaxcal[view])")
 import msgspec
 import viser
 from browser import addresses, browsing, pixels
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from hw.bench.run import Bench
@@ -166,6 +168,31 @@ def test_a_page_can_do_nothing():
         sent = view.sent
         wait_until(lambda: view.sent > sent + 3)
         assert listeners(port_of(view)) == {"0100007F"}
+
+
+def test_a_page_of_another_site_cannot_read_it():
+    """A browser lets any page open a socket to this machine; a name may lead here by a trick."""
+    with LiveView(lambda line: None, port=8195) as view:
+        port = port_of(view)
+        protocol = [f"viser-v{viser.__version__}"]
+        for host, origin, good in (
+            (f"127.0.0.1:{port}", None, True),
+            (f"localhost:{port}", "http://localhost:9000", True),
+            (f"127.0.0.1:{port}", "http://evil.example", False),
+            (f"127.0.0.1:{port}", "null", False),
+            ("evil.example", None, False),
+            ("[", None, False),
+        ):
+            asked = {"Host": host} | ({} if origin is None else {"Origin": origin})
+            page = HTTPConnection("127.0.0.1", port, timeout=10.0)
+            page.request("GET", "/", headers=asked)
+            assert page.getresponse().status == (200 if good else 403), asked
+            page.close()
+        url = view.url.replace("http", "ws")
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(url, subprotocols=protocol, origin="http://evil.example")  # type: ignore
+        with connect(url, subprotocols=protocol, origin=view.url) as socket:  # type: ignore
+            assert isinstance(socket.recv(timeout=10.0), bytes)
 
 
 def test_the_extra_is_named_where_viser_is_missing():
