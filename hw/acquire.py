@@ -18,7 +18,7 @@ import numpy as np
 
 from hw.acquire_live import Estimator
 from hw.errors import DeviceError, LostError, StaleError
-from hw.job import Job, motion_plan, open_recorder, prepare, resume_command
+from hw.job import Job, motion_plan, open_recorder, prepare, record_confirmed, resume_command
 from hw.keys import Pause
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
@@ -223,13 +223,14 @@ def _run(
     given_up: list[int] = []
     skipped: list[int] = []
     with session, watched(view, session):
-        plan = motion_plan(job, session, recorder)
+        plan = motion_plan(job, session)
         check_sample(session.poses.latest(), plan.limits, clock)
         course = check_plan(plan)
         note("arm", NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}")
         done = [row for row in range(len(job.targets)) if row not in job.missing]
         view.plan(setup, plan, job.targets, done)
         confirmation = confirm(plan)
+        record_confirmed(job, plan, session, recorder)
         by = "unattended: nobody was asked" if confirmation.unattended else "by the operator"
         note("confirmed", f"{by}; plan {plan.digest[:16]} for robot {plan.serial}, {plan.pendant}")
 

@@ -94,8 +94,12 @@ def open_recorder(path: str | os.PathLike[str], job: Job) -> Recorder:
     return recorder
 
 
-def motion_plan(job: Job, session: Session, recorder: Recorder) -> MotionPlan:
-    """The plan that the confirmation is bound to; on resume the robot must be the same one."""
+def motion_plan(job: Job, session: Session) -> MotionPlan:
+    """The plan that the confirmation is bound to; on resume the robot must be the same one.
+
+    Raises:
+        RefusedError: another robot, or a controller that does not tell what must be confirmed.
+    """
     identity = session.poses.identity()
     offset = session.poses.tcp_offset or job.setup.tcp_offset
     if offset is None:
@@ -104,15 +108,8 @@ def motion_plan(job: Job, session: Session, recorder: Recorder) -> MotionPlan:
             "[robot] tcp_offset = [x, y, z, rx, ry, rz] (m, rad); it is compared before moving",
             device="robot",
         )
-    known = {"serial_number": identity.name, "tcp_offset": list(offset)}
     if job.progress is not None:
         check_same_robot(job.progress.settings.get("robot"), identity.name, offset)
-    bench = described(job.setup, job.targets)
-    settings = {"request": asdict(job.request), "robot": known, "bench": bench}
-    recorder.put("plan", "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8), "1")
-    recorder.attributes("tracker", known)
-    recorder.attributes("ae", {"clock_hz": session.echo.clock_hz(), "trigger_delay_s": 0.0})
-    recorder.sync()
     pendant = session.poses.pendant
     if pendant is None:
         raise RefusedError("the controller does not tell its speed slider", device="robot")
@@ -121,6 +118,20 @@ def motion_plan(job: Job, session: Session, recorder: Recorder) -> MotionPlan:
     # Where every image was taken, only the end of the file is missing: any plan will do.
     to_go = job.targets[job.missing or slice(None)]
     return MotionPlan(to_go, limits, offset, identity.name, joints, pendant)
+
+
+def record_confirmed(job: Job, plan: MotionPlan, session: Session, recorder: Recorder) -> None:
+    """Keep with which robot and bench the images to come are taken.
+
+    Only once the plan is confirmed: what was refused must be told again when the run is resumed.
+    """
+    known = {"serial_number": plan.serial, "tcp_offset": list(plan.tcp_offset)}
+    bench = described(job.setup, job.targets)
+    settings = {"request": asdict(job.request), "robot": known, "bench": bench}
+    recorder.put("plan", "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8), "1")
+    recorder.attributes("tracker", known)
+    recorder.attributes("ae", {"clock_hz": session.echo.clock_hz(), "trigger_delay_s": 0.0})
+    recorder.sync()
 
 
 def resume_command(path: str | os.PathLike[str], request: AcquisitionRequest) -> str:

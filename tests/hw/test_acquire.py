@@ -302,6 +302,24 @@ def test_a_protective_stop_is_told_before_anybody_is_asked(tmp_path):
         assert not stopped.value.by_itself
 
 
+def test_an_edited_plan_is_told_until_it_is_confirmed(tmp_path):
+    path = tmp_path / "rec.h5"
+
+    def refuse(plan: MotionPlan):
+        raise RefusedError("not confirmed", device="robot")
+
+    with a_bench() as bench:
+        setup, request = setup_of(bench), AcquisitionRequest(4, "none", 1, bench=3)
+        for resumed in range(3):
+            if resumed == 1:
+                with h5py.File(path, "r+") as file:
+                    file["plan/targets"][-1, 2, 3] += 1.0
+            told = []
+            with pytest.raises(AcquisitionStopped, match="not confirmed"):
+                acquire(setup, path, None if resumed else request, refuse, say=told.append)
+            assert any("it was edited" in line for line in told) == bool(resumed)
+
+
 def test_a_resumed_run_needs_the_same_robot():
     offset = [0.0, 0.0, 0.12, 0.0, 0.0, 0.0]
     before = {"serial_number": "a", "tcp_offset": offset}
