@@ -9,18 +9,17 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from hw.acquire_live import Estimator
-from hw.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
-from hw.errors import DeviceError, LostError, RefusedError, StaleError
+from hw.errors import DeviceError, LostError, StaleError
+from hw.job import Job, motion_plan, open_recorder, prepare, record_confirmed, resume_command
+from hw.keys import Pause
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
 from hw.midplane.image_scan import image_scan
@@ -33,24 +32,17 @@ from hw.midplane.pattern_injection import (
 from hw.midplane.search import PlacementError, first_seen
 from hw.midplane.threshold_climb import threshold_climb
 from hw.planner import Planner
-from hw.pool import allowed_by, plan_pool
-from hw.poses import PosePlan, plan_poses
 from hw.recorder import Recorder
-from hw.recording_check import Progress, is_complete, read_progress
-from hw.recording_file import RecordingWriter
-from hw.recording_layout import RecordingHeader
-from hw.resuming import compare, described
+from hw.request import AcquisitionRequest
 from hw.robot.motion import Motion
 from hw.robot.safety import Confirmation, MotionPlan, check_plan, check_sample
-from hw.robot.stream import offset_changed
 from hw.session import Session, Watch, median_times
-from hw.setup import Setup, controller_arm
+from hw.setup import Setup
 from hw.stage import ProbeStage
 from hw.view.feed import Audience, Nobody, watched
-from jaxcal import CalibrationError, InputError
+from jaxcal import CalibrationError
 from jaxcal.cli.common import ExitCode
 
-MOST_IMAGES = 1000
 _MOST_GIVEN_UP = 3
 _FURTHEST_START_MM = 3.0
 _IMAGES_FOR_PREDICTION = 8
@@ -92,90 +84,6 @@ class Oracle(Protocol):
 
 
 @dataclass(frozen=True)
-class AcquisitionRequest:
-    """What to acquire.
-
-    Attributes:
-        images: poses of the plan; with ``optimal`` the most images.
-        placement: one of :data:`PLACEMENTS`.
-        seed: of the plan.
-        every_frame: record every ultrasound frame, not one an image.
-        bench: seed of the emulated bench; None for a real one.
-        operator: one of :data:`OPERATORS`: who follows the injected pattern, a person at the
-            terminal or before a window, or a rule.
-        plan: one of :data:`PLANS`; ``optimal`` chooses from a pool by the images taken so far.
-        until_tre_mm: with ``optimal``: stop once the predicted TRE is no larger than this.
-        phantom: one of :data:`PHANTOMS`: what is in the tank. A cross-wire is placed and measured
-            by what the images show, the other phantoms by the electronics.
-    """
-
-    images: int = 60
-    placement: str = "amplitude-scan"
-    seed: int = 0
-    every_frame: bool = False
-    bench: int | None = None
-    operator: str = "simulated"
-    plan: str = "sobol"
-    until_tre_mm: float | None = None
-    phantom: str = PHANTOMS[0]
-
-    def __post_init__(self) -> None:
-        if self.phantom not in PHANTOMS:
-            raise InputError(f"phantom must be one of {', '.join(PHANTOMS)}")
-        if self.plan not in PLANS:
-            raise InputError(f"plan must be one of {', '.join(PLANS)}")
-        wanted = self.until_tre_mm
-        if wanted is not None and not (np.isfinite(wanted) and wanted > 0):
-            raise InputError(f"until_tre_mm must be a positive number of mm, not {wanted}")
-        if wanted is not None and self.plan != "optimal":
-            raise InputError("until_tre_mm needs the plan optimal")
-        if self.placement not in PLACEMENTS:
-            raise InputError(f"placement must be one of {', '.join(PLACEMENTS)}")
-        if self.placement not in PLACEMENTS_OF[self.phantom]:
-            fitting = " or ".join(PLACEMENTS_OF[self.phantom])
-            raise InputError(f"with the {self.phantom} placement is {fitting}")
-        if self.operator not in OPERATORS:
-            raise InputError(f"operator must be one of {', '.join(OPERATORS)}")
-        if not 4 <= self.images <= MOST_IMAGES:
-            raise InputError(f"images must be 4 to {MOST_IMAGES}, not {self.images}")
-
-    @property
-    def by_image(self) -> bool:
-        """Whether images serve for placement and measurement, instead of the electronics."""
-        return self.phantom == "cross-wire"
-
-    @property
-    def kind(self) -> str:
-        """What the selected images of the recording hold."""
-        return "point" if self.by_image else "time_of_flight"
-
-
-class Pause:
-    """Lets a person hold the acquisition between two images."""
-
-    def __init__(self) -> None:
-        self._free = threading.Event()
-        self._free.set()
-
-    def hold(self) -> None:
-        """Stop before the next image."""
-        self._free.clear()
-
-    def go_on(self) -> None:
-        """Take the next image."""
-        self._free.set()
-
-    @property
-    def held(self) -> bool:
-        """Whether the acquisition is, or will be, held."""
-        return not self._free.is_set()
-
-    def wait(self) -> None:
-        """Return when nobody holds the acquisition."""
-        self._free.wait()
-
-
-@dataclass(frozen=True)
 class Outcome:
     """Result of a completed run.
 
@@ -193,30 +101,6 @@ class Outcome:
     sha256: str
     seconds: float
     resume: str | None = None
-
-
-@dataclass(frozen=True)
-class _Job:
-    setup: Setup
-    request: AcquisitionRequest
-    targets: np.ndarray
-    progress: Progress | None
-    changes: tuple[str, ...] = ()
-
-    @property
-    def missing(self) -> list[int]:
-        taken = set() if self.progress is None else set(self.progress.taken.tolist())
-        return [row for row in range(len(self.targets)) if row not in taken]
-
-    @property
-    def images(self) -> int:
-        """Most images of the whole recording."""
-        return min(self.request.images, len(self.targets))
-
-    @property
-    def to_take(self) -> int:
-        """Images that are still to be taken, at most."""
-        return self.images - (len(self.targets) - len(self.missing))
 
 
 Confirm = Callable[[MotionPlan], Confirmation]
@@ -258,12 +142,12 @@ def acquire(
         InputError: a plan or a recording that cannot be used; nothing moved.
         OutputError: the recording cannot be made; nothing moved.
     """
-    job = _prepare(setup, path, request)
+    job = prepare(setup, path, request)
     estimator = Estimator(job.images, setup, job.progress, job.request.kind)
     pool = "" if job.images == len(job.targets) else f" from a pool of {len(job.targets)}"
     say(f"plan: {job.images} poses{pool}, {job.to_take} to go; compiling the estimate")
     estimator.warm_up(job.targets[: job.images])
-    recorder = _open_recorder(path, job)
+    recorder = open_recorder(path, job)
     with _closing(recorder):
         try:
             return _run(
@@ -303,12 +187,6 @@ def acquire(
     )
 
 
-def resume_command(path: str | os.PathLike[str], request: AcquisitionRequest) -> str:
-    """What to type to go on with a recording."""
-    where = "--bench" if request.bench is not None else "--setup TOML --move"
-    return f"jaxcal-hw acquire {shlex.quote(os.fspath(path))} --resume {where}"
-
-
 @contextmanager
 def _closing(recorder: Recorder) -> Iterator[None]:
     """Close a recorder at the end; its failure, if any, is in its ``error``."""
@@ -319,69 +197,8 @@ def _closing(recorder: Recorder) -> Iterator[None]:
             recorder.close()
 
 
-def planned(setup: Setup, request: AcquisitionRequest) -> PosePlan:
-    """The poses of a request: a plan in the order of travel, or the pool of an optimal one.
-
-    Raises:
-        InputError: box, reach and limits leave too few poses, or the setup lacks a device.
-    """
-    if request.by_image and setup.ultrasound is None:
-        raise InputError(f"a {request.phantom} needs the images: add [ultrasound] to the setup")
-    if request.plan == "sobol":
-        return plan_poses(request.images, setup.scene, setup.extent, request.seed)
-    allowed = allowed_by(setup.motion_limits(), setup.tcp_offset)
-    return plan_pool(request.images, setup.scene, setup.extent, request.seed, allowed)
-
-
-def _prepare(
-    setup: Setup, path: str | os.PathLike[str], request: AcquisitionRequest | None
-) -> _Job:
-    if request is not None:
-        return _Job(setup, request, planned(setup, request).poses, None)
-    if not is_complete(path):
-        # Cut the file back to whole rows first, so that only these are read.
-        RecordingWriter.resume(path).close()
-    progress = read_progress(path)
-    asked = progress.settings.get("request")
-    try:
-        if not isinstance(asked, dict):
-            raise TypeError
-        request = AcquisitionRequest(**asked)
-    except TypeError:
-        raise InputError(f"{path}: has no settings of an acquisition to resume") from None
-    try:
-        changes = compare(progress, setup)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    return _Job(setup, request, progress.targets, progress, tuple(changes))
-
-
-def _open_recorder(path: str | os.PathLike[str], job: _Job) -> Recorder:
-    if job.progress is not None:
-        gap = job.progress.last_s + 1.0 - job.setup.clock.now()
-        return Recorder(path, time_offset_s=max(gap, 0.0))
-    probe = job.setup.probe
-    header = RecordingHeader(
-        kind=job.request.kind,
-        probe={
-            "kind": probe.kind,
-            "elements": probe.elements,
-            "pitch_mm": probe.pitch_mm,
-            "sound_speed_m_s": probe.sound_speed_m_s,
-            "delay_s": probe.delay_s,
-        },
-        lines=probe.elements,
-        settings=json.dumps(
-            {"request": asdict(job.request), "bench": described(job.setup, job.targets)}
-        ),
-    )
-    recorder = Recorder(path, header)
-    recorder.put("plan", "targets", job.targets, "mm")
-    return recorder
-
-
 def _run(
-    job: _Job,
+    job: Job,
     recorder: Recorder,
     estimator: Estimator,
     confirm: Confirm,
@@ -406,13 +223,14 @@ def _run(
     given_up: list[int] = []
     skipped: list[int] = []
     with session, watched(view, session):
-        plan = _motion_plan(job, session, recorder)
+        plan = motion_plan(job, session)
         check_sample(session.poses.latest(), plan.limits, clock)
         course = check_plan(plan)
         note("arm", NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}")
         done = [row for row in range(len(job.targets)) if row not in job.missing]
         view.plan(setup, plan, job.targets, done)
         confirmation = confirm(plan)
+        record_confirmed(job, plan, session, recorder)
         by = "unattended: nobody was asked" if confirmation.unattended else "by the operator"
         note("confirmed", f"{by}; plan {plan.digest[:16]} for robot {plan.serial}, {plan.pendant}")
 
@@ -485,7 +303,7 @@ def _finish(recorder: Recorder, without_image: int) -> str:
 
 
 def _rows(
-    job: _Job, estimator: Estimator, session: Session, note: Callable[[str, str], None]
+    job: Job, estimator: Estimator, session: Session, note: Callable[[str, str], None]
 ) -> Iterator[int]:
     """The poses to visit, one after the other; a pose given up does not come again in this run."""
     if job.request.plan == "sobol":
@@ -504,60 +322,8 @@ def _rows(
         yield choice.row
 
 
-def _motion_plan(job: _Job, session: Session, recorder: Recorder) -> MotionPlan:
-    """The plan that the confirmation is bound to; on resume the robot must be the same one."""
-    identity = session.poses.identity()
-    offset = session.poses.tcp_offset or job.setup.tcp_offset
-    if offset is None:
-        raise RefusedError(
-            "this controller does not tell its TCP offset: put it into the setup as "
-            "[robot] tcp_offset = [x, y, z, rx, ry, rz] (m, rad); it is compared before moving",
-            device="robot",
-        )
-    known = {"serial_number": identity.name, "tcp_offset": list(offset)}
-    if job.progress is not None:
-        _check_same_robot(job.progress.settings.get("robot"), identity.name, offset)
-    bench = described(job.setup, job.targets)
-    settings = {"request": asdict(job.request), "robot": known, "bench": bench}
-    recorder.put("plan", "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8), "1")
-    recorder.attributes("tracker", known)
-    recorder.attributes("ae", {"clock_hz": session.echo.clock_hz(), "trigger_delay_s": 0.0})
-    recorder.sync()
-    pendant = session.poses.pendant
-    if pendant is None:
-        raise RefusedError("the controller does not tell its speed slider", device="robot")
-    limits = job.setup.motion_limits(controller_arm(identity.model, identity.version))
-    joints = session.poses.latest().joints
-    # Where every image was taken, only the end of the file is missing: any plan will do.
-    to_go = job.targets[job.missing or slice(None)]
-    return MotionPlan(to_go, limits, offset, identity.name, joints, pendant)
-
-
-def _check_same_robot(before: object, serial: str, tcp_offset: Sequence[float]) -> None:
-    """Refuse a robot, or a TCP offset, other than those of the images taken so far."""
-    if before is None:
-        return
-    try:
-        known, numbers = before["serial_number"], before["tcp_offset"]  # pyright: ignore[reportIndexIssue]
-        offset = np.array(numbers, dtype=np.float64).reshape(6)
-    except (TypeError, KeyError, ValueError):
-        raise RefusedError(
-            "the recording does not say with which robot it began", device="robot"
-        ) from None
-    if known != serial:
-        what = f"the recording was begun with robot {known}, this one is {serial}"
-    elif offset_changed(offset.tolist(), tcp_offset):
-        what = (
-            f"the recording was begun with the TCP offset {offset.tolist()} (m, rad), it is "
-            f"{list(tcp_offset)} now"
-        )
-    else:
-        return
-    raise RefusedError(f"{what}: its images would not fit together", device="robot")
-
-
 def _place(
-    job: _Job,
+    job: Job,
     row: int,
     stage: ProbeStage,
     estimator: Estimator,
@@ -602,7 +368,7 @@ class _Shot:
     amplitude: float
 
 
-def _shoot(job: _Job, row: int, stage: ProbeStage, session: Session) -> _Shot:
+def _shoot(job: Job, row: int, stage: ProbeStage, session: Session) -> _Shot:
     """Average the pose, and listen or look.
 
     Raises:
@@ -621,7 +387,7 @@ def _shoot(job: _Job, row: int, stage: ProbeStage, session: Session) -> _Shot:
 
 
 def _take(
-    job: _Job,
+    job: Job,
     row: int,
     session: Session,
     recorder: Recorder,

@@ -20,12 +20,13 @@ from jaxcal.cli.common import POSITIVE, Commands, ExitCode, exit_code
 from jaxcal.cli.run import run
 
 if TYPE_CHECKING:
-    from hw.acquire import AcquisitionRequest, Confirm, Outcome
+    from hw.acquire import Confirm, Outcome
     from hw.bench.run import Bench
     from hw.extras import Extra
     from hw.keys import Keyboard
     from hw.midplane.pattern_injection import Operator
     from hw.midplane.terminal_image import Screen
+    from hw.request import AcquisitionRequest
     from hw.robot.safety import Confirmation, MotionPlan
     from hw.setup import Setup
     from hw.view.feed import LiveView
@@ -175,16 +176,20 @@ def acquire(
         raise InputError("--until-tre needs --plan optimal")
     if unattended is not None and not move:
         raise InputError("--unattended needs --move")
+    if view and not (bench or move):
+        raise InputError("--view needs --move: a dry run has nothing to show")
     from hw.extras import missing
-    from hw.recording_check import check_resumable, settings_of
+    from hw.recording_check import check_resumable
+    from hw.request import AcquisitionRequest, recorded_request
 
     if resume:
         assert recording is not None
         check_resumable(recording)
-        recorded = settings_of(recording)
-        bench_seed = _recorded_bench(recorded, bench)
-        phantom = _recorded_phantom(recorded)
-        operator = _recorded_operator(recorded)
+        recorded = recorded_request(recording)
+        if bench != (recorded.bench is not None):
+            where = "a real bench" if bench else "the emulated bench"
+            raise InputError(f"the recording was begun on {where}: resume it there")
+        bench_seed, phantom, operator = recorded.bench, recorded.phantom, recorded.operator
     needed: dict[str, Extra] = {"rtde_control": "robot"} if bench or move else {}
     if bench and phantom in (None, PHANTOMS[0]):
         needed |= {"cobs": "serial", "serial": "serial"}
@@ -196,7 +201,6 @@ def acquire(
     from jaxcal.cli.cache import enable_compilation_cache
 
     enable_compilation_cache()
-    from hw.acquire import AcquisitionRequest
 
     request = None
     if operator is None:
@@ -317,14 +321,22 @@ def free_hand(
     injected = placement == "pattern-injection"
     if injected != (setup_path is not None):
         raise InputError("--placement pattern-injection and --setup TOML go together")
+    if injected:
+        unused = {
+            "--target": target != "echo",
+            "--region": region is not None,
+            "--spacing": options["spacing_mm"] is not None,
+        }
+        for name, given in unused.items():
+            if given:
+                raise InputError(f"{name} is for segmented images: not with pattern-injection")
     host, _, port = server.partition(":")
     if not host or not ((port.isdecimal() and 0 < int(port) < 65536) or not port):
         raise click.BadParameter(f"{server!r} is not HOST or HOST:PORT", param_hint="HOST[:PORT]")
     path = recording or f"free-hand-{datetime.now():%Y%m%d-%H%M%S}.h5"
     rules = Rules(target="cross" if target == "cross" else "echo", region=region)
     asked = FreeHand(host, int(port or 18944), rules=rules, **options)
-    from hw.acquire import Pause
-    from hw.keys import Keyboard
+    from hw.keys import Keyboard, Pause
     from hw.midplane.terminal_image import Screen
 
     screen = Screen(sys.stderr)
@@ -341,7 +353,11 @@ def free_hand(
         else:
             acquire_free_hand(path, asked, person, resume=resume)
         screen.clear()
-    return _calibrated(path)
+    from hw.outcome import calibrate_and_print
+    from jaxcal.cli.cache import enable_compilation_cache
+
+    enable_compilation_cache()
+    return exit_code([calibrate_and_print(path)])
 
 
 def _check_resumed(recording: str | None, given: Sequence[str]) -> None:
@@ -350,32 +366,6 @@ def _check_resumed(recording: str | None, given: Sequence[str]) -> None:
         raise InputError("--resume needs the RECORDING to go on with")
     if given:
         raise InputError(f"{given[0]} does not go with --resume: the recording knows")
-
-
-def _calibrated(path: str) -> int:
-    """Calibrate from a finished free-hand recording and print the result."""
-    from jaxcal.calibration.calibrate import calibrate
-    from jaxcal.cli.cache import enable_compilation_cache
-    from jaxcal.cli.common import print_page
-    from jaxcal.data.segmentation.segment import segment_recording
-    from jaxcal.io.hdf5 import load
-    from jaxcal.report.record import calibration_record
-    from jaxcal.report.tables import calibration_table
-    from jaxcal.report.verdict import verdict
-
-    enable_compilation_cache()
-    data = load(path)
-    if data.calibration.kind == "time_of_flight":
-        data, _ = segment_recording(data)
-    images = data.calibration
-    scale = ("scale",) if images.kind == "pixel" and images.spacing_mm is None else ()
-    record = calibration_record(calibrate(data, estimate=scale), data)
-    hint = " --estimate scale" if scale else ""
-    again = f"jaxcal calibrate {shlex.quote(path)}{hint} --report report.html"
-    print_page(
-        calibration_table(record), *verdict(record), "", f"{path}: again, with a report: {again}"
-    )
-    return exit_code([record])
 
 
 @commands.command(short_help="Serve an emulated bench until Ctrl-C.")
@@ -444,27 +434,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run(commands, "jaxcal-hw", arguments)
 
 
-def _recorded_bench(settings: dict[str, object], bench: bool) -> int | None:
-    asked = settings.get("request")
-    seed = asked.get("bench") if isinstance(asked, dict) else None
-    if bench != (seed is not None):
-        where = "the emulated bench" if seed is not None else "a real bench"
-        raise InputError(f"the recording was begun on {where}: resume it there")
-    return seed if isinstance(seed, int) else None
-
-
-def _recorded_operator(settings: dict[str, object]) -> str:
-    asked = settings.get("request")
-    operator = asked.get("operator") if isinstance(asked, dict) else None
-    return operator if isinstance(operator, str) and operator in OPERATORS else "simulated"
-
-
-def _recorded_phantom(settings: dict[str, object]) -> str:
-    asked = settings.get("request")
-    phantom = asked.get("phantom") if isinstance(asked, dict) else None
-    return phantom if isinstance(phantom, str) and phantom in PHANTOMS else PHANTOMS[0]
-
-
 def _started(
     stack: ExitStack,
     bench: bool,
@@ -502,10 +471,10 @@ def _acquire(
     operator: str,
     show: bool,
 ) -> int:
-    from hw.acquire import AcquisitionStopped, Pause
+    from hw.acquire import AcquisitionStopped
     from hw.acquire import acquire as run_acquisition
     from hw.emulated import BenchOracle
-    from hw.keys import watch_keys
+    from hw.keys import Pause, watch_keys
     from hw.midplane.terminal_image import Screen
 
     pause, screen = Pause(), Screen(sys.stderr)
@@ -578,9 +547,10 @@ def _operators(operator: str, keyboard: Keyboard, screen: Screen) -> Callable[[]
 
 
 def _finished(path: str, outcome: Outcome, setup: Setup) -> int:
-    from hw.outcome import calibrate_and_print
+    from hw.outcome import calibrate_and_print, lines_of
 
-    return exit_code([calibrate_and_print(path, outcome, setup.clock.speed)])
+    lines = lines_of(path, outcome, setup.clock.speed)
+    return exit_code([calibrate_and_print(path, *lines)])
 
 
 def _confirming(setup: Setup, emulated: bool, unattended: str | None) -> Confirm:
@@ -632,7 +602,7 @@ def _dry_run(
     setup: Setup, path: str, request: AcquisitionRequest | None, preview: str | None
 ) -> int:
     """Everything but the motion: the plan, and the way from pose to pose, against the limits."""
-    from hw.outcome import dry_run
+    from hw.dry_run import dry_run
 
     for line in dry_run(setup, path, request, preview):
         click.echo(line)
@@ -640,7 +610,7 @@ def _dry_run(
 
 
 def _preview(setup: Setup, request: AcquisitionRequest | None, preview: str) -> None:
-    from hw.outcome import draw
+    from hw.dry_run import draw
 
     if request is None:
         raise InputError("--preview draws a new plan; it does not go with --resume")

@@ -16,10 +16,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import ModuleType
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from hw.acquire import Pause
 
 _PERIOD_S = 0.05
 _NAMES = {
@@ -56,6 +52,31 @@ def names_of(typed: bytes) -> list[str]:
         elif key.isascii() and key.decode().isprintable():
             names.append(key.decode())
     return names
+
+
+class Pause:
+    """Lets a person hold the acquisition between two images."""
+
+    def __init__(self) -> None:
+        self._free = threading.Event()
+        self._free.set()
+
+    def hold(self) -> None:
+        """Stop before the next image."""
+        self._free.clear()
+
+    def go_on(self) -> None:
+        """Take the next image."""
+        self._free.set()
+
+    @property
+    def held(self) -> bool:
+        """Whether the acquisition is, or will be, held."""
+        return not self._free.is_set()
+
+    def wait(self) -> None:
+        """Return when nobody holds the acquisition."""
+        self._free.wait()
 
 
 class Keyboard:

@@ -1,80 +1,23 @@
-"""Before and after an acquisition: the dry run of its plan, and its result."""
+"""The result of a finished acquisition: calibrated from its file, and printed."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-from typing import Any
+import shlex
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
 
-from hw.acquire import AcquisitionRequest, Outcome, planned
-from hw.poses import preview
-from hw.recording_file import check_new
-from hw.robot.limits import Limits
-from hw.robot.safety import MotionPlan, check_plan, plan_lines
-from hw.setup import Setup
-from jaxcal import InputError
+if TYPE_CHECKING:
+    from hw.acquire import Outcome
 
 
-def dry_run(
-    setup: Setup, path: str, request: AcquisitionRequest | None, figure: str | None
-) -> list[str]:
-    """What an acquisition would do, checked against the limits; nothing is opened.
+def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
+    """Calibrate from a finished file as ``jaxcal calibrate`` would, and print the result.
 
-    Raises:
-        InputError: a plan that cannot be made.
-        OutputError: a recording that cannot be made.
-        RefusedError: a plan that the limits do not allow; it names the first pose or way.
-    """
-    if request is None:
-        raise InputError("--resume needs --move: a dry run has nothing to resume")
-    check_new(path)
-    plan = planned(setup, request)
-    motion = MotionPlan(plan.poses, _dry_limits(setup), setup.tcp_offset or (0.0,) * 6, "dry run")
-    course = check_plan(motion)
-    if figure is not None:
-        preview(plan, Path(figure))
-    if course is None:
-        known = "model" if setup.tcp_offset is not None else "model and tcp_offset"
-        arm = (
-            "kinematics NOT checked here: reach, joints, singularities and links of the arm are "
-            f"checked before the confirmation, or now with [robot] {known} in the setup"
-        )
-    else:
-        arm = f"a {motion.limits.arm_model} reaches every pose on every way: {course.text}"
-    return [
-        f"dry run: {_poses(request, len(plan))}, {request.placement}, the tip travels "
-        f"{plan.travel_mm:.0f} mm ({plan.passed_over} poses passed over)",
-        *plan_lines(motion, tcp_offset_known=setup.tcp_offset is not None),
-        "every pose and every way between two lies within the limits",
-        arm,
-        "not looked at: which arm it is, its TCP offset, payload and speed slider; they are read, "
-        "shown and confirmed with --move (jaxcal-hw check shows them now)",
-        f"nothing moved and {path} was not made; add --move to acquire",
-    ]
-
-
-def _poses(request: AcquisitionRequest, count: int) -> str:
-    if request.plan == "sobol":
-        return f"{count} poses"
-    return f"at most {request.images} images; all {count} poses of the pool were checked"
-
-
-def _dry_limits(setup: Setup) -> Limits:
-    """The limits, without the arm's model where the setup lacks the controller's TCP offset."""
-    limits = setup.motion_limits()
-    return limits if setup.tcp_offset is not None else replace(limits, arm_model="")
-
-
-def draw(setup: Setup, request: AcquisitionRequest, figure: str) -> None:
-    """Write the plan's figure."""
-    preview(planned(setup, request), Path(figure))
-
-
-def calibrate_and_print(path: str, outcome: Outcome, speed: float) -> dict[str, Any]:
-    """Calibrate from the finished file as ``jaxcal calibrate`` would, and print the result.
+    Args:
+        path: of the recording.
+        lines: to print below the verdict.
 
     Returns:
         The calibration's record (:func:`jaxcal.report.record.calibration_record`).
@@ -90,7 +33,18 @@ def calibrate_and_print(path: str, outcome: Outcome, speed: float) -> dict[str, 
     recording = load(path)
     if recording.calibration.kind == "time_of_flight":
         recording, _ = segment_recording(recording)
-    record = calibration_record(calibrate(recording), recording)
+    images = recording.calibration
+    scale = ("scale",) if images.kind == "pixel" and images.spacing_mm is None else ()
+    record = calibration_record(calibrate(recording, estimate=scale), recording)
+    hint = " --estimate scale" if scale else ""
+    again = f"jaxcal calibrate {shlex.quote(path)}{hint} --report report.html"
+    last = f"{path}: again, with a report: {again}"
+    print_page(calibration_table(record), *verdict(record), "", *lines, last)
+    return record
+
+
+def lines_of(path: str, outcome: Outcome, speed: float) -> list[str]:
+    """How a robot's acquisition went, for a person."""
     lines = [
         f"{outcome.images} images in {path}, {outcome.images / outcome.seconds * 60:.1f} a minute "
         f"of the bench's time ({outcome.seconds:.0f} s"
@@ -104,8 +58,7 @@ def calibrate_and_print(path: str, outcome: Outcome, speed: float) -> dict[str, 
     if share is not None:
         lines.append(f"true offsets inside their brackets: {share[0]} of {share[1]}")
         lines.append(f"SD of the true offsets: {share[2]:.2f} mm")
-    print_page(calibration_table(record), *verdict(record), "", *lines)
-    return record
+    return lines
 
 
 def share_inside(path: str) -> tuple[int, int, float] | None:

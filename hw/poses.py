@@ -31,6 +31,7 @@ from jaxcal.io.atomic import save_figure
 MOST_POSES = 10_000
 # A turn of one degree takes the arm about as long as this many mm.
 _MM_PER_DEGREE = 1.0
+_LEAST_DEPTH_MM = 1.0
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,8 @@ class Extent:
             low, high = getattr(self, name)
             if not (np.isfinite([low, high]).all() and 0 < low <= high <= 5000):
                 raise InputError(f"{name} must be two positive mm in order, not {(low, high)}")
+        if self.depth_mm[1] < _LEAST_DEPTH_MM:
+            raise InputError(f"depth_mm {self.depth_mm} lies within the probe's face: is it in m?")
         if self.box_mm is not None:
             box = np.asarray(self.box_mm, float)
             if box.shape != (2, 3) or not np.isfinite(box).all() or (box[0] >= box[1]).any():

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from hw.errors import RefusedError
 from hw.recording_check import Progress
+from hw.robot.stream import offset_changed
 from hw.setup import Setup
 from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
@@ -103,6 +105,29 @@ def compare(progress: Progress, setup: Setup) -> list[str]:
     if before.get("plan_sha256") not in (None, now["plan_sha256"]):
         changes.append("the plan in the file is not the one that it was begun with: it was edited")
     return changes
+
+
+def check_same_robot(before: object, serial: str, tcp_offset: Sequence[float]) -> None:
+    """Refuse a robot, or a TCP offset, other than those of the images taken so far."""
+    if before is None:
+        return
+    try:
+        known, numbers = before["serial_number"], before["tcp_offset"]  # pyright: ignore[reportIndexIssue]
+        offset = np.array(numbers, dtype=np.float64).reshape(6)
+    except (TypeError, KeyError, ValueError):
+        raise RefusedError(
+            "the recording does not say with which robot it began", device="robot"
+        ) from None
+    if known != serial:
+        what = f"the recording was begun with robot {known}, this one is {serial}"
+    elif offset_changed(offset.tolist(), tcp_offset):
+        what = (
+            f"the recording was begun with the TCP offset {offset.tolist()} (m, rad), it is "
+            f"{list(tcp_offset)} now"
+        )
+    else:
+        return
+    raise RefusedError(f"{what}: its images would not fit together", device="robot")
 
 
 def _same(old: Any, new: Any) -> bool:

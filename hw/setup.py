@@ -297,6 +297,8 @@ def _setup(tables: dict[str, Any]) -> Setup:
         housing_mm=housing,
         **robot,
     )
+    if not np.linalg.norm(setup.scene.looking) > 0:
+        raise InputError("[scene] looking is a direction: it cannot be all zero")
     _check_lengths(setup, scene.get("tip_at_tcp", False))
     return setup
 

@@ -7,6 +7,7 @@ for a person. A pty (the bench's emulator) takes any baud rate, also a wrong one
 from __future__ import annotations
 
 import contextlib
+import errno
 import threading
 from typing import Any
 
@@ -107,7 +108,9 @@ def open_transport(url: str, *, baud: int = BAUD) -> Transport:
         port = serial.serial_for_url(url, **options)
     except (OSError, ValueError) as error:
         text = _first_line(error)
-        if "lock" in text:
+        if getattr(error, "errno", None) == errno.ENOENT:
+            text = "there is no such port"
+        elif "lock" in text:
             text = "another program uses it"
         raise DeviceError(f"cannot open {url}: {text}", device=DEVICE) from None
     return Transport(port, url)

@@ -207,7 +207,11 @@ class AuspisEmulator:
         while not self._unplug:
             # The thread wakes often enough to notice a request to stop.
             wait = self._clock.wall(due - self._clock.now())
-            ready, _, _ = select.select([self._link], [], [], min(max(wait, 0.0), 0.05))
+            # A client that is new on a full line must get the answer behind what waits there.
+            waiting = [self._link] if self._link.waits else []
+            ready, free, _ = select.select([self._link], waiting, [], min(max(wait, 0.0), 0.05))
+            if free:
+                self._link.flush()
             if ready:
                 self._listen()
             now = self._clock.now()

@@ -32,6 +32,15 @@ class Link(Protocol):
         """Send; False when there is no room: then none of the data are sent."""
         ...
 
+    @property
+    def waits(self) -> bool:
+        """Whether data that were sent are still kept here."""
+        ...
+
+    def flush(self) -> None:
+        """Hand over what the other end has room for."""
+        ...
+
     def close(self) -> None:
         """Vanish from the other end, as an unplugged cable does."""
         ...
@@ -64,7 +73,7 @@ class PtyLink:
     def read(self) -> bytes:
         """See :class:`Link`."""
         # The other end may have just emptied its buffer: what waits comes before any answer.
-        self._flush()
+        self.flush()
         try:
             return os.read(self._master, 4096)
         except OSError as error:
@@ -75,14 +84,20 @@ class PtyLink:
     def write(self, data: bytes) -> bool:
         """See :class:`Link`."""
         if len(self._pending) + len(data) > _MOST_PENDING:
-            self._flush()
+            self.flush()
             if len(self._pending) + len(data) > _MOST_PENDING:
                 return False
         self._pending += data
-        self._flush()
+        self.flush()
         return True
 
-    def _flush(self) -> None:
+    @property
+    def waits(self) -> bool:
+        """See :class:`Link`."""
+        return bool(self._pending)
+
+    def flush(self) -> None:
+        """See :class:`Link`."""
         try:
             sent = os.write(self._master, self._pending)
         except OSError as error:
@@ -137,18 +152,29 @@ class TcpLink:
         if self._peer is None:
             return True
         self._pending += data
-        try:
-            sent = self._peer.send(self._pending)
-        except BlockingIOError:
-            sent = 0
-        except OSError:
-            self._hang_up()
-            return True
-        del self._pending[:sent]
+        self.flush()
         if len(self._pending) > _MOST_PENDING:
             del self._pending[len(self._pending) - len(data) :]
             return False
         return True
+
+    @property
+    def waits(self) -> bool:
+        """See :class:`Link`."""
+        return bool(self._pending)
+
+    def flush(self) -> None:
+        """See :class:`Link`."""
+        if self._peer is None:
+            return
+        try:
+            sent = self._peer.send(self._pending)
+        except BlockingIOError:
+            return
+        except OSError:
+            self._hang_up()
+            return
+        del self._pending[:sent]
 
     def _hang_up(self) -> None:
         if self._peer is not None:

@@ -23,6 +23,7 @@ from hw.recording_layout import RecordingHeader
 from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images
+from jaxcal.data.segmentation.image import check_region
 
 _KIND = "free-hand"
 _SILENCE_S = 3.0
@@ -49,7 +50,7 @@ def acquire_free_hand(
     Raises:
         FreeHandStopped: interrupted, the stream was lost, or too few images; it can be resumed.
         DeviceError: nothing to connect to, or nothing that can be used in the stream.
-        InputError: a recording that cannot be resumed.
+        InputError: a recording that cannot be resumed, or a region that leaves the images.
         OutputError: the recording cannot be made.
     """
     guide, kept = Guide(asked.rules), KeptImages()
@@ -58,6 +59,7 @@ def acquire_free_hand(
         guide, kept = _resumed(path, asked)
     with UltrasoundStream(asked.host, asked.port, device=asked.device) as stream:
         posed = PosedImages(stream, asked.source, asked.target_frame, asked.lag_s)
+        check_region(asked.rules.region, posed.shape)
         for line in _found(posed, stream):
             person.say(line)
         if resume:

@@ -65,6 +65,7 @@ class PosedImages:
         pair: the frames of the poses.
         names: of all transforms that came.
         device: of the images.
+        shape: (rows, columns) of the first image.
         by_arrival: whether times of arrival are used.
 
     Raises:
@@ -84,6 +85,7 @@ class PosedImages:
         self._listen()
         self.names = sorted(self._samples)
         self.device = self._waiting[0][0].device
+        self.shape = self._waiting[0][0].array.shape
         pairs = {name: pair for name in self.names if (pair := split_name(name)) is not None}
         self.pair = _chosen(pairs, source, target)
         self._steps = path_between(list(pairs.values()), *self.pair) or []
@@ -137,7 +139,15 @@ class PosedImages:
                 both = time.monotonic()
             if both is None and time.monotonic() - started > LISTEN_S:
                 missing = "images" if not self._waiting else "transforms"
-                reason = self._stream.statistics().reason
+                counts = self._stream.statistics()
+                reason = counts.reason
+                if not self._waiting and counts.other_devices:
+                    raise DeviceError(
+                        f"{self._stream.address} sends no images of the device that was named, "
+                        f"but of {', '.join(map(repr, counts.other_devices))}: name one of these "
+                        "(--device), or none",
+                        device="ultrasound",
+                    )
                 raise DeviceError(
                     f"{self._stream.address} sent no {missing} within {LISTEN_S:g} s"
                     + (f" that can be used ({reason})" if reason else "")

@@ -20,6 +20,7 @@ from jaxcal.io.frame_names import FramePair
 
 _ENOUGH = 30
 """Default number of images to take."""
+_LONGEST_LAG_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class FreeHand:
         rules: when an image is taken.
 
     Raises:
-        InputError: a host, a number of images or a spacing that cannot be.
+        InputError: a host, a number of images, a lag or a spacing that cannot be.
     """
 
     host: str
@@ -55,6 +56,10 @@ class FreeHand:
         check_host(self.host)
         if not MINIMUM_IMAGES <= self.images <= 1000:
             raise InputError(f"images must be {MINIMUM_IMAGES} to 1000, not {self.images}")
+        if not abs(self.lag_s) <= _LONGEST_LAG_S:
+            raise InputError(
+                f"the lag must be -{_LONGEST_LAG_S:g} to {_LONGEST_LAG_S:g} s, not {self.lag_s:g}"
+            )
         if self.spacing_mm is not None:
             check_spacing_unit(np.array(self.spacing_mm))
 

@@ -78,6 +78,8 @@ _STOPPED_MM_S, _STOPPED_RAD_S = 1.0, 0.01
 """Below these speeds the TCP counts as at rest; a real arm's reading is never quite zero."""
 _REST_SEEN_S = 0.03
 """A stop is done when the poses have shown rest for so long after stopL (4 poses at 125 Hz)."""
+_STOP_AGAIN_S = 0.05
+"""stopL is sent again to a robot that still moves after this time."""
 _STOP_PATIENCE_S = 2.0
 _END_S = 5.0
 """Longest time for the end of the script and of the connection."""
@@ -534,8 +536,9 @@ class Mover:
         """
         give_up = self._clock.now() + self._clock.patience(_STOP_PATIENCE_S)
         while self._usable():
-            # stopL has no answer; the poses show whether the controller took it.
-            self._command("stopL", _STOP_M_S2, False)
+            # Asynchronous: a call that waits for rest would hold the watchdog's kicks back, and
+            # braking may take longer than the watchdog waits. The poses show what stopL did.
+            self._command("stopL", _STOP_M_S2, True)
             if self._rests():
                 return
             if self._clock.now() > give_up:
@@ -543,9 +546,9 @@ class Mover:
                 raise _Ended(LostError(text, device="robot"))
 
     def _rests(self) -> bool:
-        """Whether every pose of the next :data:`_REST_SEEN_S` shows rest."""
+        """Whether the poses show rest for :data:`_REST_SEEN_S`; False: send stopL again."""
         assert self._packet is not None
-        since = self._packet.timestamp_s
+        sent = since = self._packet.timestamp_s
         give_up = self._clock.now() + self._clock.patience(10 * _REST_SEEN_S)
         while self._clock.now() < give_up:
             self._read(self._clock.wall(_REST_SEEN_S / 4))
@@ -555,7 +558,9 @@ class Mover:
             if packet.timestamp_s > since and (
                 speed > _STOPPED_MM_S or math.hypot(*packet.tcp_speed[3:]) > _STOPPED_RAD_S
             ):
-                return False
+                since = packet.timestamp_s
+                if since - sent > _STOP_AGAIN_S:
+                    return False
             if packet.timestamp_s - since >= _REST_SEEN_S:
                 return True
         return False

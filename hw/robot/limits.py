@@ -41,6 +41,8 @@ _MOST_TEXT = 200
 FURTHEST_MM = 2000.0
 """No corner of a box may lie further than this from the base along any axis: the largest known arm
 (UR20) reaches 1.75 m."""
+_LEAST_BOX_MM = 10.0
+"""No probe fits into a box that is smaller along every axis."""
 FURTHEST_TIP_MM = 500.0
 """No part of a probe may be further from the TCP than this."""
 FORCE_WITHOUT_REASON_N = 140.0
@@ -132,6 +134,11 @@ class Limits:
                 )
             if any(a >= b for a, b in zip(low, high, strict=True)):
                 raise _refuse(f"{name}_min_mm must lie below {name}_max_mm on every axis")
+            if max(b - a for a, b in zip(low, high, strict=True)) < _LEAST_BOX_MM:
+                raise _refuse(
+                    f"{name}_min_mm and {name}_max_mm are less than {_LEAST_BOX_MM:g} mm apart "
+                    "along every axis: are they in metres? They are in mm"
+                )
         for point in (self.tip_mm, *self.hull_mm):
             if math.hypot(*point) > FURTHEST_TIP_MM:
                 raise _refuse(

@@ -109,6 +109,7 @@ class UltrasoundStatistics:
         repeated: images that came again with the same time stamp; not handed on.
         unsupported: intact messages with content that is not taken (``reason`` for the last one).
         other: messages of other types or devices; skipped.
+        other_devices: names of devices whose images were skipped, at most 64.
         transforms: accepted.
         reason: why the last unsupported message was not taken.
     """
@@ -123,6 +124,7 @@ class UltrasoundStatistics:
     other: int = 0
     transforms: int = 0
     reason: str = ""
+    other_devices: tuple[str, ...] = ()
 
 
 class UltrasoundStream:
@@ -159,6 +161,7 @@ class UltrasoundStream:
             ("received", "lost", "dropped", "repeated", "other", "transforms"), 0
         )
         self._last: dict[str, tuple[int, float]] = {}
+        self._other_devices: set[str] = set()
         self._failure: LostError | None = None
         self._stopping = False
         self._socket: socket.socket | None = None
@@ -262,6 +265,7 @@ class UltrasoundStream:
                 resynchronised=counts.resynchronised,
                 unsupported=counts.unsupported,
                 reason=self._decoder.reason,
+                other_devices=tuple(sorted(self._other_devices)),
                 **self._counts,
             )
 
@@ -307,8 +311,11 @@ class UltrasoundStream:
                 self._take_image(message, message.content.picture)
             case StatusMessage():
                 self._status = message.content
-            case _:
+            case content:
                 self._counts["other"] += 1
+                # A peer may invent devices without end.
+                if isinstance(content, Picture | TrackedFrame) and len(self._other_devices) < 64:
+                    self._other_devices.add(message.device)
 
     def _take_image(self, message: Message, picture: Picture) -> None:
         counts = self._counts

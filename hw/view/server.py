@@ -2,22 +2,29 @@
 
 Started by :class:`hw.view.feed.LiveView`. It prints one JSON line with its address, or with the
 reason why there is none, and ends when its standard input ends. It has no connection to any device,
-and drops every message from a browser: cameras and panels work in the browser alone.
+and drops every message from a browser: cameras and panels work in the browser alone. It answers
+only requests for this machine's own names, and only its own page: a page of another site, open in
+the same browser, could otherwise read the stream.
 """
 
 from __future__ import annotations
 
+import functools
+import http.client
 import json
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import closing, redirect_stdout
 from io import RawIOBase
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
 HOST = "127.0.0.1"
+_OWN_NAMES = (HOST, "localhost")
+"""As a browser names this machine, also at the end of an ssh tunnel."""
 _LARGEST = 1 << 26
 
 
@@ -36,6 +43,7 @@ def main(port: int) -> int:
     # viser looks for OpenCV at every picture, which takes longer than the picture itself.
     sys.modules.setdefault("cv2", None)  # type: ignore[arg-type]
     with redirect_stdout(sys.stderr):
+        refuse_strangers()
         try:
             server = viser.ViserServer(host=HOST, port=port, verbose=False)
         except OSError as error:
@@ -43,6 +51,7 @@ def main(port: int) -> int:
             return 2
         try:
             ignore_browsers(server)
+            check_refusal(server.get_port())
         except NotImplementedError as error:
             answer(error=str(error))
             return 2
@@ -56,6 +65,51 @@ def main(port: int) -> int:
                 page.show(told, frame)
         server.stop()
     return 0
+
+
+def refuse_strangers() -> None:
+    """Have every request checked before viser sees it.
+
+    viser has no option for this; it listens through ``websockets``. :func:`check_refusal` finds a
+    version that does not.
+    """
+    import websockets.asyncio.server as listening
+
+    serve = listening.serve
+
+    @functools.wraps(serve)
+    def checked(*arguments: Any, process_request: Callable | None = None, **options: Any) -> Any:
+        def process(connection: Any, request: Any) -> Any:
+            if not _is_own(request.headers):
+                return connection.respond(403, "this page is for its own machine only\n")
+            return None if process_request is None else process_request(connection, request)
+
+        return serve(*arguments, process_request=process, **options)
+
+    listening.serve = checked  # type: ignore[misc]
+
+
+def _is_own(headers: Any) -> bool:
+    """Whether a request names this machine, and no page of another site has made it."""
+    names = [f"//{host}" for host in headers.get_all("Host")] + headers.get_all("Origin")
+    try:
+        return all(urlsplit(name).hostname in _OWN_NAMES for name in names)
+    except ValueError:
+        return False
+
+
+def check_refusal(port: int) -> None:
+    """Check that the page at this port refuses another machine's name.
+
+    Raises:
+        NotImplementedError: it does not; do not serve it.
+    """
+    with closing(http.client.HTTPConnection(HOST, port, timeout=10.0)) as connection:
+        connection.request("GET", "/", headers={"Host": "elsewhere"})
+        if connection.getresponse().status != 403:
+            raise NotImplementedError(
+                "this viser listens in a way that is not known: install viser 1.1"
+            )
 
 
 def ignore_browsers(server: Any) -> None:

@@ -23,18 +23,14 @@ pytest.importorskip("serial", reason="pyserial is not installed (jaxcal[serial])
 from test_recorder import wait_until_closed
 
 import jaxcal
-from hw.acquire import (
-    AcquisitionRequest,
-    AcquisitionStopped,
-    Outcome,
-    Pause,
-    _check_same_robot,
-    acquire,
-)
+from hw.acquire import AcquisitionStopped, Outcome, acquire
 from hw.bench.run import Bench
 from hw.emulated import BenchOracle, setup_of, start
 from hw.errors import RefusedError
+from hw.keys import Pause
 from hw.outcome import share_inside
+from hw.request import AcquisitionRequest
+from hw.resuming import check_same_robot
 from hw.robot.safety import MotionPlan, confirm_unattended
 from jaxcal.cli.main import main
 
@@ -306,16 +302,34 @@ def test_a_protective_stop_is_told_before_anybody_is_asked(tmp_path):
         assert not stopped.value.by_itself
 
 
+def test_an_edited_plan_is_told_until_it_is_confirmed(tmp_path):
+    path = tmp_path / "rec.h5"
+
+    def refuse(plan: MotionPlan):
+        raise RefusedError("not confirmed", device="robot")
+
+    with a_bench() as bench:
+        setup, request = setup_of(bench), AcquisitionRequest(4, "none", 1, bench=3)
+        for resumed in range(3):
+            if resumed == 1:
+                with h5py.File(path, "r+") as file:
+                    file["plan/targets"][-1, 2, 3] += 1.0
+            told = []
+            with pytest.raises(AcquisitionStopped, match="not confirmed"):
+                acquire(setup, path, None if resumed else request, refuse, say=told.append)
+            assert any("it was edited" in line for line in told) == bool(resumed)
+
+
 def test_a_resumed_run_needs_the_same_robot():
     offset = [0.0, 0.0, 0.12, 0.0, 0.0, 0.0]
     before = {"serial_number": "a", "tcp_offset": offset}
-    _check_same_robot(before, "a", [*offset[:2], 0.1200000001, *offset[3:]])
+    check_same_robot(before, "a", [*offset[:2], 0.1200000001, *offset[3:]])
     with pytest.raises(RefusedError, match="begun with robot a, this one is b"):
-        _check_same_robot(before, "b", offset)
+        check_same_robot(before, "b", offset)
     with pytest.raises(RefusedError, match="TCP offset"):
-        _check_same_robot(before, "a", [*offset[:2], 0.121, *offset[3:]])
+        check_same_robot(before, "a", [*offset[:2], 0.121, *offset[3:]])
     with pytest.raises(RefusedError, match="does not say"):
-        _check_same_robot({"serial_number": "a", "tcp_offset": [0.0]}, "a", offset)
+        check_same_robot({"serial_number": "a", "tcp_offset": [0.0]}, "a", offset)
 
 
 def viewers(parent: int) -> list[int]:

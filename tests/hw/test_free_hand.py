@@ -276,7 +276,7 @@ def test_ctrl_c_at_a_terminal(tmp_path):
     [
         ({"source": "Needle"}, "no transforms lead from Needle to Reference; the stream has Probe"),
         ({"target_frame": "Table"}, "no transforms lead from Probe to Table"),
-        ({"device": "Other"}, "sent no images within"),
+        ({"device": "Other"}, "but of 'Image_Reference': name one of these"),
     ],
 )
 def test_streams_that_cannot_be_used(tmp_path, monkeypatch, options, message):
@@ -352,3 +352,26 @@ def test_rules_that_cannot_be():
         Rules(hold_s=0.0)
     with pytest.raises(InputError, match="images must be 4 to 1000"):
         FreeHand("localhost", images=3)
+    for lag in (float("nan"), 5.1):
+        with pytest.raises(InputError, match="the lag must be -5 to 5 s"):
+            FreeHand("localhost", lag_s=lag)
+
+
+def test_a_region_that_leaves_the_images_makes_no_file(tmp_path):
+    rules = Rules(region=(0, 0, 5000, 5000))
+    with plus_server() as port, pytest.raises(InputError, match="leaves the 160 x 120 px frame"):
+        acquire_free_hand(tmp_path / "r.h5", FreeHand("127.0.0.1", port, rules=rules), Scripted())
+    assert not list(tmp_path.iterdir())
+
+
+def test_options_that_nothing_would_use(tmp_path, capsys):
+    injection = ["--placement", "pattern-injection", "--setup", "hand.toml"]
+    for option in (
+        ["--target", "cross"],
+        ["--region", "0", "0", "9", "9"],
+        ["--spacing", "1", "1"],
+    ):
+        assert main(["free-hand", "localhost", *injection, *option]) == 2
+        assert f"{option[0]} is for segmented images" in capsys.readouterr().err
+    assert main(["acquire", "--setup", "bench.toml", "--view"]) == 2
+    assert "--view needs --move" in capsys.readouterr().err

@@ -210,7 +210,7 @@ def test_check_says_what_is_wrong_with_each_device(capsys):
 
 def test_who_confirms_is_told_of_an_arm_that_nothing_identifies():
     limits = Limits.from_mapping({
-        "box_min_mm": [0, 0, 0], "box_max_mm": [1, 1, 1], "tip_mm": [0, 0, 50],
+        "box_min_mm": [0, 0, 0], "box_max_mm": [99, 99, 99], "tip_mm": [0, 0, 50],
         "cone_axis": [0, 0, -1], "cone_deg": 30, "max_step_mm": 10, "max_turn_deg": 10,
         "max_speed_mm_s": 10,
     })  # fmt: skip

@@ -120,6 +120,26 @@ def test_the_robot_moves_searches_and_is_left_in_order(version):
     assert times == sorted(times)
 
 
+@both_series
+def test_a_hesitation_at_full_speed_leaves_the_watchdog_at_rest(version):
+    """From 250 mm/s the arm brakes for longer than the controller's watchdog waits."""
+    limits = replace(LIMITS, max_speed_mm_s=250.0, max_acceleration_mm_s2=2000.0)
+    plan = MotionPlan(np.array([HOME, beside(50.0, 0.0, 0.0)]), limits, OFFSET, SERIAL)
+    with EmulatedRobot(version=version) as robot, moving(robot, plan=plan) as motion:
+
+        def guard() -> StaleError | None:
+            fast = robot.state()["velocity"][0] > 0.24
+            return StaleError("no frame", device="active echo") if fast else None
+
+        motion.guard = guard
+        with pytest.raises(StaleError, match="no frame"):
+            motion.move_to(plan.targets[1])
+        assert not motion.ended
+        assert robot.state()["velocity"] == [0.0] * 6
+        motion.guard = None
+        np.testing.assert_allclose(motion.move_to(HOME).pose, HOME, atol=1e-6)
+
+
 def test_whatever_is_asked_for_only_allowed_motions_are_sent():
     rng = np.random.default_rng(5)
     home = PLAN.targets[0]

@@ -14,7 +14,6 @@ import pytest
 from test_world import placed
 
 import jaxcal
-from hw.acquire import AcquisitionRequest
 from hw.bench.frames import COLUMNS, DECIBELS, Camera, Look
 from hw.bench.phantoms import ActiveEcho, Hydrophone, phantom_named
 from hw.bench.stage import WorldStage
@@ -26,6 +25,7 @@ from hw.poses import plan_poses
 from hw.recorder import Recorder
 from hw.recording_check import check_resumable, read_progress, settings_of
 from hw.recording_layout import RecordingHeader
+from hw.request import AcquisitionRequest
 from jaxcal import InputError
 from jaxcal.data.segmentation.image import localise
 

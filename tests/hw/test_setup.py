@@ -80,6 +80,13 @@ def test_a_description_is_read(tmp_path):
         (LIMITS, "", "nothing may move"),
         ("cone_deg = 60", "cone_degrees = 60", r"\[limits\] unknown limit cone_degrees"),
         ("box_min_mm = [200, -400, 40]", "", r"\[limits\] the limit box_min_mm is missing"),
+        ("looking = [0, 0, -1]", "looking = [0, 0, 0]", r"\[scene\] looking is a direction"),
+        (
+            "box_min_mm = [200, -400, 40]\nbox_max_mm = [500, -100, 260]",
+            "box_min_mm = [0.2, -0.4, 0.04]\nbox_max_mm = [0.5, -0.1, 0.26]",
+            r"\[limits\] box_min_mm and box_max_mm .* are they in metres\?",
+        ),
+        ("depth_mm = [20, 60]", "depth_mm = [0.02, 0.06]", r"depth_mm .* is it in m\?"),
         ("max_step_mm = 250", "max_step_mm = 1000", r"\[limits\] max_step_mm must be above 0"),
         ("[[1, 0, 0, 0]", "[[-1, 0, 0, 0]", r"\[scene\] image_to_probe is a reflection"),
         ("[[1, 0, 0, 0]", "[[2, 0, 0, 0]", r"\[scene\] image_to_probe is not a rotation"),

@@ -135,7 +135,7 @@ def localise(
         raise InputError(f"false_alarm must be between 0 and 1, not {false_alarm!r}")
     if not (np.isfinite(minimum_margin_db) and minimum_margin_db >= 0):
         raise InputError(f"minimum_margin_db must be zero or positive, not {minimum_margin_db!r}")
-    first_column, first_row, columns, rows = _check_region(region, stack.shape[1:])
+    first_column, first_row, columns, rows = check_region(region, stack.shape[1:])
     expected, radius = _check_near(near, within_px, len(stack))
     scatter = np.asarray(target_sd_px, dtype=float)
     if scatter.shape not in ((), (2,)) or not (np.isfinite(scatter) & (scatter >= 0)).all():
@@ -245,9 +245,18 @@ def _check_frames(frames: np.ndarray) -> np.ndarray:
     return stack
 
 
-def _check_region(
+def check_region(
     region: Sequence[int] | np.ndarray | None, shape: tuple[int, ...]
 ) -> tuple[int, int, int, int]:
+    """The region to look in: (first column, first row, columns, rows), px; the whole frame if None.
+
+    Args:
+        region: what was asked for.
+        shape: (rows, columns) of the frames.
+
+    Raises:
+        InputError: not four whole numbers, outside the frame, or too small.
+    """
     rows, columns = shape
     if region is None:
         return 0, 0, columns, rows

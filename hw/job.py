@@ -1,0 +1,140 @@
+"""What is still to be acquired, of a new recording or of one that is resumed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from hw.errors import RefusedError
+from hw.recorder import Recorder
+from hw.recording_check import Progress, is_complete, read_progress
+from hw.recording_file import RecordingWriter
+from hw.recording_layout import RecordingHeader
+from hw.request import AcquisitionRequest, planned, request_in
+from hw.resuming import check_same_robot, compare, described, described_probe
+from hw.robot.safety import MotionPlan
+from hw.session import Session
+from hw.setup import Setup, controller_arm
+from jaxcal.io.readable import naming
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to acquire.
+
+    Attributes:
+        setup: the bench.
+        request: as it was asked for, now or when the recording was begun.
+        targets: (n, 4, 4) poses, mm: the plan in the order of travel, or the pool to choose from.
+        progress: of the recording that is resumed; None for a new one.
+        changes: lines that a person has to confirm with the plan (:func:`hw.resuming.compare`).
+    """
+
+    setup: Setup
+    request: AcquisitionRequest
+    targets: np.ndarray
+    progress: Progress | None
+    changes: tuple[str, ...] = ()
+
+    @property
+    def missing(self) -> list[int]:
+        """Rows of the poses without an image."""
+        taken = set() if self.progress is None else set(self.progress.taken.tolist())
+        return [row for row in range(len(self.targets)) if row not in taken]
+
+    @property
+    def images(self) -> int:
+        """Most images of the whole recording."""
+        return min(self.request.images, len(self.targets))
+
+    @property
+    def to_take(self) -> int:
+        """Images that are still to be taken, at most."""
+        return self.images - (len(self.targets) - len(self.missing))
+
+
+def prepare(setup: Setup, path: str | os.PathLike[str], request: AcquisitionRequest | None) -> Job:
+    """What is to be done; ``request`` None resumes the recording at ``path``.
+
+    Raises:
+        InputError: a plan that cannot be made, or a recording that does not fit this bench.
+    """
+    if request is not None:
+        return Job(setup, request, planned(setup, request).poses, None)
+    if not is_complete(path):
+        # Cut the file back to whole rows first, so that only these are read.
+        RecordingWriter.resume(path).close()
+    progress = read_progress(path)
+    with naming(path):
+        request = request_in(progress.settings)
+        changes = compare(progress, setup)
+    return Job(setup, request, progress.targets, progress, tuple(changes))
+
+
+def open_recorder(path: str | os.PathLike[str], job: Job) -> Recorder:
+    """A writer that makes the recording of a new job, or goes on with that of a resumed one."""
+    if job.progress is not None:
+        gap = job.progress.last_s + 1.0 - job.setup.clock.now()
+        return Recorder(path, time_offset_s=max(gap, 0.0))
+    probe = job.setup.probe
+    header = RecordingHeader(
+        kind=job.request.kind,
+        probe={"kind": probe.kind, **described_probe(probe)},
+        lines=probe.elements,
+        settings=json.dumps(
+            {"request": asdict(job.request), "bench": described(job.setup, job.targets)}
+        ),
+    )
+    recorder = Recorder(path, header)
+    recorder.put("plan", "targets", job.targets, "mm")
+    return recorder
+
+
+def motion_plan(job: Job, session: Session) -> MotionPlan:
+    """The plan that the confirmation is bound to; on resume the robot must be the same one.
+
+    Raises:
+        RefusedError: another robot, or a controller that does not tell what must be confirmed.
+    """
+    identity = session.poses.identity()
+    offset = session.poses.tcp_offset or job.setup.tcp_offset
+    if offset is None:
+        raise RefusedError(
+            "this controller does not tell its TCP offset: put it into the setup as "
+            "[robot] tcp_offset = [x, y, z, rx, ry, rz] (m, rad); it is compared before moving",
+            device="robot",
+        )
+    if job.progress is not None:
+        check_same_robot(job.progress.settings.get("robot"), identity.name, offset)
+    pendant = session.poses.pendant
+    if pendant is None:
+        raise RefusedError("the controller does not tell its speed slider", device="robot")
+    limits = job.setup.motion_limits(controller_arm(identity.model, identity.version))
+    joints = session.poses.latest().joints
+    # Where every image was taken, only the end of the file is missing: any plan will do.
+    to_go = job.targets[job.missing or slice(None)]
+    return MotionPlan(to_go, limits, offset, identity.name, joints, pendant)
+
+
+def record_confirmed(job: Job, plan: MotionPlan, session: Session, recorder: Recorder) -> None:
+    """Keep with which robot and bench the images to come are taken.
+
+    Only once the plan is confirmed: what was refused must be told again when the run is resumed.
+    """
+    known = {"serial_number": plan.serial, "tcp_offset": list(plan.tcp_offset)}
+    bench = described(job.setup, job.targets)
+    settings = {"request": asdict(job.request), "robot": known, "bench": bench}
+    recorder.put("plan", "settings", np.frombuffer(json.dumps(settings).encode(), np.uint8), "1")
+    recorder.attributes("tracker", known)
+    recorder.attributes("ae", {"clock_hz": session.echo.clock_hz(), "trigger_delay_s": 0.0})
+    recorder.sync()
+
+
+def resume_command(path: str | os.PathLike[str], request: AcquisitionRequest) -> str:
+    """What to type to go on with a recording."""
+    where = "--bench" if request.bench is not None else "--setup TOML --move"
+    return f"jaxcal-hw acquire {shlex.quote(os.fspath(path))} --resume {where}"
