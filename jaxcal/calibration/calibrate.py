@@ -31,6 +31,7 @@ from jaxcal.calibration.options import (
     Request,
     SolvePlan,
     check_values,
+    options_of,
     prepare,
     with_bound,
 )
@@ -245,7 +246,7 @@ def calibrate_batch(
 
 
 def _in_asked_precision(problem: Problem, options: Options | None, name: str) -> Problem:
-    precision = Options.precision if options is None else options.precision
+    precision = options_of(options).precision
     if precision == "float64":
         require_float64(name)
     return with_dtype(problem, np.dtype(precision))

@@ -37,8 +37,8 @@ from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.compiler import ONE_PROBLEM, computed_once
 from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.study import draws
-from jaxcal.study.laws import OffsetLaw
-from jaxcal.study.offsets import check_law, standard_offsets
+from jaxcal.study.laws import OffsetLaw, check_law
+from jaxcal.study.offsets import standard_offsets
 
 Scalar = float | Float[Array, ""]
 """A number of a protocol: plain, or traced, so that one compiled program serves all its values."""
