@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args
 
@@ -21,7 +22,7 @@ from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.model.distributions import SHAPES, UNIFORM, Shape
 from jaxcal.model.unknowns import EXTRA, MEDIUM, RIGID, Blocks
 from jaxcal.runtime.array_types import AnyArray, Array, Float
-from jaxcal.runtime.arrays import array_module, is_traced
+from jaxcal.runtime.arrays import array_module, is_traced, real_array
 from jaxcal.runtime.trees import array_tree
 
 if TYPE_CHECKING:
@@ -390,12 +391,10 @@ def _uses_channels(problem: Problem, request: Request, kind: str) -> bool:
 
 def _check_size(name: str, value: object, least: float, *, one: bool = True) -> None:
     """Check one number, or several; of traced ones, that it is one."""
+    numbers = np.array(np.nan)
     if not is_traced(value):
-        try:
-            given = np.asarray(value)
-            numbers = given.astype(float) if given.dtype.kind in "iufO" else np.array(np.nan)
-        except (TypeError, ValueError, OverflowError):
-            numbers = np.array(np.nan)
+        with suppress(InputError):
+            numbers = real_array(value, name)
         if not (np.isfinite(numbers).all() and (numbers >= least).all()):
             unit = _UNITS.get(name, "mm")
             unit = f", in {unit}" if unit else ""

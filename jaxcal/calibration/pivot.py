@@ -152,7 +152,7 @@ def calibrate_pivot(
         raise InputError(f"mask must have shape {shape[:-2]}, not {np.shape(mask)}")
     if not is_traced(poses) and np.ndim(poses) == 3:
         used = np.ones(len(poses), bool) if mask is None else np.asarray(mask) > 0
-        poses = check_poses(np.asarray(poses, dtype=np.float64), used)
+        poses = check_poses(poses, used)
         if used.sum() < MINIMUM_IMAGES:
             raise InputError(
                 f"{int(used.sum())} used poses are too few: at least {MINIMUM_IMAGES} are needed"

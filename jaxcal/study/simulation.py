@@ -481,6 +481,8 @@ def simulate_recording(
     Raises:
         InputError: a seed that is no whole number from 0 to 2^63 - 1, or a clock without times.
     """
+    if not isinstance(protocol, Protocol):
+        raise InputError(f"a jaxcal.Protocol is needed, not {type(protocol).__name__}")
     seed = whole_number("seed", seed, 0, LARGEST_SEED)
     curved = isinstance(protocol.probe, CurvilinearProbe)
     if clock_hz is not None and not (protocol.raw or curved):
