@@ -204,7 +204,7 @@ for call, *given in (
     )),
     *((lambda text: parse_spec(START + text), text) for text in (
         "max_iterations = 1.5", 'max_elevation_mm = "1 mm"', "tolerance_mm = true",
-        "tolerance_rad = [1]", "prior = 3",
+        "tolerance_rad = [1]", "prior = 3", "max_elevation_mm = [1]",
     )),
 ):
     try:
@@ -217,7 +217,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 76
+    assert len(lines) == 77
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
