@@ -389,7 +389,7 @@ def _uses_channels(problem: Problem, request: Request, kind: str) -> bool:
     return wanted and request.tracker_sd is None and not three
 
 
-def _check_size(name: str, value: object, least: float, *, one: bool = True) -> None:
+def _check_size(name: str, value: Any, least: float, *, one: bool = True) -> None:
     """Check one number, or several; of traced ones, that it is one."""
     numbers = np.array(np.nan)
     if not is_traced(value):
@@ -400,7 +400,7 @@ def _check_size(name: str, value: object, least: float, *, one: bool = True) -> 
             unit = f", in {unit}" if unit else ""
             wanted = "positive" if least > 0 else "not negative"
             raise InputError(f"{name} must be finite and {wanted}{unit}, not {shown(value)}")
-    if one and np.shape(value) != ():  # pyright: ignore[reportArgumentType]
+    if one and np.shape(value) != ():
         raise InputError(f"{name} must be one number, not {shown(value)}")
 
 

@@ -509,7 +509,7 @@ def _method(table: dict[str, Any], place: str) -> MethodSpec:
     _required(table, "method", where)
     if not (isinstance(name, str) and 1 <= len(name) <= 100 and name.isprintable()):
         raise InputError(f"{where}name must be 1 to 100 printable characters")
-    values = {
+    values: dict[str, Any] = {
         key: _float(value) if key in _FLOATS and type(value) in (int, float) else value
         for key, value in table.items()
     }
