@@ -23,7 +23,7 @@ from auto_grid import COMPARED, SUBSET, Cell, run_cell, write
 from common import LAWS, arguments, machine, results_folder
 
 from jaxcal.cli.cache import enable_compilation_cache
-from jaxcal.study.offsets import OFFSET_LAWS
+from jaxcal.study.laws import OFFSET_LAWS
 
 TRIALS, AGAIN = 400, 4000
 FIRST = 1000

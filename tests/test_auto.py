@@ -327,6 +327,18 @@ def test_bounds_are_respected():
     assert float(cut.elevation_sd[largest]) < float(free.elevation_sd[largest])
 
 
+@pytest.mark.slow
+def test_a_bound_that_the_images_deny_is_named():
+    data = problem(3, images=20, elevation_mm=2.0)
+    denied = jaxcal.calibrate(data, max_elevation=1e-3)
+    assert not denied.offset_law.weighed
+    found = [warning for warning in denied.warnings if "the bound on the offsets" in warning]
+    assert len(found) == 1
+    assert "was not kept: 20 of 20 images" in found[0]
+    kept = jaxcal.calibrate(data, max_elevation=2.5)
+    assert not any("bound on the offsets" in warning for warning in kept.warnings)
+
+
 def test_what_does_not_go_together_is_refused():
     data = problem(3, images=20)
     for arguments, said in (

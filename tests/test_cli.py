@@ -386,8 +386,11 @@ def test_refused_without_a_recording(arguments, said, capfd, tmp_path, monkeypat
         (["--sigma", "1", "1", "1", "--prior", "bounded"], "sigma and tracker_sd belong"),
         (["--solver", "gauss-newton"], "belongs to the conventional method"),
         (["--solver", "magic", "--method", "conventional"], "'magic' is not one of"),
-        (["--tolerance-mm", "1"], "--tolerance-mm needs --method alternating"),
-        (["--max-rounds", "9", "--method", "joint"], "--max-rounds needs --method alternating"),
+        (["--tolerance-mm", "1"], "only the alternating method has --tolerance-mm"),
+        (
+            ["--max-rounds", "9", "--method", "joint"],
+            "only the alternating method has --max-rounds",
+        ),
         (["--max-rounds", "0", "--method", "alternating"], "0 is not in the range"),
         (["--tolerance-rad", "0", "--method", "alternating"], "'0' is not a positive number"),
         (["--estimate", "latency"], "cannot estimate 'latency'"),

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import json
+import subprocess
 import sys
+from subprocess import PIPE
 
 import numpy as np
 import pytest
 
 from jaxcal import FormatError, InputError
+from jaxcal.runtime.isolated import python_command
 from jaxcal.study import run_study
 from jaxcal.study.own import Study, study_from, where_defined
 from jaxcal.study.store import Store
@@ -108,3 +112,16 @@ def test_the_class_must_be_one_that_a_worker_can_import(squares):
         study_from({"module": "no_such_module", "name": "Squares"}, "{}")
     with pytest.raises(InputError, match="not of this study"):
         study_from(where, '{"colour": 1}')
+
+
+def test_a_worker_whose_parent_is_gone_ends_without_a_word(squares):
+    command = python_command("jaxcal.study.workers")
+    worker = subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True)
+    study = squares(trials=100_000)
+    given = {"spec": study.canonical(), "where": where_defined(study), "cores": []}
+    worker.stdout.close()
+    worker.stdin.write(f'{json.dumps(given)}\n{{"chunk": 0}}\n')
+    worker.stdin.close()
+    assert worker.wait(timeout=120) == 1
+    assert worker.stderr.read() == ""
+    worker.stderr.close()

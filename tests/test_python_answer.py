@@ -139,10 +139,12 @@ def test_lists_and_single_names(recording):
 
 def test_calls_as_users_make_them():
     """Without the type checks of these tests: an InputError, in a line, for whatever is given."""
-    code = """
+    code = r"""
 import warnings
 import numpy as np
 import jaxcal
+from jaxcal.study.spec import parse_spec
+START = 'name = "a"\nseed = 1\ntrials = 1\n[[methods]]\nname = "a"\nmethod = "alternating"\n'
 warnings.simplefilter("error")
 draws = np.random.default_rng(0)
 poses = np.tile(np.eye(4), (9, 1, 1))
@@ -172,6 +174,38 @@ for call, *given in (
     (lambda images: jaxcal.Protocol(images=images), 8.5),
     (jaxcal.Problem.from_arrays, poses + 0j, points),
     (jaxcal.Problem.from_arrays, poses, points.tolist()[:-1] + [[1.0]]),
+    (lambda kind: jaxcal.Problem.from_arrays(poses, points, kind=kind), "pixels"),
+    (jaxcal.Problem.from_arrays, poses, np.ma.array(points, mask=points > 40)),
+    (jaxcal.make_images, np.ma.array(poses, mask=poses > 40), points),
+    (jaxcal.make_images, poses, points + 0j), (jaxcal.make_images, poses, points.astype(str)),
+    (lambda value: jaxcal.make_images(poses, points, max_elevation=value), np.ones(5)),
+    (lambda value: jaxcal.make_images(poses, points, face_offset_mm=value), "a"),
+    (jaxcal.Recording, poses), (jaxcal.save, None, "x.h5"), (jaxcal.simulate_recording, 3),
+    (jaxcal.calibrate_pivot, np.ma.array(poses, mask=poses > 40)),
+    (jaxcal.reconstruction_precision, np.eye(4), poses, points[:3]),
+    (jaxcal.reconstruction_precision, np.eye(4), poses[:1], points),
+    (jaxcal.calibration_reproducibility, np.eye(4), [[0.0, 20.0]]),
+    (jaxcal.calibration_reproducibility, [np.eye(4)], [[0.0, 20.0]]),
+    (jaxcal.certify, problem, result.image_to_probe, [1.0]), (jaxcal.calibrate_closed_form, 3),
+    (jaxcal.LinearProbe, 2.5), (jaxcal.LinearProbe, "64"),
+    (jaxcal.CurvilinearProbe, 64, [1.0, 2.0]),
+    (lambda chunk: jaxcal.calibrate_batch([problem], chunk=chunk), 1.5),
+    *((lambda value, name=name: jaxcal.Options(**{name: value}), value) for name, value in (
+        ("tolerance_mm", "0.1"), ("tolerance_rad", None), ("gradient_tolerance", [1.0, 2.0]),
+        ("max_rounds", 2.5), ("max_rounds", 10**20), ("trace", True), ("inner_steps", 0),
+        ("solver", np.array(["lm", "gradient"])), ("differentiate", "no"),
+    )),
+    *((lambda value, name=name: jaxcal.calibrate(problem, "joint", **{name: value}), value)
+      for name, value in (
+        ("options", {"max_rounds": 3}), ("sigma", "abc"), ("sigma", ["1", "1", "1"]),
+        ("sigma", [1.0, np.nan, 1.0]), ("max_elevation", "1 mm"), ("max_elevation", np.ones(5)),
+        ("max_elevation", np.ones((9, 1, 1))), ("sound_speed_sd", [1.0, 2.0]), ("estimate", 5),
+        ("prior", np.array(["auto", "uniform"])), ("robust", "no"), ("data", None),
+    )),
+    *((lambda text: parse_spec(START + text), text) for text in (
+        "max_iterations = 1.5", 'max_elevation_mm = "1 mm"', "tolerance_mm = true",
+        "tolerance_rad = [1]", "prior = 3", "max_elevation_mm = [1]",
+    )),
 ):
     try:
         call(*given)
@@ -183,13 +217,30 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 29
+    assert len(lines) == 77
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
     assert lines[16] == "folds must be a whole number, not '4'"
     assert lines[22] == "depth_mm must be nearest, then farthest, not (90, 10)"
     assert lines[27] == "poses must be an array of real numbers"
+    assert lines[29] == "kind must be one of point, pixel, time_of_flight, not 'pixels'"
+    assert lines[30] == "measurements must not hold masked entries: leave those rows out (mask=)"
+    assert lines[50] == "tolerance_mm must be finite and positive, in mm, not '0.1'"
+    assert lines[53] == "max_rounds must be a whole number, not 2.5"
+    assert lines[59] == (
+        "options must be made by jaxcal.Options, e.g. jaxcal.Options(max_rounds=100), not "
+        "{'max_rounds': 3}"
+    )
+    assert (
+        lines[64]
+        == "max_elevation must be one number, or one for each of 9 images, mm; its shape is (5,)"
+    )
+    assert lines[71] == "methods[0]: max_iterations must be a whole number, not 1.5"
+    assert lines[72] == (
+        "methods[0]: max_elevation must be finite and not negative, in mm, not '1 mm'"
+    )
+    assert lines[69] == "robust must be True or False, not 'no'"
 
 
 def test_drawing_is_not_imported_before_it_is_asked_for():

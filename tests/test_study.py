@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal import FormatError, InputError
+from jaxcal import FormatError, InputError, Options
+from jaxcal.calibration.options import Request, check_request
 from jaxcal.cli.main import main
 from jaxcal.data.poses import rotation_angle
 from jaxcal.diagnostics.metrics import reconstruction_precision
@@ -25,7 +26,6 @@ from jaxcal.study.laws import OFFSET_LAWS
 from jaxcal.study.offsets import nominal_bound, standard_deviation, standard_offsets
 from jaxcal.study.pipeline import (
     Block,
-    _options,
     bound_mm,
     compute_chunk,
     numbers_of,
@@ -90,9 +90,6 @@ def files(folder: Path) -> dict[str, bytes]:
 def test_every_field_of_the_documentation_is_known():
     text = jaxcal.study.spec.__doc__
     example = "\n".join(line[4:] for line in text.splitlines() if line.startswith("    "))
-    with pytest.raises(InputError, match="prior belongs to the joint"):
-        parse_spec(example)
-    example = re.sub(r"^prior.*$", "", example, flags=re.M)
     with pytest.raises(InputError, match=r"max_elevation_mm and .* contradict"):
         parse_spec(example)
     example = re.sub(r"^max_elevation_factor.*$", "", example, flags=re.M)
@@ -132,8 +129,8 @@ def test_every_field_of_the_documentation_is_known():
         ('name = "a"\nseed = 1\ntrials = 4294967297\n' + METHOD, "trials must be between"),
         (MINIMAL, "methods is missing"),
         (MINIMAL + METHOD + METHOD, "same name"),
-        (MINIMAL + METHOD + "tolerance_mm = 1", "belongs to the alternating"),
-        (MINIMAL + METHOD + "max_elevation_mm = 1", "belongs to alternating and to joint"),
+        (MINIMAL + METHOD + "tolerance_mm = 1", "only the alternating method has tolerance_mm"),
+        (MINIMAL + METHOD + "max_elevation_mm = 1", "max_elevation belongs to the alternating"),
         (MINIMAL + METHOD + "max_elevation = 1", "unit is missing, write max_elevation_mm"),
         (MINIMAL + "[probe]\npitch = 1" + METHOD, "unit is missing, write pitch_mm"),
         (MINIMAL + "conditions = 3" + METHOD, "must be a table"),
@@ -145,6 +142,35 @@ def test_bad_specs_are_refused_with_the_field_named(text, message):
     with pytest.raises(InputError, match=message) as caught:
         parse_spec(text)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("written", "asked"),
+    [
+        (
+            'method = "conventional"\nprior = "uniform"',
+            {"method": "conventional", "prior": "uniform"},
+        ),
+        (
+            'method = "joint"\nprior = "bounded"\nmax_elevation_mm = -1',
+            {"prior": "bounded", "max_elevation": -1.0},
+        ),
+        (
+            'method = "joint"\nprior = "gaussian"\nmax_elevation_factor = 1',
+            {"prior": "gaussian", "max_elevation": 1.0},
+        ),
+        ('method = "alternating"\ntolerance_mm = 0', {"tolerance_mm": 0.0}),
+        ('method = "joint"\nmax_iterations = 0', {"max_iterations": 0}),
+    ],
+)
+def test_a_study_is_told_what_calibrate_tells(written, asked):
+    given = {key: value for key, value in asked.items() if key in vars(Options())}
+    rest = {key: value for key, value in asked.items() if key not in given}
+    with pytest.raises(InputError) as told:
+        check_request(Request(**rest, options=Options(**given)))
+    with pytest.raises(InputError) as caught:
+        parse_spec(f'{MINIMAL}[[methods]]\nname = "a"\n{written}\n')
+    assert str(caught.value) == f"methods[0]: {told.value}"
 
 
 def test_what_says_the_same_has_the_same_hash():
@@ -564,6 +590,11 @@ LEAN = """
 name = "self-tuned"
 method = "joint"
 prior = "gaussian"
+[[methods]]
+name = "cut off"
+method = "joint"
+prior = "uniform"
+max_elevation_factor = 1
 """
 
 
@@ -586,10 +617,10 @@ def blocks(text, trials):
         block = Block(spec, condition, indices, devices)
 
         def whole(method, condition=condition, indices=indices):
-            bound = bound_mm(method, condition) if method.bounded else None
+            bound = None if method.bound_given is None else bound_mm(method, condition)
             drawn, problems = draw(jnp.asarray(indices.ravel()), numbers_of(condition))
             found = jaxcal.calibrate_batch(
-                problems, method.method, method.prior, max_elevation=bound, options=_options(method)
+                problems, method.method, method.prior, max_elevation=bound, options=method.options
             )
             x = np.asarray(found.image_to_probe)
             away = x[:, :3, 3] - np.asarray(drawn.image_to_probe)[:, :3, 3]
@@ -614,7 +645,7 @@ def test_what_a_study_computes_is_what_calibrations_say():
     text = small().replace("images = 6", "images = 20\nrotation_deg = [0, 30]") + LEAN
     for k, (spec, block, whole) in enumerate(blocks(text, 8)):
         parallel = spec.condition(k).rotation_deg == 0
-        for method in (spec.methods[0], spec.methods[-1]):
+        for method in (spec.methods[0], *spec.methods[-2:]):
             found, expected = block.measured(method), whole(method)
             assert (found["status"] == expected["status"]).all()
             assert (found["status"] == jaxcal.Status.UNOBSERVABLE).all() == parallel

@@ -135,7 +135,7 @@ def test_wrong_frames_are_not_handed_on(saved, tmp_path, capsys):
     [
         ({"scale_mm_per_px": (0.1, -0.1)}, "scale_mm_per_px must be positive"),
         ({"scale_mm_per_px": 0.1}, r"must have shape \(2,\), it has \(\)"),
-        ({"scale_mm_per_px": ("a", 1)}, "scale_mm_per_px must be numbers"),
+        ({"scale_mm_per_px": ("a", 1)}, "scale_mm_per_px must be an array of real numbers"),
         ({"image_plane_to_probe": np.diag([1.0, 1, -1, 1])}, "is a reflection"),
         ({"image_plane_to_probe": np.diag([2.0, 1, 1, 1])}, "not a rotation"),
         ({"image_plane_to_probe": np.full((4, 4), np.nan)}, "holds NaN"),

@@ -19,7 +19,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.calibration.conventional import closed_form_answer
 from jaxcal.calibration.dependence import independent
-from jaxcal.calibration.inputs import as_batch, converting, unknown_names
+from jaxcal.calibration.inputs import as_batch, converting, unknown_names, whole_number
 from jaxcal.calibration.options import (
     DELAY_SD_S,
     SOUND_SPEED_SD_M_S,
@@ -31,6 +31,7 @@ from jaxcal.calibration.options import (
     Request,
     SolvePlan,
     check_values,
+    options_of,
     prepare,
     with_bound,
 )
@@ -49,6 +50,9 @@ from jaxcal.runtime.precision import (
 
 if TYPE_CHECKING:
     from jax import Array
+
+LARGEST_CHUNK = 2**31 - 1
+"""Most lanes that can be asked for side by side."""
 
 
 @converting
@@ -222,8 +226,8 @@ def calibrate_batch(
     estimate = unknown_names(estimate)
     if not problems.batch_shape:
         raise InputError("calibrate_batch needs problems with a leading axis; use calibrate")
-    if chunk is not None and chunk < 1:
-        raise InputError(f"chunk must be at least 1, not {chunk}")
+    if chunk is not None:
+        chunk = whole_number("chunk", chunk, 1, LARGEST_CHUNK)
     problems = _in_asked_precision(problems, options, "jaxcal.calibrate_batch")
     request = Request(
         method,
@@ -245,7 +249,7 @@ def calibrate_batch(
 
 
 def _in_asked_precision(problem: Problem, options: Options | None, name: str) -> Problem:
-    precision = Options.precision if options is None else options.precision
+    precision = options_of(options).precision
     if precision == "float64":
         require_float64(name)
     return with_dtype(problem, np.dtype(precision))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -27,7 +27,7 @@ LARGEST_SEED = 2**63 - 1
 
 def shown(value: object) -> str:
     """What a caller gave, short, for a message."""
-    return quoted(value) if isinstance(value, str) else quoted(repr(value)).strip("'")
+    return quoted(value) if isinstance(value, str) else quoted(repr(value))[1:-1]
 
 
 def whole_number(name: str, value: object, least: int, most: int) -> int:
@@ -108,6 +108,8 @@ def unknown_names(estimate: Any) -> tuple[str, ...]:
         return tuple(name.strip() for name in estimate.split(","))
     if estimate is None:
         return ()
+    if not isinstance(estimate, Iterable):
+        raise InputError(f"estimate must be names of unknowns, not {shown(estimate)}")
     return tuple(estimate)
 
 

@@ -7,23 +7,28 @@ The numbers in the request are a :class:`Given`, which is traced.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args
 
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.inputs import shown, whole_number
 from jaxcal.calibration.names import Data, Method, PriorName, SolverName
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.model.distributions import SHAPES, UNIFORM, Shape
 from jaxcal.model.unknowns import EXTRA, MEDIUM, RIGID, Blocks
 from jaxcal.runtime.array_types import AnyArray, Array, Float
-from jaxcal.runtime.arrays import array_module, is_traced
+from jaxcal.runtime.arrays import array_module, is_traced, real_array
 from jaxcal.runtime.trees import array_tree
 
 if TYPE_CHECKING:
     import optimistix as optx
+
+Precision = Literal["float64", "float32"]
 
 Prior = Literal["none", "gaussian", "bounded"]
 """What is assumed about the offsets: in the image plane, Gaussian (or weighed laws), bounded."""
@@ -46,6 +51,20 @@ SOUND_SPEED_SD_M_S = 20.0
 
 DELAY_SD_S = 1e-6
 """Prior SD of the electronic delay about its nominal value, s."""
+
+ALTERNATION = ("tolerance_rad", "tolerance_mm", "max_rounds", "inner_steps")
+"""The options that the alternation alone has."""
+
+MOST_STEPS = 10**7
+"""Most rounds, steps and kept values that can be asked for."""
+
+_UNITS = {
+    "sound_speed_sd": "m/s",
+    "delay_sd": "s",
+    "tolerance_rad": "rad",
+    "gradient_tolerance": "",
+}
+"""Units of numbers of a request that are not in mm."""
 
 
 @dataclass(frozen=True)
@@ -81,30 +100,60 @@ class Options:
     max_iterations: int = 100
     trace: int = 0
     differentiate: bool = True
-    precision: Literal["float64", "float32"] = "float64"
+    precision: Precision = "float64"
 
     def __post_init__(self) -> None:
         if _is_optimistix(self.solver):
             _check_static(self.solver)
-        elif self.solver not in get_args(SolverName):
+        elif not _is_one_of(self.solver, SolverName):
             raise InputError(
                 "solver must be lm, gauss-newton, gradient or an optimistix least-squares solver, "
-                f"not {self.solver!r}"
+                f"not {shown(self.solver)}"
             )
-        if self.precision not in ("float64", "float32"):
-            raise InputError(f"precision must be float64 or float32, not {self.precision!r}")
+        if not _is_one_of(self.precision, Precision):
+            raise InputError(f"precision must be float64 or float32, not {shown(self.precision)}")
+        _check_flag("differentiate", self.differentiate)
         for name in ("gradient_tolerance", "tolerance_rad", "tolerance_mm"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name} must be a positive number, not {value!r}")
-        for name, least in (
-            ("max_rounds", 1),
-            ("inner_steps", 1),
-            ("max_iterations", 1),
-            ("trace", 0),
-        ):
-            if getattr(self, name) < least:
-                raise InputError(f"{name} must be at least {least}, not {getattr(self, name)}")
+            _check_size(name, getattr(self, name), np.finfo(float).tiny)
+        for name in ("max_rounds", "inner_steps", "max_iterations", "trace"):
+            whole_number(name, getattr(self, name), int(name != "trace"), MOST_STEPS)
+
+
+def options_of(options: Options | None) -> Options:
+    """The options that a caller gave, or the default ones.
+
+    Raises:
+        InputError: something else, a dictionary for example.
+    """
+    if options is None:
+        return Options()
+    if not isinstance(options, Options):
+        raise InputError(
+            "options must be made by jaxcal.Options, e.g. jaxcal.Options(max_rounds=100), not "
+            f"{shown(options)}"
+        )
+    return options
+
+
+def check_alternation(names: Iterable[str], method: str) -> None:
+    """Refuse options of the alternation (:data:`ALTERNATION`) that another method was given.
+
+    Args:
+        names: of the given ones, as the caller wrote them.
+        method: the method's name.
+    """
+    if (given := " and ".join(names)) and method != "alternating":
+        raise InputError(f"only the alternating method has {given}")
+
+
+def _is_one_of(value: object, names: Any) -> bool:
+    """Whether a value is one of a Literal's names; comparing an array would give an array."""
+    return isinstance(value, str) and value in get_args(names)
+
+
+def _check_flag(name: str, value: object) -> None:
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} must be True or False, not {shown(value)}")
 
 
 def _is_optimistix(solver: Any) -> TypeGuard[optx.AbstractLeastSquaresSolver]:
@@ -220,12 +269,18 @@ def prepare(problem: Problem, request: Request) -> tuple[SolvePlan, Given]:
         names = "element distance, offset" if channels else "lateral, range, elevational"
         raise InputError(f"sigma must be {components} numbers: {names}, mm")
     tuning = kind == "gaussian" and request.sigma is None
-    options = Options() if request.options is None else request.options
     laws: tuple[Shape, ...] = ()
     if tuning and request.prior in LAWS:
         laws = LAWS[request.prior]
     plan = SolvePlan(
-        request.method, kind, tuning, laws, channels, blocks, options, bool(request.robust)
+        request.method,
+        kind,
+        tuning,
+        laws,
+        channels,
+        blocks,
+        options_of(request.options),
+        bool(request.robust),
     )
     return plan, given
 
@@ -246,21 +301,30 @@ def check_request(request: Request) -> Prior:
     elif request.method == "alternating" or request.prior == "bounded":
         prior = "bounded"
     _check_combination(request, prior)
-    for name in ("sigma", "sound_speed_sd", "delay_sd"):
-        _check_size(name, getattr(request, name), np.finfo(float).tiny)
-    for name in ("tracker_sd", "max_elevation"):
-        _check_size(name, getattr(request, name), 0.0)
+    tiny = np.finfo(float).tiny
+    for name, least, one in (
+        ("sound_speed_sd", tiny, True),
+        ("delay_sd", tiny, True),
+        ("tracker_sd", 0.0, True),
+        ("sigma", tiny, False),
+        ("max_elevation", 0.0, False),
+    ):
+        value = getattr(request, name)
+        if value is not getattr(Request, name):  # the default
+            _check_size(name, value, least, one=one)
     return prior
 
 
 def _check_names(request: Request) -> None:
     for name, names in (("method", Method), ("prior", PriorName), ("data", Data)):
         value = getattr(request, name)
-        if value not in get_args(names):
-            raise InputError(f"{name} must be one of {', '.join(get_args(names))}, not {value!r}")
+        if not _is_one_of(value, names):
+            listed = ", ".join(get_args(names))
+            raise InputError(f"{name} must be one of {listed}, not {shown(value)}")
+    _check_flag("robust", request.robust)
     for name in request.estimate:
         if name not in EXTRA:
-            raise InputError(f"cannot estimate {name!r}; there are: {', '.join(EXTRA)}")
+            raise InputError(f"cannot estimate {shown(name)}; there are: {', '.join(EXTRA)}")
 
 
 def _check_combination(request: Request, kind: Prior) -> None:
@@ -282,8 +346,7 @@ def _check_combination(request: Request, kind: Prior) -> None:
             "max_elevation belongs to the alternating method and to the joint one's priors auto, "
             "uniform (without given sigma) and bounded"
         )
-    options = request.options
-    solver = "lm" if options is None else options.solver
+    solver = options_of(request.options).solver
     if _is_optimistix(solver) and kind == "bounded":
         raise InputError(
             "another solver would not keep the offsets within their bounds: it goes with the "
@@ -326,14 +389,19 @@ def _uses_channels(problem: Problem, request: Request, kind: str) -> bool:
     return wanted and request.tracker_sd is None and not three
 
 
-def _check_size(name: str, value: object, least: float) -> None:
-    if value is None or is_traced(value):
-        return
-    numbers = np.asarray(value, dtype=float)
-    if not (np.isfinite(numbers).all() and (numbers >= least).all()):
-        unit = {"sound_speed_sd": "m/s", "delay_sd": "s"}.get(name, "mm")
-        wanted = "positive" if least > 0 else "not negative"
-        raise InputError(f"{name} must be finite and {wanted}, in {unit}, not {value!r}")
+def _check_size(name: str, value: Any, least: float, *, one: bool = True) -> None:
+    """Check one number, or several; of traced ones, that it is one."""
+    numbers = np.array(np.nan)
+    if not is_traced(value):
+        with suppress(InputError):
+            numbers = real_array(value, name)
+        if not (np.isfinite(numbers).all() and (numbers >= least).all()):
+            unit = _UNITS.get(name, "mm")
+            unit = f", in {unit}" if unit else ""
+            wanted = "positive" if least > 0 else "not negative"
+            raise InputError(f"{name} must be finite and {wanted}{unit}, not {shown(value)}")
+    if one and np.shape(value) != ():
+        raise InputError(f"{name} must be one number, not {shown(value)}")
 
 
 def check_values(problem: Problem) -> None:
@@ -360,5 +428,12 @@ def with_bound(problem: Problem, given: Given) -> Problem:
     """The problem with the caller's bound on the offsets, where there is one."""
     if given.max_elevation is None:
         return problem
-    bound = array_module(given.max_elevation).broadcast_to(given.max_elevation, problem.mask.shape)
+    bound, wanted = given.max_elevation, problem.mask.shape
+    try:
+        bound = array_module(bound).broadcast_to(bound, wanted)
+    except ValueError:
+        raise InputError(
+            f"max_elevation must be one number, or one for each of {wanted[-1]} images, mm; its "
+            f"shape is {bound.shape}"
+        ) from None
     return replace(problem, max_elevation=bound)

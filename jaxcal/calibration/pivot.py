@@ -29,7 +29,7 @@ from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
 from jaxcal.runtime import buckets, compiler, executables
-from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.arrays import is_traced, real_array
 from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import (
@@ -152,7 +152,7 @@ def calibrate_pivot(
         raise InputError(f"mask must have shape {shape[:-2]}, not {np.shape(mask)}")
     if not is_traced(poses) and np.ndim(poses) == 3:
         used = np.ones(len(poses), bool) if mask is None else np.asarray(mask) > 0
-        poses = check_poses(np.asarray(poses, dtype=np.float64), used)
+        poses = check_poses(real_array(poses, "poses"), used)
         if used.sum() < MINIMUM_IMAGES:
             raise InputError(
                 f"{int(used.sum())} used poses are too few: at least {MINIMUM_IMAGES} are needed"

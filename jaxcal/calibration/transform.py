@@ -35,6 +35,7 @@ from jaxcal.io.outputs import check_output
 from jaxcal.io.readable import check_readable, naming, one_line, quoted
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import real_array
 
 FORMAT = "jaxcal-calibration"
 VERSION = 1
@@ -221,11 +222,11 @@ class ImageTransform:
             InputError: shapes that do not agree, NaN or numbers over 1e9, a negative SD, or a pose
                 that is not rigid.
         """
-        measured = np.asarray(pixels, dtype=np.float64)
+        measured = real_array(pixels, "pixels")
         measured = measured[None] if measured.ndim == 1 else measured
         if measured.ndim != 2 or measured.shape[1] != 2:
             raise InputError(f"pixels must have shape (n, 2), not {measured.shape}")
-        own = np.asarray(pixel_sd_px, dtype=np.float64)
+        own = real_array(pixel_sd_px, "pixel_sd_px")
         if own.shape not in ((), (2,)):
             raise InputError(f"pixel_sd_px must be one number or two, not of shape {own.shape}")
         # Written so that NaN is refused, too.
@@ -388,10 +389,7 @@ class ImageTransform:
 
 
 def _numbers(value: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be numbers of shape {shape}") from None
+    array = real_array(value, name)
     if array.shape != shape:
         raise InputError(f"{name} must have shape {shape}, it has {array.shape}")
     return array

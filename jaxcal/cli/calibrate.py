@@ -186,7 +186,7 @@ def calibrate(
     targets = [_export_target(export, inputs) for export in exports]
     import_engine()
     from jaxcal.calibration.inputs import unknown_names
-    from jaxcal.calibration.options import Options, Request, check_request
+    from jaxcal.calibration.options import Options, Request, check_alternation, check_request
 
     alternation = {
         "tolerance_mm": tolerance_mm,
@@ -194,9 +194,7 @@ def calibrate(
         "max_rounds": max_rounds,
     }
     chosen = {name: value for name, value in alternation.items() if value is not None}
-    if chosen and method != "alternating":
-        given = " and ".join("--" + name.replace("_", "-") for name in chosen)
-        raise InputError(f"{given} need{'s' * (len(chosen) == 1)} --method alternating")
+    check_alternation(["--" + name.replace("_", "-") for name in chosen], method)
     request = Request(
         method,
         prior,

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import real_array
 
 ROTATION_TOLERANCE = 1e-2
 """Largest Frobenius distance from SO(3) that counts as rounding."""
@@ -91,7 +92,7 @@ def check_poses(
         InputError: wrong shape, NaN or Inf, last row not 0 0 0 1, a reflection, or a block farther
             than 1e-2 from a rotation; the row (image) is named.
     """
-    poses = np.array(poses, dtype=np.float64)
+    poses = real_array(poses, f"{what}s")
     if poses.ndim != 3 or poses.shape[1:] not in ((4, 4), (3, 4)):
         raise InputError(f"{what} must have shape (n, 4, 4), it has {poses.shape}")
     count = len(poses)

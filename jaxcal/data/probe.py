@@ -17,6 +17,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.sound import check_sound_speed
 from jaxcal.runtime.array_types import Bool, Float, Num
+from jaxcal.runtime.arrays import real_array
 
 _LONGEST_DELAY_S = 1e-3
 
@@ -30,7 +31,10 @@ class _Array:
     delay_s: float
 
     def __post_init__(self) -> None:
-        if not 2 <= self.elements <= 65536:
+        for name, value in vars(self).items():
+            if real_array(value, name).ndim:
+                raise InputError(f"{name} must be one number, not {value}")
+        if not 2 <= self.elements <= 65536 or self.elements != int(self.elements):
             raise InputError(f"a probe needs 2 to 65536 elements, not {self.elements}")
         if not (np.isfinite(self.pitch_mm) and 0 < self.pitch_mm < 100):
             raise InputError(f"probe pitch must be in mm between 0 and 100, not {self.pitch_mm}")

@@ -17,7 +17,7 @@ from jaxcal import InputError
 from jaxcal.data.probe import CurvilinearProbe
 from jaxcal.data.recording import Images, Kind, Recording, make_images
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
-from jaxcal.runtime.arrays import array_module, is_traced
+from jaxcal.runtime.arrays import array_module
 from jaxcal.runtime.precision import importing_jax, in_own_modes
 from jaxcal.runtime.trees import array_tree, static
 
@@ -213,14 +213,6 @@ class Problem:
         Raises:
             InputError: arrays that cannot be a calibration problem; the row is named.
         """
-        for name, given in (
-            ("poses", poses),
-            ("measurements", measurements),
-            ("covariance", covariance),
-            ("max_elevation", max_elevation),
-            ("spacing_mm", spacing_mm),
-        ):
-            _check_real(given, name)
         images = make_images(
             poses,
             measurements,
@@ -231,18 +223,6 @@ class Problem:
             spacing_mm=spacing_mm,
         )
         return cls.from_recording(images, dtype=dtype)
-
-
-def _check_real(value: Any, name: str) -> None:
-    """Refuse what numpy would convert with a warning, or not at all."""
-    if value is None or is_traced(value):
-        return
-    try:
-        if np.iscomplexobj(value):
-            raise TypeError
-        np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be an array of real numbers") from None
 
 
 @importing_jax

@@ -8,7 +8,7 @@ rely on shapes, units and finite values.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import Probe
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.arrays import is_traced, real_array
 
 MINIMUM_IMAGES = 4
 """With fewer used images nothing can be solved: 3 residuals an image against 9 unknowns."""
@@ -103,6 +103,14 @@ class Recording:
     probe: Probe | None = None
     source: str = field(default="memory", compare=False)
 
+    def __post_init__(self) -> None:
+        for name, images in (("calibration", self.calibration), ("test", self.test)):
+            if not isinstance(images, Images) and (name == "calibration" or images is not None):
+                raise InputError(
+                    f"{name} takes images (jaxcal.make_images makes them), not "
+                    f"{type(images).__name__}"
+                )
+
     def __len__(self) -> int:
         return len(self.calibration)
 
@@ -186,8 +194,9 @@ def _make_images(
     time_of_flight,
     minimum,
 ) -> Images:
-    poses = np.asarray(poses, dtype=np.float64)
-    values = np.array(measurements, dtype=np.float64)
+    if kind not in get_args(Kind):
+        raise InputError(f"kind must be one of {', '.join(get_args(Kind))}, not {kind!r}")
+    poses, values = real_array(poses, "poses"), real_array(measurements, "measurements")
     count = len(poses) if poses.ndim else 0
     if values.ndim != 2:
         raise InputError(f"{kind} must have two axes, it has shape {values.shape}")
@@ -228,13 +237,14 @@ def _make_images(
 
     spacing = None
     if spacing_mm is not None:
-        spacing = np.asarray(spacing_mm, dtype=np.float64)
+        spacing = real_array(spacing_mm, "spacing_mm")
         if spacing.shape != (2,) or not (np.isfinite(spacing).all() and (spacing > 0).all()):
             raise InputError("spacing_mm must be two positive numbers [lateral, axial] in mm/px")
         if kind != "pixel":
             raise InputError(f"spacing_mm belongs to pixels, not to {kind} data")
-    if not np.isfinite(face_offset_mm):
-        raise InputError("face_offset_mm must be finite")
+    face = real_array(face_offset_mm, "face_offset_mm")
+    if face.ndim or not np.isfinite(face):
+        raise InputError("face_offset_mm must be finite, and one number")
     if kind == "pixel":
         # Without a spacing, any positive one will do: rows are not negative.
         along = 1.0 if spacing is None else spacing[1]
@@ -245,8 +255,8 @@ def _make_images(
                 "or above the transducer's face (face_offset_mm is the range of row 0)"
             )
     bound = max_elevation
-    if bound is not None:
-        bound = np.broadcast_to(np.asarray(bound, dtype=np.float64), (count,)).copy()
+    if bound is not None and np.ndim(bound) == 0:
+        bound = np.full(count, real_array(bound, "max_elevation"))
     bound = _per_image("max_elevation", bound, count, used, fill=1.0)
     if bound is not None and (bound < 0).any():
         raise InputError(f"max_elevation {np.flatnonzero(bound < 0)[0]} is negative")
@@ -276,7 +286,7 @@ def _raw_times(
         return None
     if kind != "point":
         raise InputError(f"time_of_flight beside the measurements belongs to points, not to {kind}")
-    times = np.array(times, dtype=np.float64)
+    times = real_array(times, "time_of_flight")
     if times.ndim != 2 or len(times) != count:
         raise InputError(
             f"time_of_flight must have shape ({count}, elements), it has {times.shape}"
@@ -316,7 +326,7 @@ def _per_image(
 ) -> Float[np.ndarray, " n"] | None:
     if values is None:
         return None
-    values = np.array(values, dtype=np.float64)
+    values = real_array(values, name)
     if values.shape != (count,):
         raise InputError(f"{name} must have shape ({count},), it has {values.shape}")
     values[~used] = fill
@@ -330,7 +340,7 @@ def _covariance(
 ) -> Float[np.ndarray, "n 2 2"] | None:
     if covariance is None:
         return None
-    values = np.array(covariance, dtype=np.float64)
+    values = real_array(covariance, "covariance")
     if values.shape != (count, 2, 2):
         raise InputError(f"covariance must have shape ({count}, 2, 2), it has {values.shape}")
     values[~used] = np.eye(2)

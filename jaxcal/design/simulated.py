@@ -91,7 +91,7 @@ def simulate_errors(
         InputError: no candidates, an unknown law, or a wrong number of trials.
     """
     from jaxcal.calibration.calibrate import calibrate_batch
-    from jaxcal.study.offsets import check_law
+    from jaxcal.study.laws import check_law
 
     check_law(law)
     if isinstance(poses, Plan):

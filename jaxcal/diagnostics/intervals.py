@@ -37,7 +37,7 @@ from jaxcal.diagnostics.image_points import mean_of_squares, point_jacobian
 from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.model.unknowns import in_image, size
 from jaxcal.runtime.array_types import AnyArray, Float
-from jaxcal.runtime.arrays import array_module, is_traced, traceable
+from jaxcal.runtime.arrays import array_module, is_traced, real_array, traceable
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
@@ -200,10 +200,7 @@ def _image_points(points: Any) -> Any:
     if is_traced(points):
         points = array_module(points).asarray(points)
     else:
-        try:
-            points = np.asarray(points).astype(float, casting="same_kind")
-        except (TypeError, ValueError):
-            raise InputError("points must be numbers [lateral, axial], mm") from None
+        points = real_array(points, "points")
         if not np.isfinite(points).all():
             raise InputError("points must be finite")
     if points.ndim == 0 or points.shape[-1] != 2:

@@ -381,6 +381,22 @@ def listed_departures(result: HasOutliers, components: tuple[str, ...] = COMPONE
     return ", ".join(told) + (", ..." if len(reasons) > 10 else "")
 
 
+def _bound_not_kept(result: Calibration) -> list[str]:
+    """Whether the offsets exceed the bound that should have cut off their laws."""
+    law, problem = result.offset_law, result.problem
+    if law is None or bool(law.weighed) or problem is None or problem.max_elevation is None:
+        return []
+    used = np.asarray(problem.mask) > 0
+    size = np.abs(np.asarray(result.elevation))
+    beyond = used & (size > np.asarray(problem.max_elevation))
+    if not beyond.any():
+        return []
+    return [
+        f"the bound on the offsets was not kept: {beyond.sum()} of {used.sum()} images are farther "
+        f"from the plane, up to {size[used].max():.2g} mm; is the bound too small, or not in mm?"
+    ]
+
+
 def warnings(result: Calibration) -> list[str]:
     """Everything that a person should know before using the answer, most important first."""
     found: list[str] = []
@@ -426,6 +442,7 @@ def warnings(result: Calibration) -> list[str]:
             "the alternation stopped on its tolerance while its objective was still falling "
             f"(scaled KKT residual {float(result.stationarity):.1e})"
         )
+    found += _bound_not_kept(result)
     if result.prior in TUNED and not result.sigma_tuned:
         found.append(
             "noise SDs were held fixed, not estimated"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from jaxcal import InputError
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, traceable
 
@@ -23,9 +26,22 @@ def reconstruction_precision(
 
     Returns:
         sqrt(sum over x, y, z of the unbiased variance (n - 1)), mm.
+
+    Raises:
+        InputError: shapes that do not agree.
     """
     xp = array_module(image_to_probe, poses, points, mask)
     poses, points = xp.asarray(poses), xp.asarray(points)
+    count = len(poses) if poses.ndim else 0
+    for name, values, shapes in (
+        ("image_to_probe", image_to_probe, [(4, 4)]),
+        ("poses", poses, [(count, 4, 4)]),
+        ("points", points, [(count, 2), (count, 3)]),
+        ("mask", mask, [(count,)]),
+    ):
+        if values is not None and np.shape(values) not in shapes:
+            wanted = " or ".join(map(str, shapes))
+            raise InputError(f"{name} must have shape {wanted}, not {np.shape(values)}")
     cloud = reconstruct(image_to_probe, poses, points)
     weight = xp.ones(poses.shape[0], cloud.dtype) if mask is None else xp.asarray(mask)
     weight = weight.astype(cloud.dtype)[:, None]
@@ -68,10 +84,19 @@ def calibration_reproducibility(
     Returns:
         For each point, mean over the calibrations of |X_k p - mean_k X_k p|, mm.
 
+    Raises:
+        InputError: fewer than two calibrations, or other shapes.
+
     Source: calibration reproducibility, e.g. Hsu et al. 2009, section 6.2.
     """
     xp = array_module(transforms, image_points)
     transforms, image_points = xp.asarray(transforms), xp.asarray(image_points)
+    if transforms.ndim != 3 or transforms.shape[1:] != (4, 4) or len(transforms) < 2:
+        raise InputError(
+            f"transforms must have shape (k, 4, 4), at least two, not {transforms.shape}"
+        )
+    if image_points.ndim != 2 or image_points.shape[1] != 2:
+        raise InputError(f"image_points must have shape (m, 2), not {image_points.shape}")
     zero = xp.zeros_like(image_points[:, 0])
     points = xp.stack([image_points[:, 0], zero, image_points[:, 1]], axis=1)
     images = _transformed(transforms[:, None], points[None])

@@ -9,6 +9,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
+from jaxcal import InputError
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -20,6 +22,24 @@ def is_traced(*values: object) -> bool:
     if jax is None:
         return False
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def real_array(value: Any, name: str) -> np.ndarray:
+    """A caller's numbers as a float64 array of their own.
+
+    Raises:
+        InputError: what numpy would convert with a loss (complex numbers, masked entries), with a
+            guess (texts, truth values) or not at all.
+    """
+    if np.ma.is_masked(value):
+        raise InputError(f"{name} must not hold masked entries: leave those rows out (mask=)")
+    try:
+        given = np.asarray(value)
+        if given.dtype.kind in "iufO":
+            return np.array(given, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise InputError(f"{name} must be an array of real numbers")
 
 
 def array_module(*values: object) -> Any:

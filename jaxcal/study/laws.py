@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
+from jaxcal import InputError
+from jaxcal.calibration.inputs import shown
+
 OffsetLaw = Literal[
     "uniform",
     "normal",
@@ -22,3 +25,11 @@ OffsetLaw = Literal[
 ]
 
 OFFSET_LAWS: tuple[OffsetLaw, ...] = get_args(OffsetLaw)
+
+
+def check_law(law: object) -> None:
+    """Raise InputError for something that is no law's name."""
+    if law not in OFFSET_LAWS:
+        raise InputError(
+            f"elevation_distribution must be one of {', '.join(OFFSET_LAWS)}, not {shown(law)}"
+        )

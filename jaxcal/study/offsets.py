@@ -28,9 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from jaxcal import InputError
 from jaxcal.study import draws
-from jaxcal.study.laws import OFFSET_LAWS, OffsetLaw
+from jaxcal.study.laws import OffsetLaw, check_law
 
 DEGREES_OF_FREEDOM = 4.0
 """Of the heavy-tailed law, Student's t."""
@@ -46,15 +45,6 @@ _FAR = 3.0
 """Mean of the off-centre law."""
 _SOMETIMES, _MEAN_SD = 0.1, 2.0
 """How often the sometimes off-centre law has a mean; the mean's SD. Prior ``auto`` assumes both."""
-
-
-def check_law(law: str) -> None:
-    """Raise InputError for a name that is no law."""
-    if law not in OFFSET_LAWS:
-        raise InputError(
-            f"elevation_distribution must be {', '.join(OFFSET_LAWS[:-1])} or "
-            f"{OFFSET_LAWS[-1]}, not {law!r}"
-        )
 
 
 def standard_offsets(key: Key[Array, ""], law: OffsetLaw, count: int) -> Float[Array, " count"]:

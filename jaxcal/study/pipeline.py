@@ -27,7 +27,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
-from jaxcal.calibration.calibrate import Options
+from jaxcal.calibration.options import Options
 from jaxcal.data.probe import LinearProbe
 from jaxcal.model.batch import Iterate
 from jaxcal.runtime.compiler import fast_to_run, single_threaded
@@ -145,11 +145,11 @@ class Block:
 
     def measured(self, method: MethodSpec) -> dict[str, np.ndarray]:
         """What one method makes of it: the arrays of :class:`Measured`."""
-        bound = np.asarray(bound_mm(method, self._condition)) if method.bounded else None
+        given = method.bound_given is not None
+        bound = np.asarray(bound_mm(method, self._condition)) if given else None
         kind: Kind = (method.method, method.prior)
-        options = _options(method)
-        program = lean_program(kind, options, self._devices)
-        begun = self.begun(options.max_iterations)
+        program = lean_program(kind, method.options, self._devices)
+        begun = self.begun(method.max_iterations)
         return _as_numpy(program(self.batch, self.truth, begun, bound))
 
 
@@ -160,7 +160,7 @@ def device_name() -> str:
 
 
 def bound_mm(method: MethodSpec, condition: Condition) -> float:
-    """The bound that a method is told in a condition, mm; NaN where it takes none."""
+    """The bound that a method is told in a condition, mm; NaN if none."""
     if method.max_elevation_mm is not None:
         return method.max_elevation_mm
     if method.max_elevation_factor is None:
@@ -193,16 +193,6 @@ def numbers_of(condition: Condition) -> dict[str, Any]:
         "tracker_mm": condition.tracker_mm,
         "tracker_rad": float(np.radians(condition.tracker_deg)),
     }
-
-
-def _options(method: MethodSpec) -> Options:
-    return Options(
-        tolerance_rad=method.tolerance_rad,
-        tolerance_mm=method.tolerance_mm,
-        max_rounds=method.max_rounds,
-        inner_steps=method.inner_steps,
-        max_iterations=method.max_iterations,
-    )
 
 
 def _as_numpy(measured: Measured) -> dict[str, np.ndarray]:

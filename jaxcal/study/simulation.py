@@ -37,8 +37,8 @@ from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.compiler import ONE_PROBLEM, computed_once
 from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.study import draws
-from jaxcal.study.laws import OffsetLaw
-from jaxcal.study.offsets import check_law, standard_offsets
+from jaxcal.study.laws import OffsetLaw, check_law
+from jaxcal.study.offsets import standard_offsets
 
 Scalar = float | Float[Array, ""]
 """A number of a protocol: plain, or traced, so that one compiled program serves all its values."""
@@ -481,6 +481,8 @@ def simulate_recording(
     Raises:
         InputError: a seed that is no whole number from 0 to 2^63 - 1, or a clock without times.
     """
+    if not isinstance(protocol, Protocol):
+        raise InputError(f"a jaxcal.Protocol is needed, not {type(protocol).__name__}")
     seed = whole_number("seed", seed, 0, LARGEST_SEED)
     curved = isinstance(protocol.probe, CurvilinearProbe)
     if clock_hz is not None and not (protocol.raw or curved):

@@ -26,8 +26,8 @@
     [[methods]]               # one table for each; names are unique
     name = "alternation, 1 mm"
     method = "alternating"    # or conventional, joint
-    prior = "auto"            # joint only: auto, gaussian, uniform (self-tuned) or bounded
-    max_elevation_mm = 1      # the bound that alternating and bounded are told; or
+    prior = "auto"            # of joint: auto, gaussian, uniform (self-tuned) or bounded
+    max_elevation_mm = 1      # bound on the offsets (jaxcal.calibrate's max_elevation); or
     max_elevation_factor = 1  # ... this times the true bound (jaxcal.study.offsets.nominal_bound)
     tolerance_rad = 1e-3      # alternating: stop when X turns by less in a round
     tolerance_mm = 0.1        # ... and its origin moves by less
@@ -54,18 +54,27 @@ import math
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
-from typing import Any, get_args
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
 from jaxcal import InputError
 from jaxcal.calibration.inputs import shown, whole_number
 from jaxcal.calibration.names import Method, PriorName
+from jaxcal.calibration.options import (
+    ALTERNATION,
+    DEFAULT_MAX_ELEVATION_MM,
+    Options,
+    Prior,
+    Request,
+    check_alternation,
+    check_request,
+)
 from jaxcal.data.probe import LinearProbe
-from jaxcal.io.readable import quoted
+from jaxcal.io.readable import naming, quoted
 from jaxcal.io.toml import load_toml, parse_toml
-from jaxcal.study.laws import OFFSET_LAWS, OffsetLaw
+from jaxcal.study.laws import OffsetLaw, check_law
 from jaxcal.study.own import ArraySpec
 
 MAXIMUM_BYTES = 2**20
@@ -124,6 +133,7 @@ _LIMITS = {
     "tracker_deg": (0.0, 57.0),
 }
 _UNITS = ("_mm", "_deg", "_rad")
+_FLOATS = ("max_elevation_mm", "max_elevation_factor", "tolerance_rad", "tolerance_mm")
 
 
 @dataclass(frozen=True)
@@ -152,8 +162,9 @@ class MethodSpec:
         name: how results call it.
         method: ``conventional``, ``alternating`` or ``joint``.
         prior: of the joint method: ``auto``, ``gaussian``, ``uniform`` or ``bounded``.
-        max_elevation_mm: bound on |y| of alternating and bounded; None if there is none or if
-            ``max_elevation_factor`` gives it. In a file without either it is the paper's 1 mm.
+        max_elevation_mm: bound on |y|, where :func:`jaxcal.calibrate` takes one; None if there is
+            none or if ``max_elevation_factor`` gives it. In a file without either it is the paper's
+            1 mm for alternating and bounded.
         max_elevation_factor: the bound as a multiple of the true one.
         tolerance_rad: see :class:`jaxcal.Options`.
         tolerance_mm: see :class:`jaxcal.Options`.
@@ -167,16 +178,41 @@ class MethodSpec:
     prior: PriorName = "auto"
     max_elevation_mm: float | None = None
     max_elevation_factor: float | None = None
-    tolerance_rad: float = 1e-3
-    tolerance_mm: float = 0.1
-    max_rounds: int = 1000
-    inner_steps: int = 2
-    max_iterations: int = 100
+    tolerance_rad: float = Options.tolerance_rad
+    tolerance_mm: float = Options.tolerance_mm
+    max_rounds: int = Options.max_rounds
+    inner_steps: int = Options.inner_steps
+    max_iterations: int = Options.max_iterations
+
+    def __post_init__(self) -> None:
+        if None not in (self.max_elevation_mm, self.max_elevation_factor):
+            raise InputError("max_elevation_mm and max_elevation_factor contradict each other")
+        if np.ndim(self.bound_given or 0.0):
+            raise InputError(f"max_elevation must be one number, not {shown(self.bound_given)}")
+        self.assumed()
 
     @property
-    def bounded(self) -> bool:
-        """Whether the method needs a bound."""
-        return self.method == "alternating" or self.prior == "bounded"
+    def bound_given(self) -> float | None:
+        """The bound, mm or as a multiple; None if there is none."""
+        if self.max_elevation_mm is None:
+            return self.max_elevation_factor
+        return self.max_elevation_mm
+
+    @property
+    def options(self) -> Options:
+        """The options of :func:`jaxcal.calibrate`."""
+        names = (*ALTERNATION, "max_iterations")
+        return Options(**{name: getattr(self, name) for name in names})
+
+    def assumed(self) -> Prior:
+        """What the method assumes about the offsets.
+
+        Raises:
+            InputError: what :func:`jaxcal.calibrate` refuses.
+        """
+        return check_request(
+            Request(self.method, self.prior, self.bound_given, options=self.options)
+        )
 
 
 @dataclass(frozen=True)
@@ -306,11 +342,8 @@ def load_spec(path: str | os.PathLike[str]) -> Spec:
         InputError: an unknown, missing or wrong field, which is named. Either is one line that
             starts with the path.
     """
-    content = load_toml(path, maximum_bytes=MAXIMUM_BYTES)
-    try:
-        return _spec(content)
-    except InputError as error:
-        raise type(error)(f"{path}: {error}") from None
+    with naming(path):
+        return _spec(load_toml(path, maximum_bytes=MAXIMUM_BYTES))
 
 
 def parse_spec(text: str) -> Spec:
@@ -399,11 +432,16 @@ def _number(name: str, value: object, least: float, most: float, *, above: bool 
         )
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{name} must be a number, not {shown(value)}")
-    number = float(value) if abs(value) < 2**1000 else math.inf
+    number = _float(value)
     if not least <= number <= most or (above and number == least):
         span = f"more than {least:g} and at most" if above else f"between {least:g} and"
         raise InputError(f"{name} must be {span} {most:g}, not {shown(value)}")
-    return number + 0.0  # -0.0 and 0 are one condition
+    return number
+
+
+def _float(value: int | float) -> float:
+    """A number of the file; 1 and 1.0, and -0.0 and 0, are one."""
+    return float(value) + 0.0 if abs(value) < 2**1000 else math.inf
 
 
 def _axes(
@@ -432,8 +470,8 @@ def _axes(
 
 def _condition_value(name: str, label: str, value: object) -> float | int | str:
     if name == "elevation_distribution":
-        if value not in OFFSET_LAWS:
-            raise InputError(f"{label} must be one of {', '.join(OFFSET_LAWS)}, not {shown(value)}")
+        with naming("conditions"):
+            check_law(value)
         return str(value)
     if name in _COUNTS:
         return whole_number(label, value, *_COUNTS[name])
@@ -457,48 +495,30 @@ def _methods(content: dict[str, Any]) -> tuple[MethodSpec, ...]:
         raise InputError("methods must be tables: [[methods]]")
     if not 1 <= len(tables) <= MAXIMUM_METHODS:
         raise InputError(f"there must be 1 to {MAXIMUM_METHODS} [[methods]]")
-    methods = tuple(_method(table, f"methods[{k}].") for k, table in enumerate(tables))
+    methods = tuple(_method(table, f"methods[{k}]") for k, table in enumerate(tables))
     names = [method.name for method in methods]
     if len(set(names)) < len(names):
         raise InputError("two [[methods]] have the same name")
     return methods
 
 
-def _method(table: dict[str, Any], where: str) -> MethodSpec:
+def _method(table: dict[str, Any], place: str) -> MethodSpec:
+    where = f"{place}."
     _known(table, {field.name for field in fields(MethodSpec)}, where)
-    name, method = _required(table, "name", where), _required(table, "method", where)
+    name = _required(table, "name", where)
+    _required(table, "method", where)
     if not (isinstance(name, str) and 1 <= len(name) <= 100 and name.isprintable()):
         raise InputError(f"{where}name must be 1 to 100 printable characters")
-    prior = table.get("prior", "auto")
-    for key, value, names in (("method", method, Method), ("prior", prior, PriorName)):
-        if value not in get_args(names):
-            listed = ", ".join(get_args(names))
-            raise InputError(f"{where}{key} must be one of {listed}, not {shown(value)}")
-    if method != "joint" and "prior" in table:
-        raise InputError(f"{where}prior belongs to the joint method")
-    bounded = method == "alternating" or prior == "bounded"
-    given = [key for key in ("max_elevation_mm", "max_elevation_factor") if key in table]
-    if len(given) == 2:
-        raise InputError(f"{where}{given[0]} and {where}{given[1]} contradict each other")
-    if given and not bounded:
-        raise InputError(
-            f'{where}{given[0]} belongs to alternating and to joint with prior "bounded"'
-        )
-    for key in ("tolerance_rad", "tolerance_mm", "max_rounds", "inner_steps"):
-        if key in table and method != "alternating":
-            raise InputError(f"{where}{key} belongs to the alternating method")
-    values: dict[str, Any] = {}
-    for key in given:
-        values[key] = _number(where + key, table[key], 0.0, 1000.0)
-    if bounded and not given:
-        values["max_elevation_mm"] = 1.0
-    for key, most in (("tolerance_rad", 1.0), ("tolerance_mm", 1000.0)):
-        if key in table:
-            values[key] = _number(where + key, table[key], 0.0, most, above=True)
-    for key in ("max_rounds", "inner_steps", "max_iterations"):
-        if key in table:
-            values[key] = whole_number(where + key, table[key], 1, 10**7)
-    return MethodSpec(name=name, method=method, prior=prior, **values)
+    values: dict[str, Any] = {
+        key: _float(value) if key in _FLOATS and type(value) in (int, float) else value
+        for key, value in table.items()
+    }
+    with naming(place):
+        method = MethodSpec(**values)
+        check_alternation((key for key in ALTERNATION if key in table), method.method)
+        if method.assumed() == "bounded" and method.bound_given is None:
+            method = replace(method, max_elevation_mm=DEFAULT_MAX_ELEVATION_MM)
+    return method
 
 
 def _check_size(spec: Spec) -> None:

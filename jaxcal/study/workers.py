@@ -203,8 +203,12 @@ def main() -> None:
         # Before JAX is imported, since JAX counts the cores.
         os.sched_setaffinity(0, given["cores"])
     spec = study_from(given["where"], given["spec"])
-    for line in requests:
-        _answer(answers, spec, json.loads(line)["chunk"])
+    try:
+        for line in requests:
+            _answer(answers, spec, json.loads(line)["chunk"])
+    except BrokenPipeError:
+        # The parent was killed: nobody reads an answer, nor a traceback of what cannot be flushed.
+        os._exit(1)
 
 
 def _answer(answers: BinaryIO, spec: Study, index: int) -> None:

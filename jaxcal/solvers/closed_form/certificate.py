@@ -26,6 +26,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import real_array
 from jaxcal.solvers.closed_form.reduced_objective import ReducedObjective, image_data, reduce
 from jaxcal.solvers.closed_form.rotation_relaxation import lower_bound
 
@@ -221,14 +222,16 @@ def certify(
     """
     data, constraints = image_data(problem, estimate)
     reduced = reduce(data, constraints)
-    transform = np.asarray(image_to_probe, dtype=float)
+    transform = real_array(image_to_probe, "image_to_probe")
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
         raise InputError("image_to_probe must be a finite 4x4 matrix, in mm")
     factors = np.array([1.0, sound_speed_factor])
     if {"lateral", "common"} & set(constraints.free):
         if scale_mm_per_px is None:
             raise InputError("an estimated scale belongs to the answer: give scale_mm_per_px")
-        factors = np.asarray(scale_mm_per_px, dtype=float) / data.spacing
+        factors = real_array(scale_mm_per_px, "scale_mm_per_px") / data.spacing
+    if point is not None and np.shape(point) != (3,):
+        raise InputError(f"point must have shape (3,), not {np.shape(point)}")
     left, stretch, right = np.linalg.svd(transform[:3, :3])
     if np.abs(stretch - 1).max() > ORTHONORMAL or np.linalg.det(left @ right) < 0:
         raise InputError("image_to_probe holds no rotation: its columns are not orthonormal")
@@ -241,7 +244,7 @@ def certify(
         seen[:, 1] += data.face_offset
     in_probe = seen[:, :1] * x[:3] + seen[:, 1:] * x[3:] + origin
     cloud = np.einsum("nij,nj->ni", data.rotations, in_probe) + data.translations
-    target = cloud.mean(axis=0) if point is None else np.asarray(point, dtype=float)
+    target = cloud.mean(axis=0) if point is None else real_array(point, "point")
     value = float(np.sum((cloud - target) ** 2))
     excess = max(value - float(reduced(x)), 0.0)
     found = certify_point(reduced, x, excess=excess)

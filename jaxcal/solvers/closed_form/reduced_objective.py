@@ -152,6 +152,8 @@ def image_data(
         from jaxcal.data.problem import Problem
 
         source = Problem.from_recording(problem)  # pyright: ignore[reportArgumentType]
+    if not hasattr(source, "mask"):
+        raise InputError(f"a problem or a recording is needed, not {type(problem).__name__}")
     if hasattr(source, "kind"):
         pixels, known = source.kind == "pixel", source.spacing_mm is not None
         spacing = np.asarray(source.spacing_mm, dtype=float) if known else np.ones(2)
