@@ -60,7 +60,7 @@ _HOME = {
     "certify": "jaxcal.solvers.closed_form.certificate",
     "cross_validate": "jaxcal.calibration.resampling",
     "load": "jaxcal.io.hdf5",
-    "load_calibration": "jaxcal.calibration.transform",
+    "load_calibration": "jaxcal.calibration.saved",
     "make_images": "jaxcal.data.recording",
     "predicted_tre": "jaxcal.diagnostics.intervals",
     "reconstruction_precision": "jaxcal.diagnostics.metrics",
@@ -85,8 +85,8 @@ if TYPE_CHECKING:
     from jaxcal.calibration.resampling import cross_validate as cross_validate
     from jaxcal.calibration.result import Calibration as Calibration
     from jaxcal.calibration.result import Status as Status
+    from jaxcal.calibration.saved import load_calibration as load_calibration
     from jaxcal.calibration.transform import ImageTransform as ImageTransform
-    from jaxcal.calibration.transform import load_calibration as load_calibration
     from jaxcal.data.probe import CurvilinearProbe as CurvilinearProbe
     from jaxcal.data.probe import LinearProbe as LinearProbe
     from jaxcal.data.problem import Problem as Problem

@@ -15,7 +15,8 @@ from rich.console import Console
 
 import jaxcal
 from jaxcal.calibration.resampling import relative_twist
-from jaxcal.calibration.transform import ImageTransform, load_calibration
+from jaxcal.calibration.saved import load_calibration
+from jaxcal.calibration.transform import ImageTransform
 from jaxcal.cli.main import main
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.diagnostics import influence as influences

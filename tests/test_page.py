@@ -16,7 +16,7 @@ import pytest
 from conftest import experiment
 
 import jaxcal
-from jaxcal.calibration.transform import load_calibration
+from jaxcal.calibration.saved import load_calibration
 from jaxcal.report import svg
 from jaxcal.report.page import page, write_page
 from jaxcal.report.record import calibration_record

@@ -14,7 +14,7 @@ from conftest import experiment
 
 import jaxcal
 from jaxcal.calibration.inputs import as_problem
-from jaxcal.calibration.transform import load_calibration
+from jaxcal.calibration.saved import load_calibration
 from jaxcal.report import plots
 from jaxcal.report.record import calibration_record
 

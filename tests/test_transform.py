@@ -16,11 +16,8 @@ import numpy as np
 import pytest
 
 from jaxcal import FormatError, InputError
-from jaxcal.calibration.transform import (
-    ImageTransform,
-    load_calibration,
-    transform_from_plus_matrix,
-)
+from jaxcal.calibration.saved import load_calibration
+from jaxcal.calibration.transform import ImageTransform, transform_from_plus_matrix
 from jaxcal.cli.main import main
 from jaxcal.data.poses import quaternion_from_rotation, rotations_from_quaternions
 from jaxcal.io.itk import itk_from_matrix, itk_text, matrix_from_itk, read_itk, write_itk

@@ -11,12 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import CalibrationError, InputError
-from jaxcal.calibration.transform import (
-    AppliedPoints,
-    ImageTransform,
-    SaveFormat,
-    check_target,
-)
+from jaxcal.calibration.saved import SaveFormat, check_target
+from jaxcal.calibration.transform import AppliedPoints, ImageTransform
 from jaxcal.data.problem import Problem
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.unknowns import TABLE, Blocks, in_image

@@ -1,4 +1,4 @@
-"""A calibration in use: loaded, applied to pixels, saved for other programs. Numpy only.
+"""A calibration in use, without the data: applied to pixels, and as PLUS's matrix. Numpy only.
 
 There are two descriptions of the same calibration. jaxcal's own is rigid and in mm: X = [a e z | t]
 takes the image plane (lateral, elevational, axial) to the probe, and in this plane a pixel is
@@ -15,47 +15,24 @@ z = x cross y.
 
 from __future__ import annotations
 
-import json
 import math
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any, Literal
-from zipfile import ZipFile
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal import FormatError, InputError
+from jaxcal import InputError
 from jaxcal.data.poses import check_affine, check_poses
 from jaxcal.diagnostics.image_points import point_jacobian
-from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair
-from jaxcal.io.outputs import check_output
-from jaxcal.io.readable import check_readable, naming, one_line, quoted
+from jaxcal.io.readable import naming
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import real_array
 
-FORMAT = "jaxcal-calibration"
-VERSION = 1
-MAXIMUM_BYTES = 64 * 2**20
-
-_NPZ = (
-    "image_plane_to_probe",
-    "scale_mm_per_px",
-    "face_offset_mm",
-    "range_factor",
-    "covariance",
-    "image_unknowns",
-    "image_covariance",
-    "rms_mm",
-    "converged",
-)
-_NPZ_BYTES = 65536
-"""Largest size of an ``.npz``, also unpacked."""
-
-SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
+if TYPE_CHECKING:
+    from jaxcal.calibration.saved import SaveFormat
 
 _ROUNDING = 1e-13
 _LARGEST = 1e9
@@ -305,24 +282,9 @@ class ImageTransform:
                 ``json``, which says so.
             OutputError: the file could not be written and is unchanged.
         """
-        chosen = check_target(path, format)
-        if chosen != "json":
-            self.check_usable()
-        if chosen in ("slicer", "itk"):
-            from jaxcal.io.itk import write_itk
+        from jaxcal.calibration import saved
 
-            write_itk(path, self.plus_matrix())
-        elif chosen == "numpy":
-            with atomic_path(path) as temporary, temporary.open("wb") as file:
-                if os.fspath(path).lower().endswith(".npz"):
-                    known = {key: value for key, value in self._record().items() if key in _NPZ}
-                    matrix = None if self.scale_mm_per_px is None else self.plus_matrix()
-                    known["plus_image_to_probe"] = matrix
-                    np.savez(file, **{k: v for k, v in known.items() if v is not None})
-                else:
-                    np.save(file, self.plus_matrix())
-        else:
-            write_text(path, self.text(chosen, frames=frames))
+        saved.save(self, path, format, frames=frames)
 
     def text(self, format: SaveFormat, *, frames: FramePair = ("Image", "Probe")) -> str:
         """The text that :meth:`save` writes in a format; for ``numpy`` it is PLUS's matrix.
@@ -330,62 +292,15 @@ class ImageTransform:
         Raises:
             InputError: an unknown format, or an unknown pixel size.
         """
-        if format == "json":
-            try:
-                return json.dumps(self._record(), indent=2, allow_nan=False) + "\n"
-            except ValueError:
-                failed = f"{self.source}: the solve had failed: there is no transform to write"
-                raise InputError(failed) from None
-        if format == "plus":
-            from jaxcal.io.plus import transform_element
+        from jaxcal.calibration import saved
 
-            return transform_element(frames, self.plus_matrix(), error_mm=self.error_mm) + "\n"
-        if format in ("slicer", "itk"):
-            from jaxcal.io.itk import itk_text
-
-            return itk_text(self.plus_matrix())
-        if format == "ros":
-            from jaxcal.io.ros import ros_yaml
-
-            # ROS's own frames are in lower case; the user's are written as they are.
-            child, parent = (n.lower() if n in ("Image", "Probe") else n for n in frames)
-            return ros_yaml(self.image_plane_to_probe, parent, child, self.left_out(format))
-        if format == "tusrec":
-            from jaxcal.io.tus_rec import calib_matrix
-
-            matrix = self.plus_matrix()
-            scale = self._scale() * [1.0, self.range_factor]
-            rigid = matrix.copy()
-            rigid[:3, :3] /= [*scale, scale.mean()]
-            return calib_matrix(rigid, scale)
-        if format == "numpy":
-            return np.array2string(self.plus_matrix(), separator=", ", floatmode="unique") + "\n"
-        raise InputError(f"{quoted(str(format))} is no format that is written")
+        return saved.text_of(self, format, frames=frames)
 
     def left_out(self, format: SaveFormat) -> str | None:
         """What a format cannot hold and its user must do, in words; None where nothing is."""
-        if format != "ros":
-            return None
-        from jaxcal.io.ros import range_note
+        from jaxcal.calibration import saved
 
-        return range_note(self.range_factor, self.face_offset_mm)
-
-    def _record(self) -> dict[str, Any]:
-        scale, covariance, full = self.scale_mm_per_px, self.covariance, self.image_covariance
-        return {
-            "format": FORMAT,
-            "version": VERSION,
-            "converged": self.converged,
-            "image_plane_to_probe": self.image_plane_to_probe.tolist(),
-            "plus_image_to_probe": None if scale is None else self.plus_matrix().tolist(),
-            "scale_mm_per_px": None if scale is None else scale.tolist(),
-            "face_offset_mm": self.face_offset_mm,
-            "range_factor": self.range_factor,
-            "covariance": None if covariance is None else covariance.tolist(),
-            "image_unknowns": tangent_names(self.unknowns),
-            "image_covariance": None if full is None else full.tolist(),
-            "rms_mm": self.error_mm,
-        }
+        return saved.left_out(self, format)
 
 
 def _numbers(value: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -413,73 +328,6 @@ def _checked(values: dict[str, np.ndarray]) -> Float[np.ndarray, "4 4"]:
 def _cross(vector: np.ndarray) -> Float[np.ndarray, "3 3"]:
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-_EXTENSIONS: dict[SaveFormat, tuple[str, ...]] = {
-    "json": (".json",),
-    "plus": (".xml",),
-    "slicer": (".tfm", ".txt", ".h5"),
-    "itk": (".tfm", ".txt", ".h5"),
-    "ros": (".yaml", ".yml"),
-    "tusrec": (".csv",),
-    "numpy": (".npy", ".npz"),
-}
-
-
-def _format_of(name: str) -> SaveFormat:
-    for chosen, extensions in _EXTENSIONS.items():
-        if name.lower().endswith(extensions):
-            return chosen
-    known = dict.fromkeys(each for extensions in _EXTENSIONS.values() for each in extensions)
-    raise FormatError(f"{name}: its extension tells no format (there are {', '.join(known)})")
-
-
-def check_target(
-    path: str | os.PathLike[str],
-    format: SaveFormat | None = None,
-    inputs: Sequence[str | os.PathLike[str]] = (),
-) -> SaveFormat:
-    """The format in which :meth:`ImageTransform.save` writes a file, if it may be written.
-
-    Args:
-        path: the file to make or replace.
-        format: by default that of the extension.
-        inputs: files that must not be replaced.
-
-    Raises:
-        InputError: an extension by which the file could not be read again, one of the inputs, or
-            an existing file that is no calibration in this format.
-    """
-    name = os.fspath(path)
-    chosen = _format_of(name) if format is None else format
-    extensions = _EXTENSIONS.get(chosen)
-    if extensions is None:
-        raise InputError(f"{quoted(str(chosen))} is no format that is written")
-    if not name.lower().endswith(extensions):
-        raise InputError(f"{name}: a file of format {chosen} is named {' or '.join(extensions)}")
-    check_output(path, f"a calibration (format {chosen})", lambda _: _is_one(path, chosen), inputs)
-    return chosen
-
-
-def _is_one(path: str | os.PathLike[str], format: SaveFormat) -> bool:
-    if format == "json":
-        return is_calibration_record(path)
-    load_calibration(path)
-    if format != "plus":
-        return True
-    from jaxcal.io.xml import read_xml
-
-    # A whole configuration is more than we write.
-    return read_xml(path)[0].tag == "Transform"
-
-
-def is_calibration_record(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is the JSON of a calibration, also of one that failed.
-
-    Raises:
-        FormatError: it is no JSON object.
-    """
-    return _json_object(path).get("format") == FORMAT
 
 
 def transform_from_plus_matrix(
@@ -517,175 +365,3 @@ def transform_from_plus_matrix(
     transform[:3, :3] = np.stack([lateral, np.cross(axial, lateral), axial], axis=1)
     transform[:3, 3] = matrix[:3, 3]
     return ImageTransform(transform, scale, error_mm=error_mm, source=source)
-
-
-def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
-    """Read a calibration; the file is not trusted, and JAX is not needed.
-
-    Args:
-        path: our JSON (of ``jaxcal calibrate --json`` or ``--out``, of any version), a
-            configuration or fCal result of PLUS (``.xml``), a transform of ITK (``.tfm``, ``.txt``,
-            ``.h5``), a ``calib_matrix.csv`` of TUS-REC, a YAML of easy_handeye, our ``.npz``, or
-            PLUS's matrix as ``.npy``.
-
-    Raises:
-        FormatError: not such a file.
-        InputError: matrices that cannot be used. The message of either error is one line that
-            starts with the path.
-    """
-    name = os.fspath(path)
-    lower = name.lower()
-    with naming(path):
-        if lower.endswith(".xml"):
-            return _load_plus(path)
-        if lower.endswith((".tfm", ".txt", ".h5")):
-            from jaxcal.io.itk import read_itk
-
-            return transform_from_plus_matrix(read_itk(path), source=name)
-        if lower.endswith(".csv"):
-            from jaxcal.io.tus_rec import read_calib_matrix
-
-            rigid, scale = read_calib_matrix(path)
-            matrix = rigid @ np.diag([*scale, scale.mean(), 1.0])
-            return transform_from_plus_matrix(matrix, source=name)
-        if lower.endswith((".yaml", ".yml")):
-            from jaxcal.io.ros import read_ros_yaml
-
-            return ImageTransform(read_ros_yaml(path), source=name)
-        if lower.endswith(".npy"):
-            return transform_from_plus_matrix(_load_npy(path), source=name)
-        if lower.endswith(".npz"):
-            return _load_npz(path)
-        return transform_from_record(_json_object(path), source=name)
-
-
-def _load_plus(path: str | os.PathLike[str]) -> ImageTransform:
-    from jaxcal.io.plus import read_configuration, read_result
-    from jaxcal.io.xml import read_xml
-
-    name = os.fspath(path)
-    root, _ = read_xml(path)
-    found, error = None, None
-    if root.tag == "ProbeCalibrationResult":
-        result = read_result(path)
-        found, error = result.find("Image", "Probe"), result.calibration_error_mm
-    else:
-        found = read_configuration(path).find("Image", "Probe")
-        error = None if found is None else found.error_mm
-    if found is None:
-        raise FormatError("holds no transform from Image to Probe")
-    return transform_from_plus_matrix(found.matrix, error_mm=error, source=name)
-
-
-def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
-    check_readable(path, maximum_bytes=4096)
-    try:
-        with open(path, "rb") as file:
-            found = np.lib.format.read_array(file, allow_pickle=False)
-    except Exception as error:
-        # numpy hands on whatever its parser of headers stumbles over.
-        raise FormatError(f"is not an array of numbers: {one_line(error)}") from None
-    if found.dtype.kind not in "fiu":
-        raise FormatError("is not an array of real numbers")
-    return found.astype(np.float64)
-
-
-def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
-    """What :meth:`ImageTransform.save` writes; older files have fewer names."""
-    check_readable(path, maximum_bytes=_NPZ_BYTES)
-    try:
-        with ZipFile(path) as archive:
-            if sum(member.file_size for member in archive.infolist()) > _NPZ_BYTES:
-                raise FormatError("holds more than a calibration")
-        with np.load(path, allow_pickle=False) as file:
-            record = {name: file[name].tolist() for name in _NPZ if name in file.files}
-    except FormatError:
-        raise
-    except Exception as error:
-        # zipfile, too, has errors of many kinds.
-        raise FormatError(f"holds no arrays of numbers: {one_line(error)}") from None
-    return transform_from_record({"version": VERSION} | record, source=os.fspath(path))
-
-
-def _json_object(path: str | os.PathLike[str]) -> dict[str, Any]:
-    check_readable(path, maximum_bytes=MAXIMUM_BYTES)
-    try:
-        content = Path(path).read_bytes()
-        if not content.lstrip().startswith(b"{"):
-            _format_of(os.fspath(path))
-        record = json.loads(content)
-    except (OSError, ValueError, RecursionError) as error:
-        if isinstance(error, FormatError):
-            raise
-        raise FormatError(f"is not JSON: {one_line(error)}") from None
-    if not isinstance(record, dict):
-        raise FormatError("is not a calibration: a JSON object is needed")
-    return record
-
-
-def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> ImageTransform:
-    """The calibration in an object of ``jaxcal calibrate --json``, of this or an older version.
-
-    Raises:
-        FormatError: another format, a newer version, or a field that is missing or no array.
-        InputError: numbers that :class:`ImageTransform` refuses.
-    """
-    if record.get("format", FORMAT) != FORMAT:
-        raise FormatError(f"is not a calibration: its format is {quoted(str(record['format']))}")
-    version = record.get("version", 0)
-    if not isinstance(version, int) or version > VERSION:
-        raise FormatError(
-            f"is version {quoted(str(version))} of the calibration format; this jaxcal understands "
-            f"version {VERSION}: update jaxcal"
-        )
-    # Before version 1 the field had the name of PLUS's matrix, which is a different one.
-    key = "image_to_probe" if version == 0 else "image_plane_to_probe"
-    matrix = _array(record, key, (4, 4))
-    if matrix is None:
-        raise FormatError(f"is not a calibration: {key} is missing, or the solve had failed")
-    scale = _array(record, "scale_mm_per_px", (2,))
-    offset = _array(record, "face_offset_mm", ())
-    factor = _array(record, "range_factor", ())
-    error = _array(record, "rms_mm", ())
-    usable = record.get("converged")
-    usable = usable and not record.get("wrong_frames") if isinstance(usable, bool) else None
-    unknowns = _unknowns(record)
-    size = len(tangent_names(unknowns))
-    return ImageTransform(
-        matrix,
-        scale,
-        0.0 if offset is None else float(offset),
-        _array(record, "covariance", (6, 6)),
-        None if error is None else float(error),
-        usable,
-        source,
-        1.0 if factor is None else float(factor),
-        unknowns,
-        _array(record, "image_covariance", (size, size)),
-    )
-
-
-def _unknowns(record: dict[str, Any]) -> tuple[str, ...]:
-    """The blocks whose tangents ``image_unknowns`` names."""
-    names = record.get("image_unknowns")
-    if names is None:
-        return ("translation", "rotation")
-    known = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    blocks = tuple(row.name for row in TABLE.values() if known and row.tangents[0] in names)
-    if not known or tangent_names(blocks) != names or blocks[:2] != ("translation", "rotation"):
-        raise FormatError("image_unknowns names other unknowns than those of an image point")
-    return blocks
-
-
-def _array(record: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray | None:
-    value = record.get(key)
-    if value is None:
-        return None
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise FormatError(f"{key} must be numbers of shape {shape}") from None
-    # If the solve had failed, there may be NaN instead of null.
-    if array.shape != shape:
-        raise FormatError(f"{key} must have shape {shape}, it has {array.shape}")
-    return array if np.isfinite(array).all() else None

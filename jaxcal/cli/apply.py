@@ -71,7 +71,7 @@ def apply(
     """
     import numpy as np
 
-    from jaxcal.calibration.transform import load_calibration
+    from jaxcal.calibration.saved import load_calibration
     from jaxcal.io.atomic import write_text
     from jaxcal.io.outputs import begins_with, check_output
 

@@ -25,7 +25,7 @@ from jaxcal.cli.common import (
 if TYPE_CHECKING:
     from jaxcal.calibration.options import Request
     from jaxcal.calibration.result import Calibration
-    from jaxcal.calibration.transform import SaveFormat
+    from jaxcal.calibration.saved import SaveFormat
     from jaxcal.data.recording import Recording
     from jaxcal.report.convergence import Curve
 
@@ -258,7 +258,7 @@ def _prepared(out: str) -> AbstractContextManager[Path]:
 
 
 def _export_target(text: str, inputs: list[str]) -> tuple[SaveFormat, str]:
-    from jaxcal.calibration.transform import check_target
+    from jaxcal.calibration.saved import check_target
     from jaxcal.cli.export import check_configuration
     from jaxcal.io.atomic import check_writable
 
@@ -283,7 +283,7 @@ def _export(
     """Write the transform for other programs; nothing of a calibration that did not converge."""
     if not targets:
         return []
-    from jaxcal.calibration.transform import transform_from_record
+    from jaxcal.calibration.saved import transform_from_record
     from jaxcal.cli.export import patched, written
 
     if not record["converged"] or record["wrong_frames"]:

@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.calibration.result import Calibration
-from jaxcal.calibration.transform import SaveFormat, transform_from_record
+from jaxcal.calibration.saved import SaveFormat, transform_from_record
 from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Recording
 from jaxcal.diagnostics import messages

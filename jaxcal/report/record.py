@@ -10,7 +10,7 @@ import numpy as np
 import jaxcal
 from jaxcal import InputError
 from jaxcal.calibration.result import Calibration
-from jaxcal.calibration.transform import FORMAT, VERSION
+from jaxcal.calibration.saved import FORMAT, VERSION
 from jaxcal.data.poses import rotation_angle
 from jaxcal.data.recording import Images, Recording, Truth
 from jaxcal.diagnostics import messages

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxcal import CalibrationError, FormatError, InputError, OutputError
 from jaxcal.calibration.result import Calibration
-from jaxcal.calibration.transform import is_calibration_record
+from jaxcal.calibration.saved import is_calibration_record
 from jaxcal.data.recording import Recording
 from jaxcal.io.atomic import STAGED, replace_files, write_text
 from jaxcal.io.readable import one_line
