@@ -443,6 +443,19 @@ def test_poses_of_other_times(tmp_path, times, message):
         with_poses_by_time(images, tracking)
 
 
+def test_times_that_only_rounding_puts_beyond_the_poses_have_one(tmp_path):
+    from jaxcal.io.poses_by_time import Tracking, with_poses_by_time
+
+    times = 100.3 + np.arange(COUNT) * 0.37
+    write_sequence(tmp_path / "i.mha", {}, times, images=FRAMES)
+    moments = np.linspace(times[0] + 1e-9, times[-1] - 1e-9, 200)
+    tracking = Tracking(moments, moving(moments), np.ones(200, bool), PAIR, "t.mha")
+    found, notes = with_poses_by_time(read_sequence(tmp_path / "i.mha"), tracking)
+    assert found.valid[PAIR].all()
+    assert len(notes) == 1
+    np.testing.assert_allclose(found.transforms[PAIR], moving(times), atol=1e-3)
+
+
 def to_and_fro(t: np.ndarray) -> np.ndarray:
     """An irregular motion, -1 to 1."""
     return (15 * np.sin(1.95 * t) + 7 * np.sin(5.2 * t + 1) + 3 * np.sin(10.7 * t)) / 25

@@ -1,5 +1,6 @@
 """What a recording refuses, beyond what the readers' own tests hold."""
 
+import copy
 import subprocess
 import sys
 
@@ -33,6 +34,18 @@ def test_rows_above_the_image_are_refused():
         jaxcal.make_images(
             given["poses"], changed, "pixel", spacing_mm=(0.12, 0.1), face_offset_mm=-1.5
         )
+
+
+def test_recordings_can_be_compared_and_kept_in_sets():
+    """Arrays have no single truth, so recordings are equal if they are the same."""
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=6, test_images=4))
+    other = copy.deepcopy(recording)
+    assert recording == recording
+    assert recording != other
+    assert recording.calibration != other.calibration
+    assert len({recording, other, recording}) == 2
+    transform = jaxcal.ImageTransform(np.eye(4))
+    assert transform != copy.deepcopy(transform)
 
 
 TRACED = """

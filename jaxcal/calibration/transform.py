@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -41,7 +41,7 @@ _SKEWED = 1e-3
 """Largest cosine between two columns of a matrix that count as orthogonal."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AppliedPoints:
     """Positions of pixels.
 
@@ -54,7 +54,7 @@ class AppliedPoints:
     covariance: Float[np.ndarray, "n 3 3"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ImageTransform:
     """A calibration without the data from which it was made.
 
@@ -82,7 +82,7 @@ class ImageTransform:
     covariance: Float[np.ndarray, "6 6"] | None = None
     error_mm: float | None = None
     converged: bool | None = None
-    source: str = field(default="memory", compare=False)
+    source: str = "memory"
     range_factor: float = 1.0
     unknowns: tuple[str, ...] = ("translation", "rotation")
     image_covariance: Float[np.ndarray, "q q"] | None = None

@@ -35,7 +35,7 @@ class MetresError(InputError):
     """Translations of poses look like metres, not millimetres."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Images:
     """One set of tracked images of the target.
 
@@ -70,7 +70,7 @@ class Images:
         return len(self.poses)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Truth:
     """The true values, which only a simulation knows.
 
@@ -85,7 +85,7 @@ class Truth:
     elevation: Float[np.ndarray, " n"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Recording:
     """A recording: images to calibrate with and, optionally, test images, truth and the probe.
 

@@ -22,6 +22,8 @@ from jaxcal.runtime.array_types import Bool, Float, Int
 
 LONGEST_GAP = 5.0
 """Longest time between two poses that is bridged, in median intervals."""
+_ROUNDED_S = 1e-6
+"""Times that were written as text and read again may be off by so much."""
 
 
 class Tracking(NamedTuple):
@@ -91,7 +93,7 @@ def with_poses_by_time(
     kept = _increasing(time, source)
     time, poses, valid = time[kept], poses[kept], valid[kept]
     gap = LONGEST_GAP * float(np.median(np.diff(time)))
-    asked = images.time - lag_s
+    asked = _within(images.time - lag_s, time[valid])
     between = can_interpolate(time, asked, max_gap_s=gap, valid=valid)
     if not between.any():
         raise InputError(
@@ -111,6 +113,14 @@ def with_poses_by_time(
     return replace(
         images, transforms={pair: found}, valid={pair: between}, length_stated=length_stated
     ), notes
+
+
+def _within(asked: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]) -> np.ndarray:
+    """Times, those that only rounding puts before the first or after the last pose at that pose."""
+    if not len(time):
+        return asked
+    nearest = np.clip(asked, time[0], time[-1])
+    return np.where(np.abs(asked - nearest) <= _ROUNDED_S, nearest, asked)
 
 
 def _increasing(time: Float[np.ndarray, " m"], source: str) -> Int[np.ndarray, " k"]:
