@@ -453,7 +453,7 @@ def test_times_that_only_rounding_puts_beyond_the_poses_have_one(tmp_path):
     found, notes = with_poses_by_time(read_sequence(tmp_path / "i.mha"), tracking)
     assert found.valid[PAIR].all()
     assert len(notes) == 1
-    np.testing.assert_allclose(found.transforms[PAIR], moving(times), atol=1e-3)
+    np.testing.assert_allclose(found.transforms[PAIR], moving(times), atol=5e-3)
 
 
 def to_and_fro(t: np.ndarray) -> np.ndarray:
