@@ -104,7 +104,7 @@ def direction_in_words(vector: AnyArray, blocks: tuple[str, ...]) -> str:
     words = [_block_in_words(block, parts[block]) for block in named]
     if "point" in leading and "point" not in named:
         words.append("the target moving along")
-    return " with ".join(words[:3])
+    return " with ".join([words[0], " and ".join(words[1:3])] if words[1:] else words)
 
 
 def _block_in_words(block: str, part: np.ndarray) -> str:

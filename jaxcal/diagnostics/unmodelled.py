@@ -37,14 +37,14 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-CHI_SQUARED = {1: 10.8, 2: 13.8, 3: 16.3}
-"""Chi squared that chance exceeds once in a thousand times, by its degrees of freedom."""
-
 FEWEST = 12
 """With fewer images in use nothing is looked for."""
 
 _FREEDOM = {"scale": 2, "slip": 3, "skew": 1, "beside": 1}
 """Number of parameters of each error."""
+_BY_CHANCE = {"scale": 13.8, "slip": 16.3, "skew": 10.8, "beside": 9.5}
+"""What 2 ln LR exceeds by chance in one of a thousand recordings: chi squared, and for m^2, which
+is never negative, that of two in a thousand."""
 _ROUNDS = 8
 """Rounds of tuning the SDs with the further parameters."""
 _WITHIN = (0, 2, 4)
@@ -124,7 +124,7 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
             each = _fit(kind, whitened.errors[0][used], whitened.rows[0][used])
             if each is not None:
                 found.append(each)
-    return sorted(found, key=lambda each: -each.statistic / CHI_SQUARED[_FREEDOM[each.kind]])
+    return sorted(found, key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
 
 
 def _columns(
@@ -157,7 +157,7 @@ def _fit(kind: str, errors: Float[Array, "m 3"], rows: Float[Array, "m 3 q"]) ->
     touched = np.any(rows[..., unknowns:] != 0, axis=(0, 2))
     freedom = len(errors) - unknowns / 3 - touched * (_FREEDOM[kind] / touched.sum())
     statistic = float(np.sum(freedom * np.log(before / after)))
-    if not statistic > CHI_SQUARED[_FREEDOM[kind]]:
+    if not statistic > _BY_CHANCE[kind]:
         return None
     values, step = step[unknowns:], step[:unknowns]
     if kind == "beside":

@@ -42,14 +42,16 @@ def verdict(record: dict[str, Any]) -> list[str]:
     """
     lines = [headline(record)]
     usable = record["status"] in ("converged", "max_iterations")
-    if usable and not record.get("wrong_frames"):
+    usable = usable and not record.get("wrong_frames")
+    if usable:
         lines += [*contradictions(record), *where(record)]
+    further = [text for text in record["warnings"] if text not in lines[0]]
+    lines += [*listed("Look at this", further), *listed("What to do", advice(record))]
+    if usable:
         lines += listed("What limits it", limits(record))
         lines += listed("How certain it is", [*certainty(record), *resampled_sentences(record)])
         lines += listed("How the images agree with it", [*scatter(record), *believe(record)])
-    further = [text for text in record["warnings"] if text not in lines[0]]
-    lines += listed("Look at this", further)
-    return lines + listed("What to do", advice(record))
+    return lines
 
 
 def headline(record: dict[str, Any]) -> str:
