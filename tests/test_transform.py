@@ -117,6 +117,8 @@ def test_what_must_not_be_used_is_not_saved_for_others(tmp_path, name):
     with pytest.raises(InputError, match="must not be used"):
         lost.save(tmp_path / name)
     assert not list(tmp_path.iterdir())
+    with pytest.raises(InputError, match="must not be used"):
+        lost.text("plus")
     lost.save(tmp_path / "cal.json")
     assert load_calibration(tmp_path / "cal.json").converged is False
 

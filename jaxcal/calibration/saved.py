@@ -142,6 +142,7 @@ def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair)
         except ValueError:
             failed = f"{transform.source}: the solve had failed: there is no transform to write"
             raise InputError(failed) from None
+    transform.check_usable()
     if format == "plus":
         from jaxcal.io.plus import transform_element
 

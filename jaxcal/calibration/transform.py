@@ -290,7 +290,8 @@ class ImageTransform:
         """The text that :meth:`save` writes in a format; for ``numpy`` it is PLUS's matrix.
 
         Raises:
-            InputError: an unknown format, or an unknown pixel size.
+            InputError: an unknown format, an unknown pixel size, or a calibration that must not be
+                used, in any format but ``json``.
         """
         from jaxcal.calibration import saved
 
