@@ -377,6 +377,7 @@ def test_pixels_for_a_calibration_in_mm():
         ([[np.nan, 2]], None, "not NaN"),
         ([[1.0, 2]], np.eye(4)[None].repeat(2, 0), "1 pixels but 2 poses"),
         ([[1.0, 2]], np.diag([1.0, 1, -1, 1]), "is a reflection"),
+        ([[1.0, 2]], np.eye(4, dtype=complex), "pose must be an array of real numbers"),
     ],
 )
 def test_apply_refuses(pixels, pose, message):
