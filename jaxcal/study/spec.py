@@ -441,7 +441,7 @@ def _number(name: str, value: object, least: float, most: float, *, above: bool 
 
 def _float(value: int | float) -> float:
     """A number of the file; 1 and 1.0, and -0.0 and 0, are one."""
-    return float(value) + 0.0 if abs(value) < 2**1000 else math.inf
+    return math.inf if abs(value) >= 2**1000 else float(value) + 0.0
 
 
 def _axes(
