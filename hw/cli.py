@@ -70,7 +70,7 @@ _bench_seed = click.option(
 )
 
 
-@commands.command()
+@click.command()
 @click.argument("recording", type=click.Path(), required=False)
 @_bench
 @_setup
@@ -229,7 +229,7 @@ def acquire(
         return _acquire(setup, path, request, emulated, unattended, operator, view)
 
 
-@commands.command("free-hand", short_help="Acquire with a hand-held probe, and calibrate.")
+@click.command("free-hand", short_help="Acquire with a hand-held probe, and calibrate.")
 @click.argument("server", metavar="HOST[:PORT]")
 @click.argument("recording", type=click.Path(), required=False)
 @click.option(
@@ -368,7 +368,7 @@ def _check_resumed(recording: str | None, given: Sequence[str]) -> None:
         raise InputError(f"{given[0]} does not go with --resume: the recording knows")
 
 
-@commands.command(short_help="Serve an emulated bench until Ctrl-C.")
+@click.command(short_help="Serve an emulated bench until Ctrl-C.")
 @_speed
 @_controller
 @click.option(
@@ -387,7 +387,7 @@ def bench(speed: float | None, controller: str | None, seed: int) -> int:
     return ExitCode.CONVERGED
 
 
-@commands.command("setup", short_help="Write a commented description of a bench, to fill in.")
+@click.command("setup", short_help="Write a commented description of a bench, to fill in.")
 @click.argument("out", type=click.Path(), metavar="[OUT.toml]", required=False)
 def setup_(out: str | None) -> int:
     """Write a commented description of a bench, to fill in, to OUT.toml or to standard output."""
@@ -406,7 +406,7 @@ def setup_(out: str | None) -> int:
     return ExitCode.CONVERGED
 
 
-@commands.command()
+@click.command()
 @_bench
 @_setup
 @_speed
@@ -426,6 +426,10 @@ def check(bench: bool, setup_path: str | None, speed: float | None, controller: 
         for line in finding.wrong:
             click.echo(f"  {line}")
     return ExitCode.STOPPED if any(finding.wrong for finding in found) else ExitCode.CONVERGED
+
+
+for _command in (setup_, check, acquire, free_hand, bench):
+    commands.add_command(_command)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -28,7 +28,6 @@ _PLACEMENT_S = 8.0
 """Bench seconds that an image takes, without the way to its pose."""
 _TURN_DEG_S = 30.0
 _FILL = 5
-_MOST_IMAGES = 1000
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from hw.poses import PosePlan, plan_poses
 from hw.recording_check import settings_of
 from hw.setup import Setup
 from jaxcal import InputError
+from jaxcal.calibration.inputs import LARGEST_SEED, whole_number
 from jaxcal.io.readable import naming
 
 MOST_IMAGES = 1000
@@ -63,8 +64,10 @@ class AcquisitionRequest:
             raise InputError(f"with the {self.phantom} placement is {fitting}")
         if self.operator not in OPERATORS:
             raise InputError(f"operator must be one of {', '.join(OPERATORS)}")
-        if not 4 <= self.images <= MOST_IMAGES:
-            raise InputError(f"images must be 4 to {MOST_IMAGES}, not {self.images}")
+        whole_number("images", self.images, 4, MOST_IMAGES)
+        whole_number("seed", self.seed, 0, LARGEST_SEED)
+        if self.bench is not None:
+            whole_number("bench", self.bench, 0, LARGEST_SEED)
 
     @property
     def by_image(self) -> bool:

@@ -42,16 +42,6 @@ def cross_matrix(vector: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3
     return matrix
 
 
-def vector_to_quaternion(vector: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 4"]:
-    """Unit quaternions of rotation vectors (rad)."""
-    vector = np.asarray(vector, dtype=np.float64)
-    angle = np.sqrt(np.sum(vector * vector, axis=-1, keepdims=True))
-    small = angle < _SMALL_ANGLE
-    safe = np.where(small, 1.0, angle)
-    scale = np.where(small, 0.5 - angle**2 / 48.0, np.sin(safe / 2) / safe)
-    return np.concatenate([np.cos(angle / 2), scale * vector], axis=-1)
-
-
 def quaternion_to_vector(quaternion: Float[np.ndarray, "*n 4"]) -> Float[np.ndarray, "*n 3"]:
     """Rotation vectors (rad, at most pi long) of unit quaternions."""
     quaternion = np.asarray(quaternion, dtype=np.float64)

@@ -151,7 +151,7 @@ def test_invalid_rows_are_counted(tmp_path):
     lines = table([*NAMES, "status"], [*COLUMNS, np.ones(6)])
     more = [lines[1].replace(",1.0", ",OUT_OF_VIEW"), "# a comment, not a row"]
     # The last two are what spreadsheets leave of a formula that failed.
-    more += [cell + lines[2][lines[2].index(",") :] for cell in ("nan", "#N/A", "#WERT!")]
+    more += [cell + lines[2][lines[2].index(",") :] for cell in ("nan", "#N/A", "#NAME?")]
     (tmp_path / "t.csv").write_text("\n".join([*lines, *more]))
     with pytest.raises(FormatError, match=r"t\.csv:8: the row is marked as invalid"):
         import_files([tmp_path / "t.csv"])

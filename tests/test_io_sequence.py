@@ -345,7 +345,7 @@ def test_a_bomb_takes_the_memory_of_one_frame(tmp_path):
         ({"transforms": {PROBE: random_poses(2)}}, r"shape \(2, 4, 4\)"),
         ({"images": np.zeros((3, 4, 4))}, "uint8 or int16"),
         ({"path": "a.raw"}, "ends in .mha"),
-        ({"path": "50%.mhd"}, "only LOCAL, or a file beside the header"),
+        ({"path": "50%.mhd"}, r"50%\.mhd: ElementDataFile = '50%\.zraw': only LOCAL"),
         ({"transforms": {PROBE: np.full((3, 4, 4), np.nan)}}, "holds NaN"),
     ],
 )

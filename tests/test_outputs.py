@@ -120,6 +120,12 @@ def test_where_nothing_can_be_written_no_work_begins(folder, arguments, capsys):
     assert "none/out.h5: cannot be written: its folder does not exist" in capsys.readouterr().err
 
 
+def test_an_export_goes_into_the_folder_that_the_report_makes(folder, capsys):
+    arguments = "calibrate missing.h5 --out report --export itk:./report/out.tfm"
+    assert main(arguments.split()) == 2
+    assert "missing.h5: no such file" in capsys.readouterr().err
+
+
 def test_a_simulation_replaces_a_simulation(folder, monkeypatch, capsys):
     known = jaxcal.load("rec.h5")
     truth = Truth(np.eye(4), np.zeros(3), np.zeros(6))

@@ -259,6 +259,12 @@ def test_lists_have_headings_with_room_before_them():
     ]
 
 
+def test_verdict_gives_zero_no_sign(record):
+    points = [point | {"position_mm": [-0.2, 37.0]} for point in record["tre"]["points"]]
+    said = verdict(record | {"tre": record["tre"] | {"points": points}})
+    assert sum("(lateral 0, depth 37 mm)" in line for line in said) == 1
+
+
 def test_verdict_names_outliers_and_out_of_plane_errors(record):
     lines = verdict({**record, "outliers": [3, 7]})
     assert any("Check images 3, 7 (" in line for line in lines)

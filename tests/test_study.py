@@ -160,6 +160,7 @@ def test_bad_specs_are_refused_with_the_field_named(text, message):
             {"prior": "gaussian", "max_elevation": 1.0},
         ),
         ('method = "alternating"\ntolerance_mm = 0', {"tolerance_mm": 0.0}),
+        ('method = "alternating"\ntolerance_mm = nan', {"tolerance_mm": float("nan")}),
         ('method = "joint"\nmax_iterations = 0', {"max_iterations": 0}),
     ],
 )

@@ -19,7 +19,7 @@ from jaxcal import FormatError, InputError
 from jaxcal.calibration.saved import load_calibration
 from jaxcal.calibration.transform import ImageTransform, transform_from_plus_matrix
 from jaxcal.cli.main import main
-from jaxcal.data.poses import quaternion_from_rotation, rotations_from_quaternions
+from jaxcal.data.poses import check_affine, quaternion_from_rotation, rotations_from_quaternions
 from jaxcal.io.itk import itk_from_matrix, itk_text, matrix_from_itk, read_itk, write_itk
 from jaxcal.io.ros import read_ros_yaml
 from jaxcal.io.serving import TransformServer
@@ -200,7 +200,7 @@ def test_ros_is_rigid_and_in_metres(tmp_path):
     assert "--frame-id tool0_Flange --child-frame-id US_Image" in named
     assert "robot_effector_frame: tool0_Flange\n  tracking_base_frame: US_Image\n" in named
     for format, twice in (("ros", ("a", "a")), ("plus", ("image", "Image"))):
-        with pytest.raises(InputError, match="leads from one frame to another"):
+        with pytest.raises(InputError, match=r"another, not from (a to a|Image to Image)"):
             known.text(format, frames=twice)
     # A number without a point would be text in YAML 1.1.
     tiny = ImageTransform(np.eye(4) + np.pad([[1e-2]], ((0, 3), (3, 0))))
@@ -208,6 +208,9 @@ def test_ros_is_rigid_and_in_metres(tmp_path):
     edited = tiny.text("ros").replace("qw: 1.0", "qw: 1.0  # the scalar")
     (tmp_path / "cal.yaml").write_text(edited)
     np.testing.assert_array_equal(read_ros_yaml(tmp_path / "cal.yaml")[:3, 0], [1, 0, 0])
+    (tmp_path / "cal.yaml").write_text(edited.replace("qw: 1.0", "qw: 1.0#"))
+    with pytest.raises(FormatError, match=r"qw is not a number: '1\.0#'"):
+        read_ros_yaml(tmp_path / "cal.yaml")
     # No pixels are needed, unlike everywhere else.
     with pytest.raises(InputError, match="--pixel-size"):
         tiny.plus_matrix()
@@ -379,6 +382,7 @@ def test_pixels_for_a_calibration_in_mm():
         ([[np.nan, 2]], None, "not NaN"),
         ([[1.0, 2]], np.eye(4)[None].repeat(2, 0), "1 pixels but 2 poses"),
         ([[1.0, 2]], np.diag([1.0, 1, -1, 1]), "is a reflection"),
+        ([[1.0, 2]], np.eye(4, dtype=complex), "pose must be an array of real numbers"),
     ],
 )
 def test_apply_refuses(pixels, pose, message):
@@ -444,6 +448,11 @@ def test_json_that_lies(tmp_path, change, message):
 def test_matrices_that_are_no_calibration(matrix, message):
     with pytest.raises(InputError, match=message):
         transform_from_plus_matrix(matrix)
+
+
+def test_a_complex_matrix_is_no_calibration():
+    with pytest.raises(InputError, match="the matrix must be an array of real numbers"):
+        check_affine(np.eye(4, dtype=complex))
 
 
 def test_json_bombs(tmp_path):

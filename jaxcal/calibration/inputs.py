@@ -12,7 +12,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.problem import Problem, stack
 from jaxcal.data.recording import Images, Recording
-from jaxcal.io.readable import quoted
+from jaxcal.io.readable import shown
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -23,11 +23,6 @@ _HOW = (
 )
 
 LARGEST_SEED = 2**63 - 1
-
-
-def shown(value: object) -> str:
-    """What a caller gave, short, for a message."""
-    return quoted(value) if isinstance(value, str) else quoted(repr(value))[1:-1]
 
 
 def whole_number(name: str, value: object, least: int, most: int) -> int:

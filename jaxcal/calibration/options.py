@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import shown, whole_number
+from jaxcal.calibration.inputs import whole_number
 from jaxcal.calibration.names import Data, Method, PriorName, SolverName
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.io.readable import shown
 from jaxcal.model.distributions import SHAPES, UNIFORM, Shape
 from jaxcal.model.unknowns import EXTRA, MEDIUM, RIGID, Blocks
 from jaxcal.runtime.array_types import AnyArray, Array, Float

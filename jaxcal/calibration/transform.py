@@ -222,7 +222,7 @@ class ImageTransform:
         covariance = self._covariance(plane, rotation, scale, own)
         if pose is None:
             return AppliedPoints(points, covariance)
-        given = np.asarray(pose, dtype=np.float64)
+        given = real_array(pose, "pose")
         given = given[None] if given.ndim == 2 else given
         if len(given) not in (1, count):
             raise InputError(f"{count} pixels but {len(given)} poses: one, or as many, are needed")

@@ -183,7 +183,7 @@ def calibrate(
 ) -> int:
     """Calibrate from the recording REC; nobody has to supply a starting guess."""
     inputs = [recording] if test is None else [recording, test]
-    targets = [_export_target(export, inputs) for export in exports]
+    targets = [_export_target(export, inputs, out) for export in exports]
     import_engine()
     from jaxcal.calibration.inputs import unknown_names
     from jaxcal.calibration.options import Options, Request, check_alternation, check_request
@@ -257,7 +257,7 @@ def _prepared(out: str) -> AbstractContextManager[Path]:
     return prepare_folder(out)
 
 
-def _export_target(text: str, inputs: list[str]) -> tuple[SaveFormat, str]:
+def _export_target(text: str, inputs: list[str], out: str | None) -> tuple[SaveFormat, str]:
     from jaxcal.calibration.saved import check_target
     from jaxcal.cli.export import check_configuration
     from jaxcal.io.atomic import check_writable
@@ -273,7 +273,9 @@ def _export_target(text: str, inputs: list[str]) -> tuple[SaveFormat, str]:
         raise InputError(f"--export {text}: there is no such configuration")
     else:
         check_configuration(path, None, inputs)
-    check_writable(path)
+    # The report's folder may not be there yet.
+    if out is None or Path(path).parent != Path(out):
+        check_writable(path)
     return format, path
 
 

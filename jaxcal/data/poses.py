@@ -138,7 +138,7 @@ def check_affine(matrix: np.ndarray) -> Float[np.ndarray, "4 4"]:
     Raises:
         InputError: it is none; one line.
     """
-    matrix = np.array(matrix, dtype=np.float64)
+    matrix = real_array(matrix, "the matrix")
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError("the matrix must be 4 x 4 and finite")
     if np.abs(matrix[3] - _LAST_ROW).max() > _LAST_ROW_TOLERANCE:

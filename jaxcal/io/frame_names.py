@@ -50,7 +50,9 @@ def check_frames(frames: FramePair) -> FramePair:
     """
     source, target = check_frame(frames[0]), check_frame(frames[1])
     if source == target:
-        raise FormatError(f"a transform leads from one frame to another, not from {source} to it")
+        raise FormatError(
+            f"a transform leads from one frame to another, not from {source} to {target}"
+        )
     return source, target
 
 

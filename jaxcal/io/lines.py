@@ -11,8 +11,8 @@ from pathlib import Path
 from jaxcal import FormatError
 from jaxcal.io.readable import check_readable, one_line
 
-# In English and German; everything else that begins with # is a comment.
-_COMMENT = re.compile(r"\s*#(?!(?:N/A|NV|DIV/0!|VALUE!|WERT!|REF!|BEZUG!|NUM!|ZAHL!)[,;\t])")
+# Spreadsheets' errors, in English and German, are #N/A, #NV and words like #NAME? and #DIV/0!.
+_COMMENT = re.compile(r"\s*#(?!(?:N/A|NV|[A-Z/0]+[!?])[,;\t])")
 
 MAXIMUM_BYTES = 64 * 2**20
 """Largest text file that is read."""

@@ -107,7 +107,8 @@ def check_data_name(data: str) -> None:
     """Refuse a name of another folder, a list of files (``LIST 2D``) and a pattern (``f%03d``)."""
     if data.split()[:1] in ([], ["LIST"], ["."], [".."]) or re.search(r"[/\\%:\0\n\r]", data):
         raise FormatError(
-            f"ElementDataFile = {quoted(data)}: only LOCAL, or a file beside the header, is read"
+            f"ElementDataFile = {quoted(data)}: only LOCAL, or a file beside the header, is "
+            "read (no / \\ % or : in its name)"
         )
 
 

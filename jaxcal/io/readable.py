@@ -1,4 +1,4 @@
-"""Checks of a file before it is opened, and ways to quote its content in messages."""
+"""Checks of a file before it is opened; values and contents of files, short, for messages."""
 
 from __future__ import annotations
 
@@ -60,6 +60,11 @@ def one_line(error: Exception) -> str:
 def quoted(text: str, limit: int = 40) -> str:
     """Text of an untrusted file, short and with control characters escaped, for a message."""
     return ascii(text if len(text) <= limit else f"{text[:limit]}...")
+
+
+def shown(value: object) -> str:
+    """What a caller gave, short, for a message."""
+    return quoted(value) if isinstance(value, str) else quoted(repr(value))[1:-1]
 
 
 @contextmanager

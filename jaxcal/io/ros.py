@@ -57,7 +57,9 @@ def static_transform_command(
         InputError: a matrix that is not rigid, or names that ROS does not take.
     """
     if parent == child:
-        raise InputError(f"a transform leads from one frame to another, not from {parent} to it")
+        raise InputError(
+            f"a transform leads from one frame to another, not from {parent} to {child}"
+        )
     stated = " ".join(f"--{key} {value}" for key, value in _seven(matrix).items())
     return (
         f"ros2 run tf2_ros static_transform_publisher {stated} "
@@ -123,7 +125,7 @@ def read_ros_yaml(path: str | os.PathLike[str]) -> Float[np.ndarray, "4 4"]:
     name = os.fspath(path)
     found: dict[str, float] = {}
     for line, content in text_lines(path):
-        match = re.fullmatch(r"\s*(x|y|z|qx|qy|qz|qw):\s*([^\s#]+)\s*(?:\s#.*)?", content)
+        match = re.fullmatch(r"\s*(x|y|z|qx|qy|qz|qw):\s*([^\s#]\S*)\s*(?:\s#.*)?", content)
         if match is None:
             continue
         key, text = match.groups()

@@ -91,7 +91,8 @@ def write_sequence(
         _put(path, "\n".join([*head, *lines, "ElementDataFile = LOCAL", ""]).encode() + packed)
         return
     data = Path(name).with_suffix(".zraw" if compressed else ".raw")
-    check_data_name(data.name)
+    with naming(path):
+        check_data_name(data.name)
     # The pixels first: a header without them would be half a recording.
     _put(data, packed)
     _put(path, "\n".join([*head, *lines, f"ElementDataFile = {data.name}", ""]).encode())

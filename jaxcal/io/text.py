@@ -301,7 +301,7 @@ def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list
         if columns.valid is not None and not _is_valid(table, row, columns.valid):
             why = f"the row is marked as invalid ({quoted(cells[columns.valid])})"
         elif missing is not None:
-            why = f"{table.column(missing)} is {cells[missing] or 'empty'}"
+            why = f"{table.column(missing)} is {quoted(cells[missing])[1:-1] or 'empty'}"
         else:
             kept.append(row)
             continue

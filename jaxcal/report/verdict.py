@@ -122,9 +122,9 @@ def where(record: dict[str, Any]) -> list[str]:
 
 
 def _place(point: dict[str, Any]) -> str:
-    lateral, axial = point["position_mm"]
+    lateral, axial = map(round, point["position_mm"])
     words = {"middle": "the middle"}.get(point["name"], f"the {point['name']} corner")
-    return f"{words} (lateral {lateral:.0f}, depth {axial:.0f} mm)"
+    return f"{words} (lateral {lateral}, depth {axial} mm)"
 
 
 def limits(record: dict[str, Any]) -> list[str]:

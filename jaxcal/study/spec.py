@@ -60,7 +60,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import shown, whole_number
+from jaxcal.calibration.inputs import whole_number
 from jaxcal.calibration.names import Method, PriorName
 from jaxcal.calibration.options import (
     ALTERNATION,
@@ -72,7 +72,7 @@ from jaxcal.calibration.options import (
     check_request,
 )
 from jaxcal.data.probe import LinearProbe
-from jaxcal.io.readable import naming, quoted
+from jaxcal.io.readable import naming, quoted, shown
 from jaxcal.io.toml import load_toml, parse_toml
 from jaxcal.study.laws import OffsetLaw, check_law
 from jaxcal.study.own import ArraySpec
@@ -441,7 +441,7 @@ def _number(name: str, value: object, least: float, most: float, *, above: bool 
 
 def _float(value: int | float) -> float:
     """A number of the file; 1 and 1.0, and -0.0 and 0, are one."""
-    return float(value) + 0.0 if abs(value) < 2**1000 else math.inf
+    return math.inf if abs(value) >= 2**1000 else float(value) + 0.0
 
 
 def _axes(

@@ -29,9 +29,10 @@ from hw.emulated import BenchOracle, setup_of, start
 from hw.errors import RefusedError
 from hw.keys import Pause
 from hw.outcome import share_inside
-from hw.request import AcquisitionRequest
+from hw.request import AcquisitionRequest, request_in
 from hw.resuming import check_same_robot
 from hw.robot.safety import MotionPlan, confirm_unattended
+from jaxcal import InputError
 from jaxcal.cli.main import main
 
 IMAGES = 5
@@ -330,6 +331,18 @@ def test_a_resumed_run_needs_the_same_robot():
         check_same_robot(before, "a", [*offset[:2], 0.121, *offset[3:]])
     with pytest.raises(RefusedError, match="does not say"):
         check_same_robot({"serial_number": "a", "tcp_offset": [0.0]}, "a", offset)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        None, {"unknown": 1}, {"images": "x"}, {"images": 10.5}, {"seed": -1}, {"bench": "x"},
+        {"bench": 1.5}, {"phantom": ["x"]}, {"operator": 1}, {"until_tre_mm": "x"},
+    ],
+)  # fmt: skip
+def test_a_request_in_a_file_is_not_trusted(asked):
+    with pytest.raises(InputError):
+        request_in({"request": asked})
 
 
 def viewers(parent: int) -> list[int]:
