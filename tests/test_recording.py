@@ -4,6 +4,7 @@ import copy
 import subprocess
 import sys
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -34,6 +35,14 @@ def test_rows_above_the_image_are_refused():
         jaxcal.make_images(
             given["poses"], changed, "pixel", spacing_mm=(0.12, 0.1), face_offset_mm=-1.5
         )
+
+
+def test_numbers_of_jax_that_numpy_does_not_know_are_numbers():
+    given = arrays()
+    coarse = jnp.asarray(given["measurements"], jnp.bfloat16)
+    images = jaxcal.make_images(given["poses"], coarse, "point")
+    assert images.measurements.dtype == np.float64
+    np.testing.assert_array_equal(images.measurements, np.asarray(coarse, float))
 
 
 def test_recordings_can_be_compared_and_kept_in_sets():

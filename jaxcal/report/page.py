@@ -36,11 +36,11 @@ from jaxcal.report.verdict import (
     advice,
     believe,
     certainty,
-    contradictions,
     headline,
     limits,
     scatter,
     where,
+    why_larger,
 )
 from jaxcal.runtime.array_types import Float
 
@@ -201,7 +201,7 @@ def _head(record: dict[str, Any]) -> str:
     prior = "" if record["prior"] == "none" else f", prior {record['prior']}"
     said = [headline(record)]
     if _usable(record):
-        said += [*contradictions(record), *where(record)]
+        said += [*why_larger(record), *where(record)]
         said += [*listed("What limits it", limits(record)), *scatter(record)]
     return (
         f"<header><h1>Calibration of {escape(Path(record['source']).name)}</h1>"

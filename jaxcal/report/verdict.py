@@ -44,7 +44,7 @@ def verdict(record: dict[str, Any]) -> list[str]:
     usable = record["status"] in ("converged", "max_iterations")
     usable = usable and not record.get("wrong_frames")
     if usable:
-        lines += [*contradictions(record), *where(record)]
+        lines += [*why_larger(record), *where(record)]
     further = [text for text in record["warnings"] if text not in lines[0]]
     lines += [*listed("Look at this", further), *listed("What to do", advice(record))]
     if usable:
@@ -87,7 +87,7 @@ def _mm(value: float | None) -> str:
     return f"{value:.{1 if value >= 10 else digits}f} mm"
 
 
-def contradictions(record: dict[str, Any]) -> list[str]:
+def why_larger(record: dict[str, Any]) -> list[str]:
     """Why the error is larger than the covariance states."""
     tre = record.get("tre")
     if tre is None or not tre.get("contradictions"):

@@ -35,7 +35,9 @@ def real_array(value: Any, name: str) -> np.ndarray:
         raise InputError(f"{name} must not hold masked entries: leave those rows out (mask=)")
     try:
         given = np.asarray(value)
-        if given.dtype.kind in "iufO":
+        # bfloat16 and its like are of numpy's kind V.
+        other = given.dtype.kind == "V" and np.can_cast(given.dtype, np.float64)
+        if given.dtype.kind in "iufO" or other:
             return np.array(given, np.float64)
     except (TypeError, ValueError, OverflowError):
         pass
