@@ -551,13 +551,7 @@ class Mover:
             # Input is read while braking, so a stop for good may replace a hesitation.
             told = self._stop
             self._tell("stopping", kind=type(told.error).__name__, text=told.error.args[0])
-            try:
-                self._brake()
-            except _Ended as ended:
-                text = f"{told.error.args[0]}; {ended.cause.args[0]}"
-                # A real stop stays one, whatever comes after it.
-                kind = StoppedError if isinstance(told.error, StoppedError) else type(ended.cause)
-                raise _Ended(kind(text, device="robot")) from None
+            self._brake()
         assert told is not None
         if told.for_good:
             if self._usable():
@@ -664,8 +658,13 @@ class Mover:
 
     def end(self, error: DeviceError) -> NoReturn:
         """Report why, and exit at once, so that ur_rtde can neither reconnect nor wait."""
-        text = error.args[0] + self._end_paused()
-        self._tell("error", kind=type(error).__name__, text=text, ended=True)
+        text, kind, stop = error.args[0], type(error), self._stop
+        if stop is not None and stop.error is not error:
+            text = f"{stop.error.args[0]}; {text}"
+            # A stop for good stays one, whatever comes after it.
+            if stop.for_good and kind is not StoppedError:
+                kind = type(stop.error)
+        self._tell("error", kind=kind.__name__, text=text + self._end_paused(), ended=True)
         os._exit(1)
 
     def _tell(self, what: str, **values: object) -> None:

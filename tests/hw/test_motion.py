@@ -22,7 +22,7 @@ from robots import CB_SERIES, E_SERIES, START, EmulatedRobot
 
 import hw
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
-from hw.robot.identity import read_identity
+from hw.robot.identity import read_identity, stop_program
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.pose import ur_to_pose
@@ -430,6 +430,19 @@ def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(dashboard):
             time.sleep(0.2)
             assert robot.state()["raw"] == stood
         with pytest.raises(RefusedError, match="confirm the plan again"):
+            motion.move_to(HOME)
+
+
+def test_a_stop_is_told_though_the_program_ended_at_the_same_moment():
+    with EmulatedRobot() as robot, moving(robot) as motion:
+        assert motion._process is not None
+        # What comes while it is held up, it sees at once.
+        os.kill(motion._process.pid, signal.SIGSTOP)
+        robot.set_payload(2.0)
+        assert stop_program(robot.host, timeout_s=2.0)
+        os.kill(motion._process.pid, signal.SIGCONT)
+        time.sleep(0.3)
+        with pytest.raises(RefusedError, match=r"payload is 2\.0 kg"):
             motion.move_to(HOME)
 
 
