@@ -235,6 +235,28 @@ def test_every_fault_stops_the_robot_and_the_run_is_resumed(tmp_path, name):
 
 
 @pytest.mark.slow
+def test_ctrl_c_pressed_many_times_still_tells_how_to_resume(tmp_path):
+    path = tmp_path / "rec.h5"
+    code = "import sys; from hw.cli import main; sys.exit(main())"
+    arguments = ["acquire", str(path), "--bench", "--images", "30", "--placement", "none"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("image 2/"):
+            break
+    for _ in range(12):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.02)
+    told = process.communicate(timeout=60.0)[1].splitlines()
+    assert told[-1].startswith("jaxcal-hw: error: interrupted; ")
+    assert told[-1].endswith(f"jaxcal-hw acquire {path} --resume --bench")
+    wait_until_closed(path)
+    assert len(taken(path)) >= 2
+
+
+@pytest.mark.slow
 def test_killed_and_resumed(tmp_path, capfd):
     path = tmp_path / "rec.h5"
     code = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
