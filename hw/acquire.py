@@ -148,34 +148,39 @@ def acquire(
     say(f"plan: {job.images} poses{pool}, {job.to_take} to go; compiling the estimate")
     estimator.warm_up(job.targets[: job.images])
     recorder = open_recorder(path, job)
-    with _closing(recorder):
-        try:
-            return _run(
-                job,
-                recorder,
-                estimator,
-                confirm,
-                say,
-                oracle,
-                operator,
-                pause,
-                watch,
-                Nobody() if view is None else view,
-            )
-        except KeyboardInterrupt:
-            reason, interrupted, by_itself = "interrupted", True, False
-        except (DeviceError, CalibrationError) as error:
-            reason, interrupted = str(error), False
-            # A stream that hesitated or a watchdog that tripped: a person would only try again.
-            by_itself = isinstance(error, StaleError | LostError)
-        # Motion has ended by now: no process of ours moves the robot any more.
-        with suppress(CalibrationError):
-            recorder.add_event("stopped", reason, setup.clock.now())
-            if job.progress is not None and job.progress.ended:
-                # It was complete before this run, and stays so.
-                if oracle is not None:
-                    _write_truth(recorder, oracle)
-                _finish(recorder, job.images - estimator.count)
+    reason, interrupted, by_itself = "interrupted", False, False
+    try:
+        with _closing(recorder):
+            try:
+                return _run(
+                    job,
+                    recorder,
+                    estimator,
+                    confirm,
+                    say,
+                    oracle,
+                    operator,
+                    pause,
+                    watch,
+                    Nobody() if view is None else view,
+                )
+            except KeyboardInterrupt:
+                interrupted = True
+            except (DeviceError, CalibrationError) as error:
+                reason = str(error)
+                # A stream that hesitated or a watchdog that tripped: a person would only try again.
+                by_itself = isinstance(error, StaleError | LostError)
+            # Motion has ended by now: no process of ours moves the robot any more.
+            with suppress(CalibrationError):
+                recorder.add_event("stopped", reason, setup.clock.now())
+                if job.progress is not None and job.progress.ended:
+                    # It was complete before this run, and stays so.
+                    if oracle is not None:
+                        _write_truth(recorder, oracle)
+                    _finish(recorder, job.images - estimator.count)
+    except KeyboardInterrupt:
+        # Ctrl-C once more, while everything was being closed: the pipe's end stops the robot.
+        interrupted, by_itself = True, False
     if recorder.error is not None and not interrupted:
         # The recorder's failure is the cause of what went wrong.
         reason = str(recorder.error)

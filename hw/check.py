@@ -11,7 +11,8 @@ import numpy as np
 from hw.active_echo.device import ActiveEcho
 from hw.errors import DeviceError
 from hw.extras import missing
-from hw.robot.rtde import safety_text
+from hw.robot.identity import LOCAL
+from hw.robot.rtde import state_text
 from hw.robot.stream import PoseStream
 from hw.setup import Setup
 from hw.ultrasound.receiver import UltrasoundStream
@@ -66,11 +67,11 @@ def _robot(setup: Setup, seconds: float) -> Finding:
         samples = stream.drain()
         times = np.array([sample.t_device for sample in samples])
         rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
-        trouble = safety_text(steady.sample.safety_bits)
+        trouble = state_text(steady.sample.robot_mode, steady.sample.safety_bits)
         if trouble:
-            wrong.append(f"it is in {trouble}: look at the pendant (this is never unlocked here)")
-        if steady.sample.robot_mode != 7:
-            wrong.append(f"it is not running (robot mode {steady.sample.robot_mode}): start it")
+            wrong.append(trouble)
+        if identity.remote is False:
+            wrong.append(LOCAL)
         gaps = np.diff(times)
         if len(gaps) and gaps.max() > 5 * np.median(gaps):
             wrong.append(f"poses stopped for {gaps.max():.2f} s: look at the network")

@@ -16,6 +16,7 @@ from hw.recording_file import RecordingWriter
 from hw.recording_layout import RecordingHeader
 from hw.request import AcquisitionRequest, planned, request_in
 from hw.resuming import check_same_robot, compare, described, described_probe
+from hw.robot.identity import LOCAL
 from hw.robot.safety import MotionPlan
 from hw.session import Session
 from hw.setup import Setup, controller_arm
@@ -101,6 +102,8 @@ def motion_plan(job: Job, session: Session) -> MotionPlan:
         RefusedError: another robot, or a controller that does not tell what must be confirmed.
     """
     identity = session.poses.identity()
+    if identity.remote is False:
+        raise RefusedError(LOCAL, device="robot")
     offset = session.poses.tcp_offset or job.setup.tcp_offset
     if offset is None:
         raise RefusedError(

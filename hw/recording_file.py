@@ -468,7 +468,7 @@ def _open_for_writing(path: Path) -> h5py.File:
         cache.evictions_enabled = False
         file.id.set_mdc_config(cache)
     except BlockingIOError:
-        raise OutputError(f"{path}: is being written by another program") from None
+        raise OutputError(f"{path}: is open in another program: close it there") from None
     except OSError as error:
         raise OutputError(f"{path}: cannot be opened for writing: {one_line(error)}") from None
     return file

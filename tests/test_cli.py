@@ -17,6 +17,7 @@ import pytest
 
 import jaxcal
 from hw.cli import commands as bench_commands
+from hw.errors import DeviceError
 from jaxcal.cli import cache, common, demo
 from jaxcal.cli.main import commands, main
 from jaxcal.data.recording import Recording, make_images
@@ -486,6 +487,18 @@ def test_ctrl_c_is_one_line(capfd, monkeypatch):
     monkeypatch.setattr(demo, "import_engine", interrupt)
     assert main(["demo"]) == 130
     assert capfd.readouterr() == ("", "jaxcal: interrupted\n")
+
+
+def test_a_further_ctrl_c_does_not_hide_what_was_to_be_told(capfd, monkeypatch):
+    def fail():
+        try:
+            raise DeviceError("interrupted; resume it", device="robot")
+        finally:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo, "import_engine", fail)
+    assert main(["demo"]) == 130
+    assert capfd.readouterr() == ("", "jaxcal: error: robot: interrupted; resume it\n")
 
 
 def test_ctrl_c_while_importing_leaves_at_once():

@@ -249,6 +249,8 @@ class Assembly:
             "drop": lambda: robot().drop(),
             "protective_stop": lambda: robot().protective_stop(),
             "unlock": lambda: robot().unlock(),
+            "robot_state": lambda robot_mode, safety_mode: robot().enter(robot_mode, safety_mode),
+            "remote": lambda on: robot().ask("set_remote", bool(on)),
             "payload": lambda mass_kg: robot().set_payload(float(mass_kg)),
             "speed_slider": lambda fraction: robot().set_speed_slider(float(fraction)),
             "tcp_offset": lambda offset: robot().set_tcp_offset(tuple(map(float, offset))),

@@ -17,8 +17,11 @@ READY, DONE = 1, 2
 STOPPED, PLAYING, PAUSED = 1, 2, 4
 """Values of runtime_state."""
 
-NORMAL_BIT, PROTECTIVE_BIT = 1 << 0, 1 << 2
-"""Bits of safety_status_bits."""
+NORMAL, REDUCED, PROTECTIVE, SAFEGUARD, SYSTEM_EMERGENCY, ROBOT_EMERGENCY = 1, 2, 3, 5, 6, 7
+"""Values of safety_mode; further ones: 4 recovery, 8 violation, 9 fault."""
+POWER_OFF, RUNNING = 3, 7
+"""Values of robot_mode; further ones: 2 booting, 4 power on, 5 idle (brakes on), 6 backdrive."""
+_POWERED = frozenset({4, 5, 6, RUNNING})
 
 _REAL_TIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71})
 _START_S = 0.05
@@ -60,7 +63,12 @@ class Controller:
     int_out: list[int] = field(default_factory=lambda: [0] * 48)
     double_out: list[float] = field(default_factory=lambda: [0.0] * 48)
     running: bool = False
-    protective: bool = False
+    robot_mode: int = RUNNING
+    safety_mode: int = NORMAL
+    remote: bool = True
+    """Whether scripts are taken (e-Series: remote control; in local control none are)."""
+    foreign: bool = False
+    """Whether the program that runs is another than ur_rtde's, which answers no registers."""
     log: list[tuple[float, int, tuple[float, ...]]] = field(default_factory=list)
     """Commands taken: bench time, code, double registers 0-8. The last 10,000."""
     reason: str = ""
@@ -73,6 +81,7 @@ class Controller:
     """Called when a program stops: the reason, and whether it is a fault of the program."""
 
     _starts: float | None = None
+    _paused_move: tuple[list[float], float, float] | None = None
     _latched: bool = False
     _waits_for: float | None = None
     _finishes: float | None = None
@@ -84,22 +93,59 @@ class Controller:
     @property
     def runtime_state(self) -> int:
         """1 stopped, 2 playing, 4 paused."""
-        if self.protective:
+        if self.safety_mode in (PROTECTIVE, SAFEGUARD):
             return PAUSED
         return PLAYING if self.running else STOPPED
 
     @property
+    def fit(self) -> bool:
+        """Whether the arm may move: brakes released, and no safety stop."""
+        return self.robot_mode == RUNNING and self.safety_mode in (NORMAL, REDUCED)
+
+    @property
     def robot_status_bits(self) -> int:
         """Bit 0 power, bit 1 program running."""
-        return 1 | (2 if self.running else 0)
+        return int(self.robot_mode in _POWERED) | (2 if self.running else 0)
 
     @property
     def safety_status_bits(self) -> int:
-        """Bit 0 normal, bit 2 protective stop."""
-        return PROTECTIVE_BIT if self.protective else NORMAL_BIT
+        """Bit k - 1 for safety_mode k up to robot emergency stop, bit k for 8 and 9.
+
+        Besides: bit 7 in both emergency stops, bit 10 in every stop.
+        """
+        if self.safety_mode in (NORMAL, REDUCED):
+            return 1 << (self.safety_mode - 1)
+        if self.safety_mode > ROBOT_EMERGENCY:
+            return 1 << self.safety_mode | 1 << 10
+        emergency = self.safety_mode in (SYSTEM_EMERGENCY, ROBOT_EMERGENCY)
+        return 1 << (self.safety_mode - 1) | (1 << 7 if emergency else 0) | 1 << 10
+
+    def enter(self, t: float, robot_mode: int, safety_mode: int) -> None:
+        """Another state of the robot: what a person does at the pendant, a gate, or a fault does.
+
+        A safeguard stop only pauses the program: without a reset input, the program goes on by
+        itself when the stop is released. Every other state in which the robot may not move ends it.
+        """
+        resumes = self.safety_mode == SAFEGUARD and self.running
+        self.robot_mode, self.safety_mode = robot_mode, safety_mode
+        if safety_mode == SAFEGUARD and self.running:
+            if self._finishes is not None:
+                self._paused_move = (self.double_in[:6], self.double_in[6], self.double_in[7])
+            self._finishes = None
+            self.arm.stop(t)
+        elif not self.fit:
+            self.halt(t, f"robot mode {robot_mode}, safety mode {safety_mode}")
+        elif resumes:
+            self._kicked = t
+            if self._paused_move is not None:
+                pose, speed, acceleration = self._paused_move
+                self._finishes = self.arm.move_linear(t, pose, speed, acceleration)
+                self._paused_move = None
 
     def upload(self, t: float) -> None:
-        """A script has come: it replaces the one that runs."""
+        """A script has come: it replaces the one that runs, if the robot takes scripts now."""
+        if not (self.remote and self.fit):
+            return
         self.halt(t, "another script was sent")
         self._starts = t + _START_S
 
@@ -108,6 +154,7 @@ class Controller:
         ran, self.running = self.running, False
         self._latched = False
         self._waits_for = self._finishes = self._watchdog_s = self._starts = None
+        self._paused_move = None
         self.arm.stop(t)
         if ran:
             self.reason = reason
@@ -115,7 +162,7 @@ class Controller:
 
     def protect(self, t: float, reason: str = "protective stop") -> None:
         """A protective stop."""
-        self.protective = True
+        self.safety_mode = PROTECTIVE
         self.halt(t, reason)
 
     def kick(self, t: float) -> None:
@@ -124,13 +171,13 @@ class Controller:
 
     def step(self, t: float) -> None:
         """Do what the program would do by bench time t."""
-        if self._starts is not None and t >= self._starts and not self.protective:
+        if self._starts is not None and t >= self._starts:
             self._start(t)
-        if not self.protective and self.arm.at_its_end(t):
+        if self.fit and self.arm.at_its_end(t):
             # A real controller stops too: for a fast joint, a singularity, the end of the reach.
             self.protect(t, "protective stop: the arm cannot follow the path")
             return
-        if not self.running:
+        if not self.running or self.foreign or not self.fit:
             return
         if self._watchdog_s is not None and t - self._kicked > self._watchdog_s:
             self.halt(t, f"watchdog: nothing written for {t - self._kicked:.3f} s")
@@ -158,6 +205,7 @@ class Controller:
     def _start(self, t: float) -> None:
         self._starts = None
         self.running, self._latched, self._kicked = True, False, t
+        self.foreign = False
         self._operation = self._writes = 0
         self.int_in[0] = 0
         self.int_out[0] = READY

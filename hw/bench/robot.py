@@ -130,6 +130,10 @@ class RobotProcess:
         """What a person does at the pendant after a protective stop."""
         self.ask("unlock")
 
+    def enter(self, robot_mode: int, safety_mode: int) -> None:
+        """As :meth:`hw.bench.rtde.RtdeServer.enter`."""
+        self.ask("enter", robot_mode, safety_mode)
+
     def set_tcp_offset(self, offset: Sequence[float]) -> None:
         """What a person does at the pendant: another tool (m, rad)."""
         self.ask("set_tcp_offset", tuple(offset))
@@ -242,7 +246,7 @@ def _state(robot: RtdeServer) -> dict:
         "packets": robot.packets,
         "late": robot.late,
         "skipped": robot.skipped,
-        "unlocks": robot.unlock_requests,
+        "dashboard": robot.asked,
     }
 
 
@@ -262,6 +266,10 @@ def _do(robot: RtdeServer, name: str, values: list) -> dict:
             | "set_tcp_offset"
             | "set_payload"
             | "set_speed_slider"
+            | "enter"
+            | "set_remote"
+            | "play"
+            | "spoil_dashboard"
         ):
             getattr(robot, name)(*values)
         case _:

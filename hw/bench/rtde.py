@@ -31,7 +31,7 @@ import threading
 from collections.abc import Callable
 
 from hw.bench.arm import Arm
-from hw.bench.controller import Controller
+from hw.bench.controller import NORMAL, Controller
 from hw.bench.rtde_fields import INPUTS, OUTPUTS, STRUCT, output_type
 from hw.clock import REAL, Clock
 from hw.robot._process import ANSWERS, be_prompt
@@ -50,6 +50,15 @@ DASHBOARD, PRIMARY, SCRIPT, RTDE = DASHBOARD_PORT, PRIMARY_PORT, 30003, 30004
 _MAX_WAITING = 1 << 16
 """Bytes that may wait for a client that does not read; further packets for it are dropped."""
 _ROBOT_MESSAGE = 20
+_ROBOT_MODES = (
+    *("DISCONNECTED", "CONFIRM_SAFETY", "BOOTING", "POWER_OFF"),
+    *("POWER_ON", "IDLE", "BACKDRIVE", "RUNNING"),
+)
+_SAFETY_MODES = (
+    *("NORMAL", "NORMAL", "REDUCED", "PROTECTIVE_STOP", "RECOVERY", "SAFEGUARD_STOP"),
+    *("SYSTEM_EMERGENCY_STOP", "ROBOT_EMERGENCY_STOP", "VIOLATION", "FAULT"),
+)
+"""The dashboard's words for robot_mode and safety_mode."""
 _LATE_S = 1.0
 _MAX_INPUT = 1 << 20
 """Bytes that a client may send without completing a message or script."""
@@ -103,7 +112,9 @@ class RtdeServer:
         nominal = frequency_hz or (500.0 if version[0] >= 5 else 125.0)
         self.frequency_hz = min(nominal, max_rate_hz / clock.speed)
         self.controller = Controller(arm, told=self._say_why)
-        self.unlock_requests = 0
+        self.asked: list[str] = []
+        """Every line that the dashboard was sent."""
+        self._dashboard_says: str | None = None
         self.packets = 0
         self.skipped = 0
         self.late = 0
@@ -198,7 +209,36 @@ class RtdeServer:
         """What a person does at the pendant after a protective stop."""
 
         def act() -> None:
-            self.controller.protective = False
+            self.controller.safety_mode = NORMAL
+
+        self._call(act)
+
+    def enter(self, robot_mode: int, safety_mode: int) -> None:
+        """The robot enters these modes; see :meth:`hw.bench.controller.Controller.enter`."""
+        self._call(lambda: self.controller.enter(self.clock.now(), robot_mode, safety_mode))
+
+    def set_remote(self, on: bool) -> None:
+        """What a person does at the pendant of an e-Series: remote or local control."""
+
+        def act() -> None:
+            self.controller.remote = on
+
+        self._call(act)
+
+    def play(self) -> None:
+        """What a person does at the pendant: another program runs from now on."""
+
+        def act() -> None:
+            self.controller.halt(self.clock.now(), "another program was started")
+            self.controller.running = self.controller.foreign = True
+
+        self._call(act)
+
+    def spoil_dashboard(self, answer: str | None) -> None:
+        """The dashboard answers with this text, with "" not at all, with None as usual."""
+
+        def act() -> None:
+            self._dashboard_says = answer
 
         self._call(act)
 
@@ -375,8 +415,8 @@ class RtdeServer:
             "target_TCP_speed": velocity,
             "actual_TCP_force": arm.force,
             "tcp_offset": arm.tcp_offset,
-            "robot_mode": 7,
-            "safety_mode": 3 if program.protective else 1,
+            "robot_mode": program.robot_mode,
+            "safety_mode": program.safety_mode,
             "runtime_state": program.runtime_state,
             "robot_status_bits": program.robot_status_bits,
             "safety_status_bits": program.safety_status_bits,
@@ -532,6 +572,11 @@ class RtdeServer:
         while (end := data.find(b"\n")) >= 0 and connection in self._connections:
             line = bytes(data[:end]).decode("ascii", "replace").strip()
             del data[: end + 1]
+            self.asked.append(line)
+            if self._dashboard_says is not None:
+                if self._dashboard_says:
+                    self._send(connection, (self._dashboard_says + "\n").encode())
+                continue
             if line.lower() == "quit":
                 self._send(connection, b"Disconnected\n")
                 self._forget(connection)
@@ -550,13 +595,13 @@ class RtdeServer:
                 model = self.arm.model
                 return "UR5" if model is None else model.name.removesuffix("e")
             case "is in remote control" if self._since(None, (5, 6)):
-                return "true"
+                return "true" if program.remote else "false"
             case "robotmode":
-                return "Robotmode: RUNNING"
+                return f"Robotmode: {_ROBOT_MODES[program.robot_mode]}"
             case "safetystatus" if self._since(None, (5, 4)):
-                return f"Safetystatus: {'PROTECTIVE_STOP' if program.protective else 'NORMAL'}"
+                return f"Safetystatus: {_SAFETY_MODES[program.safety_mode]}"
             case "safetymode":
-                return f"Safetymode: {'PROTECTIVE_STOP' if program.protective else 'NORMAL'}"
+                return f"Safetymode: {_SAFETY_MODES[program.safety_mode]}"
             case "programstate":
                 return f"{'PLAYING' if program.running else 'STOPPED'} rtde_control"
             case "running":
@@ -565,7 +610,6 @@ class RtdeServer:
                 program.halt(self.clock.now(), "the dashboard stopped it")
                 return "Stopped"
             case "unlock protective stop":
-                self.unlock_requests += 1
                 return "Protective stop releasing"
             case _:
                 return f"could not understand: '{line}'"

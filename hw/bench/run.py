@@ -83,7 +83,8 @@ class Bench:
         """Cause a fault; returns the bench time at which it was in force.
 
         Args:
-            name: mute, drop, protective_stop, unlock, tcp_offset (offset), payload
+            name: mute, drop, protective_stop, unlock, robot_state (robot_mode, safety_mode),
+                remote (on), tcp_offset (offset), payload
                 (mass_kg), speed_slider (fraction), crc_errors (rate),
                 miss_triggers (rate), miss_lines (rate), echo_stale, echo_mute, unplug, replug,
                 image_stale, image_freeze, image_drop or image_corrupt (rate).

@@ -54,9 +54,17 @@ from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedE
 from hw.extras import require
 from hw.rigid import turn_deg
 from hw.robot._process import ASKS, RECEIVES, be_prompt
-from hw.robot.identity import read_identity
+from hw.robot.identity import LOCAL, read_identity, stop_program
 from hw.robot.limits import Limits, numbers
-from hw.robot.rtde import Packet, PacketReader, PendantSettings, safety_text, too_late
+from hw.robot.rtde import (
+    PROGRAM_RUNS,
+    Packet,
+    PacketReader,
+    PendantSettings,
+    safety_text,
+    state_text,
+    too_late,
+)
 from hw.robot.safety import (
     Command,
     Confirmation,
@@ -83,12 +91,13 @@ _STOP_AGAIN_S = 0.05
 _STOP_PATIENCE_S = 2.0
 _END_S = 5.0
 """Longest time for the end of the script and of the connection."""
+_DASHBOARD_S = 0.3
+"""Longest wait (wall s) for the dashboard; the caller waits for the end of this process."""
 _CAUSE_S = 0.1
 """The poses tell of a safety stop by so much later than the controller's program ends."""
 _ARRIVED_MM, _ARRIVED_DEG = 0.2, 0.1
 _REST_MM_S = 0.2
 _LEAST_PATIENCE_S = 3.0
-_PROGRAM_RUNS = 0b10
 _BOX_MARGIN_MM = 1.0
 _RECONNECTS = ("econnect", "Lost connection", "Could not receive", "closed the connection")
 
@@ -175,7 +184,8 @@ class Mover:
     def start(self) -> None:
         """Connect; the caller waits for the line ``ready``."""
         check_plan(self._plan)
-        self._serial = read_identity(self._host).name
+        identity = read_identity(self._host)
+        self._serial = identity.name
         self._reader = PacketReader(self._host)
         asked_s, stamp_s = self._reader.bound
         if math.isfinite(asked_s):
@@ -189,6 +199,7 @@ class Mover:
             self._tell("ready", serial=self._serial, tcp_offset=self._offset)
             return
         self._gate.check_start(self._serial, self._offset or self._plan.tcp_offset, self._pendant)
+        self._check_robot(identity.remote)
         module = require("rtde_control", extra="robot")
         self._log("connect", host=self._host, serial=self._serial)
         try:
@@ -196,7 +207,7 @@ class Mover:
             be_prompt(RECEIVES)
             self._control = module.RTDEControlInterface(self._host)
         except RuntimeError as error:
-            raise LostError(f"ur_rtde: {error}", device="robot") from None
+            raise LostError(_said(error), device="robot") from None
         finally:
             be_prompt(ASKS)
         self._command("setWatchdog", IDLE_WATCHDOG_HZ)
@@ -207,13 +218,27 @@ class Mover:
         self._wait_for_packet(running=True)
         self._tell("ready", serial=self._serial, tcp_offset=self._offset)
 
+    def _check_robot(self, remote: bool | None) -> None:
+        """Whether the robot can take a program now: ur_rtde would stop whatever runs, unasked."""
+        assert self._packet is not None
+        problem = LOCAL if remote is False else ""
+        problem = problem or state_text(self._packet.robot_mode, self._packet.safety_bits)
+        # The program of a connection that was lost ends by its watchdog.
+        give_up = self._clock.now() + self._clock.patience(1.1 / IDLE_WATCHDOG_HZ)
+        while not problem and self._packet.program:
+            if self._clock.now() > give_up:
+                problem = "a program runs on the robot, or is paused: stop it at the pendant"
+            self._read(self._clock.wall(0.01))
+        if problem:
+            raise RefusedError(problem, device="robot")
+
     def _wait_for_packet(self, *, running: bool = False) -> None:
         give_up = self._clock.now() + 2.0 + self._clock.speed
         while self._clock.now() < give_up:
             self._read(self._clock.wall(0.01))
             self._kick()
             packet = self._packet
-            if packet is not None and (not running or packet.status_bits & _PROGRAM_RUNS):
+            if packet is not None and (not running or packet.status_bits & PROGRAM_RUNS):
                 return
         raise LostError("the controller sends no poses, or runs no program", device="robot")
 
@@ -225,6 +250,7 @@ class Mover:
             self._end_script()
             self._log("disconnect")
             self._control.disconnect()
+        self._end_paused()
 
     def _end_script(self) -> None:
         self._log("kickWatchdog", times=self._kicks)
@@ -232,6 +258,24 @@ class Mover:
         # is gone, too. The robot rests by now.
         _end_within(_END_S)
         self._command("stopScript")
+
+    def _end_paused(self) -> str:
+        """End a program that a safety stop has paused: it might go on when the stop is released.
+
+        A paused program reads no commands, so the dashboard is asked.
+
+        Returns:
+            What a person must do if it could not be ended.
+        """
+        packet = self._packet
+        if self._control is None or packet is None or not packet.program:
+            return ""
+        if not safety_text(packet.safety_bits):
+            return ""
+        self._log("dashboard: stop")
+        if stop_program(self._host, timeout_s=_DASHBOARD_S):
+            return ""
+        return "; the program may be paused: stop it at the pendant before you reset the robot"
 
     # The loop
 
@@ -467,10 +511,10 @@ class Mover:
         packet, sample = self._packet, self._sample
         if packet is None or sample is None or self._control is None:
             return None
-        stopped = _safety_stop(packet)
+        stopped = _unfit(packet)
         if stopped is not None:
             return stopped, True
-        if not packet.status_bits & _PROGRAM_RUNS:
+        if not packet.status_bits & PROGRAM_RUNS:
             return self._program_stopped(), True
         if not self._control.isConnected():
             return self._lost("the control connection is gone"), True
@@ -507,13 +551,7 @@ class Mover:
             # Input is read while braking, so a stop for good may replace a hesitation.
             told = self._stop
             self._tell("stopping", kind=type(told.error).__name__, text=told.error.args[0])
-            try:
-                self._brake()
-            except _Ended as ended:
-                text = f"{told.error.args[0]}; {ended.cause.args[0]}"
-                # A real stop stays one, whatever comes after it.
-                kind = StoppedError if isinstance(told.error, StoppedError) else type(ended.cause)
-                raise _Ended(kind(text, device="robot")) from None
+            self._brake()
         assert told is not None
         if told.for_good:
             if self._usable():
@@ -572,7 +610,7 @@ class Mover:
             self._control is not None
             and self._control.isConnected()
             and packet is not None
-            and packet.status_bits & _PROGRAM_RUNS
+            and packet.status_bits & PROGRAM_RUNS
             and not safety_text(packet.safety_bits)
         )
 
@@ -581,7 +619,7 @@ class Mover:
         give_up = self._clock.now() + self._clock.patience(_CAUSE_S)
         while self._clock.now() < give_up:
             self._read(self._clock.wall(_CAUSE_S / 10))
-            stopped = None if self._packet is None else _safety_stop(self._packet)
+            stopped = None if self._packet is None else _unfit(self._packet)
             if stopped is not None:
                 return stopped
         return self._lost(what)
@@ -606,7 +644,7 @@ class Mover:
         try:
             return getattr(self._control, name)(*values)
         except RuntimeError as error:
-            raise _Ended(self._program_stopped(f"ur_rtde: {error}")) from None
+            raise _Ended(self._program_stopped(_said(error))) from None
         finally:
             be_prompt(ASKS)
 
@@ -620,7 +658,13 @@ class Mover:
 
     def end(self, error: DeviceError) -> NoReturn:
         """Report why, and exit at once, so that ur_rtde can neither reconnect nor wait."""
-        self._tell("error", kind=type(error).__name__, text=error.args[0], ended=True)
+        text, kind, stop = error.args[0], type(error), self._stop
+        if stop is not None and stop.error is not error:
+            text = f"{stop.error.args[0]}; {text}"
+            # A stop for good stays one, whatever comes after it.
+            if stop.for_good and kind is not StoppedError:
+                kind = type(stop.error)
+        self._tell("error", kind=kind.__name__, text=text + self._end_paused(), ended=True)
         os._exit(1)
 
     def _tell(self, what: str, **values: object) -> None:
@@ -631,12 +675,17 @@ class Mover:
             self._closing = True
 
 
-def _safety_stop(packet: Packet) -> StoppedError | None:
-    problem = safety_text(packet.safety_bits)
+def _said(error: RuntimeError) -> str:
+    """An error of ur_rtde; some of its texts begin with its name."""
+    return f"ur_rtde: {str(error).removeprefix('ur_rtde: ')}"
+
+
+def _unfit(packet: Packet) -> StoppedError | None:
+    """The stop if the robot is not fit to move: a safety stop, or a mode other than running."""
+    problem = state_text(packet.robot_mode, packet.safety_bits)
     if not problem:
         return None
-    text = f"{problem}: release it at the robot, then confirm the plan again"
-    return StoppedError(text, device="robot")
+    return StoppedError(f"{problem}; then confirm the plan again", device="robot")
 
 
 def _end_within(seconds: float) -> None:

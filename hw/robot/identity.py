@@ -23,6 +23,7 @@ import time
 from dataclasses import dataclass
 
 from hw.errors import LostError
+from jaxcal.io.readable import quoted
 
 DASHBOARD_PORT, PRIMARY_PORT = 29999, 30001
 
@@ -31,6 +32,7 @@ ROBOT_STATE, KINEMATICS_INFO = 16, 5
 KINEMATICS = struct.Struct(">6I24dI")
 """Checksums of the joints; DH theta, a, d, alpha (rad, m), six each; state of the calibration."""
 _MOST_MESSAGE = 1 << 16
+LOCAL = "the robot is in local control: switch it to remote control at the pendant"
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class Identity:
             checksums, or None where the controller tells none.
         version: of PolyScope.
         model: as the dashboard says.
+        remote: whether it is in remote control; None where the dashboard knows no such thing (CB).
     """
 
     address: str
@@ -51,6 +54,7 @@ class Identity:
     calibration: str | None
     version: str
     model: str
+    remote: bool | None = None
 
     @property
     def identified(self) -> bool:
@@ -80,19 +84,38 @@ def read_identity(host: str, *, timeout_s: float = 3.0) -> Identity:
             version = stream.ask("PolyscopeVersion")
             serial = stream.ask("get serial number")
             model = stream.ask("get robot model")
+            remote = stream.ask("is in remote control")
     except TimeoutError:
         raise LostError(f"the dashboard of {host} does not answer", device="robot") from None
     except (OSError, UnicodeError) as error:
         text = f"no connection to the dashboard of {host}: {error}"
         raise LostError(text, device="robot") from error
     number = re.search(r"\d+\.\d+\.\d+(\.\d+)?", version)
+    if number is None:
+        raise LostError(
+            f"the dashboard of {host} tells no version but {quoted(version)}: look at "
+            "the pendant, or restart the controller",
+            device="robot",
+        )
     return Identity(
         address=host,
         serial=serial if re.fullmatch(r"\d{4,20}", serial) else None,
         calibration=_read_calibration(host, timeout_s),
-        version=number.group() if number else "unknown",
+        version=number.group(),
         model=model if re.fullmatch(r"[\w-]{1,40}", model) else "unknown",
+        remote={"true": True, "false": False}.get(remote.lower()),
     )
+
+
+def stop_program(host: str, *, timeout_s: float) -> bool:
+    """Ask the dashboard to stop the program; returns whether it says that it did."""
+    try:
+        with socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection:
+            stream = _Lines(connection, time.monotonic() + timeout_s)
+            stream.line()
+            return stream.ask("stop").startswith("Stopped")
+    except OSError:
+        return False
 
 
 def _read_calibration(host: str, timeout_s: float) -> str | None:

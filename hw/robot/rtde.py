@@ -46,28 +46,58 @@ _OPTIONAL = ("tcp_offset", "payload", "payload_cog", "actual_q")
 """Older controllers may lack these, but all known controllers send the joints, actual_q."""
 
 RUNNING_MODE = 7
+PROGRAM_RUNS = 0b10
+"""Bit of robot_status_bits."""
 NORMAL_BITS = 0b11
 """safety_status_bits of a robot that may move: normal, or reduced mode."""
-_SAFETY_NAMES = (
-    "normal",
-    "reduced mode",
-    "protective stop",
-    "recovery mode",
-    "safeguard stop",
-    "system emergency stop",
-    "robot emergency stop",
-    "emergency stop",
-    "safety violation",
-    "safety fault",
-    "stopped by safety",
+_POWER = "switch the robot on and release its brakes at the pendant"
+_SAFETY_STATES = (
+    (2, "protective stop", "find its cause, then release it at the pendant"),
+    (3, "recovery mode", "move the joints back into their limits at the pendant"),
+    (4, "safeguard stop", "close the gate (or what else stops it), then reset it"),
+    (5, "system emergency stop", f"release it where it was pressed, then {_POWER}"),
+    (6, "robot emergency stop", f"release the button, then {_POWER}"),
+    (7, "emergency stop", f"release it, then {_POWER}"),
+    (8, "safety violation", "read the pendant's log, then restart the robot's safety there"),
+    (9, "safety fault", "read the pendant's log, then restart the controller"),
+    (10, "stopped by safety", "look at the pendant"),
 )
+"""Bits of safety_status_bits above normal and reduced, and what a person must do."""
+_SUMMARIES = (1 << 7) | (1 << 10)
+"""Bits that are set besides the one that says more."""
+_MODES = {
+    -1: ("no controller", "look at the pendant"),
+    0: ("disconnected", "look at the pendant"),
+    1: ("waiting for its safety configuration", "confirm it at the pendant"),
+    2: ("booting", "wait until it has started"),
+    3: ("powered off", _POWER),
+    4: ("powered on with its brakes on", "release its brakes at the pendant"),
+    5: ("idle with its brakes on", "release its brakes at the pendant"),
+    6: ("in backdrive", "leave backdrive at the pendant"),
+    8: ("updating its firmware", "wait until it is done"),
+}
+"""Values of robot_mode other than running, and what a person must do."""
+_PLAYS = frozenset({2, 3, 4, 5})
+"""Values of runtime_state while a program plays, pauses, is paused, or resumes."""
 
 
 def safety_text(bits: int) -> str:
-    """What is wrong by safety_status_bits; an empty string when the robot may move."""
+    """Which safety stop by safety_status_bits, and what a person must do; empty if none is."""
     wrong = bits & ~NORMAL_BITS
-    names = [name for k, name in enumerate(_SAFETY_NAMES) if wrong >> k & 1]
-    return ", ".join(names) or (f"safety bits {bits:#x}" if wrong else "")
+    shown = wrong & ~_SUMMARIES or wrong
+    found = [state for state in _SAFETY_STATES if shown >> state[0] & 1]
+    if not found:
+        return f"safety bits {bits:#x}: look at the pendant" if wrong else ""
+    return f"{', '.join(name for _, name, _ in found)}: {found[-1][2]}"
+
+
+def state_text(robot_mode: int, safety_bits: int) -> str:
+    """Why the robot may not move, and what a person must do; an empty string when it may."""
+    problem = safety_text(safety_bits)
+    if problem or robot_mode == RUNNING_MODE:
+        return problem
+    name, cure = _MODES.get(robot_mode, (f"in mode {robot_mode}", "look at the pendant"))
+    return f"the robot is not running, it is {name}: {cure}"
 
 
 _BOUND_TRIES, _LEAST_TRIES, _BOUND_S, _BOUND_WITHIN_S = 5, 3, 0.01, 0.25
@@ -154,6 +184,11 @@ class Packet:
     pendant: PendantSettings
     joints: tuple[float, ...] | None = None
     """Angles of the joints, rad."""
+
+    @property
+    def program(self) -> bool:
+        """Whether a program plays or is paused."""
+        return bool(self.status_bits & PROGRAM_RUNS) or self.runtime_state in _PLAYS
 
 
 def too_late(latency_s: float, limit_s: float) -> LostError | None:

@@ -33,7 +33,7 @@ from hw.robot.feasibility import Arm, Course, check_model, follow, follow_all
 from hw.robot.kinematics import model_named, tool_of
 from hw.robot.limits import Limits, between, numbers
 from hw.robot.pose import pose_to_ur
-from hw.robot.rtde import RUNNING_MODE, PendantSettings, safety_text
+from hw.robot.rtde import PendantSettings, state_text
 from hw.robot.stream import PoseSample, offset_changed
 
 _ROTATION_TOLERANCE = 1e-6
@@ -536,11 +536,11 @@ def check_sample(sample: PoseSample, limits: Limits, clock: Clock) -> None:
         raise StaleError(f"the newest pose is {sample.age_text(clock.now())}", device="robot")
     if age < -oldest:
         raise _refuse("the newest pose is of another clock: it lies in the future")
-    problem = safety_text(sample.safety_bits)
+    problem = state_text(sample.robot_mode, sample.safety_bits)
+    if not problem and sample.safety_bits == 0:
+        problem = "the robot tells no safety state: look at the pendant"
     if problem:
-        raise _refuse(f"the robot reports: {problem}")
-    if sample.safety_bits == 0 or sample.robot_mode != RUNNING_MODE:
-        raise _refuse(f"the robot is not running (mode {sample.robot_mode})")
+        raise _refuse(problem)
 
 
 def _array(value: object, what: str) -> np.ndarray:

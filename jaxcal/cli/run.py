@@ -34,7 +34,7 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
             sys.stdout.flush()
         return code
     except (KeyboardInterrupt, click.Abort) as interruption:
-        _report(name, str(interruption) or "interrupted", ExitCode.INTERRUPTED)
+        _report(name, _interrupted(interruption), ExitCode.INTERRUPTED)
         if arguments is None:
             # Under the threads of an interrupted compilation an orderly exit may crash.
             os._exit(ExitCode.INTERRUPTED)
@@ -78,7 +78,17 @@ def _invoke(commands: click.Group, name: str, arguments: Sequence[str]) -> int:
         return done.exit_code
 
 
-def _status(error: Exception) -> ExitCode | None:
+def _interrupted(error: BaseException) -> str:
+    """What to tell after an interrupt, also where a further one came during the first."""
+    text, cause = str(error), error.__context__
+    while not text and cause is not None:
+        if _status(cause) is not None:
+            text = f"error: {cause}"
+        cause = cause.__context__
+    return text or "interrupted"
+
+
+def _status(error: BaseException) -> ExitCode | None:
     """Errors meant for a person may say how the program is to end (those of ``hw`` do)."""
     status = getattr(error, "exit_code", None)
     return None if status is None else ExitCode(status)

@@ -25,6 +25,7 @@ from test_recorder import wait_until_closed
 import jaxcal
 from hw.acquire import AcquisitionStopped, Outcome, acquire
 from hw.bench.run import Bench
+from hw.check import check
 from hw.emulated import BenchOracle, setup_of, start
 from hw.errors import RefusedError
 from hw.keys import Pause
@@ -233,6 +234,67 @@ def test_an_unplugged_port_stops_the_run_and_it_is_resumed(tmp_path):
 def test_every_fault_stops_the_robot_and_the_run_is_resumed(tmp_path, name):
     """In real time; images may be silent for a second before that counts."""
     fault_in_the_middle(tmp_path, name, 1.0, None if name.startswith("image") else 0.2)
+
+
+@pytest.mark.slow
+def test_a_robot_that_may_not_move_is_named_and_the_run_is_resumed(tmp_path):
+    """Before the connection, before and after the confirmation, and while it rests at a pose."""
+    path, request = tmp_path / "rec.h5", AcquisitionRequest(IMAGES, "none", 1, bench=3)
+    with start(3, 2.0, 500) as bench:
+        setup, asked = setup_of(bench), []
+
+        def confirm(plan: MotionPlan):
+            asked.append(plan.digest)
+            bench.fault("robot_state", robot_mode=5, safety_mode=1)
+            return confirm_unattended(plan, plan.digest, clock=setup.clock)
+
+        bench.fault("robot_state", robot_mode=3, safety_mode=7)
+        assert any("robot emergency stop: release" in line for line in check(setup, 0.2)[0].wrong)
+        with pytest.raises(AcquisitionStopped, match="robot emergency stop: release"):
+            acquire(setup, path, request, confirm)
+        bench.fault("robot_state", robot_mode=7, safety_mode=1)
+        bench.fault("remote", on=False)
+        assert any("switch it to remote" in line for line in check(setup, 0.2)[0].wrong)
+        with pytest.raises(AcquisitionStopped, match="local control: switch it to remote"):
+            acquire(setup, path, None, confirm)
+        bench.fault("remote", on=True)
+        assert not asked
+        with pytest.raises(AcquisitionStopped, match="release its brakes"):
+            acquire(setup, path, None, confirm)
+        assert asked
+        bench.fault("robot_state", robot_mode=7, safety_mode=1)
+
+        def say(line: str) -> None:
+            if line.startswith("image 2/"):
+                bench.fault("robot_state", robot_mode=7, safety_mode=5)
+
+        with pytest.raises(AcquisitionStopped, match="safeguard stop: close the gate") as told:
+            run(bench, path, None, say)
+        assert not told.value.by_itself
+        bench.fault("robot_state", robot_mode=7, safety_mode=1)
+        assert finish(bench, path).images == IMAGES
+
+
+@pytest.mark.slow
+def test_ctrl_c_pressed_many_times_still_tells_how_to_resume(tmp_path):
+    path = tmp_path / "rec.h5"
+    code = "import sys; from hw.cli import main; sys.exit(main())"
+    arguments = ["acquire", str(path), "--bench", "--images", "30", "--placement", "none"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("image 2/"):
+            break
+    for _ in range(12):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.02)
+    told = process.communicate(timeout=60.0)[1].splitlines()
+    assert told[-1].startswith("jaxcal-hw: error: interrupted; ")
+    assert told[-1].endswith(f"jaxcal-hw acquire {path} --resume --bench")
+    wait_until_closed(path)
+    assert len(taken(path)) >= 2
 
 
 @pytest.mark.slow

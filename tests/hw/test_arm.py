@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from hw.bench.arm import Arm
-from hw.bench.controller import Controller
+from hw.bench.controller import NORMAL, Controller
 from hw.bench.robot import START as START_DOWN
 from hw.robot.kinematics import MODELS, forward, link_frames, tool_of
 from hw.robot.pose import pose_to_ur, ur_to_pose
@@ -162,7 +162,7 @@ def test_the_arm_stops_protectively_before_a_wrist_singularity_and_its_reach():
         program.step(0.1)
         arm.move_linear(0.1, target.tolist(), 0.1, 1.0)
         t = 0.1
-        while not program.protective:
+        while program.safety_mode == NORMAL:
             t += 0.002
             program.step(t)
             assert t < 30.0, text
@@ -177,11 +177,11 @@ def test_the_arm_stops_protectively_before_a_wrist_singularity_and_its_reach():
         np.testing.assert_allclose(pose[:3, 3], told[:3, 3], atol=0.2)
         assert not arm.within_reach(out.tolist())
         # Once released, it may go back.
-        program.protective = False
+        program.safety_mode = NORMAL
         arrival = arm.move_linear(rest, start.tolist(), 0.05, 1.0)
         for now in np.linspace(rest, arrival, 200):
             program.step(now)
-        assert not program.protective
+        assert program.safety_mode == NORMAL
         assert arm.raw(arrival) == pytest.approx(tuple(start), abs=1e-9)
 
 

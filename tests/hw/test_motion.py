@@ -22,7 +22,7 @@ from robots import CB_SERIES, E_SERIES, START, EmulatedRobot
 
 import hw
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
-from hw.robot.identity import read_identity
+from hw.robot.identity import read_identity, stop_program
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.pose import ur_to_pose
@@ -80,6 +80,12 @@ def moving(
         yield motion
 
 
+def only_asked(state: dict) -> bool:
+    """Whether the dashboard was only asked, or told to stop the program: no power, no unlocking."""
+    asked = {"PolyscopeVersion", "get serial number", "get robot model", "is in remote control"}
+    return set(state["dashboard"]) <= asked | {"stop"}
+
+
 def sent(robot: EmulatedRobot, code: int) -> list[tuple[float, ...]]:
     return [tuple(values) for _, command, values in robot.state()["log"] if command == code]
 
@@ -107,7 +113,7 @@ def test_the_robot_moves_searches_and_is_left_in_order(version):
     assert state["raw"][:3] == pytest.approx([0.4, -0.1, 0.301])
     assert not state["running"]
     assert state["reason"] == "the client stopped the script"
-    assert state["unlocks"] == 0
+    assert only_asked(state)
     assert len(moves) == 4
     assert [round(move[6] * 1000, 6) for move in moves] == [50.0, 10.0, 50.0, 8.0]
     names = [entry[1] for entry in log]
@@ -273,7 +279,7 @@ def fault_in_motion(
     deadline = time.monotonic() + 5.0
     while (state := robot.state())["rest_since"] is None and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert state["unlocks"] == 0
+    assert only_asked(state)
     assert "\n" not in str(error)
     # It stopped on the way, and did not merely arrive.
     assert state["raw"][0] < START[0] + 0.049
@@ -295,7 +301,10 @@ FAULTS = [
     ("silent", BOTH, StaleError, "the caller was silent", False),
     # The same stop for another reason.
     ("hesitation", ["CB"], StaleError, "no frame for 0.2 s", False),
-    ("protective_stop", ["CB"], StoppedError, "protective stop: release it at the robot", True),
+    ("protective_stop", ["CB"], StoppedError, "protective stop: find its cause", True),
+    ("off", ["CB"], StoppedError, "powered off: switch the robot on and release", True),
+    ("backdrive", ["e"], StoppedError, "in backdrive: leave backdrive at the pendant", True),
+    ("emergency", ["e"], StoppedError, "robot emergency stop: release the button, then", True),
     ("force", ["CB"], StoppedError, r"a force of 40.0 N", True),
     ("set_payload", ["CB"], RefusedError, "payload is 2.0 kg", True),
     ("set_speed_slider", ["e"], RefusedError, "speed slider is at 50 %, not 100", True),
@@ -337,6 +346,9 @@ def test_the_robot_rests_within_200_ms_of_a_fault(version, name, kind, text, end
             "kill": lambda: kill_mover(motion),
             "force": lambda: robot.ask("force", [0.0, 0.0, -40.0, 0.0, 0.0, 0.0]),
             "set_tcp_offset": lambda: robot.ask(name, [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]),
+            "off": lambda: robot.enter(3, 1),
+            "backdrive": lambda: robot.enter(6, 1),
+            "emergency": lambda: robot.enter(3, 7),
             "set_payload": lambda: robot.set_payload(2.0),
             "set_speed_slider": lambda: robot.set_speed_slider(0.5),
         }
@@ -357,6 +369,81 @@ def test_the_robot_rests_within_200_ms_of_a_fault(version, name, kind, text, end
             moves += 1
         if name != "mute":
             assert len(sent(robot, 3)) == moves
+
+
+STATES = [
+    (2, 1, "booting: wait"),
+    (3, 1, "powered off: switch the robot on"),
+    (5, 1, "idle with its brakes on: release its brakes"),
+    (6, 1, "in backdrive: leave backdrive"),
+    (7, 3, "protective stop: find its cause"),
+    (7, 4, "recovery mode: move the joints back"),
+    (7, 5, "safeguard stop: close the gate"),
+    (3, 6, "system emergency stop: release it where"),
+    (3, 7, "robot emergency stop: release the button"),
+    (3, 8, "safety violation: read the pendant's log"),
+    (3, 9, "safety fault: read the pendant's log"),
+]
+"""robot_mode, safety_mode, and what the refusal must say."""
+
+
+def test_a_robot_that_may_not_move_is_sent_nothing_and_its_state_is_named():
+    with EmulatedRobot() as robot:
+        for robot_mode, safety_mode, text in STATES:
+            robot.enter(robot_mode, safety_mode)
+            with pytest.raises(RefusedError, match=text), moving(robot):
+                pass
+        robot.enter(7, 2)
+        robot.ask("set_remote", False)
+        with pytest.raises(RefusedError, match="local control: switch it to remote"), moving(robot):
+            pass
+        robot.ask("set_remote", True)
+        robot.ask("play")
+        with pytest.raises(RefusedError, match="a program runs on the robot"), moving(robot):
+            pass
+        state = robot.state()
+        assert state["running"]
+        assert "stop" not in state["dashboard"]
+        assert state["log"] == []
+        assert only_asked(state)
+        robot.ask("spoil_dashboard", "Command is not allowed")
+        with pytest.raises(LostError, match="no version but 'Command is not allowed'"):
+            read_identity(robot.host)
+
+
+@pytest.mark.parametrize("dashboard", [None, ""], ids=["answers", "mute"])
+def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(dashboard):
+    """Such a stop only pauses the program, and may be released by closing a gate."""
+    with EmulatedRobot() as robot, moving(robot, caller_s=2.0) as motion:
+
+        def fault() -> None:
+            robot.ask("spoil_dashboard", dashboard)
+            robot.enter(7, 5)
+
+        error, *_ = fault_in_motion(robot, motion, fault)
+        assert type(error) is StoppedError
+        assert "safeguard stop: close the gate" in str(error)
+        assert ("stop it at the pendant before" in str(error)) == (dashboard is not None)
+        if dashboard is None:
+            stood = robot.state()["raw"]
+            robot.enter(7, 1)
+            time.sleep(0.2)
+            assert robot.state()["raw"] == stood
+        with pytest.raises(RefusedError, match="confirm the plan again"):
+            motion.move_to(HOME)
+
+
+def test_a_stop_is_told_though_the_program_ended_at_the_same_moment():
+    with EmulatedRobot() as robot, moving(robot) as motion:
+        assert motion._process is not None
+        # What comes while it is held up, it sees at once.
+        os.kill(motion._process.pid, signal.SIGSTOP)
+        robot.set_payload(2.0)
+        assert stop_program(robot.host, timeout_s=2.0)
+        os.kill(motion._process.pid, signal.SIGCONT)
+        time.sleep(0.3)
+        with pytest.raises(RefusedError, match=r"payload is 2\.0 kg"):
+            motion.move_to(HOME)
 
 
 @both_series
@@ -471,7 +558,7 @@ def test_a_second_client_is_refused_and_the_first_goes_on():
         while math.hypot(*robot.state()["velocity"]) < 0.02:
             assert not future.done()
             time.sleep(0.002)
-        with pytest.raises(LostError, match="in use"), moving(robot):
+        with pytest.raises(RefusedError, match="a program runs"), moving(robot):
             pass
         assert future.result(timeout=20.0).pose[0, 3] == pytest.approx(450.0)
         assert robot.state()["running"]

@@ -341,6 +341,16 @@ def test_files_that_are_not_resumed(tmp_path):
         spoil(change)
 
 
+def test_a_recording_that_a_reader_holds_open_is_not_said_to_be_written(tmp_path):
+    path = tmp_path / "rec.h5"
+    RecordingWriter.create(path, HEADER).close()
+    with (
+        h5py.File(path, "r"),
+        pytest.raises(jaxcal.OutputError, match="is open in another program: close it there"),
+    ):
+        Recorder(path)
+
+
 def test_rows_fit_the_layout_or_are_refused_whole(tmp_path):
     writer = RecordingWriter.create(tmp_path / "rec.h5", HEADER)
     with pytest.raises(jaxcal.FormatError, match="one row in each"):

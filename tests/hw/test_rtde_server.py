@@ -97,7 +97,7 @@ def test_a_protective_stop_ends_the_program_until_a_person_releases_it():
         assert control.reuploadScript()
         until(control.isProgramRunning)
         assert control.moveL(START, 0.1, 1.0)
-        assert robot.state()["unlocks"] == 0
+        assert "unlock protective stop" not in robot.state()["dashboard"]
         control.disconnect()
 
 
