@@ -39,7 +39,7 @@ def test_rows_above_the_image_are_refused():
 
 def test_numbers_of_jax_that_numpy_does_not_know_are_numbers():
     given = arrays()
-    coarse = jnp.asarray(given["measurements"], jnp.bfloat16)
+    coarse = np.asarray(jnp.asarray(given["measurements"], jnp.bfloat16))
     images = jaxcal.make_images(given["poses"], coarse, "point")
     assert images.measurements.dtype == np.float64
     np.testing.assert_array_equal(images.measurements, np.asarray(coarse, float))
