@@ -206,6 +206,13 @@ for call, *given in (
         "max_iterations = 1.5", 'max_elevation_mm = "1 mm"', "tolerance_mm = true",
         "tolerance_rad = [1]", "prior = 3", "max_elevation_mm = [1]",
     )),
+    (lambda level: jaxcal.transform_intervals(result, level), "0.95"),
+    (lambda level: jaxcal.transform_intervals(result, level), None),
+    (lambda probe: jaxcal.Protocol(probe=probe), "linear"),
+    (lambda raw: jaxcal.Protocol(raw=raw), "no"),
+    (lambda radius: jaxcal.CurvilinearProbe(radius_mm=radius), None),
+    (jaxcal.Problem.from_recording, "rec.h5"), (jaxcal.segment, "rec.h5"),
+    (jaxcal.segment_recording, "rec.h5"),
 ):
     try:
         call(*given)
@@ -217,7 +224,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 77
+    assert len(lines) == 85
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
@@ -239,6 +246,10 @@ for call, *given in (
     assert lines[71] == "methods[0]: max_iterations must be a whole number, not 1.5"
     assert lines[72] == (
         "methods[0]: max_elevation must be finite and not negative, in mm, not '1 mm'"
+    )
+    assert lines[77] == "level must be between 0 and 1, not '0.95'"
+    assert lines[82] == (
+        "jaxcal.Problem.from_recording takes a recording (jaxcal.load reads one), not str"
     )
     assert lines[69] == "robust must be True or False, not 'no'"
 

@@ -24,9 +24,9 @@ import numpy as np
 from jaxtyping import Array, Complex64, Float, Int, Key
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import LARGEST_SEED, whole_number
+from jaxcal.calibration.inputs import LARGEST_SEED, check_flag, whole_number
 from jaxcal.data.geometry import matrix_from_rotation
-from jaxcal.data.probe import L14_5, CurvilinearProbe, Probe
+from jaxcal.data.probe import L14_5, CurvilinearProbe, Probe, check_probe
 from jaxcal.data.problem import Channels, Problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, Truth, make_images
 from jaxcal.data.segmentation.deviations import fit_deviations, halves
@@ -108,6 +108,8 @@ class Protocol:
         if not is_traced(self.depth_mm) and shallow > deep:
             raise InputError(f"depth_mm must be nearest, then farthest, not {self.depth_mm}")
         check_law(self.elevation_distribution)
+        check_probe(self.probe)
+        check_flag("raw", self.raw)
 
 
 def _is_within(value: Any, largest: int) -> bool:
