@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -143,6 +144,7 @@ def test_calls_as_users_make_them():
 import warnings
 import numpy as np
 import jaxcal
+from jaxcal.study import run_study
 from jaxcal.study.spec import parse_spec
 START = 'name = "a"\nseed = 1\ntrials = 1\n[[methods]]\nname = "a"\nmethod = "alternating"\n'
 warnings.simplefilter("error")
@@ -212,7 +214,10 @@ for call, *given in (
     (lambda raw: jaxcal.Protocol(raw=raw), "no"),
     (lambda radius: jaxcal.CurvilinearProbe(radius_mm=radius), None),
     (jaxcal.Problem.from_recording, "rec.h5"), (jaxcal.segment, "rec.h5"),
-    (jaxcal.segment_recording, "rec.h5"),
+    (jaxcal.segment_recording, "rec.h5"), (jaxcal.simulate, 3, jaxcal.Protocol()),
+    (jaxcal.ImageTransform(np.eye(4)).apply, [[0.0, 50.0]], "pose"),
+    (run_study, "no-such-study.toml", "no-such-folder"),
+    (lambda n: run_study(parse_spec(START), "no-such-folder", workers=n), "2"),
 ):
     try:
         call(*given)
@@ -224,7 +229,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 85
+    assert len(lines) == 89
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
@@ -251,6 +256,9 @@ for call, *given in (
     assert lines[82] == (
         "jaxcal.Problem.from_recording takes a recording (jaxcal.load reads one), not str"
     )
+    assert lines[85] == "key must be a JAX key, e.g. jax.random.key(1), not 3"
+    assert lines[87].startswith("run_study takes a study, not 'no-such-study.toml'")
+    assert not Path("no-such-folder").exists()
     assert lines[69] == "robust must be True or False, not 'no'"
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Complex64, Float, Int, Key
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import LARGEST_SEED, check_flag, whole_number
+from jaxcal.calibration.inputs import LARGEST_SEED, check_flag, shown, whole_number
 from jaxcal.data.geometry import matrix_from_rotation
 from jaxcal.data.probe import L14_5, CurvilinearProbe, Probe, check_probe
 from jaxcal.data.problem import Channels, Problem
@@ -232,8 +232,13 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
         key: a JAX key; for trial k of a study ``jax.random.fold_in(root, k)``, so that draws do not
             depend on chunks or devices.
         protocol: the distributions.
+
+    Raises:
+        InputError: what is no key.
     """
     require_float64("jaxcal.simulate")
+    if not hasattr(key, "shape"):
+        raise InputError(f"key must be a JAX key, e.g. jax.random.key(1), not {shown(key)}")
     numbers, noise = draw(key, protocol), draw_noise(key, protocol)
     planes = arrange(numbers, protocol)
     distances = _distances(planes, noise, protocol)
