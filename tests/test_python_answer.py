@@ -144,6 +144,7 @@ def test_calls_as_users_make_them():
 import warnings
 import numpy as np
 import jaxcal
+from jaxcal import backend
 from jaxcal.study import run_study
 from jaxcal.study.spec import parse_spec
 START = 'name = "a"\nseed = 1\ntrials = 1\n[[methods]]\nname = "a"\nmethod = "alternating"\n'
@@ -217,6 +218,7 @@ for call, *given in (
     (jaxcal.segment_recording, "rec.h5"), (jaxcal.simulate, 3, jaxcal.Protocol()),
     (jaxcal.ImageTransform(np.eye(4)).apply, [[0.0, 50.0]], "pose"),
     (run_study, "no-such-study.toml", "no-such-folder"),
+    (lambda local: backend.arrow_least_squares(lambda s, y, d: d, np.zeros(2), local), points),
     (lambda n: run_study(parse_spec(START), "no-such-folder", workers=n), "2"),
 ):
     try:
@@ -229,7 +231,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 89
+    assert len(lines) == 90
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
