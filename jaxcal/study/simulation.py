@@ -506,9 +506,12 @@ def simulate_recording(
     else:
         times = times_of_flight(array["distances"], protocol.probe, clock_hz)
         calibration = make_images(array["poses"], times, "time_of_flight", where="simulation")
+    test = None
+    if protocol.test_images:
+        test = make_images(array["test_poses"], array["test_points"], where="simulation", minimum=1)
     return Recording(
         calibration=calibration,
-        test=make_images(array["test_poses"], array["test_points"], where="simulation"),
+        test=test,
         truth=Truth(array["image_to_probe"], array["point"], array["elevation"]),
         probe=protocol.probe,
         source=f"simulation (seed {seed})",
