@@ -77,7 +77,7 @@ class Store(Generic[S]):
                 )
             if not resume:
                 raise InputError(
-                    f"{folder}: holds this study already: --resume (resume=True) continues it"
+                    f"{folder}: holds this study already: --resume continues it (in Python resume=True)"
                 )
             store._make_folder()
             return store
