@@ -77,7 +77,8 @@ class Store(Generic[S]):
                 )
             if not resume:
                 raise InputError(
-                    f"{folder}: holds this study already: --resume continues it (in Python resume=True)"
+                    f"{folder}: holds this study already: --resume continues it "
+                    "(in Python resume=True)"
                 )
             store._make_folder()
             return store
