@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import jax
 
+from jaxcal import InputError
 from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import (
@@ -93,7 +94,15 @@ def initial_fit(problem: Problem, blocks: Blocks = RIGID) -> Parameters:
     Args:
         problem: one problem (vmap for a batch).
         blocks: the free unknowns.
+
+    Raises:
+        InputError: something else than one problem.
     """
+    if not isinstance(problem, Problem) or problem.batch_shape:
+        raise InputError(
+            "initial_fit takes one problem: jaxcal.Problem.from_recording makes one, "
+            "jax.vmap(initial_fit) takes a batch"
+        )
     images = ImagePlanes.of(jax.tree.map(lambda leaf: leaf[None], problem))
     found = conventional(images, blocks).fit.place.parameters()
     return jax.tree.map(lambda leaf: leaf[0], found)

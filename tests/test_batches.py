@@ -90,6 +90,24 @@ def test_compiler_flags_change_rounding_only(monkeypatch):
     np.testing.assert_allclose(fast.image_to_probe, plain.image_to_probe, rtol=0, atol=1e-12)
 
 
+def test_stacking_compiles_nothing():
+    problems = [problem(k % 3, images=9) for k in range(7)]
+    compiled = []
+
+    def listen(event: str, _: float, **__: str | int) -> None:
+        if "backend_compile" in event:
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        batch = jaxcal.stack(problems)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert compiled == []
+    np.testing.assert_array_equal(batch.poses[5], problems[2].poses)
+    assert batch.measurements.dtype == problems[0].measurements.dtype
+
+
 @pytest.mark.slow
 def test_a_batch_has_the_derivatives_of_its_problems():
     problems = jaxcal.stack(

@@ -649,7 +649,7 @@ def test_plans_that_cannot_be(capfd, tmp_path):
         (["--images", 10, "--cone", 0, "--turn", 0], "would not determine"),
         (["--estimate", "scale"], "needs a recording"),
         (["--depth", 80, 20], "in order"),
-        (["--images", 2], "4 to"),
+        (["--images", 2], "between 4 and"),
         ([tmp_path / "absent.h5"], "absent"),
         (["--images", 5, "--figure", tmp_path / "no" / "p.png"], "folder does not exist"),
         (["--images", 5, "--figure", tmp_path / "p.xyz"], "these endings work: "),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 from dataclasses import replace
 
 import jax
@@ -211,10 +213,75 @@ def test_candidates_that_determine_nothing_are_no_plan(constraints, words):
     assert "\n" not in str(caught.value)
 
 
+def pose_of(candidates):
+    model = candidates.model
+    return candidates.constraints, model.image_to_probe, model.point
+
+
+def test_other_types_are_refused_in_words_where_types_are_not_checked():
+    # In a process of its own: here the annotations are checked first, and give another error.
+    code = """
+import numpy as np
+import jaxcal
+from jaxcal import design
+
+candidates = design.make_candidates(count=50)
+plan = design.plan(candidates, 5, polish=False)
+for call, said in (
+    (lambda: design.plan(candidates, "12"), "the number of poses must be a whole number"),
+    (lambda: design.plan("candidates", 12), "candidates must be made by make_candidates"),
+    (lambda: design.plan(candidates, 12, prior="x"), "result must be made by jaxcal.calibrate"),
+    (lambda: design.plan(candidates, 12, rules="x"), "rules must be made by jaxcal.design.Rules"),
+    (lambda: design.plan(candidates, 12, polish="no"), "polish must be True or False"),
+    (lambda: design.plan(candidates, 12, cost_s="x"), "cost_s must be an array"),
+    (lambda: design.least_error(candidates, 12.5), "the number of poses must be a whole number"),
+    (lambda: design.simulate_errors(plan, trials="9"), "trials must be a whole number"),
+    (lambda: design.images_to(plan, "0.2"), "the wanted error must be a positive number"),
+    (lambda: design.make_candidates("linear"), "probe must be a jaxcal.LinearProbe"),
+    (lambda: design.make_candidates(region="x"), "region must be made by jaxcal.design.Region"),
+    (lambda: design.make_candidates(model="x"), "model must be made by jaxcal.design.Model"),
+    (lambda: design.candidates_around("a.h5", None), "candidates_around takes a recording"),
+    (lambda: design.known_information("x", candidates.model, []), "result must be made by"),
+    (lambda: design.plan_figure("plan"), "plan must be made by jaxcal.design.plan"),
+    (lambda: design.gain(np.eye(3), np.eye(9), np.eye(9), candidates.model), "pose must have"),
+    (lambda: design.Constraints(cone_deg="40"), "cone_deg must be 0 to 85 degrees, not '40'"),
+    (lambda: design.Constraints(reach_mm=3), "reach_mm must be two mm in order, not 3"),
+    (lambda: design.Constraints(allowed="all"), "allowed must be a function of poses"),
+    (lambda: design.Region(depth_mm=5), "depth_mm of the region must be two mm in order"),
+    (lambda: design.Region.of_probe(None), "probe must be a jaxcal.LinearProbe"),
+    (lambda: design.Noise(np.ones((2, 4))), "the noise model's coefficients must have shape"),
+    (lambda: design.Model(np.eye(3)), "image_to_probe of the model must be an array of shape"),
+):
+    try:
+        call()
+    except jaxcal.InputError as error:
+        assert str(error).startswith(said), error
+    else:
+        raise AssertionError(said)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_batch_is_no_calibration_to_plan_from():
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=8), seed=1)
+    batch = jaxcal.calibrate_batch([recording, recording], "conventional")
+    with pytest.raises(InputError, match="the result is of a batch"):
+        design.candidates_around(recording, batch)
+
+
 def test_what_cannot_be_asked():
     candidates = some(50)
     for call, match in (
-        (lambda: design.plan(candidates, 3), "4 to"),
+        (lambda: design.plan(candidates, 3), "between 4 and"),
+        (lambda: design.plan(candidates, 12, prior=-np.eye(9)), "negative eigenvalues"),
+        (lambda: design.make_candidates(count=0), "count must be between 1"),
+        (lambda: design.make_candidates(seed=-1), "seed must be between 0"),
+        (lambda: design.pose_in_words(np.full((4, 4), np.nan), *pose_of(candidates)), "NaN"),
+        (lambda: some(50, reference=-np.eye(3)), "3x3 rotation"),
+        (lambda: some(50, box_mm=((1.0,) * 3, (0.0,) * 3)), "least and the largest corner"),
+        (lambda: design.Rules(replicates=0), "replicates"),
+        (lambda: design.Rules(space_filling=2.0), "space_filling"),
         (lambda: check_criterion("volume"), "criterion must be"),
         (lambda: design.plan(candidates, 10, prior=np.eye(6)), "9 x 9"),
         (lambda: some(50, cone_deg=99.0), "cone_deg"),
@@ -265,7 +332,7 @@ def test_no_set_of_poses_goes_below_the_bound(criterion):
     assert design.least_error(pool, 20, criterion, chosen) < 0.8 * least
     with pytest.raises(InputError, match="choose the criterion tre or rp"):
         design.least_error(pool, 20, "d")
-    with pytest.raises(InputError, match="at least one pose"):
+    with pytest.raises(InputError, match="between 1 and"):
         design.least_error(pool, 0)
 
 

@@ -9,6 +9,8 @@ import optimistix as optx
 import pytest
 from scipy.optimize import least_squares
 
+import jaxcal
+from jaxcal import backend
 from jaxcal.solvers.general import LevenbergMarquardt, arrow_least_squares
 
 POINTS = 12
@@ -151,3 +153,24 @@ def test_shared_and_local_unknowns_are_those_of_a_dense_solver(arrow, points, li
         step = 1e-5
         ends = [arrow(points + sign * step * along, most, along)[0] for sign in (1, -1)]
         np.testing.assert_allclose(forward, (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
+
+
+def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
+    one = jaxcal.Problem.from_recording(
+        jaxcal.simulate_recording(jaxcal.Protocol(images=8), seed=1)
+    )
+    batch = jaxcal.stack([one, one])
+    for call, said in (
+        (lambda: backend.initial_fit(batch), "takes one problem"),
+        (lambda: backend.ImagePlanes.of(one), "a batch with one leading axis"),
+        (
+            lambda: backend.channel_residual(backend.initial_fit(one), one),
+            "the problem has no times of flight",
+        ),
+        (
+            lambda: backend.arrow_least_squares(lambda s, y, d: d, np.zeros(2, int), np.zeros(3)),
+            "floating arrays",
+        ),
+    ):
+        with pytest.raises(jaxcal.InputError, match=said):
+            call()

@@ -1,9 +1,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from test_geometry import random_poses
 
-from jaxcal import calibration_reproducibility, reconstruction_precision
+from jaxcal import InputError, calibration_reproducibility, reconstruction_precision
 
 
 def test_reconstruction_precision_is_the_norm_of_unbiased_sds():
@@ -21,6 +22,13 @@ def test_reconstruction_precision_is_the_norm_of_unbiased_sds():
     masked = reconstruction_precision(transform, poses, points, mask)
     expected = np.linalg.norm(np.std(cloud[mask > 0], axis=0, ddof=1))
     np.testing.assert_allclose(masked, expected)
+
+
+def test_a_single_image_has_no_scatter():
+    pose, points = random_poses(0, 3), np.full((3, 2), 20.0)
+    for mask in ([1.0, 0.0, 0.0], np.zeros(3)):
+        with pytest.raises(InputError, match="at least two images"):
+            reconstruction_precision(np.eye(4), pose, points, np.array(mask))
 
 
 def test_reproducibility_of_shifted_calibrations():

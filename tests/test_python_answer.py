@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -143,6 +144,8 @@ def test_calls_as_users_make_them():
 import warnings
 import numpy as np
 import jaxcal
+from jaxcal import backend
+from jaxcal.study import run_study
 from jaxcal.study.spec import parse_spec
 START = 'name = "a"\nseed = 1\ntrials = 1\n[[methods]]\nname = "a"\nmethod = "alternating"\n'
 warnings.simplefilter("error")
@@ -206,6 +209,17 @@ for call, *given in (
         "max_iterations = 1.5", 'max_elevation_mm = "1 mm"', "tolerance_mm = true",
         "tolerance_rad = [1]", "prior = 3", "max_elevation_mm = [1]",
     )),
+    (lambda level: jaxcal.transform_intervals(result, level), "0.95"),
+    (lambda level: jaxcal.transform_intervals(result, level), None),
+    (lambda probe: jaxcal.Protocol(probe=probe), "linear"),
+    (lambda raw: jaxcal.Protocol(raw=raw), "no"),
+    (lambda radius: jaxcal.CurvilinearProbe(radius_mm=radius), None),
+    (jaxcal.Problem.from_recording, "rec.h5"), (jaxcal.segment, "rec.h5"),
+    (jaxcal.segment_recording, "rec.h5"), (jaxcal.simulate, 3, jaxcal.Protocol()),
+    (jaxcal.ImageTransform(np.eye(4)).apply, [[0.0, 50.0]], "pose"),
+    (run_study, "no-such-study.toml", "no-such-folder"),
+    (lambda local: backend.arrow_least_squares(lambda s, y, d: d, np.zeros(2), local), points),
+    (lambda n: run_study(parse_spec(START), "no-such-folder", workers=n), "2"),
 ):
     try:
         call(*given)
@@ -217,7 +231,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 77
+    assert len(lines) == 90
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
@@ -240,6 +254,13 @@ for call, *given in (
     assert lines[72] == (
         "methods[0]: max_elevation must be finite and not negative, in mm, not '1 mm'"
     )
+    assert lines[77] == "level must be between 0 and 1, not '0.95'"
+    assert lines[82] == (
+        "jaxcal.Problem.from_recording takes a recording (jaxcal.load reads one), not str"
+    )
+    assert lines[85] == "key must be a JAX key, e.g. jax.random.key(1), not 3"
+    assert lines[87].startswith("run_study takes a study, not 'no-such-study.toml'")
+    assert not Path("no-such-folder").exists()
     assert lines[69] == "robust must be True or False, not 'no'"
 
 

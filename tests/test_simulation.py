@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import experiment
 
+import jaxcal
 from jaxcal import InputError, Protocol, simulate
 from jaxcal.diagnostics.metrics import reconstruct
 from jaxcal.study.simulation import draw
@@ -39,6 +40,14 @@ def test_draws_do_not_depend_on_the_batch():
     # A program for another number of lanes may round what follows differently.
     np.testing.assert_allclose(whole.poses[3], part.poses[0], rtol=0, atol=1e-12 * 300)
     np.testing.assert_allclose(whole.points[3], part.points[0], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_few_test_images_or_none(count, tmp_path):
+    recording = experiment(1, images=8, test_images=count)
+    jaxcal.save(recording, tmp_path / "rec.h5")
+    for one in (recording, jaxcal.load(tmp_path / "rec.h5")):
+        assert (0 if one.test is None else len(one.test.poses)) == count
 
 
 def test_normal_offsets_have_the_given_sd():

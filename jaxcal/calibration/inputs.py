@@ -38,6 +38,18 @@ def whole_number(name: str, value: object, least: int, most: int) -> int:
     return int(value)
 
 
+def check_flag(name: str, value: object) -> None:
+    """Raise InputError if what a caller gave is not True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} must be True or False, not {shown(value)}")
+
+
+def check_made(name: str, value: object, kind: type, by: str) -> None:
+    """Raise InputError, which names what makes such an object, if a caller gave something else."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name} must be made by {by}, not {shown(value)}")
+
+
 def as_problem(value: Any, name: str) -> Problem:
     """The problem that a caller gave; recordings and images are converted.
 

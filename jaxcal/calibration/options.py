@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import whole_number
+from jaxcal.calibration.inputs import check_flag, whole_number
 from jaxcal.calibration.names import Data, Method, PriorName, SolverName
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
@@ -113,7 +113,7 @@ class Options:
             )
         if not _is_one_of(self.precision, Precision):
             raise InputError(f"precision must be float64 or float32, not {shown(self.precision)}")
-        _check_flag("differentiate", self.differentiate)
+        check_flag("differentiate", self.differentiate)
         for name in ("gradient_tolerance", "tolerance_rad", "tolerance_mm"):
             _check_size(name, getattr(self, name), np.finfo(float).tiny)
         for name in ("max_rounds", "inner_steps", "max_iterations", "trace"):
@@ -150,11 +150,6 @@ def check_alternation(names: Iterable[str], method: str) -> None:
 def _is_one_of(value: object, names: Any) -> bool:
     """Whether a value is one of a Literal's names; comparing an array would give an array."""
     return isinstance(value, str) and value in get_args(names)
-
-
-def _check_flag(name: str, value: object) -> None:
-    if not isinstance(value, bool | np.bool_):
-        raise InputError(f"{name} must be True or False, not {shown(value)}")
 
 
 def _is_optimistix(solver: Any) -> TypeGuard[optx.AbstractLeastSquaresSolver]:
@@ -322,7 +317,7 @@ def _check_names(request: Request) -> None:
         if not _is_one_of(value, names):
             listed = ", ".join(get_args(names))
             raise InputError(f"{name} must be one of {listed}, not {shown(value)}")
-    _check_flag("robust", request.robust)
+    check_flag("robust", request.robust)
     for name in request.estimate:
         if name not in EXTRA:
             raise InputError(f"cannot estimate {shown(name)}; there are: {', '.join(EXTRA)}")

@@ -223,10 +223,10 @@ class ImageTransform:
         if pose is None:
             return AppliedPoints(points, covariance)
         given = real_array(pose, "pose")
-        given = given[None] if given.ndim == 2 else given
+        given = check_poses(given[None] if given.ndim == 2 else given)
         if len(given) not in (1, count):
             raise InputError(f"{count} pixels but {len(given)} poses: one, or as many, are needed")
-        poses = np.broadcast_to(check_poses(given), (count, 4, 4))
+        poses = np.broadcast_to(given, (count, 4, 4))
         turn = poses[:, :3, :3]
         points = np.einsum("nij,nj->ni", turn, points) + poses[:, :3, 3]
         return AppliedPoints(points, turn @ covariance @ turn.swapaxes(1, 2))

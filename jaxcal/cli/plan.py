@@ -70,21 +70,29 @@ _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"%PDF", b"%!PS", b"<?xml", b"RIFF", b
     "--lateral",
     type=POSITIVE,
     metavar="MM",
-    help="Lateral position of the target, up to this either way.",
+    help="Lateral position of the target, up to this either way.  [default: 0.41 of the aperture; "
+    "with REC where it was]",
 )
-@click.option("--cone", type=NOT_NEGATIVE, metavar="DEG", help="Largest tilt.  [default: 40]")
+@click.option(
+    "--cone",
+    type=NOT_NEGATIVE,
+    metavar="DEG",
+    help="Largest tilt.  [default: 40; with REC that of its images, at least 30]",
+)
 @click.option(
     "--turn",
     type=NOT_NEGATIVE,
     metavar="DEG",
-    help="Largest turn about the beam's direction.  [default: 90]",
+    help="Largest turn about the beam's direction.  [default: 90; with REC that of its images, at "
+    "least 60]",
 )
 @click.option(
     "--sigma",
     type=POSITIVE,
     nargs=3,
     metavar="LATERAL RANGE ELEVATIONAL",
-    help="SDs of the errors, mm, without REC. They may be wrong by a factor of three.",
+    help="SDs of the errors, mm, without REC. They may be wrong by a factor of three.  [default: "
+    "those that the probe's geometry gives]",
 )
 @click.option(
     "--estimate", metavar="LIST", help="With REC: further unknowns (scale), as for calibrate."
@@ -281,11 +289,13 @@ def _print(found: Plan, record: dict[str, Any], figure: str | None) -> None:
             f"{lateral:.0f}, {depth:.0f}",
             f"{pose['tre_mm']:.3g}",
         )
+    there = found.known.images
     counts = [
-        f"{wanted} mm: {'over 1000' if count is None else count}"
+        f"{wanted} mm: "
+        + ("over 1000" if count is None else "reached" if count <= there else f"{count}")
         for wanted, count in record["images_to_tre_mm"].items()
     ]
-    before = "" if not found.known.images else f" after the {found.known.images} that there are"
+    before = "" if not there else f" after the {there} that there are"
     print_page(
         table,
         "Tilts and turns from the middle orientation, with the marker to your right; left is where "

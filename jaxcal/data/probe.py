@@ -17,7 +17,7 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.sound import check_sound_speed
 from jaxcal.runtime.array_types import Bool, Float, Num
-from jaxcal.runtime.arrays import real_array
+from jaxcal.runtime.arrays import is_number, real_array
 
 _LONGEST_DELAY_S = 1e-3
 
@@ -160,7 +160,7 @@ class CurvilinearProbe(_Array):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.radius_mm < 1e4:
+        if not (is_number(self.radius_mm) and 0 < self.radius_mm < 1e4):
             raise InputError(f"probe radius must be in mm, up to 10000, not {self.radius_mm}")
         if self.half_angle_rad > np.pi / 2:
             raise InputError(
@@ -238,6 +238,16 @@ class CurvilinearProbe(_Array):
 
 
 Probe = LinearProbe | CurvilinearProbe
+
+
+def check_probe(probe: object) -> None:
+    """Raise InputError if what a caller gave as a transducer is none."""
+    if not isinstance(probe, Probe):
+        raise InputError(
+            "probe must be a jaxcal.LinearProbe or a jaxcal.CurvilinearProbe, not "
+            f"{type(probe).__name__}"
+        )
+
 
 L14_5 = LinearProbe(elements=128, pitch_mm=58.5 / 128)
 """The paper's 58.5 mm L14-5W linear array (section 3.2)."""

@@ -15,9 +15,9 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.probe import CurvilinearProbe
-from jaxcal.data.recording import Images, Kind, Recording, make_images
+from jaxcal.data.recording import Images, Kind, Recording, images_of, make_images
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
-from jaxcal.runtime.arrays import array_module
+from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.precision import importing_jax, in_own_modes
 from jaxcal.runtime.trees import array_tree, static
 
@@ -143,7 +143,7 @@ class Problem:
             InputError: for times of flight that cannot be segmented, or come without a probe.
         """
         probe = recording.probe if isinstance(recording, Recording) else None
-        images = recording.calibration if isinstance(recording, Recording) else recording
+        images = images_of(recording, "jaxcal.Problem.from_recording")
         dtype = np.float64 if dtype is None else dtype
 
         # device_put, since JAX would compile jax.numpy.asarray of a number.
@@ -252,4 +252,12 @@ def stack(problems: list[Problem]) -> Problem:
                 f"problem {index} differs from problem 0 in its number of images or in its parts; "
                 "pad it with images that are masked out"
             )
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)
+
+    def stacked(*leaves: Any) -> Any:
+        if is_traced(*leaves):
+            return jnp.stack(leaves)
+        # By numpy: jax.numpy.stack of thousands of arrays takes minutes to compile.
+        kept = [leaf.sharding for leaf in leaves[:1] if isinstance(leaf, jax.Array)]
+        return jax.device_put(np.stack(leaves), *kept)
+
+    return jax.tree.map(stacked, *problems)

@@ -115,6 +115,27 @@ class Recording:
         return len(self.calibration)
 
 
+def check_recording(value: object, name: str) -> None:
+    """Raise InputError, which names the function, if what a caller gave is no recording."""
+    if not isinstance(value, Recording):
+        raise InputError(
+            f"{name} takes a recording (jaxcal.load reads one), not {type(value).__name__}"
+        )
+
+
+def images_of(value: object, name: str) -> Images:
+    """Images that a caller gave, or the calibration images of a recording.
+
+    Raises:
+        InputError: something else; ``name`` is the function's.
+    """
+    if isinstance(value, Images):
+        return value
+    check_recording(value, name)
+    assert isinstance(value, Recording)
+    return value.calibration
+
+
 def make_images(
     poses: np.ndarray,
     measurements: np.ndarray,

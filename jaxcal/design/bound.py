@@ -19,9 +19,11 @@ import math
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.inputs import whole_number
 from jaxcal.calibration.result import Calibration
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import Criterion, check_criterion, weight_of
+from jaxcal.design.greedy import MOST_POSES
 from jaxcal.design.information import covariance_of
 from jaxcal.design.planning import (
     Known,
@@ -64,8 +66,7 @@ def least_error(
     check_criterion(criterion)
     if criterion == "d":
         raise InputError("the bound is on an error in mm: choose the criterion tre or rp")
-    if n < 1:
-        raise InputError(f"a plan has at least one pose, not {n}")
+    whole_number("the number of poses", n, 1, MOST_POSES)
     known = known_before(prior, candidates)
     check_candidates(candidates)
     candidates = with_effective_noise(prior, candidates)

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.inputs import LARGEST_SEED, check_made, whole_number
 from jaxcal.data.poses import check_poses, nearest_rotations
 from jaxcal.data.probe import Probe
+from jaxcal.data.recording import check_recording
 from jaxcal.design.constraints import Constraints, Region
-from jaxcal.design.information import Model
+from jaxcal.design.information import Model, check_result
 from jaxcal.design.noise import Noise
 from jaxcal.runtime.array_types import Float
 
@@ -67,11 +69,12 @@ class Candidates:
     def __post_init__(self) -> None:
         if self._checked:
             return
-        if not 1 <= len(self.poses) <= MOST_CANDIDATES:
-            raise InputError(
-                f"there must be 1 to {MOST_CANDIDATES} candidates, not {len(self.poses)}"
-            )
-        object.__setattr__(self, "poses", check_poses(self.poses, what="candidate pose"))
+        poses = check_poses(self.poses, what="candidate pose")
+        if not 1 <= len(poses) <= MOST_CANDIDATES:
+            raise InputError(f"there must be 1 to {MOST_CANDIDATES} candidates, not {len(poses)}")
+        object.__setattr__(self, "poses", poses)
+        check_made("model", self.model, Model, "jaxcal.design.Model")
+        check_made("constraints", self.constraints, Constraints, "jaxcal.design.Constraints")
         # Copies with other SDs, or with some of the poses, need no new check.
         object.__setattr__(self, "_checked", True)
 
@@ -140,6 +143,8 @@ def sobol_poses(
 
     There are fewer poses if the constraints allow fewer than ``count`` of 50 ``count`` tries.
     """
+    whole_number("count", count, 1, MOST_CANDIDATES)
+    whole_number("seed", seed, 0, LARGEST_SEED)
     x, point = model.image_to_probe, model.point
     found: list[np.ndarray] = []
     passed = first = 0
@@ -185,10 +190,12 @@ def make_candidates(
     if constraints is None:
         default = Region() if probe is None else Region.of_probe(probe)
         constraints = Constraints(region=default)
+    check_made("constraints", constraints, Constraints, "jaxcal.design.Constraints")
     if region is not None:
         constraints = replace(constraints, region=region)
     if model is None:
         model = Model() if probe is None else Model(noise=Noise.of_probe(probe))
+    check_made("model", model, Model, "jaxcal.design.Model")
     poses, _ = sobol_poses(count, model, constraints, seed)
     if len(poses) < count:
         raise InputError(
@@ -224,6 +231,8 @@ def candidates_around(
     Raises:
         InputError: a calibration that failed.
     """
+    check_recording(recording, "candidates_around")
+    check_result(result)
     answer = result.numpy()
     x, point = np.asarray(answer.image_to_probe, float), np.asarray(answer.point, float)
     if not (np.isfinite(x).all() and np.isfinite(point).all()):
@@ -236,7 +245,9 @@ def candidates_around(
     sigma = np.asarray(answer.sigma, float)
     if np.isfinite(sigma).all():
         model = replace(model, noise=Noise.learned(result, targets))
-    if constraints is None:
+    if constraints is not None:
+        check_made("constraints", constraints, Constraints, "jaxcal.design.Constraints")
+    else:
         images = poses[used, :3, :3] @ x[:3, :3]
         reference, _ = nearest_rotations(images.mean(axis=0)[None])
         constraints = Constraints(

@@ -21,15 +21,26 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.inputs import check_made
 from jaxcal.data.poses import rotations_from_vectors, targets_in_images
-from jaxcal.data.probe import CurvilinearProbe, Probe
+from jaxcal.data.probe import CurvilinearProbe, Probe, check_probe
 from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.arrays import is_number, real_array
 
 _INSIDE = 1e-9
 """Numbers outside by less than this, due to rounding, count as inside."""
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 Allowed = Callable[[Float[np.ndarray, "n 4 4"]], Bool[np.ndarray, " n"]]
+
+
+def _are_in_order(value: Any, shape: tuple[int, ...]) -> bool:
+    """Whether a caller's value holds two numbers or points, the first nowhere the larger one."""
+    try:
+        numbers = real_array(value, "it")
+    except InputError:
+        return False
+    return numbers.shape == shape and bool((numbers[0] <= numbers[1]).all())
 
 
 @dataclass(frozen=True)
@@ -48,13 +59,14 @@ class Region:
 
     def __post_init__(self) -> None:
         for name in ("lateral_mm", "depth_mm"):
-            low, high = getattr(self, name)
-            if not (np.isfinite([low, high]).all() and low <= high):
-                raise InputError(f"{name} of the region must be two mm in order, not {low, high}")
+            value = getattr(self, name)
+            if not (_are_in_order(value, (2,)) and np.isfinite(value).all()):
+                raise InputError(f"{name} of the region must be two mm in order, not {value!r}")
         if not 0 < self.depth_mm[0] <= self.depth_mm[1] <= 5000:
             raise InputError(f"depths must be positive mm, up to 5000, not {self.depth_mm}")
-        if self.radius_mm is not None and not 0 < self.radius_mm < 1e4:
-            raise InputError(f"the array's radius must be in mm, not {self.radius_mm}")
+        radius = self.radius_mm
+        if radius is not None and not (is_number(radius) and 0 < radius < 1e4):
+            raise InputError(f"the array's radius must be in mm, not {radius!r}")
 
     @classmethod
     def of_probe(
@@ -64,6 +76,7 @@ class Region:
         lateral_mm: tuple[float, float] | None = None,
     ) -> Region:
         """The region in front of a probe; by default 0.82 of its aperture."""
+        check_probe(probe)
         half = 0.41 * probe.width_mm
         radius = probe.radius_mm if isinstance(probe, CurvilinearProbe) else None
         return cls((-half, half) if lateral_mm is None else lateral_mm, depth_mm, radius)
@@ -128,13 +141,24 @@ class Constraints:
     def __post_init__(self) -> None:
         for name, largest in (("cone_deg", 85.0), ("turn_deg", 180.0)):
             value = getattr(self, name)
-            if not (np.isfinite(value) and 0 <= value <= largest):
-                raise InputError(f"{name} must be 0 to {largest:g} degrees, not {value}")
-        reference = np.asarray(self.reference, float)
-        if reference.shape != (3, 3) or not np.allclose(
-            reference @ reference.T, np.eye(3), atol=1e-6
+            if not (is_number(value) and 0 <= value <= largest):
+                raise InputError(f"{name} must be 0 to {largest:g} degrees, not {value!r}")
+        reference = real_array(self.reference, "reference")
+        if not (
+            reference.shape == (3, 3)
+            and np.allclose(reference @ reference.T, np.eye(3), atol=1e-6)
+            and np.linalg.det(reference) > 0
         ):
             raise InputError("the reference orientation must be a 3x3 rotation")
+        check_made("region", self.region, Region, "jaxcal.design.Region")
+        if self.box_mm is not None and not _are_in_order(self.box_mm, (2, 3)):
+            raise InputError(
+                f"box_mm must be the least and the largest corner, three mm each, not {self.box_mm}"
+            )
+        if self.reach_mm is not None and not _are_in_order(self.reach_mm, (2,)):
+            raise InputError(f"reach_mm must be two mm in order, not {self.reach_mm}")
+        if self.allowed is not None and not callable(self.allowed):
+            raise InputError(f"allowed must be a function of poses, not {self.allowed!r}")
 
     def keeps(
         self,

@@ -26,6 +26,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.inputs import check_made
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.information import Model
 from jaxcal.diagnostics.image_points import mean_of_squares, point_jacobian
@@ -99,6 +100,15 @@ def gain(
     """
     import jax.numpy as jnp
 
+    check_made("model", model, Model, "jaxcal.design.Model")
+    square = (model.size, model.size)
+    for name, value, shape in (
+        ("pose", pose, (4, 4)),
+        ("covariance", covariance, square),
+        ("weight", weight, square),
+    ):
+        if np.shape(value) != shape:
+            raise InputError(f"{name} must have shape {shape}, not {np.shape(value)}")
     rows = model.jacobian(jnp.asarray(pose))
     spread = rows @ jnp.asarray(covariance)
     around = jnp.eye(3) + spread @ rows.T

@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal import InputError
+from jaxcal.calibration.inputs import check_made
 from jaxcal.design.planning import Plan
+from jaxcal.runtime.arrays import is_number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,6 +25,9 @@ def plan_figure(plan: Plan, wanted_mm: float | None = None) -> Figure:
         plan: what to draw.
         wanted_mm: a wanted TRE to mark in the figure.
     """
+    check_made("plan", plan, Plan, "jaxcal.design.plan or next_poses")
+    if wanted_mm is not None and not (is_number(wanted_mm) and wanted_mm > 0):
+        raise InputError(f"the wanted error must be a positive number of mm, not {wanted_mm!r}")
     from matplotlib.figure import Figure
     from matplotlib.ticker import StrMethodFormatter
 

@@ -15,10 +15,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxcal import InputError
+from jaxcal.calibration.inputs import whole_number
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import gains
 from jaxcal.design.information import covariance_of
 from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.arrays import is_number
+
+MOST_POSES = 2000
+"""Of one plan."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,14 @@ class Rules:
     replicates: int = 2
     apart_deg: float = 5.0
     apart_mm: float = 8.0
+
+    def __post_init__(self) -> None:
+        if not (is_number(self.space_filling) and 0 <= self.space_filling <= 1):
+            raise InputError(f"space_filling must be 0 to 1, not {self.space_filling!r}")
+        whole_number("replicates", self.replicates, 1, MOST_POSES)
+        for name in ("apart_deg", "apart_mm"):
+            if not (is_number(value := getattr(self, name)) and value >= 0):
+                raise InputError(f"{name} must be zero or a positive number, not {value!r}")
 
 
 @dataclass

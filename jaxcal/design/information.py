@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.inputs import check_made
 from jaxcal.data.poses import targets_in_images
 from jaxcal.design.noise import Noise
 from jaxcal.model.unknowns import RIGID, block_slice
@@ -54,6 +55,12 @@ class Model:
     noise: Noise = field(default_factory=lambda: Noise.constant((0.5, 0.3, 1.0)))
     scale: bool = False
     face_offset_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, shape in (("image_to_probe", (4, 4)), ("point", (3,))):
+            if np.shape(getattr(self, name)) != shape:
+                raise InputError(f"{name} of the model must be an array of shape {shape}")
+        check_made("noise", self.noise, Noise, "jaxcal.design.Noise")
 
     @property
     def size(self) -> int:
@@ -108,6 +115,16 @@ def covariance_of(information: Float[np.ndarray, "*k p p"]) -> Float[np.ndarray,
     return 0.5 * (found + np.swapaxes(found, -1, -2))
 
 
+def check_result(result: object) -> None:
+    """Raise InputError if what a caller gave is not the calibration of one problem."""
+    from jaxcal.calibration.result import Calibration
+
+    check_made("result", result, Calibration, "jaxcal.calibrate")
+    assert isinstance(result, Calibration)
+    if np.ndim(result.image_to_probe) != 2:
+        raise InputError("poses are planned for one problem; the result is of a batch")
+
+
 def known_information(
     result: Calibration, model: Model, poses: Float[np.ndarray, "n 4 4"]
 ) -> Float[np.ndarray, "p p"]:
@@ -122,6 +139,8 @@ def known_information(
         model: with the calibration's X and target.
         poses: of the images, probe -> tracker, mm.
     """
+    check_result(result)
+    check_made("model", model, Model, "jaxcal.design.Model")
     answer = result.numpy()
     used = np.asarray(answer.mask) > 0
     if len(used) != len(poses):

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.probe import Probe
+from jaxcal.data.probe import Probe, check_probe
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import is_number, real_array
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
@@ -52,15 +53,17 @@ class Noise:
         given = isinstance(self.coefficients, np.ndarray)
         if given and not np.isfinite(self.coefficients).all():
             raise InputError("the noise model's coefficients must be finite")
-        if not 1 <= self.doubt <= 100:
-            raise InputError(f"doubt is a factor between 1 and 100, not {self.doubt}")
+        if np.shape(self.coefficients) != (3, 4):
+            raise InputError("the noise model's coefficients must have shape (3, 4)")
+        if not (is_number(self.doubt) and 1 <= self.doubt <= 100):
+            raise InputError(f"doubt is a factor between 1 and 100, not {self.doubt!r}")
 
     @classmethod
     def constant(
         cls, sigma_mm: tuple[float, float, float] | np.ndarray, doubt: float = UNKNOWN_BY
     ) -> Noise:
         """The same SDs everywhere: lateral, range, elevational, mm."""
-        sigma = np.asarray(sigma_mm, float)
+        sigma = real_array(sigma_mm, "SDs")
         if sigma.shape != (3,) or not (np.isfinite(sigma).all() and (sigma > 0).all()):
             raise InputError(f"SDs must be three positive mm, not {sigma_mm}")
         coefficients = np.zeros((3, 4))
@@ -88,6 +91,7 @@ class Noise:
             focus_mm: range at which the beam is thinnest.
             doubt: see the class.
         """
+        check_probe(probe)
         lateral, depth = np.meshgrid(
             np.linspace(-0.4, 0.4, 9) * probe.width_mm, np.linspace(15.0, 90.0, 12)
         )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.inputs import check_flag, check_made, whole_number
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import (
@@ -18,9 +19,10 @@ from jaxcal.design.criteria import (
     weight_of,
 )
 from jaxcal.design.exchange import exchange
-from jaxcal.design.greedy import Chosen, Rules, Search, choose, space_features
+from jaxcal.design.greedy import MOST_POSES, Chosen, Rules, Search, choose, space_features
 from jaxcal.design.information import (
     Model,
+    check_result,
     covariance_of,
     effective_elevational,
     known_information,
@@ -28,11 +30,11 @@ from jaxcal.design.information import (
 from jaxcal.design.noise import Noise
 from jaxcal.diagnostics.messages import direction_in_words
 from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.arrays import real_array
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
 
-MOST_POSES = 2000
 _SINGULAR = 1e-10
 """Eigenvalue ratio (scaled units, equal SDs) below which a direction is not determined."""
 _TRIED_RAD, _TRIED_SHARE = 0.4, 0.6
@@ -139,14 +141,18 @@ def plan(
             missing), or a number of poses that is too small or too large.
     """
     check_criterion(criterion)
+    check_flag("polish", polish)
+    check_flag("swap", swap)
     known = known_before(prior, candidates)
     least = MINIMUM_IMAGES if known.images == 0 else 1
-    if not least <= n <= MOST_POSES:
-        raise InputError(f"a plan has {least} to {MOST_POSES} poses, not {n}")
-    if cost_s is not None and not (len(cost_s) == len(candidates) and (cost_s > 0).all()):
-        raise InputError("cost_s must have a positive number of seconds for each candidate")
+    whole_number("the number of poses", n, least, MOST_POSES)
+    if cost_s is not None:
+        cost_s = real_array(cost_s, "cost_s")
+        if cost_s.shape != (len(candidates),) or not (cost_s > 0).all():
+            raise InputError("cost_s must have a positive number of seconds for each candidate")
     check_candidates(candidates)
     rules = Rules() if rules is None else rules
+    check_made("rules", rules, Rules, "jaxcal.design.Rules")
     if isinstance(prior, Plan):
         candidates = _with_taken(candidates, prior)
     candidates = with_effective_noise(prior, candidates)
@@ -198,6 +204,7 @@ def known_before(
     prior: Known | Plan | Calibration | np.ndarray | None, candidates: Candidates
 ) -> Known:
     """The information of a prior about the unknowns of the candidates' model."""
+    check_made("candidates", candidates, Candidates, "make_candidates or candidates_around")
     size = candidates.model.size
     if prior is None:
         return Known(candidates.model.beliefs())
@@ -208,7 +215,11 @@ def known_before(
     if isinstance(prior, np.ndarray):
         if prior.shape != (size, size) or not np.isfinite(prior).all():
             raise InputError(f"information must be a finite {size} x {size} matrix")
+        values = np.linalg.eigvalsh(prior)
+        if not np.allclose(prior, prior.T) or values[0] < -_SINGULAR * abs(values[-1]):
+            raise InputError("information must be a symmetric matrix without negative eigenvalues")
         return Known(prior + candidates.model.beliefs())
+    check_result(prior)
     if candidates.taken is None:
         raise InputError(
             "the poses of the calibration's images are needed: "

@@ -19,6 +19,7 @@ from jaxcal.design.criteria import rp_weight, tre_weight
 from jaxcal.design.information import covariance_of
 from jaxcal.diagnostics.intervals import student_variance
 from jaxcal.runtime.array_types import Float, Int
+from jaxcal.runtime.arrays import is_number
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
@@ -72,10 +73,11 @@ def images_to(
     Raises:
         InputError: more than 1000 would be needed.
     """
-    from jaxcal.design.planning import MOST_POSES, Plan, next_poses
+    from jaxcal.design.greedy import MOST_POSES
+    from jaxcal.design.planning import Plan, next_poses
 
-    if not (np.isfinite(tre_mm) and tre_mm > 0):
-        raise InputError(f"the wanted error must be a positive number of mm, not {tre_mm}")
+    if not (is_number(tre_mm) and tre_mm > 0):
+        raise InputError(f"the wanted error must be a positive number of mm, not {tre_mm!r}")
     first = 0
     if isinstance(result, Plan):
         reached = np.flatnonzero(result.tre_mm <= tre_mm)

@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.inputs import LARGEST_SEED, check_made, whole_number
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.planning import Plan
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import real_array
 from jaxcal.runtime.precision import importing_jax, in_own_modes
 
 if TYPE_CHECKING:
@@ -99,12 +101,14 @@ def simulate_errors(
         poses = _with_taken(poses)
     if candidates is None:
         raise InputError("poses alone do not say what the images show: give candidates as well")
+    check_made("candidates", candidates, Candidates, "make_candidates or candidates_around")
+    poses = real_array(poses, "poses")
     if poses.ndim not in (3, 4) or poses.shape[-2:] != (4, 4):
         raise InputError(f"poses must be (n, 4, 4) or (trials, n, 4, 4), not {poses.shape}")
     if poses.ndim == 4:
         trials = len(poses)
-    if not 2 <= trials <= MOST_TRIALS:
-        raise InputError(f"trials must be 2 to {MOST_TRIALS}, not {trials}")
+    whole_number("trials", trials, 2, MOST_TRIALS)
+    whole_number("seed", seed, 0, LARGEST_SEED)
     poses = np.broadcast_to(poses, (trials, *poses.shape[-3:]))
     model = candidates.model
     problems = _recordings(poses, model, law, np.random.default_rng(seed))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaxcal.data.poses import check_poses
 from jaxcal.design.constraints import Constraints
 from jaxcal.runtime.array_types import Float
 
@@ -37,7 +38,8 @@ def pose_in_words(
     Returns:
         e.g. "tilt 20 degrees towards the marker, target in the lower left corner".
     """
-    s1, s2, w1, w2, turn = constraints.coordinates(pose[None], image_to_probe, point)[0]
+    pose = check_poses(np.asarray(pose)[None])
+    s1, s2, w1, w2, turn = constraints.coordinates(pose, image_to_probe, point)[0]
     parts = []
     tilt, turned = float(np.degrees(np.hypot(w1, w2))), float(np.degrees(turn))
     if tilt >= _LEAST_TILT_DEG:

@@ -37,7 +37,7 @@ from jaxcal.diagnostics.image_points import mean_of_squares, point_jacobian
 from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.model.unknowns import in_image, size
 from jaxcal.runtime.array_types import AnyArray, Float
-from jaxcal.runtime.arrays import array_module, is_traced, real_array, traceable
+from jaxcal.runtime.arrays import array_module, is_number, is_traced, real_array, traceable
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
@@ -432,5 +432,5 @@ def _radial(dimensions: int, freedom: float) -> _Radial:
 
 
 def _check_level(level: float) -> None:
-    if not 0 < level < 1:
-        raise InputError(f"level must be between 0 and 1, not {level}")
+    if not (is_number(level) and 0 < level < 1):
+        raise InputError(f"level must be between 0 and 1, not {level!r}")

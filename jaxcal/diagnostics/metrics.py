@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.runtime.array_types import AnyArray, Float
-from jaxcal.runtime.arrays import array_module, traceable
+from jaxcal.runtime.arrays import array_module, is_traced, traceable
 
 
 @traceable
@@ -28,7 +28,7 @@ def reconstruction_precision(
         sqrt(sum over x, y, z of the unbiased variance (n - 1)), mm.
 
     Raises:
-        InputError: shapes that do not agree.
+        InputError: shapes that do not agree, or fewer than two images to count.
     """
     xp = array_module(image_to_probe, poses, points, mask)
     poses, points = xp.asarray(poses), xp.asarray(points)
@@ -46,6 +46,8 @@ def reconstruction_precision(
     weight = xp.ones(poses.shape[0], cloud.dtype) if mask is None else xp.asarray(mask)
     weight = weight.astype(cloud.dtype)[:, None]
     count = xp.sum(weight)
+    if not is_traced(count) and count < 2:
+        raise InputError(f"a scatter needs at least two images, not {count:g}")
     mean = xp.sum(weight * cloud, axis=0) / count
     return xp.asarray(xp.sqrt(xp.sum(weight * (cloud - mean) ** 2) / (count - 1)))
 

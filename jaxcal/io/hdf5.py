@@ -38,6 +38,7 @@ from jaxcal.data.recording import (
     Kind,
     Recording,
     Truth,
+    check_recording,
     make_images,
     unit_of,
 )
@@ -117,8 +118,7 @@ def save(
             :func:`jaxcal.data.recording.make_images`, or are too large).
         OutputError: the file could not be written; it is as it was.
     """
-    if not isinstance(recording, Recording):
-        raise InputError(f"jaxcal.save takes a recording, not {type(recording).__name__}")
+    check_recording(recording, "jaxcal.save")
     # Built in memory: HDF5 handles a full disk badly, but an ordinary write reports it.
     image = io.BytesIO()
     with h5py.File(image, "w") as file:

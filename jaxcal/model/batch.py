@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxcal import InputError
 from jaxcal.data.problem import Problem
 from jaxcal.model import unrolled
 from jaxcal.model.parameters import Parameters
@@ -72,7 +73,15 @@ class ImagePlanes(eqx.Module):
         Args:
             problems: the batch.
             channels: take the times of flight along.
+
+        Raises:
+            InputError: one problem, or a batch with more axes.
         """
+        if problems.mask.ndim != 2:
+            raise InputError(
+                "a batch with one leading axis is needed, e.g. jaxcal.stack([problem]); this one "
+                f"has the shape {problems.mask.shape[:-1]}"
+            )
         used = problems.mask > 0
 
         def plane(values: Array, instead: float) -> Array:

@@ -33,6 +33,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxcal import InputError
 from jaxcal.model.batch import RIGID_UNKNOWNS, ImagePlanes, Iterate, targets, whole
 from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import (
@@ -299,7 +300,8 @@ class ChannelDistances(Observation):
 
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
         channels = images.channels
-        assert channels is not None
+        if channels is None:
+            raise InputError("the problem has no times of flight")
         square = 0.0
         for value, element in zip(q, channels.elements, strict=True):
             square = square + (value[..., None] - element[:, None, :]) ** 2

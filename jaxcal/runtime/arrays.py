@@ -44,6 +44,15 @@ def real_array(value: Any, name: str) -> np.ndarray:
     raise InputError(f"{name} must be an array of real numbers")
 
 
+def is_number(value: Any) -> bool:
+    """Whether a caller's value is one finite real number, not a text, truth value or array."""
+    try:
+        number = real_array(value, "it")
+    except InputError:
+        return False
+    return number.ndim == 0 and bool(np.isfinite(number))
+
+
 def array_module(*values: object) -> Any:
     """What to compute with: jax.numpy where one of the values is traced, otherwise numpy."""
     return sys.modules["jax"].numpy if is_traced(*values) else np

@@ -30,6 +30,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxcal import InputError
 from jaxcal.model import unrolled
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.solvers.levenberg_marquardt import (
@@ -180,8 +181,15 @@ def arrow_least_squares(
 
     Returns:
         optimistix's solution; its ``value`` is (shared, local).
+
+    Raises:
+        InputError: shared unknowns that are integers, local ones that are not one a row.
     """
     flat, unravel = ravel_pytree(shared)
+    if not jnp.issubdtype(flat.dtype, jnp.floating):
+        raise InputError("shared must hold floating arrays, e.g. 0.0 instead of 0")
+    if jnp.ndim(local) != 1:
+        raise InputError(f"local must be one number a row, not of shape {jnp.shape(local)}")
     first = (flat, jnp.asarray(local, flat.dtype))
     bound = jnp.broadcast_to(jnp.asarray(limit, flat.dtype), first[1].shape)
 

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 from jaxcal import FormatError, InputError
+from jaxcal.calibration.inputs import whole_number
+from jaxcal.io.readable import shown
 from jaxcal.study.cluster import compute_on_cluster, connected
 from jaxcal.study.own import Study
 from jaxcal.study.spec import Chunk
@@ -25,6 +27,8 @@ try:
     import fcntl
 except ImportError:  # not on Windows
     fcntl = None
+
+_MOST_WORKERS = 10_000
 
 Computed = tuple[Chunk, dict[str, np.ndarray], str]
 """A chunk, its results, and what computed it."""
@@ -99,14 +103,18 @@ def run_study(
         watcher: is told about the progress.
 
     Raises:
-        InputError: another spec's results are there, the folder is in use, or no scheduler answers,
-            in which case nothing was written.
+        InputError: no study, another spec's results are there, the folder is in use, or no
+            scheduler answers; nothing was written then.
         OutputError: the folder or a file cannot be written; what was written before stays.
         MissingExtraError: Dask is needed and not installed.
         CalibrationError: the cluster was lost; ``resume`` continues.
     """
-    if workers < 0 or (workers and scheduler is not None):
-        raise InputError("workers must not be negative, nor be given beside a scheduler")
+    if not isinstance(spec, Study):
+        raise InputError(
+            f"run_study takes a study, not {shown(spec)}: jaxcal.study.load_spec(path) reads one"
+        )
+    if whole_number("workers", workers, 0, _MOST_WORKERS) and scheduler is not None:
+        raise InputError("workers must not be given beside a scheduler")
     watcher = Silence() if watcher is None else watcher
     begun = time.monotonic()
     # First of all, so that no folder is made where nothing can be computed.

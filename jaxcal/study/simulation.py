@@ -24,13 +24,14 @@ import numpy as np
 from jaxtyping import Array, Complex64, Float, Int, Key
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import LARGEST_SEED, whole_number
+from jaxcal.calibration.inputs import LARGEST_SEED, check_flag, whole_number
 from jaxcal.data.geometry import matrix_from_rotation
-from jaxcal.data.probe import L14_5, CurvilinearProbe, Probe
+from jaxcal.data.probe import L14_5, CurvilinearProbe, Probe, check_probe
 from jaxcal.data.problem import Channels, Problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, Truth, make_images
 from jaxcal.data.segmentation.deviations import fit_deviations, halves
 from jaxcal.data.segmentation.time_of_flight import fit_in_plane
+from jaxcal.io.readable import shown
 from jaxcal.model import unrolled
 from jaxcal.runtime import executables
 from jaxcal.runtime.arrays import is_traced
@@ -108,6 +109,8 @@ class Protocol:
         if not is_traced(self.depth_mm) and shallow > deep:
             raise InputError(f"depth_mm must be nearest, then farthest, not {self.depth_mm}")
         check_law(self.elevation_distribution)
+        check_probe(self.probe)
+        check_flag("raw", self.raw)
 
 
 def _is_within(value: Any, largest: int) -> bool:
@@ -230,8 +233,13 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
         key: a JAX key; for trial k of a study ``jax.random.fold_in(root, k)``, so that draws do not
             depend on chunks or devices.
         protocol: the distributions.
+
+    Raises:
+        InputError: what is no key.
     """
     require_float64("jaxcal.simulate")
+    if not hasattr(key, "shape"):
+        raise InputError(f"key must be a JAX key, e.g. jax.random.key(1), not {shown(key)}")
     numbers, noise = draw(key, protocol), draw_noise(key, protocol)
     planes = arrange(numbers, protocol)
     distances = _distances(planes, noise, protocol)
@@ -499,9 +507,12 @@ def simulate_recording(
     else:
         times = times_of_flight(array["distances"], protocol.probe, clock_hz)
         calibration = make_images(array["poses"], times, "time_of_flight", where="simulation")
+    test = None
+    if protocol.test_images:
+        test = make_images(array["test_poses"], array["test_points"], where="simulation", minimum=1)
     return Recording(
         calibration=calibration,
-        test=make_images(array["test_poses"], array["test_points"], where="simulation"),
+        test=test,
         truth=Truth(array["image_to_probe"], array["point"], array["elevation"]),
         probe=protocol.probe,
         source=f"simulation (seed {seed})",

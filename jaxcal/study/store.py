@@ -76,7 +76,10 @@ class Store(Generic[S]):
                     f"{_difference(found, spec)}): choose another folder, or go back to that spec"
                 )
             if not resume:
-                raise InputError(f"{folder}: holds this study already: --resume continues it")
+                raise InputError(
+                    f"{folder}: holds this study already: --resume continues it "
+                    "(in Python resume=True)"
+                )
             store._make_folder()
             return store
         if any(store.folder.glob("chunks/chunk-*.h5")):

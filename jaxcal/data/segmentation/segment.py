@@ -16,8 +16,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxcal import InputError
-from jaxcal.data.probe import CurvilinearProbe, Probe
-from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording, make_images
+from jaxcal.data.probe import CurvilinearProbe, Probe, check_probe
+from jaxcal.data.recording import (
+    MINIMUM_IMAGES,
+    Images,
+    Recording,
+    check_recording,
+    images_of,
+    make_images,
+)
 from jaxcal.data.segmentation.time_of_flight import (
     DistanceFit,
     fit_in_plane,
@@ -141,7 +148,7 @@ def segment(
         InputError: no times of flight, no probe, times for another number of elements, negative
             times, microseconds; for a recording, fewer than 4 frames that can be segmented.
     """
-    images = data.calibration if isinstance(data, Recording) else data
+    images = images_of(data, "jaxcal.segment")
     probe = data.probe if probe is None and isinstance(data, Recording) else probe
     if method not in ("least-squares", "shortest"):
         raise InputError(f"method must be least-squares or shortest, not {method!r}")
@@ -154,6 +161,7 @@ def segment(
         raise InputError(
             "times of flight need a probe to be segmented: the recording has no /probe"
         )
+    check_probe(probe)
     used = images.mask
     check_times_of_flight(times, probe, used)
     distances = np.where(used[:, None], probe.one_way_range_mm(times), np.nan)
@@ -235,6 +243,7 @@ def segment_recording(
     Raises:
         InputError: as :func:`segment`.
     """
+    check_recording(recording, "jaxcal.segment_recording")
     probe = recording.probe if probe is None else probe
     found = segment(recording, probe, **options)
     test = recording.test
