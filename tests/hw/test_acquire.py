@@ -275,11 +275,11 @@ def test_a_robot_that_may_not_move_is_named_and_the_run_is_resumed(tmp_path):
         assert finish(bench, path).images == IMAGES
 
 
-@pytest.mark.slow
 def test_ctrl_c_pressed_many_times_still_tells_how_to_resume(tmp_path):
     path = tmp_path / "rec.h5"
     code = "import sys; from hw.cli import main; sys.exit(main())"
-    arguments = ["acquire", str(path), "--bench", "--images", "30", "--placement", "none"]
+    arguments = ["acquire", str(path), "--bench", "--images", "30", "--placement", "none",
+                 "--speed", "3"]  # fmt: skip
     process = subprocess.Popen(
         [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True
     )
