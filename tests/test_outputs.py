@@ -126,6 +126,26 @@ def test_an_export_goes_into_the_folder_that_the_report_makes(folder, capsys):
     assert "missing.h5: no such file" in capsys.readouterr().err
 
 
+def test_the_page_goes_into_the_folder_that_the_report_makes(folder):
+    assert main(["simulate", "sim.h5", "--images", "12"]) == 0
+    arguments = "calibrate sim.h5 --method conventional --out new/report --report new/report/p.html"
+    assert main(arguments.split()) in (0, 5)
+    assert (folder / "new/report/p.html").is_file()
+
+
+@pytest.mark.parametrize("target", ["numpy:x.npy", "itk:x.tfm", "tusrec:x.csv", "plus:config.xml"])
+def test_pixels_are_missed_before_the_solve(folder, target, capsys):
+    """A recording of points in mm, unusable beyond that: no work begins."""
+    recording = jaxcal.load("rec.h5")
+    points = make_images(recording.calibration.poses, np.ones((6, 2)), "point")
+    jaxcal.save(Recording(points), "points.h5")
+    assert main(["calibrate", "points.h5", "--export", target]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "holds no pixels" in error
+    assert "jaxcal export with --pixel-size" in error
+
+
 def test_a_simulation_replaces_a_simulation(folder, monkeypatch, capsys):
     known = jaxcal.load("rec.h5")
     truth = Truth(np.eye(4), np.zeros(3), np.zeros(6))

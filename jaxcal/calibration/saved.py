@@ -85,6 +85,11 @@ def check_target(
     return chosen
 
 
+def needs_pixels(path: str | os.PathLike[str], format: SaveFormat) -> bool:
+    """Whether a file of this format takes pixels to the probe, and so needs the pixels' size."""
+    return format not in ("json", "ros") and not os.fspath(path).lower().endswith(".npz")
+
+
 def _is_one(path: str | os.PathLike[str], format: SaveFormat) -> bool:
     if format == "json":
         return is_calibration_record(path)

@@ -215,12 +215,14 @@ def calibrate(
     measured, notes = _segmented(load(recording))
     test_data = None if test is None else _segmented(load(test))[0]
     check_test_images(measured, test_data)
+    _check_pixels(measured, targets)
     enable_compilation_cache()
-    if report is not None:
-        from jaxcal.report.page import check_page
-
-        check_page(report, inputs)
     with nullcontext() if out is None else _prepared(out) as folder:
+        if report is not None:
+            from jaxcal.report.page import check_page
+
+            # The page may be wanted in the report's folder, which is there from now on.
+            check_page(report, inputs)
         with progress(f"calibrating ({method})") as show:
             traced = folder is not None and method == "conventional"
             with _first_answer(measured, request, show):
@@ -277,6 +279,20 @@ def _export_target(text: str, inputs: list[str], out: str | None) -> tuple[SaveF
     if out is None or Path(path).parent != Path(out):
         check_writable(path)
     return format, path
+
+
+def _check_pixels(recording: Recording, targets: list[tuple[SaveFormat, str]]) -> None:
+    """Refuse exports that need the size of a pixel, where only points in mm were recorded."""
+    from jaxcal.calibration.saved import needs_pixels
+
+    if recording.calibration.kind == "pixel":
+        return
+    for format, path in targets:
+        if needs_pixels(path, format):
+            raise InputError(
+                f"--export {format}:{path}: {recording.source} holds no pixels, whose size this "
+                "format needs: calibrate with --out, then jaxcal export with --pixel-size"
+            )
 
 
 def _export(
