@@ -171,6 +171,12 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
             lambda: backend.arrow_least_squares(lambda s, y, d: d, np.zeros(2, int), np.zeros(3)),
             "floating arrays",
         ),
+        (lambda: backend.size(("rotation", "angle")), "'angle' is no unknown: choose from trans"),
+        (
+            lambda: backend.retract(backend.initial_fit(one), jnp.zeros(6), backend.RIGID),
+            "a step of translation, rotation, point has 9 numbers",
+        ),
+        (lambda: backend.LevenbergMarquardt(damping=-1.0), "damping must be .* not -1.0"),
     ):
         with pytest.raises(jaxcal.InputError, match=said):
             call()

@@ -220,6 +220,10 @@ for call, *given in (
     (run_study, "no-such-study.toml", "no-such-folder"),
     (lambda local: backend.arrow_least_squares(lambda s, y, d: d, np.zeros(2), local), points),
     (lambda n: run_study(parse_spec(START), "no-such-folder", workers=n), "2"),
+    *((call, path) for call in (jaxcal.load, jaxcal.load_calibration, result.save)
+      for path in (None, 3, b"rec.h5")),
+    (jaxcal.save, jaxcal.Recording(jaxcal.make_images(poses, points)), None),
+    (backend.LevenbergMarquardt, "fast"),
 ):
     try:
         call(*given)
@@ -231,7 +235,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 90
+    assert len(lines) == 101
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
@@ -260,6 +264,8 @@ for call, *given in (
     )
     assert lines[85] == "key must be a JAX key, e.g. jax.random.key(1), not 3"
     assert lines[87].startswith("run_study takes a study, not 'no-such-study.toml'")
+    for line in lines[90:100]:
+        assert line.startswith("the name of a file must be text or a pathlib.Path, not ")
     assert not Path("no-such-folder").exists()
     assert lines[69] == "robust must be True or False, not 'no'"
 

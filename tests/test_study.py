@@ -174,6 +174,14 @@ def test_a_study_is_told_what_calibrate_tells(written, asked):
     assert str(caught.value) == f"methods[0]: {told.value}"
 
 
+@pytest.mark.parametrize("factor", ["-1", "0", "inf", "nan"])
+def test_a_factor_of_the_bound_has_no_unit(factor):
+    method = f'method = "joint"\nprior = "uniform"\nmax_elevation_factor = {factor}'
+    with pytest.raises(InputError, match="max_elevation_factor must be positive") as caught:
+        parse_spec(f'{MINIMAL}[[methods]]\nname = "a"\n{method}\n')
+    assert "mm" not in str(caught.value)
+
+
 def test_what_says_the_same_has_the_same_hash():
     spec = parse_spec(small())
     again = small().replace("seed = 11\ntrials = 10", "trials = 10 # few\nseed = 11")

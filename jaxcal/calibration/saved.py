@@ -16,7 +16,7 @@ from jaxcal.calibration.transform import ImageTransform, transform_from_plus_mat
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.outputs import check_output
-from jaxcal.io.readable import check_readable, naming, one_line, quoted
+from jaxcal.io.readable import check_readable, naming, one_line, path_name, quoted
 from jaxcal.model.unknowns import TABLE, tangent_names
 
 FORMAT = "jaxcal-calibration"
@@ -74,7 +74,7 @@ def check_target(
         InputError: an extension by which the file could not be read again, one of the inputs, or
             an existing file that is no calibration in this format.
     """
-    name = os.fspath(path)
+    name = path_name(path)
     chosen = _format_of(name) if format is None else format
     extensions = _EXTENSIONS.get(chosen)
     if extensions is None:
@@ -222,7 +222,7 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
         InputError: matrices that cannot be used. The message of either error is one line that
             starts with the path.
     """
-    name = os.fspath(path)
+    name = path_name(path)
     lower = name.lower()
     with naming(path):
         if lower.endswith(".xml"):

@@ -43,7 +43,7 @@ from jaxcal.data.recording import (
     unit_of,
 )
 from jaxcal.io.atomic import atomic_path
-from jaxcal.io.readable import check_readable, naming, quoted
+from jaxcal.io.readable import check_readable, naming, path_name, quoted
 from jaxcal.io.target_search import FATES, FrameResults
 from jaxcal.io.untrusted import (
     Node,
@@ -119,6 +119,7 @@ def save(
         OutputError: the file could not be written; it is as it was.
     """
     check_recording(recording, "jaxcal.save")
+    name = path_name(path)
     # Built in memory: HDF5 handles a full disk badly, but an ordinary write reports it.
     image = io.BytesIO()
     with h5py.File(image, "w") as file:
@@ -127,7 +128,7 @@ def save(
             _write_frames(file.create_group("segmentation"), segmentation)
         elif segmentation is not None:
             _write_fate(file.create_group("segmentation"), segmentation)
-    _read(io.BytesIO(image.getvalue()), os.fspath(path))
+    _read(io.BytesIO(image.getvalue()), name)
     with atomic_path(path) as temporary:
         temporary.write_bytes(image.getvalue())
 

@@ -11,6 +11,7 @@ import stat
 from collections.abc import Callable, Iterable
 
 from jaxcal import CalibrationError, InputError
+from jaxcal.io.readable import path_name
 
 Path = str | os.PathLike[str]
 
@@ -30,7 +31,7 @@ def check_output(
     Raises:
         InputError: it is one of the inputs, or of another kind.
     """
-    name = os.fspath(path)
+    name = path_name(path)
     try:
         status = os.stat(path)
     except (OSError, ValueError):

@@ -10,6 +10,18 @@ from contextlib import contextmanager
 from jaxcal import FormatError, InputError
 
 
+def path_name(path: object) -> str:
+    """A path as text.
+
+    Raises:
+        InputError: it is neither text nor a ``pathlib.Path``.
+    """
+    name = os.fspath(path) if isinstance(path, str | os.PathLike) else None
+    if not isinstance(name, str):
+        raise InputError(f"the name of a file must be text or a pathlib.Path, not {shown(path)}")
+    return name
+
+
 def check_readable(path: str | os.PathLike[str], *, maximum_bytes: int | None = None) -> None:
     """Check that a path names an ordinary, readable, non-empty file.
 
@@ -20,7 +32,9 @@ def check_readable(path: str | os.PathLike[str], *, maximum_bytes: int | None = 
     Raises:
         FormatError: missing, a directory, a device or pipe (opening one may hang), not permitted,
             empty or too large; one line that starts with the path.
+        InputError: no path.
     """
+    path = path_name(path)
     try:
         status = os.stat(path)
     except FileNotFoundError:

@@ -14,8 +14,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxcal import InputError
 from jaxcal.data.geometry import matrix_from_rotation, rotation_from_vector
-from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, block_slice, stepped
+from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, block_slice, size, stepped
 
 
 class Parameters(eqx.Module):
@@ -72,7 +73,16 @@ class Parameters(eqx.Module):
 
 
 def retract(parameters: Parameters, tangent: Float[Array, " p"], blocks: Blocks) -> Parameters:
-    """Move parameters by a tangent vector (mm, rad, mm, log units; in the order of ``blocks``)."""
+    """Move parameters by a tangent vector (mm, rad, mm, log units; in the order of ``blocks``).
+
+    Raises:
+        InputError: as many numbers as the blocks have unknowns are needed.
+    """
+    if tangent.shape != (size(blocks),):
+        raise InputError(
+            f"a step of {', '.join(blocks)} has {size(blocks)} numbers, not the shape "
+            f"{tangent.shape}"
+        )
 
     def part(name: str) -> Float[Array, " k"]:
         if name in blocks:

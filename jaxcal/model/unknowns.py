@@ -15,6 +15,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxcal import InputError
+
 Blocks = tuple[str, ...]
 """Names of free unknowns, in the table's order; X and the target come first."""
 
@@ -217,7 +219,14 @@ def further_derivatives(
 
 
 def size(blocks: Blocks) -> int:
-    """Number of scalar unknowns in the given blocks."""
+    """Number of scalar unknowns in the given blocks.
+
+    Raises:
+        InputError: no such unknown.
+    """
+    for name in blocks:
+        if name not in TABLE:
+            raise InputError(f"{name!r} is no unknown: choose from {', '.join(TABLE)}")
     return sum(TABLE[name].size for name in blocks)
 
 

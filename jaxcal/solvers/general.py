@@ -90,6 +90,12 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     atol: float = 0.0
     norm: Callable[[PyTree], Array] = optx.max_norm
 
+    def __check_init__(self) -> None:
+        for name, value in (("tolerance", self.tolerance), ("damping", self.damping)):
+            known = isinstance(value, int | float) and value >= 0
+            if not (known or isinstance(value, jax.Array)):
+                raise InputError(f"{name} must be a number of at least 0, not {value!r}")
+
     def init(
         self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> tuple[Descent, Rounding, Any]:

@@ -187,6 +187,9 @@ class MethodSpec:
     def __post_init__(self) -> None:
         if None not in (self.max_elevation_mm, self.max_elevation_factor):
             raise InputError("max_elevation_mm and max_elevation_factor contradict each other")
+        factor = self.max_elevation_factor
+        if isinstance(factor, int | float) and not 0 < factor < np.inf:
+            raise InputError(f"max_elevation_factor must be positive and finite, not {factor:g}")
         if np.ndim(self.bound_given or 0.0):
             raise InputError(f"max_elevation must be one number, not {shown(self.bound_given)}")
         self.assumed()
