@@ -247,6 +247,14 @@ def test_picks_in_a_folder_name_the_images(tmp_path, folder):
     np.testing.assert_allclose(recording.calibration.poses, POSES[[0, 3, 4, 6]], atol=1e-9)
 
 
+def test_images_that_are_not_read_are_named(tmp_path):
+    for name in ("a.TIF", "b.tif", "c.jpg", "notes.txt"):
+        (tmp_path / name).write_bytes(b"x")
+    told = r"holds no PNG images \(\.jpg and \.tif must be converted to PNG first\)$"
+    with pytest.raises(FormatError, match=told):
+        read_folder(tmp_path)
+
+
 def test_names_without_numbers_are_not_counted(tmp_path, folder):
     table = pose_table(tmp_path / "p.csv", "", lambda k: "")
     for name in folder.glob("*.png"):
@@ -643,12 +651,16 @@ def test_dicom_that_lies(tmp_path):
             try:
                 found = read_pixel_size(clip)
                 assert min(found.spacing_mm) > 0
+                assert None not in (found.columns, found.rows)
             except FormatError as error:
                 told = str(error)
         assert not told or told.startswith(str(clip))
     clip.write_bytes(good.replace(b"1.2.840.10008.1.2.1\0", b"1.2.840.10008.1.2.1.99\0"))
     with pytest.raises(FormatError):
         read_pixel_size(clip)
+    without = dicom_clip(tmp_path / "d.dcm", [{}], change=lambda data: data.pop("Rows"))
+    with pytest.raises(FormatError, match="does not say how large its images are"):
+        read_pixel_size(without)
     clip.write_bytes(b"root:x:0:0")
     with pytest.raises(FormatError, match="is not a DICOM file"):
         read_pixel_size(clip)

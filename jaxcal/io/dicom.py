@@ -72,6 +72,8 @@ def read_pixel_size(path: str | os.PathLike[str]) -> PixelSize:
             f"{name}: states no pixel size (no two-dimensional ultrasound region in cm): measure "
             "it on the image's ruler and give it with --spacing"
         )
+    if None in (found[0].columns, found[0].rows):
+        raise FormatError(f"{name}: is damaged or cut: it does not say how large its images are")
     sizes = np.array([each.spacing_mm for each in found])
     if (np.abs(sizes / sizes[0] - 1) > _AGREES).any():
         told = "; ".join(f"{each.region}: {_text(each.spacing_mm)}" for each in found)

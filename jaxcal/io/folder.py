@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Int
 
 MOST_IMAGES = 100_000
+_OTHERS = (".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".tif", ".tiff")
+"""Endings of images that are not read."""
 PROBE_TO_TRACKER = ("Probe", "Tracker")
 
 
@@ -34,15 +37,14 @@ def read_folder(path: str | os.PathLike[str]) -> TrackedSequence:
     folder, name = Path(path), os.fspath(path)
     try:
         # Macs leave a hidden ``._a.png``, which is no image, beside each ``a.png``.
-        paths = [
-            entry
-            for entry in folder.iterdir()
-            if entry.suffix.lower() == ".png" and not entry.name.startswith(".")
-        ]
+        listed = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
         raise FormatError(f"{name}: cannot be read: {one_line(error)}") from None
+    paths = [entry for entry in listed if entry.suffix.lower() == ".png"]
     if not paths:
-        raise FormatError(f"{name}: holds no PNG images")
+        others = Counter(entry.suffix.lower() for entry in listed) & Counter(_OTHERS)
+        hint = f" ({' and '.join(sorted(others))} must be converted to PNG first)" if others else ""
+        raise FormatError(f"{name}: holds no PNG images{hint}")
     if len(paths) > MOST_IMAGES:
         raise FormatError(f"{name}: holds {len(paths)} images (at most {MOST_IMAGES})")
     inside = folder.resolve()
