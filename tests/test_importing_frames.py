@@ -255,6 +255,20 @@ def test_images_that_are_not_read_are_named(tmp_path):
         read_folder(tmp_path)
 
 
+@pytest.mark.parametrize("command", [["segment"], ["import"]])
+def test_tracking_alone_needs_a_file_of_points(tmp_path, command, capsys):
+    write_sequence(tmp_path / "t.igs.mha", {PAIR: POSES}, np.arange(COUNT) / 20)
+    out = [str(tmp_path / "o.h5")] if command == ["import"] else []
+    assert main([*command, str(tmp_path / "t.igs.mha"), *out]) == 2
+    advice = capsys.readouterr().err.split("(")[1].split(")")[0].split()
+    assert advice[:2] == ["jaxcal", "import"]
+    points = tmp_path / "p.csv"
+    lines = [f"{k},{u!r},{v!r}" for k, (u, v) in enumerate(POINTS.tolist())]
+    points.write_text("\n".join(["frame,u,v", *lines]))
+    took = [str(points), str(tmp_path / "o.h5")]
+    assert main(advice[1:-2] + took) == 0
+
+
 def test_names_without_numbers_are_not_counted(tmp_path, folder):
     table = pose_table(tmp_path / "p.csv", "", lambda k: "")
     for name in folder.glob("*.png"):

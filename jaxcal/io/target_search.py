@@ -8,6 +8,7 @@ so.
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -98,7 +99,8 @@ def search_target(
 
     if sequence.pixels is None:
         raise InputError(
-            f"{sequence.source}: holds no pixels: name a file with the target's points as well"
+            f"{sequence.source}: holds no pixels: import it with a file of the target's points "
+            f"(jaxcal import {shlex.quote(sequence.source)} POINTS.csv OUT.h5)"
         )
     count = len(sequence)
     fate = np.where(
