@@ -273,6 +273,34 @@ def test_pixels_beside_that_are_a_link_to_another_folder(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("named", "times"),
+    [
+        ('units: "mm" "mm" "mm" "s"', [0, 0.1, 0.2, 0.3, 0.5]),
+        ('units: "mm" "mm" "mm" "ms"', [0, 1e-4, 2e-4, 3e-4, 5e-4]),
+        ('labels: "x" "y" "z" "time"', [0, 0.1, 0.2, 0.3, 0.5]),
+        ('labels: "x" "y" "z" "frame"', None),
+        ("# nothing", None),
+    ],
+)
+def test_times_of_slicers_volume_sequences(tmp_path, named, times):
+    """They are values of an index, which need not be a time."""
+    written(tmp_path / "a.seq.nrrd")
+    edit(tmp_path / "a.seq.nrrd", rb"Seq_Frame\d+_[^\n]*\n", b"", count=0)
+    edit(tmp_path / "a.seq.nrrd", rb"sizes: 4 6 5", b"sizes: 4 6 1 5")
+    edit(tmp_path / "a.seq.nrrd", rb"domain domain list", b"domain domain domain list")
+    values = f"{named}\naxis 3 index type:=numeric\naxis 3 index values:=0 0.1%200.2 0.3 0.5\n\n"
+    edit(tmp_path / "a.seq.nrrd", rb"\n\n", b"\n" + values.encode())
+    found = read_sequence(tmp_path / "a.seq.nrrd")
+    np.testing.assert_allclose(found.time, np.full(5, np.nan) if times is None else times)
+    assert len(list(found.images())) == 5
+    for lie, message in ((b"0.1 x 0.3 0.5", "are not numbers"), (b"0 1", "2 index values for 5")):
+        edit(tmp_path / "a.seq.nrrd", rb"values:=[^\n]*", b"values:=" + lie)
+        if times is not None:
+            with pytest.raises(FormatError, match=message):
+                read_sequence(tmp_path / "a.seq.nrrd")
+
+
+@pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         (rb"encoding: gzip", b"data file: ../x", "has 'data file'"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Int
 
 MOST_IMAGES = 100_000
-_OTHERS = (".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".tif", ".tiff")
+_OTHERS = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".tif", ".tiff"}
 """Endings of images that are not read."""
 PROBE_TO_TRACKER = ("Probe", "Tracker")
 
@@ -42,8 +41,8 @@ def read_folder(path: str | os.PathLike[str]) -> TrackedSequence:
         raise FormatError(f"{name}: cannot be read: {one_line(error)}") from None
     paths = [entry for entry in listed if entry.suffix.lower() == ".png"]
     if not paths:
-        others = Counter(entry.suffix.lower() for entry in listed) & Counter(_OTHERS)
-        hint = f" ({' and '.join(sorted(others))} must be converted to PNG first)" if others else ""
+        others = sorted({entry.suffix.lower() for entry in listed} & _OTHERS)
+        hint = f" ({' and '.join(others)} must be converted to PNG first)" if others else ""
         raise FormatError(f"{name}: holds no PNG images{hint}")
     if len(paths) > MOST_IMAGES:
         raise FormatError(f"{name}: holds {len(paths)} images (at most {MOST_IMAGES})")

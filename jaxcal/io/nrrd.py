@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -22,6 +25,7 @@ from jaxcal.io.sequence_header import (
     written_orientation,
 )
 
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _NRRD_TYPES = {
     "uchar": "u1",
     "unsigned char": "u1",
@@ -84,7 +88,39 @@ def read_nrrd(path: Path, name: str) -> TrackedSequence:
     pixels = None
     if columns > 1 and rows > 1:
         pixels = _nrrd_pixels(path, header, (columns, rows, channels), count)
-    return sequence_of(header, count, pixels, "Status", name)
+    found = sequence_of(header, count, pixels, "Status", name)
+    if not np.isfinite(found.time).any() and (time := _index_times(fields, count)) is not None:
+        return replace(found, time=time)
+    return found
+
+
+def _index_times(fields: dict[str, str], count: int) -> np.ndarray | None:
+    """Times, s, that 3D Slicer gives to the images of a volume sequence; None if there are none.
+
+    Slicer calls them values of the index of the axis that lists the images. An index may also be
+    something else than time: it counts only if its unit or its name says so.
+    """
+    axis = len(fields["sizes"].split()) - 1
+    values = fields.get(f"axis {axis} index values", fields.get("axis 0 index values"))
+    if values is None:
+        return None
+    unit, label = (_of_axis(fields.get(name, ""), axis) for name in ("units", "labels"))
+    factor = _SECONDS.get(unit)
+    if factor is None and not (unit == "" and label.lower() == "time"):
+        return None
+    try:
+        time = np.array([float(each) for each in unquote(values).split()])
+    except ValueError:
+        raise FormatError(f"index values {quoted(values)} are not numbers") from None
+    if len(time) != count or not np.isfinite(time).all():
+        raise FormatError(f"has {len(time)} index values for {count} images, or not all are finite")
+    return time * (factor or 1.0)
+
+
+def _of_axis(texts: str, axis: int) -> str:
+    """One axis' text in a field of quoted texts, or nothing."""
+    found = re.findall(r'"([^"]*)"', texts)
+    return found[axis] if axis < len(found) else ""
 
 
 def _nrrd_size(fields: dict[str, str]) -> tuple[int, int, int, int]:
