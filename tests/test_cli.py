@@ -639,13 +639,13 @@ def test_plan_from_nothing_is_words_and_counts(capfd):
 
 
 def test_a_plan_is_tried_in_simulated_recordings(capfd):
-    arguments = ["plan", "--images", "12", "--simulate", "normal"]
+    arguments = ["plan", "--images", "6", "--simulate", "normal"]
     assert main(arguments) == 0
     out, _ = capfd.readouterr()
     assert "In 1000 simulated recordings with normal offsets" in " ".join(out.split())
     assert main([*arguments, "--json"]) == 0
     (found,) = json.loads(capfd.readouterr().out)["simulated"]
-    assert (found["images"], found["trials"], found["lost"]) == (12, 1000, 0)
+    assert (found["images"], found["trials"], found["lost"]) == (6, 1000, 0)
     assert f"error over the image {found['tre_mm']:.2g} mm" in " ".join(out.split())
 
 
