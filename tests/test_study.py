@@ -617,12 +617,12 @@ def blocks(text):
     measure = jax.jit(jax.vmap(reconstruction_precision))
     for k in range(spec.condition_count):
         condition = spec.condition(k)
-        indices = k * spec.trials + np.arange(spec.trials, dtype=np.uint32)[None]
+        indices = (k * spec.trials + np.arange(spec.trials, dtype=np.uint32)).reshape(2, -1)
         block = Block(spec, condition, indices, devices)
 
         def whole(method, condition=condition, indices=indices):
             bound = None if method.bound_given is None else bound_mm(method, condition)
-            drawn, problems = by_public_functions(spec, condition, indices[0])
+            drawn, problems = by_public_functions(spec, condition, indices.ravel())
             found = jaxcal.calibrate_batch(
                 problems, method.method, method.prior, max_elevation=bound, options=method.options
             )
