@@ -22,6 +22,8 @@ DeprecationWarning for one minor version.
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 
 from jaxcal import InputError
@@ -103,6 +105,12 @@ def initial_fit(problem: Problem, blocks: Blocks = RIGID) -> Parameters:
             "initial_fit takes one problem: jaxcal.Problem.from_recording makes one, "
             "jax.vmap(initial_fit) takes a batch"
         )
+    return _initial_fit(problem, blocks)
+
+
+# Compiled as a whole: step by step it would be several hundred programs.
+@partial(jax.jit, static_argnums=1)
+def _initial_fit(problem: Problem, blocks: Blocks) -> Parameters:
     images = ImagePlanes.of(jax.tree.map(lambda leaf: leaf[None], problem))
     found = conventional(images, blocks).fit.place.parameters()
     return jax.tree.map(lambda leaf: leaf[0], found)

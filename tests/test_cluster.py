@@ -229,7 +229,7 @@ def junk():
 
 def test_no_scheduler(tmp_path, capfd, monkeypatch, junk):
     """Said in one line, and nothing is made, so that the right command may follow."""
-    monkeypatch.setattr("jaxcal.study.cluster.CONNECT_SECONDS", 1)
+    monkeypatch.setattr("jaxcal.study.cluster.CONNECT_SECONDS", 0.3)
     spec = tmp_path / "spec.toml"
     spec.write_text(SPEC)
     unreachable = "tcp://127.0.0.1:9", "nonsense://x", junk

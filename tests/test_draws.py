@@ -12,6 +12,12 @@ from jaxcal.study import draws
 
 KEY = jax.random.key(20261121)
 
+# Compiled as a whole, not operation by operation.
+words = jax.jit(draws.words, static_argnums=(1, 2))
+normals = jax.jit(draws.normals, static_argnums=(1, 2))
+uniforms = jax.jit(draws.uniforms, static_argnums=(1, 2))
+unit_vectors = jax.jit(draws.unit_vectors, static_argnums=(1, 2))
+
 
 @pytest.mark.parametrize(
     ("key", "counter", "answer"),
@@ -28,13 +34,13 @@ def test_threefry_gives_the_known_answers(key, counter, answer):
 
 
 def test_numbers_depend_on_key_stream_and_place_alone():
-    one, other = draws.words(KEY, 3, (5, 4))
-    longer, _ = draws.words(KEY, 3, (40,))
+    one, other = words(KEY, 3, (5, 4))
+    longer, _ = words(KEY, 3, (40,))
     np.testing.assert_array_equal(np.ravel(one), longer[:20])
     keys = jax.random.split(KEY, 3)
-    batch = jax.vmap(lambda key: draws.normals(key, 3, 7))(keys)
-    np.testing.assert_allclose(batch[1], draws.normals(keys[1], 3, 7), rtol=1e-5)
-    every = np.concatenate([np.ravel(v) for s in (3, 4) for v in draws.words(KEY, s, (40,))])
+    batch = jax.jit(jax.vmap(lambda key: draws.normals(key, 3, 7)))(keys)
+    np.testing.assert_allclose(batch[1], normals(keys[1], 3, 7), rtol=1e-5)
+    every = np.concatenate([np.ravel(v) for s in (3, 4) for v in words(KEY, s, (40,))])
     # 160 words of 32 bits: a repetition would be no accident.
     assert len(np.unique(every)) == every.size
     assert np.asarray(one).dtype == np.asarray(other).dtype == np.uint32
@@ -54,12 +60,12 @@ def test_normals_are_normal_and_independent():
 
 
 def test_uniforms_and_directions():
-    values = np.asarray(draws.uniforms(KEY, 1, 100_001))
+    values = np.asarray(uniforms(KEY, 1, 100_001))
     assert values.shape == (100_001,)
     assert 0 < values.min() < 1e-3
     assert 1 - 1e-3 < values.max() < 1
     assert stats.kstest(values, "uniform").pvalue > 1e-3
-    vectors = np.asarray(draws.unit_vectors(KEY, 2, 50_000))
+    vectors = np.asarray(unit_vectors(KEY, 2, 50_000))
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=0), 1, atol=1e-15)
     for component in vectors:
         assert stats.kstest(component, "uniform", (-1, 2)).pvalue > 1e-3
@@ -84,12 +90,13 @@ def test_fit_in_deviations_is_the_plain_fit(count, noise_mm, within):
     lateral = generator.uniform(-29, 29, (3, 50))
     distance = generator.uniform(10, 90, (3, 50))
     pairs = jax.vmap(lambda key: draws.normal_pairs(key, 0, (50, -(-count // 2))))
-    noise = pairs(jax.random.split(KEY, 3))
+    noise = jax.jit(pairs)(jax.random.split(KEY, 3))
     fit = jax.jit(lambda *given: fit_deviations(*given, elements))
     found = fit(noise, jnp.asarray(noise_mm), jnp.asarray(lateral), jnp.asarray(distance))
     drawn = np.concatenate(halves(noise, count), axis=-1)
     exact = np.hypot(lateral[..., None] - elements, distance[..., None])
-    plain, _ = fit_distances(exact + noise_mm * drawn.astype(float), elements, steps=25)
+    plainly = jax.jit(lambda distances: fit_distances(distances, elements, steps=25)[0])
+    plain = plainly(exact + noise_mm * drawn.astype(float))
     np.testing.assert_allclose(np.stack(found, axis=-1), plain, rtol=0, atol=within)
     exactly = fit(noise, jnp.asarray(0.0), jnp.asarray(lateral), jnp.asarray(distance))
     np.testing.assert_array_equal(np.stack(exactly), np.stack([lateral, distance]))

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 
@@ -336,11 +337,18 @@ def test_bounded_curves_end_in_one_minimum(recording, result):
     assert len(values[0]) < len(values[1])
 
 
-def test_report_files(tmp_path, record, result, recording):
-    files = write_report(tmp_path, record, result, recording, CURVES)
-    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in files}
-    assert json.loads((tmp_path / "calibration.json").read_text()) == record
-    with (tmp_path / "residuals.csv").open() as table:
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, record, result, recording):
+    """A folder with a whole report, and its files."""
+    folder = tmp_path_factory.mktemp("report")
+    return folder, write_report(folder, record, result, recording, CURVES, {"joint": record})
+
+
+def test_report_files(written, record, result):
+    folder, files = written
+    assert {path.name for path in folder.iterdir()} == {path.name for path in files}
+    assert json.loads((folder / "calibration.json").read_text()) == record
+    with (folder / "residuals.csv").open() as table:
         rows = list(csv.DictReader(table))
     assert tuple(rows[0]) == COLUMNS
     assert len(rows) == 20
@@ -349,8 +357,8 @@ def test_report_files(tmp_path, record, result, recording):
     assert rows[LEFT_OUT]["used"] == "0"
     assert rows[LEFT_OUT]["lateral_mm"] == rows[LEFT_OUT]["elevation_mm"] == ""
     assert {"verdict.txt", "accuracy.svg", "convergence.png"} <= {path.name for path in files}
-    assert (tmp_path / "verdict.txt").read_text().startswith(verdict(record)[0])
-    for path in tmp_path.glob("*.png"):
+    assert (folder / "verdict.txt").read_text().startswith(verdict(record)[0])
+    for path in folder.glob("*.png"):
         content = path.read_bytes()
         assert content.startswith(b"\x89PNG")
         assert content.endswith(b"IEND\xaeB`\x82")
@@ -362,10 +370,10 @@ def test_report_of_a_failed_solve(tmp_path, failed, recording):
     assert "nan" not in (tmp_path / "residuals.csv").read_text().lower()
 
 
-def test_a_report_takes_the_place_of_another(tmp_path, record, result, failed, recording):
+def test_a_report_takes_the_place_of_another(tmp_path, written, failed, recording):
     """Nothing of the old one stays; files that no report writes do."""
     (tmp_path / "mine.png").write_text("x")
-    write_report(tmp_path, record, result, recording, CURVES, {"joint": record})
+    shutil.copytree(written[0], tmp_path, dirs_exist_ok=True)
     assert (tmp_path / "comparison.json").exists()
     with prepare_folder(tmp_path):
         pass
