@@ -41,11 +41,18 @@ def same_objective():
         replace(problem(k, images=20, elevation_mm=e, noise_mm=s), max_elevation=jnp.full(20, m))
         for k in range(2)
         for e, s, m in SETTINGS
-    ]
-    problems = jaxcal.stack(lanes)
-    joint = jaxcal.calibrate_batch(problems, method="joint", prior="bounded")
+    ][:14]  # and two that have no answer: the next bucket of lanes is 24
+    lost, too_few = (jax.tree.map(np.array, lanes[0]) for _ in range(2))
+    lost.poses[3, 0, 3] = np.nan
+    too_few.mask[3:] = 0.0
+    problems = jaxcal.stack([*lanes, lost, too_few])
+    joint = jaxcal.calibrate_batch(problems, method="joint", prior="bounded").numpy()
     options = Options(tolerance_rad=1e-10, tolerance_mm=1e-10, max_rounds=1500)
-    return problems, joint, jaxcal.calibrate_batch(problems, "alternating", options=options)
+    alternation = jaxcal.calibrate_batch(problems, "alternating", options=options).numpy()
+    for found in (joint, alternation):
+        assert found.status[len(lanes) :].tolist() == ["failed", "failed"]
+    good = slice(0, len(lanes))
+    return jaxcal.stack(lanes), joint[good], alternation[good]
 
 
 def test_joint_reaches_the_alternations_objective_at_kkt_precision(same_objective):
