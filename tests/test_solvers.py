@@ -64,7 +64,13 @@ def test_recovers_the_truth_from_exact_data(solver):
     recording = jaxcal.simulate_recording(
         jaxcal.Protocol(images=12, elevation_mm=0.0, noise_mm=0.0), 1
     )
-    result = jaxcal.calibrate(recording, **solver.arguments)
+    # Rubbish in images left out, of which nothing may be seen.
+    images = recording.calibration
+    used, points = np.ones(12, bool), images.measurements.copy()
+    used[[3, 8]] = False
+    points[[3, 8]] = [[1e4], [np.nan]]
+    spoilt = replace(recording, calibration=replace(images, mask=used, measurements=points))
+    result = jaxcal.calibrate(spoilt, **solver.arguments)
     truth = recording.truth
     assert result.status == "converged"
     if result.prior == "bounded":
