@@ -159,7 +159,8 @@ def test_leaving_an_image_out_is_foretold(result):
     problem = result.problem
     sd = np.sqrt(np.diagonal(result.unknowns_covariance))
     for image in (2, 11):
-        mask = problem.mask.at[image].set(0.0)
+        mask = np.array(problem.mask)
+        mask[image] = 0.0
         without = jaxcal.calibrate(replace(problem, mask=mask), "conventional", estimate=("scale",))
         twist = relative_twist(
             jnp.asarray(result.image_to_probe), jnp.asarray(without.image_to_probe)
@@ -373,13 +374,13 @@ def test_test_images_that_scatter_contradict_the_error(record):
 
 @pytest.mark.parametrize("shift_mm", [0.0, 6.0])
 def test_a_slip_of_the_mount_is_no_stream_and_lowers_the_verdict(shift_mm):
-    recording = experiment(3, images=48)
+    recording = experiment(3, images=24)
     images = recording.calibration
     points = np.array(images.measurements)
-    points[24:, 0] += shift_mm
+    points[12:, 0] += shift_mm
     slipped = jaxcal.make_images(images.poses, points)
-    result = jaxcal.calibrate(jaxcal.Recording(slipped))
-    assert int(result.images_used) == 48
+    result = jaxcal.calibrate(jaxcal.Recording(slipped), prior="gaussian")
+    assert int(result.images_used) == 24
     told = result.record()["tre"]["contradictions"]
     moved = [words for words in told if "the points move sideways by" in words]
     assert len(moved) == (shift_mm > 0)

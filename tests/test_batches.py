@@ -23,16 +23,17 @@ METHODS = {
     "auto": {},
     "robust": {"prior": "gaussian", "robust": True},
 }
-IMAGES = 23
+IMAGES = 11
 
 
 def hard_problems() -> tuple[list[jaxcal.Problem], list[jaxcal.Problem]]:
     """Ordinary ones; and these with a left-out image, an outlier, parallel poses and NaN."""
     good = [problem(k, images=IMAGES, elevation_mm=1.5, noise_mm=1.0) for k in range(5)]
-    rest = replace(good[1], mask=good[1].mask.at[3].set(0.0))
-    outlier = replace(good[2], measurements=good[2].measurements.at[4, 0].add(30.0))
-    parallel = replace(good[3], poses=good[3].poses.at[:, :3, :3].set(jnp.eye(3)))
-    lost = replace(good[4], poses=good[4].poses.at[3, 0, 3].set(jnp.nan))
+    rest, outlier, parallel, lost = (jax.tree.map(np.array, one) for one in good[1:])
+    rest.mask[3] = 0.0
+    outlier.measurements[4, 0] += 30.0
+    parallel.poses[:, :3, :3] = np.eye(3)
+    lost.poses[3, 0, 3] = np.nan
     return good, [good[0], rest, outlier, parallel, lost]
 
 
@@ -42,15 +43,15 @@ LONG = [pytest.param(name, marks=pytest.mark.slow) for name in METHODS if name !
 @pytest.mark.parametrize("name", ["conventional", *LONG])
 def test_a_lane_is_its_problem_and_bad_ones_leave_it_alone(name):
     good, hard = hard_problems()
-    result = jaxcal.calibrate_batch(jaxcal.stack(hard), **METHODS[name])
+    result = jaxcal.calibrate_batch(jaxcal.stack(hard), **METHODS[name]).numpy()
     # The same program, the last two lanes sound.
-    sound = jaxcal.calibrate_batch(jaxcal.stack([*hard[:3], *good[3:]]), **METHODS[name])
+    sound = jaxcal.calibrate_batch(jaxcal.stack([*hard[:3], *good[3:]]), **METHODS[name]).numpy()
     assert result.status.tolist() == [*["converged"] * 3, "unobservable", "failed"]
     assert sound.status.tolist() == ["converged"] * 5
     for field in ("covariance", "elevation_sd"):
         assert np.isnan(np.asarray(getattr(result, field))[3]).all()
-    each = [jaxcal.calibrate(one, **METHODS[name]) for one in hard[:3]]
-    alone = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+    each = [jaxcal.calibrate(one, **METHODS[name]).numpy() for one in hard[:3]]
+    alone = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
     flat = [jax.tree_util.tree_leaves_with_path(each) for each in (result, sound, alone)]
     for (path, lane), (_, beside), (_, one) in zip(*flat, strict=True):
         where = jax.tree_util.keystr(path)
@@ -91,7 +92,7 @@ def test_compiler_flags_change_rounding_only(monkeypatch):
 
 
 def test_stacking_compiles_nothing():
-    problems = [problem(k % 3, images=9) for k in range(7)]
+    problems = [problem(k % 3, images=IMAGES) for k in range(7)]
     compiled = []
 
     def listen(event: str, _: float, **__: str | int) -> None:

@@ -21,7 +21,7 @@ from jaxcal.report.next_poses import next_poses_record
 from jaxcal.report.record import calibration_record
 from jaxcal.report.verdict import verdict
 
-FILES = 12
+FILES = 6
 BY_SYMMETRY = {("px, unknown", "u and v swapped")} | {
     (form, "u mirrored") for form in ("mm", "px, known", "px, unknown")
 }

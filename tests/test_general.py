@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 import jaxcal
 from jaxcal import backend
+from jaxcal.model.parameters import Parameters
 from jaxcal.solvers.general import LevenbergMarquardt, arrow_least_squares
 
 POINTS = 12
@@ -160,11 +161,12 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
         jaxcal.simulate_recording(jaxcal.Protocol(images=8), seed=1)
     )
     batch = jaxcal.stack([one, one])
+    somewhere = Parameters.of(jnp.eye(3), jnp.zeros(3), jnp.zeros(3))
     for call, said in (
         (lambda: backend.initial_fit(batch), "takes one problem"),
         (lambda: backend.ImagePlanes.of(one), "a batch with one leading axis"),
         (
-            lambda: backend.channel_residual(backend.initial_fit(one), one),
+            lambda: backend.channel_residual(somewhere, one),
             "the problem has no times of flight",
         ),
         (

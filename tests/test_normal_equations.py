@@ -44,7 +44,7 @@ from jaxcal.solvers.levenberg_marquardt import (
 from jaxcal.solvers.normal_equations import accumulate, component_sums
 
 LANES, IMAGES, ELEMENTS, LEFT_OUT = 3, 11, 5, 4
-SIGMA = jnp.asarray([0.3, 0.4, 1.5])[:, None] * jnp.asarray([1.0, 0.7, 1.3])
+SIGMA = jnp.asarray(np.outer([0.3, 0.4, 1.5], [1.0, 0.7, 1.3]))
 GATE = jnp.asarray([1.0, 0.0, 1.0])
 """Second derivatives in two lanes, none in the one between."""
 
@@ -76,6 +76,7 @@ def drawn() -> tuple[Problem, Parameters]:
     points, distances = (v + 0.3 * rng.normal(size=v.shape) for v in (points, distances))
     mask = np.ones(shape)
     mask[:, LEFT_OUT] = 0
+    points[..., 1] -= 2.0  # Range is measured from the face.
     points[:, LEFT_OUT], poses[1, LEFT_OUT] = [1e30, np.nan], np.nan
     distances[:, LEFT_OUT] = np.nan
     problems = Problem(
@@ -86,8 +87,6 @@ def drawn() -> tuple[Problem, Parameters]:
             jnp.asarray(distances), jnp.asarray(heard), jnp.tile(elements, (LANES, 1, 1))
         ),
     )
-    # Range is measured from the face.
-    problems = replace(problems, measurements=problems.measurements.at[..., 1].add(-2.0))
     small = Rotation.from_rotvec(rng.normal(scale=0.01, size=(LANES, 3))).as_matrix()
     near = Parameters(
         jnp.asarray(rotation @ small),
@@ -106,9 +105,9 @@ def shapes() -> jax.Array:
     return jnp.asarray(np.stack([first, rng.uniform(-0.4, 0.4, first.shape), second]))
 
 
-OFFSETS = jnp.asarray(np.random.default_rng(9).normal(size=(LANES, IMAGES)))
+OFFSETS = np.random.default_rng(9).normal(size=(LANES, IMAGES))
 # Images left out have a range of 1 mm; an offset has to fit in there.
-OFFSETS = OFFSETS.at[:, LEFT_OUT].set(0.0)
+OFFSETS[:, LEFT_OUT] = 0.0
 TAU = jnp.asarray([0.3, 0.2, 0.5])
 
 DIRECTIONS = jnp.asarray(np.random.default_rng(10).normal(size=(3, LANES, IMAGES)))
@@ -145,7 +144,10 @@ CASES = {
         RIGID,
     ),
     "in plane": (InPlane.of, (*RIGID, "scale")),
-    "held offsets": (lambda images: HeldOffsets.of(OFFSETS, images), (*RIGID, "scale")),
+    "held offsets": (
+        lambda images: HeldOffsets.of(jnp.asarray(OFFSETS), images),
+        (*RIGID, "scale"),
+    ),
     "bounded offsets": (
         lambda images: BoundedOffsets.of(jnp.full((LANES, IMAGES), 1.2), images),
         RIGID + EXTRA,
@@ -156,6 +158,7 @@ CASES = {
 """Every observation, and the unknowns it is looked at with."""
 
 
+@partial(jax.jit, static_argnums=1)
 def case(drawn, name: str) -> tuple[Iterate, Any, ImagePlanes, MediumPrior | None]:
     make, blocks = CASES[name]
     problems, near = drawn
@@ -190,36 +193,61 @@ def whitened(step, local, place: Iterate, observation, images: ImagePlanes, medi
 
 
 def dense(place: Iterate, observation, images: ImagePlanes, medium):
-    """Cost, gradient, exact and Gauss-Newton's curvature, squares of the columns."""
+    """Cost, gradient, exact and Gauss-Newton's curvature, squares of the columns.
+
+    Forward derivatives only: they make the smallest programs.
+    """
     zero, units = jnp.zeros((place.unknowns, LANES)), jnp.eye(place.unknowns)
 
     def residuals(step, local=None):
         return whitened(step, local, place, observation, images, medium)
 
-    def half(step):
-        return 0.5 * jnp.sum(residuals(step) ** 2)
+    def halves(step, local=None):
+        return 0.5 * jnp.sum(residuals(step, local) ** 2, axis=-1)
 
-    def everywhere(unit):
-        return jnp.broadcast_to(unit[:, None], zero.shape)
+    def along(function, at):
+        """The value, and the derivative by every unknown."""
 
-    exact = jax.vmap(lambda unit: jax.jvp(jax.grad(half), (zero,), (everywhere(unit),))[1])(units)
+        def one(unit):
+            return jax.jvp(function, (at,), (jnp.broadcast_to(unit[:, None], zero.shape),))
+
+        return jax.vmap(one, out_axes=(None, 0))(units)
+
+    def slopes(step, local=None):
+        return along(lambda at: jnp.sum(halves(at, local), axis=1), step)
+
     local = None
     if isinstance(observation, LocalUnknown):
         q, _ = targets(place, images)
         still = [jnp.zeros((LANES, 1))] * place.extras.shape[0]
         local, free = observation.local(q, Further.of(place, still), images)
-    jacobian = jax.vmap(
-        lambda unit: jax.jvp(lambda step: residuals(step, local), (zero,), (everywhere(unit),))[1]
-    )(units)
+    (half, gradient), (_, exact) = along(lambda at: slopes(at, local), zero)
+    _, jacobian = along(lambda at: residuals(at, local), zero)
     newton = jnp.einsum("aknr,bknr->abk", jacobian, jacobian)
-    squares = jnp.einsum("aakk->ak", newton[..., None] * jnp.eye(LANES))
+    squares = jnp.einsum("aak->ak", newton)
     if local is not None:
-        _, own = jax.jvp(lambda y: residuals(zero, y), (local,), (jnp.ones_like(local),))
+        # Through the solution for the image's own unknown, which moves along.
+        half, gradient = slopes(zero)
+        ones = jnp.ones_like(local)
+
+        def by_own(step, at):
+            return jax.jvp(lambda y: halves(step, y), (at,), (ones,))[1]
+
+        def eliminated(whole, meets, bend):
+            give = jnp.where(free * images.mask > 0, 1 / jnp.where(bend > 0, bend, 1.0), 0.0)
+            return whole - jnp.einsum("akn,bkn,kn->abk", meets, meets, give)
+
+        _, meets = along(lambda at: by_own(at, local), zero)
+        _, bend = jax.jvp(lambda y: by_own(zero, y), (local,), (ones,))
+        exact = eliminated(exact, meets, bend)
+        _, own = jax.jvp(lambda y: residuals(zero, y), (local,), (ones,))
         meets, bend = jnp.einsum("aknr,knr->akn", jacobian, own), jnp.sum(own**2, axis=-1)
-        give = jnp.where(free * images.mask > 0, 1 / jnp.where(bend > 0, bend, 1.0), 0.0)
-        newton = newton - jnp.einsum("akn,bkn,kn->abk", meets, meets, give)
-    cost = jnp.sum(residuals(zero) ** 2, axis=(1, 2))
-    return cost, jax.grad(half)(zero), exact, newton, squares
+        newton = eliminated(newton, meets, bend)
+    return 2 * half, gradient, exact, newton, squares
+
+
+# One program for each observation, which the tests share.
+sums_of = jax.jit(accumulate)
 
 
 def assert_close(found, wanted, tolerance: float) -> None:
@@ -239,10 +267,10 @@ def test_sums_are_the_derivatives_of_the_cost(drawn, name):
     cost, gradient, exact, newton, squares = jax.jit(dense)(place, observation, images, medium)
     # Newton's steps to a tracker's error end within rounding of its best value, not at it.
     tolerance = 1e-9 if "tracked" in name else 1e-12
-    normal = jax.jit(accumulate)(place, observation, images, GATE, medium)
+    normal = sums_of(place, observation, images, GATE, medium)
     assert_close(normal.cost, cost, 1e-13)
     assert_close(normal.gradient, gradient, tolerance)
-    assert_close(normal.stacked(), jnp.where(GATE > 0, exact, newton), tolerance)
+    assert_close(normal.stacked(), np.where(GATE > 0, exact, newton), tolerance)
     assert np.abs(exact - newton).max() > 1e-5 * np.abs(newton).max()
     if isinstance(observation, LocalUnknown):
         assert_close(normal.diagonal(), squares, 1e-12)
@@ -254,21 +282,23 @@ def test_components_apart_come_to_the_whole(drawn, name):
     place, observation, images, medium = case(drawn, name)
 
     @jax.jit
-    def both():
-        ones = jnp.ones(LANES)
+    def apart():
         sums = component_sums(place, observation, images, observation.sigma, medium)
-        return sums, *(
-            accumulate(place, observation, images, gate, medium) for gate in (ones, None)
-        )
+        return sums, sums.weighed(1 / observation.sigma**2)
 
-    sums, exact, newton = both()
-    weighed = sums.weighed(1 / observation.sigma**2)
+    sums, weighed = jax.tree.map(np.asarray, apart())
+    exact, newton = (
+        sums_of(place, observation, images, gate, medium)
+        for gate in (jnp.ones_like(GATE), 0 * GATE)
+    )
     for part in ("cost", "gradient", "curvature"):
         assert_close(getattr(weighed, part), getattr(newton, part), 1e-13)
     assert_close(weighed.curvature + sums.rest, exact.curvature, 1e-13)
-    alone = observation.with_sigma(jnp.full_like(observation.sigma, 1e12).at[0].set(1.0))
     if name == "channels":
-        first = jax.jit(accumulate)(place, alone, images, None)
+        only_first = np.full(observation.sigma.shape, 1e12)
+        only_first[0] = 1.0
+        alone = observation.with_sigma(jnp.asarray(only_first))
+        first = sums_of(place, alone, images, GATE, None)
         assert_close(sums.squares[0], first.cost, 1e-12)
         assert_close(sums.gradient[0], first.gradient, 1e-12)
 
@@ -299,13 +329,9 @@ def test_images_left_out_and_padding_count_for_nothing(drawn, name):
     # Padding is whole vectors of 64 bytes; none for times of flight.
     padded = images.padded()
     assert padded.mask.shape[1] == (IMAGES if name == "channels" else 16)
-    ways = [
-        (observation, images),
-        (without, few),
-        (observation.padded(), padded),
-    ]
-    sums = jax.jit(accumulate)
-    whole, fewer, more = (sums(place, each, data, None, medium) for each, data in ways)
+    whole = sums_of(place, observation, images, GATE, medium)
+    fewer = sums_of(place, without.padded(), few.padded(), GATE, medium)
+    more = sums_of(place, observation.padded(), padded, GATE, medium)
     for leaf, other, third in zip(*map(jax.tree.leaves, (whole, fewer, more)), strict=True):
         assert np.isfinite(leaf).all()
         np.testing.assert_allclose(leaf, other, rtol=1e-11, atol=1e-11 * np.abs(leaf).max())
@@ -319,14 +345,18 @@ def test_sums_of_planes_have_both_derivatives():
         kept = [plane if unrolled.is_zero(plane) else scale * plane for plane in planes]
         return sum(jnp.sum(value**2) for value in total(kept))
 
-    found = total(planes)
+    @jax.jit
+    def everything(at):
+        by_reverse = jax.grad(squares)
+        # And again: curvature is asked for at optima.
+        bend = jax.grad(by_reverse)(at)
+        return total(planes), by_reverse(at), jax.jvp(squares, (at,), (1.0,))[1], bend
+
+    found, *slopes, bend = everything(2.0)
     np.testing.assert_array_equal(found, [[3, 12], [0, 0], [3, 3]])
-    at = jnp.asarray(2.0)
     expected = 2 * 2.0 * (3**2 + 12**2 + 2 * 3**2)
-    for slope in (jax.grad(squares)(at), jax.jvp(squares, (at,), (1.0,))[1]):
-        np.testing.assert_allclose(slope, expected, rtol=1e-15)
-    # And again: curvature is asked for at optima.
-    np.testing.assert_allclose(jax.grad(jax.grad(squares))(at), expected / 2, rtol=1e-15)
+    np.testing.assert_allclose(slopes, [expected] * 2, rtol=1e-15)
+    np.testing.assert_allclose(bend, expected / 2, rtol=1e-15)
 
 
 def test_the_gradient_has_forward_and_reverse_derivatives_by_the_data(drawn):
@@ -381,10 +411,14 @@ def test_derivatives_of_planes_leave_out_what_vanishes():
 
 def test_offsets_are_the_closest_points_of_the_circles(drawn):
     place, observation, images, _ = case(drawn, "bounded offsets")
-    found = np.asarray(local_unknowns(place, observation, images))
-    q, _ = targets(place, images)
-    still = [jnp.zeros((LANES, 1))] * place.extras.shape[0]
-    distance = np.asarray(Further.of(place, still).points(images)[1])
+
+    @jax.jit
+    def looked_at():
+        still = [jnp.zeros((LANES, 1))] * place.extras.shape[0]
+        distance = Further.of(place, still).points(images)[1]
+        return local_unknowns(place, observation, images), targets(place, images)[0], distance
+
+    found, q, distance = jax.tree.map(np.asarray, looked_at())
     for k, i in [(0, 0), (1, 7), (2, 10), (2, 3)]:
         best: Any = minimize_scalar(
             lambda y, k=k, i=i: (
@@ -421,12 +455,20 @@ def descent(drawn):
 def test_where_the_last_step_was_not_looked_at_the_gradient_is_gone_too(descent):
     place, observation, images, run = descent
     found = run(place, observation, images)
-    rounding = Rounding.of(found.place, observation, images)
-    normal = jax.jit(accumulate)(found.place, observation, images, None)
+    normal, gated = (sums_of(place, observation, images, gate) for gate in (None, 0 * GATE))
+    for one, other in zip(jax.tree.leaves(normal), jax.tree.leaves(gated), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(one).max())
+    normal = sums_of(found.place, observation, images, None)
+
+    @jax.jit
+    def cosine():
+        rounding = Rounding.of(found.place, observation, images)
+        return gradient_cosine(normal, rounding.vanished)
+
     assert np.all(found.settled)
     assert not np.any(found.active)
     assert np.all(found.cosine <= 1e-10)
-    assert np.all(gradient_cosine(normal, rounding.vanished) <= 1e-10)
+    assert np.all(np.asarray(cosine()) <= 1e-10)
     # Its cost is that before the last step: higher, by nothing.
     np.testing.assert_allclose(found.cost, normal.cost, rtol=1e-10)
 
@@ -448,8 +490,14 @@ def test_a_step_that_fails_is_tried_again_with_more_damping(drawn):
     place, observation, images, _ = case(drawn, "bounded offsets")
     place = Iterate.of(place.parameters(), RIGID)
     far = (60, -50, 70, 1.5, -1, 1.2, 80, 90, -40)
-    away = place.moved([jnp.full(LANES, float(value)) for value in far])
-    rounding = Rounding.of(away, observation, images)
+
+    @jax.jit
+    def begun():
+        away = place.moved([jnp.full(LANES, float(value)) for value in far])
+        start = Descent.before(away, jnp.zeros(LANES), 1e-9)
+        return start, Rounding.of(away, observation, images)
+
+    state, rounding = begun()
     step = jax.jit(
         partial(
             iterate_once,
@@ -459,9 +507,9 @@ def test_a_step_that_fails_is_tried_again_with_more_damping(drawn):
             max_steps=100,
         )
     )
-    state, failed = Descent.before(away, jnp.zeros(LANES), 1e-9), 0
+    failed = 0
     while np.any(state.active):
-        before, state = state, step(state)
+        before, state = state, jax.tree.map(np.asarray, step(state))
         taken = ~np.asarray(before.retry)
         assert np.all(state.cost[taken] <= before.cost[taken] * (1 + 1e-9))
         failed += int(np.sum(state.retry & state.active))

@@ -40,6 +40,7 @@ def load(name: str):
     return corpus.load(name)
 
 
+@cache
 def data_of(name: str, row: int) -> Data:
     """Plain arrays of the used images."""
     family, _ = load(name)
@@ -72,6 +73,12 @@ def data_of(name: str, row: int) -> Data:
         heard=np.asarray(channels.heard)[0][used],
         elements=np.asarray(channels.elements)[0],
     )
+
+
+@cache
+def conventional(name: str, row: int, blocks=RIGID) -> least_squares.Fit:
+    """The fit that the others start from."""
+    return least_squares.conventional(data_of(name, row), blocks)
 
 
 def answers(name: str, call: str, row: int) -> list[corpus.Arrays]:
@@ -144,7 +151,7 @@ ORDINARY = [("points12", row) for row in (0, 1, 2, 3, 4, 5, 34, 42)] + [
 @pytest.mark.parametrize(("name", "row"), ORDINARY)
 def test_conventional(name, row):
     data = data_of(name, row)
-    fit = least_squares.conventional(data, RIGID)
+    fit = conventional(name, row)
     spread = uncertainty.residual_variance(fit.cost, len(data), 9)
     covariance = uncertainty.covariance(fit.jacobian, 9, spread)
     seen = uncertainty.observability(data, fit.unknowns, RIGID, fit.jacobian, spread)
@@ -174,7 +181,7 @@ def test_conventional(name, row):
 def test_given_standard_deviations(name, row):
     data, blocks = data_of(name, row), SCALE if name.startswith("pixels") else RIGID
     shape = None if data.covariance is None else data.shape()
-    start = least_squares.conventional(data, blocks).unknowns
+    start = conventional(name, row, blocks).unknowns
     fit = least_squares.joint(data, blocks, GIVEN, start, shape)
     covariance = uncertainty.covariance(fit.jacobian, size(blocks))
     for answer in answers(name, "given", row):
@@ -195,9 +202,7 @@ def test_given_standard_deviations(name, row):
 def test_a_tracker_that_errs(name, row):
     """Offsets as unknowns of their own; without tracker errors they go over into q_y."""
     data, tau = data_of(name, row), 0.2
-    start = least_squares.joint(
-        data, RIGID, GIVEN, least_squares.conventional(data, RIGID).unknowns
-    )
+    start = least_squares.joint(data, RIGID, GIVEN, conventional(name, row).unknowns)
     fit = least_squares.joint_explicit(data, RIGID, GIVEN, tau, start.unknowns)
     whole = uncertainty.covariance(fit.jacobian, 9 + len(data))
     (answer,) = answers(name, "tracker", row)
@@ -220,7 +225,7 @@ def test_bounded(name, row):
     """The same minimum from starts of the oracle's own, and the KKT conditions at the answer."""
     data = data_of(name, row)
     bound = np.ones(len(data)) if data.bound is None else data.bound
-    start = least_squares.conventional(data, RIGID).unknowns
+    start = conventional(name, row).unknowns
     fit = least_squares.bounded(data, RIGID, bound, start)
     (answer,) = answers(name, "bounded", row)
     assert answer["cost"] == pytest.approx(fit.cost, rel=1e-9)
@@ -253,7 +258,7 @@ def test_bounded(name, row):
 @pytest.mark.parametrize(("name", "row"), ORDINARY)
 def test_alternation(name, row):
     data = data_of(name, row)
-    start = least_squares.conventional(data, RIGID).unknowns
+    start = conventional(name, row).unknowns
     u, y = least_squares.alternate(data, RIGID, np.ones(len(data)), start)
     for answer in answers(name, "alternating", row):
         # Fewer than 9 active bounds leave a direction free, and its SD unknown.
@@ -266,9 +271,10 @@ def test_alternation(name, row):
         )
 
 
+@cache
 def tuned(name: str, row: int, blocks=RIGID) -> tuple[Data, variance.Tuned]:
     data = data_of(name, row)
-    start = least_squares.conventional(data, blocks).unknowns
+    start = conventional(name, row, blocks).unknowns
     return data, variance.reml(variance.point_components(data), start, 3, blocks)
 
 
@@ -276,9 +282,8 @@ def tuned(name: str, row: int, blocks=RIGID) -> tuple[Data, variance.Tuned]:
     ("name", "row"), [*ORDINARY[:6], ORDINARY[7], *ORDINARY[8:], ("pixels24", 0), ("pixels24", 1)]
 )
 def test_self_tuned_is_restricted_maximum_likelihood(name, row):
-    data, blocks = data_of(name, row), SCALE if name.startswith("pixels") else RIGID
-    start = least_squares.conventional(data, blocks).unknowns
-    found = variance.reml(variance.point_components(data), start, 3, blocks)
+    blocks = SCALE if name.startswith("pixels") else RIGID
+    _, found = tuned(name, row, blocks)
     covariance = uncertainty.covariance(found.fit.jacobian, size(blocks))
     for answer in answers(name, "gaussian", row):
         np.testing.assert_allclose(answer["sigma"], found.sigma, rtol=1e-7)
@@ -295,7 +300,7 @@ def test_self_tuned_with_correlated_errors_is_helmerts(row):
     the data likeliest are up to 39 per cent off.
     """
     data = data_of("covariances24", row)
-    start = least_squares.conventional(data, RIGID).unknowns
+    start = conventional("covariances24", row).unknowns
     components = variance.point_components(data, data.shape())
     found = variance.helmert(components, start, 3, RIGID)
     (answer,) = answers("covariances24", "gaussian", row)
@@ -407,7 +412,7 @@ def medium_sd(given: tuple | None) -> np.ndarray | None:
 @pytest.mark.parametrize(("name", "call", "blocks", "given"), CHANNELS)
 def test_times_of_flight(name, call, blocks, given, row):
     data = data_of(name, row)
-    start = least_squares.conventional(data, RIGID).unknowns
+    start = conventional(name, row).unknowns
     found = variance.reml(variance.channel_components(data), start, 2, blocks, medium_sd(given))
     u, covariance = found.fit.unknowns, uncertainty.covariance(found.fit.jacobian, size(blocks))
     for answer in answers(name, call, row):
@@ -428,7 +433,7 @@ def test_times_of_flight(name, call, blocks, given, row):
 @pytest.mark.parametrize(("name", "row"), [("curved12", 2)])
 def test_model_average_on_times_of_flight(name, row):
     data = data_of(name, row)
-    start = least_squares.conventional(data, RIGID).unknowns
+    start = conventional(name, row).unknowns
     first = variance.reml(variance.channel_components(data), start, 2, RIGID)
     found = model_average.average(
         data,

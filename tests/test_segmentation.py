@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import h5py
 import jax
@@ -87,7 +88,7 @@ def test_distance_fit_agrees_with_scipy_and_its_covariance_holds():
     truth = np.stack([rng.uniform(-29, 29, 400), rng.uniform(10, 90, 400)], axis=1)
     exact = np.hypot(truth[:, :1] - elements, truth[:, 1:])
     distances = exact + 0.5 * rng.normal(size=exact.shape)
-    points, inverse = fit_distances(distances, elements)
+    points, inverse = map(np.asarray, jax.jit(fit_distances)(distances, elements))
     for k in range(0, 400, 40):
 
         def residual(p, k=k):
@@ -265,7 +266,7 @@ def curvilinear(noise, elevation, fraction=0.0, robust=True, frames=FRAMES):
 def test_curvilinear_covariance_holds(robust):
     for noise in SIGMAS:
         for fraction in (0.0, 0.2):
-            exact, _, full = curvilinear(noise, 5.0, fraction, robust, frames=8000)
+            exact, _, full = curvilinear(noise, 5.0, fraction, robust, frames=4000)
             error = full.position - exact
             assert np.abs(error.mean(axis=0) / error.std(axis=0)).max() < 0.1
             own = error[:, 2] ** 2 / full.covariance[:, 2, 2]
@@ -313,7 +314,9 @@ def test_in_plane_points_of_a_curvilinear_array_hold():
 def test_elevation_agrees_with_scipy():
     truth, distances = draw(C5_2, 6, 0.2, elevation=5.0)
     positions = C5_2.element_positions()
-    plane, full = fit_out_of_plane(distances, positions, steps=8)
+    plane, full = jax.tree.map(
+        np.asarray, jax.jit(partial(fit_out_of_plane, steps=8))(distances, positions)
+    )
     for k in range(6):
 
         def model(p):
@@ -364,7 +367,7 @@ def test_shortest_time_with_gaps():
         [3.0, 4.0, 5.0, 6.0, 7.0],
     ])  # fmt: skip
     for pitch in (None, 1.0):
-        line, least = shortest(distances, pitch_mm=pitch)
+        line, least = jax.jit(partial(shortest, pitch_mm=pitch))(distances)
         np.testing.assert_array_equal(line, [2, np.nan, 4, 0])
         np.testing.assert_array_equal(least, [4.0, np.nan, 7.0, 3.0])
 

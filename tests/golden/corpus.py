@@ -344,15 +344,15 @@ def compute(family: Family, call: Call, road: str, rows: np.ndarray | None = Non
     problems, keywords = family.problems(rows), call.keywords()
     with jax.enable_x64(True):
         if road == "batch":
-            return numbers(jaxcal.calibrate_batch(problems, **keywords))
+            return numbers(jaxcal.calibrate_batch(problems, **keywords).numpy())
         each: list[Arrays | None] = []
         for place, row in enumerate(rows):
             # Images of a single pose are refused, one problem at a time.
             if not family.usable()[row] or family.kinds[row] == "one pose":
                 each.append(None)
                 continue
-            problem = jax.tree.map(lambda leaf, place=place: leaf[place], problems)
-            each.append(numbers(jaxcal.calibrate(problem, **keywords)))
+            problem = jax.tree.map(lambda leaf, k=place: np.asarray(np.asarray(leaf)[k]), problems)
+            each.append(numbers(jaxcal.calibrate(problem, **keywords).numpy()))
     pattern = next(answer for answer in each if answer is not None)
 
     def refused(name: str, like: np.ndarray) -> np.ndarray:

@@ -89,6 +89,8 @@ class Unknowns:
 
 def turn(w: np.ndarray) -> np.ndarray:
     """exp of the cross product matrix, by its series (complex w allowed)."""
+    if not np.any(w):
+        return np.eye(3)
     cross = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
     total = term = np.eye(3, dtype=cross.dtype)
     largest = np.abs(w).max()
