@@ -2,7 +2,7 @@
 
 import sys
 
-from hw.cli import main
+from hw.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -33,7 +33,7 @@ WIDTH = 100
 
 def text() -> str:
     """The page."""
-    from hw.cli import commands as bench
+    from hw.cli.main import commands as bench
     from jaxcal.cli.main import commands as engine
 
     parts = [_HEAD.rstrip()]

@@ -237,7 +237,7 @@ def _run_python(block: Block, names: dict[str, object], where: str) -> str:
 
 
 def _run_commands(block: Block, where: str) -> str:
-    from hw.cli import main as bench
+    from hw.cli.main import main as bench
     from jaxcal.cli.main import main as engine
 
     printed = io.StringIO()

@@ -1,0 +1,310 @@
+"""``jaxcal-hw acquire``: the images of a plan of poses, and a calibration from them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from datetime import datetime
+from typing import TYPE_CHECKING
+
+import click
+
+from hw.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
+from hw.cli.common import (
+    bench_option,
+    bench_seed_option,
+    check_resumed,
+    controller_option,
+    setup_of,
+    setup_option,
+    speed_option,
+    started,
+)
+from hw.cli.confirming import confirming_by
+from jaxcal import InputError
+from jaxcal.cli.common import POSITIVE, ExitCode, exit_code
+
+if TYPE_CHECKING:
+    from hw.acquire import Outcome
+    from hw.bench.run import Bench
+    from hw.extras import Extra
+    from hw.keys import Keyboard
+    from hw.midplane.pattern_injection import Operator
+    from hw.midplane.terminal_image import Screen
+    from hw.request import AcquisitionRequest
+    from hw.robot.safety import Confirmation, MotionPlan
+    from hw.setup import Setup
+    from hw.view.feed import LiveView
+
+_RESUMED_BY_ITSELF = 30
+"""How often an acquisition on the emulated bench is resumed without a person."""
+
+
+@click.command()
+@click.argument("recording", type=click.Path(), required=False)
+@bench_option
+@setup_option
+@click.option("--images", type=click.IntRange(4, 1000), help="Poses of the plan.  [default: 60]")
+@click.option(
+    "--plan",
+    type=click.Choice(PLANS),
+    help="How poses are planned: spread evenly beforehand, or chosen from a confirmed pool as the "
+    "images tell; then --images is the most.  [default: sobol]",
+)
+@click.option(
+    "--until-tre",
+    type=POSITIVE,
+    metavar="MM",
+    help="With --plan optimal: stop once the predicted error over the image is this small.",
+)
+@click.option(
+    "--placement",
+    type=click.Choice(PLACEMENTS),
+    help="How the target is brought into the mid-plane.  [default: amplitude-scan; image-scan with "
+    "a cross-wire]",
+)
+@click.option(
+    "--phantom",
+    type=click.Choice(PHANTOMS),
+    help="What is in the tank: an element that hears and answers, wires that only show in the "
+    "image, or a hydrophone that only hears.  [default: active-echo]",
+)
+@click.option(
+    "--operator",
+    type=click.Choice(OPERATORS),
+    help="Who follows the injected pattern: you at this terminal, you before a window, or a rule.  "
+    "[default: person with --setup, simulated with --bench]",
+)
+@click.option(
+    "--seed", type=click.IntRange(min=0), metavar="N", help="Seed of the plan.  [default: 0]"
+)
+@click.option("--every-frame", is_flag=True, help="Record every ultrasound frame, not one a pose.")
+@click.option("--resume", is_flag=True, help="Go on with RECORDING, which ended early.")
+@click.option("--move", is_flag=True, help="Move the robot, after a confirmation; else a dry run.")
+@click.option(
+    "--unattended",
+    metavar="DIGEST",
+    help="Move without asking anybody: then nobody at the robot says, just before it moves, that "
+    "its way is clear. DIGEST names the plan (16 digits or more, as --move shows it); "
+    "any other plan, robot, TCP offset, payload or speed slider is refused.",
+)
+@click.option("--preview", type=click.Path(), metavar="PNG", help="Draw the plan.")
+@click.option("--view", is_flag=True, help="Show it live in the browser, on this machine only.")
+@speed_option
+@controller_option
+@bench_seed_option
+def acquire(
+    recording: str | None,
+    bench: bool,
+    setup_path: str | None,
+    images: int | None,
+    plan: str | None,
+    until_tre: float | None,
+    placement: str | None,
+    phantom: str | None,
+    operator: str | None,
+    seed: int | None,
+    every_frame: bool,
+    resume: bool,
+    move: bool,
+    unattended: str | None,
+    preview: str | None,
+    view: bool,
+    speed: float | None,
+    controller: str | None,
+    bench_seed: int | None,
+) -> int:
+    """Take the images of a plan of poses, and calibrate from them.
+
+    RECORDING is the file to make (by default one named after the time), or to --resume.
+    """
+    if bench == (setup_path is not None):
+        also = ", also to --resume" if resume else ""
+        raise InputError(f"give either --bench or --setup TOML{also}")
+    if not bench and (speed, controller, bench_seed) != (None, None, None):
+        raise InputError("--speed, --controller and --bench-seed need --bench")
+    given = [
+        name
+        for name, value in (
+            ("--images", images),
+            ("--plan", plan),
+            ("--until-tre", until_tre),
+            ("--placement", placement),
+            ("--phantom", phantom),
+            ("--operator", operator),
+            ("--seed", seed),
+            ("--every-frame", every_frame or None),
+            ("--bench-seed", bench_seed),
+        )
+        if value is not None
+    ]
+    if resume:
+        check_resumed(recording, given)
+    if operator is not None and not resume and placement != "pattern-injection":
+        raise InputError("--operator needs --placement pattern-injection")
+    if until_tre is not None and plan != "optimal" and not resume:
+        raise InputError("--until-tre needs --plan optimal")
+    if unattended is not None and not move:
+        raise InputError("--unattended needs --move")
+    if view and not (bench or move):
+        raise InputError("--view needs --move: a dry run has nothing to show")
+    from hw.extras import missing
+    from hw.recording_check import check_resumable
+    from hw.request import AcquisitionRequest, recorded_request
+
+    if resume:
+        assert recording is not None
+        check_resumable(recording)
+        recorded = recorded_request(recording)
+        if bench != (recorded.bench is not None):
+            where = "a real bench" if bench else "the emulated bench"
+            raise InputError(f"the recording was begun on {where}: resume it there")
+        bench_seed, phantom, operator = recorded.bench, recorded.phantom, recorded.operator
+    needed: dict[str, Extra] = {"rtde_control": "robot"} if bench or move else {}
+    if bench and phantom in (None, PHANTOMS[0]):
+        needed |= {"cobs": "serial", "serial": "serial"}
+    for module, extra in needed.items():
+        # Before a file is made, and before anybody is asked to confirm a plan.
+        if (cure := missing(module, extra=extra)) is not None:
+            raise InputError(cure)
+    path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
+    from jaxcal.cli.cache import enable_compilation_cache
+
+    enable_compilation_cache()
+
+    request = None
+    if operator is None:
+        asks = placement == "pattern-injection" and not bench
+        operator = "person" if asks else "simulated"
+    if not resume:
+        phantom = phantom or PHANTOMS[0]
+        request = AcquisitionRequest(
+            images or 60,
+            placement or PLACEMENTS_OF[phantom][0],
+            seed or 0,
+            every_frame,
+            (bench_seed or 0) if bench else None,
+            operator,
+            plan or PLANS[0],
+            until_tre,
+            phantom,
+        )
+    with ExitStack() as stack:
+        emulated = started(stack, bench, bench_seed, speed, controller, phantom)
+        setup = setup_of(setup_path, emulated)
+        if not bench and not move:
+            return _dry_run(setup, path, request, preview)
+        if preview is not None:
+            _preview(setup, request, preview)
+        return _acquire(setup, path, request, emulated, unattended, operator, view)
+
+
+def _acquire(
+    setup: Setup,
+    path: str,
+    request: AcquisitionRequest | None,
+    emulated: Bench | None,
+    unattended: str | None,
+    operator: str,
+    show: bool,
+) -> int:
+    from hw.acquire import AcquisitionStopped
+    from hw.acquire import acquire as run_acquisition
+    from hw.emulated import BenchOracle
+    from hw.keys import Pause, watch_keys
+    from hw.midplane.terminal_image import Screen
+
+    pause, screen = Pause(), Screen(sys.stderr)
+    confirming = confirming_by(setup, emulated is not None, unattended)
+
+    def say(line: str) -> None:
+        screen.say(line)
+        if view is not None:
+            view.say(line)
+
+    def attempt(request: AcquisitionRequest | None) -> Outcome:
+        def confirm(plan: MotionPlan) -> Confirmation:
+            with keyboard.lines():
+                return confirming(plan)
+
+        return run_acquisition(
+            setup,
+            path,
+            request,
+            confirm,
+            say=say,
+            oracle=None if emulated is None else BenchOracle(emulated),
+            operator=_operators(operator, keyboard, screen),
+            pause=pause,
+            view=view,
+        )
+
+    # A person's Enter accepts a place.
+    pause_keys = ("p",) if operator == "person" else ("enter", "p")
+    with ExitStack() as stack:
+        view: LiveView | None = None
+        if show:
+            from hw.view.feed import LiveView
+
+            view = stack.enter_context(LiveView(screen.say))
+        keyboard = stack.enter_context(watch_keys(pause, screen.say, pause_keys))
+        for _ in range(_RESUMED_BY_ITSELF if emulated is not None else 0):
+            try:
+                return _finished(path, attempt(request), setup)
+            except AcquisitionStopped as error:
+                if error.exit_code == ExitCode.INTERRUPTED or not error.by_itself:
+                    raise
+                # A busy machine trips the emulated controller's watchdog: resume without a person.
+                say(f"stopped: {error}")
+                request = None
+        return _finished(path, attempt(request), setup)
+
+
+def _operators(operator: str, keyboard: Keyboard, screen: Screen) -> Callable[[], Operator]:
+    """Who follows the injected pattern at each pose.
+
+    Raises:
+        InputError: a person without a terminal, or without a display for the window.
+    """
+    from hw.midplane.live_view import TerminalOperator, WindowOperator
+    from hw.midplane.pattern_injection import SteadyOperator
+
+    match operator:
+        case "person":
+            if not keyboard.there:
+                raise InputError(
+                    "pattern injection by a person needs a terminal to read keys from; "
+                    "--operator simulated follows a rule instead"
+                )
+            return lambda: TerminalOperator(keyboard, screen)
+        case "window":
+            window = WindowOperator()
+            return lambda: window
+    return SteadyOperator
+
+
+def _finished(path: str, outcome: Outcome, setup: Setup) -> int:
+    from hw.outcome import calibrate_and_print, lines_of
+
+    lines = lines_of(path, outcome, setup.clock.speed)
+    return exit_code([calibrate_and_print(path, *lines)])
+
+
+def _dry_run(
+    setup: Setup, path: str, request: AcquisitionRequest | None, preview: str | None
+) -> int:
+    """Everything but the motion: the plan, and the way from pose to pose, against the limits."""
+    from hw.dry_run import dry_run
+
+    for line in dry_run(setup, path, request, preview):
+        click.echo(line)
+    return ExitCode.CONVERGED
+
+
+def _preview(setup: Setup, request: AcquisitionRequest | None, preview: str) -> None:
+    from hw.dry_run import draw
+
+    if request is None:
+        raise InputError("--preview draws a new plan; it does not go with --resume")
+    draw(setup, request, preview)

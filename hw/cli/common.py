@@ -1,0 +1,74 @@
+"""What commands of ``jaxcal-hw`` share: options of the bench, and how a bench is found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+import click
+
+from hw.choices import PHANTOMS
+from jaxcal import InputError
+from jaxcal.cli.common import POSITIVE
+
+if TYPE_CHECKING:
+    from hw.bench.run import Bench
+    from hw.setup import Setup
+
+POSE_HZ = {"cb": 125, "e": 500}
+"""Poses a second of a controller's series."""
+
+bench_option = click.option("--bench", is_flag=True, help="The emulated bench: no hardware at all.")
+setup_option = click.option(
+    "--setup", "setup_path", type=click.Path(), metavar="TOML", help="The bench's description."
+)
+speed_option = click.option(
+    "--speed", type=POSITIVE, metavar="K", help="Emulated bench: times faster than real time."
+)
+controller_option = click.option(
+    "--controller",
+    type=click.Choice(list(POSE_HZ)),
+    help="Emulated bench: series of the robot, CB (125 poses/s) or e-Series (500).  [default: cb]",
+)
+bench_seed_option = click.option(
+    "--bench-seed", type=click.IntRange(min=0), metavar="N", help="Emulated bench: which world."
+)
+
+
+def check_resumed(recording: str | None, given: Sequence[str]) -> None:
+    """Refuse --resume without a recording, or with options that the recording knows."""
+    if recording is None:
+        raise InputError("--resume needs the RECORDING to go on with")
+    if given:
+        raise InputError(f"{given[0]} does not go with --resume: the recording knows")
+
+
+def started(
+    stack: ExitStack,
+    bench: bool,
+    seed: int | None,
+    speed: float | None,
+    controller: str | None,
+    phantom: str | None = None,
+) -> Bench | None:
+    """Start the emulated bench if it was asked for."""
+    if not bench:
+        return None
+    from hw.emulated import SPEED, start
+
+    speed = SPEED if speed is None else speed
+    return stack.enter_context(
+        start(seed or 0, speed, POSE_HZ[controller or "cb"], phantom or PHANTOMS[0])
+    )
+
+
+def setup_of(path: str | None, emulated: Bench | None) -> Setup:
+    """The description of the emulated bench, or of the one in a file."""
+    from hw import emulated as emulation
+    from hw.setup import load_setup
+
+    if emulated is not None:
+        return emulation.setup_of(emulated)
+    assert path is not None
+    return load_setup(path)

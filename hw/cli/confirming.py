@@ -1,0 +1,57 @@
+"""How a person confirms a plan of motion at the terminal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from hw.acquire import Confirm
+    from hw.robot.safety import Confirmation, MotionPlan
+    from hw.setup import Setup
+
+
+def confirming_by(setup: Setup, emulated: bool, unattended: str | None) -> Confirm:
+    """Who confirms a plan: a person, or ``--unattended``; nobody on the emulated bench."""
+
+    def ask(plan: MotionPlan) -> Confirmation:
+        from hw.robot.safety import Challenge, confirm, confirm_unattended
+
+        if emulated:
+            return confirm_unattended(plan, plan.digest, clock=setup.clock)
+        for line in plan_page(plan):
+            click.echo(line, err=True)
+        if unattended is not None:
+            return confirm_unattended(plan, unattended, clock=setup.clock)
+        challenge = Challenge(plan)
+        click.echo(
+            "Clear the tank, keep the emergency stop in reach, then type "
+            f"{challenge.code} to let it move.",
+            err=True,
+        )
+        try:
+            code = click.prompt("code", err=True)
+        except click.Abort:
+            raise KeyboardInterrupt from None
+        return confirm(challenge, code, clock=setup.clock)
+
+    return ask
+
+
+def plan_page(plan: MotionPlan) -> list[str]:
+    """Everything that a person must know of a plan to confirm it."""
+    from hw.robot.safety import plan_lines
+
+    lines = [
+        f"{len(plan.targets)} poses for robot {plan.serial}",
+        *plan_lines(plan),
+        f"at the pendant: {plan.pendant}",
+        f"the plan's digest begins with {plan.digest[:16]}",
+    ]
+    if not plan.identified:
+        lines.append(
+            "NOTHING IDENTIFIES THIS ARM: its controller tells neither serial number nor "
+            "calibration, only its address is known; look which arm it is"
+        )
+    return lines

@@ -1,0 +1,146 @@
+"""``jaxcal-hw free-hand``: images of a hand-held probe, and a calibration from them."""
+
+from __future__ import annotations
+
+import sys
+from datetime import datetime
+from typing import Any
+
+import click
+from click.core import ParameterSource
+
+from hw.choices import HAND_PLACEMENTS
+from hw.cli.common import check_resumed
+from jaxcal import InputError
+from jaxcal.cli.common import POSITIVE, exit_code
+
+
+@click.command("free-hand", short_help="Acquire with a hand-held probe, and calibrate.")
+@click.argument("server", metavar="HOST[:PORT]")
+@click.argument("recording", type=click.Path(), required=False)
+@click.option(
+    "--images", type=click.IntRange(4, 1000), default=30, show_default=True, help="To take."
+)
+@click.option("--from", "source", metavar="FRAME", help="Tracked frame on the probe, e.g. Probe.")
+@click.option("--to", "target_frame", metavar="FRAME", help="Frame the target rests in.")
+@click.option("--device", metavar="NAME", help="Of the images, where several are sent.")
+@click.option(
+    "--target",
+    type=click.Choice(["echo", "cross"]),
+    default="echo",
+    show_default=True,
+    help="What to look for: one bright spot, or a crossing of wires.",
+)
+@click.option(
+    "--region",
+    type=int,
+    nargs=4,
+    metavar="COLUMN ROW COLUMNS ROWS",
+    help="Part of the frames to look in, px.",
+)
+@click.option(
+    "--spacing",
+    "spacing_mm",
+    type=POSITIVE,
+    nargs=2,
+    metavar="LATERAL AXIAL",
+    help="Size of a pixel, mm.",
+)
+@click.option(
+    "--lag",
+    "lag_s",
+    type=float,
+    default=0.0,
+    metavar="SECONDS",
+    help="An image stamped t shows what was at t - SECONDS.",
+)
+@click.option(
+    "--placement",
+    type=click.Choice(HAND_PLACEMENTS),
+    default=HAND_PLACEMENTS[0],
+    show_default=True,
+    help="How the target is found: by segmenting the images, or by the bar that the active echo "
+    "element injects and you follow (needs --setup).",
+)
+@click.option(
+    "--setup",
+    "setup_path",
+    type=click.Path(),
+    metavar="TOML",
+    help="For pattern injection: [active_echo] url, [probe], and [scene] image_to_probe as drawn.",
+)
+@click.option("--resume", is_flag=True, help="Go on with RECORDING, as it was begun.")
+def free_hand(
+    server: str,
+    recording: str | None,
+    resume: bool,
+    target: str,
+    region: tuple[int, int, int, int] | None,
+    placement: str,
+    setup_path: str | None,
+    **options: Any,
+) -> int:
+    """Acquire with a hand-held probe: images and poses of a PlusServer or any OpenIGTLink tracker.
+
+    Connects to HOST (port 18944), which must send IMAGE and TRANSFORM, or TRACKEDFRAME. Hold the
+    probe still over the target: an image is taken by itself where the target is credible and the
+    pose differs from those before. What is still missing is said. With --placement
+    pattern-injection you slide the probe across the mid-plane, back to where the injected bar is
+    longest, and accept with Enter. RECORDING is the file to make (by default one named after the
+    time); afterwards it is calibrated, as jaxcal calibrate would.
+    """
+    from hw.freehand.acquire import acquire_free_hand
+    from hw.freehand.guide import Rules
+    from hw.freehand.request import FreeHand
+    from hw.freehand.terminal import INJECTION_KEYS, KEYS, TerminalPerson
+
+    if resume:
+        context = click.get_current_context()
+        given = [
+            option.opts[0]
+            for option in context.command.params
+            if isinstance(option, click.Option)
+            and option.name not in ("resume", "placement", "setup_path")
+            and context.get_parameter_source(str(option.name)) is ParameterSource.COMMANDLINE
+        ]
+        check_resumed(recording, given)
+    injected = placement == "pattern-injection"
+    if injected != (setup_path is not None):
+        raise InputError("--placement pattern-injection and --setup TOML go together")
+    if injected:
+        unused = {
+            "--target": target != "echo",
+            "--region": region is not None,
+            "--spacing": options["spacing_mm"] is not None,
+        }
+        for name, given in unused.items():
+            if given:
+                raise InputError(f"{name} is for segmented images: not with pattern-injection")
+    host, _, port = server.partition(":")
+    if not host or not ((port.isdecimal() and 0 < int(port) < 65536) or not port):
+        raise click.BadParameter(f"{server!r} is not HOST or HOST:PORT", param_hint="HOST[:PORT]")
+    path = recording or f"free-hand-{datetime.now():%Y%m%d-%H%M%S}.h5"
+    rules = Rules(target="cross" if target == "cross" else "echo", region=region)
+    asked = FreeHand(host, int(port or 18944), rules=rules, **options)
+    from hw.keys import Keyboard, Pause
+    from hw.midplane.terminal_image import Screen
+
+    screen = Screen(sys.stderr)
+    with Keyboard(Pause(), (), screen.say) as keyboard, keyboard.asking():
+        person = TerminalPerson(screen, keyboard, INJECTION_KEYS if injected else KEYS)
+        if setup_path is not None:
+            from hw.freehand.injection import acquire_by_injection
+            from hw.setup import load_hand_held
+
+            if not keyboard.there:
+                raise InputError("pattern injection needs a terminal to read keys from")
+            setup = load_hand_held(setup_path)
+            acquire_by_injection(path, asked, setup, person, resume=resume)
+        else:
+            acquire_free_hand(path, asked, person, resume=resume)
+        screen.clear()
+    from hw.outcome import calibrate_and_print
+    from jaxcal.cli.cache import enable_compilation_cache
+
+    enable_compilation_cache()
+    return exit_code([calibrate_and_print(path)])

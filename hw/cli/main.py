@@ -1,0 +1,50 @@
+"""The entry point ``jaxcal-hw``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import click
+
+from hw.cli.acquire import acquire
+from hw.cli.bench import bench
+from hw.cli.check import check
+from hw.cli.free_hand import free_hand
+from hw.cli.setup import setup
+from hw.interrupts import as_interrupts
+from jaxcal import __version__
+from jaxcal.cli.common import Commands
+from jaxcal.cli.run import run
+
+
+@click.group(
+    cls=Commands,
+    no_args_is_help=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="Exit status: 0 done; 2 bad usage or input, with one line that says what; 3 done, but "
+    "the calibration did not converge; 4 a device failed: motion has ended, and the recording can "
+    "be resumed; 5 done, but the calibration is less than fair; 130 interrupted, with motion ended "
+    "as by 4.",
+)
+@click.version_option(__version__, prog_name="jaxcal-hw")
+def commands() -> None:
+    """Acquire recordings for jaxcal: robot, active echo element and ultrasound machine.
+
+    The operator is responsible for the robot: its own safety configuration and emergency stop come
+    first, and nothing here replaces them.
+    """
+
+
+for _command in (setup, check, acquire, free_hand, bench):
+    commands.add_command(_command)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``jaxcal-hw``; see :func:`jaxcal.cli.run.run`."""
+    with as_interrupts():
+        return run(commands, "jaxcal-hw", arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
