@@ -10,7 +10,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -29,10 +30,13 @@ from hw.check import check
 from hw.emulated import BenchOracle, setup_of, start
 from hw.errors import RefusedError
 from hw.keys import Pause
+from hw.midplane.search import Settings
 from hw.outcome import share_inside
+from hw.poses import Extent
 from hw.request import AcquisitionRequest, request_in
 from hw.resuming import check_same_robot
 from hw.robot.safety import MotionPlan, confirm_unattended
+from hw.setup import Setup
 from jaxcal import InputError
 from jaxcal.cli.main import main
 
@@ -51,8 +55,9 @@ def run(
     request: AcquisitionRequest | None,
     say: Callable[[str], None] = lambda line: None,
     pause: Pause | None = None,
+    setup: Setup | None = None,
 ) -> Outcome:
-    setup = setup_of(bench)
+    setup = setup_of(bench) if setup is None else setup
 
     def agree(plan: MotionPlan):
         return confirm_unattended(plan, plan.digest, clock=setup.clock)
@@ -60,12 +65,12 @@ def run(
     return acquire(setup, path, request, agree, say=say, oracle=BenchOracle(bench), pause=pause)
 
 
-def finish(bench: Bench, path: Path) -> Outcome:
+def finish(bench: Bench, path: Path, setup: Setup | None = None) -> Outcome:
     """Resume until it is done; every resumption keeps what is there."""
     for _ in range(ATTEMPTS):
         before = taken(path)
         try:
-            return run(bench, path, None)
+            return run(bench, path, None, setup=setup)
         except AcquisitionStopped as error:
             print(error)
             np.testing.assert_array_equal(taken(path)[: len(before)], before)
@@ -236,65 +241,66 @@ def test_every_fault_stops_the_robot_and_the_run_is_resumed(tmp_path, name):
     fault_in_the_middle(tmp_path, name, 1.0, None if name.startswith("image") else 0.2)
 
 
-@pytest.mark.slow
-def test_a_robot_that_may_not_move_is_named_and_the_run_is_resumed(tmp_path):
+@pytest.fixture(scope="module")
+def e_series() -> Iterator[Bench]:
+    """An e-Series bench, whose controller knows local control."""
+    with start(3, 5.0, 500) as bench:
+        yield bench
+
+
+def quick_setup_of(bench: Bench) -> Setup:
+    """Poses close to one another, and the target soon heard: what is tested is something else."""
+    near = Extent(cone_deg=5.0, turn_deg=5.0, lateral_mm=5.0, depth_mm=(60.0, 70.0))
+    return replace(setup_of(bench), extent=near, search=Settings(span_mm=1.0))
+
+
+def test_a_robot_that_may_not_move_is_named_and_the_run_is_resumed(e_series, tmp_path):
     """Before the connection, before and after the confirmation, and while it rests at a pose."""
-    path, request = tmp_path / "rec.h5", AcquisitionRequest(IMAGES, "none", 1, bench=3)
-    with start(3, 2.0, 500) as bench:
-        setup, asked = setup_of(bench), []
+    bench, path, request = e_series, tmp_path / "rec.h5", AcquisitionRequest(4, "none", 1, bench=3)
+    setup, asked = quick_setup_of(bench), []
 
-        def confirm(plan: MotionPlan):
-            asked.append(plan.digest)
-            bench.fault("robot_state", robot_mode=5, safety_mode=1)
-            return confirm_unattended(plan, plan.digest, clock=setup.clock)
+    def confirm(plan: MotionPlan):
+        asked.append(plan.digest)
+        bench.fault("robot_state", robot_mode=5, safety_mode=1)
+        return confirm_unattended(plan, plan.digest, clock=setup.clock)
 
-        bench.fault("robot_state", robot_mode=3, safety_mode=7)
-        assert any("robot emergency stop: release" in line for line in check(setup, 0.2)[0].wrong)
-        with pytest.raises(AcquisitionStopped, match="robot emergency stop: release"):
-            acquire(setup, path, request, confirm)
-        bench.fault("robot_state", robot_mode=7, safety_mode=1)
-        bench.fault("remote", on=False)
-        assert any("switch it to remote" in line for line in check(setup, 0.2)[0].wrong)
-        with pytest.raises(AcquisitionStopped, match="local control: switch it to remote"):
-            acquire(setup, path, None, confirm)
-        bench.fault("remote", on=True)
-        assert not asked
-        with pytest.raises(AcquisitionStopped, match="release its brakes"):
-            acquire(setup, path, None, confirm)
-        assert asked
-        bench.fault("robot_state", robot_mode=7, safety_mode=1)
+    bench.fault("protective_stop")
+    with pytest.raises(AcquisitionStopped, match="protective stop") as told:
+        acquire(setup, path, request, confirm)
+    assert not told.value.by_itself
+    bench.fault("unlock")
+    bench.fault("robot_state", robot_mode=3, safety_mode=7)
+    assert any("robot emergency stop: release" in line for line in check(setup, 0.2)[0].wrong)
+    with pytest.raises(AcquisitionStopped, match="robot emergency stop: release"):
+        acquire(setup, path, None, confirm)
+    bench.fault("robot_state", robot_mode=7, safety_mode=1)
+    bench.fault("remote", on=False)
+    assert any("switch it to remote" in line for line in check(setup, 0.2)[0].wrong)
+    with pytest.raises(AcquisitionStopped, match="local control: switch it to remote"):
+        acquire(setup, path, None, confirm)
+    bench.fault("remote", on=True)
+    assert not asked
+    with pytest.raises(AcquisitionStopped, match="release its brakes"):
+        acquire(setup, path, None, confirm)
+    assert asked
+    bench.fault("robot_state", robot_mode=7, safety_mode=1)
 
-        def say(line: str) -> None:
-            if line.startswith("image 2/"):
-                bench.fault("robot_state", robot_mode=7, safety_mode=5)
+    stopped = []
 
-        with pytest.raises(AcquisitionStopped, match="safeguard stop: close the gate") as told:
-            run(bench, path, None, say)
-        assert not told.value.by_itself
-        bench.fault("robot_state", robot_mode=7, safety_mode=1)
-        assert finish(bench, path).images == IMAGES
+    def say(line: str) -> None:
+        if line.startswith("image 1/"):
+            stopped.append(bench.fault("robot_state", robot_mode=7, safety_mode=5))
 
-
-def test_ctrl_c_pressed_many_times_still_tells_how_to_resume(tmp_path):
-    path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli import main; sys.exit(main())"
-    arguments = ["acquire", str(path), "--bench", "--images", "30", "--placement", "none",
-                 "--speed", "3"]  # fmt: skip
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True
-    )
-    assert process.stderr is not None
-    for line in process.stderr:
-        if line.startswith("image 2/"):
+    # What a busy machine stops is gone on with; the gate is open until the first image is there.
+    for _ in range(ATTEMPTS):
+        with pytest.raises(AcquisitionStopped) as told:
+            run(bench, path, None, say, setup=setup)
+        if stopped:
             break
-    for _ in range(12):
-        process.send_signal(signal.SIGINT)
-        time.sleep(0.02)
-    told = process.communicate(timeout=60.0)[1].splitlines()
-    assert told[-1].startswith("jaxcal-hw: error: interrupted; ")
-    assert told[-1].endswith(f"jaxcal-hw acquire {path} --resume --bench")
-    wait_until_closed(path)
-    assert len(taken(path)) >= 2
+    assert "safeguard stop: close the gate" in str(told.value)
+    assert not told.value.by_itself
+    bench.fault("robot_state", robot_mode=7, safety_mode=1)
+    assert finish(bench, path, setup).images == 4
 
 
 @pytest.mark.slow
@@ -326,13 +332,20 @@ def test_killed_and_resumed(tmp_path, capfd):
     np.testing.assert_array_equal(taken(path)[: len(before)], before)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["INT", "TERM"])
-def test_a_signal_to_a_background_job_ends_it_in_order(tmp_path, number):
-    """A shell's background job is started with Ctrl-C ignored."""
+@pytest.mark.parametrize(
+    ("number", "times", "moment", "least"),
+    [(signal.SIGINT, 12, "image 1/", 1), (signal.SIGTERM, 1, "confirmed: ", 0)],
+    ids=["INT", "TERM"],
+)
+def test_signals_end_a_background_job_in_order(tmp_path, number, times, moment, least):
+    """Ctrl-C many times, and the end that a system asks for.
+
+    A shell's background job is started with Ctrl-C ignored.
+    """
     path = tmp_path / "rec.h5"
     code = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
-    arguments = ["acquire", str(path), "--bench", "--images", str(IMAGES), "--placement", "none",
-                 "--speed", "3", "--bench-seed", "3"]  # fmt: skip
+    arguments = ["acquire", str(path), "--bench", "--images", "4", "--placement", "none",
+                 "--bench-seed", "3"]  # fmt: skip
     process = subprocess.Popen(
         [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
@@ -340,47 +353,40 @@ def test_a_signal_to_a_background_job_ends_it_in_order(tmp_path, number):
     assert process.stderr is not None
     with process.stderr:
         for line in process.stderr:
-            if line.startswith("image 2/"):
-                process.send_signal(number)
+            if line.startswith(moment):
                 break
+        for k in range(times):
+            if k:
+                time.sleep(0.02)
+            process.send_signal(number)
         rest = process.stderr.read()
     assert process.wait() == 130, rest
-    # One more may have been taken before the signal came.
-    assert re.search(rf"interrupted; [2-{IMAGES}] of {IMAGES} images are in {path}", rest), rest
+    # More may have been taken before the signal came.
+    told = rf"jaxcal-hw: error: interrupted; [{least}-4] of 4 images are in {path}; .*then: "
+    told += rf"jaxcal-hw acquire {path} --resume --bench"
+    assert re.fullmatch(told, rest.splitlines()[-1]), rest
     assert "Traceback" not in rest
+    wait_until_closed(path)
     with h5py.File(path) as file:
         assert not file.attrs["complete"]
-        assert len(file["calibration/target"]) >= 2
+        assert len(file["calibration/target"]) >= least
 
 
-def test_a_protective_stop_is_told_before_anybody_is_asked(tmp_path):
-    path, asked = tmp_path / "rec.h5", []
-    with a_bench() as bench:
-        bench.fault("protective_stop")
-        with pytest.raises(AcquisitionStopped, match="protective stop") as stopped:
-            acquire(
-                setup_of(bench), path, AcquisitionRequest(4, "none", 1, bench=3), asked.append
-            )  # fmt: skip
-        assert asked == []
-        assert not stopped.value.by_itself
-
-
-def test_an_edited_plan_is_told_until_it_is_confirmed(tmp_path):
+def test_an_edited_plan_is_told_until_it_is_confirmed(e_series, tmp_path):
     path = tmp_path / "rec.h5"
 
     def refuse(plan: MotionPlan):
         raise RefusedError("not confirmed", device="robot")
 
-    with a_bench() as bench:
-        setup, request = setup_of(bench), AcquisitionRequest(4, "none", 1, bench=3)
-        for resumed in range(3):
-            if resumed == 1:
-                with h5py.File(path, "r+") as file:
-                    file["plan/targets"][-1, 2, 3] += 1.0
-            told = []
-            with pytest.raises(AcquisitionStopped, match="not confirmed"):
-                acquire(setup, path, None if resumed else request, refuse, say=told.append)
-            assert any("it was edited" in line for line in told) == bool(resumed)
+    setup, request = setup_of(e_series), AcquisitionRequest(4, "none", 1, bench=3)
+    for resumed in range(3):
+        if resumed == 1:
+            with h5py.File(path, "r+") as file:
+                file["plan/targets"][-1, 2, 3] += 1.0
+        told = []
+        with pytest.raises(AcquisitionStopped, match="not confirmed"):
+            acquire(setup, path, None if resumed else request, refuse, say=told.append)
+        assert any("it was edited" in line for line in told) == bool(resumed)
 
 
 def test_a_resumed_run_needs_the_same_robot():
