@@ -48,6 +48,10 @@ def test_a_person_takes_an_image_skips_a_pose_and_stops(tmp_path: Path):
                  "--placement", "pattern-injection", "--operator", "person"]  # fmt: skip
     with Terminal(["-c", ACQUIRE, *arguments], tmp_path) as person:
         person.wait_for("p pauses, Ctrl-C stops", 240)
+        # Steps twice as large: as few as a bar that must be seen to shrink allows.
+        person.wait_for("step 0.25 mm", 240)
+        person.type("+")
+        person.wait_for("step 0.50 mm")
         shown = answer(person, "image 1/4: offset|resume")
         assert "image 1/4: offset" in shown
         # The frame as half blocks, the bar, and how it went by place.
@@ -57,7 +61,7 @@ def test_a_person_takes_an_image_skips_a_pose_and_stops(tmp_path: Path):
         person.wait_for(ASKED.pattern, flags=re.DOTALL)
         person.type("s")
         person.wait_for("skipped: pose 2: the operator gave up the pose")
-        person.wait_for(ASKED.pattern, flags=re.DOTALL)
+        # On the way to the next pose.
         person.type("\x03")
         assert person.finish() == 130
         assert "1 of 4 images are in" in person.shown
