@@ -214,7 +214,7 @@ def test_signals_end_a_background_job_in_order(tmp_path, number, times, moment, 
     A shell's background job is started with Ctrl-C ignored.
     """
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["acquire", str(path), "--bench", "--images", "4", "--placement", "none",
                  "--bench-seed", "3"]  # fmt: skip
     process = subprocess.Popen(
@@ -274,7 +274,7 @@ def test_a_person_takes_an_image_skips_a_pose_and_stops(tmp_path):
     from terminal import Terminal
 
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["acquire", str(path), "--bench", "--bench-seed", "3", "--images", "4",
                  "--placement", "pattern-injection", "--operator", "person"]  # fmt: skip
     with Terminal(["-c", code, *arguments], tmp_path) as person:
@@ -461,7 +461,7 @@ def test_a_fault_of_any_device_stops_the_robot_and_the_run_is_resumed(e_series, 
 @pytest.mark.slow
 def test_killed_and_resumed(tmp_path, capfd):
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["acquire", str(path), "--bench", "--images", str(IMAGES), "--placement", "none",
                  "--speed", "3", "--bench-seed", "3"]  # fmt: skip
     process = subprocess.Popen(
@@ -542,7 +542,7 @@ def viewers(parent: int) -> list[int]:
 def test_a_killed_view_changes_nothing_in_an_acquisition(tmp_path):
     pytest.importorskip("viser", reason="viser is not installed (jaxcal[view])")
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["acquire", str(path), "--bench", "--images", str(IMAGES), "--placement", "none",
                  "--speed", "3", "--bench-seed", "3", "--view"]  # fmt: skip
     process = subprocess.Popen(
@@ -563,7 +563,7 @@ def test_a_killed_view_changes_nothing_in_an_acquisition(tmp_path):
     if code == 4:
         # Not by the view: a busy machine held a device up, and the last line says which.
         assert "view" not in lines[-1]
-        again = [sys.executable, "-c", "import sys; from hw.cli import main; sys.exit(main())"]
+        again = [sys.executable, "-c", "import sys; from hw.cli.main import main; sys.exit(main())"]
         again += ["acquire", str(path), "--bench", "--resume", "--speed", "3"]
         code = subprocess.run(again, capture_output=True, timeout=500, check=False).returncode
     assert code in (0, 3, 5), lines
@@ -574,7 +574,7 @@ def test_a_killed_view_changes_nothing_in_an_acquisition(tmp_path):
 @pytest.mark.parametrize("what", ["limit", "removed"])
 def test_a_failing_disk_is_one_line_and_status_4(tmp_path, what):
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli import main; sys.exit(main())"
+    code = "import sys; from hw.cli.main import main; sys.exit(main())"
     limit = 3 * 2**20 if what == "limit" else resource.RLIM_INFINITY
     arguments = ["acquire", str(path), "--bench", "--images", "12", "--placement", "none",
                  "--speed", "2", "--bench-seed", "3"]  # fmt: skip

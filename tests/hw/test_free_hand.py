@@ -17,7 +17,7 @@ from plus_server import COLUMNS, ROWS, SPACING_MM, TARGET_MM, holds, image_to_pr
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from hw.cli import main
+from hw.cli.main import main
 from hw.errors import DeviceError
 from hw.freehand.acquire import acquire_free_hand
 from hw.freehand.guide import Guide, Rules, Taken, orientation_sds
@@ -265,7 +265,7 @@ def test_ctrl_c_at_a_terminal(tmp_path, tracked):
     pytest.importorskip("pty", reason="there are no pseudo-terminals here")
     from terminal import Terminal
 
-    command = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["-c", command, "free-hand", f"127.0.0.1:{tracked}", "r.h5"]
     with Terminal(arguments, tmp_path) as person:
         person.wait_for(r"image 1/30: target at", 60)

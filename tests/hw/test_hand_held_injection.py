@@ -20,7 +20,7 @@ from hw.bench.active_echo import AuspisEmulator
 from hw.bench.frames import Camera
 from hw.bench.ultrasound import ImageServer
 from hw.bench.world import make_world
-from hw.cli import main
+from hw.cli.main import main
 from hw.clock import REAL
 from hw.freehand.guide import Rules
 from hw.freehand.injection import acquire_by_injection, hand_advice
@@ -291,7 +291,7 @@ def test_from_the_command_line(tmp_path, bench):
     x = np.asarray(WORLD.scene.image_to_probe, float).tolist()
     setup = tmp_path / "hand.toml"
     setup.write_text(SETUP.format(url=bench.echo.path, x=x))
-    command = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     server = f"{bench.images.host}:{bench.images.port}"
     arguments = [
         "free-hand",

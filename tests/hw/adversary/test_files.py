@@ -18,7 +18,7 @@ import pytest
 
 import jaxcal
 from hw.acquire import acquire as run_acquisition
-from hw.cli import main as acquire
+from hw.cli.main import main as acquire
 from hw.errors import RefusedError
 from hw.recorder import Recorder
 from hw.recording_check import check_resumable, read_progress
