@@ -207,7 +207,6 @@ def test_simulate_writes_what_load_reads(simulated):
     assert 1 < np.abs(recording.truth.elevation).max() <= 2
 
 
-@pytest.mark.slow
 def test_curvilinear_times_of_flight_become_points(capfd, tmp_path):
     raw, points = tmp_path / "raw.h5", tmp_path / "points.h5"
     options = ["--probe", "curvilinear", "--clock-mhz", "20", "--noise", "0.2"]
