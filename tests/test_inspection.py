@@ -116,7 +116,6 @@ def test_few_false_alarms_and_true_ones(scores):
         assert found.mean() > 0.35, name
 
 
-@pytest.mark.slow
 def test_complaints_are_warnings_in_words():
     data = problem(1, images=40, elevation_mm=1.0, noise_mm=0.5)
     result = jaxcal.calibrate(data, "conventional")

@@ -458,10 +458,13 @@ def test_unwritable_folder(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_full_disk(finished, tmp_path):
+def test_full_disk(tmp_path):
     """No file may grow beyond 4 KiB, a real refusal by the system: nothing half is left."""
     path, folder = tmp_path / "spec.toml", tmp_path / "out"
-    path.write_text(small())
+    spec = conventional_only(small())
+    path.write_text(spec)
+    # First, so that JAX has cached the programs: under the limit it would leave half a program.
+    run_study(parse_spec(spec), tmp_path / "undisturbed")
     run = ["run", path, "--out", folder]
     # Python would leave truncated bytecode beside our sources.
     limited = 'export PYTHONDONTWRITEBYTECODE=1; ulimit -f 4; exec "$@"'
@@ -473,8 +476,8 @@ def test_full_disk(finished, tmp_path):
     assert "Traceback" not in err
     assert out == ""
     assert list((folder / "chunks").iterdir()) == []
-    run_study(parse_spec(small()), folder, resume=True)
-    assert files(folder) == files(finished)
+    run_study(parse_spec(spec), folder, resume=True)
+    assert files(folder) == files(tmp_path / "undisturbed")
 
 
 def start_and_wait(run, folder, count):
@@ -485,15 +488,19 @@ def start_and_wait(run, folder, count):
         if time.monotonic() > deadline or child.poll() is not None:
             child.kill()
             raise AssertionError(child.communicate())
-        time.sleep(0.002)
+        time.sleep(0.005)
     return child
 
 
-LONG = small(trials=160, chunk=2).split('\n[[methods]]\nname = "arcs"')[0]
+def conventional_only(spec: str) -> str:
+    return spec.split('\n[[methods]]\nname = "arcs"')[0]
+
+
+LONG = conventional_only(small(trials=160, chunk=2))
 
 
 @pytest.fixture(scope="module")
-def long_study(finished, tmp_path_factory):
+def long_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("long") / "undisturbed"
     run_study(parse_spec(LONG), folder)
     return folder
@@ -513,7 +520,6 @@ def kill_and_resume(kills, long_study, path, folder, seed):
         assert child.returncode == -signal.SIGKILL
     assert len(Store(folder, spec).present()) < spec.chunk_count
     assert main(["study", "run", str(path), "--out", str(folder), "--resume"]) == 0
-    assert open_results(folder).identical(open_results(long_study))
     assert files(folder) == files(long_study)
 
 
@@ -531,10 +537,10 @@ def test_interrupted_killed_and_resumed(long_study, tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_ten_times_and_resumed(long_study, tmp_path):
+def test_killed_three_times_and_resumed(long_study, tmp_path):
     path = tmp_path / "spec.toml"
     path.write_text(LONG)
-    kill_and_resume(10, long_study, path, tmp_path / "killed", 2)
+    kill_and_resume(3, long_study, path, tmp_path / "killed", 2)
 
 
 def test_two_processes_do_not_share_a_folder(finished, tmp_path, capsys):
@@ -571,14 +577,19 @@ def test_full_file_system(long_study, tmp_path):
 
 
 @pytest.mark.slow
-def test_several_devices_share_a_block(finished, tmp_path):
+def test_several_devices_share_a_block(tmp_path):
+    """More trials than one device takes at a time, so that both have some of each chunk."""
+    trials = LANES["cpu"] + 6
+    spec = conventional_only(small(trials, chunk=trials))
     path, folder = tmp_path / "spec.toml", tmp_path / "out"
-    path.write_text(small())
+    path.write_text(spec)
     child = process(["run", path, "--out", folder], before=("env", "JAX_NUM_CPU_DEVICES=2"))
+    # In chunks for one device, whose programs are those of the other tests.
+    run_study(parse_spec(conventional_only(small(trials, chunk=trials // 2))), tmp_path / "one")
     _, err = child.communicate(timeout=300)
     assert child.returncode == 0, err
-    assert "2 x cpu" in Store.open(folder).versions(parse_spec(small()).chunk(0))
-    one, two = open_results(finished), open_results(folder)
+    assert "2 x cpu" in Store.open(folder).versions(parse_spec(spec).chunk(0))
+    one, two = open_results(tmp_path / "one"), open_results(folder)
     for name in one.data_vars:
         # Another program rounds the noise, which is drawn in float32, differently: by 1e-7 of it.
         np.testing.assert_allclose(one[name], two[name], rtol=1e-6, atol=1e-6, err_msg=str(name))
@@ -586,9 +597,9 @@ def test_several_devices_share_a_block(finished, tmp_path):
 
 @pytest.mark.slow
 def test_self_tuned_and_bounded_methods():
-    """Every method of a spec through the pipeline; bounds are those that were asked for."""
+    """Through the pipeline; bounds are those that were asked for."""
     text = (
-        small(trials=64, chunk=64).replace("images = 6", "images = 20")
+        conventional_only(small(trials=64, chunk=64))
         + """
 [[methods]]
 name = "joint"
@@ -604,9 +615,9 @@ max_elevation_mm = 0.25
     got = compute_chunk(spec, spec.chunk(1))
     assert np.isfinite(got["rp"]).all()
     # Uniform within 2 mm: 1.15 mm, from 20 images each.
-    assert np.median(got["sigma"][2, :, 2]) == pytest.approx(2 / np.sqrt(3), rel=0.1)
-    assert (got["sigma"][3, :, 2] <= 0.25 + 1e-9).all()
-    assert bound_mm(spec.methods[3], spec.condition(1)) == 0.25
+    assert np.median(got["sigma"][1, :, 2]) == pytest.approx(2 / np.sqrt(3), rel=0.1)
+    assert (got["sigma"][2, :, 2] <= 0.25 + 1e-9).all()
+    assert bound_mm(spec.methods[2], spec.condition(1)) == 0.25
     assert not jnp.isnan(got["rotation_error"]).any()
 
 

@@ -12,13 +12,14 @@ arrays (and a key), which work under jit.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import calibrate, calibrate_batch
@@ -132,6 +133,17 @@ def cross_validate(
     # Outliers were found with all images, so no fold looks for them again.
     options: dict[str, Any] = {**arguments, "robust": False}
     fits = calibrate_batch(_many(problem, problem.mask * rest), **options)
+    return _compared(problem, result, fits, fold)
+
+
+@jax.jit
+def _compared(
+    problem: Problem, result: Calibration, fits: Calibration, fold: Array
+) -> CrossValidation:
+    """The calibrations of the folds against that of all images, and against the held-out images.
+
+    As one program: compiled operation by operation it takes several times as long.
+    """
     held = jax.tree.map(lambda leaf: leaf[fold], fits)
     errors, cloud = _seen(held, problem)
     mask = problem.mask
@@ -192,6 +204,16 @@ def bootstrap(
     result = calibrate(problem, **arguments) if result is None else result
     mask = jnp.asarray(result.mask, problem.mask.dtype)
     problem = replace(problem, mask=mask)
+    rows = _rows(root, mask, resamples)
+    # Each draw has as many images as were used, since the mask leaves out the other rows.
+    options: dict[str, Any] = {**arguments, "robust": False}
+    fits = calibrate_batch(_drawn(problem, rows, mask), **options)
+    return _scatter(problem, result, fits)
+
+
+@partial(jax.jit, static_argnums=2)
+def _rows(root: Key[Array, ""], mask: Float[Array, " n"], resamples: int) -> Int[Array, "k n"]:
+    """Used images drawn with replacement, for each resample."""
     cumulative = jnp.cumsum(mask)
 
     def draw(index: Array) -> Array:
@@ -200,11 +222,13 @@ def bootstrap(
         chosen = jnp.searchsorted(cumulative, uniform * cumulative[-1], side="right")
         return jnp.minimum(chosen, mask.shape[0] - 1)
 
-    rows = jax.vmap(draw)(jnp.arange(resamples))
-    # Each draw has as many images as were used, since the mask leaves out the other rows.
-    options: dict[str, Any] = {**arguments, "robust": False}
-    fits = calibrate_batch(_drawn(problem, rows, mask), **options)
-    converged = jnp.asarray(fits.converged, mask.dtype)
+    return jax.vmap(draw)(jnp.arange(resamples))
+
+
+@jax.jit
+def _scatter(problem: Problem, result: Calibration, fits: Calibration) -> Bootstrap:
+    """How the calibrations of the resamples scatter about that of all images."""
+    converged = jnp.asarray(fits.converged, problem.mask.dtype)
     whole = jnp.asarray(result.image_to_probe)
     drawn = jnp.asarray(fits.image_to_probe)
     moved = jax.vmap(relative_twist, (None, 0))(whole, drawn)
