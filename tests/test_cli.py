@@ -4,6 +4,7 @@ Commands that compile run in processes of their own; what must be refused before
 one.
 """
 
+import io
 import json
 import os
 import subprocess
@@ -22,6 +23,7 @@ from hw.cli import main as bench_main
 from hw.errors import DeviceError
 from jaxcal.cli import cache, common, demo
 from jaxcal.cli.main import commands, main
+from jaxcal.cli.run import run
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.runtime import program_cache
 from jaxcal.study.simulation import Protocol
@@ -538,6 +540,25 @@ def test_a_bug_is_one_line_too(capfd, monkeypatch):
     monkeypatch.setenv("JAXCAL_TRACEBACK", "1")
     with pytest.raises(ZeroDivisionError):
         main(["demo"])
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8"])
+def test_a_name_that_the_terminal_cannot_show_loses_no_answer(monkeypatch, encoding):
+    @click.group()
+    def told():
+        pass
+
+    @told.command()
+    @click.argument("name")
+    def say(name):
+        click.echo(f"{name}: 0.2 mm")
+
+    shown = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, encoding=encoding))
+    monkeypatch.setattr(sys, "argv", ["told", "say", "\N{GREEK SMALL LETTER SIGMA}\udcff.h5"])
+    assert run(told, "told") == 0
+    expected = {"cp1252": b"\\u03c3", "utf-8": "\N{GREEK SMALL LETTER SIGMA}".encode()}[encoding]
+    assert shown.getvalue() == expected + b"\\udcff.h5: 0.2 mm\n"
 
 
 def test_a_pipe_closed_early_is_no_error(jaxcal_process):
