@@ -131,7 +131,6 @@ LONGEST = (
     "test_normal_equations",
     "test_cli",
     "test_motion",
-    "test_operator",
     "test_acquire",
     "test_guest",
     "test_view",

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 import jaxcal
-from hw.cli import commands as bench_commands
-from hw.cli import main as bench_main
+from hw.cli.main import commands as bench_commands
+from hw.cli.main import main as bench_main
 from hw.errors import DeviceError
 from jaxcal.cli import cache, common, demo
 from jaxcal.cli.main import commands, main

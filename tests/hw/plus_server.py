@@ -153,7 +153,7 @@ def serve(listener: socket.socket, asked: dict) -> None:
         try:
             for index, message in enumerate(messages(asked)):
                 client.sendall(message)
-                time.sleep(1 / asked.get("rate_hz", 60.0))
+                time.sleep(1 / asked.get("rate_hz", 120.0))
                 if index == asked.get("dies_after"):
                     client.close()
                     break

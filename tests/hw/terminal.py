@@ -7,12 +7,19 @@ import os
 import pty
 import re
 import select
-import signal
 import struct
+import subprocess
 import sys
 import termios
 import time
 from pathlib import Path
+
+OF_ITS_OWN = """
+import fcntl, os, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
+"""
+"""Makes the terminal the one whose Ctrl-C reaches this process, which then becomes the command."""
 
 ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
@@ -31,22 +38,24 @@ class Terminal:
     ) -> None:
         self.shown = ""
         self._read = 0
-        self.code: int | None = None
         environment = {**os.environ, "TERM": "xterm-256color", "PYTHONUTF8": "1"}
-        self.pid, self._terminal = pty.fork()
-        if self.pid == 0:
-            os.chdir(folder)
-            os.execve(sys.executable, [sys.executable, *arguments], environment)
+        self._terminal, its_end = pty.openpty()
         columns, lines = size
         fcntl.ioctl(self._terminal, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
+        # pty.fork would run Python in a copy of this process, of whose locks some may be held.
+        self._process = subprocess.Popen(
+            [sys.executable, "-IS", "-c", OF_ITS_OWN, *arguments],
+            cwd=folder, env=environment, start_new_session=True,
+            stdin=its_end, stdout=its_end, stderr=its_end,
+        )  # fmt: skip
+        os.close(its_end)
 
     def __enter__(self) -> Terminal:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self.code is None:
-            os.kill(self.pid, signal.SIGKILL)
-            os.waitpid(self.pid, 0)
+        self._process.kill()
+        self._process.wait()
         os.close(self._terminal)
 
     def type(self, keys: str) -> None:
@@ -68,9 +77,7 @@ class Terminal:
         deadline = time.monotonic() + timeout_s
         while self._more(deadline):
             pass
-        _, status = os.waitpid(self.pid, 0)
-        self.code = os.waitstatus_to_exitcode(status)
-        return self.code
+        return self._process.wait(10.0)
 
     def modes(self) -> list:
         """Of the terminal, as ``termios`` has them."""

@@ -10,7 +10,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -29,10 +30,14 @@ from hw.check import check
 from hw.emulated import BenchOracle, setup_of, start
 from hw.errors import RefusedError
 from hw.keys import Pause
+from hw.midplane.search import Settings
 from hw.outcome import share_inside
+from hw.poses import Extent
 from hw.request import AcquisitionRequest, request_in
 from hw.resuming import check_same_robot
 from hw.robot.safety import MotionPlan, confirm_unattended
+from hw.session import Watch
+from hw.setup import Setup
 from jaxcal import InputError
 from jaxcal.cli.main import main
 
@@ -51,21 +56,30 @@ def run(
     request: AcquisitionRequest | None,
     say: Callable[[str], None] = lambda line: None,
     pause: Pause | None = None,
+    setup: Setup | None = None,
+    watch: Watch | None = None,
 ) -> Outcome:
-    setup = setup_of(bench)
+    setup = setup_of(bench) if setup is None else setup
 
     def agree(plan: MotionPlan):
         return confirm_unattended(plan, plan.digest, clock=setup.clock)
 
-    return acquire(setup, path, request, agree, say=say, oracle=BenchOracle(bench), pause=pause)
+    oracle = BenchOracle(bench)
+    return acquire(setup, path, request, agree, say=say, oracle=oracle, pause=pause, watch=watch)
 
 
-def finish(bench: Bench, path: Path) -> Outcome:
+def finish(
+    bench: Bench,
+    path: Path,
+    setup: Setup | None = None,
+    say: Callable[[str], None] = lambda line: None,
+    pause: Pause | None = None,
+) -> Outcome:
     """Resume until it is done; every resumption keeps what is there."""
     for _ in range(ATTEMPTS):
         before = taken(path)
         try:
-            return run(bench, path, None)
+            return run(bench, path, None, say, pause, setup)
         except AcquisitionStopped as error:
             print(error)
             np.testing.assert_array_equal(taken(path)[: len(before)], before)
@@ -75,48 +89,6 @@ def finish(bench: Bench, path: Path) -> Outcome:
 def taken(path: Path) -> np.ndarray:
     with h5py.File(path) as file:
         return np.asarray(file["calibration/pose"])
-
-
-@pytest.mark.slow
-def test_a_short_run_ends_in_a_recording_that_calibrate_takes(tmp_path, capsys):
-    path, lines, pause = tmp_path / "rec.h5", [], Pause()
-
-    def say(line: str) -> None:
-        lines.append(line)
-        if line.startswith("image 2/"):
-            pause.hold()
-            threading.Timer(0.3, pause.go_on).start()
-
-    with a_bench() as bench:
-        try:
-            run(bench, path, AcquisitionRequest(IMAGES, "none", 1, bench=3), say, pause)
-        except AcquisitionStopped as error:
-            print(error)
-            finish(bench, path)
-        truth = bench.world_truth()
-    assert any(line.startswith("paused") for line in lines)
-    assert sum(line.startswith(f"image {IMAGES}/{IMAGES}: ") for line in lines) <= 1
-    assert main(["calibrate", str(path), "--json"]) in (0, 3, 5)
-    assert '"truth_error"' in capsys.readouterr().out
-    recording = jaxcal.load(path)
-    assert len(recording) == IMAGES
-    np.testing.assert_allclose(recording.truth.image_to_probe, truth["image_to_probe"])
-    inside, images, _ = share_inside(str(path))
-    assert (inside, images) == (IMAGES, IMAGES)
-    with h5py.File(path) as file:
-        assert file.attrs["complete"]
-        assert sorted(file["calibration/target"]) == list(range(IMAGES))
-        assert len(file["estimate/images"]) >= 1
-        assert np.isfinite(file["estimate/covariance"][-1]).all()
-        assert {b"robot", b"active echo", b"ultrasound"} <= set(file["clock/device"][()])
-        assert len(file["us/frames"]) == IMAGES
-        assert len(file["tracker/pose"]) > 500
-        # Poses that waited in one socket arrive together; the controller's own time goes on.
-        assert (np.diff(file["tracker/t_host"]) >= 0).all()
-        assert (np.diff(file["tracker/t_device"]) > 0).all()
-        kinds = set(file["events/kind"][()])
-        assert {b"started", b"confirmed", b"command", b"finished"} <= kinds
-    assert (tmp_path / "rec.h5.sha256").exists()
 
 
 @pytest.mark.slow
@@ -225,82 +197,271 @@ def fault_in_the_middle(tmp_path, name: str, speed: float, rest_s: float | None)
 
 
 @pytest.mark.slow
-def test_an_unplugged_port_stops_the_run_and_it_is_resumed(tmp_path):
-    fault_in_the_middle(tmp_path, "unplug", 5.0, None)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_fault_stops_the_robot_and_the_run_is_resumed(tmp_path, name):
     """In real time; images may be silent for a second before that counts."""
     fault_in_the_middle(tmp_path, name, 1.0, None if name.startswith("image") else 0.2)
 
 
-@pytest.mark.slow
-def test_a_robot_that_may_not_move_is_named_and_the_run_is_resumed(tmp_path):
-    """Before the connection, before and after the confirmation, and while it rests at a pose."""
-    path, request = tmp_path / "rec.h5", AcquisitionRequest(IMAGES, "none", 1, bench=3)
-    with start(3, 2.0, 500) as bench:
-        setup, asked = setup_of(bench), []
+@pytest.mark.parametrize(
+    ("number", "times", "moment", "least"),
+    [(signal.SIGINT, 12, "image 1/", 1), (signal.SIGTERM, 1, "confirmed: ", 0)],
+    ids=["INT", "TERM"],
+)
+def test_signals_end_a_background_job_in_order(tmp_path, number, times, moment, least):
+    """Ctrl-C many times, and the end that a system asks for.
 
-        def confirm(plan: MotionPlan):
-            asked.append(plan.digest)
-            bench.fault("robot_state", robot_mode=5, safety_mode=1)
-            return confirm_unattended(plan, plan.digest, clock=setup.clock)
-
-        bench.fault("robot_state", robot_mode=3, safety_mode=7)
-        assert any("robot emergency stop: release" in line for line in check(setup, 0.2)[0].wrong)
-        with pytest.raises(AcquisitionStopped, match="robot emergency stop: release"):
-            acquire(setup, path, request, confirm)
-        bench.fault("robot_state", robot_mode=7, safety_mode=1)
-        bench.fault("remote", on=False)
-        assert any("switch it to remote" in line for line in check(setup, 0.2)[0].wrong)
-        with pytest.raises(AcquisitionStopped, match="local control: switch it to remote"):
-            acquire(setup, path, None, confirm)
-        bench.fault("remote", on=True)
-        assert not asked
-        with pytest.raises(AcquisitionStopped, match="release its brakes"):
-            acquire(setup, path, None, confirm)
-        assert asked
-        bench.fault("robot_state", robot_mode=7, safety_mode=1)
-
-        def say(line: str) -> None:
-            if line.startswith("image 2/"):
-                bench.fault("robot_state", robot_mode=7, safety_mode=5)
-
-        with pytest.raises(AcquisitionStopped, match="safeguard stop: close the gate") as told:
-            run(bench, path, None, say)
-        assert not told.value.by_itself
-        bench.fault("robot_state", robot_mode=7, safety_mode=1)
-        assert finish(bench, path).images == IMAGES
-
-
-def test_ctrl_c_pressed_many_times_still_tells_how_to_resume(tmp_path):
+    A shell's background job is started with Ctrl-C ignored.
+    """
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli import main; sys.exit(main())"
-    arguments = ["acquire", str(path), "--bench", "--images", "30", "--placement", "none",
-                 "--speed", "3"]  # fmt: skip
+    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    arguments = ["acquire", str(path), "--bench", "--images", "4", "--placement", "none",
+                 "--bench-seed", "3"]  # fmt: skip
     process = subprocess.Popen(
-        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True
-    )
+        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
+    )  # fmt: skip
     assert process.stderr is not None
-    for line in process.stderr:
-        if line.startswith("image 2/"):
-            break
-    for _ in range(12):
-        process.send_signal(signal.SIGINT)
-        time.sleep(0.02)
-    told = process.communicate(timeout=60.0)[1].splitlines()
-    assert told[-1].startswith("jaxcal-hw: error: interrupted; ")
-    assert told[-1].endswith(f"jaxcal-hw acquire {path} --resume --bench")
+    with process.stderr:
+        for line in process.stderr:
+            if line.startswith(moment):
+                break
+        for k in range(times):
+            if k:
+                time.sleep(0.02)
+            process.send_signal(number)
+        rest = process.stderr.read()
+    assert process.wait() == 130, rest
+    # More may have been taken before the signal came.
+    told = rf"jaxcal-hw: error: interrupted; [{least}-4] of 4 images are in {path}; .*then: "
+    told += rf"jaxcal-hw acquire {path} --resume --bench"
+    assert re.fullmatch(told, rest.splitlines()[-1]), rest
+    assert "Traceback" not in rest
     wait_until_closed(path)
-    assert len(taken(path)) >= 2
+    with h5py.File(path) as file:
+        assert not file.attrs["complete"]
+        assert len(file["calibration/target"]) >= least
+
+
+KEYS = {"Step down": "j", "Step up": "k", "m lets the robot": "m", "Enter accepts": "\r"}
+# The last row of the view: what stands before it is complete.
+ASKED = re.compile(
+    r"(?P<title>pose \d of 4)(?P<view>(?:(?!pose \d of 4).)*?)"
+    r"(?P<advice>Step down|Step up|m lets the robot|Enter accepts)(?:(?!pose \d of 4).)*?: stop",
+    re.DOTALL,
+)
+
+
+def do_as_told(person, until: str) -> str:
+    """Press what the screen says until a line is shown; what was shown meanwhile."""
+    began, offset = len(person.shown), None
+    deadline = time.monotonic() + 400
+    while time.monotonic() < deadline:
+        found = person.wait_for(rf"{ASKED.pattern}|{until}", flags=re.DOTALL)
+        if found.group("advice") is None:
+            return person.shown[began:]
+        here = re.findall(r"[+-]\d+\.\d\d mm \|[# ]*\|.*?seen", found.group("view"))[-1]
+        # The view is painted again and again while nothing is pressed.
+        if here != offset:
+            offset = here
+            person.type(KEYS[found.group("advice")])
+    raise AssertionError("the person was asked for ever")
+
+
+def test_a_person_takes_an_image_skips_a_pose_and_stops(tmp_path):
+    """At a terminal of their own, by the injected pattern."""
+    pytest.importorskip("pty", reason="there are no pseudo-terminals here")
+    from terminal import Terminal
+
+    path = tmp_path / "rec.h5"
+    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    arguments = ["acquire", str(path), "--bench", "--bench-seed", "3", "--images", "4",
+                 "--placement", "pattern-injection", "--operator", "person"]  # fmt: skip
+    with Terminal(["-c", code, *arguments], tmp_path) as person:
+        person.wait_for("p pauses, Ctrl-C stops", 240)
+        # Steps twice as large: as few as a bar that must be seen to shrink allows.
+        person.wait_for("step 0.25 mm", 240)
+        person.type("+")
+        person.wait_for("step 0.50 mm")
+        shown = do_as_told(person, "image 1/4: offset|resume")
+        assert "image 1/4: offset" in shown
+        # The frame as half blocks, the bar, and how it went by place.
+        assert shown.count("▀") > 1000
+        assert "#" * 25 in shown
+        assert "▇" in shown
+        person.wait_for(ASKED.pattern, flags=re.DOTALL)
+        person.type("s")
+        person.wait_for("skipped: pose 2: the operator gave up the pose")
+        # On the way to the next pose.
+        person.type("\x03")
+        assert person.finish() == 130
+        assert "1 of 4 images are in" in person.shown
+        assert "Traceback" not in person.shown
+    with h5py.File(path) as file:
+        low, high, true = (
+            np.asarray(file[f"placement/{name}"]) for name in ("low", "high", "true_elevation")
+        )
+        assert len(true) == 1
+        assert low[0] < true[0] < high[0]
+        # As wide as the rule's brackets are.
+        assert 1.0 < high[0] - low[0] < 3.0
+        assert '"operator": "person"' in bytes(file["plan/settings"][()]).decode()
+
+
+@pytest.fixture(scope="module")
+def e_series() -> Iterator[Bench]:
+    """An e-Series bench, whose controller knows local control."""
+    with start(3, 5.0, 500) as bench:
+        yield bench
+
+
+def quick_setup_of(bench: Bench) -> Setup:
+    """Poses close to one another, and the target soon heard: what is tested is something else."""
+    near = Extent(cone_deg=5.0, turn_deg=5.0, lateral_mm=5.0, depth_mm=(60.0, 70.0))
+    return replace(setup_of(bench), extent=near, search=Settings(span_mm=1.0))
+
+
+def test_a_robot_that_may_not_move_is_named_and_the_run_is_resumed(e_series, tmp_path, capsys):
+    """Before the connection, before and after the confirmation, and while it rests at a pose.
+
+    In the end the recording is whole, and calibrate takes it.
+    """
+    bench, path, request = e_series, tmp_path / "rec.h5", AcquisitionRequest(4, "none", 1, bench=3)
+    setup, asked = quick_setup_of(bench), []
+
+    def confirm(plan: MotionPlan):
+        asked.append(plan.digest)
+        bench.fault("robot_state", robot_mode=5, safety_mode=1)
+        return confirm_unattended(plan, plan.digest, clock=setup.clock)
+
+    bench.fault("protective_stop")
+    with pytest.raises(AcquisitionStopped, match="protective stop") as told:
+        acquire(setup, path, request, confirm)
+    assert not told.value.by_itself
+    bench.fault("unlock")
+    bench.fault("robot_state", robot_mode=3, safety_mode=7)
+    assert any("robot emergency stop: release" in line for line in check(setup, 0.2)[0].wrong)
+    with pytest.raises(AcquisitionStopped, match="robot emergency stop: release"):
+        acquire(setup, path, None, confirm)
+    bench.fault("robot_state", robot_mode=7, safety_mode=1)
+    bench.fault("remote", on=False)
+    assert any("switch it to remote" in line for line in check(setup, 0.2)[0].wrong)
+    with pytest.raises(AcquisitionStopped, match="local control: switch it to remote"):
+        acquire(setup, path, None, confirm)
+    bench.fault("remote", on=True)
+    assert not asked
+    with pytest.raises(AcquisitionStopped, match="release its brakes"):
+        acquire(setup, path, None, confirm)
+    assert asked
+    bench.fault("robot_state", robot_mode=7, safety_mode=1)
+
+    stopped = []
+
+    def say(line: str) -> None:
+        if line.startswith("image 1/"):
+            stopped.append(bench.fault("robot_state", robot_mode=7, safety_mode=5))
+
+    # What a busy machine stops is gone on with; the gate is open until the first image is there.
+    for _ in range(ATTEMPTS):
+        with pytest.raises(AcquisitionStopped) as told:
+            run(bench, path, None, say, setup=setup)
+        if stopped:
+            break
+    assert "safeguard stop: close the gate" in str(told.value)
+    assert not told.value.by_itself
+    bench.fault("robot_state", robot_mode=7, safety_mode=1)
+    lines, pause = [], Pause()
+
+    def hold(line: str) -> None:
+        lines.append(line)
+        if line.startswith("image 2/"):
+            pause.hold()
+            threading.Timer(0.1, pause.go_on).start()
+
+    assert finish(bench, path, setup, hold, pause).images == 4
+    assert any(line.startswith("paused") for line in lines)
+    check_recording(path, bench, 4)
+    assert main(["calibrate", str(path), "--method", "conventional", "--json"]) in (0, 3, 5)
+    assert '"truth_error"' in capsys.readouterr().out
+
+
+def check_recording(path: Path, bench: Bench, images: int) -> None:
+    """A complete one, with the truth of its bench."""
+    recording = jaxcal.load(path)
+    assert len(recording) == images
+    truth = bench.world_truth()["image_to_probe"]
+    np.testing.assert_allclose(recording.truth.image_to_probe, truth)
+    assert share_inside(str(path))[:2] == (images, images)
+    with h5py.File(path) as file:
+        assert file.attrs["complete"]
+        assert sorted(file["calibration/target"]) == list(range(images))
+        assert len(file["estimate/images"]) >= 1
+        assert np.isfinite(file["estimate/covariance"][-1]).all()
+        assert {b"robot", b"active echo", b"ultrasound"} <= set(file["clock/device"][()])
+        assert len(file["us/frames"]) == images
+        assert len(file["tracker/pose"]) > 500
+        # Poses that waited in one socket arrive together; the controller's own time goes on.
+        assert (np.diff(file["tracker/t_host"]) >= 0).all()
+        assert (np.diff(file["tracker/t_device"]) > 0).all()
+        kinds = set(file["events/kind"][()])
+        assert {b"started", b"confirmed", b"command", b"finished"} <= kinds
+    assert path.with_name(f"{path.name}.sha256").exists()
+
+
+DEVICE_FAULTS = {
+    "crc_errors": ({"rate": 1.0}, "active echo: .* arrived damaged"),
+    "echo_stale": ({}, "active echo: no frame for"),
+    "unplug": ({}, "active echo: .* is gone"),
+    "image_stale": ({}, "ultrasound: no image for"),
+    "removed": ({}, "was removed while it was being recorded"),
+}
+
+
+def test_a_fault_of_any_device_stops_the_robot_and_the_run_is_resumed(e_series, tmp_path):
+    """One after the other in one recording, which still has no image; the disk's comes last."""
+    bench, path = e_series, tmp_path / "rec.h5"
+    setup, watch = quick_setup_of(bench), Watch(grace_s=0.5, image_age_s=0.5)
+    request: AcquisitionRequest | None = AcquisitionRequest(4, "none", 1, bench=3)
+    for name, (arguments, what) in DEVICE_FAULTS.items():
+        struck = threading.Event()
+
+        def strike(name=name, arguments=arguments, struck=struck) -> None:
+            while bench.rest_since() is not None:
+                time.sleep(0.002)
+            if name == "removed":
+                path.unlink()
+            else:
+                bench.fault(name, **arguments)
+            struck.set()
+
+        def say(line: str, strike=strike) -> None:
+            if line.startswith("confirmed: "):
+                threading.Thread(target=strike, daemon=True).start()
+
+        for _ in range(ATTEMPTS):
+            with pytest.raises(AcquisitionStopped) as caught:
+                run(bench, path, request, say, setup=setup, watch=watch)
+            request = None
+            if struck.is_set():
+                break
+        assert re.search(what, str(caught.value))
+        assert "\n" not in str(caught.value)
+        assert "--resume --bench" in str(caught.value)
+        deadline = time.monotonic() + 30
+        while bench.rest_since() is None:
+            assert time.monotonic() < deadline
+        bench.recover()
+        if name != "removed":
+            with h5py.File(path) as file:
+                assert not file.attrs["complete"]
+                assert file["events/kind"][-1] == b"stopped"
+            assert main(["calibrate", str(path)]) == 2
 
 
 @pytest.mark.slow
 def test_killed_and_resumed(tmp_path, capfd):
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["acquire", str(path), "--bench", "--images", str(IMAGES), "--placement", "none",
                  "--speed", "3", "--bench-seed", "3"]  # fmt: skip
     process = subprocess.Popen(
@@ -326,61 +487,21 @@ def test_killed_and_resumed(tmp_path, capfd):
     np.testing.assert_array_equal(taken(path)[: len(before)], before)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["INT", "TERM"])
-def test_a_signal_to_a_background_job_ends_it_in_order(tmp_path, number):
-    """A shell's background job is started with Ctrl-C ignored."""
-    path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
-    arguments = ["acquire", str(path), "--bench", "--images", str(IMAGES), "--placement", "none",
-                 "--speed", "3", "--bench-seed", "3"]  # fmt: skip
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
-    )  # fmt: skip
-    assert process.stderr is not None
-    with process.stderr:
-        for line in process.stderr:
-            if line.startswith("image 2/"):
-                process.send_signal(number)
-                break
-        rest = process.stderr.read()
-    assert process.wait() == 130, rest
-    # One more may have been taken before the signal came.
-    assert re.search(rf"interrupted; [2-{IMAGES}] of {IMAGES} images are in {path}", rest), rest
-    assert "Traceback" not in rest
-    with h5py.File(path) as file:
-        assert not file.attrs["complete"]
-        assert len(file["calibration/target"]) >= 2
-
-
-def test_a_protective_stop_is_told_before_anybody_is_asked(tmp_path):
-    path, asked = tmp_path / "rec.h5", []
-    with a_bench() as bench:
-        bench.fault("protective_stop")
-        with pytest.raises(AcquisitionStopped, match="protective stop") as stopped:
-            acquire(
-                setup_of(bench), path, AcquisitionRequest(4, "none", 1, bench=3), asked.append
-            )  # fmt: skip
-        assert asked == []
-        assert not stopped.value.by_itself
-
-
-def test_an_edited_plan_is_told_until_it_is_confirmed(tmp_path):
+def test_an_edited_plan_is_told_until_it_is_confirmed(e_series, tmp_path):
     path = tmp_path / "rec.h5"
 
     def refuse(plan: MotionPlan):
         raise RefusedError("not confirmed", device="robot")
 
-    with a_bench() as bench:
-        setup, request = setup_of(bench), AcquisitionRequest(4, "none", 1, bench=3)
-        for resumed in range(3):
-            if resumed == 1:
-                with h5py.File(path, "r+") as file:
-                    file["plan/targets"][-1, 2, 3] += 1.0
-            told = []
-            with pytest.raises(AcquisitionStopped, match="not confirmed"):
-                acquire(setup, path, None if resumed else request, refuse, say=told.append)
-            assert any("it was edited" in line for line in told) == bool(resumed)
+    setup, request = setup_of(e_series), AcquisitionRequest(4, "none", 1, bench=3)
+    for resumed in range(3):
+        if resumed == 1:
+            with h5py.File(path, "r+") as file:
+                file["plan/targets"][-1, 2, 3] += 1.0
+        told = []
+        with pytest.raises(AcquisitionStopped, match="not confirmed"):
+            acquire(setup, path, None if resumed else request, refuse, say=told.append)
+        assert any("it was edited" in line for line in told) == bool(resumed)
 
 
 def test_a_resumed_run_needs_the_same_robot():
@@ -421,7 +542,7 @@ def viewers(parent: int) -> list[int]:
 def test_a_killed_view_changes_nothing_in_an_acquisition(tmp_path):
     pytest.importorskip("viser", reason="viser is not installed (jaxcal[view])")
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["acquire", str(path), "--bench", "--images", str(IMAGES), "--placement", "none",
                  "--speed", "3", "--bench-seed", "3", "--view"]  # fmt: skip
     process = subprocess.Popen(
@@ -442,7 +563,7 @@ def test_a_killed_view_changes_nothing_in_an_acquisition(tmp_path):
     if code == 4:
         # Not by the view: a busy machine held a device up, and the last line says which.
         assert "view" not in lines[-1]
-        again = [sys.executable, "-c", "import sys; from hw.cli import main; sys.exit(main())"]
+        again = [sys.executable, "-c", "import sys; from hw.cli.main import main; sys.exit(main())"]
         again += ["acquire", str(path), "--bench", "--resume", "--speed", "3"]
         code = subprocess.run(again, capture_output=True, timeout=500, check=False).returncode
     assert code in (0, 3, 5), lines
@@ -453,7 +574,7 @@ def test_a_killed_view_changes_nothing_in_an_acquisition(tmp_path):
 @pytest.mark.parametrize("what", ["limit", "removed"])
 def test_a_failing_disk_is_one_line_and_status_4(tmp_path, what):
     path = tmp_path / "rec.h5"
-    code = "import sys; from hw.cli import main; sys.exit(main())"
+    code = "import sys; from hw.cli.main import main; sys.exit(main())"
     limit = 3 * 2**20 if what == "limit" else resource.RLIM_INFINITY
     arguments = ["acquire", str(path), "--bench", "--images", "12", "--placement", "none",
                  "--speed", "2", "--bench-seed", "3"]  # fmt: skip

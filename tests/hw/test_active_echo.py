@@ -41,6 +41,13 @@ def emulator(request: pytest.FixtureRequest) -> Iterator[AuspisEmulator]:
         yield device
 
 
+@pytest.fixture
+def pty_emulator() -> Iterator[AuspisEmulator]:
+    """The same, for what does not depend on the kind of line."""
+    with AuspisEmulator(echo, clock=Clock(speed=10.0)) as device:
+        yield device
+
+
 def opened(device: AuspisEmulator, **options) -> ActiveEcho:
     return ActiveEcho(device.path, clock=device._clock, **options)
 
@@ -111,8 +118,8 @@ def test_frames_are_what_the_element_heard(emulator: AuspisEmulator) -> None:
     assert (np.abs(ticks - 100e6 / 30) < 3).sum() > 20
 
 
-def test_a_threshold_takes_effect_in_the_frames_that_say_so(emulator: AuspisEmulator) -> None:
-    with opened(emulator) as device:
+def test_a_threshold_takes_effect_in_the_frames_that_say_so(pty_emulator: AuspisEmulator) -> None:
+    with opened(pty_emulator) as device:
         device.stream(True)
         for threshold in (5, 900, 12):
             device.set_threshold(threshold)
@@ -173,15 +180,15 @@ def test_a_second_program_is_refused() -> None:
         open_transport("/dev/no-such-port")
 
 
-def test_mute_devices(emulator: AuspisEmulator) -> None:
-    emulator.mute()
+def test_mute_devices(pty_emulator: AuspisEmulator) -> None:
+    pty_emulator.mute()
     with pytest.raises(StaleError, match=r"did not answer STRM within 1 s"):
-        opened(emulator)
-    emulator.recover()
-    with opened(emulator) as device:
+        opened(pty_emulator)
+    pty_emulator.recover()
+    with opened(pty_emulator) as device:
         device.stream(True)
         frames_of(device, 2)
-        emulator.mute()
+        pty_emulator.mute()
         with pytest.raises(StaleError, match="did not answer"):
             device.threshold()
 
@@ -200,13 +207,13 @@ def test_no_frame_triggers(emulator: AuspisEmulator) -> None:
 
 
 @pytest.mark.parametrize("fault", ["miss_triggers", "crc_errors"])
-def test_lost_frames_are_counted_and_never_filled(emulator: AuspisEmulator, fault: str) -> None:
-    with opened(emulator, queue=2000) as device:
+def test_lost_frames_are_counted_and_never_filled(pty_emulator: AuspisEmulator, fault: str) -> None:
+    with opened(pty_emulator, queue=2000) as device:
         device.stream(True)
         first = device.read(20.0).frame
-        getattr(emulator, fault)(0.3)
+        getattr(pty_emulator, fault)(0.3)
         frames = frames_of(device, 100)
-        emulator.recover()
+        pty_emulator.recover()
         frames += frames_of(device, 2)
         while more := device.drain():
             frames += more
@@ -224,11 +231,11 @@ def test_lost_frames_are_counted_and_never_filled(emulator: AuspisEmulator, faul
         assert seen.crc_errors == 0
 
 
-def test_missed_line_triggers(emulator: AuspisEmulator) -> None:
+def test_missed_line_triggers(pty_emulator: AuspisEmulator) -> None:
     """Nothing tells which line was missed, so the frame is not handed on; it is not lost either."""
-    with opened(emulator) as device:
+    with opened(pty_emulator) as device:
         device.stream(True)
-        emulator.miss_lines(0.5)
+        pty_emulator.miss_lines(0.5)
         frames = frames_of(device, 40)
         seen = device.statistics()
         lines, triggers = device.trigger_count()
@@ -238,9 +245,9 @@ def test_missed_line_triggers(emulator: AuspisEmulator) -> None:
     assert triggers * LINES - lines >= seen.short
 
 
-def test_full_queue(emulator: AuspisEmulator) -> None:
+def test_full_queue(pty_emulator: AuspisEmulator) -> None:
     """The oldest go, and are counted."""
-    with opened(emulator, queue=4) as device:
+    with opened(pty_emulator, queue=4) as device:
         device.stream(True)
         until(lambda: device.statistics().received > 30)
         device.stream(False)
@@ -283,8 +290,8 @@ def test_left_streaming(emulator: AuspisEmulator) -> None:
         assert device.statistics().lost == 0
 
 
-def test_refusals(emulator: AuspisEmulator) -> None:
-    with opened(emulator, lines=64) as device:
+def test_refusals(pty_emulator: AuspisEmulator) -> None:
+    with opened(pty_emulator, lines=64) as device:
         with pytest.raises(RefusedError, match="refused PATT:LOAD: 4,value out of range"):
             device.load_pattern(bytes(64))
         assert device.device_error() == "4,value out of range"
@@ -298,17 +305,17 @@ def test_refusals(emulator: AuspisEmulator) -> None:
             with pytest.raises(DeviceError, match=r"active echo: (threshold|delay|a pattern)"):
                 call()
     with pytest.raises(DeviceError, match="lines must be"):
-        opened(emulator, lines=0)
+        opened(pty_emulator, lines=0)
 
 
-def test_bad_commands_are_not_obeyed(emulator: AuspisEmulator) -> None:
-    transport = open_transport(emulator.path)
+def test_bad_commands_are_not_obeyed(pty_emulator: AuspisEmulator) -> None:
+    transport = open_transport(pty_emulator.path)
     bad = encode_line("THR 5")
     transport.write(bad.replace(b"5", b"7") + b"\x80\xff\n" + b"FLY 3\n" + b"x" * 9000 + b"\n")
     transport.write(b"THR 21\n")
-    until(lambda: emulator.threshold == 21)
+    until(lambda: pty_emulator.threshold == 21)
     transport.close()
-    with opened(emulator) as device:
+    with opened(pty_emulator) as device:
         errors = []
         while error := device.device_error():
             errors.append(error)
@@ -452,8 +459,9 @@ def test_another_device_on_the_port() -> None:
         os.close(slave)
 
 
-def test_a_device_that_takes_nothing() -> None:
+def test_a_device_that_takes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its line is full: commands fail in time, and so does closing."""
+    monkeypatch.setattr("hw.active_echo.transport._WRITE_TIMEOUT_S", 0.2)
     master, slave = os.openpty()
     tty.setraw(slave)
     transport = open_transport(os.ttyname(slave))

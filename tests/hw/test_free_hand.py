@@ -17,7 +17,7 @@ from plus_server import COLUMNS, ROWS, SPACING_MM, TARGET_MM, holds, image_to_pr
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from hw.cli import main
+from hw.cli.main import main
 from hw.errors import DeviceError
 from hw.freehand.acquire import acquire_free_hand
 from hw.freehand.guide import Guide, Rules, Taken, orientation_sds
@@ -44,6 +44,20 @@ def plus_server(**asked) -> Iterator[int]:
     finally:
         process.kill()
         process.communicate()
+
+
+@pytest.fixture(scope="module")
+def separate() -> Iterator[int]:
+    """Port of a server of separate messages, which begins anew for every client."""
+    with plus_server(mode="separate") as port:
+        yield port
+
+
+@pytest.fixture(scope="module")
+def tracked() -> Iterator[int]:
+    """The same of tracked frames."""
+    with plus_server(mode="tracked") as port:
+        yield port
 
 
 class Scripted:
@@ -114,11 +128,9 @@ def test_a_run_from_the_command_line_to_a_calibration(tmp_path, capsys):
     assert SPACING_MM[0] > SPACING_MM[1]
 
 
-def test_images_and_transforms_apart(tmp_path):
-    person = Scripted()
-    with plus_server(mode="separate") as port:
-        asked = FreeHand("127.0.0.1", port, images=4, spacing_mm=SPACING_MM)
-        assert acquire_free_hand(tmp_path / "r.h5", asked, person) == 4
+def test_images_and_transforms_apart(tmp_path, separate):
+    asked = FreeHand("127.0.0.1", separate, images=4, spacing_mm=SPACING_MM)
+    assert acquire_free_hand(tmp_path / "r.h5", asked, Scripted()) == 4
     check(tmp_path / "r.h5", [0, 1, 2, 3])
     images = jaxcal.load(tmp_path / "r.h5").calibration
     np.testing.assert_array_equal(images.spacing_mm, SPACING_MM)
@@ -172,14 +184,13 @@ def test_a_lost_stream_is_gone_on_with(tmp_path):
     assert len(set(away.argmin(axis=1))) == 7
 
 
-def test_too_few_images_stay_resumable(tmp_path):
-    with plus_server(mode="tracked") as port:
-        asked = FreeHand("127.0.0.1", port, images=9)
-        with pytest.raises(FreeHandStopped, match="1 images are too few: 4 are needed"):
-            acquire_free_hand(tmp_path / "r.h5", asked, Scripted(image_1="q"))
+def test_too_few_images_stay_resumable(tmp_path, tracked):
+    asked = FreeHand("127.0.0.1", tracked, images=9)
+    with pytest.raises(FreeHandStopped, match="1 images are too few: 4 are needed"):
+        acquire_free_hand(tmp_path / "r.h5", asked, Scripted(image_1="q"))
 
 
-def test_poses_in_metres_are_noticed_at_the_second_image(tmp_path):
+def test_poses_in_metres_are_noticed_at_the_second_image(tmp_path, tracked):
     path = tmp_path / "r.h5"
     with plus_server(mode="tracked", metres=True) as port:
         asked = FreeHand("127.0.0.1", port, images=4)
@@ -189,8 +200,7 @@ def test_poses_in_metres_are_noticed_at_the_second_image(tmp_path):
         assert not file.attrs["complete"]
         assert file["calibration/mask"][()].tolist() == [False]
     # Once the server sends mm, it goes on.
-    with plus_server(mode="tracked") as port:
-        assert acquire_free_hand(path, FreeHand("127.0.0.1", port), Scripted(), resume=True) == 4
+    assert acquire_free_hand(path, FreeHand("127.0.0.1", tracked), Scripted(), resume=True) == 4
     check(path, [0, 1, 2, 3])
     with pytest.raises(InputError, match=r"only 0\.0002 mm per pixel: it looks like m"):
         FreeHand("127.0.0.1", spacing_mm=(0.0002, 0.0002))
@@ -251,24 +261,23 @@ def test_clients_refuse_such_a_host_too(host):
         read_identity(host)
 
 
-def test_ctrl_c_at_a_terminal(tmp_path):
+def test_ctrl_c_at_a_terminal(tmp_path, tracked):
     pytest.importorskip("pty", reason="there are no pseudo-terminals here")
     from terminal import Terminal
 
-    command = "import sys; from hw.cli import main; sys.exit(main(sys.argv[1:]))"
-    with plus_server(mode="tracked") as port:
-        arguments = ["-c", command, "free-hand", f"127.0.0.1:{port}", "r.h5"]
-        with Terminal(arguments, tmp_path) as person:
-            person.wait_for(r"image 1/30: target at", 60)
-            person.wait_for("next: bring the target to the", 60)
-            person.type("u")
-            person.wait_for("taken back: the last image; ", 60)
-            person.wait_for(r"image \d/30: target at", 60)
-            person.type("\x03")
-            assert person.finish(60) == 130
-            assert person.shown.count("▀") > 1000
-            assert "go on with: jaxcal-hw free-hand" in person.shown.replace("\r\n", " ")
-            assert "Traceback" not in person.shown
+    command = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    arguments = ["-c", command, "free-hand", f"127.0.0.1:{tracked}", "r.h5"]
+    with Terminal(arguments, tmp_path) as person:
+        person.wait_for(r"image 1/30: target at", 60)
+        person.wait_for("next: bring the target to the", 60)
+        person.type("u")
+        person.wait_for("taken back: the last image; ", 60)
+        person.wait_for(r"image \d/30: target at", 60)
+        person.type("\x03")
+        assert person.finish(60) == 130
+        assert person.shown.count("▀") > 1000
+        assert "go on with: jaxcal-hw free-hand" in person.shown.replace("\r\n", " ")
+        assert "Traceback" not in person.shown
 
 
 @pytest.mark.parametrize(
@@ -279,10 +288,10 @@ def test_ctrl_c_at_a_terminal(tmp_path):
         ({"device": "Other"}, "but of 'Image_Reference': name one of these"),
     ],
 )
-def test_streams_that_cannot_be_used(tmp_path, monkeypatch, options, message):
+def test_streams_that_cannot_be_used(tmp_path, monkeypatch, separate, options, message):
     monkeypatch.setattr("hw.freehand.posed.LISTEN_S", 1.0)
-    with plus_server(mode="separate") as port, pytest.raises(DeviceError, match=message):
-        acquire_free_hand(tmp_path / "r.h5", FreeHand("127.0.0.1", port, **options), Scripted())
+    with pytest.raises(DeviceError, match=message):
+        acquire_free_hand(tmp_path / "r.h5", FreeHand("127.0.0.1", separate, **options), Scripted())
     assert not list(tmp_path.iterdir())
 
 
@@ -295,9 +304,9 @@ def test_no_server(tmp_path, capsys):
         assert main(["free-hand", wrong]) == 2
 
 
-def test_poses_between_stamps():
+def test_poses_between_stamps(separate):
     """A tracker faster than the images, with stamps of its own: poses are interpolated."""
-    with plus_server(mode="separate") as port, UltrasoundStream("127.0.0.1", port) as stream:
+    with UltrasoundStream("127.0.0.1", separate) as stream:
         posed = PosedImages(stream, None, None, lag_s=0.025)
         assert posed.pair == ("Probe", "Reference")
         images = [posed.read(3.0) for _ in range(12)]
@@ -357,10 +366,11 @@ def test_rules_that_cannot_be():
             FreeHand("localhost", lag_s=lag)
 
 
-def test_a_region_that_leaves_the_images_makes_no_file(tmp_path):
+def test_a_region_that_leaves_the_images_makes_no_file(tmp_path, separate):
     rules = Rules(region=(0, 0, 5000, 5000))
-    with plus_server() as port, pytest.raises(InputError, match="leaves the 160 x 120 px frame"):
-        acquire_free_hand(tmp_path / "r.h5", FreeHand("127.0.0.1", port, rules=rules), Scripted())
+    asked = FreeHand("127.0.0.1", separate, rules=rules)
+    with pytest.raises(InputError, match="leaves the 160 x 120 px frame"):
+        acquire_free_hand(tmp_path / "r.h5", asked, Scripted())
     assert not list(tmp_path.iterdir())
 
 

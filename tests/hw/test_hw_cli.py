@@ -14,7 +14,8 @@ import pytest
 from test_setup import GOOD
 
 import jaxcal
-from hw.cli import _plan_page, main
+from hw.cli.confirming import plan_page
+from hw.cli.main import main
 from hw.recording_check import read_progress
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import RecordingHeader
@@ -157,7 +158,7 @@ def test_a_refused_resume_leaves_a_complete_recording_as_it_is(tmp_path, capsys)
 @pytest.mark.parametrize("given", [subprocess.PIPE, subprocess.DEVNULL])
 def test_a_bench_serves_until_ctrl_c_whatever_its_standard_input_is(given):
     process = subprocess.Popen(
-        [sys.executable, "-c", "import sys; from hw.cli import main; sys.exit(main(['bench']))"],
+        [sys.executable, "-m", "hw", "bench"],
         stdin=given, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert process.stdout is not None
@@ -171,7 +172,7 @@ def test_a_bench_serves_until_ctrl_c_whatever_its_standard_input_is(given):
 
 def test_without_ur_rtde_no_file_is_made_and_nobody_is_asked(tmp_path):
     code = (
-        "import sys; sys.modules['rtde_control'] = None; from hw.cli import main; "
+        "import sys; sys.modules['rtde_control'] = None; from hw.cli.main import main; "
         "sys.exit(main(['acquire', 'rec.h5', '--bench']))"
     )
     done = subprocess.run(
@@ -184,7 +185,7 @@ def test_without_ur_rtde_no_file_is_made_and_nobody_is_asked(tmp_path):
 
 def test_help_needs_no_jax_and_no_drivers():
     code = (
-        "import sys; from hw.cli import main; codes = [main(args) for args in "
+        "import sys; from hw.cli.main import main; codes = [main(args) for args in "
         "(['--help'], ['--version'], ['acquire', '--help'], ['acquire', '--placement', 'x'])]; "
         "loaded = {'jax', 'serial', 'rtde_receive', 'h5py'} & set(sys.modules); "
         "sys.exit(f'{codes} {loaded}' if loaded or codes != [0, 0, 0, 2] else 0)"
@@ -216,10 +217,10 @@ def test_who_confirms_is_told_of_an_arm_that_nothing_identifies():
     })  # fmt: skip
     poses = np.eye(4)[None]
     known = MotionPlan(poses, limits, (0.0,) * 6, "20195500042, calibration 0123456789ab")
-    page = "\n".join(_plan_page(known))
+    page = "\n".join(plan_page(known))
     assert known.serial in page
     assert known.digest[:16] in page
     assert "speed slider at 100 %" in page
     assert "NOTHING IDENTIFIES" not in page
     unknown = MotionPlan(poses, limits, (0.0,) * 6, "UR5@192.168.1.10")
-    assert "NOTHING IDENTIFIES THIS ARM" in "\n".join(_plan_page(unknown))
+    assert "NOTHING IDENTIFIES THIS ARM" in "\n".join(plan_page(unknown))

@@ -72,7 +72,7 @@ def test_a_terminal_by_keys_and_by_lines(tmp_path):
 
 def test_without_a_terminal_nothing_is_read(tmp_path, capsys):
     """Pytest's standard input is none; a person cannot be asked there, and that is said."""
-    from hw.cli import main
+    from hw.cli.main import main
 
     pytest.importorskip("rtde_control", reason="without ur_rtde this is said first")
     arguments = ["acquire", str(tmp_path / "a.h5"), "--bench", "--placement", "pattern-injection"]

@@ -51,15 +51,16 @@ def stages(count: int, seed: int = 0, world=None, **arguments):
 def test_brackets_hold_the_true_offsets(name):
     inside, offsets = [], []
     for seed in range(3):
-        for stage in stages(20, seed):
+        for stage in stages(10, seed):
             placement = PROCEDURES[name](stage)
             offsets.append(stage.elevation_mm)
             inside.append(placement.bracket.contains(stage.elevation_mm))
             assert placement.procedure == name
             assert abs(placement.bracket.centre_mm) < 0.3
             assert placement.bracket.max_elevation_mm < 1.3
-    assert np.mean(inside) >= 0.95
-    assert abs(np.mean(offsets)) < 3.5 * 0.33 / np.sqrt(60)
+    # Of 99 % brackets all 30, or but one or two, hold: at least 28 in 99.7 % of such runs.
+    assert np.sum(inside) >= 28
+    assert abs(np.mean(offsets)) < 3.5 * 0.33 / np.sqrt(30)
     # 0.3 mm of the response and 0.1 mm of the last stop, and little beside.
     assert np.std(offsets) < 0.45
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -21,11 +22,13 @@ import pytest
 from robots import CB_SERIES, E_SERIES, START, EmulatedRobot
 
 import hw
+from hw.clock import REAL
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 from hw.robot.identity import read_identity, stop_program
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.pose import ur_to_pose
+from hw.robot.rtde import PacketReader, state_text
 from hw.robot.safety import MotionPlan, confirm_unattended
 from jaxcal.runtime.isolated import import_path
 
@@ -63,6 +66,16 @@ LIMITS = Limits(
 )
 PLAN = MotionPlan(np.array([HOME, beside(10.0, 5.0, 0.0), beside(50.0, 0.0, 0.0)]), LIMITS,
                   OFFSET, SERIAL)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def robots() -> Iterator[dict[str, EmulatedRobot]]:
+    """One of each series, for tests that leave it in order and take the arm as it stands."""
+    with ExitStack() as stack:
+        yield {
+            series: stack.enter_context(EmulatedRobot(version=version))
+            for series, version in SERIES.items()
+        }
 
 
 @contextmanager
@@ -126,12 +139,11 @@ def test_the_robot_moves_searches_and_is_left_in_order(version):
     assert times == sorted(times)
 
 
-@both_series
-def test_a_hesitation_at_full_speed_leaves_the_watchdog_at_rest(version):
+def test_a_hesitation_at_full_speed_leaves_the_watchdog_at_rest():
     """From 250 mm/s the arm brakes for longer than the controller's watchdog waits."""
     limits = replace(LIMITS, max_speed_mm_s=250.0, max_acceleration_mm_s2=2000.0)
     plan = MotionPlan(np.array([HOME, beside(50.0, 0.0, 0.0)]), limits, OFFSET, SERIAL)
-    with EmulatedRobot(version=version) as robot, moving(robot, plan=plan) as motion:
+    with EmulatedRobot(version=CB_SERIES) as robot, moving(robot, plan=plan) as motion:
 
         def guard() -> StaleError | None:
             fast = robot.state()["velocity"][0] > 0.24
@@ -150,7 +162,7 @@ def test_whatever_is_asked_for_only_allowed_motions_are_sent():
     rng = np.random.default_rng(5)
     home = PLAN.targets[0]
     asked = []
-    for _ in range(60):
+    for _ in range(30):
         kind = rng.integers(6)
         pose = beside(*rng.uniform(-6.0, 6.0, 3)) if kind else home + 0.0
         if kind == 1:
@@ -163,7 +175,7 @@ def test_whatever_is_asked_for_only_allowed_motions_are_sent():
     asked += [(beside(0.0, 2.0, 1.0), 10.0), (home, 5.0), (home, None)]
     plan = MotionPlan(home[None], LIMITS, OFFSET, SERIAL)
     arrived = []
-    with EmulatedRobot(speed=3.0) as robot:
+    with EmulatedRobot(speed=3.0, version=CB_SERIES) as robot:
         with moving(robot, plan=plan, caller_s=2.0) as motion:
             for pose, speed in asked:
                 with suppress(RefusedError):
@@ -191,15 +203,14 @@ def test_nothing_but_the_mover_commands_a_robot():
     assert (package / "robot" / "_mover.py").read_text().count('"moveL"') == 1
 
 
-@both_series
-def test_a_guard_that_fails_stops_the_robot(version):
+def test_a_guard_that_fails_stops_the_robot():
     def guard() -> str | None:
         if robot.state()["velocity"][0] > 0.04:
             raise ZeroDivisionError
         return None
 
     with (
-        EmulatedRobot(version=version) as robot,
+        EmulatedRobot(version=CB_SERIES) as robot,
         moving(robot, guard=guard, caller_s=2.0) as motion,
     ):
         with pytest.raises(ZeroDivisionError):
@@ -212,10 +223,9 @@ def test_a_guard_that_fails_stops_the_robot(version):
             motion.move_to(HOME)
 
 
-@both_series
-def test_a_dry_run_sends_nothing(version):
+def test_a_dry_run_sends_nothing():
     log: list = []
-    with EmulatedRobot(version=version) as robot:
+    with EmulatedRobot(version=CB_SERIES) as robot:
         motion = Motion(robot.host, PLAN, None, clock=robot.clock, log=lambda *e: log.append(e))
         with motion:
             assert not motion.ended
@@ -254,12 +264,19 @@ def test_motion_needs_its_own_unused_confirmation():
         assert robot.state()["log"] == []
 
 
+def farther(robot: EmulatedRobot) -> np.ndarray:
+    """The one of two poses of the plan, 50 mm apart, that the arm is farther from."""
+    x = robot.state()["raw"][0] * 1000.0
+    return max(PLAN.targets[0], PLAN.targets[2], key=lambda pose: abs(x - pose[0, 3]))
+
+
 def fault_in_motion(
     robot: EmulatedRobot, motion: Motion, fault: Callable[[], object]
 ) -> tuple[DeviceError, float, float]:
     """What the caller was told, and how long robot and caller took (bench s)."""
+    target = farther(robot)
     with ThreadPoolExecutor(1) as pool:
-        future = pool.submit(motion.move_to, PLAN.targets[2])
+        future = pool.submit(motion.move_to, target)
         hesitations = 0
         while math.hypot(*robot.state()["velocity"]) < 0.04:
             if future.done():
@@ -269,7 +286,7 @@ def fault_in_motion(
                 # A busy machine held one of the processes up: asked for again, as the stage does.
                 hesitations += 1
                 assert hesitations < 5, f"over before the fault: {error}"
-                future = pool.submit(motion.move_to, PLAN.targets[2])
+                future = pool.submit(motion.move_to, target)
             time.sleep(0.002)
         before = robot.state()["t"]
         fault()
@@ -282,8 +299,19 @@ def fault_in_motion(
     assert only_asked(state)
     assert "\n" not in str(error)
     # It stopped on the way, and did not merely arrive.
-    assert state["raw"][0] < START[0] + 0.049
+    assert abs(1000.0 * state["raw"][0] - target[0, 3]) > 1.0
     return error, state["rest_since"] - before, told
+
+
+def put_in_order(robot: EmulatedRobot) -> None:
+    """End every fault, and set at the pendant what the plan says."""
+    robot.mute(False)
+    robot.ask("spoil_dashboard", None)
+    robot.enter(7, 1)
+    robot.set_payload(0.0)
+    robot.set_speed_slider(1.0)
+    robot.set_tcp_offset(OFFSET)
+    robot.ask("force", [0.0] * 6)
 
 
 def kill_mover(motion: Motion) -> None:
@@ -313,15 +341,15 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("version", "name", "kind", "text", "ends"),
-    [
-        pytest.param(SERIES[series], name, *rest, id=f"{name}-{series}")
-        for name, at, *rest in FAULTS
-        for series in at
-    ],
-)
-def test_the_robot_rests_within_200_ms_of_a_fault(version, name, kind, text, ends):
+@pytest.mark.parametrize("fault", FAULTS, ids=[fault[0] for fault in FAULTS])
+def test_the_robot_rests_within_200_ms_of_a_fault(robots, fault):
+    name, at, *expected = fault
+    with ThreadPoolExecutor(len(at)) as pool:
+        for done in [pool.submit(check_fault, robots[series], name, *expected) for series in at]:
+            done.result()
+
+
+def check_fault(robot: EmulatedRobot, name: str, kind: type, text: str, ends: bool) -> None:
     reasons: list[str | StaleError | None] = [None]
 
     def guard() -> str | StaleError | None:
@@ -332,10 +360,8 @@ def test_the_robot_rests_within_200_ms_of_a_fault(version, name, kind, text, end
 
     # On a machine with other work any caller is silent for a while; only one case is about that.
     patience = 0.15 if name == "silent" else 2.0
-    with (
-        EmulatedRobot(version=version) as robot,
-        moving(robot, guard=guard, caller_s=patience) as motion,
-    ):
+    put_in_order(robot)
+    with moving(robot, guard=guard, caller_s=patience) as motion:
         faults = {
             "guard": lambda: reasons.__setitem__(0, "30 echo frames were lost"),
             "hesitation": lambda: reasons.__setitem__(
@@ -360,15 +386,15 @@ def test_the_robot_rests_within_200_ms_of_a_fault(version, name, kind, text, end
         assert rest_s <= STOP_WITHIN_S
         assert told_s < 5.0
         reasons[0] = None
-        moves = len(sent(robot, 3)) if name != "mute" else 0
+        moves = len(sent(robot, 3))
         if ends:
             with pytest.raises(RefusedError, match="confirm the plan again"):
                 motion.move_to(HOME)
         else:
-            assert motion.move_to(PLAN.targets[1]).pose[0, 3] == pytest.approx(410.0)
+            target = farther(robot)
+            assert motion.move_to(target).pose[0, 3] == pytest.approx(target[0, 3])
             moves += 1
-        if name != "mute":
-            assert len(sent(robot, 3)) == moves
+        assert len(sent(robot, 3)) == moves
 
 
 STATES = [
@@ -389,7 +415,16 @@ STATES = [
 
 def test_a_robot_that_may_not_move_is_sent_nothing_and_its_state_is_named():
     with EmulatedRobot() as robot:
-        for robot_mode, safety_mode, text in STATES:
+        with closing(PacketReader(robot.host)) as packets:
+            for robot_mode, safety_mode, text in STATES:
+                robot.enter(robot_mode, safety_mode)
+                deadline, told = time.monotonic() + 5.0, ""
+                while not re.search(text, told) and time.monotonic() < deadline:
+                    for packet in packets.read():
+                        told = state_text(packet.robot_mode, packet.safety_bits)
+                assert re.search(text, told)
+        # By its mode, by its safety, and by both.
+        for robot_mode, safety_mode, text in (STATES[2], STATES[6], STATES[8]):
             robot.enter(robot_mode, safety_mode)
             with pytest.raises(RefusedError, match=text), moving(robot):
                 pass
@@ -397,12 +432,7 @@ def test_a_robot_that_may_not_move_is_sent_nothing_and_its_state_is_named():
         robot.ask("set_remote", False)
         with pytest.raises(RefusedError, match="local control: switch it to remote"), moving(robot):
             pass
-        robot.ask("set_remote", True)
-        robot.ask("play")
-        with pytest.raises(RefusedError, match="a program runs on the robot"), moving(robot):
-            pass
         state = robot.state()
-        assert state["running"]
         assert "stop" not in state["dashboard"]
         assert state["log"] == []
         assert only_asked(state)
@@ -412,9 +442,11 @@ def test_a_robot_that_may_not_move_is_sent_nothing_and_its_state_is_named():
 
 
 @pytest.mark.parametrize("dashboard", [None, ""], ids=["answers", "mute"])
-def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(dashboard):
+def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashboard):
     """Such a stop only pauses the program, and may be released by closing a gate."""
-    with EmulatedRobot() as robot, moving(robot, caller_s=2.0) as motion:
+    robot = robots["e"]
+    put_in_order(robot)
+    with moving(robot, caller_s=2.0) as motion:
 
         def fault() -> None:
             robot.ask("spoil_dashboard", dashboard)
@@ -434,7 +466,7 @@ def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(dashboard):
 
 
 def test_a_stop_is_told_though_the_program_ended_at_the_same_moment():
-    with EmulatedRobot() as robot, moving(robot) as motion:
+    with EmulatedRobot(version=CB_SERIES) as robot, moving(robot) as motion:
         assert motion._process is not None
         # What comes while it is held up, it sees at once.
         os.kill(motion._process.pid, signal.SIGSTOP)
@@ -446,15 +478,12 @@ def test_a_stop_is_told_though_the_program_ended_at_the_same_moment():
             motion.move_to(HOME)
 
 
-@both_series
-def test_a_reset_control_connection_is_not_used_again(version):
-    with EmulatedRobot(version=version) as robot:
+def test_a_reset_control_connection_is_not_used_again():
+    with EmulatedRobot(speed=3.0, version=CB_SERIES) as robot:
         with moving(robot) as motion:
             motion.move_to(PLAN.targets[1])
-            robot.ask(
-                "drop",
-            )
-            time.sleep(0.5)
+            robot.ask("drop")
+            time.sleep(0.3)
             with pytest.raises((LostError, RefusedError)):
                 motion.move_to(HOME)
             moves = len(sent(robot, 3))
@@ -481,9 +510,8 @@ with Motion(host, plan, given, clock=clock, dry_run=False) as motion:
 """
 
 
-@both_series
-def test_killing_the_caller_stops_the_robot(version):
-    with EmulatedRobot(version=version) as robot:
+def test_killing_the_caller_stops_the_robot():
+    with EmulatedRobot() as robot:
         values = [
             robot.host, robot.clock.origin_s, PLAN.targets.tolist(), asdict(LIMITS), OFFSET,
             read_identity(robot.host).name,
@@ -522,7 +550,7 @@ def is_mover(process: str) -> bool:
 
 
 def test_a_stop_before_the_start_or_at_rest_is_kept():
-    with EmulatedRobot() as robot:
+    with EmulatedRobot(version=CB_SERIES) as robot:
         given = confirm_unattended(PLAN, PLAN.digest, clock=robot.clock)
         motion = Motion(robot.host, PLAN, given, clock=robot.clock, dry_run=False)
         motion.stop("not today")
@@ -536,9 +564,9 @@ def test_a_stop_before_the_start_or_at_rest_is_kept():
         assert sent(robot, 3) == []
 
 
-@both_series
-def test_what_is_set_at_the_pendant_is_compared_before_and_during_a_motion(version):
-    with EmulatedRobot(version=version) as robot:
+def test_what_is_set_at_the_pendant_is_compared_before_and_during_a_motion():
+    """By a CB controller, which must be asked for its TCP offset before each motion."""
+    with EmulatedRobot(version=CB_SERIES, speed=3.0) as robot:
         with moving(robot) as motion:
             motion.move_to(PLAN.targets[1])
             robot.set_tcp_offset((0.0, 0.0, 0.2, 0.0, 0.0, 0.0))
@@ -552,24 +580,57 @@ def test_what_is_set_at_the_pendant_is_compared_before_and_during_a_motion(versi
         assert len(sent(robot, 3)) == 1
 
 
-def test_a_second_client_is_refused_and_the_first_goes_on():
-    with EmulatedRobot() as robot, moving(robot) as motion, ThreadPoolExecutor(1) as pool:
+def test_who_is_not_let_in_waits_and_changes_nothing():
+    """A second client, one beside another program, and one of a controller that is silent."""
+
+    def started(host: str) -> object:
+        plan = replace(PLAN, serial=serial)
+        given = confirm_unattended(plan, plan.digest, clock=REAL)
+        return Motion(host, plan, given, dry_run=False).start()
+
+    with (
+        EmulatedRobot(version=CB_SERIES) as robot, EmulatedRobot(version=CB_SERIES) as other,
+        EmulatedRobot() as silent, moving(robot, caller_s=2.0) as motion,
+        ThreadPoolExecutor(4) as pool,
+    ):  # fmt: skip
+        serial = motion.serial
+        other.ask("play")
+        silent.ask("mute")
         future = pool.submit(motion.move_to, PLAN.targets[2])
         while math.hypot(*robot.state()["velocity"]) < 0.02:
             assert not future.done()
             time.sleep(0.002)
-        with pytest.raises(RefusedError, match="a program runs"), moving(robot):
-            pass
+        begun = time.monotonic()
+        second, beside_it, of_silent = [
+            pool.submit(started, each.host) for each in (robot, other, silent)
+        ]
+        for refused in (second, beside_it):
+            with pytest.raises(RefusedError, match="a program runs on the robot, or is paused"):
+                refused.result()
+        with pytest.raises(LostError, match="does not answer"):
+            of_silent.result()
+        assert time.monotonic() - begun < 30.0
         assert future.result(timeout=20.0).pose[0, 3] == pytest.approx(450.0)
         assert robot.state()["running"]
+        state = other.state()
+        assert state["running"]
+        assert state["log"] == []
+        assert only_asked(state)
+        assert "stop" not in state["dashboard"]
 
 
 def test_a_plan_goes_on_after_its_confirmation_has_expired():
-    with EmulatedRobot() as robot:
+    with EmulatedRobot(speed=3.0, version=CB_SERIES) as robot:
         plan = replace(PLAN, serial=read_identity(robot.host).name)
-        given = confirm_unattended(plan, plan.digest, clock=robot.clock, valid_s=6.0)
-        named = {"clock": robot.clock, "dry_run": False}
-        with Motion(robot.host, plan, given, **named) as motion:
+        named = {"clock": robot.clock, "dry_run": False, "caller_s": 2.0}
+        # A busy machine may take longer to connect.
+        for valid_s in (2.0, 6.0, 60.0):
+            given = confirm_unattended(plan, plan.digest, clock=robot.clock, valid_s=valid_s)
+            motion = Motion(robot.host, plan, given, **named)
+            with suppress(RefusedError):
+                motion.start()
+                break
+        with closing(motion):
             motion.move_to(PLAN.targets[1])
             robot.clock.sleep(given.expires_s - robot.clock.now() + 0.1)
             assert motion.move_to(HOME).pose[0, 3] == pytest.approx(400.0)
@@ -578,10 +639,9 @@ def test_a_plan_goes_on_after_its_confirmation_has_expired():
             Motion(robot.host, plan, late, **named).start()
 
 
-@both_series
-def test_danger_or_force_before_a_request_sends_no_motion(version):
+def test_danger_or_force_before_a_request_sends_no_motion():
     log: list = []
-    with EmulatedRobot(version=version) as robot:
+    with EmulatedRobot(version=CB_SERIES) as robot:
         with moving(robot, log) as motion:
             robot.ask("force", [0.0, 0.0, -180.0, 0.0, 0.0, 0.0])
             time.sleep(0.1)
@@ -613,12 +673,5 @@ def test_no_thread_of_the_emulated_controller_waits_behind_other_programs():
     assert of_threads.count(max(of_threads)) >= 3
 
 
-def test_nobody_answers():
-    with EmulatedRobot() as robot:
-        robot.ask("mute")
-        start = time.monotonic()
-        with pytest.raises(LostError, match="does not answer"), moving(robot):
-            pass
-        assert time.monotonic() - start < 30.0
-    with suppress(RefusedError):
-        Motion("127.0.0.1", PLAN, None).close()
+def test_closing_what_was_not_started_does_nothing():
+    Motion("127.0.0.1", PLAN, None).close()

@@ -6,6 +6,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -34,8 +35,19 @@ def beside(mm: float) -> list[float]:
     return [START[0] + mm / 1000.0, *START[1:]]
 
 
-@pytest.mark.parametrize("version", [E_SERIES, CB_SERIES])
-def test_ur_rtde_receives_and_controls(version):
+def disconnect(*clients) -> None:
+    """Each of them takes half a second."""
+    with ThreadPoolExecutor(len(clients)) as pool:
+        list(pool.map(lambda client: client.disconnect(), clients))
+
+
+def test_ur_rtde_receives_and_controls():
+    """Both series at once: most of it is waiting."""
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(receive_and_control, [E_SERIES, CB_SERIES]))
+
+
+def receive_and_control(version: tuple[int, ...]) -> None:
     with EmulatedRobot(version=version, speed=2.0) as robot:
         receive = rtde_receive.RTDEReceiveInterface(robot.host)
         control = rtde_control.RTDEControlInterface(robot.host)
@@ -81,8 +93,7 @@ def test_ur_rtde_receives_and_controls(version):
         assert "watchdog" in robot.state()["reason"]
         assert not control.moveL(beside(10.0), 0.1, 1.0)
         assert robot.state()["raw"] == pytest.approx(START)
-        control.disconnect()
-        receive.disconnect()
+        disconnect(control, receive)
 
 
 def test_a_protective_stop_ends_the_program_until_a_person_releases_it():
@@ -279,8 +290,7 @@ def test_setting_the_tcp_moves_the_pose_that_is_told_and_not_the_tool():
         moved = ur_to_pose(np.array(robot.arm.true_raw(robot.clock.now())))
         np.testing.assert_allclose(moved[:3, 3] - before[:3, 3], [10.0, 0.0, 0.0], atol=1e-6)
         np.testing.assert_allclose(moved[:3, :3], before[:3, :3], atol=1e-6)
-        control.disconnect()
-        receive.disconnect()
+        disconnect(control, receive)
 
 
 def test_a_command_that_is_not_emulated_ends_the_program_and_says_why():

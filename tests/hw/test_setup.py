@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from hw.cli import main
+from hw.cli.main import main
 from hw.setup import _TABLES, load_setup
 
 GOOD = """

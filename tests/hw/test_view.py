@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from hw.emulated import setup_of, start
 from hw.errors import LostError, StaleError
 from hw.extras import missing
 from hw.midplane.bracket import Bracket, Placement
-from hw.poses import plan_poses
+from hw.poses import Extent, plan_poses
 from hw.recorder import Recorder
 from hw.recording_layout import RecordingHeader
 from hw.robot.motion import Motion
@@ -46,7 +47,7 @@ def wait_until(condition, timeout_s: float = 30.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.1)
+        time.sleep(0.02)
 
 
 def listeners(port: int) -> set[str]:
@@ -70,8 +71,14 @@ def port_of(view: LiveView) -> int:
 def bench() -> Iterator[Bench]:
     pytest.importorskip("serial", reason="needs jaxcal[serial]")
     pytest.importorskip("rtde_receive", reason="needs jaxcal[robot]")
-    with start(3, 1.0) as bench:
+    with start(3, 5.0) as bench:
         yield bench
+
+
+@pytest.fixture(scope="module")
+def shared_view() -> Iterator[LiveView]:
+    with LiveView(lambda line: None, port=8190, rate_hz=50.0) as view:
+        yield view
 
 
 def a_plan(setup: Setup, serial: str = "none") -> MotionPlan:
@@ -103,31 +110,29 @@ def travel(session: Session, plan: MotionPlan, pose: np.ndarray) -> PoseSample:
     raise AssertionError("the bench cannot keep up with itself")
 
 
-def test_the_page_is_on_loopback_only():
-    with LiveView(lambda line: None, port=8190) as view:
-        assert view.url.startswith("http://127.0.0.1:")
-        assert listeners(port_of(view)) == {"0100007F"}
-    with pytest.raises(ProcessLookupError):
-        os.kill(view.pid, 0)
+def test_the_page_is_on_loopback_only(shared_view):
+    assert shared_view.url.startswith("http://127.0.0.1:")
+    assert listeners(port_of(shared_view)) == {"0100007F"}
 
 
 def test_a_dead_viewer_is_told_once_and_holds_nothing_up():
     said = []
-    with LiveView(said.append, port=8191) as view:
+    with LiveView(said.append, port=8191, rate_hz=50.0) as view:
         wait_until(lambda: view.sent > 2)
         os.kill(view.pid, signal.SIGKILL)
         wait_until(lambda: len(said) > 1)
         for row in range(100):
             view.going(row)
             view.say("a line")
-        time.sleep(0.5)
+        # Ten messages more, if there were any.
+        time.sleep(0.2)
     assert len(said) == 2
     assert "the acquisition goes on without it" in said[1]
 
 
 def test_a_viewer_that_does_not_read_costs_one_message():
     said = []
-    with LiveView(said.append, port=8192) as view:
+    with LiveView(said.append, port=8192, rate_hz=50.0) as view:
         wait_until(lambda: view.sent > 2)
         os.kill(view.pid, signal.SIGSTOP)
         try:
@@ -135,7 +140,7 @@ def test_a_viewer_that_does_not_read_costs_one_message():
             # More than the pipe holds, so that a message stays half handed over.
             for _ in range(20):
                 view.say("x" * 50_000)
-                time.sleep(0.05)
+                time.sleep(0.02)
             wait_until(lambda: view.left_out > 5)
             assert view.sent - before < 20
         finally:
@@ -144,6 +149,8 @@ def test_a_viewer_that_does_not_read_costs_one_message():
         wait_until(lambda: view.sent > before + 20)
         assert missed > 5
     assert len(said) == 1
+    with pytest.raises(ProcessLookupError):
+        os.kill(view.pid, 0)
 
 
 def threads_and_children(pid: int) -> tuple[int, list[str]]:
@@ -152,47 +159,47 @@ def threads_and_children(pid: int) -> tuple[int, list[str]]:
     return len(threads), [child for t in threads for child in (t / "children").read_text().split()]
 
 
-def test_a_page_can_do_nothing():
+def test_a_page_can_do_nothing(shared_view):
     """A browser's messages are dropped, those too on which viser itself would act."""
-    with LiveView(lambda line: None, port=8193) as view:
-        protocol = [f"viser-v{viser.__version__}"]
-        with connect(view.url.replace("http", "ws"), subprotocols=protocol) as socket:  # type: ignore
-            assert isinstance(socket.recv(timeout=10.0), bytes)
-            before = threads_and_children(view.pid)
-            # viser would open a tunnel through a public server, in a process of its own.
-            socket.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
-            time.sleep(1.0)
-            assert threads_and_children(view.pid) == before
-            assert not before[1]
-            socket.send(b"not a message")
-        sent = view.sent
-        wait_until(lambda: view.sent > sent + 3)
-        assert listeners(port_of(view)) == {"0100007F"}
+    view = shared_view
+    protocol = [f"viser-v{viser.__version__}"]
+    with connect(view.url.replace("http", "ws"), subprotocols=protocol) as socket:  # type: ignore
+        assert isinstance(socket.recv(timeout=10.0), bytes)
+        before = threads_and_children(view.pid)
+        # viser would open a tunnel through a public server, in a process of its own.
+        socket.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
+        time.sleep(0.5)
+        assert threads_and_children(view.pid) == before
+        assert not before[1]
+        socket.send(b"not a message")
+    sent = view.sent
+    wait_until(lambda: view.sent > sent + 3)
+    assert listeners(port_of(view)) == {"0100007F"}
 
 
-def test_a_page_of_another_site_cannot_read_it():
+def test_a_page_of_another_site_cannot_read_it(shared_view):
     """A browser lets any page open a socket to this machine; a name may lead here by a trick."""
-    with LiveView(lambda line: None, port=8195) as view:
-        port = port_of(view)
-        protocol = [f"viser-v{viser.__version__}"]
-        for host, origin, good in (
-            (f"127.0.0.1:{port}", None, True),
-            (f"localhost:{port}", "http://localhost:9000", True),
-            (f"127.0.0.1:{port}", "http://evil.example", False),
-            (f"127.0.0.1:{port}", "null", False),
-            ("evil.example", None, False),
-            ("[", None, False),
-        ):
-            asked = {"Host": host} | ({} if origin is None else {"Origin": origin})
-            page = HTTPConnection("127.0.0.1", port, timeout=10.0)
-            page.request("GET", "/", headers=asked)
-            assert page.getresponse().status == (200 if good else 403), asked
-            page.close()
-        url = view.url.replace("http", "ws")
-        with pytest.raises(InvalidStatus, match="403"):
-            connect(url, subprotocols=protocol, origin="http://evil.example")  # type: ignore
-        with connect(url, subprotocols=protocol, origin=view.url) as socket:  # type: ignore
-            assert isinstance(socket.recv(timeout=10.0), bytes)
+    view = shared_view
+    port = port_of(view)
+    protocol = [f"viser-v{viser.__version__}"]
+    for host, origin, good in (
+        (f"127.0.0.1:{port}", None, True),
+        (f"localhost:{port}", "http://localhost:9000", True),
+        (f"127.0.0.1:{port}", "http://evil.example", False),
+        (f"127.0.0.1:{port}", "null", False),
+        ("evil.example", None, False),
+        ("[", None, False),
+    ):
+        asked = {"Host": host} | ({} if origin is None else {"Origin": origin})
+        page = HTTPConnection("127.0.0.1", port, timeout=10.0)
+        page.request("GET", "/", headers=asked)
+        assert page.getresponse().status == (200 if good else 403), asked
+        page.close()
+    url = view.url.replace("http", "ws")
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(url, subprotocols=protocol, origin="http://evil.example")  # type: ignore
+    with connect(url, subprotocols=protocol, origin=view.url) as socket:  # type: ignore
+        assert isinstance(socket.recv(timeout=10.0), bytes)
 
 
 def test_the_extra_is_named_where_viser_is_missing():
@@ -202,7 +209,9 @@ def test_the_extra_is_named_where_viser_is_missing():
 
 
 def test_a_browser_sees_the_bench_move_and_killing_the_view_changes_nothing(bench, tmp_path):
-    setup = setup_of(bench)
+    # Near one another, and far enough from where the arm waits to be seen to move.
+    near = Extent(cone_deg=5.0, turn_deg=5.0, lateral_mm=5.0, depth_mm=(20.0, 25.0))
+    setup = replace(setup_of(bench), extent=near)
     said = []
     with (
         LiveView(said.append, port=8194) as view,

@@ -81,7 +81,7 @@ class Bridge:
 
 @pytest.fixture
 def bridge() -> Iterator[Bridge]:
-    with AuspisEmulator(echo, lines=LINES, link="tcp") as device:
+    with AuspisEmulator(echo, lines=LINES, link="tcp", rate_hz=100.0) as device:
         between = Bridge(device.path)
         yield between
         between.close()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from hw.cli import main
+from hw.cli.main import main
 from hw.errors import RefusedError
 from hw.robot.limits import numbers
 
