@@ -610,13 +610,22 @@ def test_cache_that_cannot_be_trusted_is_not_used(spoil, tmp_path, monkeypatch, 
     assert capfd.readouterr() == ("", "")
 
 
-def test_cache_keeps_the_newest(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache, "KEPT_PROGRAMS", 2)
+def test_cache_keeps_the_newest(tmp_path):
     for age, name in enumerate("abcd"):
         (tmp_path / name).write_text("")
         os.utime(tmp_path / name, (0, -age))
-    cache._prune(tmp_path)
+    (tmp_path / "e").symlink_to("nowhere")
+    os.utime(tmp_path / "e", (0, -9), follow_symlinks=False)
+    cache._prune(tmp_path, 2)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
+
+
+def test_cache_clear_removes_what_jax_keeps_there(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = program_cache.private_folder("xla")
+    (folder / "jit_f-cache").write_text("")
+    assert main(["cache", "clear"]) == 0
+    assert os.listdir(folder) == []
 
 
 def test_numbers_are_positive_and_finite():
