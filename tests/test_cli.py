@@ -4,6 +4,7 @@ Commands that compile run in processes of their own; what must be refused before
 one.
 """
 
+import io
 import json
 import os
 import subprocess
@@ -22,6 +23,7 @@ from hw.cli.main import main as bench_main
 from hw.errors import DeviceError
 from jaxcal.cli import cache, common, demo
 from jaxcal.cli.main import commands, main
+from jaxcal.cli.run import run
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.runtime import program_cache
 from jaxcal.study.simulation import Protocol
@@ -541,6 +543,25 @@ def test_a_bug_is_one_line_too(capfd, monkeypatch):
         main(["demo"])
 
 
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8"])
+def test_a_name_that_the_terminal_cannot_show_loses_no_answer(monkeypatch, encoding):
+    @click.group()
+    def told():
+        pass
+
+    @told.command()
+    @click.argument("name")
+    def say(name):
+        click.echo(f"{name}: 0.2 mm")
+
+    shown = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, encoding=encoding))
+    monkeypatch.setattr(sys, "argv", ["told", "say", "\N{GREEK SMALL LETTER SIGMA}\udcff.h5"])
+    assert run(told, "told") == 0
+    expected = {"cp1252": b"\\u03c3", "utf-8": "\N{GREEK SMALL LETTER SIGMA}".encode()}[encoding]
+    assert shown.getvalue() == expected + b"\\udcff.h5: 0.2 mm\n"
+
+
 def test_a_pipe_closed_early_is_no_error(jaxcal_process):
     read, write = os.pipe()
     os.close(read)
@@ -590,13 +611,22 @@ def test_cache_that_cannot_be_trusted_is_not_used(spoil, tmp_path, monkeypatch, 
     assert capfd.readouterr() == ("", "")
 
 
-def test_cache_keeps_the_newest(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache, "KEPT_PROGRAMS", 2)
+def test_cache_keeps_the_newest(tmp_path):
     for age, name in enumerate("abcd"):
         (tmp_path / name).write_text("")
         os.utime(tmp_path / name, (0, -age))
-    cache._prune(tmp_path)
+    (tmp_path / "e").symlink_to("nowhere")
+    os.utime(tmp_path / "e", (0, -9), follow_symlinks=False)
+    cache._prune(tmp_path, 2)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
+
+
+def test_cache_clear_removes_what_jax_keeps_there(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = program_cache.private_folder("xla")
+    (folder / "jit_f-cache").write_text("")
+    assert main(["cache", "clear"]) == 0
+    assert os.listdir(folder) == []
 
 
 def test_numbers_are_positive_and_finite():

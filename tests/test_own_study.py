@@ -125,3 +125,13 @@ def test_a_worker_whose_parent_is_gone_ends_without_a_word(squares):
     assert worker.wait(timeout=120) == 1
     assert worker.stderr.read() == ""
     worker.stderr.close()
+
+
+def test_a_file_names_the_versions_that_computed_it_not_those_that_wrote_it(tmp_path, squares):
+    """A worker of a cluster may have others."""
+    study = squares()
+    store = Store.create(tmp_path / "study", study, resume=False)
+    chunk = study.chunk(0)
+    maker = {"jaxcal": "9.9.9", "jax": "8.8.8", "device": "4 x gpu"}
+    store.write(chunk, study.compute(chunk), maker)
+    assert store.versions(chunk) == "jaxcal 9.9.9, jax 8.8.8, 4 x gpu"

@@ -301,6 +301,31 @@ def test_the_table_goes_on_and_goes_back(tmp_path):
     assert path.read_text() == "frame,u,v\n0,1,1\n"
 
 
+def test_a_sequence_whose_name_is_not_utf8_goes_on(tmp_path):
+    picks_of(tmp_path / "p.csv", "h\udcff.igs.mha").pick(0, 1.0, 1.0)
+    assert picks_of(tmp_path / "p.csv", "h\udcff.igs.mha").points == {0: (1.0, 1.0)}
+
+
+def test_two_pages_do_not_lose_each_others_points(tmp_path):
+    """Nor does an editor: what another program has put there is never written over."""
+    path = tmp_path / "p.csv"
+    first, second = picks_of(path), picks_of(path)
+    first.pick(0, 1.0, 1.0)
+    for change in (lambda: second.pick(1, 2.0, 2.0), lambda: second.skip(1)):
+        with pytest.raises(OutputError, match=r"p\.csv: was changed by another program"):
+            change()
+    assert second.points == {}
+    again = picks_of(path)
+    again.pick(1, 2.0, 2.0)
+    with pytest.raises(OutputError, match="was changed"):
+        first.undo()
+    assert picks_of(path).points == {0: (1.0, 1.0), 1: (2.0, 2.0)}
+    # A table that was removed is written again as this page knows it.
+    path.unlink()
+    again.pick(3, 3.0, 3.0)
+    assert list(picks_of(path).points) == [0, 1, 3]
+
+
 def test_a_table_that_cannot_be_written_changes_nothing(tmp_path):
     folder = tmp_path / "gone"
     folder.mkdir()

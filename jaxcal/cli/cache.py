@@ -134,6 +134,7 @@ def clear() -> int:
     """Remove all kept programs."""
     try:
         removed = program_cache.clear()
+        _prune(program_cache.private_folder("xla"), 0)
     except (OSError, RuntimeError) as error:
         raise OutputError(f"the cache cannot be cleared: {error}") from error
     print_page(f"{removed} programs removed")
@@ -233,7 +234,8 @@ def _enable_compilation_cache() -> None:
     warnings.filterwarnings("ignore", message=".*persistent compilation cache.*")
 
 
-def _prune(folder: Path) -> None:
-    programs = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)
-    for path in programs[:-KEPT_PROGRAMS]:
+def _prune(folder: Path, kept: int = KEPT_PROGRAMS) -> None:
+    # Not stat: a link that leads nowhere would end it, and nothing would be removed any more.
+    programs = sorted(folder.iterdir(), key=lambda path: path.lstat().st_mtime)
+    for path in programs[: max(len(programs) - kept, 0)]:
         path.unlink(missing_ok=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -24,6 +25,8 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
     Returns:
         The exit status. Errors have been reported on standard error by then, in one line.
     """
+    if arguments is None:
+        _print_anything()
     try:
         if arguments is None and (instruction := os.environ.get(_completion_variable(name))):
             from click.shell_completion import shell_complete
@@ -61,6 +64,15 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
             "JAXCAL_TRACEBACK=1 shows where)",
             ExitCode.INTERNAL_ERROR,
         )
+
+
+def _print_anything() -> None:
+    """Write what the terminal's encoding lacks with backslashes, as Python does on standard error.
+
+    A file's name may hold it, and no answer is to be lost by a name.
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _completion_variable(name: str) -> str:

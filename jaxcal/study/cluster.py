@@ -69,12 +69,12 @@ def connected(scheduler: Any) -> Client:
 
 def compute_from_text(
     canonical: str, where: tuple[tuple[str, str], ...], index: int
-) -> tuple[dict[str, np.ndarray], str]:
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """What a worker does: chunk ``index`` of the study with this canonical text and class."""
-    from jaxcal.study.pipeline import device_name
+    from jaxcal.study.pipeline import made_by
 
     spec = _spec(canonical, where)
-    return spec.compute(spec.chunk(index)), device_name()
+    return spec.compute(spec.chunk(index)), made_by()
 
 
 @lru_cache(maxsize=4)
@@ -89,7 +89,7 @@ def _threads(client: Client) -> dict[str, int]:
 
 def compute_on_cluster(
     client: Client, spec: Study, chunks: list[Chunk]
-) -> Iterator[tuple[Chunk, dict[str, np.ndarray], str]]:
+) -> Iterator[tuple[Chunk, dict[str, np.ndarray], dict[str, str]]]:
     """Compute chunks on worker processes; yields them as they are done.
 
     Args:
@@ -121,7 +121,7 @@ def compute_on_cluster(
         for future in done:
             chunk = by_key.pop(future.key)
             try:
-                arrays, device = future.result()
+                arrays, maker = future.result()
             except Exception as error:
                 raise CalibrationError(
                     f"chunk {chunk.index} could not be computed on the cluster: "
@@ -130,7 +130,7 @@ def compute_on_cluster(
             future.release()
             if waiting:
                 hand_out()
-            yield chunk, arrays, device
+            yield chunk, arrays, maker
     except TimeoutError:
         raise CalibrationError("the cluster has no worker") from None
     except OSError as error:

@@ -27,6 +27,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
+import jaxcal
 from jaxcal.calibration.options import Options
 from jaxcal.data.probe import LinearProbe
 from jaxcal.model.batch import Iterate
@@ -153,10 +154,14 @@ class Block:
         return _as_numpy(program(self.batch, self.truth, begun, bound))
 
 
-def device_name() -> str:
-    """What computes in this process, in words."""
+def made_by() -> dict[str, str]:
+    """What computes in this process: versions, and the device in words."""
     devices = jax.local_devices()
-    return f"{len(devices)} x {devices[0].platform} {devices[0].device_kind}"
+    return {
+        "jaxcal": jaxcal.__version__,
+        "jax": jax.__version__,
+        "device": f"{len(devices)} x {devices[0].platform} {devices[0].device_kind}",
+    }
 
 
 def bound_mm(method: MethodSpec, condition: Condition) -> float:

@@ -30,7 +30,7 @@ except ImportError:  # not on Windows
 
 _MOST_WORKERS = 10_000
 
-Computed = tuple[Chunk, dict[str, np.ndarray], str]
+Computed = tuple[Chunk, dict[str, np.ndarray], dict[str, str]]
 """A chunk, its results, and what computed it."""
 
 
@@ -126,8 +126,8 @@ def run_study(
             watcher.begin(spec.condition_count * spec.trials, done)
             trials = 0
             with closing(_computed(spec, missing, workers, client)) as results:
-                for chunk, arrays, device in results:
-                    store.write(chunk, arrays, device)
+                for chunk, arrays, maker in results:
+                    store.write(chunk, arrays, maker)
                     trials += chunk.stop - chunk.start
                     watcher.advance(chunk.stop - chunk.start)
     return RunSummary(spec.chunk_count, len(missing), trials, time.monotonic() - begun)
@@ -172,10 +172,10 @@ def _computed(
 
 
 def _compute_here(spec: Study, missing: Iterable[Chunk]) -> Iterator[Computed]:
-    from jaxcal.study.pipeline import device_name
+    from jaxcal.study.pipeline import made_by
 
     for chunk in missing:
-        yield chunk, spec.compute(chunk), device_name()
+        yield chunk, spec.compute(chunk), made_by()
 
 
 @contextmanager

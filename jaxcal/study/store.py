@@ -27,7 +27,6 @@ from typing import Any, Generic, TypeVar, overload
 import h5py
 import numpy as np
 
-import jaxcal
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.readable import check_readable, one_line
@@ -114,19 +113,17 @@ class Store(Generic[S]):
         indices = {int(match[1]) for match in found if match}
         return sorted(index for index in indices if index < self.spec.chunk_count)
 
-    def write(self, chunk: Chunk, results: dict[str, np.ndarray], device: str) -> None:
+    def write(self, chunk: Chunk, results: dict[str, np.ndarray], maker: dict[str, str]) -> None:
         """Write the file of a chunk, whole or not at all.
 
         Args:
             chunk: which.
             results: as :meth:`jaxcal.study.Study.compute` returns them.
-            device: what computed it.
+            maker: what computed it, as :func:`jaxcal.study.pipeline.made_by` says it.
 
         Raises:
             OutputError: the disk is full, the folder not writable.
         """
-        import jax
-
         path = self.path(chunk)
         start = chunk.condition * self.spec.trials
         # JAX may have been told to run in 32 bits; the file's types do not depend on it.
@@ -153,9 +150,7 @@ class Store(Generic[S]):
                     "index_start": start + chunk.start,
                     "index_stop": start + chunk.stop,
                     "checksum": _checksum(results),
-                    "jaxcal": jaxcal.__version__,
-                    "jax": jax.__version__,
-                    "device": device,
+                    **maker,
                 },
                 {name: array_spec.unit for name, array_spec in wanted.items()},
             )

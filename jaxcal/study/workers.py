@@ -69,8 +69,8 @@ class Worker:
                 }
             )
 
-    def compute(self, chunk: Chunk) -> tuple[dict[str, np.ndarray], str] | None:
-        """A chunk's arrays and the device that computed them; None where the worker died.
+    def compute(self, chunk: Chunk) -> tuple[dict[str, np.ndarray], dict[str, str]] | None:
+        """A chunk's arrays and what computed them; None where the worker died.
 
         Raises:
             CalibrationError: the chunk cannot be computed.
@@ -90,7 +90,7 @@ class Worker:
                 if len(body) < size:
                     return None
                 arrays[name] = np.frombuffer(body, kind).reshape(shape).copy()
-            return arrays, str(header["device"])
+            return arrays, header["maker"]
         except (OSError, ValueError):
             return None
 
@@ -109,7 +109,7 @@ class Worker:
 
 def compute_on_workers(
     spec: Study, chunks: list[Chunk], groups: list[set[int]]
-) -> Iterator[tuple[Chunk, dict[str, np.ndarray], str]]:
+) -> Iterator[tuple[Chunk, dict[str, np.ndarray], dict[str, str]]]:
     """Compute chunks on worker processes; yields them as they are done.
 
     Args:
@@ -144,7 +144,7 @@ def compute_on_workers(
         except Exception as error:
             hand_over(error)
 
-    def _computed(place: int, chunk: Chunk) -> tuple[dict[str, np.ndarray], str]:
+    def _computed(place: int, chunk: Chunk) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         for _ in range(MOST_DEATHS):
             if place not in workers:
                 workers[place] = Worker(spec, groups[place])
@@ -212,13 +212,13 @@ def main() -> None:
 
 
 def _answer(answers: BinaryIO, spec: Study, index: int) -> None:
-    from jaxcal.study.pipeline import device_name
+    from jaxcal.study.pipeline import made_by
 
     try:
         arrays = spec.compute(spec.chunk(index))
         found = {name: np.asarray(values, order="C") for name, values in arrays.items()}
         described = [[name, values.dtype.str, list(values.shape)] for name, values in found.items()]
-        header: dict[str, Any] = {"arrays": described, "device": device_name()}
+        header: dict[str, Any] = {"arrays": described, "maker": made_by()}
     except Exception as error:
         found = {}
         header = {"error": f"{type(error).__name__}: {one_line(error)[:300]}"}

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxcal import FormatError, InputError
+from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import write_text
 from jaxcal.io.readable import check_readable
 from jaxcal.io.text import read_pose_table
@@ -62,12 +62,15 @@ class Picks:
     ) -> None:
         self._files = tuple(files)
         self.path, self.shown, self.size = os.fspath(path), list(shown), size
-        self._head = f"{_HEAD}{name}: {size[0]} x {size[1]} px, {count} frames"
+        # As the file will have it, also where the name is not UTF-8.
+        named = name.encode("utf-8", errors="backslashreplace").decode()
+        self._head = f"{_HEAD}{named}: {size[0]} x {size[1]} px, {count} frames"
         self.points: dict[int, Point] = {}
         self.skipped: set[int] = set()
         self._before: list[tuple[int, Point | None, bool]] = []
-        if Path(path).exists():
-            self._load(count)
+        self._known = self._content()
+        if self._known is not None:
+            self._load(self._known.decode(errors="replace"), count)
 
     @property
     def next_frame(self) -> int | None:
@@ -79,7 +82,8 @@ class Picks:
 
         Raises:
             InputError: no such frame, or a position outside it.
-            OutputError: the table cannot be written; nothing has changed.
+            OutputError: the table cannot be written, or another program has changed it; nothing has
+                changed.
         """
         if not (
             np.isfinite([u, v]).all() and _inside(u, self.size[0]) and _inside(v, self.size[1])
@@ -125,8 +129,21 @@ class Picks:
         told = " ".join(map(str, sorted(others)))
         column = "file" if self._files else "frame"
         head = [self._head, f"{_SKIPPED} {told}".rstrip(), f"{column},u,v"]
+        # Points that a second page or an editor has put there must not be lost.
+        if self._content() not in (self._known, None):
+            raise OutputError(
+                f"{self.path}: was changed by another program: Ctrl-C, and the same command goes on"
+            )
         write_text(self.path, "\n".join([*head, *rows, ""]))
+        self._known = self._content()
         self.points, self.skipped = points, others
+
+    def _content(self) -> bytes | None:
+        """The table as it is on the disk; None where there is none."""
+        if not Path(self.path).exists():
+            return None
+        check_readable(self.path, maximum_bytes=_MOST_BYTES)
+        return Path(self.path).read_bytes()
 
     def _named(self, frame: int) -> str:
         if not self._files:
@@ -134,9 +151,8 @@ class Picks:
         doubled = self._files[frame].replace('"', '""')
         return f'"{doubled}"'
 
-    def _load(self, count: int) -> None:
-        check_readable(self.path, maximum_bytes=_MOST_BYTES)
-        lines = Path(self.path).read_text("utf-8", errors="replace").splitlines()
+    def _load(self, content: str, count: int) -> None:
+        lines = content.splitlines()
         if not lines[0].startswith(_HEAD):
             raise FormatError(f"{self.path}: exists and was not made by jaxcal pick: name another")
         if lines[0] != self._head:
