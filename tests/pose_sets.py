@@ -105,15 +105,15 @@ def make(kind: str, seed: int, elevation: float, noise: float) -> PoseSet:
 def _spectrum(q, rotations, x, sigma) -> tuple[np.ndarray, np.ndarray, float]:
     """Singular values and right vectors of the whitened Jacobian, rotations in mm at the lever."""
     lever = float(np.sqrt((q**2).sum() / len(q)))
-    rows = []
-    for point, rotation in zip(q, rotations, strict=True):
-        a, b, c = point
-        # X Exp([v, w]) moves q by -v - w x q; c moves it by (R X_R)'.
-        cross = np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
-        moved = np.hstack([-np.eye(3), cross / lever, x[:3, :3].T @ rotation.T])
-        distance = np.hypot(b, c)
-        rows += [moved[0] / sigma[0], (b * moved[1] + c * moved[2]) / distance / sigma[1],
-                 moved[1] / sigma[2]]  # fmt: skip
-    _, values, right = np.linalg.svd(np.array(rows), full_matrices=True)
-    values = np.concatenate([values, np.zeros(9 - len(values))])
+    a, b, c = q.T
+    # X Exp([v, w]) moves q by -v - w x q; c moves it by (R X_R)'.
+    cross = np.zeros((len(q), 3, 3))
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -c, b, -a
+    cross -= cross.swapaxes(1, 2)
+    by_target = (rotations @ x[:3, :3]).swapaxes(1, 2)
+    by_shift = np.broadcast_to(-np.eye(3), cross.shape)
+    moved = np.concatenate([by_shift, cross / lever, by_target], axis=2)
+    along = (b[:, None] * moved[:, 1] + c[:, None] * moved[:, 2]) / np.hypot(b, c)[:, None]
+    rows = np.concatenate([moved[:, 0] / sigma[0], along / sigma[1], moved[:, 1] / sigma[2]])
+    _, values, right = np.linalg.svd(rows, full_matrices=False)
     return values, right, lever

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -138,12 +137,12 @@ def test_following_the_advice_helps():
 
 
 @pytest.mark.slow
-def test_five_hundred_sets_in_a_batch():
+def test_two_hundred_and_fifty_sets_in_a_batch():
     rng = np.random.default_rng(7)
     sets = [
         make(kind, seed, float(rng.choice([0.0, 0.5, 2.0, 5.0])),
              float(rng.choice([0.0, 0.05, 0.5, 2.0])))
-        for kind in DEGENERATE + WEAK for seed in range(1000, 1056)
+        for kind in DEGENERATE + WEAK for seed in range(1000, 1028)
     ]  # fmt: skip
     data = jaxcal.stack([jaxcal.Problem.from_arrays(s.poses, s.points, mask=s.mask) for s in sets])
     status = jaxcal.calibrate_batch(data).status
@@ -154,12 +153,11 @@ def test_five_hundred_sets_in_a_batch():
             assert found == "converged", (posed.kind, posed.relative_sd)
         elif posed.relative_sd > HOPELESS:
             assert found != "converged", (posed.kind, posed.relative_sd)
-    assert jnp.asarray([s.deficient for s in sets]).sum() > 200
+    assert sum(s.deficient for s in sets) > 100
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("road", ["side by side", "one by one"])
-def test_two_thousand_weak_sets_by_the_conventional_method(road):
+def test_two_thousand_weak_sets_by_the_conventional_method():
     rng = np.random.default_rng(11)
     sets = [
         make(kind, seed, float(rng.choice([0.0, 0.5, 2.0, 5.0])),
@@ -167,15 +165,17 @@ def test_two_thousand_weak_sets_by_the_conventional_method(road):
         for kind in WEAK for seed in range(3000, 3512)
     ]  # fmt: skip
     data = jaxcal.stack([jaxcal.Problem.from_arrays(s.poses, s.points, mask=s.mask) for s in sets])
-    if road == "side by side":
-        result = jaxcal.calibrate_batch(data, "conventional")
-    else:
-        one = jax.jit(lambda p: jaxcal.calibrate(p, "conventional", robust=False))
-        result = jax.lax.map(one, data)
-    # The batch's descent may crawl along a flat valley; one problem begins at the closed form.
-    unfinished = np.flatnonzero(np.asarray(result.status) == "max_iterations")
+    one = jax.jit(lambda p: jaxcal.calibrate(p, "conventional", robust=False))
+    each = jax.lax.map(one, data)
+    # A batch descends as one traced problem does, so its slow lanes are those that are slow here.
+    slowest = np.argsort(np.asarray(each.iterations))[-128:]
+    hardest = jax.tree.map(lambda leaf: leaf[slowest], data)
+    together = jaxcal.calibrate_batch(hardest, "conventional")
+    np.testing.assert_array_equal(together.status, np.asarray(each.status)[slowest])
+    # The descent may crawl along a flat valley; one problem begins at the closed form.
+    unfinished = np.flatnonzero(np.asarray(each.status) == "max_iterations")
     assert len(unfinished) <= len(sets) / 1000
     for lane in unfinished:
         alone = jaxcal.calibrate(jax.tree.map(lambda leaf, k=lane: leaf[k], data), "conventional")
         assert alone.status == "converged"
-    assert set(result.status) <= {"converged", "unobservable", "max_iterations"}
+    assert set(each.status) <= {"converged", "unobservable", "max_iterations"}

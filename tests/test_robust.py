@@ -94,7 +94,7 @@ def test_robust_solve_is_that_of_the_good_images():
 
 @pytest.mark.slow
 def test_a_wrong_echo_is_told_by_its_range():
-    data = problem(0, images=20, elevation_mm=0.5, noise_mm=0.5)
+    data = problem(0, images=50, elevation_mm=0.5, noise_mm=0.5)
     spoilt = replace(data, measurements=data.measurements.at[7, 1].add(40.0))
     plain = jaxcal.calibrate(spoilt, "conventional", robust=False)
     robust = jaxcal.calibrate(spoilt, "conventional", robust=True)
@@ -109,7 +109,7 @@ def test_a_wrong_echo_is_told_by_its_range():
 
 @pytest.mark.slow
 def test_command_line(tmp_path, capsys):
-    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=20), 3)
+    recording = jaxcal.simulate_recording(jaxcal.Protocol(images=50), 3)
     points = recording.calibration.measurements.copy()
     points[4] += [30.0, 25.0]
     images = replace(recording.calibration, measurements=points)
@@ -120,8 +120,8 @@ def test_command_line(tmp_path, capsys):
     record = json.loads(capsys.readouterr().out)
     assert record["robust"]
     assert record["outliers"] == [4]
-    assert record["images"] == 20
-    assert record["images_used"] == 19
+    assert record["images"] == 50
+    assert record["images_used"] == 49
     assert record["outlier_reasons"][0]["image"] == 4
 
 
@@ -132,7 +132,7 @@ def test_of_clean_images_hardly_any_is_left_out(consensus):
     for law in ("uniform", "normal"):
         clean = jaxcal.stack([
             problem(seed, images=12, elevation_mm=2.0, noise_mm=2.0, elevation_distribution=law)
-            for seed in range(128)
+            for seed in range(64)
         ])  # fmt: skip
         left_out += np.sum(np.asarray(consensus(clean).keep) == 0)
         images += clean.mask.size
@@ -141,12 +141,12 @@ def test_of_clean_images_hardly_any_is_left_out(consensus):
 
 @pytest.mark.slow
 def test_a_third_of_a_dozen_images(consensus):
-    clean = jaxcal.stack([problem(seed, images=12, noise_mm=1.0) for seed in range(128)])
-    keys = jax.random.split(jax.random.key(5), 128)
+    clean = jaxcal.stack([problem(seed, images=12, noise_mm=1.0) for seed in range(64)])
+    keys = jax.random.split(jax.random.key(5), 64)
     spoilt, outlier = jax.vmap(lambda k, p: contaminate(k, p, 0.3, "mixed"))(keys, clean)
     found = consensus(spoilt)
     wrong = np.any(np.asarray(found.keep) != 1 - np.asarray(outlier), axis=1)
-    assert wrong.sum() <= 2
+    assert wrong.sum() <= 1
 
 
 @pytest.mark.slow

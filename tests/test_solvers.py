@@ -181,8 +181,11 @@ LONG = [pytest.param(name, marks=pytest.mark.slow) for name in LATER]
 
 
 @pytest.mark.parametrize("name", [*list(DERIVATIVES)[:3], *LONG])
-def test_derivatives_in_both_modes_are_finite_differences(name):
-    """By poses, measurements and given SDs; forward, and its transpose, by one program."""
+def test_derivatives_are_finite_differences(name):
+    """By poses, measurements and given SDs; of the first three forward as well, by one program.
+
+    The gradient is the transpose of the same rules, and with both the others compile far longer.
+    """
     start = of_channels() if name == "channels" else noisy(12)
     rng = np.random.default_rng(0)
     weight = jnp.asarray(rng.normal(size=(4, 4)))
@@ -209,6 +212,9 @@ def test_derivatives_in_both_modes_are_finite_differences(name):
 
     @jax.jit
     def everything(data):
+        if name in LATER:
+            (found, facts), gradient = jax.value_and_grad(value, has_aux=True)(data)
+            return found, None, gradient, facts
         found, push, facts = jax.linearize(value, data, has_aux=True)
         (gradient,) = jax.linear_transpose(push, data)(jnp.ones_like(found))
         return found, push(along), gradient, facts
@@ -217,12 +223,14 @@ def test_derivatives_in_both_modes_are_finite_differences(name):
     assert valid
     assert status == jaxcal.Status.CONVERGED
     leaves = zip(jax.tree.leaves(gradient), jax.tree.leaves(along), strict=True)
-    np.testing.assert_allclose(forward, sum(jnp.sum(a * b) for a, b in leaves), rtol=1e-9)
+    back = sum(np.sum(a * b) for a, b in leaves)
+    if forward is not None:
+        np.testing.assert_allclose(forward, back, rtol=1e-9)
     step = 1e-5
     ends = [
         everything(jax.tree.map(lambda v, d, h=h: v + h * d, data, along))[0] for h in (step, -step)
     ]
-    np.testing.assert_allclose(forward, (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
+    np.testing.assert_allclose(back, (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
 
 
 @pytest.mark.slow
