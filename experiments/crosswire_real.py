@@ -24,7 +24,7 @@ import jaxcal
 from jaxcal.calibration.options import Method
 from jaxcal.calibration.resampling import CrossValidation
 from jaxcal.cli.cache import enable_compilation_cache
-from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.misfits import misfits
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.text import read_crosswire, read_poses
 
@@ -83,7 +83,7 @@ def crosswire(folder: Path) -> tuple[list[list[object]], list[str], np.ndarray]:
         f"not used: {gained:.1f} +- {error:.1f} in leave-one-out log density.",
         f"The elevational residuals have kurtosis {kurtosis[2]:.1f} (Gaussian 3, uniform 1.8): "
         "heavy-tailed, so no bound fits them.",
-        *(f"The noise model is contradicted: {text}." for text in messages.misfits(joint.numpy())),
+        *(f"The noise model is contradicted: {text}." for text in misfits(joint.numpy())),
         f"No image moves the transform by more than {np.nanmax(held_joint.influence):.2f} of its "
         f"SDs, and the robust solve leaves out {int(np.sum(robust.outlier))}.",
     ]

@@ -23,7 +23,8 @@ from jaxtyping import Array
 
 import jaxcal
 from jaxcal.cli.cache import enable_compilation_cache
-from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.misfits import misfits
+from jaxcal.diagnostics.outliers import outliers, suspects
 from jaxcal.study.laws import OffsetLaw
 
 SEED = 20261124
@@ -80,13 +81,13 @@ def main() -> None:
                 suspected = left = named = 0
                 for k in range(trials):
                     one = result[k]
-                    suspects, outliers = messages.suspects(one), messages.outliers(one)
-                    suspected += bool(suspects)
-                    left += bool(outliers)
-                    complaints = messages.misfits(one)
+                    suspicious, wrong = suspects(one), outliers(one)
+                    suspected += bool(suspicious)
+                    left += bool(wrong)
+                    complaints = misfits(one)
                     for words, kind in KINDS.items():
                         said[kind] += any(words in text for text in complaints)
-                    found = {each["image"] for each in suspects} | set(outliers)
+                    found = {each["image"] for each in suspicious} | set(wrong)
                     if fault == "three images":
                         named += bool(found & {11, 12, 13})
                     elif fault == "drift":

@@ -24,7 +24,7 @@ from jaxcal.calibration.result import Status
 from jaxcal.data.poses import check_poses
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
-from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.outliers import images_that_stand_out, listed_departures
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
@@ -117,9 +117,9 @@ class Pivot(eqx.Module):
                 f"not observable: these poses do not determine the tip along ({direction}) of the "
                 "tool's frame; tilt the tool about a further axis"
             )
-        named = messages.images_that_stand_out(self)
+        named = images_that_stand_out(self)
         if named:
-            told = messages.listed_departures(self, AXES)
+            told = listed_departures(self, AXES)
             verb = "left out" if self.robust else "kept"
             found.append(f"{verb} {len(named)} poses that do not fit the rest: {told}")
         return found

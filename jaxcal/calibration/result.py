@@ -378,16 +378,16 @@ class Calibration:
     @property
     def warnings(self) -> list[str]:
         """What a person should know before using this answer, in words (one problem)."""
-        from jaxcal.diagnostics import messages
+        from jaxcal.diagnostics.warnings import warnings
 
-        return messages.warnings(self)
+        return warnings(self)
 
     @property
     def observability(self) -> dict[str, float | str | None]:
         """condition, weakest_direction (text), weakest_sd_mm, known_only_from_prior (text)."""
-        from jaxcal.diagnostics import messages
+        from jaxcal.diagnostics.directions import observability
 
-        return messages.observability(self)
+        return observability(self)
 
     def __getitem__(self, index: Any) -> Calibration:
         """Some calibrations of a batch.

@@ -42,7 +42,7 @@ def _record(result: Pivot) -> dict[str, Any]:
     import numpy as np
 
     from jaxcal.calibration.pivot import AXES
-    from jaxcal.diagnostics import messages
+    from jaxcal.diagnostics.outliers import images_that_stand_out, outlier_reasons
     from jaxcal.report.record import plain
 
     mask, covariance = np.asarray(result.mask), np.asarray(result.covariance)
@@ -58,8 +58,8 @@ def _record(result: Pivot) -> dict[str, Any]:
             "sigma_mm": float(result.sigma),
             "rms_mm": float(result.rms),
             "robust": result.robust,
-            "outliers": messages.images_that_stand_out(result),
-            "outlier_reasons": messages.outlier_reasons(result, AXES),
+            "outliers": images_that_stand_out(result),
+            "outlier_reasons": outlier_reasons(result, AXES),
             "warnings": result.warnings,
         }
     )

@@ -28,7 +28,7 @@ from jaxcal.design.information import (
     known_information,
 )
 from jaxcal.design.noise import Noise
-from jaxcal.diagnostics.messages import direction_in_words
+from jaxcal.diagnostics.directions import direction_in_words
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import real_array
 

@@ -5,7 +5,8 @@
     residual_checks  images that stand out, the fit of the noise model, which poses to add
     unmodelled       errors that the model leaves out and that the residuals show
     summary          all of these for a calibration or a batch
-    messages         the same in words
+    directions, law_words, misfits, outliers   the same in words
+    warnings         everything that a person should know before using an answer
     intervals        confidence intervals and target registration error
     metrics          reconstruction precision, reproducibility
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jaxcal.diagnostics.messages import DRIFT_SCORE, in_two_groups
+from jaxcal.diagnostics.misfits import DRIFT_SCORE, in_two_groups
 
 CHANCE = 3.0
 """SDs of chance beyond which the residuals contradict the stated error."""

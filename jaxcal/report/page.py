@@ -23,8 +23,8 @@ from jaxcal.calibration.result import Calibration
 from jaxcal.calibration.saved import SaveFormat, transform_from_record
 from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Recording
-from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.metrics import reconstruct
+from jaxcal.diagnostics.outliers import outliers
 from jaxcal.io.atomic import check_writable, write_text
 from jaxcal.io.outputs import check_output
 from jaxcal.report import svg
@@ -384,7 +384,7 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
 def _close_up(
     answer: Calibration, cloud: Float[np.ndarray, "n 3"], shown: np.ndarray
 ) -> dict[str, Any]:
-    point, named = np.asarray(answer.point), set(messages.outliers(answer))
+    point, named = np.asarray(answer.point), set(outliers(answer))
     lines: list[dict[str, Any]] = []
     covariance = np.asarray(answer.point_covariance, float)
     reach = 0.0
@@ -436,7 +436,7 @@ def _bar(size: float) -> float:
 
 def _residuals(record: dict[str, Any], answer: Calibration) -> str:
     used = np.flatnonzero(np.asarray(answer.mask) > 0)
-    named = [image for image in messages.outliers(answer) if image in used]
+    named = [image for image in outliers(answer) if image in used]
     residual = np.asarray(answer.residual)[used]
     images = used.astype(float).tolist()
     first = svg.series(

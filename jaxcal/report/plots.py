@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from jaxcal import InputError
 from jaxcal.calibration.result import Calibration
 from jaxcal.data.poses import targets_in_images
-from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.image_points import mean_of_squares
 from jaxcal.diagnostics.influence import KINDS, in_image, influence_of
 from jaxcal.diagnostics.intervals import image_jacobian, tre_at
+from jaxcal.diagnostics.outliers import outliers
 from jaxcal.report.accuracy import region_of
 from jaxcal.report.summary import recording_of
 from jaxcal.runtime.array_types import Float
@@ -95,7 +95,7 @@ def plot_residuals(calibration: Calibration) -> Figure:
     residual = np.asarray(answer.residual)
     # A solve that failed has no residuals to draw.
     used = np.flatnonzero((np.asarray(answer.mask) > 0) & np.isfinite(residual).all(axis=1))
-    named = np.intersect1d(messages.outliers(answer), used)
+    named = np.intersect1d(outliers(answer), used)
     figure = canvas(PAGE_MM, 110.0)
     panels = figure.subplots(3, 1, sharex=True, sharey=True)
     for panel, (name, axis) in zip(

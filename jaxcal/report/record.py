@@ -13,8 +13,10 @@ from jaxcal.calibration.result import Calibration
 from jaxcal.calibration.saved import FORMAT, VERSION
 from jaxcal.data.poses import rotation_angle
 from jaxcal.data.recording import Images, Recording, Truth
-from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.law_words import offset_law
 from jaxcal.diagnostics.metrics import reconstruction_precision
+from jaxcal.diagnostics.misfits import noise_model
+from jaxcal.diagnostics.outliers import outlier_reasons, outliers, suspects
 from jaxcal.model.unknowns import in_image, tangent_names
 from jaxcal.report.accuracy import accuracy_record, settle
 from jaxcal.report.certified import certificate_record
@@ -94,7 +96,7 @@ def calibration_record(
         "point_mm": answer.point,
         "elevation_mm": answer.elevation,
         "elevation_sd_mm": answer.elevation_sd,
-        "offset_law": messages.offset_law(answer),
+        "offset_law": offset_law(answer),
         "sigma_lateral_mm": answer.sigma[0],
         "sigma_range_mm": answer.sigma[1],
         "sigma_elevation_mm": answer.sigma[2],
@@ -120,10 +122,10 @@ def calibration_record(
         "scaled_kkt_residual": answer.stationarity,
         "robust": result.robust,
         "wrong_frames": None if result.status == "failed" else result.wrong_frames,
-        "noise_model": messages.noise_model(answer),
-        "outliers": messages.outliers(answer),
-        "outlier_reasons": messages.outlier_reasons(answer),
-        "suspects": messages.suspects(answer),
+        "noise_model": noise_model(answer),
+        "outliers": outliers(answer),
+        "outlier_reasons": outlier_reasons(answer),
+        "suspects": suspects(answer),
         "warnings": result.warnings,
         **accuracy_record(result, recording, tre_points),
     }

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.report.accuracy import FAIR_MM
 from jaxcal.report.paragraphs import listed
 from jaxcal.report.resampled import resampled_sentences
@@ -252,7 +252,7 @@ def certainty(record: dict[str, Any]) -> list[str]:
         f"{_AXES[about]} axis (one standard deviation)."
     ]
     unseen = record["observability"]["known_only_from_prior"]
-    if unseen and record["prior"] in messages.TUNED:
+    if unseen and record["prior"] in TUNED:
         lines.append(
             f"The images do not show {unseen}: it rests on the assumption that the target lay "
             "evenly on both sides of the image plane."

@@ -53,6 +53,12 @@ def is_number(value: Any) -> bool:
     return number.ndim == 0 and bool(np.isfinite(number))
 
 
+def finite_or_none(value: Any) -> float | None:
+    """A number for JSON, which knows neither NaN nor infinity."""
+    number = float(value)
+    return number if np.isfinite(number) else None
+
+
 def array_module(*values: object) -> Any:
     """What to compute with: jax.numpy where one of the values is traced, otherwise numpy."""
     return sys.modules["jax"].numpy if is_traced(*values) else np

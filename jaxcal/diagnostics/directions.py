@@ -1,0 +1,87 @@
+"""Directions of the unknowns in words: the least known one, and which images would tell it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxcal.model.unknowns import TABLE, block_slice
+from jaxcal.runtime.array_types import AnyArray
+from jaxcal.runtime.arrays import finite_or_none
+
+if TYPE_CHECKING:
+    from jaxcal.calibration.result import Calibration
+
+WORTH = 0.7
+"""A kind of further image is advised if it tells at least this share of what the best one tells."""
+
+
+def direction_in_words(vector: AnyArray, blocks: tuple[str, ...]) -> str:
+    """Name a direction of the unknowns.
+
+    Args:
+        vector: components in scaled units (mm at the lever arm), in the order of ``blocks``.
+        blocks: the unknowns.
+    """
+    parts = {}
+    for block in blocks:
+        parts[block] = np.asarray(vector[block_slice(blocks, block)], dtype=float)
+    size = {block: float(np.linalg.norm(part)) for block, part in parts.items()}
+    total = float(np.linalg.norm(vector))
+    if not np.isfinite(total) or total == 0:
+        return "unknown"
+    # X's own blocks are named first: to a reader the target's motion is a consequence of X's.
+    leading = [block for block in blocks if size[block] > 0.35 * total]
+    named = (
+        [block for block in leading if block != "point"]
+        or leading
+        or [max(size, key=lambda block: size[block])]
+    )
+    words = [_block_in_words(block, parts[block]) for block in named]
+    if "point" in leading and "point" not in named:
+        words.append("the target moving along")
+    return " with ".join([words[0], " and ".join(words[1:3])] if words[1:] else words)
+
+
+def _block_in_words(block: str, part: np.ndarray) -> str:
+    row, unit = TABLE[block], part / np.linalg.norm(part)
+    largest = int(np.argmax(np.abs(unit)))
+    if abs(unit[largest]) > 0.9:
+        return row.words.format(row.axes[largest])
+    # Rounded before it is formatted, and without the sign of a zero.
+    unit = np.round(unit * np.sign(unit[largest]), 2) + 0.0
+    return row.oblique.format(*unit)
+
+
+def observability(result: Calibration) -> dict[str, float | str | None]:
+    """The least known direction, and the direction known only from the prior, as plain values."""
+    from_prior = None
+    if np.any(result.prior_direction != 0):
+        from_prior = direction_in_words(result.prior_direction, result.blocks)
+    return {
+        "condition": finite_or_none(result.condition),
+        "weakest_direction": direction_in_words(result.weakest, result.blocks),
+        "weakest_sd_mm": finite_or_none(result.weakest_sd),
+        "known_only_from_prior": from_prior,
+        "advice": poses_to_add(result),
+    }
+
+
+def poses_to_add(result: Calibration) -> str:
+    """Which further images would tell most about the weakest direction, in words."""
+    gain = np.nan_to_num(np.asarray(result.inspection.gain, dtype=float))
+    if not gain.max() > 0:
+        return "add images with the probe tilted about each of its axes"
+    worth = gain >= WORTH * gain.max()
+    tilts = [name for name, good in zip(TABLE["rotation"].axes, worth[:3], strict=True) if good]
+    parts = []
+    if tilts:
+        listed = " and ".join([", ".join(tilts[:-1]), tilts[-1]] if tilts[1:] else tilts)
+        plural = "axes" if tilts[1:] else "axis"
+        parts.append(f"poses tilted by 20 to 30 degrees about the {listed} {plural}")
+    if worth[3]:
+        parts.append("images with the target nearer and farther")
+    if worth[4]:
+        parts.append("images with the target farther to both sides")
+    return "add " + ", and ".join(parts)

@@ -1,0 +1,151 @@
+"""Images that do not fit the rest (outliers), and those that hardly do (suspects), in words."""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Protocol, TypedDict, runtime_checkable
+
+import numpy as np
+
+from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
+from jaxcal.runtime.array_types import AnyArray
+from jaxcal.runtime.arrays import finite_or_none
+
+if TYPE_CHECKING:
+    from jaxcal.calibration.result import Calibration
+
+COMPONENTS = ("lateral", "range", "elevational")
+SUSPECTED = 0.02
+"""Half of this is the share of recordings with Gaussian errors in which chance alone makes an
+image suspect."""
+
+
+class OutlierReason(TypedDict):
+    """Why an image is an outlier: its most deviant component, and by how many SDs (signed)."""
+
+    image: int
+    component: str
+    sds: float | None
+    left_out: bool
+
+
+@runtime_checkable
+class HasOutliers(Protocol):
+    """A result whose images may be outliers."""
+
+    @property
+    def outlier(self) -> AnyArray:
+        """(n,) 1 where an image is an outlier."""
+        ...
+
+    @property
+    def departure(self) -> AnyArray:
+        """(n, 3) errors of each image in SDs."""
+        ...
+
+    @property
+    def mask(self) -> AnyArray:
+        """(n,) 1 for used images."""
+        ...
+
+
+def outliers(result: Calibration) -> list[int]:
+    """Images that do not fit the rest (see :mod:`jaxcal.solvers.consensus`)."""
+    return images_that_stand_out(result)
+
+
+def images_that_stand_out(result: HasOutliers) -> list[int]:
+    """Indices of the images marked as outliers."""
+    return [int(image) for image in np.flatnonzero(np.asarray(result.outlier) > 0)]
+
+
+def outlier_reasons(
+    result: HasOutliers, components: tuple[str, ...] = COMPONENTS
+) -> list[OutlierReason]:
+    """For every outlier: its most deviant component, by how many SDs, and whether it was left out.
+
+    The keys are ``image``, ``component`` (a name from ``components``), ``sds`` (signed) and
+    ``left_out``.
+    """
+    departure = np.asarray(result.departure, dtype=float)
+    found: list[OutlierReason] = []
+    for image in images_that_stand_out(result):
+        worst = int(np.argmax(np.abs(departure[image])))
+        reason: OutlierReason = {
+            "image": image,
+            "component": components[worst],
+            "sds": finite_or_none(departure[image, worst]),
+            "left_out": bool(np.asarray(result.mask)[image] == 0),
+        }
+        found.append(reason)
+    return found
+
+
+def listed_departures(result: HasOutliers, components: tuple[str, ...] = COMPONENTS) -> str:
+    """The first ten outliers with component and SDs, in words."""
+    reasons = outlier_reasons(result, components)
+    told = [
+        f"{reason['image']} ({reason['component']}, {abs(reason['sds'] or 0):.0f} SDs)"
+        for reason in reasons[:10]
+    ]
+    return ", ".join(told) + (", ..." if len(reasons) > 10 else "")
+
+
+def suspects(result: Calibration) -> list[OutlierReason]:
+    """Images in use that deviate by less than outliers do, but by more than chance explains.
+
+    With Gaussian errors, the largest range error of all images (in SDs taken from medians) exceeds
+    the limit in one recording of a hundred. Only range errors count: lateral errors grow with the
+    depth and offsets may have any law, so large ones are no sign of a wrong image.
+    """
+    count = int(result.images_used)
+    if count < FEWEST_TO_CHECK:
+        return []
+    # The second factor corrects medians of few images; it is from simulated Gaussian errors.
+    limit = NormalDist().inv_cdf(1 - SUSPECTED / (4 * count)) * (1 + 8 / count)
+    departure = np.asarray(result.departure, dtype=float)
+    departure = np.where(np.asarray(result.mask)[:, None] > 0, departure, 0.0)
+    departure[:, [0, 2]] = 0.0
+    departure[images_that_stand_out(result)] = 0.0
+    found: list[OutlierReason] = []
+    for image in np.flatnonzero((np.abs(departure) > limit).any(axis=1)):
+        found.append(
+            {
+                "image": int(image),
+                "component": COMPONENTS[1],
+                "sds": finite_or_none(departure[image, 1]),
+                "left_out": False,
+            }
+        )
+    return found
+
+
+def suspects_in_words(result: Calibration) -> list[str]:
+    """The suspects in words; successive ones with errors of one kind and sign are joined."""
+    runs: list[list[OutlierReason]] = []
+    for each in suspects(result):
+        last = runs[-1][-1] if runs else None
+        alike = last is not None and each["component"] == last["component"]
+        one_side = last is not None and (each["sds"] or 0) * (last["sds"] or 0) > 0
+        if last is not None and alike and one_side and each["image"] == last["image"] + 1:
+            runs[-1].append(each)
+        else:
+            runs.append([each])
+    told = []
+    for run in runs[:10]:
+        sizes = sorted(abs(each["sds"] or 0) for each in run)
+        first, last = run[0]["image"], run[-1]["image"]
+        if first == last:
+            told.append(f"{first} ({run[0]['component']} error, {sizes[0]:.1f} SDs)")
+        else:
+            told.append(
+                f"{first} to {last} in a row ({run[0]['component']} errors to one side, "
+                f"{sizes[0]:.1f} to {sizes[-1]:.1f} SDs)"
+            )
+    if not told:
+        return []
+    listed = ", ".join(told) + (", ..." if len(runs) > 10 else "")
+    return [
+        f"suspicious images, too far off for chance and not far enough to be left out: {listed}; "
+        "look at them"
+    ]

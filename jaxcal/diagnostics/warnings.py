@@ -1,0 +1,196 @@
+"""Everything that a person should know before using a calibration."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxcal.diagnostics.directions import observability
+from jaxcal.diagnostics.misfits import misfits
+from jaxcal.diagnostics.outliers import listed_departures, outliers, suspects_in_words
+from jaxcal.diagnostics.uncertainty import TUNED
+from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
+
+if TYPE_CHECKING:
+    from jaxcal.calibration.result import Calibration
+
+IMPLAUSIBLE_RMS_MM = 10.0
+"""Residuals with a larger root mean square do not come from a target within the beam."""
+USUAL_PIXEL_MM = (0.02, 1.0)
+"""Estimated pixel sizes outside this interval lead to a warning."""
+STEADY = 1e-3
+"""If the scaled KKT residual of a stopped alternation is larger, there is a warning."""
+WEAK_MM = 1.5
+"""If the SD of the weakest direction (mm at the target) is larger, there is a warning."""
+WEAK_TRANSLATION_MM = 0.3
+WEAK_SHARE = 0.7
+"""If the SD of sound speed or delay exceeds this share of its prior SD, the data added little."""
+
+
+def warnings(result: Calibration) -> list[str]:
+    """Everything that a person should know before using the answer, most important first."""
+    found: list[str] = []
+    status = result.status
+    sight = observability(result)
+    weakest, from_prior = sight["weakest_direction"], sight["known_only_from_prior"]
+    bounded = result.prior == "bounded"
+    resting = int(np.sum(result.at_bound > 0))
+    used = int(result.images_used)
+    if status == "failed":
+        found.append("the solve failed: its result holds no usable numbers")
+        return found
+    if result.wrong_frames is not None:
+        # The answer has no meaning, so no other warning is of use.
+        return [result.wrong_frames]
+    if status == "unobservable":
+        found.append(f"not observable: these images do not determine {weakest}; {sight['advice']}")
+    if status == "max_iterations":
+        found.append(
+            "not converged: the iteration limit was reached "
+            f"(scaled KKT residual {float(result.stationarity):.1e})"
+        )
+    found += result.notes
+    rms = float(result.rms)
+    if rms > IMPLAUSIBLE_RMS_MM:
+        found.append(
+            f"residuals of {rms:.1f} mm are larger than a beam is thick: either some images are "
+            "far off, or the poses are wrong (order or signs of their numbers, units, direction)"
+        )
+    found += _weak_direction(result)
+    if bounded and from_prior:
+        held = f"{resting} of {used} images rest on it"
+        if resting == 0:
+            held = "no image rests on it, so any value in an interval fits equally well"
+        found.append(f"{from_prior} is fixed by nothing but the bound on the offsets: {held}")
+    if result.searched_start:
+        found.append(
+            "the closed-form start was unusable (degenerate poses or points, or too few images for "
+            "their noise); the start was searched for among 24 rotations"
+        )
+    if result.method == "alternating" and result.tolerance_met and result.stationarity > STEADY:
+        found.append(
+            "the alternation stopped on its tolerance while its objective was still falling "
+            f"(scaled KKT residual {float(result.stationarity):.1e})"
+        )
+    found += _bound_not_kept(result)
+    if result.prior in TUNED and not result.sigma_tuned:
+        found.append(
+            "noise SDs were held fixed, not estimated"
+            + (
+                f": {used} images are fewer than the {MINIMUM_SELF_TUNING} that it takes"
+                if used < MINIMUM_SELF_TUNING
+                else ""
+            )
+        )
+    if np.any(result.sigma_floored):
+        names = [
+            name
+            for name, floored in zip(
+                ("lateral", "range", "elevational"), result.sigma_floored, strict=True
+            )
+            if floored
+        ]
+        found.append(
+            f"the {' and '.join(names)} error is too small to estimate; its SD rests on its floor"
+        )
+    if result.prior in TUNED and status == "converged":
+        sd = float(np.sqrt(result.covariance[1, 1]))
+        if sd > WEAK_TRANSLATION_MM:
+            law = result.offset_law
+            on = "a mean of the offsets that the data hardly show"
+            if law is None or not law.mean_probability > 0.5:
+                on = "offsets that average zero"
+            found.append(
+                "translation along the elevational axis is weakly seen "
+                f"(SD {sd:.2f} mm) and rests on {on}"
+            )
+    found += _medium_warnings(result)
+    found += _unusual_pixels(result)
+    if status == "converged":
+        found += [f"noise model: {text}" for text in misfits(result)]
+    if status == "converged":
+        found += suspects_in_words(result)
+    named = outliers(result)
+    if named and result.robust:
+        found.append(
+            f"left out {len(named)} of {used + len(named)} images that do not fit the rest: "
+            f"{listed_departures(result)}"
+        )
+    elif named:
+        found.append(
+            f"images that do not fit the rest: {listed_departures(result)}; a robust solve "
+            "(--robust) leaves them out"
+        )
+    return found
+
+
+def _bound_not_kept(result: Calibration) -> list[str]:
+    """Whether the offsets exceed the bound that should have cut off their laws."""
+    law, problem = result.offset_law, result.problem
+    if law is None or bool(law.weighed) or problem is None or problem.max_elevation is None:
+        return []
+    used = np.asarray(problem.mask) > 0
+    size = np.abs(np.asarray(result.elevation))
+    beyond = used & (size > np.asarray(problem.max_elevation))
+    if not beyond.any():
+        return []
+    return [
+        f"the bound on the offsets was not kept: {beyond.sum()} of {used.sum()} images are farther "
+        f"from the plane, up to {size[used].max():.2g} mm; is the bound too small, or not in mm?"
+    ]
+
+
+def _weak_direction(result: Calibration) -> list[str]:
+    """A warning about the weakest direction if its SD is large, and what would help."""
+    sight = observability(result)
+    sd = sight["weakest_sd_mm"]
+    if result.status != "converged" or not isinstance(sd, float) or sd <= WEAK_MM:
+        return []
+    only = ""
+    if result.prior != "none" and abs(float(result.weakest @ result.prior_direction)) > 0.7:
+        only = ", known only from what is believed of the offsets"
+    return [
+        f"weakly determined: {sight['weakest_direction']} (SD {sd:.1f} mm at the target{only}); "
+        f"{sight['advice']}"
+    ]
+
+
+def _unusual_pixels(result: Calibration) -> list[str]:
+    """A warning about estimated pixel sizes that hardly any image has."""
+    if result.scale_mm_per_px is None or "scale" not in result.blocks:
+        return []
+    lateral, axial = (float(size) for size in np.asarray(result.scale_mm_per_px))
+    least, largest = USUAL_PIXEL_MM
+    if least <= min(lateral, axial) and max(lateral, axial) <= largest:
+        return []
+    return [
+        f"pixels of {lateral:.3g} x {axial:.3g} mm are unusual for ultrasound ({least:g} to "
+        f"{largest:g} mm): are the poses' translations in mm?"
+    ]
+
+
+def _medium_warnings(result: Calibration) -> list[str]:
+    """Warnings about a sound speed or a delay that the data hardly determine."""
+    found = []
+    speed = (result.sound_speed_m_s, result.sound_speed_sd_m_s, result.sound_speed_prior_m_s)
+    delay = (result.delay_s, result.delay_sd_s, result.delay_prior_s)
+    for name, (value, sd, believed), unit in (
+        ("sound speed", speed, "m/s"),
+        ("delay", delay, "us"),
+    ):
+        if value is None or sd is None or not np.isfinite(sd):
+            continue
+        factor = 1e6 if unit == "us" else 1.0
+        shown = f"{factor * float(value):.4g} +- {factor * float(sd):.2g} {unit}"
+        if believed is not None and float(sd) > WEAK_SHARE * float(believed):
+            found.append(
+                f"the {name} is hardly seen in these data: {shown} is little more than what was "
+                f"believed before (SD {factor * float(believed):.2g} {unit})"
+            )
+        elif believed is None and name == "delay":
+            found.append(
+                f"the delay ({shown}) is nearly a shift of the transform along the axial axis: "
+                "only times of flight tell the two apart"
+            )
+    return found
