@@ -16,8 +16,8 @@ from scipy.stats import multivariate_normal, norm, t, uniform
 
 import jaxcal
 from jaxcal import InputError
-from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.intervals import degrees_of_freedom
+from jaxcal.diagnostics.law_words import offset_law
 from jaxcal.model.distributions import FAMILIES, UNIFORM
 from jaxcal.model.shapes import tilted
 from jaxcal.solvers.auto import Answers, median, weights
@@ -332,7 +332,7 @@ def test_a_one_sided_law_is_found_and_mended():
     assert precision(auto) < 0.5 * precision(plain)
     np.testing.assert_allclose(np.sum(law.probability, axis=1), 1, rtol=1e-9)
     one = jax.tree.map(lambda leaf: leaf[int(np.argmax(law.mean_probability))], auto)
-    said = messages.offset_law(one.numpy())
+    said = offset_law(one.numpy())
     assert said is not None
     assert "about a mean of" in str(said["words"])
     # The offsets are 0 to 5 mm: their mean is 2.5 mm on the side that the image frame tells.

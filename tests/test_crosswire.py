@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.outliers import suspects
 from jaxcal.io.text import read_crosswire
 
 
@@ -43,9 +43,9 @@ def test_self_tuned(recording):
 
 def names_what_an_eye_sees(result: jaxcal.Calibration) -> None:
     """Images 11 to 13 stand out in range, and the elevational errors change slowly."""
-    suspects = messages.suspects(result)
-    assert {each["image"] for each in suspects} >= {11, 12, 13}
-    assert all(each["component"] == "range" for each in suspects)
+    found = suspects(result)
+    assert {each["image"] for each in found} >= {11, 12, 13}
+    assert all(each["component"] == "range" for each in found)
     assert any("11 to 13 in a row (range errors to one side" in text for text in result.warnings)
     drifting = [text for text in result.warnings if "elevational offsets" in text]
     assert any("successive images" in text or "drift in the course" in text for text in drifting)

@@ -12,8 +12,8 @@ from conftest import problem
 from scipy import stats
 
 import jaxcal
-from jaxcal.diagnostics import messages
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.misfits import MISFIT_SCORE, noise_model
 from jaxcal.diagnostics.residual_checks import (
     MISFITS,
     check_noise_model,
@@ -97,7 +97,7 @@ def test_few_false_alarms_and_true_ones(scores):
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(200, 40, 3))
     _, misfit = run(normal)
-    limit = messages.MISFIT_SCORE
+    limit = MISFIT_SCORE
     alarms = (np.abs(misfit) > limit).any(axis=(1, 2))
     # 1.2 % expected: more than 9 of 200 in one of a thousand such tests.
     assert alarms.sum() <= 9
@@ -127,4 +127,4 @@ def test_complaints_are_warnings_in_words():
     )
     few = jaxcal.calibrate(replace(data, mask=data.mask.at[12:].set(0.0)), "conventional")
     assert not few.inspection.misfit.any()
-    assert not messages.noise_model(few)["checked"]
+    assert not noise_model(few)["checked"]

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 import jaxcal
-from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.law_words import _law_in_words, offset_law
 from jaxcal.diagnostics.offset_fit import CONTRADICTED, contradicted, distribution
 from jaxcal.model.distributions import FAMILIES
 
@@ -43,13 +43,13 @@ def test_many_offsets_tell_the_laws_apart():
 
 
 def test_words_never_name_a_law_that_the_offsets_contradict():
-    said = messages._law_in_words({"gaussian": 1.0, "uniform": 0.0, "bell": 0.0, "student": 0.0},
+    said = _law_in_words({"gaussian": 1.0, "uniform": 0.0, "bell": 0.0, "student": 0.0},
                                   ["gaussian", "bell", "student"])  # fmt: skip
     assert "look uniform between edges" in said
     assert said.startswith("The estimate rests on offsets that are Gaussian (100 %), but")
-    none = messages._law_in_words({"gaussian": 1.0, "uniform": 0.0}, list(FAMILIES))
+    none = _law_in_words({"gaussian": 1.0, "uniform": 0.0}, list(FAMILIES))
     assert none.startswith("None of the laws that were compared fits the offsets")
-    fine = messages._law_in_words({"gaussian": 0.2, "uniform": 0.8}, ["student"])
+    fine = _law_in_words({"gaussian": 0.2, "uniform": 0.8}, ["student"])
     assert fine == (
         "Of the laws that were compared, the data prefer offsets that are uniform between edges "
         "(80 %) or Gaussian (20 %)"
@@ -60,7 +60,7 @@ def test_words_never_name_a_law_that_the_offsets_contradict():
 def test_five_thousand_uniform_offsets_are_not_called_gaussian():
     protocol = jaxcal.Protocol(images=5000, elevation_mm=1.0, noise_mm=0.2)
     result = jaxcal.calibrate(jaxcal.simulate_recording(protocol, 0))
-    law = messages.offset_law(result.numpy())
+    law = offset_law(result.numpy())
     assert law is not None
     words = str(law["words"])
     assert "uniform between edges" in words

@@ -13,7 +13,7 @@ from conftest import problem
 
 import jaxcal
 from jaxcal.cli.main import main
-from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.outliers import outlier_reasons, outliers
 from jaxcal.model.unknowns import RIGID
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.study.contamination import OUTLIER_KINDS, contaminate
@@ -85,8 +85,8 @@ def test_robust_solve_is_that_of_the_good_images():
     np.testing.assert_array_equal(robust.mask, 1 - outlier)
     first = jax.tree.map(lambda leaf: leaf[0], robust)
     named = np.flatnonzero(outlier[0]).tolist()
-    assert messages.outliers(first) == named
-    reasons = messages.outlier_reasons(first)
+    assert outliers(first) == named
+    reasons = outlier_reasons(first)
     assert [reason["image"] for reason in reasons] == named
     assert all(abs(reason["sds"] or 0) > 6 and reason["left_out"] for reason in reasons)
     assert any("left out 15 of 50 images" in text for text in first.warnings)
@@ -98,12 +98,12 @@ def test_a_wrong_echo_is_told_by_its_range():
     spoilt = replace(data, measurements=data.measurements.at[7, 1].add(40.0))
     plain = jaxcal.calibrate(spoilt, "conventional", robust=False)
     robust = jaxcal.calibrate(spoilt, "conventional", robust=True)
-    reason = messages.outlier_reasons(robust)
+    reason = outlier_reasons(robust)
     assert [(r["image"], r["component"], r["left_out"]) for r in reason] == [(7, "range", True)]
     assert (reason[0]["sds"] or 0) < -100
     assert robust.status == "converged"
     assert float(robust.rms) < 0.2 * float(plain.rms)
-    assert 7 in messages.outliers(plain)
+    assert 7 in outliers(plain)
     assert any("--robust" in text for text in plain.warnings)
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Recording, make_images
-from jaxcal.diagnostics import messages
+from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.unmodelled import unmodelled
 from jaxcal.report.record import calibration_record
 
@@ -134,7 +134,7 @@ def test_a_second_echo_in_forty_per_cent_of_the_images_is_told_of(answers):
         record = calibration_record(result, spoilt)
         assert record["verdict"] == "uncertain"
         assert any("two groups" in words for words in record["tre"]["contradictions"])
-        assert any("come in two groups" in words for words in messages.misfits(result))
+        assert any("come in two groups" in words for words in misfits(result))
 
 
 def test_images_left_out_that_agree_among_themselves_are_told_of():
