@@ -25,9 +25,9 @@ from jaxcal.design.candidates import sobol_poses, sobol_sequence
 from jaxcal.design.criteria import check_criterion, gains, rp_weight, tre_weight, weight_of
 from jaxcal.design.greedy import Rules, are_alike
 from jaxcal.design.information import covariance_of, known_information
-from jaxcal.design.noise import _basis, _gamma_slopes
 from jaxcal.design.planning import Known
 from jaxcal.design.predict import curve
+from jaxcal.diagnostics.sd_by_place import basis_at, log_sd_slopes
 
 MOUNT = np.eye(4)
 MOUNT[:3, :3] = Rotation.from_rotvec([0.4, -0.8, 1.1]).as_matrix()
@@ -351,10 +351,10 @@ def test_sds_that_grow_with_depth_are_learned_and_moved_away_from():
     places = np.column_stack(
         [rng.uniform(-25, 25, count), np.zeros(count), rng.uniform(15, 85, count)]
     )
-    basis = _basis(places)
+    basis = basis_at(places)
     basis[:, 1:] -= basis[:, 1:].mean(axis=0)
     squared = np.exp(basis @ [0.0, 1.6, 0.0, 0.0]) * rng.chisquare(1, count)
-    slopes = _gamma_slopes(basis, squared / squared.mean())
+    slopes = 2 * log_sd_slopes(basis, squared, np.ones_like(squared))
     assert slopes[0] == pytest.approx(1.6, abs=0.2)
     assert np.abs(slopes[1:]).max() < 0.3
     noise = Noise.of_probe(jaxcal.LinearProbe())

@@ -20,6 +20,7 @@ from jaxcal.diagnostics.residual_checks import (
     kurtosis_score,
     skewness_score,
 )
+from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import inverses, quadratic
 from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import Points
@@ -114,6 +115,28 @@ def test_few_false_alarms_and_true_ones(scores):
         _, misfit = run(errors)
         found = np.asarray(misfit)[:, MISFITS.index(name), column] > limit
         assert found.mean() > 0.35, name
+
+
+def test_range_errors_are_judged_by_those_at_their_place():
+    """Three wrong images stand out in the middle, while the large errors of corners do not."""
+    rng = np.random.default_rng(4)
+    lanes, count = 40, 200
+    x, z = rng.uniform(-25, 25, (lanes, count)), rng.uniform(15, 80, (lanes, count))
+    sd = np.exp(0.8 * (z / 50 - 1) + 0.8 * (x / 25) ** 2)
+    errors = sd * rng.normal(size=(lanes, count))
+    wrong = slice(0, 3)
+    x[:, wrong], z[:, wrong], errors[:, wrong] = 0.0, 40.0, 6.0
+    places = np.stack([x, np.zeros_like(x), z], axis=-1)
+
+    def in_robust_sds(errors):
+        return errors / (1.4826 * np.median(np.abs(errors), axis=1, keepdims=True))
+
+    before = in_robust_sds(errors)
+    after = in_robust_sds(errors / relative_sd(places, before, np.ones_like(errors)))
+    # The largest of 197 Gaussian errors exceeds 4.1 SDs in 0.8 % of the recordings.
+    assert (np.abs(before[:, 3:]).max(axis=1) > 4.1).mean() > 0.4
+    assert (np.abs(after[:, 3:]).max(axis=1) > 4.1).mean() < 0.1
+    assert (after[:, wrong] > 4.1).mean() > 0.9
 
 
 def test_complaints_are_warnings_in_words():

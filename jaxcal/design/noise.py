@@ -1,12 +1,10 @@
 """SDs of lateral position, range and elevational offset as functions of where the target is.
 
 Beams are worst in the corners of an image, but a plan for equal SDs puts most of its poses there.
-So the logarithm of each SD is a polynomial of the target's place,
-
-    ln s_k = a_k0 + a_k1 d + a_k2 d^2 + a_k3 x^2,   d = depth / 50 mm - 1,  x = lateral / 25 mm,
-
-learned from a calibration's residuals if there are enough images, and before that taken from the
-geometry of the probe. The elevational SD is that of the target's distance from the mid-plane.
+So the logarithm of each SD is a polynomial of the target's place
+(:mod:`jaxcal.diagnostics.sd_by_place`), learned from a calibration's residuals if there are enough
+images, and before that taken from the geometry of the probe. The elevational SD is that of the
+target's distance from the mid-plane.
 """
 
 from __future__ import annotations
@@ -18,6 +16,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.probe import Probe, check_probe
+from jaxcal.diagnostics.sd_by_place import basis_at, log_sd_slopes
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import is_number, real_array
 
@@ -27,11 +26,6 @@ if TYPE_CHECKING:
 FEWEST_TO_LEARN = 20
 """Fewest images from which SDs are learned as functions of the place."""
 
-_DEPTH_MM, _LATERAL_MM = 50.0, 25.0
-_PRIOR_SD = 0.3
-"""Prior SD of all coefficients but the first (our choice): a factor of e^0.3 for 50 mm of depth is
-common."""
-_SCORING_STEPS = 30
 _LEAST_SD_MM = 1e-3
 UNKNOWN_BY = 3.0
 """A factor by which SDs that are not tuned to data may be wrong."""
@@ -109,7 +103,7 @@ class Noise:
             ],
             axis=1,
         )
-        basis = _basis(place)
+        basis = basis_at(place)
         found, *_ = np.linalg.lstsq(basis, np.log(sigma))
         return cls(found.T, doubt)
 
@@ -117,9 +111,8 @@ class Noise:
     def learned(cls, result: Calibration, targets: Float[np.ndarray, "n 3"]) -> Noise:
         """The noise model from a calibration's SDs and residuals.
 
-        The variance of each error is a Gamma regression on the place with a logarithmic link
-        (Fisher scoring). A normal prior holds its coefficients near zero; at the images' mean the
-        variance is the calibration's own. With fewer than :data:`FEWEST_TO_LEARN` images, each SD
+        The slopes are those of the squared residuals; at the images' mean place the variance is the
+        calibration's own. With fewer than :data:`FEWEST_TO_LEARN` images, each SD
         is the same everywhere. For methods other than joint, which weigh all errors alike, it is so
         with any number of images, and the three SDs are equal.
 
@@ -143,42 +136,14 @@ class Noise:
         model = cls.constant(sigma, doubt)
         if count < FEWEST_TO_LEARN:
             return model
-        basis = _basis(targets[used])
+        basis = basis_at(targets[used])
         basis[:, 1:] -= (mean := basis[:, 1:].mean(axis=0))
-        squared = np.asarray(answer.residual, float)[used][:, [0, 2, 1]] ** 2
-        coefficients = model.coefficients.copy()
-        for row in range(3):
-            slopes = _gamma_slopes(basis, squared[:, row] / max(squared[:, row].mean(), 1e-12))
-            coefficients[row, 1:] = 0.5 * slopes
-            coefficients[row, 0] -= 0.5 * slopes @ mean
-        return replace(model, coefficients=coefficients)
+        squared = np.asarray(answer.residual, float)[used][:, [0, 2, 1]].T ** 2
+        slopes = log_sd_slopes(basis, squared, np.ones_like(squared))
+        first = model.coefficients[:, 0] - slopes @ mean
+        return replace(model, coefficients=np.column_stack([first, slopes]))
 
     def sigma(self, target: Float[Any, "*n 3"]) -> Float[Any, "*n 3"]:
         """SDs (lateral, range, elevational; mm) of targets in the image frame (traceable)."""
         xp = target.__array_namespace__()
-        return xp.exp(_basis(target) @ self.coefficients.T)
-
-
-def _basis(target: Float[Any, "*n 3"]) -> Float[Any, "*n 4"]:
-    xp = target.__array_namespace__()
-    deeper = target[..., 2] / _DEPTH_MM - 1.0
-    aside = target[..., 0] / _LATERAL_MM
-    return xp.stack([xp.ones_like(deeper), deeper, deeper**2, aside**2], axis=-1)
-
-
-def _gamma_slopes(
-    basis: Float[np.ndarray, "n 4"], ratio: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, 3]:
-    """Slopes of the log variance, which maximise sum(-ln v - r / v) / 2 plus the log prior."""
-    precision = np.diag([0.0, *np.full(3, 0.25 / _PRIOR_SD**2)])
-    slopes = np.zeros(4)
-    for _ in range(_SCORING_STEPS):
-        part = ratio * np.exp(-basis @ slopes)
-        # A squared normal error has the Fisher information 1/2 about its log variance.
-        step = np.linalg.solve(
-            0.5 * basis.T @ basis + precision, 0.5 * basis.T @ (part - 1) - precision @ slopes
-        )
-        slopes += np.clip(step, -1.0, 1.0)
-        if np.abs(step).max() < 1e-10:
-            break
-    return slopes[1:]
+        return xp.exp(basis_at(target) @ self.coefficients.T)

@@ -94,30 +94,26 @@ def listed_departures(result: HasOutliers, components: tuple[str, ...] = COMPONE
 def suspects(result: Calibration) -> list[OutlierReason]:
     """Images in use that deviate by less than outliers do, but by more than chance explains.
 
-    With Gaussian errors, the largest range error of all images (in SDs taken from medians) exceeds
-    the limit in one recording of a hundred. Only range errors count: lateral errors grow with the
-    depth and offsets may have any law, so large ones are no sign of a wrong image.
+    With Gaussian errors, the largest range error of all images (in SDs taken from medians, at the
+    target's place in the image) exceeds the limit in one recording of a hundred. Only range errors
+    count: offsets may have any law, so large ones are no sign of a wrong image.
     """
     count = int(result.images_used)
     if count < FEWEST_TO_CHECK:
         return []
     # The second factor corrects medians of few images; it is from simulated Gaussian errors.
     limit = NormalDist().inv_cdf(1 - SUSPECTED / (4 * count)) * (1 + 8 / count)
-    departure = np.asarray(result.departure, dtype=float)
-    departure = np.where(np.asarray(result.mask)[:, None] > 0, departure, 0.0)
-    departure[:, [0, 2]] = 0.0
-    departure[images_that_stand_out(result)] = 0.0
-    found: list[OutlierReason] = []
-    for image in np.flatnonzero((np.abs(departure) > limit).any(axis=1)):
-        found.append(
-            {
-                "image": int(image),
-                "component": COMPONENTS[1],
-                "sds": finite_or_none(departure[image, 1]),
-                "left_out": False,
-            }
-        )
-    return found
+    error = np.array(result.inspection.range_at_place, dtype=float)
+    error[images_that_stand_out(result)] = 0.0
+    return [
+        {
+            "image": int(image),
+            "component": COMPONENTS[1],
+            "sds": finite_or_none(error[image]),
+            "left_out": False,
+        }
+        for image in np.flatnonzero(np.abs(error) > limit)
+    ]
 
 
 def suspects_in_words(result: Calibration) -> list[str]:

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import TUNED, Uncertainty, Whitened, inverses, quadratic
 from jaxcal.model.outliers import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
@@ -59,6 +60,8 @@ class Inspection:
         outlier: 1 where an image does not fit the rest.
         departure: errors of lateral position, range and elevational offset in robust SDs of the
             images in use; 0 where the caller masked the image.
+        range_at_place: range errors of the images in use, in robust SDs of errors at the target's
+            place in the image; 0 with fewer than 20 images in use.
         kurtosis: of the standardised residuals; 3 for Gaussian ones.
         misfit: standard normal scores of :data:`MISFITS` for each component; 0 with fewer than 20
             images in use.
@@ -68,6 +71,7 @@ class Inspection:
 
     outlier: Float[Array, "*batch n"]
     departure: Float[Array, "*batch n 3"]
+    range_at_place: Float[Array, "*batch n"]
     kurtosis: Float[Array, "*batch 3"]
     misfit: Float[Array, "*batch 5 3"]
     gain: Float[Array, "*batch 5"]
@@ -107,7 +111,8 @@ def inspect(
         residual = whitened.errors / np.sqrt(left)
     kurtosis, misfit = check_noise_model(residual, seen.distance, kept)
     gain = gains(answer, seen, unknowns, problem, uncertainty)
-    return Inspection(outlier, departure, kurtosis, misfit, gain)
+    at_place = range_at_place(departure[..., 1], seen, kept)
+    return Inspection(outlier, departure, at_place, kurtosis, misfit, gain)
 
 
 def departures(
@@ -135,6 +140,29 @@ def departures(
     # An image in use pulls the fit towards itself; the fit predicts an image that is not in use.
     left = np.where(kept[..., None] > 0, np.maximum(1 - leverage, 0.05), 1 + leverage)
     return errors / np.sqrt(left) / sigma
+
+
+def range_at_place(
+    departure: Float[Array, "k n"], seen: ImageErrors, kept: Float[Array, "k n"]
+) -> Float[Array, "k n"]:
+    """Range errors in robust SDs of errors at the target's place in the image.
+
+    Args:
+        departure: the same in robust SDs of all images.
+        seen: the images.
+        kept: 1 for images in use.
+    """
+    found = np.zeros_like(departure)
+    judged = (kept.sum(axis=1) >= FEWEST_TO_CHECK) & np.isfinite(departure).all(axis=1)
+    errors, mask = departure[judged], kept[judged]
+    found[judged] = mask * errors / relative_sd(seen.q[judged], errors, mask)
+
+    def typical(values: Float[Array, "k n"]) -> Float[Array, " k"]:
+        return medians(np.abs(values)[..., None], kept)[:, 0]
+
+    now = typical(found)
+    by = np.where(judged & (now > 0), typical(departure) / np.where(now > 0, now, 1.0), 1.0)
+    return found * by[:, None]
 
 
 def medians(values: Float[Array, "k n c"], weight: Float[Array, "k n"]) -> Float[Array, "k c"]:
