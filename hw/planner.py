@@ -19,7 +19,6 @@ from hw.shapes import Float
 from jaxcal import InputError
 from jaxcal.calibration.result import Calibration
 from jaxcal.design import Candidates, Model, Noise, images_to, next_poses
-from jaxcal.design.greedy import Cover, space_features
 from jaxcal.design.planning import Known
 
 FEWEST_TO_TRUST = 8
@@ -96,10 +95,10 @@ class Planner:
         left = replace(self._nominal, poses=self._targets[open_rows], taken=taken)
         known, left = self._known(answer, left)
         cost = None if here is None else self._seconds(here, left.poses)
-        rules = replace(BENCH_RULES, space_filling=0.0)
+        fills = (len(taken) + 1) % _FILL == 0
+        rules = replace(BENCH_RULES, space_filling=float(fills))
         found = next_poses(known, left, 1, cost_s=cost, rules=rules)
-        filling = self._filling(open_rows, left, len(taken))
-        row = open_rows[int(found.rows[0])] if filling is None else filling
+        row = open_rows[int(found.rows[0])]
         if not isinstance(known, Calibration):
             return Choice(row)
         now, then = (float(value) for value in found.tre_mm)
@@ -127,17 +126,6 @@ class Planner:
             return answer, replace(left, model=replace(model, noise=noise))
         model = left.model
         return Known(model.beliefs() + model.information(taken), max(len(taken), 1)), left
-
-    def _filling(self, open_rows: list[int], left: Candidates, count: int) -> int | None:
-        """The row of the pose that fills space; None where this image is not one of those."""
-        if (count + 1) % _FILL or count == 0:
-            return None
-        assert left.taken is not None
-        cover = Cover(space_features(self._nominal))
-        for feature in space_features(replace(left, poses=left.taken)):
-            cover.add(feature)
-        gains = cover.gains()[open_rows]
-        return open_rows[int(np.argmax(gains))]
 
     def _seconds(
         self, here: Float[np.ndarray, "4 4"], poses: Float[np.ndarray, "n 4 4"]

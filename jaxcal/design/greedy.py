@@ -1,9 +1,10 @@
 """Greedy choice: each pose is the one that gains most in addition to those before it.
 
-By default every fifth pose fills space instead: it is the pose that most reduces the candidates'
-mean distance to the nearest chosen pose. The optimum consists of a few poses, which would not show
-that the model is wrong elsewhere. The number of replicates is limited, since errors that belong to
-a pose (the response of the target, the tracker's field) do not average out over its replicates.
+By default every fifth pose fills space instead: it is the one that gains most among those that
+reduce the candidates' mean distance to the nearest chosen pose nearly as much as any could. The
+optimum consists of a few poses, which would not show that the model is wrong elsewhere. The number
+of replicates is limited, since errors that belong to a pose (the response of the target, the
+tracker's field) do not average out over its replicates.
 
 Cost: with m candidates and k sets of SDs, each pose takes k products of 3m x 9 with 9 x 9.
 """
@@ -25,6 +26,10 @@ from jaxcal.runtime.arrays import is_number
 
 MOST_POSES = 2000
 """Of one plan."""
+
+COVERING = 0.8
+"""A pose fills space if it reduces the distances by at least this share of what the best one does
+(our choice)."""
 
 
 @dataclass(frozen=True)
@@ -151,9 +156,11 @@ class Cover:
         """Add a pose."""
         self._nearest = np.minimum(self._nearest, _apart(feature[None], self._references)[0])
 
-    def gains(self) -> Float[np.ndarray, " m"]:
-        """By how much each candidate would reduce the sum of the references' distances."""
-        return np.maximum(self._nearest - self._apart, 0.0).sum(axis=1)
+    def filled_by(self, open_to: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+        """Which of the open candidates fill space, at least one."""
+        gains = np.maximum(self._nearest - self._apart, 0.0).sum(axis=1)
+        gains = np.where(open_to, gains, -np.inf)
+        return open_to & (gains >= COVERING * gains.max())
 
 
 def _apart(
@@ -197,7 +204,7 @@ def choose(
     information = search.known.copy()
     chosen = Chosen([], [], information)
     alike = search.counts([])
-    cover = Cover(features) if search.rules.space_filling > 0 and count > 1 else None
+    cover = Cover(features) if search.rules.space_filling > 0 else None
     if cover is not None:
         for other in taken_features:
             cover.add(other)
@@ -209,11 +216,12 @@ def choose(
         if not open_to.any():
             # With few candidates, poses that are alike are better than none.
             open_to = free if free.any() else np.ones_like(free)
-        if filling and cover is not None and cover.begun:
-            value = cover.gains()
-        else:
-            value, filling = search.scores(information), False
-            value = value if cost_s is None else value / cost_s
+        value = search.scores(information)
+        value = value if cost_s is None else value / cost_s
+        filling = filling and cover is not None and cover.begun
+        if filling:
+            assert cover is not None
+            open_to = cover.filled_by(open_to)
         row = int(np.argmax(np.where(open_to, value, -np.inf)))
         information = information + search.information_of(row)
         alike += search.alike(search.rotations[row], search.places[row])
