@@ -1,13 +1,14 @@
 """Errors that the model leaves out: how often are they told of, and what becomes of the verdict?
 
 Simulated recordings (uniform offsets of SD 1 mm, noise level 1) without any fault and with one of
-five, calibrated with the default prior:
+six, calibrated with the default prior:
 
 - ``scale``: ranges 4 % too long (a sound speed of 1540 m/s in water of 1480 m/s);
 - ``skew``: lateral positions off by 3 % of the depth;
 - ``beside``: all targets 6 mm farther from the image plane, to one side;
 - ``slip``: the image moves by 2 mm on the probe from the first image to the last;
-- ``second echo``: 40 % of the images, any of them, 5 mm too deep.
+- ``second echo``: 40 % of the images, any of them, 5 mm too deep;
+- ``curve``: ranges too long by 1 mm 20 mm to the side, by the square of the lateral position.
 
 For each: the share in which something is told of (a kind of error that the model leaves out, or
 two groups), in which it is the right thing, in which the verdict is good or fair, and in which it
@@ -33,13 +34,15 @@ from jaxtyping import Array
 import jaxcal
 from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.data.recording import Recording, make_images
+from jaxcal.diagnostics.unmodelled import SIDE_MM
 from jaxcal.report.accuracy import FAIR_MM, region_of
 from jaxcal.report.record import calibration_record
 
 SEED = 20261123
-FAULTS = ("none", "scale", "skew", "beside", "slip", "second echo")
+FAULTS = ("none", "scale", "skew", "beside", "slip", "second echo", "curve")
 IMAGES = (12, 30, 60)
 STRETCH, SKEW, BESIDE_MM, SLIP_MM, ECHO_MM, ECHO_SHARE = 1.04, 0.03, 6.0, 2.0, 5.0, 0.4
+CURVE_MM = 1.0
 HEADER = [
     "fault", "images", "trials", "told_of", "right", "good_or_fair", "good_and_wrong",
     "stated_good_and_wrong",
@@ -73,6 +76,8 @@ def draw(images: int, fault: str, indices: Array):
             order = jax.random.permutation(jax.random.fold_in(key, 7), images)
             late = order < round(ECHO_SHARE * images)
             points = points.at[:, 1].add(ECHO_MM * late)
+        if fault == "curve":
+            points = points.at[:, 1].add(CURVE_MM * (points[:, 0] / SIDE_MM) ** 2)
         return poses, points, x, size
 
     return jax.vmap(one)(indices)
@@ -92,6 +97,8 @@ def judged(result, recording: Recording, x: np.ndarray, size: np.ndarray, fault:
     true = there * [size[0], 1.0, size[1]]
     if fault == "skew":
         true[:, 0] -= SKEW * true[:, 2]
+    if fault == "curve":
+        true[:, 2] -= CURVE_MM * (true[:, 0] / SIDE_MM) ** 2
     found = np.asarray(result.image_to_probe)
     apart = there @ found[:3, :3].T + found[:3, 3] - true @ x[:3, :3].T - x[:3, 3]
     error = float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))

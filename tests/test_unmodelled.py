@@ -39,6 +39,12 @@ def skewed(recording: Recording) -> Recording:
     return with_points(recording, points)
 
 
+def curved(recording: Recording) -> Recording:
+    points = recording.calibration.measurements.copy()
+    points[:, 1] += 1.5 * (points[:, 0] / 20.0) ** 2
+    return with_points(recording, points)
+
+
 def beside(recording: Recording) -> Recording:
     """The poses are shifted so that every target lies 8 mm farther from the plane."""
     images, truth = recording.calibration, recording.truth
@@ -62,10 +68,13 @@ def slipped(recording: Recording) -> Recording:
     return replace(recording, calibration=make_images(poses, images.measurements))
 
 
-FAULTS = {"scale": wrong_scale, "skew": skewed, "beside": beside, "slip": slipped}
+FAULTS = {
+    "scale": wrong_scale, "skew": skewed, "curve": curved, "beside": beside, "slip": slipped,
+}  # fmt: skip
 WORDS = {
     "scale": "check pixel size",
     "skew": "of the depth",
+    "curve": "20 mm to either side of the middle",
     "beside": "beside the image plane in all images",
     "slip": "from the first image to the last",
 }
@@ -116,13 +125,15 @@ def test_what_the_model_leaves_out_is_found_and_lowers_the_verdict(answers, kind
         np.testing.assert_allclose(middle, [0.0, 0.04], atol=0.012)
     if kind == "skew":
         np.testing.assert_allclose(middle, [0.05], atol=0.015)
+    if kind == "curve":
+        np.testing.assert_allclose(middle, [1.5], atol=0.4)
     if kind == "beside":
         np.testing.assert_allclose(middle, [8.0], atol=2.0)
 
 
 @pytest.mark.parametrize("images", CLEAN)
 def test_hardly_anything_is_found_in_clean_recordings(answers, images):
-    """Of 3 or 4 tests that chance passes once in a thousand times each."""
+    """Of 4 or 5 tests that chance passes once in a thousand times each."""
     results = [result for _, result in answers[f"clean {images}"]]
     assert [result.images_used for result in results] == [images] * len(SEEDS)
     assert sum(bool(unmodelled(result)) for result in results) <= 2

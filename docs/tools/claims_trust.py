@@ -185,7 +185,7 @@ claim(
 
 
 # Errors that the model leaves out.
-FAULTS = ("scale", "skew", "beside", "slip", "second echo")
+FAULTS = ("scale", "skew", "beside", "slip", "second echo", "curve")
 
 
 def _left_out(of: str, *images: str) -> tuple[float, float]:

@@ -1,12 +1,14 @@
 """Would an error that the model leaves out explain the residuals better?
 
-Four are looked for, each with a few parameters theta, linearised at the answer:
+Five are looked for, each with a few parameters theta, linearised at the answer:
 
     scale   the pixels' sizes or the sound speed: x and r are too long by a share of themselves
     slip    X moves within the image plane, steadily in the course of the recording (elevational
             offsets may drift for other reasons, and do not count)
     skew    the lateral position is too large by a share of the depth: a steered beam, or clicks
             beside the target
+    curve   ranges are too long by the square of the lateral position: an image of a curved array
+            taken for that of a straight one, or delays that are wrong towards the sides
     beside  the target lies beside the image plane by m in all images, so ranges are too long by
             m^2 / (2 r), which hardly any other error imitates; theta = m^2
 
@@ -40,13 +42,15 @@ Array = np.ndarray
 FEWEST = 12
 """With fewer images in use nothing is looked for."""
 
-_FREEDOM = {"scale": 2, "slip": 3, "skew": 1, "beside": 1}
+_FREEDOM = {"scale": 2, "slip": 3, "skew": 1, "curve": 1, "beside": 1}
 """Number of parameters of each error."""
-_BY_CHANCE = {"scale": 13.8, "slip": 16.3, "skew": 10.8, "beside": 9.5}
+_BY_CHANCE = {"scale": 13.8, "slip": 16.3, "skew": 10.8, "curve": 10.8, "beside": 9.5}
 """What 2 ln LR exceeds by chance in one of a thousand recordings: chi squared, and for m^2, which
 is never negative, that of two in a thousand."""
 _ROUNDS = 8
 """Rounds of tuning the SDs with the further parameters."""
+SIDE_MM = 20.0
+"""The lateral position at which a curve is stated."""
 _WITHIN = (0, 2, 4)
 """Parameters of X that move the image within its plane: laterally, axially, and about y."""
 
@@ -56,10 +60,11 @@ class Unmodelled:
     """An error that the model leaves out, and that the residuals show.
 
     Attributes:
-        kind: ``scale``, ``slip``, ``skew`` or ``beside``.
+        kind: ``scale``, ``slip``, ``skew``, ``curve`` or ``beside``.
         values: its parameters: by which shares lateral positions and ranges are too long; motion of
             X from the first image to the last (lateral and axial, mm; about y, rad); by which share
-            of the depth lateral positions are too large; the distance m in mm.
+            of the depth lateral positions are too large; by how many mm ranges are too long 20 mm
+            to the side; the distance m in mm.
         statistic: 2 ln LR.
         step: by how much the unknowns would change if it were corrected.
     """
@@ -85,6 +90,8 @@ class Unmodelled:
             by[:, 2] -= self.values[1] * (points[:, 1] - face_mm)
         if self.kind == "skew":
             by[:, 0] -= self.values[0] * points[:, 1]
+        if self.kind == "curve":
+            by[:, 2] -= self.values[0] * (points[:, 0] / SIDE_MM) ** 2
         if self.kind == "beside":
             by[:, 1] += self.values[0]
         slip = np.zeros_like(by)
@@ -137,6 +144,7 @@ def _columns(
     found = {
         "slip": order[:, None, None] * seen.rows[0][..., _WITHIN] * [[1.0], [1.0], [0.0]],
         "skew": np.stack([-distance, zero, zero], axis=-1)[..., None],
+        "curve": np.stack([zero, -((lateral / SIDE_MM) ** 2), zero], axis=-1)[..., None],
         "beside": np.stack([zero, 0.5 / distance, zero], axis=-1)[..., None],
     }
     if not {"scale", "sound-speed"} & set(blocks):
@@ -164,7 +172,7 @@ def _fit(kind: str, errors: Float[Array, "m 3"], rows: Float[Array, "m 3 q"]) ->
         if not values[0] > 0:
             return None
         values = np.sqrt(values)
-    if kind in ("scale", "skew"):
+    if kind in ("scale", "skew", "curve"):
         # What has to be added is what is missing.
         values = -values
     return Unmodelled(kind, values, statistic, step)

@@ -20,6 +20,7 @@ import math
 from typing import Any
 
 from jaxcal.diagnostics.misfits import DRIFT_SCORE, in_two_groups
+from jaxcal.diagnostics.unmodelled import SIDE_MM
 
 CHANCE = 3.0
 """SDs of chance beyond which the residuals contradict the stated error."""
@@ -141,6 +142,11 @@ def _from_unmodelled(record: dict[str, Any]) -> list[tuple[float, str]]:
         "skew": lambda: (
             f"lateral positions that are too large by {100 * values[0]:.1f} % of the depth would "
             "explain the errors far better: a steered beam, or clicks beside the target?"
+        ),
+        "curve": lambda: (
+            f"ranges that are too long by {values[0]:.1f} mm {SIDE_MM:.0f} mm to either side of "
+            "the middle would explain the errors far better: a curved array taken for a straight "
+            "one, or the delays of another probe?"
         ),
         "beside": lambda: (
             f"a target {values[0]:.1f} mm beside the image plane in all images would explain the "
