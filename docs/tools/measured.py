@@ -61,8 +61,9 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "outside a 99 % interval",
         "with 4 to 20 poses",
         "250 clean recordings for each of three distributions and 30, 54 and 200 images",
-        "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of five faults: "
+        "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of six faults: "
         "ranges 4 % too long",
+        "one mm at 20 mm to the side",
         "off by 3 % of the depth, all targets 6 mm to one side of the plane",
         "a range 5 SDs too long",
         "with 30 and 60 images: the first plan",
