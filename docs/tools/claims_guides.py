@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from claims import Row, claim, number, span, table
+from claims import Row, claim, number, table
 
 SAFETY, POSES = "docs/safety.md", "docs/how-to/poses.md"
 
