@@ -26,6 +26,13 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
         The exit status. Errors have been reported on standard error by then, in one line.
     """
     if arguments is None:
+        if sys.stdout is None:
+            # Nobody would see the answer, and the next file to be opened would take its place.
+            return _report(
+                name,
+                "error: standard output is closed; > /dev/null discards what is printed",
+                ExitCode.BAD_INPUT,
+            )
         _print_anything()
     try:
         if arguments is None and (instruction := os.environ.get(_completion_variable(name))):
