@@ -20,6 +20,7 @@ import pytest
 import jaxcal
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.cli.main import main
+from jaxcal.io.folder import read_folder
 from jaxcal.io.picker.frames import Frames
 from jaxcal.io.picker.picks import Picks
 from jaxcal.io.picker.server import Picker
@@ -103,6 +104,7 @@ def test_a_person_in_a_browser(tmp_path, sequence):
         with picking(sequence) as (process, url):
             browser.get(url)
             wait_until(browser, SHOWN_FRAME, "0")
+            assert "frame 0 (1 of 6)" in browser.execute_script(WHERE)
             click(browser, 12.0, 34.0)
             wait_until(browser, SHOWN_FRAME, "1")
             click(browser, 50.0, 20.0)
@@ -266,6 +268,20 @@ def test_requests_that_are_refused(tmp_path, sequence, path, body, status):
             assert request(page, path=other)[0] == 404
         assert request(page, "PUT", "pick", body)[0] == 501
     assert not (tmp_path / "p.csv").exists()
+
+
+def test_the_images_of_a_folder_are_shown_by_name(tmp_path, sequence):
+    """As the table has them; numbers that count from 0 would be taken for those in the names."""
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for k in range(3):
+        (folder / f"b{k + 9}.png").write_bytes(encode_png(FRAMES[k]))
+    images = read_folder(folder)
+    picks = Picks(tmp_path / "p.csv", "images", (COLUMNS, ROWS), 3, [0, 2], images.files)
+    with Picker(picks, Frames(images), "images") as page:
+        assert json.loads(request(page, path="state")[1])["files"] == ["b9.png", "b11.png"]
+    with serving(tmp_path / "q.csv", sequence) as page:
+        assert json.loads(request(page, path="state")[1])["files"] == []
 
 
 def test_frames_come_in_any_order(tmp_path, sequence):

@@ -46,6 +46,7 @@ class Picks:
     Attributes:
         points: [u, v] by the number of the frame, px.
         skipped: numbers of the frames without a target.
+        files: names of the images of a folder; empty for a sequence.
 
     Raises:
         FormatError: a file that was not written here, or one of another sequence.
@@ -60,7 +61,7 @@ class Picks:
         shown: Sequence[int],
         files: Sequence[str] = (),
     ) -> None:
-        self._files = tuple(files)
+        self.files = tuple(files)
         self.path, self.shown, self.size = os.fspath(path), list(shown), size
         # As the file will have it, also where the name is not UTF-8.
         named = name.encode("utf-8", errors="backslashreplace").decode()
@@ -127,7 +128,7 @@ class Picks:
         others = {k for k in self.skipped if k != frame} | ({frame} if skipped else set())
         rows = [f"{self._named(k)},{points[k][0]!r},{points[k][1]!r}" for k in sorted(points)]
         told = " ".join(map(str, sorted(others)))
-        column = "file" if self._files else "frame"
+        column = "file" if self.files else "frame"
         head = [self._head, f"{_SKIPPED} {told}".rstrip(), f"{column},u,v"]
         # Points that a second page or an editor has put there must not be lost.
         if self._content() not in (self._known, None):
@@ -146,9 +147,9 @@ class Picks:
         return Path(self.path).read_bytes()
 
     def _named(self, frame: int) -> str:
-        if not self._files:
+        if not self.files:
             return str(frame)
-        doubled = self._files[frame].replace('"', '""')
+        doubled = self.files[frame].replace('"', '""')
         return f'"{doubled}"'
 
     def _load(self, content: str, count: int) -> None:
@@ -166,12 +167,12 @@ class Picks:
         self.skipped = {int(number) for number in told.split() if len(number) < 10}
         if len(lines) > 3:
             table = read_pose_table(self.path)
-            frames = table.file if self._files else table.frame
+            frames = table.file if self.files else table.frame
             if frames is None or table.points is None:
-                column = "file" if self._files else "frame"
+                column = "file" if self.files else "frame"
                 raise FormatError(f"{self.path}: has no columns {column}, u and v")
-            places = {name: k for k, name in enumerate(self._files)}
-            if self._files:
+            places = {name: k for k, name in enumerate(self.files)}
+            if self.files:
                 frames = [places.get(str(name), count) for name in frames]
             self.points = {
                 int(frame): (float(u), float(v))
