@@ -577,6 +577,18 @@ def test_a_full_disk_is_one_line(jaxcal_process):
     assert (done.returncode, done.stderr) == (2, "jaxcal: error: No space left on device\n")
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows keeps a folder that is in use")
+@pytest.mark.parametrize("command", [["pick", "f.igs.mha"], ["segment", "."]])
+def test_a_current_folder_that_was_removed_is_said(command, tmp_path, monkeypatch, capsys):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert main(command) == 2
+    said = "jaxcal: error: the current folder is no longer there: change to another one\n"
+    assert capsys.readouterr().err == said
+
+
 @pytest.mark.skipif(os.name == "nt", reason="descriptors are closed by a shell")
 def test_a_closed_standard_output_is_one_line():
     """Said before any work: an answer that nobody can see is not a success."""
