@@ -26,6 +26,7 @@ from jaxcal.io.picker.picks import Picks
 from jaxcal.io.picker.server import Picker
 from jaxcal.io.png import encode_png, read_png
 from jaxcal.io.sequence_files import read_sequence, write_sequence
+from jaxcal.io.text import read_pose_table
 
 sys.path.insert(0, str(Path(__file__).parent / "hw"))
 from browser import addresses, browsing, screenshot
@@ -317,9 +318,36 @@ def test_the_table_goes_on_and_goes_back(tmp_path):
     assert path.read_text() == "frame,u,v\n0,1,1\n"
 
 
-def test_a_sequence_whose_name_is_not_utf8_goes_on(tmp_path):
-    picks_of(tmp_path / "p.csv", "h\udcff.igs.mha").pick(0, 1.0, 1.0)
-    assert picks_of(tmp_path / "p.csv", "h\udcff.igs.mha").points == {0: (1.0, 1.0)}
+def test_a_sequence_with_any_name_goes_on(tmp_path):
+    for name in ("h\udcff.igs.mha", "of\ntwo lines\u2028and a third.igs.mha"):
+        path = tmp_path / f"{len(name)}.csv"
+        picks_of(path, name).pick(0, 1.0, 1.0)
+        assert picks_of(path, name).points == {0: (1.0, 1.0)}
+
+
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [
+        ('b "1", c.png', True),
+        ("#1;2 \N{LATIN SMALL LETTER U WITH DIAERESIS}.png", True),
+        ("line\nbreak.png", False),
+        ("return\r.png", False),
+        (" blank.png", False),
+        ('"quoted".png', False),
+        ("back\\slash.png", False),
+        ("not utf-8 \udcff.png", False),
+    ],
+)
+def test_a_name_that_the_table_cannot_hold_is_refused_before_any_click(tmp_path, name, kept):
+    path, names = tmp_path / "p.csv", ["a.png", name]
+    if not kept:
+        with pytest.raises(InputError, match="a table of points cannot name this image"):
+            Picks(path, "images", (COLUMNS, ROWS), 2, [0, 1], names)
+        return
+    Picks(path, "images", (COLUMNS, ROWS), 2, [0, 1], names).pick(1, 1.0, 2.0)
+    again = Picks(path, "images", (COLUMNS, ROWS), 2, [0, 1], names)
+    assert again.points == {1: (1.0, 2.0)}
+    assert list(read_pose_table(path).file or ()) == [name]
 
 
 def test_two_pages_do_not_lose_each_others_points(tmp_path):

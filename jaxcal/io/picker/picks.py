@@ -23,12 +23,14 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import write_text
-from jaxcal.io.readable import check_readable
+from jaxcal.io.readable import check_readable, quoted
 from jaxcal.io.text import read_pose_table
 
 _HEAD = "# jaxcal pick of "
 _SKIPPED = "# skipped:"
 _MOST_BYTES = 2**24
+_UNTOLD = r'^[\s"]|[\\\r\n\ud800-\udfff]'
+"""What in an image's name would not be read back from a table as it is."""
 Point = tuple[float, float]
 
 
@@ -49,6 +51,7 @@ class Picks:
         files: names of the images of a folder; empty for a sequence.
 
     Raises:
+        InputError: an image's name that would not be read back from the table.
         FormatError: a file that was not written here, or one of another sequence.
     """
 
@@ -63,8 +66,14 @@ class Picks:
     ) -> None:
         self.files = tuple(files)
         self.path, self.shown, self.size = os.fspath(path), list(shown), size
-        # As the file will have it, also where the name is not UTF-8.
-        named = name.encode("utf-8", errors="backslashreplace").decode()
+        for each in files:
+            if re.search(_UNTOLD, each):
+                raise InputError(
+                    f"{quoted(each)}: a table of points cannot name this image: rename it (no "
+                    "line break, backslash, or blank or quotation mark at the beginning; UTF-8)"
+                )
+        # As the file will have it, also where the name is not UTF-8 or has several lines.
+        named = " ".join(name.encode("utf-8", errors="backslashreplace").decode().splitlines())
         self._head = f"{_HEAD}{named}: {size[0]} x {size[1]} px, {count} frames"
         self.points: dict[int, Point] = {}
         self.skipped: set[int] = set()
