@@ -643,6 +643,10 @@ def test_server_refuses():
     for name in ("TransducerOriginPixelsToProbe", "Image\nToProbe", ""):
         with pytest.raises(InputError, match="1 to 20 bytes"):
             TransformServer(name, np.eye(4), port=0)
+    # An empty one would let every machine connect.
+    for host, said in (("", "not an empty one"), ("\udcff", "cannot listen at")):
+        with pytest.raises(InputError, match=said):
+            TransformServer("ImageToProbe", np.eye(4), host, port=0)
     with (
         TransformServer("ImageToProbe", np.eye(4), port=0) as server,
         pytest.raises(InputError, match="cannot listen at"),
