@@ -158,9 +158,9 @@ def test_a_person_in_a_browser(tmp_path, sequence):
 
 
 @contextmanager
-def picking(sequence: Path):
+def picking(sequence: Path, *options: str):
     """The command in a process of its own, and the address that it prints."""
-    process = subprocess.Popen([*PICK, str(sequence)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*PICK, str(sequence), *options], stdout=subprocess.PIPE, text=True)
     try:
         said = ""
         while (found := re.search(r"open (http://127\.0\.0\.1:\d+/[\w-]{20,}/)", said)) is None:
@@ -185,15 +185,17 @@ def test_ctrl_c_keeps_what_was_picked(sequence):
 
 
 def test_the_next_command_can_be_copied(tmp_path, sequence):
-    """Whatever blanks are in the names."""
+    """Whatever blanks are in the names, and with the options that choose the poses."""
     renamed = sequence.rename(tmp_path / "Sonde 1.igs.mha")
     out = tmp_path / "Sonde 1-picks.csv"
     Picks(out, renamed.name, (COLUMNS, ROWS), len(FRAMES), range(len(FRAMES))).pick(0, 1.0, 2.0)
-    with picking(renamed) as (process, _):
+    # Without the lag the import would take other poses.
+    given = ["--poses", str(renamed), "--from", "Probe", "--to", "Reference", "--lag", "-0.05"]
+    with picking(renamed, *given) as (process, _):
         process.send_signal(signal.SIGINT)
         said, _ = process.communicate(timeout=30)
     command = said.partition("next: ")[2].strip()
-    assert shlex.split(command) == ["jaxcal", "import", str(renamed), str(out), "OUT.h5"]
+    assert shlex.split(command) == ["jaxcal", "import", str(renamed), str(out), "OUT.h5", *given]
 
 
 def test_a_place_that_cannot_be_written_is_said_before_the_page(sequence, capsys):
