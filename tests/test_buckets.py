@@ -176,3 +176,5 @@ def test_a_recording_of_another_length_compiles_nothing(problems, name):
     assert compiled == []
     assert found.images_used == 11
     assert np.isfinite(found.image_to_probe).all()
+    # No image rests on its bound, which leaves an interval of answers and no covariance.
+    assert np.isfinite(found.covariance).all() == (name == "auto")

@@ -577,6 +577,27 @@ def test_a_full_disk_is_one_line(jaxcal_process):
     assert (done.returncode, done.stderr) == (2, "jaxcal: error: No space left on device\n")
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows keeps a folder that is in use")
+@pytest.mark.parametrize("command", [["pick", "f.igs.mha"], ["segment", "."]])
+def test_a_current_folder_that_was_removed_is_said(command, tmp_path, monkeypatch, capsys):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert main(command) == 2
+    said = "jaxcal: error: the current folder is no longer there: change to another one\n"
+    assert capsys.readouterr().err == said
+
+
+@pytest.mark.skipif(os.name == "nt", reason="descriptors are closed by a shell")
+def test_a_closed_standard_output_is_one_line():
+    """Said before any work: an answer that nobody can see is not a success."""
+    command = ["/bin/sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-m", "jaxcal", "--help"]
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False, timeout=60)
+    said = "jaxcal: error: standard output is closed; > /dev/null discards what is printed\n"
+    assert (done.returncode, done.stderr) == (2, said)
+
+
 def test_messages_are_not_markup(capfd):
     common.print_page("[bold]a[/bold] :smile:", "- " + "word " * 30)
     lines = capfd.readouterr().out.splitlines()

@@ -179,6 +179,18 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
             "a step of translation, rotation, point has 9 numbers",
         ),
         (lambda: backend.LevenbergMarquardt(damping=-1.0), "damping must be .* not -1.0"),
+        *(
+            (lambda sigma=sigma: backend.Points(jnp.array(sigma)), "sigma must be positive")
+            for sigma in ([[-0.3], [0.3], [0.6]], [[0.3], [0.0], [0.6]], [[0.3], [0.3], [jnp.nan]])
+        ),
+        (
+            lambda: backend.TrackedPoints(jnp.ones((3, 1)), jnp.array([-0.1])),
+            "tracker_sd must be zero or positive",
+        ),
+        (
+            lambda: backend.BoundedOffsets(jnp.ones((1, 1)), jnp.full((1, 8), -2.0)),
+            "bound must be zero or positive",
+        ),
     ):
         with pytest.raises(jaxcal.InputError, match=said):
             call()

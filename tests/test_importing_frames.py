@@ -184,6 +184,16 @@ def test_a_folder_with_poses(tmp_path, folder, first, cells, capsys):
         np.testing.assert_allclose(images.time, np.array(found) / 20)
 
 
+def test_the_images_of_a_folder_are_told_by_name(tmp_path, folder, capsys):
+    """Numbers that count from 0 would be taken for those in the names."""
+    table = str(pose_table(tmp_path / "poses.csv", "", lambda k: ""))
+    assert main(["segment", str(folder), "--poses", table, "--json"]) == 0
+    frames = json.loads(capsys.readouterr().out)["per_frame"]
+    assert [each["file"] for each in frames] == [f"b{k + 2}.png" for k in range(COUNT)]
+    assert not any("frame" in each for each in frames)
+    assert [k for k, each in enumerate(frames) if each["fate"] != "found"] == [HIDDEN]
+
+
 def test_images_without_a_pose_are_counted(tmp_path, folder):
     table = pose_table(tmp_path / "p.csv", "frame,", lambda k: f"{k + 2},", rows=[0, 1, 3, 4, 6])
     recording, notes, frames = import_files([folder], ImportOptions(poses=table))

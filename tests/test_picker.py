@@ -20,11 +20,13 @@ import pytest
 import jaxcal
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.cli.main import main
+from jaxcal.io.folder import read_folder
 from jaxcal.io.picker.frames import Frames
 from jaxcal.io.picker.picks import Picks
 from jaxcal.io.picker.server import Picker
 from jaxcal.io.png import encode_png, read_png
 from jaxcal.io.sequence_files import read_sequence, write_sequence
+from jaxcal.io.text import read_pose_table
 
 sys.path.insert(0, str(Path(__file__).parent / "hw"))
 from browser import addresses, browsing, screenshot
@@ -103,6 +105,7 @@ def test_a_person_in_a_browser(tmp_path, sequence):
         with picking(sequence) as (process, url):
             browser.get(url)
             wait_until(browser, SHOWN_FRAME, "0")
+            assert "frame 0 (1 of 6)" in browser.execute_script(WHERE)
             click(browser, 12.0, 34.0)
             wait_until(browser, SHOWN_FRAME, "1")
             click(browser, 50.0, 20.0)
@@ -155,9 +158,9 @@ def test_a_person_in_a_browser(tmp_path, sequence):
 
 
 @contextmanager
-def picking(sequence: Path):
+def picking(sequence: Path, *options: str):
     """The command in a process of its own, and the address that it prints."""
-    process = subprocess.Popen([*PICK, str(sequence)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*PICK, str(sequence), *options], stdout=subprocess.PIPE, text=True)
     try:
         said = ""
         while (found := re.search(r"open (http://127\.0\.0\.1:\d+/[\w-]{20,}/)", said)) is None:
@@ -182,15 +185,17 @@ def test_ctrl_c_keeps_what_was_picked(sequence):
 
 
 def test_the_next_command_can_be_copied(tmp_path, sequence):
-    """Whatever blanks are in the names."""
+    """Whatever blanks are in the names, and with the options that choose the poses."""
     renamed = sequence.rename(tmp_path / "Sonde 1.igs.mha")
     out = tmp_path / "Sonde 1-picks.csv"
     Picks(out, renamed.name, (COLUMNS, ROWS), len(FRAMES), range(len(FRAMES))).pick(0, 1.0, 2.0)
-    with picking(renamed) as (process, _):
+    # Without the lag the import would take other poses.
+    given = ["--poses", str(renamed), "--from", "Probe", "--to", "Reference", "--lag", "-0.05"]
+    with picking(renamed, *given) as (process, _):
         process.send_signal(signal.SIGINT)
         said, _ = process.communicate(timeout=30)
     command = said.partition("next: ")[2].strip()
-    assert shlex.split(command) == ["jaxcal", "import", str(renamed), str(out), "OUT.h5"]
+    assert shlex.split(command) == ["jaxcal", "import", str(renamed), str(out), "OUT.h5", *given]
 
 
 def test_a_place_that_cannot_be_written_is_said_before_the_page(sequence, capsys):
@@ -268,6 +273,20 @@ def test_requests_that_are_refused(tmp_path, sequence, path, body, status):
     assert not (tmp_path / "p.csv").exists()
 
 
+def test_the_images_of_a_folder_are_shown_by_name(tmp_path, sequence):
+    """As the table has them; numbers that count from 0 would be taken for those in the names."""
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for k in range(3):
+        (folder / f"b{k + 9}.png").write_bytes(encode_png(FRAMES[k]))
+    images = read_folder(folder)
+    picks = Picks(tmp_path / "p.csv", "images", (COLUMNS, ROWS), 3, [0, 2], images.files)
+    with Picker(picks, Frames(images), "images") as page:
+        assert json.loads(request(page, path="state")[1])["files"] == ["b9.png", "b11.png"]
+    with serving(tmp_path / "q.csv", sequence) as page:
+        assert json.loads(request(page, path="state")[1])["files"] == []
+
+
 def test_frames_come_in_any_order(tmp_path, sequence):
     frames = Frames(read_sequence(sequence))
     for number in (3, 4, 0, 6, 5, 5, 1):
@@ -301,9 +320,36 @@ def test_the_table_goes_on_and_goes_back(tmp_path):
     assert path.read_text() == "frame,u,v\n0,1,1\n"
 
 
-def test_a_sequence_whose_name_is_not_utf8_goes_on(tmp_path):
-    picks_of(tmp_path / "p.csv", "h\udcff.igs.mha").pick(0, 1.0, 1.0)
-    assert picks_of(tmp_path / "p.csv", "h\udcff.igs.mha").points == {0: (1.0, 1.0)}
+def test_a_sequence_with_any_name_goes_on(tmp_path):
+    for name in ("h\udcff.igs.mha", "of\ntwo lines\u2028and a third.igs.mha"):
+        path = tmp_path / f"{len(name)}.csv"
+        picks_of(path, name).pick(0, 1.0, 1.0)
+        assert picks_of(path, name).points == {0: (1.0, 1.0)}
+
+
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [
+        ('b "1", c.png', True),
+        ("#1;2 \N{LATIN SMALL LETTER U WITH DIAERESIS}.png", True),
+        ("line\nbreak.png", False),
+        ("return\r.png", False),
+        (" blank.png", False),
+        ('"quoted".png', False),
+        ("back\\slash.png", False),
+        ("not utf-8 \udcff.png", False),
+    ],
+)
+def test_a_name_that_the_table_cannot_hold_is_refused_before_any_click(tmp_path, name, kept):
+    path, names = tmp_path / "p.csv", ["a.png", name]
+    if not kept:
+        with pytest.raises(InputError, match="a table of points cannot name this image"):
+            Picks(path, "images", (COLUMNS, ROWS), 2, [0, 1], names)
+        return
+    Picks(path, "images", (COLUMNS, ROWS), 2, [0, 1], names).pick(1, 1.0, 2.0)
+    again = Picks(path, "images", (COLUMNS, ROWS), 2, [0, 1], names)
+    assert again.points == {1: (1.0, 2.0)}
+    assert list(read_pose_table(path).file or ()) == [name]
 
 
 def test_two_pages_do_not_lose_each_others_points(tmp_path):

@@ -373,6 +373,17 @@ def test_pixels_for_a_calibration_in_mm():
     np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-11)
     with pytest.raises(InputError, match="pixels of its own"):
         with_pixels.with_pixels((1.0, 1.0))
+    for size, origin, said in (
+        ((0.2, 1e308), (0.0, 0.0), "no ultrasound image's is over 10 mm"),
+        ((200.0, 200.0), (0.0, 0.0), "the spacing is 200 mm per pixel"),
+        ((2e-4, 2e-4), (0.0, 0.0), "looks like metres"),
+        ((1e-320, 0.1), (0.0, 0.0), "looks like metres"),
+        ((np.nan, 0.1), (0.0, 0.0), "two positive numbers"),
+        ((0.2, 0.1), (1e308, 0.0), "its origin two numbers up to 1e"),
+        ((0.2, 0.1), (0.0, np.nan), "its origin two numbers up to 1e"),
+    ):
+        with pytest.raises(InputError, match=said):
+            known.with_pixels(size, origin)
 
 
 @pytest.mark.parametrize(
@@ -632,6 +643,10 @@ def test_server_refuses():
     for name in ("TransducerOriginPixelsToProbe", "Image\nToProbe", ""):
         with pytest.raises(InputError, match="1 to 20 bytes"):
             TransformServer(name, np.eye(4), port=0)
+    # An empty one would let every machine connect.
+    for host, said in (("", "not an empty one"), ("\udcff", "cannot listen at")):
+        with pytest.raises(InputError, match=said):
+            TransformServer("ImageToProbe", np.eye(4), host, port=0)
     with (
         TransformServer("ImageToProbe", np.eye(4), port=0) as server,
         pytest.raises(InputError, match="cannot listen at"),

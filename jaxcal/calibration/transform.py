@@ -24,6 +24,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.poses import check_affine, check_poses
+from jaxcal.data.recording import check_spacing_unit
 from jaxcal.diagnostics.image_points import point_jacobian
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.readable import naming
@@ -151,12 +152,20 @@ class ImageTransform:
         Args:
             size_mm: [lateral, axial] of a pixel.
             origin_px: [u, v] of lateral 0, range 0.
+
+        Raises:
+            InputError: the calibration has pixels already; a size that is not positive or not in
+                mm; an origin that is NaN or over 1e9.
         """
         if self.scale_mm_per_px is not None:
             raise InputError("the calibration has pixels of its own: no other size is needed")
         scale = np.array(size_mm, dtype=np.float64)
-        if not (np.isfinite(scale).all() and (scale > 0).all() and np.isfinite(origin_px).all()):
-            raise InputError("a pixel's size must be two positive numbers, its origin two numbers")
+        if not ((scale > 0).all() and (np.abs(origin_px) <= _LARGEST).all()):
+            raise InputError(
+                "a pixel's size must be two positive numbers, its origin two numbers up to "
+                f"{_LARGEST:g}"
+            )
+        check_spacing_unit(scale)
         moved = self.image_plane_to_probe.copy()
         moved[:3, 3] -= moved[:3, 0] * scale[0] * origin_px[0]
 

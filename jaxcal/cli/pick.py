@@ -86,8 +86,9 @@ def _tell(placed: Any, source: str, out: str, options: dict[str, Any]) -> None:
                 ("poses", "poses"),
                 ("from", "source"),
                 ("to", "target"),
+                ("lag", "lag_s"),
             )
             if options[key]
-            for part in (f"--{name}", options[key])
+            for part in (f"--{name}", str(options[key]))
         ]
         click.echo(f"next: {shlex.join(['jaxcal', 'import', source, out, 'OUT.h5', *given])}")

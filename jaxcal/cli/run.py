@@ -26,6 +26,13 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
         The exit status. Errors have been reported on standard error by then, in one line.
     """
     if arguments is None:
+        if sys.stdout is None:
+            # Nobody would see the answer, and the next file to be opened would take its place.
+            return _report(
+                name,
+                "error: standard output is closed; > /dev/null discards what is printed",
+                ExitCode.BAD_INPUT,
+            )
         _print_anything()
     try:
         if arguments is None and (instruction := os.environ.get(_completion_variable(name))):
@@ -51,7 +58,8 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
         _drop(sys.stdout)
         if error.errno == errno.EPIPE:
             return ExitCode.BROKEN_PIPE
-        return _report(name, f"error: {error.strerror or error}", ExitCode.BAD_INPUT)
+        said = _current_folder() or error.strerror or error
+        return _report(name, f"error: {said}", ExitCode.BAD_INPUT)
     except Exception as error:
         if os.environ.get("JAXCAL_TRACEBACK"):
             raise
@@ -64,6 +72,15 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
             "JAXCAL_TRACEBACK=1 shows where)",
             ExitCode.INTERNAL_ERROR,
         )
+
+
+def _current_folder() -> str | None:
+    """What is wrong with the folder that relative names begin at: it may have been removed."""
+    try:
+        os.getcwd()
+    except OSError:
+        return "the current folder is no longer there: change to another one"
+    return None
 
 
 def _print_anything() -> None:

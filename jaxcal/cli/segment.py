@@ -192,7 +192,11 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
                 "images": len(images),
                 "spacing_mm": None if images.spacing_mm is None else images.spacing_mm.tolist(),
                 "per_frame": [
-                    {"frame": k, "fate": FATES[fate], "reason": found.reason[k] or None}
+                    {
+                        **({"file": found.files[k]} if found.files else {"frame": k}),
+                        "fate": FATES[fate],
+                        "reason": found.reason[k] or None,
+                    }
                     for k, fate in enumerate(found.fate)
                 ],
                 "notes": notes,

@@ -24,6 +24,9 @@ MINIMUM_IMAGES = 4
 LARGEST = 1e7
 """Largest coordinate accepted, in mm or px, and largest variance of one: ten kilometres."""
 
+LARGEST_PIXEL_MM = 10.0
+"""Largest pixel accepted; a size in micrometres is larger."""
+
 Kind = Literal["point", "pixel", "time_of_flight"]
 _EXTENT_MM = 50.0
 """Of a target's path through the image where nothing better is known."""
@@ -409,17 +412,22 @@ def _check_units(images: Images) -> None:
 
 
 def check_spacing_unit(spacing_mm: Float[np.ndarray, 2]) -> None:
-    """Refuse a pixel's size in metres in place of millimetres.
+    """Refuse a pixel's size that cannot be in millimetres.
 
     Args:
         spacing_mm: [lateral, axial] per px, as if in mm.
 
     Raises:
-        InputError: it looks like metres.
+        InputError: it is far too large, or looks like metres.
     """
-    if spacing_mm.max() < 1e-3:
+    if not spacing_mm.max() <= LARGEST_PIXEL_MM:
         raise InputError(
-            f"the spacing is only {spacing_mm.max():.3g} mm per pixel: it looks like metres; give "
+            f"the spacing is {spacing_mm.max():.3g} mm per pixel, and no ultrasound image's is "
+            f"over {LARGEST_PIXEL_MM:g} mm: give it in mm"
+        )
+    if spacing_mm.min() < 1e-3:
+        raise InputError(
+            f"the spacing is only {spacing_mm.min():.3g} mm per pixel: it looks like metres; give "
             "it, and the poses, in mm"
         )
 

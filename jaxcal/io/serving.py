@@ -47,6 +47,9 @@ class TransformServer:
             raise InputError(f"{name!r}: a device's name has 1 to {_LONGEST_NAME} bytes of text")
         if not np.isfinite(matrix).all():
             raise InputError("the matrix holds NaN or Inf")
+        if not host:
+            # The system would take it for every address that this machine has.
+            raise InputError("an address to listen at is needed, not an empty one")
         self._name, self._matrix = name, np.asarray(matrix, dtype=np.float64)
         self._clients: set[socket.socket] = set()
         self._listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
@@ -54,7 +57,8 @@ class TransformServer:
         try:
             self._listener.bind((host, port))
             self._listener.listen()
-        except (OSError, OverflowError) as error:
+        # A TypeError: a name that no network has, not in Unicode or with too long a part.
+        except (OSError, OverflowError, TypeError) as error:
             self._listener.close()
             reason = getattr(error, "strerror", None) or str(error)
             raise InputError(f"cannot listen at {host}:{port}: {reason}") from None

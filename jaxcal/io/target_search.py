@@ -36,6 +36,7 @@ class FrameResults:
         covariance: (n, 2, 2), px^2; NaN where not found.
         contrast_db: (n,) the target's envelope over the background, dB; NaN where not measured.
         margin_db: (n,) the target's envelope over the next brightest place, dB; NaN likewise.
+        files: names of the images of a folder; empty for a sequence.
     """
 
     target: str
@@ -45,6 +46,7 @@ class FrameResults:
     covariance: Float[np.ndarray, "n 2 2"]
     contrast_db: Float[np.ndarray, " n"]
     margin_db: Float[np.ndarray, " n"]
+    files: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.fate)
@@ -119,4 +121,5 @@ def search_target(
         if located.found[0]:
             fate[row] = FOUND
             position[row], covariance[row] = located.position[0], located.covariance[0]
-    return FrameResults(target, fate, tuple(reason), position, covariance, contrast, margin)
+    found = position, covariance, contrast, margin
+    return FrameResults(target, fate, tuple(reason), *found, sequence.files)

@@ -31,6 +31,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxcal import InputError
@@ -48,6 +49,7 @@ from jaxcal.model.unknowns import (
     stepped,
 )
 from jaxcal.model.unrolled import Matrix, Vector, add
+from jaxcal.runtime.arrays import is_traced
 
 TRACKER_STEPS = 4
 """Newton steps for a tracker's elevational error; the range curves so little that two would do."""
@@ -113,6 +115,9 @@ class Observation(eqx.Module):
 
     Attributes:
         sigma: SD of each component, mm; ones where residuals are not in SDs.
+
+    Raises:
+        InputError: an SD that is not positive; inf stands for nothing known.
     """
 
     sigma: eqx.AbstractVar[Float[Array, "components lanes"]]
@@ -120,6 +125,9 @@ class Observation(eqx.Module):
     """Whether residuals are in SDs; otherwise their variance is estimated from them."""
     oriented: ClassVar[bool] = False
     """Whether residuals depend on how the image is turned in other ways than through q."""
+
+    def __check_init__(self) -> None:
+        _check_values("sigma", self.sigma)
 
     @abc.abstractmethod
     def components(self, q: Vector, further: Further, images: ImagePlanes) -> list[Component]:
@@ -166,6 +174,15 @@ class Observation(eqx.Module):
         """
         del before, now, squares
         return 0.0
+
+
+def _check_values(name: str, values: Array, *, zero: bool = False) -> None:
+    """Refuse NaN and what is below zero (or is zero), where the values are known already."""
+    if is_traced(values):
+        return
+    known = np.asarray(values)
+    if not (known >= 0 if zero else known > 0).all():
+        raise InputError(f"{name} must be {'zero or ' if zero else ''}positive, mm")
 
 
 class Points(Observation):
@@ -403,11 +420,17 @@ class BoundedOffsets(LocalUnknown):
     Attributes:
         sigma: one.
         bound: m_i, mm; at most 0.95 of the image's range is used.
+
+    Raises:
+        InputError: a bound below zero.
     """
 
     sigma: Float[Array, "1 lanes"]
     bound: Float[Array, "lanes n"]
     whitened: ClassVar[bool] = False
+
+    def __check_init__(self) -> None:
+        _check_values("bound", self.bound, zero=True)
 
     @classmethod
     def of(cls, bound: Float[Array, "lanes n"], images: ImagePlanes) -> BoundedOffsets:
@@ -453,11 +476,17 @@ class TrackedPoints(LocalUnknown):
         sigma: SDs of lateral position, range and offset, mm.
         tracker_sd: tau, mm.
         shape: as in :class:`OwnCovariances`, or None.
+
+    Raises:
+        InputError: an SD that is not positive, or a ``tracker_sd`` below zero.
     """
 
     sigma: Float[Array, "3 lanes"]
     tracker_sd: Float[Array, " lanes"]
     shape: Float[Array, "3 lanes n"] | None = None
+
+    def __check_init__(self) -> None:
+        _check_values("tracker_sd", self.tracker_sd, zero=True)
 
     def components_at(
         self, q: Vector, local: Array, further: Further, images: ImagePlanes

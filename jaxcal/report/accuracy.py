@@ -22,7 +22,7 @@ from jaxcal import InputError
 from jaxcal.calibration.result import Calibration
 from jaxcal.data.poses import targets_in_images
 from jaxcal.data.problem import Problem
-from jaxcal.data.recording import Recording
+from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
 from jaxcal.diagnostics.image_errors import Unknowns
@@ -115,8 +115,8 @@ def _tre(
     image = _to_image(answer, places)
     if wanted:
         given = np.array(wanted, float)
-        if not np.isfinite(given).all():
-            raise InputError("points of --tre must be finite numbers")
+        if not (np.abs(given) <= LARGEST).all():
+            raise InputError(f"points of --tre must be numbers up to {LARGEST:g}")
         names += ("asked for",) * len(given)
         image = np.concatenate([image, given])
         places = np.concatenate([places, _from_image(answer, given)])

@@ -81,6 +81,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         rtol: without effect; optimistix asks every solver for it.
         atol: without effect, as ``rtol``.
         norm: without effect, as ``rtol``.
+
+    Raises:
+        InputError: a tolerance or damping below zero, or one that is no number.
     """
 
     tolerance: float = 1e-10
@@ -189,7 +192,8 @@ def arrow_least_squares(
         optimistix's solution; its ``value`` is (shared, local).
 
     Raises:
-        InputError: shared unknowns that are integers, local ones that are not one a row.
+        InputError: shared unknowns that are integers, local ones that are not one a row; a
+            ``tolerance`` or ``damping`` below zero.
     """
     flat, unravel = ravel_pytree(shared)
     if not jnp.issubdtype(flat.dtype, jnp.floating):

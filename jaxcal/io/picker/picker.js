@@ -6,6 +6,9 @@ const frame = of("frame"), loupe = of("loupe");
 let state = null, index = 0, image = null, scale = 1, ended = false, busy = Promise.resolve();
 const images = new Map();
 
+// The numbers of a folder's images count from 0, their names need not.
+const named = (k) => state.files[k] ?? `frame ${state.shown[k]}`;
+
 function load(k) {
   const number = state.shown[k];
   if (number === undefined) return null;
@@ -14,7 +17,7 @@ function load(k) {
     made.onload = () => { if (made === image) draw(); };
     made.onerror = () => {
       images.delete(number);
-      if (made === image) trouble(`frame ${number} cannot be shown`);
+      if (made === image) trouble(`${named(k)} cannot be shown`);
     };
     made.src = `frame/${number}.png`;
     images.set(number, made);
@@ -38,12 +41,12 @@ function tell() {
   const point = state.points[number];
   of("name").textContent = state.name;
   of("where").textContent = ended ? "Finished. You may close this page."
-    : `frame ${number} (${index + 1} of ${state.shown.length}), `
+    : `${named(index)} (${index + 1} of ${state.shown.length}), `
       + `${picked} picked, ${state.skipped.length} skipped`
       + (point ? `, here at ${point[0].toFixed(2)}, ${point[1].toFixed(2)} px`
         : state.skipped.includes(number) ? ", skipped here" : "")
       + (state.next === null ? ". All done: finish, or look back." : "");
-  document.title = `${number}: ${state.name}`;
+  document.title = `${named(index)}: ${state.name}`;
   const bar = of("bar");
   if (bar.childElementCount !== state.shown.length)
     bar.replaceChildren(...state.shown.map(() => document.createElement("i")));

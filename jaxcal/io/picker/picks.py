@@ -23,12 +23,14 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import write_text
-from jaxcal.io.readable import check_readable
+from jaxcal.io.readable import check_readable, quoted
 from jaxcal.io.text import read_pose_table
 
 _HEAD = "# jaxcal pick of "
 _SKIPPED = "# skipped:"
 _MOST_BYTES = 2**24
+_UNTOLD = r'^[\s"]|[\\\r\n\ud800-\udfff]'
+"""What in an image's name would not be read back from a table as it is."""
 Point = tuple[float, float]
 
 
@@ -46,8 +48,10 @@ class Picks:
     Attributes:
         points: [u, v] by the number of the frame, px.
         skipped: numbers of the frames without a target.
+        files: names of the images of a folder; empty for a sequence.
 
     Raises:
+        InputError: an image's name that would not be read back from the table.
         FormatError: a file that was not written here, or one of another sequence.
     """
 
@@ -60,10 +64,16 @@ class Picks:
         shown: Sequence[int],
         files: Sequence[str] = (),
     ) -> None:
-        self._files = tuple(files)
+        self.files = tuple(files)
         self.path, self.shown, self.size = os.fspath(path), list(shown), size
-        # As the file will have it, also where the name is not UTF-8.
-        named = name.encode("utf-8", errors="backslashreplace").decode()
+        for each in files:
+            if re.search(_UNTOLD, each):
+                raise InputError(
+                    f"{quoted(each)}: a table of points cannot name this image: rename it (no "
+                    "line break, backslash, or blank or quotation mark at the beginning; UTF-8)"
+                )
+        # As the file will have it, also where the name is not UTF-8 or has several lines.
+        named = " ".join(name.encode("utf-8", errors="backslashreplace").decode().splitlines())
         self._head = f"{_HEAD}{named}: {size[0]} x {size[1]} px, {count} frames"
         self.points: dict[int, Point] = {}
         self.skipped: set[int] = set()
@@ -127,7 +137,7 @@ class Picks:
         others = {k for k in self.skipped if k != frame} | ({frame} if skipped else set())
         rows = [f"{self._named(k)},{points[k][0]!r},{points[k][1]!r}" for k in sorted(points)]
         told = " ".join(map(str, sorted(others)))
-        column = "file" if self._files else "frame"
+        column = "file" if self.files else "frame"
         head = [self._head, f"{_SKIPPED} {told}".rstrip(), f"{column},u,v"]
         # Points that a second page or an editor has put there must not be lost.
         if self._content() not in (self._known, None):
@@ -146,9 +156,9 @@ class Picks:
         return Path(self.path).read_bytes()
 
     def _named(self, frame: int) -> str:
-        if not self._files:
+        if not self.files:
             return str(frame)
-        doubled = self._files[frame].replace('"', '""')
+        doubled = self.files[frame].replace('"', '""')
         return f'"{doubled}"'
 
     def _load(self, content: str, count: int) -> None:
@@ -166,12 +176,12 @@ class Picks:
         self.skipped = {int(number) for number in told.split() if len(number) < 10}
         if len(lines) > 3:
             table = read_pose_table(self.path)
-            frames = table.file if self._files else table.frame
+            frames = table.file if self.files else table.frame
             if frames is None or table.points is None:
-                column = "file" if self._files else "frame"
+                column = "file" if self.files else "frame"
                 raise FormatError(f"{self.path}: has no columns {column}, u and v")
-            places = {name: k for k, name in enumerate(self._files)}
-            if self._files:
+            places = {name: k for k, name in enumerate(self.files)}
+            if self.files:
                 frames = [places.get(str(name), count) for name in frames]
             self.points = {
                 int(frame): (float(u), float(v))

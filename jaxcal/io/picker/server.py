@@ -104,6 +104,7 @@ class Picker:
             "name": self.name,
             "size": picks.size,
             "shown": picks.shown,
+            "files": [picks.files[frame] for frame in picks.shown] if picks.files else [],
             "points": {str(frame): point for frame, point in picks.points.items()},
             "skipped": sorted(picks.skipped),
             "next": picks.next_frame,
