@@ -1,7 +1,7 @@
 """The command line: exit codes, one line of error, pure JSON, whole files or none.
 
-Commands that compile run in processes of their own; what must be refused before that runs in this
-one.
+One calibration runs in a process of its own, as a user's; the others share its kept programs in
+this one.
 """
 
 import io
@@ -21,7 +21,7 @@ import jaxcal
 from hw.cli.main import commands as bench_commands
 from hw.cli.main import main as bench_main
 from hw.errors import DeviceError
-from jaxcal.cli import cache, common, demo
+from jaxcal.cli import cache, common, demo, plan
 from jaxcal.cli.main import commands, main
 from jaxcal.cli.run import run
 from jaxcal.data.recording import Recording, make_images
@@ -71,11 +71,6 @@ SCHEMA = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _no_cache_in_this_process(monkeypatch):
-    monkeypatch.setenv("JAXCAL_NO_CACHE", "1")
-
-
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory):
     return tmp_path_factory.mktemp("cli")
@@ -89,8 +84,7 @@ def jaxcal_process():
         "COLUMNS": "100",
         "PYTHONWARNINGS": "error::DeprecationWarning",  # they are not shown otherwise
     }
-    for name in ("JAXCAL_NO_CACHE", "JAX_COMPILATION_CACHE_DIR"):
-        environment.pop(name, None)
+    environment.pop("JAX_COMPILATION_CACHE_DIR")
 
     def run(*arguments, **others):
         options = {"capture_output": True, "text": True, "check": False, "timeout": 300, **others}
@@ -101,10 +95,9 @@ def jaxcal_process():
 
 
 @pytest.fixture(scope="module")
-def simulated(shared, jaxcal_process):
+def simulated(shared):
     path = shared / "simulated.h5"
-    done = jaxcal_process("simulate", path, "--elevation", 2, "--seed", 1)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert main(["simulate", str(path), "--elevation", "2", "--seed", "1"]) == 0
     return path
 
 
@@ -124,6 +117,15 @@ def recording(tmp_path):
     path = tmp_path / "rec.h5"
     jaxcal.save(Recording(make_images(poses, generator.uniform(10, 50, (6, 2)))), path)
     return path
+
+
+def told(capfd, *arguments, code=0):
+    """Run what prints an answer and no word besides; the answer."""
+    capfd.readouterr()
+    assert main([str(argument) for argument in arguments]) == code
+    out, err = capfd.readouterr()
+    assert err == ""
+    return out
 
 
 def refused(capfd, *arguments):
@@ -212,16 +214,11 @@ def test_simulate_writes_what_load_reads(simulated):
 def test_curvilinear_times_of_flight_become_points(capfd, tmp_path):
     raw, points = tmp_path / "raw.h5", tmp_path / "points.h5"
     options = ["--probe", "curvilinear", "--clock-mhz", "20", "--noise", "0.2"]
-    assert main(["simulate", str(raw), *options]) == 0
-    told = capfd.readouterr()
-    assert told.err == ""
-    assert "50 images of times of flight" in told.out
+    assert "50 images of times of flight" in told(capfd, "simulate", raw, *options)
     ticks = jaxcal.load(raw).calibration.measurements * 20e6
     np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-6)
-    assert main(["segment", str(raw), "--out", str(points), "--json"]) == 0
-    told = capfd.readouterr()
-    assert told.err == ""
-    assert json.loads(told.out)["images_used"] == 50
+    found = json.loads(told(capfd, "segment", raw, "--out", points, "--json"))
+    assert found["images_used"] == 50
     with h5py.File(points) as file:
         assert file["segmentation/out_of_plane"].shape == (50, 3)
     assert jaxcal.load(points).probe.kind == "curvilinear"
@@ -267,12 +264,13 @@ def test_calibrate_writes_the_whole_report(calibrated):
         assert path.read_bytes().endswith(b"IEND\xaeB`\x82")
 
 
-def test_calibrate_speaks_to_a_person(calibrated, simulated, jaxcal_process):
-    done = jaxcal_process("calibrate", simulated)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "image_plane_to_probe (mm)" in done.stdout
-    assert "the target stays within" in done.stdout
-    assert max(map(len, done.stdout.splitlines())) <= 100
+@pytest.mark.usefixtures("calibrated")
+def test_calibrate_speaks_to_a_person(simulated, capfd, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    out = told(capfd, "calibrate", simulated)
+    assert "image_plane_to_probe (mm)" in out
+    assert "the target stays within" in out
+    assert max(map(len, out.splitlines())) <= 100
 
 
 @pytest.mark.slow
@@ -326,20 +324,17 @@ def degenerate(shared, simulated):
     return shared
 
 
-def test_equal_poses_are_counted_and_refused(degenerate, jaxcal_process, tmp_path):
-    done = jaxcal_process("calibrate", degenerate / "duplicates.h5", "--out", tmp_path)
-    assert done.returncode == 2
-    assert "count once" in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+def test_equal_poses_are_counted_and_refused(degenerate, capfd, tmp_path):
+    line = refused(capfd, "calibrate", degenerate / "duplicates.h5", "--out", tmp_path)
+    assert "count once" in line
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_degenerate_set_is_solved_but_not_observable(degenerate, jaxcal_process, tmp_path):
+@pytest.mark.usefixtures("calibrated")
+def test_a_degenerate_set_is_solved_but_not_observable(degenerate, capfd, tmp_path):
     files = REPORT - DETERMINED
-    report = ["--out", tmp_path]
-    done = jaxcal_process("calibrate", degenerate / "parallel.h5", "--json", *report)
-    assert (done.returncode, done.stderr) == (3, "")
-    record = json.loads(done.stdout)
+    parallel = degenerate / "parallel.h5"
+    record = json.loads(told(capfd, "calibrate", parallel, "--json", "--out", tmp_path, code=3))
     assert (record["status"], record["converged"]) == ("unobservable", False)
     assert record["covariance"] is None
     assert record["warnings"]
@@ -607,7 +602,6 @@ def test_messages_are_not_markup(capfd):
 
 @pytest.mark.parametrize("spoil", ["open", "open_parent", "link", "file", "unwritable", "off"])
 def test_cache_that_cannot_be_trusted_is_not_used(spoil, tmp_path, monkeypatch, capfd):
-    monkeypatch.delenv("JAXCAL_NO_CACHE")
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     folder = program_cache.private_folder("xla")
@@ -675,38 +669,36 @@ def test_calibrate_ends_with_the_images_that_would_help_most(calibrated, simulat
         assert np.linalg.norm(seen[[0, 2]] - pose["target_mm"]) < 2
 
 
-def test_plan_from_a_recording_says_what_to_add(simulated, calibrated, jaxcal_process, shared):
-    figure = shared / "plan.png"
-    done = jaxcal_process("plan", simulated, "--images", 4, "--json", "--figure", figure)
-    assert (done.returncode, done.stderr) == (0, "")
-    found = json.loads(done.stdout)
+@pytest.mark.usefixtures("calibrated")
+def test_plan_from_a_recording_says_what_to_add(simulated, capfd, tmp_path):
+    figure = tmp_path / "plan.png"
+    found = json.loads(told(capfd, "plan", simulated, "--images", 4, "--json", "--figure", figure))
     assert (found["images_before"], len(found["poses"]), len(found["tre_mm"])) == (50, 4, 5)
     assert found["tre_mm"] == sorted(found["tre_mm"], reverse=True)
     assert figure.read_bytes().startswith(b"\x89PNG")
 
 
 def test_plan_from_nothing_is_words_and_counts(capfd):
-    assert main(["plan", "--images", "6", "--cone", "20", "--seed", "1"]) == 0
-    out, _ = capfd.readouterr()
+    out = told(capfd, "plan", "--images", 6, "--cone", 20, "--seed", 1)
     assert "tilt 20 degrees" in out
     assert "How many images an error takes" in out
     assert out.count("target") >= 6
 
 
 def test_a_plan_is_tried_in_simulated_recordings(capfd):
-    arguments = ["plan", "--images", "6", "--simulate", "normal"]
-    assert main(arguments) == 0
-    out, _ = capfd.readouterr()
-    assert "In 1000 simulated recordings with normal offsets" in " ".join(out.split())
-    assert main([*arguments, "--json"]) == 0
-    (found,) = json.loads(capfd.readouterr().out)["simulated"]
-    assert (found["images"], found["trials"], found["lost"]) == (6, 1000, 0)
-    assert f"error over the image {found['tre_mm']:.2g} mm" in " ".join(out.split())
+    arguments = ["plan", "--images", 24, "--sigma", 0.1, 0.1, 1]
+    arguments += ["--simulate", "normal", "--simulate", "uniform"]
+    normal, uniform = json.loads(told(capfd, *arguments, "--json"))["simulated"]
+    assert (normal["images"], normal["trials"], normal["lost"]) == (24, 1000, 0)
+    # Offsets with edges tell the default method more than their SD says.
+    assert uniform["tre_mm"] < 0.9 * normal["tre_mm"]
+    words = plan._simulated_in_words(normal)
+    assert words.startswith("In 1000 simulated recordings with normal offsets: error over the ")
+    assert f"image {normal['tre_mm']:.2g} mm" in words
 
 
 def test_a_plan_has_no_more_poses_than_its_error_takes(capfd):
-    assert main(["plan", "--until-tre", "0.3", "--json"]) == 0
-    errors = json.loads(capfd.readouterr().out)["tre_mm"]
+    errors = json.loads(told(capfd, "plan", "--until-tre", "0.3", "--json"))["tre_mm"]
     assert errors[-1] <= 0.3 < errors[-2]
 
 

@@ -181,9 +181,9 @@ print(json.dumps(said))
 """
 
 
-@pytest.fixture
-def saved(tmp_path: Path) -> Path:
-    path = tmp_path / "recording.h5"
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("saved") / "recording.h5"
     jaxcal.save(experiment(5, images=20, elevation_mm=1.0, noise_mm=0.5), path)
     return path
 
@@ -268,7 +268,8 @@ def test_a_person_sees_the_conventional_fit_before_anything_is_compiled(saved, m
         assert "converged after" in terminal.shown
 
 
-def test_json_is_one_object_and_nothing_else(saved, capfd):
+def test_json_is_one_object_and_nothing_else(saved, capfd, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(saved.parent / "empty"))  # of the test before
     asked = ["--method", "alternating", "--require", "uncertain", "--json"]
     assert main(["calibrate", str(saved), *asked]) == 0
     said, error = capfd.readouterr()

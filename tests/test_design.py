@@ -531,15 +531,15 @@ def test_simulated_errors_with_equal_sds_are_the_bound(scale, face):
 
 
 def test_simulated_errors_know_the_law():
-    """Offsets with edges tell more than their SD says, and a mean cannot be told from a shift."""
+    """A mean cannot be told from a shift. (What edges tell: see the plan in test_cli.py.)"""
     candidates = some(100, model=replace(MODEL, noise=Noise.constant((0.1, 0.1, 1.0))))
-    sets = candidates.poses[np.random.default_rng(2).integers(100, size=(200, 24))]
+    sets = candidates.poses[np.random.default_rng(2).integers(100, size=(1000, 16))]
     found = {
-        law: design.simulate_errors(sets, law, candidates, seed=3)
+        law: design.simulate_errors(sets, law, candidates, method="conventional", seed=3)
         for law in ("uniform", "normal", "one-sided")
     }
-    assert found["uniform"].trials == 200
-    assert found["uniform"].tre_mm < 0.8 * found["normal"].tre_mm
+    assert found["uniform"].trials == 1000
+    assert found["uniform"].tre_mm == pytest.approx(found["normal"].tre_mm, rel=0.05)
     assert found["one-sided"].tre_mm > 1.5 * found["normal"].tre_mm
     assert found["normal"].tre_mm < found["normal"].tre_95_mm
 
@@ -549,7 +549,7 @@ def test_simulated_errors_count_the_images_taken_before():
     result = jaxcal.calibrate(recording, "conventional")
     around = design.candidates_around(recording, result, count=60)
     more = design.next_poses(result, around, 4)
-    found = design.simulate_errors(more, "normal", around, method="conventional", trials=64)
+    found = design.simulate_errors(more, "normal", around, method="conventional")
     alone = design.simulate_errors(more.poses, "normal", around, method="conventional", trials=64)
     assert (found.images, alone.images) == (14, 4)
     assert found.tre_mm < 0.5 * alone.tre_mm

@@ -138,10 +138,12 @@ def test_any_number_of_images(solver, images):
 
 
 @pytest.mark.parametrize(
-    "solver", [s for s in SOLVERS if s.name not in ("lm", "alternating")], ids=lambda s: s.name
+    "solver",
+    [s for s in SOLVERS if s.name not in ("lm", "alternating", "bounded")],
+    ids=lambda s: s.name,
 )
 def test_batches_of_any_shape_and_bad_lanes(solver):
-    """Of the first of the solvers see test_batches.py, of the alternation test_joint.py."""
+    """Of the first of the solvers see test_batches.py, of those with bounds test_joint.py."""
     lanes = [noisy(12, seed) for seed in range(5)]
     poisoned = replace(lanes[0], poses=np.array(lanes[0].poses))
     poisoned.poses[3, 0, 3] = np.nan
@@ -258,7 +260,9 @@ def test_derivative_of_the_other_minimisers_matches_finite_differences(solver):
     np.testing.assert_allclose(derivative, difference, rtol=tolerance)
 
 
+@pytest.mark.parametrize("solver", SOLVERS[1:], ids=lambda s: s.name)
 def test_float32(solver):
+    """Of the first of the solvers see test_guest.py."""
     reference = noisy(12)
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), reference)
     arguments = dict(solver.arguments)

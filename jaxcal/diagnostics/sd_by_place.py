@@ -35,7 +35,7 @@ def basis_at(target: Float[Any, "*n 3"]) -> Float[Any, "*n 4"]:
 
 
 def log_sd_slopes(
-    basis: Float[np.ndarray, "*k n 4"],
+    basis: Float[np.ndarray, "*#k n 4"],
     squares: Float[np.ndarray, "*k n"],
     mask: Float[np.ndarray, "*k n"],
 ) -> Float[np.ndarray, "*k 3"]:
