@@ -119,7 +119,7 @@ def test_masked_images_beyond_the_bucket_change_nothing(name, problems):
         jax.tree.map(jnp.asarray, buckets.taken(smaller, [*range(8), 0])),
     ]  # nine: one comes twice
 
-    @settings(max_examples=12, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=12)
     @given(
         source=st.sampled_from(sources),
         count=st.integers(9, 12),

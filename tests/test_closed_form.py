@@ -163,7 +163,7 @@ def test_crosswire_in_ten_milliseconds_without_jax(crosswire, tmp_path):
 # Against local searches
 
 
-@settings(max_examples=12, deadline=None, derandomize=True)
+@settings(max_examples=12)
 @given(
     seed=st.integers(0, 10_000),
     count=st.integers(4, 20),
@@ -229,7 +229,7 @@ def test_five_images_with_large_errors_need_the_relaxation_and_trap_searches():
     assert trapped > 0
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), count=st.integers(4, 12), near=st.floats(1e-6, 2.0))
 def test_the_bound_holds_at_any_transform(seed, count, near):
     images = drawn(seed, count, noise=3.0, offset=3.0)

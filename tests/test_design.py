@@ -136,7 +136,7 @@ def test_weights_are_the_errors_that_they_stand_for():
     assert np.mean(precision) == pytest.approx(wanted, rel=0.05)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     cone=st.floats(2, 60), turn=st.floats(2, 180), seed=st.integers(0, 1000),
     half=st.floats(20, 80), near=st.floats(100, 250), tilted=st.booleans(),

@@ -22,7 +22,7 @@ def random_poses(seed: int, count: int = 5) -> np.ndarray:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_nearest_rotation_is_a_rotation_and_no_other_is_nearer(seed):
     rng = np.random.default_rng(seed)
     matrices = rng.normal(size=(4, 3, 3))

@@ -128,7 +128,7 @@ def refused(path, message, error=FormatError):
 # -- round trips
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(["point", "pixel", "time_of_flight"]),
@@ -687,9 +687,9 @@ def test_circular_and_dangling_links(path):
 def test_growing_chain_of_links_ends(path):
     with h5py.File(path, "r+") as file:
         file["calibration/mask"] = h5py.SoftLink("mask/" * 5000 + "mask")
-    started = time.perf_counter()
+    started = time.process_time()
     refused(path, "circular or too deep")
-    assert time.perf_counter() - started < 2
+    assert time.process_time() - started < 2
 
 
 @pytest.mark.parametrize("there", [True, False])

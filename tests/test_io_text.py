@@ -105,7 +105,7 @@ def test_crosswire_reflection_names_the_file(pair):
         read_crosswire(*pair[:2])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     seed=st.integers(0, 2**32 - 1),
     count=st.integers(4, 9),

@@ -32,7 +32,7 @@ def solve(posed: PoseSet, method: Method = "joint") -> jaxcal.Calibration:
     return jaxcal.calibrate(data, method)
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=50)
 @given(kinds, st.integers(0, 10**6), elevations, noises)
 def test_no_set_is_misjudged(kind, seed, elevation, noise):
     posed = make(kind, seed, elevation, noise)
@@ -57,7 +57,7 @@ def test_no_set_is_misjudged(kind, seed, elevation, noise):
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=50)
 @given(kinds, st.integers(0, 10**6), elevations, noises)
 def test_the_conventional_method_arrives_or_says_why_not(kind, seed, elevation, noise):
     """Its residuals are the offsets: along a weak direction Gauss-Newton alone would crawl."""

@@ -122,7 +122,7 @@ def test_a_worker_whose_parent_is_gone_ends_without_a_word(squares):
     worker.stdout.close()
     worker.stdin.write(f'{json.dumps(given)}\n{{"chunk": 0}}\n')
     worker.stdin.close()
-    assert worker.wait(timeout=120) == 1
+    assert worker.wait(timeout=600) == 1
     assert worker.stderr.read() == ""
     worker.stderr.close()
 

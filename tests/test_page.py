@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import sys
-import time
 from base64 import b64decode
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -22,7 +21,7 @@ from jaxcal.report.page import page, write_page
 from jaxcal.report.record import calibration_record
 
 sys.path.insert(0, str(Path(__file__).parent / "hw"))
-from browser import browsing
+from browser import browsing, open_page
 
 HOSTILE = '</script><script>alert(1)</script><img src=x onerror=alert(1)>"&\u2028.h5'
 
@@ -197,11 +196,7 @@ def test_in_a_browser_without_a_network(tmp_path, text, width, scheme):
         features = [{"name": "prefers-color-scheme", "value": scheme}]
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
         browser.execute_cdp_cmd("Log.enable", {})
-        browser.get((tmp_path / "cal.html").as_uri())
-        for _ in range(100):
-            time.sleep(0.1)
-            if browser.execute_script("return document.readyState") == "complete":
-                break
+        open_page(browser, (tmp_path / "cal.html").as_uri())
         seen = browser.execute_script(CHECK)
         entries = [json.loads(entry["message"])["message"] for entry in
                    browser.get_log("performance")]  # fmt: skip
@@ -247,11 +242,7 @@ def test_on_paper(tmp_path, text):
         browser.execute_cdp_cmd(
             "Emulation.setEmulatedMedia", {"media": "print", "features": features}
         )
-        browser.get((tmp_path / "cal.html").as_uri())
-        for _ in range(100):
-            time.sleep(0.1)
-            if browser.execute_script("return document.readyState") == "complete":
-                break
+        open_page(browser, (tmp_path / "cal.html").as_uri())
         seen, printed = browser.execute_script(CHECK), browser.execute_script(PRINTED)
         pdf = browser.execute_cdp_cmd("Page.printToPDF", {"preferCSSPageSize": True})["data"]
     assert seen["found"] == []

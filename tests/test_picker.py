@@ -29,7 +29,7 @@ from jaxcal.io.sequence_files import read_sequence, write_sequence
 from jaxcal.io.text import read_pose_table
 
 sys.path.insert(0, str(Path(__file__).parent / "hw"))
-from browser import addresses, browsing, screenshot
+from browser import addresses, browsing, open_page, screenshot
 
 ROWS, COLUMNS, COUNT = 60, 80, 7
 PAIR = ("Probe", "Reference")
@@ -66,7 +66,7 @@ def serving(path: Path, sequence: Path):
         yield page
 
 
-def wait_until(browser, script: str, expected, timeout_s: float = 30.0):
+def wait_until(browser, script: str, expected, timeout_s: float = 180.0):
     deadline = time.monotonic() + timeout_s
     while (found := browser.execute_script(script)) != expected:
         assert time.monotonic() < deadline, f"{script}: {found!r}, not {expected!r}"
@@ -103,7 +103,7 @@ def test_a_person_in_a_browser(tmp_path, sequence):
     with browsing(tmp_path / "profile", (1000, 800)) as browser:
         addresses(browser)
         with picking(sequence) as (process, url):
-            browser.get(url)
+            open_page(browser, url)
             wait_until(browser, SHOWN_FRAME, "0")
             assert "frame 0 (1 of 6)" in browser.execute_script(WHERE)
             click(browser, 12.0, 34.0)
@@ -124,7 +124,7 @@ def test_a_person_in_a_browser(tmp_path, sequence):
             trouble = "return document.getElementById('trouble').textContent.slice(0, 22)"
             wait_until(browser, trouble, "jaxcal does not answer")
         with picking(sequence) as (process, url):
-            browser.get(url)
+            open_page(browser, url)
             wait_until(browser, SHOWN_FRAME, "4")
             from selenium.webdriver.common.action_chains import ActionChains
             from selenium.webdriver.common.keys import Keys
@@ -141,7 +141,7 @@ def test_a_person_in_a_browser(tmp_path, sequence):
                 click(browser, *place)
             wait_until(browser, "return state.next", None)
             press(browser, "f")
-            said, _ = process.communicate(timeout=30)
+            said, _ = process.communicate(timeout=300)
         hosts = addresses(browser)
     assert hosts <= {"127.0.0.1"}
     assert process.returncode == 0
@@ -179,7 +179,7 @@ def picking(sequence: Path, *options: str):
 def test_ctrl_c_keeps_what_was_picked(sequence):
     with picking(sequence) as (process, _):
         process.send_signal(signal.SIGINT)
-        said, _ = process.communicate(timeout=30)
+        said, _ = process.communicate(timeout=300)
     assert process.returncode == 0
     assert "no points" in said
 
@@ -193,7 +193,7 @@ def test_the_next_command_can_be_copied(tmp_path, sequence):
     given = ["--poses", str(renamed), "--from", "Probe", "--to", "Reference", "--lag", "-0.05"]
     with picking(renamed, *given) as (process, _):
         process.send_signal(signal.SIGINT)
-        said, _ = process.communicate(timeout=30)
+        said, _ = process.communicate(timeout=300)
     command = said.partition("next: ")[2].strip()
     assert shlex.split(command) == ["jaxcal", "import", str(renamed), str(out), "OUT.h5", *given]
 
@@ -208,7 +208,7 @@ def test_a_place_that_cannot_be_written_is_said_before_the_page(sequence, capsys
 
 def request(page, method="GET", path="", body=None, **headers):
     token = page.url.rsplit("/", 2)[1]
-    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=180)
     sent = {
         "Host": f"127.0.0.1:{page.port}",
         **{k.replace("_", "-"): v for k, v in headers.items()},

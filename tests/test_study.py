@@ -469,7 +469,7 @@ def test_full_disk(tmp_path):
     # Python would leave truncated bytecode beside our sources.
     limited = 'export PYTHONDONTWRITEBYTECODE=1; ulimit -f 4; exec "$@"'
     child = process(run, before=("bash", "-c", limited, "bash"))
-    out, err = child.communicate(timeout=120)
+    out, err = child.communicate(timeout=600)
     assert child.returncode == 2, err
     last = err.strip().splitlines()[-1]
     assert "cannot be written" in last, err
@@ -482,7 +482,7 @@ def test_full_disk(tmp_path):
 
 def start_and_wait(run, folder, count):
     child = process(run)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 600
     store = Store(folder, parse_spec(LONG))
     while len(store.present()) < count:
         if time.monotonic() > deadline or child.poll() is not None:
@@ -528,7 +528,7 @@ def test_interrupted_killed_and_resumed(long_study, tmp_path):
     path.write_text(LONG)
     child = start_and_wait(["run", path, "--out", folder], folder, 5)
     child.send_signal(signal.SIGINT)
-    _, told = child.communicate(timeout=120)
+    _, told = child.communicate(timeout=600)
     assert child.returncode == 130
     done = len(Store(folder, parse_spec(LONG)).present())
     again = f"jaxcal study run {path} --out {folder} --resume"
@@ -566,7 +566,7 @@ def test_full_file_system(long_study, tmp_path):
         ["run", path, "--out", small_disk / "out"],
         before=("unshare", "-rm", "bash", "-c", script, "bash"),
     )  # fmt: skip
-    _, err = child.communicate(timeout=120)
+    _, err = child.communicate(timeout=600)
     assert child.returncode == 2, err
     assert "No space left on device" in err.strip().splitlines()[-1]
     there = files(kept)
@@ -586,7 +586,7 @@ def test_several_devices_share_a_block(tmp_path):
     child = process(["run", path, "--out", folder], before=("env", "JAX_NUM_CPU_DEVICES=2"))
     # In chunks for one device, whose programs are those of the other tests.
     run_study(parse_spec(conventional_only(small(trials, chunk=trials // 2))), tmp_path / "one")
-    _, err = child.communicate(timeout=300)
+    _, err = child.communicate(timeout=600)
     assert child.returncode == 0, err
     assert "2 x cpu" in Store.open(folder).versions(parse_spec(spec).chunk(0))
     one, two = open_results(tmp_path / "one"), open_results(folder)

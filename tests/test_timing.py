@@ -28,7 +28,7 @@ def screw(t: np.ndarray, turn: np.ndarray, speed: np.ndarray) -> np.ndarray:
     return poses
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.tuples(*[st.floats(-3, 3)] * 3),
     st.tuples(*[st.floats(-80, 80)] * 3),

@@ -569,7 +569,7 @@ def test_served_to_another_client():
         client = pyigtl.OpenIGTLinkClient("127.0.0.1", server.port)
         try:
             for _ in range(2):
-                message = client.wait_for_message("ImageToProbe", timeout=20)
+                message = client.wait_for_message("ImageToProbe", timeout=180)
                 np.testing.assert_allclose(message.matrix, matrix, atol=1e-4)
         finally:
             client.stop()
@@ -629,7 +629,7 @@ def test_served_once_in_ages():
     asked = iter([False, False, True])
     with (
         TransformServer("ImageToProbe", np.eye(4), port=0) as server,
-        socket.create_connection(("127.0.0.1", server.port), timeout=10) as client,
+        socket.create_connection(("127.0.0.1", server.port), timeout=180) as client,
     ):
         # Ends the wait for the next time.
         client.sendall(b"?")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from base64 import b64decode
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -41,7 +42,7 @@ def browsing(folder: Path, size: tuple[int, int] = (720, 480)) -> Iterator:
     path, driver = chromium()
     options = webdriver.ChromeOptions()
     options.binary_location = path
-    # Whoever asks waits for what the page says, not for its last byte.
+    # Whoever asks waits for what the page says, or by open_page.
     options.page_load_strategy = "none"
     for option in (*OPTIONS, f"--user-data-dir={folder}", f"--window-size={size[0]},{size[1]}"):
         options.add_argument(option)
@@ -51,6 +52,16 @@ def browsing(folder: Path, size: tuple[int, int] = (720, 480)) -> Iterator:
         yield browser
     finally:
         browser.quit()
+
+
+def open_page(browser, url: str, timeout_s: float = 180.0) -> None:
+    """Go there, and return when that page is loaded; until then the one before it may answer."""
+    browser.get(url)
+    deadline = time.monotonic() + timeout_s
+    ready = [url, "complete"]
+    while browser.execute_script("return [document.URL, document.readyState]") != ready:
+        assert time.monotonic() < deadline, f"{url} was not loaded"
+        time.sleep(0.05)
 
 
 def addresses(browser) -> set[str]:

@@ -42,6 +42,7 @@ class Terminal:
         self._terminal, its_end = pty.openpty()
         columns, lines = size
         fcntl.ioctl(self._terminal, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
+        self.modes_before = self.modes()
         # pty.fork would run Python in a copy of this process, of whose locks some may be held.
         self._process = subprocess.Popen(
             [sys.executable, "-IS", "-c", OF_ITS_OWN, *arguments],
@@ -77,7 +78,7 @@ class Terminal:
         deadline = time.monotonic() + timeout_s
         while self._more(deadline):
             pass
-        return self._process.wait(10.0)
+        return self._process.wait(timeout_s)
 
     def modes(self) -> list:
         """Of the terminal, as ``termios`` has them."""

@@ -36,7 +36,7 @@ def content(item: EchoPacket | Reply) -> tuple:
     )  # fmt: skip
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.lists(st.tuples(st.integers(0, 2**32 - 1), st.integers(0, 300)), max_size=6),
     st.integers(1, 700),
@@ -85,7 +85,7 @@ def test_size_of_a_frame() -> None:
     assert 115_200 < 30 * max(sizes) * 10 < 921_600
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=60))
 def test_lines_carry_their_crc(text: str) -> None:
     line = encode_line(text)

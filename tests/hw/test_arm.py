@@ -17,7 +17,7 @@ from hw.robot.pose import pose_to_ur, ur_to_pose
 START = (0.4, 0.0, 0.3, 0.0, 3.0, 0.0)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     target=st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6),
     speed=st.floats(0.001, 0.5),

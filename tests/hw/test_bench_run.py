@@ -35,7 +35,7 @@ def listen(bench: Bench, threshold: int, frames: int):
     with ActiveEcho(bench.active_echo_url, clock=bench.clock, lines=128) as echo:
         echo.set_threshold(threshold)
         echo.stream(True)
-        return [echo.read(5.0) for _ in range(frames)]
+        return [echo.read(600.0) for _ in range(frames)]
 
 
 def test_truth_is_the_worlds(bench):
@@ -81,14 +81,14 @@ def test_images_show_the_injected_bar_below_the_echo(bench):
         echo.set_threshold(10)
 
         def brightness(count: int) -> float:
-            array = [stream.read(5.0).array for _ in range(count)][-1]
+            array = [stream.read(600.0).array for _ in range(count)][-1]
             assert array.shape == (480, 640)
             return float(array[row, 300:340].mean())
 
         before = brightness(3)
         echo.load_pattern(bar(31, 64, 128))
         echo.inject(True, ticks)
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 180
         while brightness(1) < 250 and time.monotonic() < deadline:
             pass
         assert brightness(1) == 255
@@ -102,16 +102,16 @@ def test_images_show_the_injected_bar_below_the_echo(bench):
 def test_faults_come_and_go(bench):
     with ActiveEcho(bench.active_echo_url, clock=bench.clock, lines=128) as echo:
         echo.stream(True)
-        echo.read(5.0)
+        echo.read(600.0)
         at = bench.fault("crc_errors", rate=1.0)
         assert at <= bench.clock.now()
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 180
         while echo.statistics().crc_errors < 5 and time.monotonic() < deadline:
             time.sleep(0.02)
         assert echo.statistics().crc_errors >= 5
         bench.recover()
         echo.drain()
-        assert echo.read(5.0).frame > 0
+        assert echo.read(600.0).frame > 0
     with pytest.raises(RuntimeError, match="no fault 'gremlins'"):
         bench.fault("gremlins")
     with pytest.raises(RuntimeError, match="TypeError"):
@@ -139,11 +139,11 @@ def test_a_bench_ends_with_whoever_started_it():
         "print(start_bench(speed=5.0).pid, flush=True)\nos._exit(1)\n"
     )
     started = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60,
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300,
         env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False,
     )  # fmt: skip
     pid = int(started.stdout)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 180
     while time.monotonic() < deadline:
         try:
             os.kill(pid, 0)

@@ -14,27 +14,29 @@ PROGRAM = """
 import sys, time
 from types import SimpleNamespace
 from hw.keys import watch_keys
+from hw.midplane.terminal_image import Screen
 state = SimpleNamespace(held=False)
 pause = SimpleNamespace(held=False)
 pause.hold = lambda: setattr(pause, "held", True)
 pause.go_on = lambda: setattr(pause, "held", False)
-say = lambda line: print(line, flush=True)
+# Two threads speak here, each line in one piece, as in the programs.
+say = Screen(sys.stdout).say
 with watch_keys(pause, say, ("p",)) as keyboard:
     with keyboard.lines():
-        print("question", flush=True)
-        print("answer", sys.stdin.readline().strip(), flush=True)
+        say("question")
+        say(f"answer {sys.stdin.readline().strip()}")
     with keyboard.asking():
-        print("asking", flush=True)
-        while (key := keyboard.read(20.0)) != "enter":
-            print("key", key, flush=True)
-    print("not asking", flush=True)
+        say("asking")
+        while (key := keyboard.read(600.0)) != "enter":
+            say(f"key {key}")
+    say("not asking")
     while not pause.held:
         time.sleep(0.01)
-    print("held", flush=True)
+    say("held")
     while pause.held:
         time.sleep(0.01)
-    print("gone on", flush=True)
-    time.sleep(60)
+    say("gone on")
+    time.sleep(600)
 """
 
 
@@ -50,7 +52,6 @@ def test_keys_are_names():
 
 def test_a_terminal_by_keys_and_by_lines(tmp_path):
     with Terminal(["-c", PROGRAM], tmp_path) as person:
-        before = person.modes()
         person.wait_for("p pauses, Ctrl-C stops")
         person.wait_for("question")
         person.type("a word\n")
@@ -61,14 +62,15 @@ def test_a_terminal_by_keys_and_by_lines(tmp_path):
         person.type("\r")
         person.wait_for("not asking")
         person.type("kp")
-        # Two threads print here: either line may begin before the other's newline is written.
-        person.wait_for("p goes on\\s*held|held\\s*paused after this image; p goes on")
+        # Two threads speak: either may be the first.
+        paused = "paused after this image; p goes on"
+        person.wait_for(f"{paused}\r\nheld\r\n|held\r\n{paused}\r\n")
         person.type("p")
         person.wait_for("gone on")
         person.type("\x03")
         assert person.finish() != 0
         assert "KeyboardInterrupt" in person.shown
-        assert person.modes() == before
+        assert person.modes() == person.modes_before
 
 
 def test_without_a_terminal_nothing_is_read(tmp_path, capsys):

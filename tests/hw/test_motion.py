@@ -34,6 +34,8 @@ from jaxcal.runtime.isolated import import_path
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 
+pytestmark = pytest.mark.real_time
+
 HOME = ur_to_pose(np.array(START))
 SERIAL = "of the robot at hand"
 OFFSET = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)

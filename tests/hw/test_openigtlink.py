@@ -46,7 +46,7 @@ def decode(data: bytes) -> list[Message]:
     return MessageDecoder().feed(data, 0.0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.binary(max_size=3000))
 def test_crc(data: bytes) -> None:
     """The library's, bit by bit as the protocol's polynomial says."""

@@ -14,7 +14,7 @@ from hw.robot.pose import pose_to_ur, ur_to_pose
 number = st.floats(-4.0, 4.0)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(raw=st.lists(number, min_size=6, max_size=6))
 def test_poses_are_scipy_s_in_millimetres(raw):
     pose = ur_to_pose(np.array(raw))

@@ -21,7 +21,7 @@ from jaxcal import InputError
 SCENE = make_world(0).scene
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     count=st.integers(1, 60), cone=st.floats(0, 60), turn=st.floats(0, 180),
     seed=st.integers(0, 2**31),

@@ -86,7 +86,7 @@ def take(recorder: Recorder, images: SimpleNamespace, index: int) -> None:
 
 def wait_until_closed(path) -> None:
     """The writer of a killed acquisition closes the file by itself; then it can be opened."""
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 180
     while True:
         try:
             with h5py.File(path, "r+"):
@@ -177,7 +177,7 @@ def test_killed_opened_resumed_finished_calibrated(tmp_path, capsys, victim):
     time.sleep(1.3)
     os.kill(process.pid if victim == "acquisition" else writer, signal.SIGKILL)
     if victim == "writer":
-        assert process.wait(60) == 1  # the acquisition notices
+        assert process.wait(180) == 1  # the acquisition notices
     process.kill()
     process.wait()
     process.stdout.close()
@@ -220,7 +220,7 @@ def test_thirty_kills_of_the_writer_at_any_moment(tmp_path):
         process, writer = acquisition(path)
         time.sleep(rng.uniform(0.0, 2.2))
         os.kill(writer, signal.SIGKILL)
-        process.wait(60)
+        process.wait(180)
         process.stdout.close()
         with Recorder(path) as recorder:
             assert recorder.rows["calibration"] == 8

@@ -24,7 +24,7 @@ rtde_receive = pytest.importorskip("rtde_receive", reason="no wheel of ur_rtde h
 rtde_control = pytest.importorskip("rtde_control", reason="no wheel of ur_rtde here")
 
 
-def until(condition: Callable[[], object], seconds: float = 10.0) -> None:
+def until(condition: Callable[[], object], seconds: float = 180.0) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "it did not happen in time"
@@ -175,9 +175,9 @@ def test_variables_depend_on_the_version():
 )
 def test_junk_ends_its_own_connection_only(port, data):
     with RtdeServer(Arm(START), address()) as server:
-        with socket.create_connection((server.host, 29999), timeout=5.0) as good:
+        with socket.create_connection((server.host, 29999), timeout=60.0) as good:
             good.recv(200)
-            with socket.create_connection((server.host, port), timeout=5.0) as bad:
+            with socket.create_connection((server.host, port), timeout=60.0) as bad:
                 try:
                     bad.sendall(data)
                     bad.settimeout(0.3)
@@ -249,7 +249,7 @@ def test_one_client_owns_the_registers_and_nothing_unknown_is_started_or_ignored
     with EmulatedRobot() as robot:
 
         def connect() -> socket.socket:
-            return socket.create_connection((robot.host, 30004), timeout=5.0)
+            return socket.create_connection((robot.host, 30004), timeout=60.0)
 
         with connect() as first, connect() as second:
             assert ask(first, "I", b"input_int_register_0")[0] == 1
@@ -295,7 +295,7 @@ def test_setting_the_tcp_moves_the_pose_that_is_told_and_not_the_tool():
 
 def test_a_command_that_is_not_emulated_ends_the_program_and_says_why():
     with EmulatedRobot() as robot:
-        with socket.create_connection((robot.host, 30001), timeout=5.0) as primary:
+        with socket.create_connection((robot.host, 30001), timeout=60.0) as primary:
             control = rtde_control.RTDEControlInterface(robot.host)
             assert control.setPayload(0.7, [0.0, 0.0, 0.03])
             control.speedL([0.01, 0.0, 0.0, 0.0, 0.0, 0.0], 0.5, 0.1)

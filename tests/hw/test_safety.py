@@ -160,7 +160,7 @@ def offer(targets: object, chosen: int, start: np.ndarray, speed: object, age: f
     return True
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     targets=st.one_of(
         malformed,
@@ -192,7 +192,7 @@ def _nearby(start: np.ndarray, step: tuple, tilt: tuple) -> np.ndarray:
 def test_many_random_motions_are_safe_and_some_are_allowed():
     came_through = [0]
 
-    @settings(max_examples=400, deadline=None)
+    @settings(max_examples=400)
     @given(
         corner=st.tuples(st.floats(300, 500), st.floats(-200, 0), st.floats(180, 360)),
         tilt=small_tilts, step=steps, turn=small_tilts, speed=st.floats(0.5, 60.0),
@@ -205,7 +205,7 @@ def test_many_random_motions_are_safe_and_some_are_allowed():
     assert came_through[0] >= 20
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(step=st.tuples(*[st.floats(-8.0, 8.0)] * 3), turn=st.floats(-2.0, 2.0), speed=speeds)
 def test_searches_stay_in_their_envelope_and_under_their_speed(step, turn, speed):
     goal = _nearby(HOME, step, (turn, 0.0, 0.0))

@@ -14,6 +14,8 @@ from robots import address
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 
+pytestmark = pytest.mark.real_time
+
 _PATH = Path(__file__).parents[2] / "experiments" / "stop_study.py"
 _SPEC = importlib.util.spec_from_file_location("stop_study", _PATH)
 assert _SPEC is not None

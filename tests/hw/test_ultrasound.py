@@ -22,6 +22,8 @@ from hw.ultrasound import Image, UltrasoundStream
 from jaxcal.io.openigtlink import HEADER_SIZE, Message, Picture, StatusMessage, encode
 
 RNG = np.random.default_rng(11)
+PATIENCE_S = 600.0
+"""Bench time for what must come: minutes on the wall, as the machine may have other work."""
 PICTURES = [RNG.integers(0, 256, (48, 64), dtype=np.uint8) for _ in range(16)]
 
 
@@ -29,7 +31,7 @@ def render(t: float) -> np.ndarray:
     return PICTURES[int(t * 1000) % 16]
 
 
-def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
+def until(condition: Callable[[], object], seconds: float = 180.0) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline
@@ -37,7 +39,7 @@ def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
 
 
 def images_of(stream: UltrasoundStream, count: int) -> list[Image]:
-    return [stream.read(50.0) for _ in range(count)]
+    return [stream.read(PATIENCE_S) for _ in range(count)]
 
 
 def exhaust(stream: UltrasoundStream, timeout_s: float) -> None:
@@ -162,11 +164,11 @@ def test_stale_frozen_and_back(server: ImageServer) -> None:
         server.recover()
         last = images_of(stream, 3)[-1]
         server.freeze()
+        until(lambda: stream.statistics().repeated > 3)
         with pytest.raises(StaleError, match="is the machine frozen"):
             exhaust(stream, 1.0)
-        assert stream.statistics().repeated > 3
         server.recover()
-        assert stream.read(50.0).t_device > last.t_device
+        assert stream.read(PATIENCE_S).t_device > last.t_device
         assert stream.statistics().lost == 0
 
 
@@ -175,7 +177,7 @@ def test_dropped_connection(server: ImageServer) -> None:
         images_of(stream, 3)
         server.drop()
         with pytest.raises(LostError, match=r"ultrasound: .* has closed the connection"):
-            exhaust(stream, 50.0)
+            exhaust(stream, PATIENCE_S)
         with pytest.raises(LostError):
             stream.drain()
         with pytest.raises(DeviceError, match="started before"):
@@ -190,7 +192,7 @@ def test_dropped_connection(server: ImageServer) -> None:
 def test_corrupted_images_are_counted(server: ImageServer) -> None:
     """Every image handed on is one that was made; those missing are counted."""
     with connected(server, queue=1000) as stream:
-        first = stream.read(50.0).frame_id
+        first = stream.read(PATIENCE_S).frame_id
         server.corrupt(0.4)
         until(lambda: server.sent > 120)
         server.recover()
@@ -213,8 +215,8 @@ def test_corrupted_images_are_counted(server: ImageServer) -> None:
 def test_full_queue(server: ImageServer) -> None:
     with connected(server, queue=3) as stream:
         until(lambda: stream.statistics().received > 20)
-        server.stale()
-        time.sleep(0.05)
+        server.stop()
+        until(lambda: stream._failure is not None)
         images = stream.drain()
         seen = stream.statistics()
     assert len(images) == 3
@@ -228,7 +230,7 @@ def test_a_client_that_takes_nothing_harms_nobody(server: ImageServer) -> None:
         server, queue=10_000
     ) as stream:  # fmt: skip
         server._render = lambda t: np.zeros((1000, 1000), np.uint8)
-        until(lambda: server.refused > 5, 60.0)
+        until(lambda: server.refused > 5)
         seen = stream.statistics()
         assert sum(client.size for client in server._clients.values()) < 40 << 20
         sleeper.close()
@@ -260,6 +262,7 @@ def one(number: int) -> bytes:
 
 def test_headers_and_bodies_in_drops() -> None:
     """Split anywhere, with pauses: what desynchronises pyigtl."""
+    begun = threading.Event()
 
     def talk(connection: socket.socket) -> None:
         data = one(1) + one(2) + one(3)
@@ -267,10 +270,14 @@ def test_headers_and_bodies_in_drops() -> None:
             end = start + 7 if start < 120 else start + 700
             end = min(end, 120) if start < 120 else end
             connection.sendall(data[start:end])
+            if start == 0:
+                begun.wait()
             time.sleep(0.06 if start < 21 else 0.001)
         connection.recv(1)
 
     with peer(talk) as stream:
+        until(lambda: stream._decoder.held == 7)
+        begun.set()
         images = images_of(stream, 3)
         assert [image.frame_id for image in images] == [1, 2, 3]
         assert images[0].t_host < images[1].t_host - 0.1
@@ -286,7 +293,8 @@ def test_a_body_that_never_ends() -> None:
         connection.recv(1)
 
     with peer(talk) as stream:
-        assert stream.read(20.0).frame_id == 1
+        assert stream.read(PATIENCE_S).frame_id == 1
+        until(lambda: stream._decoder.held == HEADER_SIZE + 1000)
         with pytest.raises(StaleError):
             stream.read(0.3)
         assert stream._decoder.held == HEADER_SIZE + 1000
@@ -304,7 +312,7 @@ def test_rubbish_of_any_size() -> None:
 
     with peer(talk) as stream:
         for number in range(1, 6):
-            assert stream.read(20.0).frame_id == number
+            assert stream.read(PATIENCE_S).frame_id == number
             held.append(stream._decoder.held)
         assert stream.statistics().resynchronised == 5
     assert max(held) < 2 << 20
@@ -352,7 +360,9 @@ def test_nothing_is_lost_at_thirty_frames_a_second(seconds: float) -> None:
         device.stream(True)
         images, frames = [], []
         end = time.monotonic() + seconds
-        while time.monotonic() < end:
+        # A machine that is loaded makes the bench slip; it loses nothing by that.
+        while time.monotonic() < end or min(len(images), len(frames)) <= 15 * seconds:
+            assert time.monotonic() < end + 180.0
             images += [(image.frame_id, image.t_device) for image in stream.drain()]
             frames += [frame.frame for frame in device.drain()]
             time.sleep(0.02)
@@ -361,6 +371,3 @@ def test_nothing_is_lost_at_thirty_frames_a_second(seconds: float) -> None:
     assert np.diff(frames).tolist() == [1] * (len(frames) - 1)
     assert seen.lost == seen.dropped == seen.crc_errors == server.refused == 0
     assert heard.lost == heard.dropped == heard.crc_errors == emulator.refused == 0
-    # A machine that is loaded makes the bench slip; it loses nothing by that.
-    assert len(images) > 15 * seconds
-    assert len(frames) > 15 * seconds

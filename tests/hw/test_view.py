@@ -43,7 +43,7 @@ PLACEMENT = Placement(
 )
 
 
-def wait_until(condition, timeout_s: float = 30.0) -> None:
+def wait_until(condition, timeout_s: float = 180.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, "it did not happen in time"
@@ -97,7 +97,7 @@ def a_session(setup: Setup, folder: Path) -> Iterator[Session]:
 def travel(session: Session, plan: MotionPlan, pose: np.ndarray) -> PoseSample:
     """Go there; what a busy machine holds up is waited for, and confirmed anew, as by a person."""
     setup = session.setup
-    deadline = time.monotonic() + 120.0
+    deadline = time.monotonic() + 300.0
     while time.monotonic() < deadline:
         confirmation = confirm_unattended(plan, plan.digest, clock=setup.clock)
         with suppress(StaleError, LostError):
@@ -136,18 +136,17 @@ def test_a_viewer_that_does_not_read_costs_one_message():
         wait_until(lambda: view.sent > 2)
         os.kill(view.pid, signal.SIGSTOP)
         try:
-            before = view.sent
             # More than the pipe holds, so that a message stays half handed over.
             for _ in range(20):
                 view.say("x" * 50_000)
                 time.sleep(0.02)
             wait_until(lambda: view.left_out > 5)
-            assert view.sent - before < 20
+            sent, missed = view.sent, view.left_out
+            wait_until(lambda: view.left_out > missed + 5)
+            assert view.sent == sent
         finally:
             os.kill(view.pid, signal.SIGCONT)
-        missed = view.left_out
-        wait_until(lambda: view.sent > before + 20)
-        assert missed > 5
+        wait_until(lambda: view.sent > sent + 20)
     assert len(said) == 1
     with pytest.raises(ProcessLookupError):
         os.kill(view.pid, 0)
@@ -159,17 +158,26 @@ def threads_and_children(pid: int) -> tuple[int, list[str]]:
     return len(threads), [child for t in threads for child in (t / "children").read_text().split()]
 
 
+def settled(pid: int) -> tuple[int, list[str]]:
+    """The same once it no longer changes: a server starts threads for a page a little later."""
+    found, since = threads_and_children(pid), time.monotonic()
+    while time.monotonic() < since + 0.5:
+        time.sleep(0.02)
+        if (now := threads_and_children(pid)) != found:
+            found, since = now, time.monotonic()
+    return found
+
+
 def test_a_page_can_do_nothing(shared_view):
     """A browser's messages are dropped, those too on which viser itself would act."""
     view = shared_view
     protocol = [f"viser-v{viser.__version__}"]
     with connect(view.url.replace("http", "ws"), subprotocols=protocol) as socket:  # type: ignore
-        assert isinstance(socket.recv(timeout=10.0), bytes)
-        before = threads_and_children(view.pid)
+        assert isinstance(socket.recv(timeout=180.0), bytes)
+        before = settled(view.pid)
         # viser would open a tunnel through a public server, in a process of its own.
         socket.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
-        time.sleep(0.5)
-        assert threads_and_children(view.pid) == before
+        assert settled(view.pid) == before
         assert not before[1]
         socket.send(b"not a message")
     sent = view.sent
@@ -191,7 +199,7 @@ def test_a_page_of_another_site_cannot_read_it(shared_view):
         ("[", None, False),
     ):
         asked = {"Host": host} | ({} if origin is None else {"Origin": origin})
-        page = HTTPConnection("127.0.0.1", port, timeout=10.0)
+        page = HTTPConnection("127.0.0.1", port, timeout=180.0)
         page.request("GET", "/", headers=asked)
         assert page.getresponse().status == (200 if good else 403), asked
         page.close()
@@ -199,7 +207,7 @@ def test_a_page_of_another_site_cannot_read_it(shared_view):
     with pytest.raises(InvalidStatus, match="403"):
         connect(url, subprotocols=protocol, origin="http://evil.example")  # type: ignore
     with connect(url, subprotocols=protocol, origin=view.url) as socket:  # type: ignore
-        assert isinstance(socket.recv(timeout=10.0), bytes)
+        assert isinstance(socket.recv(timeout=180.0), bytes)
 
 
 def test_the_extra_is_named_where_viser_is_missing():
@@ -229,13 +237,13 @@ def test_a_browser_sees_the_bench_move_and_killing_the_view_changes_nothing(benc
             # In one step: a page that is being loaded may have no body yet, or soon another one.
             return browser.execute_script("return document.body ? document.body.innerText : ''")
 
-        wait_until(lambda: "0 of 5 images" in text(), 60)
-        wait_until(lambda: "B-mode, newest frame" in text(), 60)
+        wait_until(lambda: "0 of 5 images" in text())
+        wait_until(lambda: "B-mode, newest frame" in text())
         before = pixels(browser)
         view.going(0)
         travel(session, plan, plan.targets[0])
         view.taken(0, PLACEMENT, None)
-        wait_until(lambda: "1 of 5 images" in text(), 60)
+        wait_until(lambda: "1 of 5 images" in text())
         after = pixels(browser)
         # The scene's part of the page: arm, image plane and poses have moved.
         scene = slice(0, int(0.6 * before.shape[1]))
