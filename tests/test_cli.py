@@ -358,6 +358,7 @@ def test_a_degenerate_set_is_solved_but_not_observable(degenerate, capfd, tmp_pa
         (["simulate"], "Missing argument 'OUT.h5'"),
         (["simulate", "x.h5", "--clock-mhz", "20"], "it needs --raw"),
         (["simulate", "x.h5", "--raw", "--clock-mhz", "0"], "'0' is not a positive number"),
+        (["simulate", "x.h5", "--raw", "--clock-mhz", "0.001"], "1000 Hz is too slow"),
         (["simulate", "x.h5", "--probe", "square"], "'square' is not one of"),
         (["simulate", "x.h5", "--images", "3"], "between 4 and"),
         (["simulate", "x.h5", "--images", "10000000000000000000000"], "between 4 and"),

@@ -287,6 +287,7 @@ def test_what_cannot_be_asked():
         (lambda: design.plan(candidates, 10, prior=np.eye(6)), "9 x 9"),
         (lambda: some(50, cone_deg=99.0), "cone_deg"),
         (lambda: Region((5.0, -5.0)), "lateral_mm"),
+        (lambda: Region((-1e308, 1e308)), "up to 5000 mm"),
         (lambda: Noise.constant((1.0, 0.0, 1.0)), "three positive"),
         (lambda: Noise(np.full((3, 4), np.nan)), "finite"),
         (lambda: design.images_to(design.plan(candidates, 5), -1.0), "positive"),

@@ -64,6 +64,8 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "1000 clean recordings each of 12, 30 and 60 images, and 200 each with one of six faults: "
         "ranges 4 % too long",
         "one mm at 20 mm to the side",
+        "400 recordings each of 12, 30 and 60 images, and ranges that are too long by 1 mm at 20 "
+        "mm to the side",
         "off by 3 % of the depth, all targets 6 mm to one side of the plane",
         "a range 5 SDs too long",
         "with 30 and 60 images: the first plan",

@@ -29,6 +29,8 @@ from jaxcal.runtime.arrays import is_number, real_array
 
 _INSIDE = 1e-9
 """Numbers outside by less than this, due to rounding, count as inside."""
+_LARGEST_MM = 5000
+"""Nothing is seen so far away."""
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 Allowed = Callable[[Float[np.ndarray, "n 4 4"]], Bool[np.ndarray, " n"]]
@@ -62,8 +64,14 @@ class Region:
             value = getattr(self, name)
             if not (_are_in_order(value, (2,)) and np.isfinite(value).all()):
                 raise InputError(f"{name} of the region must be two mm in order, not {value!r}")
-        if not 0 < self.depth_mm[0] <= self.depth_mm[1] <= 5000:
-            raise InputError(f"depths must be positive mm, up to 5000, not {self.depth_mm}")
+        if not 0 < self.depth_mm[0] <= self.depth_mm[1] <= _LARGEST_MM:
+            raise InputError(
+                f"depths must be positive mm, up to {_LARGEST_MM}, not {self.depth_mm}"
+            )
+        if max(map(abs, self.lateral_mm)) > _LARGEST_MM:
+            raise InputError(
+                f"lateral positions must be up to {_LARGEST_MM} mm, not {self.lateral_mm}"
+            )
         radius = self.radius_mm
         if radius is not None and not (is_number(radius) and 0 < radius < 1e4):
             raise InputError(f"the array's radius must be in mm, not {radius!r}")

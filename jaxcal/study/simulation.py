@@ -431,14 +431,17 @@ def times_of_flight(
         clock_hz: the counter's frequency: times are rounded to its period; None: not at all.
 
     Raises:
-        InputError: a clock that is not positive.
+        InputError: a clock that is not positive, or so slow that a time becomes zero.
     """
     times = probe.time_of_flight_s(np.where(np.asarray(distances) > 0, distances, np.nan))
     if clock_hz is None:
         return times
     if not (np.isfinite(clock_hz) and clock_hz > 0):
         raise InputError(f"the clock needs a positive frequency in Hz, not {clock_hz}")
-    return np.round(times * clock_hz) / clock_hz
+    counted = np.round(times * clock_hz)
+    if (counted == 0).any():
+        raise InputError(f"a clock of {clock_hz:g} Hz is too slow: it counts no period of a time")
+    return counted / clock_hz
 
 
 NUMBERS = (
