@@ -386,7 +386,7 @@ def _shoot(job: Job, row: int, stage: ProbeStage, session: Session) -> _Shot:
     else:
         heard = session.listen(job.setup.frames, stage.arrived_s)
         measurement, amplitude = median_times(heard)
-    session.check()
+    stage.check()
     session.record_image()
     return _Shot(steady.sample.pose, measurement, amplitude)
 

@@ -90,7 +90,12 @@ class ProbeStage:
         return float((tracked[:3, 3] - self.plan_pose[:3, 3]) @ direction)
 
     def read(self, frames: int) -> Echoes:
-        """Whole frames that began after the last move."""
+        """Whole frames that began after the last move.
+
+        Raises:
+            DeviceError: motion has ended, or a device is in lasting trouble.
+        """
+        self._motion.check()
         heard = self._session.listen(frames, self._arrived)
         answered = np.array([np.isfinite(frame.tof_s) for frame in heard])
         amplitude = np.array([frame.amplitude for frame in heard], float)
@@ -113,8 +118,9 @@ class ProbeStage:
         """The newest B-mode frame for the operator; None where no images come.
 
         Raises:
-            DeviceError: a device is lost, or in lasting trouble.
+            DeviceError: motion has ended, or a device is lost or in lasting trouble.
         """
+        self._motion.check()
         self._session.wait_until_clear()
         image = self._session.latest_image()
         return image.array if image is not None and image.array.dtype == np.uint8 else None
@@ -123,8 +129,9 @@ class ProbeStage:
         """The next B-mode frame that began after the last move.
 
         Raises:
-            DeviceError: no images come.
+            DeviceError: motion has ended, or no images come.
         """
+        self._motion.check()
         return self._session.image_after(self._arrived + IMAGE_AGE_S)
 
     def image_bench(self, row: int, *, credible: bool = False) -> ImageBench:
@@ -158,6 +165,15 @@ class ProbeStage:
         raise PlacementError(
             f"no credible target in {_LOOKS} frames: {reason}", device="ultrasound"
         )
+
+    def check(self) -> None:
+        """Raise the error if a device is in trouble, or motion has ended.
+
+        Raises:
+            DeviceError: what is wrong.
+        """
+        self._session.check()
+        self._motion.check()
 
     @property
     def arrived_s(self) -> float:

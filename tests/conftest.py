@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -191,6 +192,9 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
                 if not left or held_up.longest_s < HELD_UP_S:
                     raise
                 print(f"run again: held up for {held_up.longest_s:.3f} s, then {error!r}")
+        # What the failed run left open is not the next one's fault.
+        with warnings.catch_warnings(action="ignore"):
+            gc.collect()
     return True
 
 

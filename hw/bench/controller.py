@@ -81,6 +81,7 @@ class Controller:
     """Called when a program stops: the reason, and whether it is a fault of the program."""
 
     _starts: float | None = None
+    _plays: bool = False
     _paused_move: tuple[list[float], float, float] | None = None
     _latched: bool = False
     _waits_for: float | None = None
@@ -147,7 +148,12 @@ class Controller:
         if not (self.remote and self.fit):
             return
         self.halt(t, "another script was sent")
-        self._starts = t + _START_S
+        self._starts, self._plays = t + _START_S, False
+
+    def play(self, t: float) -> None:
+        """A person starts another program, which runs once it is loaded."""
+        self.halt(t, "another program was started")
+        self._starts, self._plays = t + _START_S, True
 
     def halt(self, t: float, reason: str, *, fault: bool = False) -> None:
         """Stop the program, and the arm with it; ``fault``: as a runtime error of the script."""
@@ -205,7 +211,9 @@ class Controller:
     def _start(self, t: float) -> None:
         self._starts = None
         self.running, self._latched, self._kicked = True, False, t
-        self.foreign = False
+        self.foreign = self._plays
+        if self.foreign:
+            return
         self._operation = self._writes = 0
         self.int_in[0] = 0
         self.int_out[0] = READY

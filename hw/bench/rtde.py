@@ -226,13 +226,8 @@ class RtdeServer:
         self._call(act)
 
     def play(self) -> None:
-        """What a person does at the pendant: another program runs from now on."""
-
-        def act() -> None:
-            self.controller.halt(self.clock.now(), "another program was started")
-            self.controller.running = self.controller.foreign = True
-
-        self._call(act)
+        """What a person does at the pendant: the program ends, and soon another one runs."""
+        self._call(lambda: self.controller.play(self.clock.now()))
 
     def spoil_dashboard(self, answer: str | None) -> None:
         """The dashboard answers with this text, with "" not at all, with None as usual."""

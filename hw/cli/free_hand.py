@@ -12,7 +12,8 @@ from click.core import ParameterSource
 from hw.choices import HAND_PLACEMENTS
 from hw.cli.common import check_resumed
 from jaxcal import InputError
-from jaxcal.cli.common import POSITIVE, exit_code
+from jaxcal.cli.common import exit_code
+from jaxcal.cli.sequence_options import spacing_option
 
 
 @click.command("free-hand", short_help="Acquire with a hand-held probe, and calibrate.")
@@ -38,14 +39,7 @@ from jaxcal.cli.common import POSITIVE, exit_code
     metavar="COLUMN ROW COLUMNS ROWS",
     help="Part of the frames to look in, px.",
 )
-@click.option(
-    "--spacing",
-    "spacing_mm",
-    type=POSITIVE,
-    nargs=2,
-    metavar="LATERAL AXIAL",
-    help="Size of a pixel, mm.",
-)
+@spacing_option
 @click.option(
     "--lag",
     "lag_s",

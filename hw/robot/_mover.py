@@ -43,6 +43,7 @@ import os
 import select
 import signal
 import sys
+import threading
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import NoReturn
@@ -54,7 +55,7 @@ from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedE
 from hw.extras import require
 from hw.rigid import turn_deg
 from hw.robot._process import ASKS, RECEIVES, be_prompt
-from hw.robot.identity import LOCAL, read_identity, stop_program
+from hw.robot.identity import LOCAL, read_identity, stop_program, until_local
 from hw.robot.limits import Limits, numbers
 from hw.robot.rtde import (
     PROGRAM_RUNS,
@@ -93,6 +94,8 @@ _END_S = 5.0
 """Longest time for the end of the script and of the connection."""
 _DASHBOARD_S = 0.3
 """Longest wait (wall s) for the dashboard; the caller waits for the end of this process."""
+_CONTROL_S = 0.2
+"""The dashboard is asked so often (wall s) whether the robot is still in remote control."""
 _CAUSE_S = 0.1
 """The poses tell of a safety stop by so much later than the controller's program ends."""
 _ARRIVED_MM, _ARRIVED_DEG = 0.2, 0.1
@@ -178,6 +181,12 @@ class Mover:
         self._input = b""
         self._control = None
         self._serial = ""
+        self._runs = False
+        """Whether our program has run; from then on a packet without a program means its end."""
+        self._replaced = False
+        """Whether our program has ended, whatever runs now."""
+        self._local = False
+        """Whether a person has switched the robot to local control."""
 
     # Start and end
 
@@ -216,7 +225,16 @@ class Mover:
             self._offset = numbers(self._command("getTCPOffset"), 6, "TCP offset")
         self._gate.check_authority(self._serial, self._offset, self._pendant)
         self._wait_for_packet(running=True)
+        self._runs = True
+        if identity.remote:
+            threading.Thread(target=self._watch_control, name="control", daemon=True).start()
         self._tell("ready", serial=self._serial, tcp_offset=self._offset)
+
+    def _watch_control(self) -> None:
+        """In a thread of its own: no packet tells whether the robot is in remote control."""
+        be_prompt(0)
+        until_local(self._host, period_s=_CONTROL_S)
+        self._local = True
 
     def _check_robot(self, remote: bool | None) -> None:
         """Whether the robot can take a program now: ur_rtde would stop whatever runs, unasked."""
@@ -268,7 +286,7 @@ class Mover:
             What a person must do if it could not be ended.
         """
         packet = self._packet
-        if self._control is None or packet is None or not packet.program:
+        if self._control is None or packet is None or not packet.program or self._replaced:
             return ""
         if not safety_text(packet.safety_bits):
             return ""
@@ -316,6 +334,8 @@ class Mover:
                 raise _Ended(self._lost(error.args[0])) from None
             for packet in packets:
                 self._packet = packet
+                # In every packet: the newest one may already tell of another program.
+                self._replaced |= self._runs and not packet.program
                 t_host = self._clock.at(packet.monotonic_s)
                 lag = self._lag.of(t_host, packet.timestamp_s)
                 self._sample = PoseSample(
@@ -406,7 +426,9 @@ class Mover:
 
     def _kick(self) -> None:
         now = self._clock.now()
-        if self._control is not None and now - self._kicked > _KICK_S:
+        if self._control is None or self._replaced:
+            return
+        if now - self._kicked > _KICK_S:
             self._kicked = now
             self._kicks += 1
             if not self._call("kickWatchdog"):
@@ -514,7 +536,9 @@ class Mover:
         stopped = _unfit(packet)
         if stopped is not None:
             return stopped, True
-        if not packet.status_bits & PROGRAM_RUNS:
+        if self._local:
+            return StoppedError(f"{LOCAL}; then confirm the plan again", device="robot"), True
+        if self._replaced or not packet.status_bits & PROGRAM_RUNS:
             return self._program_stopped(), True
         if not self._control.isConnected():
             return self._lost("the control connection is gone"), True
@@ -611,6 +635,7 @@ class Mover:
             and self._control.isConnected()
             and packet is not None
             and packet.status_bits & PROGRAM_RUNS
+            and not self._replaced
             and not safety_text(packet.safety_bits)
         )
 
@@ -622,6 +647,9 @@ class Mover:
             stopped = None if self._packet is None else _unfit(self._packet)
             if stopped is not None:
                 return stopped
+        if self._replaced and self._packet is not None and self._packet.program:
+            text = "another program was started on the robot: stop it at the pendant"
+            return StoppedError(f"{text}, then confirm the plan again", device="robot")
         return self._lost(what)
 
     def _lost(self, what: str) -> LostError:

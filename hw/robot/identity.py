@@ -32,6 +32,7 @@ ROBOT_STATE, KINEMATICS_INFO = 16, 5
 KINEMATICS = struct.Struct(">6I24dI")
 """Checksums of the joints; DH theta, a, d, alpha (rad, m), six each; state of the calibration."""
 _MOST_MESSAGE = 1 << 16
+_REMOTE = "is in remote control"
 LOCAL = "the robot is in local control: switch it to remote control at the pendant"
 
 
@@ -84,7 +85,7 @@ def read_identity(host: str, *, timeout_s: float = 3.0) -> Identity:
             version = stream.ask("PolyscopeVersion")
             serial = stream.ask("get serial number")
             model = stream.ask("get robot model")
-            remote = stream.ask("is in remote control")
+            remote = stream.ask(_REMOTE)
     except TimeoutError:
         raise LostError(f"the dashboard of {host} does not answer", device="robot") from None
     except (OSError, UnicodeError) as error:
@@ -105,6 +106,25 @@ def read_identity(host: str, *, timeout_s: float = 3.0) -> Identity:
         model=model if re.fullmatch(r"[\w-]{1,40}", model) else "unknown",
         remote={"true": True, "false": False}.get(remote.lower()),
     )
+
+
+def until_local(host: str, *, period_s: float, timeout_s: float = 3.0) -> None:
+    """Ask the dashboard again and again; returns once it says that the robot is in local control.
+
+    A dashboard that is silent or gone says nothing about that, and is connected to again.
+    """
+    while True:
+        with (
+            contextlib.suppress(OSError),
+            socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection,
+        ):
+            stream = _Lines(connection, time.monotonic() + timeout_s)
+            stream.line()
+            while stream.ask(_REMOTE).lower() != "false":
+                time.sleep(period_s)
+                stream.deadline = time.monotonic() + timeout_s
+            return
+        time.sleep(period_s)
 
 
 def stop_program(host: str, *, timeout_s: float) -> bool:
@@ -161,7 +181,7 @@ def _calibration_in(parts: bytes) -> str | None:
 
 class _Lines:
     def __init__(self, connection: socket.socket, deadline: float) -> None:
-        self._socket, self._deadline, self._data = connection, deadline, b""
+        self._socket, self.deadline, self._data = connection, deadline, b""
 
     def ask(self, text: str) -> str:
         self._socket.sendall(text.encode() + b"\n")
@@ -169,7 +189,7 @@ class _Lines:
 
     def line(self) -> str:
         while b"\n" not in self._data:
-            left = self._deadline - time.monotonic()
+            left = self.deadline - time.monotonic()
             if left <= 0:
                 raise TimeoutError
             self._socket.settimeout(left)

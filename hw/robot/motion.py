@@ -200,7 +200,7 @@ class Motion:
             LostError: the connection is gone; motion needs a new confirmation.
         """
         with self._one_at_a_time:
-            self._alive()
+            self.check()
             while not self._answers.empty():
                 self._answers.get()
             asked = np.asarray(pose).tolist()
@@ -329,7 +329,12 @@ class Motion:
                 self._process.wait(timeout=8.0)
         self._kill(RefusedError("motion was closed", device="robot"))
 
-    def _alive(self) -> None:
+    def check(self) -> None:
+        """Raise the error if motion has ended, also where nothing was asked to move meanwhile.
+
+        Raises:
+            DeviceError: why it has ended.
+        """
         if self._process is None:
             raise RefusedError("motion was not started", device="robot")
         over = self._ended or self._stop

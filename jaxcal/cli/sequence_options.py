@@ -64,6 +64,14 @@ _TRACKING = (
         help="Orientation of the frames, if their file does not say it.",
     ),
 )
+spacing_option = click.option(
+    "--spacing",
+    "spacing_mm",
+    type=POSITIVE,
+    nargs=2,
+    metavar="LATERAL AXIAL",
+    help="Size of a pixel, mm.",
+)
 _SEARCH = (
     click.option(
         "--target",
@@ -78,14 +86,7 @@ _SEARCH = (
         metavar="COLUMN ROW COLUMNS ROWS",
         help="Part of the frames to look in, px: its first column and row, and its size.",
     ),
-    click.option(
-        "--spacing",
-        "spacing_mm",
-        type=POSITIVE,
-        nargs=2,
-        metavar="LATERAL AXIAL",
-        help="Size of a pixel, mm.",
-    ),
+    spacing_option,
     click.option(
         "--spacing-from",
         type=click.Path(),

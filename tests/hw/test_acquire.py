@@ -8,6 +8,7 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -268,19 +269,20 @@ def do_as_told(person, until: str) -> str:
     raise AssertionError("the person was asked for ever")
 
 
+@pytest.mark.real_time
 def test_a_person_takes_an_image_skips_a_pose_and_stops(tmp_path):
     """At a terminal of their own, by the injected pattern."""
     pytest.importorskip("pty", reason="there are no pseudo-terminals here")
     from terminal import Terminal
 
-    path = tmp_path / "rec.h5"
+    path = Path(tempfile.mkdtemp(dir=tmp_path)) / "rec.h5"
     code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["acquire", str(path), "--bench", "--bench-seed", "3", "--images", "4",
                  "--placement", "pattern-injection", "--operator", "person"]  # fmt: skip
     with Terminal(["-c", code, *arguments], tmp_path) as person:
-        person.wait_for("p pauses, Ctrl-C stops", 240)
+        person.wait_for("p pauses, Ctrl-C stops")
         # Steps twice as large: as few as a bar that must be seen to shrink allows.
-        person.wait_for("step 0.25 mm", 240)
+        person.wait_for("step 0.25 mm")
         person.type("+")
         person.wait_for("step 0.50 mm")
         shown = do_as_told(person, "image 1/4: offset|resume")
@@ -355,26 +357,31 @@ def test_a_robot_that_may_not_move_is_named_and_the_run_is_resumed(e_series, tmp
     assert asked
     bench.fault("robot_state", robot_mode=7, safety_mode=1)
 
-    stopped = []
+    for image, name, wrong, right, text in (
+        ("image 1/", "robot_state", {"robot_mode": 7, "safety_mode": 5},
+         {"robot_mode": 7, "safety_mode": 1}, "safeguard stop: close the gate"),
+        ("image 2/", "remote", {"on": False}, {"on": True}, "local control: switch it to remote"),
+    ):  # fmt: skip
+        stopped = []
 
-    def say(line: str) -> None:
-        if line.startswith("image 1/"):
-            stopped.append(bench.fault("robot_state", robot_mode=7, safety_mode=5))
+        def say(line: str, image=image, name=name, wrong=wrong, stopped=stopped) -> None:
+            if line.startswith(image):
+                stopped.append(bench.fault(name, **wrong))
 
-    # What a busy machine stops is gone on with; the gate is open until the first image is there.
-    for _ in range(ATTEMPTS):
-        with pytest.raises(AcquisitionStopped) as told:
-            run(bench, path, None, say, setup=setup)
-        if stopped:
-            break
-    assert "safeguard stop: close the gate" in str(told.value)
-    assert not told.value.by_itself
-    bench.fault("robot_state", robot_mode=7, safety_mode=1)
+        # What a busy machine stops is gone on with; nothing is wrong until the image is there.
+        for _ in range(ATTEMPTS):
+            with pytest.raises(AcquisitionStopped) as told:
+                run(bench, path, None, say, setup=setup)
+            if stopped:
+                break
+        assert text in str(told.value)
+        assert not told.value.by_itself
+        bench.fault(name, **right)
     lines, pause = [], Pause()
 
     def hold(line: str) -> None:
         lines.append(line)
-        if line.startswith("image 2/"):
+        if line.startswith("image 3/"):
             pause.hold()
             threading.Timer(0.1, pause.go_on).start()
 

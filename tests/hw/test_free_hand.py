@@ -163,7 +163,7 @@ def test_a_lost_stream_is_gone_on_with(tmp_path):
         with pytest.raises(FreeHandStopped, match="has closed the connection") as stopped:
             acquire_free_hand(path, wanted, person)
     assert stopped.value.exit_code == 4
-    assert re.search(r"[3-5] of 7 images are in .*r\.h5; go on with: jaxcal-hw free-hand",
+    assert re.search(r"[1-6] of 7 images are in .*r\.h5; go on with: jaxcal-hw free-hand",
                      str(stopped.value))  # fmt: skip
     with pytest.raises(FormatError, match="incomplete"):
         jaxcal.load(path)
@@ -268,13 +268,13 @@ def test_ctrl_c_at_a_terminal(tmp_path, tracked):
     command = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["-c", command, "free-hand", f"127.0.0.1:{tracked}", "r.h5"]
     with Terminal(arguments, tmp_path) as person:
-        person.wait_for(r"image 1/30: target at", 60)
-        person.wait_for("next: bring the target to the", 60)
+        person.wait_for(r"image 1/30: target at")
+        person.wait_for("next: bring the target to the")
         person.type("u")
-        person.wait_for("taken back: the last image; ", 60)
-        person.wait_for(r"image \d/30: target at", 60)
+        person.wait_for("taken back: the last image; ")
+        person.wait_for(r"image \d/30: target at")
         person.type("\x03")
-        assert person.finish(60) == 130
+        assert person.finish() == 130
         assert person.shown.count("▀") > 1000
         assert "go on with: jaxcal-hw free-hand" in person.shown.replace("\r\n", " ")
         assert "Traceback" not in person.shown
@@ -309,7 +309,7 @@ def test_poses_between_stamps(separate):
     with UltrasoundStream("127.0.0.1", separate) as stream:
         posed = PosedImages(stream, None, None, lag_s=0.025)
         assert posed.pair == ("Probe", "Reference")
-        images = [posed.read(3.0) for _ in range(12)]
+        images = [posed.read(180.0) for _ in range(12)]
         samples = {name: list(posed._samples[name]) for name in posed._needed}
     held = [each for each in images if each.pose is not None]
     assert len(held) > 8

@@ -111,7 +111,7 @@ def test_a_terminal_that_tells_no_size_counts_as_80_by_24(tmp_path):
     code = "import sys; from hw.midplane.terminal_image import Screen; "
     code += "Screen(sys.stdout).show(['word ' * 8])"
     with Terminal(["-c", code], tmp_path, size=(0, 0)) as person:
-        assert person.finish(60) == 0
+        assert person.finish() == 0
         assert "word word word" in person.shown
 
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -465,6 +466,46 @@ def test_a_motion_does_not_go_on_when_a_safeguard_stop_is_released(robots, dashb
             assert robot.state()["raw"] == stood
         with pytest.raises(RefusedError, match="confirm the plan again"):
             motion.move_to(HOME)
+
+
+TAKEN_OVER = {
+    "local": ("set_remote", [False], "local control: switch it to remote"),
+    "play": ("play", [], "another program was started on the robot: stop it at the pendant"),
+}
+"""What a person does at the pendant in the middle of a run, and what must be said."""
+
+
+@pytest.mark.parametrize("name", TAKEN_OVER)
+def test_a_person_who_takes_the_robot_over_ends_motion(name):
+    """While it moves, and while it rests: nothing need be asked to move for that."""
+    request, values, text = TAKEN_OVER[name]
+    # The dashboard is asked five times a second; a program's end is in the next packet.
+    within_s = STOP_WITHIN_S + (0.25 if name == "local" else 0.0)
+    for at_rest in (False, True):
+        with EmulatedRobot() as robot, moving(robot, caller_s=2.0) as motion:
+            if at_rest:
+                motion.check()
+                robot.ask(request, *values)
+                with pytest.raises(StoppedError, match=text):
+                    until_ended(motion)
+                assert sent(robot, 3) == []
+            else:
+                fault = partial(robot.ask, request, *values)
+                error, rest_s, told_s = fault_in_motion(robot, motion, fault)
+                with pytest.raises(StoppedError, match=text):
+                    raise error
+                assert rest_s <= within_s
+                assert told_s < 1.5
+            with pytest.raises(RefusedError, match="confirm the plan again"):
+                motion.move_to(HOME)
+            assert robot.state()["running"] == (name == "play")
+
+
+def until_ended(motion: Motion) -> None:
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline:
+        motion.check()
+        time.sleep(0.01)
 
 
 def test_a_stop_is_told_though_the_program_ended_at_the_same_moment():
