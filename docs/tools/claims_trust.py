@@ -309,6 +309,25 @@ claim(
 )
 
 
+def _over_five_laws(of: str, cone: str) -> float:
+    """The largest over the numbers of images, of the mean over the laws."""
+    where = {"cone": cone, "poses": "optimal", "method": "auto"}
+    counts = (column("pose_design", of, images=images, **where) for images in ("12", "30", "60"))
+    return max(sum(values) / len(values) for values in counts)
+
+
+claim(
+    ACCURACY,
+    "the mean of the five ratios is at most {:.2f} (TRE) and {:.2f} (RP) with 40 degrees, {:.2f} "
+    "and {:.2f} with 10 degrees.",
+    lambda: [
+        _over_five_laws(of, cone)
+        for cone in ("wide", "narrow")
+        for of in ("tre_over_random", "rp_over_random")
+    ],
+)
+
+
 def _filled(of: str, *shares: str, poses: str = "planned") -> list[float]:
     """Of the recordings whose ranges are too long towards the sides."""
     where = {"poses": poses, "curve_mm": "1", "space_filling": shares}
