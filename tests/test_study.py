@@ -28,7 +28,10 @@ from jaxcal.study.offsets import nominal_bound, standard_deviation, standard_off
 from jaxcal.study.pipeline import (
     LANES,
     Block,
+    _block,
+    _trials,
     bound_mm,
+    compile_pieces,
     compute_chunk,
     numbers_of,
     shape_of,
@@ -496,7 +499,7 @@ def conventional_only(spec: str) -> str:
     return spec.split('\n[[methods]]\nname = "arcs"')[0]
 
 
-LONG = conventional_only(small(trials=160, chunk=2))
+LONG = conventional_only(small(trials=100, chunk=2))
 
 
 @pytest.fixture(scope="module")
@@ -510,8 +513,8 @@ def kill_and_resume(kills, long_study, path, folder, seed):
     """Kill it so often at random, each time further on; then finish it, and compare."""
     random = np.random.default_rng(seed)
     spec = parse_spec(LONG)
-    # A chunk takes some ms; the last half is for a child that ends late.
-    first, last = len(Store(folder, spec).present()) + 1, spec.chunk_count // 2
+    # A chunk takes some ms; the last three quarters are for a child that ends late.
+    first, last = len(Store(folder, spec).present()) + 1, spec.chunk_count // 4
     for count in np.sort(random.choice(np.arange(first, last), kills, replace=False)):
         child = start_and_wait(["run", path, "--out", folder, "--resume"], folder, count)
         time.sleep(random.uniform(0, 0.02))
@@ -532,7 +535,7 @@ def test_interrupted_killed_and_resumed(long_study, tmp_path):
     assert child.returncode == 130
     done = len(Store(folder, parse_spec(LONG)).present())
     again = f"jaxcal study run {path} --out {folder} --resume"
-    assert told == f"jaxcal: interrupted: {done} of 160 chunks are done; continue with: {again}\n"
+    assert told == f"jaxcal: interrupted: {done} of 100 chunks are done; continue with: {again}\n"
     kill_and_resume(1, long_study, path, folder, 1)
 
 
@@ -570,7 +573,7 @@ def test_full_file_system(long_study, tmp_path):
     assert child.returncode == 2, err
     assert "No space left on device" in err.strip().splitlines()[-1]
     there = files(kept)
-    assert 0 < len(there) < 160
+    assert 0 < len(there) < 100
     assert there.items() <= files(long_study).items()
     run_study(parse_spec(LONG), kept, resume=True)
     assert files(kept) == files(long_study)
@@ -636,7 +639,8 @@ def blocks(text):
     measure = jax.jit(jax.vmap(reconstruction_precision))
     for k in range(spec.condition_count):
         condition = spec.condition(k)
-        indices = (k * spec.trials + np.arange(spec.trials, dtype=np.uint32)).reshape(2, -1)
+        # One piece, as in the other tests: the same programs.
+        indices = (k * spec.trials + np.arange(spec.trials, dtype=np.uint32)).reshape(1, -1)
         block = Block(spec, condition, indices, devices)
 
         def whole(method, condition=condition, indices=indices):
@@ -658,6 +662,18 @@ def blocks(text):
             }
 
         yield spec, block, whole
+
+
+def test_pieces_go_through_a_program_one_by_one_in_order():
+    devices = tuple(jax.local_devices())[:1]
+    each = compile_pieces(lambda one, other, factor: factor * one + other, devices, pieces=2)
+    pieces, lanes = _block(parse_spec(small(trials=200, chunk=150)), devices)
+    assert (pieces, lanes) == (3, LANES["cpu"])
+    trials = np.arange(pieces * lanes * 2.0)
+    cut = trials.reshape(pieces, lanes, 2)
+    np.testing.assert_array_equal(
+        _trials(each(cut, -cut, 3.0)), 2 * trials.reshape(pieces * lanes, 2)
+    )
 
 
 def test_what_a_study_computes_is_what_calibrations_say():
