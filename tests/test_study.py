@@ -499,7 +499,7 @@ def conventional_only(spec: str) -> str:
     return spec.split('\n[[methods]]\nname = "arcs"')[0]
 
 
-LONG = conventional_only(small(trials=100, chunk=2))
+LONG = conventional_only(small(trials=160, chunk=2))
 
 
 @pytest.fixture(scope="module")
@@ -513,8 +513,8 @@ def kill_and_resume(kills, long_study, path, folder, seed):
     """Kill it so often at random, each time further on; then finish it, and compare."""
     random = np.random.default_rng(seed)
     spec = parse_spec(LONG)
-    # A chunk takes some ms; the last three quarters are for a child that ends late.
-    first, last = len(Store(folder, spec).present()) + 1, spec.chunk_count // 4
+    # A chunk takes some ms; the last half is for a child that ends late.
+    first, last = len(Store(folder, spec).present()) + 1, spec.chunk_count // 2
     for count in np.sort(random.choice(np.arange(first, last), kills, replace=False)):
         child = start_and_wait(["run", path, "--out", folder, "--resume"], folder, count)
         time.sleep(random.uniform(0, 0.02))
@@ -532,10 +532,10 @@ def test_interrupted_killed_and_resumed(long_study, tmp_path):
     child = start_and_wait(["run", path, "--out", folder], folder, 5)
     child.send_signal(signal.SIGINT)
     _, told = child.communicate(timeout=120)
-    assert child.returncode == 130
+    assert child.returncode == 130, told
     done = len(Store(folder, parse_spec(LONG)).present())
     again = f"jaxcal study run {path} --out {folder} --resume"
-    assert told == f"jaxcal: interrupted: {done} of 100 chunks are done; continue with: {again}\n"
+    assert told == f"jaxcal: interrupted: {done} of 160 chunks are done; continue with: {again}\n"
     kill_and_resume(1, long_study, path, folder, 1)
 
 
@@ -573,7 +573,7 @@ def test_full_file_system(long_study, tmp_path):
     assert child.returncode == 2, err
     assert "No space left on device" in err.strip().splitlines()[-1]
     there = files(kept)
-    assert 0 < len(there) < 100
+    assert 0 < len(there) < 160
     assert there.items() <= files(long_study).items()
     run_study(parse_spec(LONG), kept, resume=True)
     assert files(kept) == files(long_study)
