@@ -551,9 +551,9 @@ def test_simulated_errors_count_the_images_taken_before():
     around = design.candidates_around(recording, result, count=60)
     more = design.next_poses(result, around, 4)
     found = design.simulate_errors(more, "normal", around, method="conventional")
-    alone = design.simulate_errors(more.poses, "normal", around, method="conventional", trials=64)
-    assert (found.images, alone.images) == (14, 4)
-    assert found.tre_mm < 0.5 * alone.tre_mm
+    assert found.images == 14
+    # What was predicted for all of them; 4 SDs are 5 %.
+    assert found.tre_mm == pytest.approx(more.tre_mm[-1], rel=0.05)
 
 
 @pytest.mark.parametrize(

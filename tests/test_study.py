@@ -28,7 +28,10 @@ from jaxcal.study.offsets import nominal_bound, standard_deviation, standard_off
 from jaxcal.study.pipeline import (
     LANES,
     Block,
+    _block,
+    _trials,
     bound_mm,
+    compile_pieces,
     compute_chunk,
     numbers_of,
     shape_of,
@@ -529,7 +532,7 @@ def test_interrupted_killed_and_resumed(long_study, tmp_path):
     child = start_and_wait(["run", path, "--out", folder], folder, 5)
     child.send_signal(signal.SIGINT)
     _, told = child.communicate(timeout=600)
-    assert child.returncode == 130
+    assert child.returncode == 130, told
     done = len(Store(folder, parse_spec(LONG)).present())
     again = f"jaxcal study run {path} --out {folder} --resume"
     assert told == f"jaxcal: interrupted: {done} of 160 chunks are done; continue with: {again}\n"
@@ -636,7 +639,8 @@ def blocks(text):
     measure = jax.jit(jax.vmap(reconstruction_precision))
     for k in range(spec.condition_count):
         condition = spec.condition(k)
-        indices = (k * spec.trials + np.arange(spec.trials, dtype=np.uint32)).reshape(2, -1)
+        # One piece, as in the other tests: the same programs.
+        indices = (k * spec.trials + np.arange(spec.trials, dtype=np.uint32)).reshape(1, -1)
         block = Block(spec, condition, indices, devices)
 
         def whole(method, condition=condition, indices=indices):
@@ -658,6 +662,18 @@ def blocks(text):
             }
 
         yield spec, block, whole
+
+
+def test_pieces_go_through_a_program_one_by_one_in_order():
+    devices = tuple(jax.local_devices())[:1]
+    each = compile_pieces(lambda one, other, factor: factor * one + other, devices, pieces=2)
+    pieces, lanes = _block(parse_spec(small(trials=200, chunk=150)), devices)
+    assert (pieces, lanes) == (3, LANES["cpu"])
+    trials = np.arange(pieces * lanes * 2.0)
+    cut = trials.reshape(pieces, lanes, 2)
+    np.testing.assert_array_equal(
+        _trials(each(cut, -cut, 3.0)), 2 * trials.reshape(pieces * lanes, 2)
+    )
 
 
 def test_what_a_study_computes_is_what_calibrations_say():

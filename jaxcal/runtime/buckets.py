@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -91,6 +92,7 @@ def _each_image(tree: Any, change: Callable[[Any, int], Any]) -> Any:
     return assembled(type(tree), changed)
 
 
+@cache
 def _axis_of_images(annotation: str) -> int | None:
     """Counted from the last axis, since leading ones are a batch's; None where there is none."""
     shape = _SHAPE.search(annotation)
