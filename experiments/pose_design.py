@@ -32,7 +32,7 @@ Part ``real``: of the 54 images of the real cross-wire recording (where it is at
 by the criterion from their poses alone, as candidates of a plan; they predict the other 27. The
 same for 200 random halves. Part ``figure``: what a lab needs, images against error.
 
-Seed 20261129. Full: 1,000 trials a cell. ``--trials N`` for fewer (the committed table says how
+Seed 20261129. Full: 2,000 trials a cell. ``--trials N`` for fewer (the committed table says how
 many), ``--quick`` for 24 of two laws.
 """
 
@@ -534,7 +534,7 @@ def timings() -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="few trials of two laws")
-    parser.add_argument("--trials", type=int, default=1000, help="of each cell")
+    parser.add_argument("--trials", type=int, default=2000, help="of each cell")
     parser.add_argument("--benches", type=int, default=64, help="emulated benches")
     parser.add_argument("--part", choices=PARTS, default="all")
     given = parser.parse_args()

@@ -14,6 +14,7 @@ from scipy import stats
 import jaxcal
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.misfits import MISFIT_SCORE, noise_model
+from jaxcal.diagnostics.outliers import suspects
 from jaxcal.diagnostics.residual_checks import (
     MISFITS,
     check_noise_model,
@@ -137,6 +138,20 @@ def test_range_errors_are_judged_by_those_at_their_place():
     assert (np.abs(before[:, 3:]).max(axis=1) > 4.1).mean() > 0.4
     assert (np.abs(after[:, 3:]).max(axis=1) > 4.1).mean() < 0.1
     assert (after[:, wrong] > 4.1).mean() > 0.9
+
+
+def test_an_image_whose_range_is_off_is_a_suspect():
+    data = problem(3, images=60, elevation_mm=1.0, noise_mm=1.0)
+    clean = jaxcal.calibrate(data, "conventional")
+    assert suspects(clean) == []
+    # In the middle of the image, where errors are small.
+    place = np.asarray(data.measurements)
+    middle = int(np.argmin(np.abs(place[:, 0]) + np.abs(place[:, 1] - 50.0)))
+    sd = 1.4826 * np.median(np.abs(np.asarray(clean.residual)[:, 2]))
+    off = replace(data, measurements=data.measurements.at[middle, 1].add(-6 * sd))
+    found = suspects(jaxcal.calibrate(off, "conventional"))
+    assert [each["image"] for each in found] == [middle]
+    assert found[0]["component"] == "range"
 
 
 def test_complaints_are_warnings_in_words():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from claims import ACCURACY, INDEX, Row, claim, column, number, only, percent, span, table
 
@@ -325,6 +327,37 @@ claim(
         for cone in ("wide", "narrow")
         for of in ("tre_over_random", "rp_over_random")
     ],
+)
+
+
+SYMMETRIC = ("uniform", "normal", "heavy-tailed", "triangular")
+
+
+def _standard_errors(*arms: str) -> tuple[float, float]:
+    """Of the table's ratios of root mean squares over the laws, in %."""
+    found = []
+    for arm, cone, images, of in itertools.product(
+        arms, ("wide", "narrow"), ("12", "30", "60"), ("tre", "rp")
+    ):
+        squared = 0.0
+        for poses in (arm, "random"):
+            where = {"cone": cone, "images": images, "poses": poses, "method": "auto"}
+            means, errors = (
+                np.array(column("pose_design", f"{of}_{what}", law=SYMMETRIC, **where))
+                for what in ("mm", "error_mm")
+            )
+            squared += np.sum((means * errors) ** 2) / np.sum(means**2) ** 2
+        found.append(100 * squared**0.5)
+    return span(found)
+
+
+claim(
+    ACCURACY,
+    "One standard error is {:.1f} to {:.1f} % (re-planned: {:.1f} to {:.1f} %).",
+    lambda: (
+        *_standard_errors("sobol", "optimal", "wrong+", "wrong-"),
+        *_standard_errors("replanned"),
+    ),
 )
 
 

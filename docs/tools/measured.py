@@ -49,7 +49,6 @@ SETTINGS: dict[str, tuple[str, ...]] = {
         "clocks of 20 and 100 MHz",
         "from 0.5 mm of noise on",
         "2000 trials a cell (re-planned: 48), offsets of SD 1 mm, 0.5 mm of noise",
-        "about 0.7 % (re-planned: 4 %)",
         "off-centre by three SDs",
         "a mean one time in ten; with 8, 20 and 50 images",
         "where the alternation's 1 mm is",
