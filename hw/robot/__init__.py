@@ -1,5 +1,5 @@
 """The robot: where its tool is, what it may do, and how it is asked to move.
 
-``pose`` converts units, ``stream`` reads poses, ``safety`` says what may be commanded, and
-``motion`` commands it.
+``pose`` converts units, ``stream`` reads poses, ``safety`` says what may be commanded, ``motion``
+asks for it, and ``mover`` is the process that commands the robot.
 """

@@ -6,7 +6,7 @@ anything that ends motion (a stop, a protective stop, a reset connection, a stop
 confirmation is needed. A protective stop is reported; this software never releases it.
 
 A stop is latched on both sides of the pipe: here in :attr:`Motion._stop`, in the other process as
-described in :mod:`hw.robot._mover`. There are two kinds of stops.
+described in :mod:`hw.robot.mover.control_loop`. There are two kinds of stops.
 
 - A *stop* (:meth:`Motion.stop`, a guard that reports danger or fails, an interrupt such as Ctrl-C,
   force, the box, a protective stop, a motion that does not arrive) ends motion:
@@ -30,13 +30,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 
 import numpy as np
 
 from hw.clock import REAL, Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 from hw.robot._process import spawn
+from hw.robot.mover.messages import Setup, error_of, line_of, sample_of, told
 from hw.robot.safety import Confirmation, MotionPlan, check_plan
 from hw.robot.stream import PoseSample
 
@@ -46,7 +46,6 @@ Guard = Callable[[], str | StaleError | None]
 """Called before a motion is requested and at every tick of it. A returned reason (str) stops the
 robot and ends motion; a returned StaleError stops the robot as a hesitation."""
 
-_KINDS = {kind.__name__: kind for kind in (LostError, RefusedError, StaleError, StoppedError)}
 _TICK_S = 0.02
 _START_PATIENCE_S = 30.0
 # The controller's watchdog has stopped the robot long before; a busy machine gets time to answer.
@@ -125,11 +124,14 @@ class Motion:
         if self._stop is not None:
             self._ended = self._stop
             raise RefusedError(f"motion was stopped ({self._stop.args[0]})", device="robot")
-        self._process = spawn("hw.robot._mover", stdin=True)
+        setup = Setup(
+            self.host, self.plan, given, self.clock, self.dry_run, self._caller_s
+        ).message()
+        self._process = spawn("hw.robot.mover", stdin=True)
         self._thread = threading.Thread(target=self._receive, name="motion", daemon=True)
         self._thread.start()
         try:
-            self._send(self._setup())
+            self._send(setup)
             try:
                 answer = self._answers.get(timeout=_START_PATIENCE_S)
             except queue.Empty:
@@ -138,7 +140,7 @@ class Motion:
             self._kill(RefusedError("motion was interrupted at its start", device="robot"))
             raise
         if answer.get("what") != "ready":
-            error = _error(answer) or LostError(
+            error = error_of(answer) or LostError(
                 f"the controller at {self.host} did not accept the connection within "
                 f"{_START_PATIENCE_S:g} s",
                 device="robot",
@@ -149,30 +151,6 @@ class Motion:
         offset = answer["tcp_offset"]
         self.tcp_offset = None if offset is None else tuple(offset)
         return self
-
-    def _setup(self) -> dict:
-        given = self._confirmation
-        return {
-            "host": self.host,
-            "clock": [self.clock.speed, self.clock.origin_s],
-            "dry_run": self.dry_run,
-            "caller_s": self._caller_s,
-            "plan": {
-                "targets": self.plan.targets.tolist(),
-                "limits": asdict(self.plan.limits),
-                "tcp_offset": self.plan.tcp_offset,
-                "serial": self.plan.serial,
-                "pendant": asdict(self.plan.pendant),
-            },
-            "confirmation": None
-            if given is None
-            else {
-                "digest": given.digest,
-                "serial": given.serial,
-                "issued_s": given.issued_s,
-                "expires_s": given.expires_s,
-            },
-        }
 
     def __enter__(self) -> Motion:
         return self.start()
@@ -240,7 +218,7 @@ class Motion:
         with contextlib.suppress(queue.Empty):
             while not answer.get("ended", False):
                 answer = self._answers.get(timeout=max(0.0, deadline - time.monotonic()))
-        self._kill(_error(answer) or LostError("the motion process hangs", device="robot"))
+        self._kill(error_of(answer) or LostError("the motion process hangs", device="robot"))
 
     def _wait(self, count: int) -> PoseSample:
         """Wait for a move's answer; a stop is sent again until the other process confirms it."""
@@ -252,15 +230,14 @@ class Motion:
                 answer = self._answers.get(timeout=tick)
             except queue.Empty:
                 answer = {}
-            error = _error(answer)
+            error = error_of(answer)
             match answer.get("what"):
                 case "arrived" if answer["move"] == count and self._stop is None:
                     # The robot arrived. Once a stop was asked for, this answer does not count.
                     self._in_motion = False
                     if hesitation is not None:
                         raise hesitation
-                    t_host, t_device, raw, *rest = answer["sample"]
-                    return PoseSample(t_host, t_device, tuple(raw), *rest)
+                    return sample_of(answer["sample"])
                 case "error" if error is not None and answer["ended"]:
                     self._in_motion = False
                     self._kill(error)
@@ -303,8 +280,7 @@ class Motion:
         return None
 
     def _send_stop(self, error: DeviceError) -> None:
-        kind, reason = type(error).__name__, error.args[0]
-        self._send({"request": "stop", "kind": kind, "reason": reason, "move": self._count})
+        self._send({"request": "stop", "move": self._count, **told(error)})
 
     @property
     def ended(self) -> bool:
@@ -345,7 +321,7 @@ class Motion:
             )
         while not self._answers.empty():
             answer = self._answers.get()
-            error = _error(answer)
+            error = error_of(answer)
             if error is not None and answer.get("ended"):
                 self._kill(error)
                 raise error
@@ -367,7 +343,7 @@ class Motion:
         if process is None or process.stdin is None:
             return
         with self._sending, contextlib.suppress(OSError, ValueError):
-            process.stdin.write(json.dumps(message).encode() + b"\n")
+            process.stdin.write(line_of(message))
             process.stdin.flush()
 
     def _receive(self) -> None:
@@ -393,9 +369,3 @@ class Motion:
                 pass
             case _:
                 self._answers.put(message)
-
-
-def _error(answer: dict) -> DeviceError | None:
-    if "kind" not in answer:
-        return None
-    return _KINDS.get(str(answer["kind"]), LostError)(str(answer["text"]), device="robot")

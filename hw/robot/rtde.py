@@ -3,7 +3,7 @@
 ur_rtde keeps only the newest packet, and skips packets whenever its thread is late: on two busy
 cores it skipped a tenth of 500 packets/s. A tracker must not lose poses, so they are read here
 from the socket, where no packet is lost or mixed with another. Commands go through ur_rtde
-(:mod:`hw.robot.motion`).
+(:mod:`hw.robot.mover.controller`).
 
 Data from the socket are untrusted: a message is at most 64 KiB by its format, and anything that
 does not fit the recipe ends the connection.

@@ -197,13 +197,16 @@ def test_nothing_but_the_mover_commands_a_robot():
     package = Path(hw.__file__).parent
     for path in package.rglob("*.py"):
         text = path.read_text()
-        if path.name != "_mover.py":
+        if path.name != "connection.py":
             assert "RTDEControlInterface" not in text, path
+        if path.name != "controller.py":
+            assert '"moveL"' not in text, path
         for forbidden in ("moveJ(", "speedL(", "servoL(", "setTcp", "unlockProtective"):
             assert forbidden not in text, path
         if "bench" not in path.parts:
             assert "unlock protective" not in text, path
-    assert (package / "robot" / "_mover.py").read_text().count('"moveL"') == 1
+    controller = package / "robot" / "mover" / "controller.py"
+    assert controller.read_text().count('"moveL"') == 1
 
 
 def test_a_guard_that_fails_stops_the_robot():
@@ -587,7 +590,7 @@ def test_killing_the_caller_stops_the_robot():
 
 def is_mover(process: str) -> bool:
     try:
-        return b"hw.robot._mover" in Path(f"/proc/{process}/cmdline").read_bytes()
+        return b"hw.robot.mover" in Path(f"/proc/{process}/cmdline").read_bytes()
     except OSError:
         return False
 
@@ -718,3 +721,38 @@ def test_no_thread_of_the_emulated_controller_waits_behind_other_programs():
 
 def test_closing_what_was_not_started_does_nothing():
     Motion("127.0.0.1", PLAN, None).close()
+
+
+def test_a_safety_stop_that_is_over_when_the_mover_looks_ends_motion():
+    """A gate that was open for a moment; the robot would go on by itself."""
+    with EmulatedRobot() as robot, moving(robot, caller_s=2.0) as motion:
+        assert motion._process is not None
+        os.kill(motion._process.pid, signal.SIGSTOP)
+        robot.enter(7, 5)
+        time.sleep(0.05)
+        robot.enter(7, 1)
+        time.sleep(0.05)
+        os.kill(motion._process.pid, signal.SIGCONT)
+        with pytest.raises(StoppedError, match="safeguard stop: close the gate"):
+            until_ended(motion)
+        with pytest.raises(RefusedError, match="confirm the plan again"):
+            motion.move_to(HOME)
+
+
+def test_a_stop_while_it_connects_is_heard():
+    """At once after the setup, so that both may be read together."""
+    with EmulatedRobot(version=CB_SERIES) as robot, ThreadPoolExecutor(1) as pool:
+        plan = replace(PLAN, serial=read_identity(robot.host).name)
+        given = confirm_unattended(plan, plan.digest, clock=robot.clock)
+        motion = Motion(robot.host, plan, given, clock=robot.clock, dry_run=False)
+        with closing(motion):
+            started = pool.submit(motion.start)
+            while motion._process is None:
+                time.sleep(0.001)
+            time.sleep(0.01)
+            motion.stop("the operator")
+            started.result()
+            assert motion._process.wait(timeout=5.0) == 1
+            with pytest.raises(RefusedError, match="the operator"):
+                motion.check()
+        assert sent(robot, 3) == []
