@@ -62,7 +62,7 @@ class Motion:
         clock: bench time.
         dry_run: check and log, but send nothing to the robot.
         log: called with every command before it is sent (of the watchdog's kicks only with their
-            number), every refusal and every stop.
+            number), every refusal and every stop. If it fails, the robot is stopped.
         guard: see :data:`Guard`; may be set at any time.
         caller_s: bench seconds that this process may be silent during a motion, e.g. held up by
             another thread, before the motion is stopped: while it is silent, no guard is called.
@@ -127,17 +127,20 @@ class Motion:
         setup = Setup(
             self.host, self.plan, given, self.clock, self.dry_run, self._caller_s
         ).message()
-        self._process = spawn("hw.robot.mover", stdin=True)
-        self._thread = threading.Thread(target=self._receive, name="motion", daemon=True)
-        self._thread.start()
         try:
-            self._send(setup)
+            with self._sending:
+                # The setup must come first: a stop that is asked for now waits until it is sent.
+                self._process = spawn("hw.robot.mover", stdin=True)
+                self._write(setup)
+            self._thread = threading.Thread(target=self._receive, name="motion", daemon=True)
+            self._thread.start()
             try:
                 answer = self._answers.get(timeout=_START_PATIENCE_S)
             except queue.Empty:
                 answer = {}
         except BaseException:
-            self._kill(RefusedError("motion was interrupted at its start", device="robot"))
+            if self._process is not None:
+                self._kill(RefusedError("motion was interrupted at its start", device="robot"))
             raise
         if answer.get("what") != "ready":
             error = error_of(answer) or LostError(
@@ -179,8 +182,6 @@ class Motion:
         """
         with self._one_at_a_time:
             self.check()
-            while not self._answers.empty():
-                self._answers.get()
             asked = np.asarray(pose).tolist()
             self._count += 1
             self._in_motion = True
@@ -249,7 +250,9 @@ class Motion:
                         raise error if hesitation is None else hesitation
                 case "stopping":
                     stopping = error
-            hesitation = hesitation or self._ask_guard()
+            # Asked also while the robot brakes for a hesitation: it may tell of a danger now.
+            told_now = self._ask_guard()
+            hesitation = hesitation or told_now
             if self._stop is not None and type(stopping) is not StoppedError:
                 self._send_stop(self._stop)
             elif hesitation is not None and stopping is None:
@@ -339,10 +342,14 @@ class Motion:
             self._thread.join()
 
     def _send(self, message: dict) -> None:
+        with self._sending:
+            self._write(message)
+
+    def _write(self, message: dict) -> None:
         process = self._process
         if process is None or process.stdin is None:
             return
-        with self._sending, contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(OSError, ValueError):
             process.stdin.write(line_of(message))
             process.stdin.flush()
 
@@ -358,12 +365,19 @@ class Motion:
             text = "the motion process ended; the robot's own watchdog stops it"
             self._answers.put({"what": "error", "kind": "LostError", "text": text, "ended": True})
 
+    def _note(self, t: float, command: str, values: dict[str, object]) -> None:
+        try:
+            self._log(t, command, values)
+        except Exception as error:
+            # It runs in a thread that must go on: here nobody would see the exception.
+            self.stop(f"the log failed: {type(error).__name__}: {error}")
+
     def _hear(self, message: dict) -> None:
         match message["what"]:
             case "log":
-                self._log(message["t"], message["command"], message["numbers"])
+                self._note(message["t"], message["command"], message["numbers"])
             case "stopping":
-                self._log(self.clock.now(), "stop", {"why": message["text"]})
+                self._note(self.clock.now(), "stop", {"why": message["text"]})
                 self._answers.put(message)
             case "alive" | "closed":
                 pass

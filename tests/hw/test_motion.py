@@ -749,10 +749,49 @@ def test_a_stop_while_it_connects_is_heard():
             started = pool.submit(motion.start)
             while motion._process is None:
                 time.sleep(0.001)
-            time.sleep(0.01)
             motion.stop("the operator")
             started.result()
             assert motion._process.wait(timeout=5.0) == 1
             with pytest.raises(RefusedError, match="the operator"):
                 motion.check()
         assert sent(robot, 3) == []
+
+
+def test_a_danger_told_after_a_hesitation_ends_motion():
+    """The robot still brakes for the hesitation when the guard tells of the danger."""
+    told: list[str | StaleError] = []
+
+    def guard() -> str | StaleError | None:
+        if robot.state()["velocity"][0] < 0.04 and not told:
+            return None
+        told.append("danger" if told else StaleError("no frame", device="active echo"))
+        return told[-1]
+
+    with (
+        EmulatedRobot(version=CB_SERIES) as robot,
+        moving(robot, guard=guard, caller_s=2.0) as motion,
+    ):
+        with pytest.raises(StoppedError, match="danger"):
+            motion.move_to(PLAN.targets[2])
+        assert motion.ended
+
+
+def test_a_log_that_fails_stops_the_robot():
+    times: list[float] = []
+
+    def log(t: float, command: str, numbers: dict[str, object]) -> None:
+        if command == "moveL":
+            times.append(t)
+            raise OSError("no space left on device")
+
+    with EmulatedRobot(version=CB_SERIES) as robot:
+        plan = replace(PLAN, serial=read_identity(robot.host).name)
+        given = confirm_unattended(plan, plan.digest, clock=robot.clock)
+        named = {"clock": robot.clock, "dry_run": False, "caller_s": 2.0}
+        with Motion(robot.host, plan, given, log=log, **named) as motion:
+            with pytest.raises(StoppedError, match="the log failed: OSError: no space left"):
+                motion.move_to(PLAN.targets[2])
+            assert motion.ended
+        state = robot.state()
+    assert state["rest_since"] - times[0] <= STOP_WITHIN_S
+    assert state["reason"] == "the client stopped the script"
