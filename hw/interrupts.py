@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import _thread
 import signal
-import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
 
 ENDING = tuple(
     getattr(signal, name)
@@ -16,7 +15,9 @@ ENDING = tuple(
     if hasattr(signal, name)
 )
 """The signals by which a person, a shell or a system asks a program to end; SIGBREAK on Windows."""
-_AGAIN_S = 0.01
+
+_asked: list[int] = []
+"""Signals that have come within :func:`as_interrupts`. No lock: a handler may run at any place."""
 
 
 @contextmanager
@@ -25,9 +26,6 @@ def as_interrupts() -> Iterator[None]:
 
     A shell starts background jobs with SIGINT ignored, so a stop by SIGINT would have no effect:
     here it has. SIGHUP stays ignored where it is ignored, since that is what ``nohup`` is for.
-
-    Python only reports an exception that is raised in a finaliser or in a callback of the garbage
-    collector (JAX has one), and goes on. A KeyboardInterrupt that is raised there is raised again.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -39,30 +37,28 @@ def as_interrupts() -> Iterator[None]:
         for number, handler in before.items()
         if not (number == getattr(signal, "SIGHUP", None) and handler is signal.SIG_IGN)
     ]
-    report = sys.unraisablehook
-
-    def raise_again(problem: sys.UnraisableHookArgs) -> None:
-        if issubclass(problem.exc_type, KeyboardInterrupt):
-            # Later, and by another thread: raised within this function, it would be lost as well.
-            _thread.start_new_thread(_interrupt_later, ())
-        else:
-            report(problem)
-
+    _asked.clear()
     for number in heard:
-        signal.signal(number, signal.default_int_handler)
-    sys.unraisablehook = raise_again
+        signal.signal(number, _interrupt)
     try:
         yield
     finally:
-        sys.unraisablehook = report
         for number in heard:
             signal.signal(number, before[number] or signal.SIG_DFL)
+        _asked.clear()
 
 
-def _interrupt_later() -> None:
-    time.sleep(_AGAIN_S)
-    if hasattr(signal, "pthread_kill"):
-        # A signal to the main thread itself also ends what that thread waits for.
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-    else:
-        _thread.interrupt_main()
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    _asked.append(number)
+    raise KeyboardInterrupt
+
+
+def heed_interrupt() -> None:
+    """Raise the KeyboardInterrupt of a signal that came within :func:`as_interrupts` once more.
+
+    The first one may have been dropped: Python only reports exceptions of finalisers and of
+    callbacks of the garbage collector (JAX has one), Tk those of its callbacks, and both go on.
+    Whatever moves the robot, or waits for a person in a window, calls this.
+    """
+    if _asked:
+        raise KeyboardInterrupt

@@ -35,6 +35,7 @@ import numpy as np
 
 from hw.clock import REAL, Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
+from hw.interrupts import heed_interrupt
 from hw.robot._process import spawn
 from hw.robot.mover.messages import Setup, error_of, line_of, sample_of, told
 from hw.robot.safety import Confirmation, MotionPlan, check_plan
@@ -273,6 +274,7 @@ class Motion:
 
     def _ask_guard(self) -> StaleError | None:
         """Ask the guard; a danger is latched and sent, a hesitation is returned."""
+        heed_interrupt()
         if self.guard is None or self._stop is not None:
             return None
         reason = self.guard()

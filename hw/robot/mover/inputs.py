@@ -154,7 +154,7 @@ class Inputs:
             case "heard":
                 self.heard_s = self._clock.now()
             case "close":
-                self._caller.left = True
+                self._caller.closed = True
 
 
 def lost(what: str) -> LostError:

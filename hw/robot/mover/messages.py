@@ -149,8 +149,17 @@ class Caller:
     def __init__(self, requests: int, answers: int) -> None:
         self._requests, self._answers = requests, answers
         self._data = b""
-        self.left = False
-        """Whether it has asked to close, has closed its end or was killed."""
+        self._parent = os.getppid()
+        self.closed = False
+        """Whether it has asked to close, or has closed its end."""
+
+    @property
+    def left(self) -> bool:
+        """Whether it is gone or going, so that the robot must be stopped.
+
+        When it is killed, the system closes its end, unless a child of it holds the same pipe.
+        """
+        return self.closed or os.getppid() != self._parent
 
     def fileno(self) -> int:
         """For select."""
@@ -169,7 +178,7 @@ class Caller:
 
     def read(self) -> list[dict]:
         """Wait for input; the requests that have come."""
-        self.left = not self._receive() or self.left
+        self.closed = not self._receive() or self.closed
         return self.read_so_far()
 
     def read_so_far(self) -> list[dict]:
@@ -184,10 +193,10 @@ class Caller:
         return bool(data)
 
     def tell(self, what: str, **values: object) -> None:
-        """Send it a message; one that is gone is noted, since the robot must be stopped then."""
+        """Send it a message; that nobody listens any more is noted, and is no error."""
         view = memoryview(line_of({"what": what, **values}))
         try:
             while view:
                 view = view[os.write(self._answers, view) :]
         except BrokenPipeError:
-            self.left = True
+            self.closed = True
