@@ -8,10 +8,10 @@ confirmation is needed. A protective stop is reported; this software never relea
 A stop is latched on both sides of the pipe: here in :attr:`Motion._stop`, in the other process as
 described in :mod:`hw.robot.mover.control_loop`. There are two kinds of stops.
 
-- A *stop* (:meth:`Motion.stop`, a guard that reports danger or fails, an interrupt such as Ctrl-C,
-  force, the box, a protective stop, a motion that does not arrive) ends motion:
-  :attr:`Motion.ended` is true, every later move is refused, and only a new confirmation lets the
-  robot move again.
+- A *stop* (:meth:`Motion.stop`, a guard that reports danger or fails, a log that fails, an
+  interrupt such as Ctrl-C, force, the box, a protective stop, a motion that does not arrive) ends
+  motion: :attr:`Motion.ended` is true, every later move is refused, and only a new confirmation
+  lets the robot move again.
 - A *hesitation* (StaleError: poses, echo frames, images or this process were silent for a moment)
   stops the robot in the same way, but the same move may be asked for again. Nothing said that
   moving was dangerous; for a moment the software could not know that it was safe.
