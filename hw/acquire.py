@@ -34,8 +34,11 @@ from hw.midplane.threshold_climb import threshold_climb
 from hw.planner import Planner
 from hw.recorder import Recorder
 from hw.request import AcquisitionRequest
+from hw.robot.confirmation import Confirmation
+from hw.robot.gate import check_sample
 from hw.robot.motion import Motion
-from hw.robot.safety import Confirmation, MotionPlan, check_plan, check_sample
+from hw.robot.motion_plan import MotionPlan
+from hw.robot.path_checks import check_plan
 from hw.session import Session, Watch, median_times
 from hw.setup import Setup
 from hw.stage import ProbeStage

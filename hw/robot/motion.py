@@ -37,8 +37,10 @@ from hw.clock import REAL, Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 from hw.interrupts import heed_interrupt
 from hw.robot._process import spawn
+from hw.robot.confirmation import Confirmation
+from hw.robot.motion_plan import MotionPlan
 from hw.robot.mover.messages import Setup, error_of, line_of, sample_of, told
-from hw.robot.safety import Confirmation, MotionPlan, check_plan
+from hw.robot.path_checks import check_plan
 from hw.robot.stream import PoseSample
 
 Log = Callable[[float, str, dict[str, object]], None]

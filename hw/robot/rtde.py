@@ -186,6 +186,21 @@ class Packet:
     """Angles of the joints, rad."""
 
     @property
+    def speed_mm_s(self) -> float:
+        """Of the TCP."""
+        return 1000.0 * math.hypot(*self.tcp_speed[:3])
+
+    @property
+    def turning_rad_s(self) -> float:
+        """Of the TCP."""
+        return math.hypot(*self.tcp_speed[3:])
+
+    @property
+    def force_n(self) -> float:
+        """At the TCP."""
+        return math.hypot(*self.tcp_force[:3])
+
+    @property
     def program(self) -> bool:
         """Whether a program plays or is paused."""
         return bool(self.status_bits & PROGRAM_RUNS) or self.runtime_state in _PLAYS

@@ -26,12 +26,13 @@ import hw
 from hw.clock import REAL
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 from hw.interrupts import as_interrupts
+from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity, stop_program
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
+from hw.robot.motion_plan import MotionPlan
 from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import PacketReader, state_text
-from hw.robot.safety import MotionPlan, confirm_unattended
 from jaxcal.runtime.isolated import import_path
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
@@ -546,7 +547,8 @@ from hw.clock import Clock
 from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
-from hw.robot.safety import MotionPlan, confirm_unattended
+from hw.robot.confirmation import confirm_unattended
+from hw.robot.motion_plan import MotionPlan
 host, origin, targets, limits, offset, serial = json.loads(sys.argv[1])
 clock = Clock(1.0, origin)
 plan = MotionPlan.from_poses(targets, Limits.from_mapping(limits), offset, serial)

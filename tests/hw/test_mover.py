@@ -12,7 +12,9 @@ import pytest
 
 from hw.clock import Clock
 from hw.errors import LostError, RefusedError, StaleError, StoppedError
+from hw.robot.confirmation import Confirmation
 from hw.robot.limits import Limits
+from hw.robot.motion_plan import MotionPlan
 from hw.robot.mover.__main__ import combined
 from hw.robot.mover.inputs import Inputs
 from hw.robot.mover.messages import (
@@ -26,7 +28,6 @@ from hw.robot.mover.messages import (
 )
 from hw.robot.mover.stop_latch import Stop, StopLatch
 from hw.robot.rtde import PendantSettings
-from hw.robot.safety import Confirmation, MotionPlan
 from hw.robot.stream import PoseSample
 
 CLOCK = Clock()

@@ -7,13 +7,13 @@ from typing import NoReturn
 
 from hw.errors import DeviceError, LostError, StoppedError
 from hw.robot._process import ASKS, be_prompt
+from hw.robot.gate import Gate
 from hw.robot.mover.connection import Connection
 from hw.robot.mover.control_loop import ControlLoop
 from hw.robot.mover.controller import Controller
 from hw.robot.mover.inputs import Inputs
 from hw.robot.mover.messages import Caller, Setup, told
 from hw.robot.mover.stop_latch import Ended, Stop
-from hw.robot.safety import Gate
 
 
 def main() -> NoReturn:

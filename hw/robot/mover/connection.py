@@ -9,13 +9,14 @@ import threading
 from hw.errors import LostError, RefusedError
 from hw.extras import require
 from hw.robot._process import ASKS, RECEIVES, be_prompt
+from hw.robot.gate import Gate
 from hw.robot.identity import LOCAL, read_identity, stop_program, until_local
 from hw.robot.limits import numbers
 from hw.robot.mover.controller import IDLE_WATCHDOG_HZ, STOP_PATIENCE_S, Controller, said
 from hw.robot.mover.inputs import Inputs
 from hw.robot.mover.messages import Setup
+from hw.robot.path_checks import check_plan
 from hw.robot.rtde import PROGRAM_RUNS, PacketReader, safety_text, state_text, too_late
-from hw.robot.safety import Gate, check_plan
 from hw.robot.stream import Lag
 
 _END_S = 5.0

@@ -27,6 +27,7 @@ import numpy as np
 
 from hw.errors import DeviceError, RefusedError, StaleError, StoppedError
 from hw.rigid import turn_deg
+from hw.robot.gate import Command, Gate
 from hw.robot.limits import numbers
 from hw.robot.mover.connection import Connection
 from hw.robot.mover.controller import Controller
@@ -34,7 +35,6 @@ from hw.robot.mover.inputs import Inputs
 from hw.robot.mover.messages import Caller, Setup, plain, told
 from hw.robot.mover.monitor import Monitor
 from hw.robot.mover.stop_latch import Ended, Stop
-from hw.robot.safety import Command, Gate
 from hw.robot.stream import PoseSample
 
 _REPORT_S = 0.05
@@ -176,7 +176,7 @@ class ControlLoop:
             serial=self._controller.serial,
             tcp_offset=self._inputs.tcp_offset,
             pendant=self._inputs.pendant,
-            force_n=math.hypot(*self._inputs.packet.tcp_force[:3]),
+            force_n=self._inputs.packet.force_n,
         )
 
     def _pretend(self, pose: object, speed_mm_s: object) -> None:
@@ -193,11 +193,10 @@ class ControlLoop:
     def _follow(self, command: Command) -> None:
         """Answer when the motion has arrived and rests; latch a stop for good when it is late."""
         now = self._clock.now()
-        speed = math.hypot(*self._inputs.packet.tcp_speed[:3]) * 1000.0
         pose = self._inputs.sample.pose
         off = float(np.linalg.norm(pose[:3, 3] - command.pose[:3, 3]))
         there = off < _ARRIVED_MM and turn_deg(pose, command.pose) < _ARRIVED_DEG
-        if not (there and speed < _REST_MM_S):
+        if not (there and self._inputs.packet.speed_mm_s < _REST_MM_S):
             # The controller calls an arm steady once it has rested for half a second.
             self._steady_due = now + _STEADY_S
         elif now >= self._steady_due:

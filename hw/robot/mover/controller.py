@@ -150,9 +150,8 @@ class Controller:
             self._inputs.read(self._clock.wall(_REST_SEEN_S / 4))
             self.kick()
             packet = self._inputs.packet
-            speed = math.hypot(*packet.tcp_speed[:3]) * 1000.0
             if packet.timestamp_s > since and (
-                speed > _STOPPED_MM_S or math.hypot(*packet.tcp_speed[3:]) > _STOPPED_RAD_S
+                packet.speed_mm_s > _STOPPED_MM_S or packet.turning_rad_s > _STOPPED_RAD_S
             ):
                 since = packet.timestamp_s
                 if since - sent > _STOP_AGAIN_S:

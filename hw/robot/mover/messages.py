@@ -19,9 +19,10 @@ from dataclasses import asdict, dataclass
 
 from hw.clock import Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
+from hw.robot.confirmation import Confirmation
 from hw.robot.limits import Limits
+from hw.robot.motion_plan import MotionPlan
 from hw.robot.rtde import PendantSettings
-from hw.robot.safety import Confirmation, MotionPlan
 from hw.robot.stream import PoseSample
 
 _KINDS = {kind.__name__: kind for kind in (LostError, RefusedError, StaleError, StoppedError)}

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
-
 from hw.errors import StaleError, StoppedError
 from hw.robot.identity import LOCAL
 from hw.robot.mover.controller import Controller, unfit
 from hw.robot.mover.inputs import Inputs, lost
 from hw.robot.mover.messages import Setup
 from hw.robot.mover.stop_latch import Stop
+from hw.robot.path_checks import out_of_box_mm
 from hw.robot.rtde import PROGRAM_RUNS
-from hw.robot.safety import out_of_box_mm
 
 _BOX_MARGIN_MM = 1.0
 
@@ -58,7 +56,7 @@ class Monitor:
             return _hesitation(
                 f"no fresh pose: the newest is {sample.age_text(now)}; the motion was stopped"
             )
-        force = max(math.hypot(*packet.tcp_force[:3]) for packet in packets)
+        force = max(packet.force_n for packet in packets)
         if force > limits.max_force_n:
             return _for_good(f"a force of {force:.1f} N, over the cap of {limits.max_force_n:g} N")
         out = out_of_box_mm(sample.pose, limits)
