@@ -49,7 +49,6 @@ class Controller:
     """
 
     def __init__(self, setup: Setup, inputs: Inputs, caller: Caller) -> None:
-        self.host = setup.host
         self.serial = ""
         """Which robot is connected: :attr:`hw.robot.identity.Identity.name`."""
         self.rtde_control: Any = None
