@@ -31,11 +31,14 @@ def main() -> NoReturn:
         cause = LostError(f"{type(error).__name__}: {error}", device="robot")
         caller.tell("error", ended=True, **told(cause))
         os._exit(1)
-    caller.tell("closed")
     os._exit(0)
 
 
-def _serve(setup: Setup, caller: Caller, library: int) -> None:
+def _serve(setup: Setup, caller: Caller, library: int) -> NoReturn:
+    """Move, and end the process: at once, so that ur_rtde can neither reconnect nor wait.
+
+    To return would call its destructor, which takes half a second.
+    """
     inputs = Inputs(caller, library, setup.clock)
     gate = Gate(setup.plan, setup.confirmation, setup.clock)
     controller = Controller(setup, inputs, caller)
@@ -52,8 +55,9 @@ def _serve(setup: Setup, caller: Caller, library: int) -> None:
         answer = told(cause)
         answer["text"] += connection.end_paused()
         caller.tell("error", ended=True, **answer)
-        # At once, so that ur_rtde can neither reconnect nor wait.
         os._exit(1)
+    caller.tell("closed")
+    os._exit(0)
 
 
 def combined(stop: Stop | None, error: DeviceError) -> DeviceError:
