@@ -35,11 +35,12 @@ from common import arguments, machine, results_folder, write_table
 
 from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
 from hw.errors import DeviceError
+from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
+from hw.robot.motion_plan import MotionPlan
 from hw.robot.pose import ur_to_pose
-from hw.robot.safety import MotionPlan, confirm_unattended
 from hw.robot.stream import PoseStream
 
 SEED = 7

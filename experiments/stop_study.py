@@ -44,11 +44,12 @@ from hw.bench.arm import Motion as ArmMotion
 from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
 from hw.clock import Clock
 from hw.errors import DeviceError
+from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
+from hw.robot.motion_plan import MotionPlan
 from hw.robot.pose import ur_to_pose
-from hw.robot.safety import MotionPlan, confirm_unattended
 from jaxcal.runtime.isolated import import_path
 
 SEED = 16

@@ -34,8 +34,11 @@ from hw.midplane.threshold_climb import threshold_climb
 from hw.planner import Planner
 from hw.recorder import Recorder
 from hw.request import AcquisitionRequest
+from hw.robot.confirmation import Confirmation
+from hw.robot.gate import check_sample
 from hw.robot.motion import Motion
-from hw.robot.safety import Confirmation, MotionPlan, check_plan, check_sample
+from hw.robot.motion_plan import MotionPlan
+from hw.robot.path_checks import check_plan
 from hw.session import Session, Watch, median_times
 from hw.setup import Setup
 from hw.stage import ProbeStage
@@ -152,18 +155,9 @@ def acquire(
     try:
         with _closing(recorder):
             try:
-                return _run(
-                    job,
-                    recorder,
-                    estimator,
-                    confirm,
-                    say,
-                    oracle,
-                    operator,
-                    pause,
-                    watch,
-                    Nobody() if view is None else view,
-                )
+                audience = Nobody() if view is None else view
+                run = _Run(job, recorder, estimator, say, oracle, operator, pause, audience)
+                return run.outcome(confirm, watch)
             except KeyboardInterrupt:
                 interrupted = True
             except (DeviceError, CalibrationError) as error:
@@ -202,168 +196,6 @@ def _closing(recorder: Recorder) -> Iterator[None]:
             recorder.close()
 
 
-def _run(
-    job: Job,
-    recorder: Recorder,
-    estimator: Estimator,
-    confirm: Confirm,
-    say: Callable[[str], None],
-    oracle: Oracle | None,
-    operator: Callable[[], Operator],
-    pause: Pause | None,
-    watch: Watch | None,
-    view: Audience,
-) -> Outcome:
-    setup, clock = job.setup, job.setup.clock
-    started = clock.now()
-
-    def note(kind: str, text: str) -> None:
-        recorder.add_event(kind, text, clock.now())
-        say(f"{kind}: {text}")
-
-    note("resumed" if job.progress else "started", f"{job.to_take} images to take")
-    for change in job.changes:
-        note("changed", change)
-    session = Session(setup, recorder, watch=watch, every_frame=job.request.every_frame)
-    given_up: list[int] = []
-    skipped: list[int] = []
-    with session, watched(view, session):
-        plan = motion_plan(job, session)
-        check_sample(session.poses.latest(), plan.limits, clock)
-        course = check_plan(plan)
-        note("arm", NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}")
-        done = [row for row in range(len(job.targets)) if row not in job.missing]
-        view.plan(setup, plan, job.targets, done)
-        confirmation = confirm(plan)
-        record_confirmed(job, plan, session, recorder)
-        by = "unattended: nobody was asked" if confirmation.unattended else "by the operator"
-        note("confirmed", f"{by}; plan {plan.digest[:16]} for robot {plan.serial}, {plan.pendant}")
-
-        def log(t: float, command: str, numbers: dict[str, object]) -> None:
-            # Runs in the thread that hears the motion process; the recorder keeps its own error.
-            with suppress(CalibrationError):
-                recorder.add_event("command", f"{command} {json.dumps(numbers)}", t)
-
-        motion = Motion(
-            setup.robot_host,
-            plan,
-            confirmation,
-            clock=clock,
-            dry_run=False,
-            log=log,
-            guard=session.trouble,
-            caller_s=setup.caller_s,
-        )
-        with motion:
-            stage = ProbeStage(session, motion, job.targets, note)
-            failures = 0
-            for row in _rows(job, estimator, session, note):
-                if pause is not None and pause.held:
-                    note("paused", "before the next image")
-                    pause.wait()
-                    note("continued", "by the operator")
-                began = clock.now()
-                view.going(row)
-                try:
-                    placement = _place(job, row, stage, estimator, operator, view)
-                    shot = _shoot(job, row, stage, session)
-                except SkippedError as error:
-                    skipped.append(row)
-                    view.given_up(row)
-                    note("skipped", f"pose {row + 1}: {error.args[0]}")
-                    continue
-                except PlacementError as error:
-                    given_up.append(row)
-                    view.given_up(row)
-                    note("given up", f"pose {row + 1}: {error}")
-                    session.check()
-                    failures += 1
-                    if failures == _MOST_GIVEN_UP:
-                        raise
-                    continue
-                failures = 0
-                _take(job, row, session, recorder, estimator, placement, shot, oracle, began)
-                view.taken(row, placement, estimator.answer)
-                say(estimator.line(job.images, placement))
-    if oracle is not None:
-        _write_truth(recorder, oracle)
-    note("finished", f"{estimator.count} images")
-    without = tuple(sorted(given_up + skipped))
-    # A pool has other poses for those without an image.
-    again = without if job.request.plan == "sobol" else ()
-    digest = _finish(recorder, len(again))
-    return Outcome(
-        estimator.count,
-        without,
-        digest,
-        clock.now() - started,
-        resume_command(recorder.kept, job.request) if again else None,
-    )
-
-
-def _finish(recorder: Recorder, without_image: int) -> str:
-    """Mark the recording complete; poses without an image may still be asked for again."""
-    recorder.attributes("plan", {"without_image": without_image})
-    return recorder.finish()
-
-
-def _rows(
-    job: Job, estimator: Estimator, session: Session, note: Callable[[str, str], None]
-) -> Iterator[int]:
-    """The poses to visit, one after the other; a pose given up does not come again in this run."""
-    if job.request.plan == "sobol":
-        yield from job.missing
-        return
-    planner = Planner(job.targets, job.setup, job.request.until_tre_mm)
-    left = job.missing
-    while left and estimator.count < job.images:
-        here = session.poses.latest().pose
-        choice = planner.choose(left, estimator.poses, here, estimator.answer)
-        if choice.text:
-            note("planned", choice.text)
-        if choice.row is None:
-            return
-        left.remove(choice.row)
-        yield choice.row
-
-
-def _place(
-    job: Job,
-    row: int,
-    stage: ProbeStage,
-    estimator: Estimator,
-    operator: Callable[[], Operator],
-    view: Audience,
-) -> Placement:
-    pose, settings = job.targets[row], job.setup.search
-    start = estimator.expected_offset_mm(pose) if estimator.count >= _IMAGES_FOR_PREDICTION else 0.0
-    start = float(np.clip(start, -_FURTHEST_START_MM, _FURTHEST_START_MM))
-    stage.go_to(row)
-    if job.request.by_image:
-        bench = stage.image_bench(row, credible=job.request.placement == "none")
-        if job.request.placement == "image-scan":
-            return image_scan(bench, settings, start, watch=view.stop)
-        return first_seen(bench, settings, start, watch=view.stop)
-    match job.request.placement:
-        case "threshold-climb":
-            return threshold_climb(stage, settings, start, watch=view.stop)
-        case "amplitude-scan":
-            return amplitude_scan(stage, settings, start, watch=view.stop)
-        case "pattern-injection":
-            title = f"pose {row + 1} of {len(job.targets)}"
-            return pattern_injection(
-                stage,
-                stage,
-                operator(),
-                settings,
-                start,
-                frame=stage.frame,
-                title=title,
-                watch=view.stop,
-            )
-    return first_seen(stage, settings, 0.0, watch=view.stop)
-
-
 @dataclass(frozen=True)
 class _Shot:
     """What was measured at the place where the probe stands."""
@@ -373,53 +205,213 @@ class _Shot:
     amplitude: float
 
 
-def _shoot(job: Job, row: int, stage: ProbeStage, session: Session) -> _Shot:
-    """Average the pose, and listen or look.
+class _Run:
+    """One way through a job; arguments as of :func:`acquire`."""
 
-    Raises:
-        PlacementError: no frame shows a credible target.
-        DeviceError: a device is in lasting trouble.
-    """
-    steady = session.poses.steady(job.setup.settle_s)
-    if job.request.by_image:
-        measurement, amplitude = stage.locate(row)
-    else:
-        heard = session.listen(job.setup.frames, stage.arrived_s)
-        measurement, amplitude = median_times(heard)
-    stage.check()
-    session.record_image()
-    return _Shot(steady.sample.pose, measurement, amplitude)
+    def __init__(
+        self,
+        job: Job,
+        recorder: Recorder,
+        estimator: Estimator,
+        say: Callable[[str], None],
+        oracle: Oracle | None,
+        operator: Callable[[], Operator],
+        pause: Pause | None,
+        view: Audience,
+    ) -> None:
+        self._job, self._recorder, self._estimator, self._say = job, recorder, estimator, say
+        self._oracle, self._operator, self._pause, self._view = oracle, operator, pause, view
+        self._clock = job.setup.clock
+        self._without: list[int] = []
+        """Rows of the plan for which there is no image: given up, or skipped by the operator."""
+
+    def outcome(self, confirm: Confirm, watch: Watch | None) -> Outcome:
+        """Open the devices, have the plan confirmed, take the images, and finish the file."""
+        job, recorder, estimator = self._job, self._recorder, self._estimator
+        started = self._clock.now()
+        self._note("resumed" if job.progress else "started", f"{job.to_take} images to take")
+        for change in job.changes:
+            self._note("changed", change)
+        session = Session(job.setup, recorder, watch=watch, every_frame=job.request.every_frame)
+        with session, watched(self._view, session):
+            motion = self._confirmed(session, confirm)
+            with motion:
+                self._take_images(session, ProbeStage(session, motion, job.targets, self._note))
+        if self._oracle is not None:
+            _write_truth(recorder, self._oracle)
+        self._note("finished", f"{estimator.count} images")
+        without = tuple(sorted(self._without))
+        # A pool has other poses for those without an image.
+        again = without if job.request.plan == "sobol" else ()
+        digest = _finish(recorder, len(again))
+        return Outcome(
+            estimator.count,
+            without,
+            digest,
+            self._clock.now() - started,
+            resume_command(recorder.kept, job.request) if again else None,
+        )
+
+    def _note(self, kind: str, text: str) -> None:
+        self._recorder.add_event(kind, text, self._clock.now())
+        self._say(f"{kind}: {text}")
+
+    def _log(self, t: float, command: str, numbers: dict[str, object]) -> None:
+        # Runs in the thread that hears the motion process; the recorder keeps its own error.
+        with suppress(CalibrationError):
+            self._recorder.add_event("command", f"{command} {json.dumps(numbers)}", t)
+
+    def _confirmed(self, session: Session, confirm: Confirm) -> Motion:
+        """The motion of the plan, once that was checked and confirmed; not started yet."""
+        job, setup = self._job, self._job.setup
+        plan = motion_plan(job, session)
+        check_sample(session.poses.latest(), plan.limits, self._clock)
+        course = check_plan(plan)
+        reach = NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}"
+        self._note("arm", reach)
+        done = [row for row in range(len(job.targets)) if row not in job.missing]
+        self._view.plan(setup, plan, job.targets, done)
+        confirmation = confirm(plan)
+        record_confirmed(job, plan, session, self._recorder)
+        by = "unattended: nobody was asked" if confirmation.unattended else "by the operator"
+        text = f"{by}; plan {plan.digest[:16]} for robot {plan.serial}, {plan.pendant}"
+        self._note("confirmed", text)
+        return Motion(
+            setup.robot_host,
+            plan,
+            confirmation,
+            clock=self._clock,
+            dry_run=False,
+            log=self._log,
+            guard=session.trouble,
+            caller_s=setup.caller_s,
+        )
+
+    def _take_images(self, session: Session, stage: ProbeStage) -> None:
+        """Visit the poses one after the other; those without a mid-plane are left out."""
+        view, failures = self._view, 0
+        for row in self._rows(session):
+            if self._pause is not None and self._pause.held:
+                self._note("paused", "before the next image")
+                self._pause.wait()
+                self._note("continued", "by the operator")
+            began = self._clock.now()
+            view.going(row)
+            try:
+                placement = self._place(row, stage)
+                shot = self._shoot(row, stage, session)
+            except SkippedError as error:
+                self._without.append(row)
+                view.given_up(row)
+                self._note("skipped", f"pose {row + 1}: {error.args[0]}")
+                continue
+            except PlacementError as error:
+                self._without.append(row)
+                view.given_up(row)
+                self._note("given up", f"pose {row + 1}: {error}")
+                session.check()
+                failures += 1
+                if failures == _MOST_GIVEN_UP:
+                    raise
+                continue
+            failures = 0
+            self._select(row, placement, shot, began)
+            view.taken(row, placement, self._estimator.answer)
+            self._say(self._estimator.line(self._job.images, placement))
+
+    def _rows(self, session: Session) -> Iterator[int]:
+        """The poses to visit in turn; a pose given up does not come again in this run."""
+        job, estimator = self._job, self._estimator
+        if job.request.plan == "sobol":
+            yield from job.missing
+            return
+        planner = Planner(job.targets, job.setup, job.request.until_tre_mm)
+        left = job.missing
+        while left and estimator.count < job.images:
+            here = session.poses.latest().pose
+            choice = planner.choose(left, estimator.poses, here, estimator.answer)
+            if choice.text:
+                self._note("planned", choice.text)
+            if choice.row is None:
+                return
+            left.remove(choice.row)
+            yield choice.row
+
+    def _place(self, row: int, stage: ProbeStage) -> Placement:
+        """Go to a pose, and bring the target into the mid-plane as the request says."""
+        job, estimator, watch = self._job, self._estimator, self._view.stop
+        pose, settings, placement = job.targets[row], job.setup.search, job.request.placement
+        start = 0.0
+        if estimator.count >= _IMAGES_FOR_PREDICTION:
+            expected = estimator.expected_offset_mm(pose)
+            start = float(np.clip(expected, -_FURTHEST_START_MM, _FURTHEST_START_MM))
+        stage.go_to(row)
+        if job.request.by_image:
+            bench = stage.image_bench(row, credible=placement == "none")
+            if placement == "image-scan":
+                return image_scan(bench, settings, start, watch=watch)
+            return first_seen(bench, settings, start, watch=watch)
+        match placement:
+            case "threshold-climb":
+                return threshold_climb(stage, settings, start, watch=watch)
+            case "amplitude-scan":
+                return amplitude_scan(stage, settings, start, watch=watch)
+            case "pattern-injection":
+                return pattern_injection(
+                    stage,
+                    stage,
+                    self._operator(),
+                    settings,
+                    start,
+                    frame=stage.frame,
+                    title=f"pose {row + 1} of {len(job.targets)}",
+                    watch=watch,
+                )
+        return first_seen(stage, settings, 0.0, watch=watch)
+
+    def _shoot(self, row: int, stage: ProbeStage, session: Session) -> _Shot:
+        """Average the pose, and listen or look.
+
+        Raises:
+            PlacementError: no frame shows a credible target.
+            DeviceError: a device is in lasting trouble.
+        """
+        setup = self._job.setup
+        steady = session.poses.steady(setup.settle_s)
+        if self._job.request.by_image:
+            measurement, amplitude = stage.locate(row)
+        else:
+            heard = session.listen(setup.frames, stage.arrived_s)
+            measurement, amplitude = median_times(heard)
+        stage.check()
+        session.record_image()
+        return _Shot(steady.sample.pose, measurement, amplitude)
+
+    def _select(self, row: int, placement: Placement, shot: _Shot, began: float) -> None:
+        """Put the image among those of the calibration, and solve again."""
+        clock, bracket, oracle = self._clock, placement.bracket, self._oracle
+        self._recorder.add_selected(
+            shot.pose,
+            shot.measurement,
+            kind=self._job.request.kind,
+            max_elevation=bracket.max_elevation_mm,
+            amplitude=shot.amplitude,
+            t_host=clock.now(),
+            target=row,
+            bracket=(bracket.centre_mm, bracket.low_mm, bracket.high_mm, bracket.sd_mm),
+            offset=placement.offset_mm,
+            true_elevation=float("nan") if oracle is None else oracle.elevation_mm(),
+            seconds=clock.now() - began,
+        )
+        estimate = self._estimator.add(shot.pose, shot.measurement, bracket.max_elevation_mm)
+        if estimate is not None:
+            self._recorder.add_estimate({"t_host": np.array([clock.now()]), **estimate})
 
 
-def _take(
-    job: Job,
-    row: int,
-    session: Session,
-    recorder: Recorder,
-    estimator: Estimator,
-    placement: Placement,
-    shot: _Shot,
-    oracle: Oracle | None,
-    began: float,
-) -> None:
-    """Select the image, and solve again."""
-    clock, bracket = job.setup.clock, placement.bracket
-    recorder.add_selected(
-        shot.pose,
-        shot.measurement,
-        kind=job.request.kind,
-        max_elevation=bracket.max_elevation_mm,
-        amplitude=shot.amplitude,
-        t_host=clock.now(),
-        target=row,
-        bracket=(bracket.centre_mm, bracket.low_mm, bracket.high_mm, bracket.sd_mm),
-        offset=placement.offset_mm,
-        true_elevation=float("nan") if oracle is None else oracle.elevation_mm(),
-        seconds=clock.now() - began,
-    )
-    estimate = estimator.add(shot.pose, shot.measurement, bracket.max_elevation_mm)
-    if estimate is not None:
-        recorder.add_estimate({"t_host": np.array([clock.now()]), **estimate})
+def _finish(recorder: Recorder, without_image: int) -> str:
+    """Mark the recording complete; poses without an image may still be asked for again."""
+    recorder.attributes("plan", {"without_image": without_image})
+    return recorder.finish()
 
 
 def _write_truth(recorder: Recorder, oracle: Oracle) -> None:

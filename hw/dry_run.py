@@ -9,7 +9,8 @@ from hw.poses import preview
 from hw.recording_file import check_new
 from hw.request import AcquisitionRequest, planned
 from hw.robot.limits import Limits
-from hw.robot.safety import MotionPlan, check_plan, plan_lines
+from hw.robot.motion_plan import MotionPlan, plan_lines
+from hw.robot.path_checks import check_plan
 from hw.setup import Setup
 from jaxcal import InputError
 

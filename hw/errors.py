@@ -52,5 +52,10 @@ class StoppedError(DeviceError):
     """A motion was stopped before it arrived; the text says why."""
 
 
+def refused(message: str) -> RefusedError:
+    """What the robot's gate, or one of its checks, does not allow."""
+    return RefusedError(message, device="robot")
+
+
 def _rebuild(kind: type[DeviceError], message: str, device: Device) -> DeviceError:
     return kind(message, device=device)

@@ -6,6 +6,8 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
 
 ENDING = tuple(
     getattr(signal, name)
@@ -13,6 +15,9 @@ ENDING = tuple(
     if hasattr(signal, name)
 )
 """The signals by which a person, a shell or a system asks a program to end; SIGBREAK on Windows."""
+
+_asked: list[int] = []
+"""Signals that have come within :func:`as_interrupts`. No lock: a handler may run at any place."""
 
 
 @contextmanager
@@ -32,10 +37,28 @@ def as_interrupts() -> Iterator[None]:
         for number, handler in before.items()
         if not (number == getattr(signal, "SIGHUP", None) and handler is signal.SIG_IGN)
     ]
+    _asked.clear()
     for number in heard:
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, _interrupt)
     try:
         yield
     finally:
         for number in heard:
             signal.signal(number, before[number] or signal.SIG_DFL)
+        _asked.clear()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    _asked.append(number)
+    raise KeyboardInterrupt
+
+
+def heed_interrupt() -> None:
+    """Raise the KeyboardInterrupt of a signal that came within :func:`as_interrupts` once more.
+
+    The first one may have been dropped: Python only reports exceptions of finalisers and of
+    callbacks of the garbage collector (JAX has one), Tk those of its callbacks, and both go on.
+    Whatever moves the robot, or waits for a person in a window, calls this.
+    """
+    if _asked:
+        raise KeyboardInterrupt

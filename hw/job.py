@@ -17,7 +17,7 @@ from hw.recording_layout import RecordingHeader
 from hw.request import AcquisitionRequest, planned, request_in
 from hw.resuming import check_same_robot, compare, described, described_probe
 from hw.robot.identity import LOCAL
-from hw.robot.safety import MotionPlan
+from hw.robot.motion_plan import MotionPlan
 from hw.session import Session
 from hw.setup import Setup, controller_arm
 from jaxcal.io.readable import naming

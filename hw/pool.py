@@ -75,7 +75,7 @@ def allowed_by(limits: Limits, tcp_offset: tuple[float, ...] | None) -> Allowed:
     """Which poses the limits of motion allow: box, cone, and where the arm is known its joints.
 
     A pose that is allowed may still not be reached from another one; the way is checked by
-    :mod:`hw.robot.safety`.
+    :mod:`hw.robot.path_checks`.
 
     Args:
         limits: of motion.

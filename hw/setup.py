@@ -242,31 +242,10 @@ def _setup(tables: dict[str, Any]) -> Setup:
     for key in ("image_to_probe", "point_mm", "looking"):
         if key not in scene:
             raise InputError(f"[scene] needs {key}")
-    ultrasound = None
-    if found["ultrasound"]:
-        if "host" not in found["ultrasound"]:
-            raise InputError("[ultrasound] needs host")
-        ultrasound = (found["ultrasound"]["host"], found["ultrasound"].get("port", PORT))
-        check_host(ultrasound[0], "[ultrasound] host")
-        if not 1 <= ultrasound[1] <= 65535:
-            raise InputError("[ultrasound] port must be 1 to 65535")
+    ultrasound = _ultrasound(found["ultrasound"])
     if not found["limits"]:
         raise InputError("[limits] is missing: without it nothing may move")
-    check_host(found["robot"]["host"], "[robot] host")
-    robot = {{"host": "robot_host"}.get(key, key): value for key, value in found["robot"].items()}
-    for key in ("settle_s", "frequency_hz"):
-        if key in robot and not (np.isfinite(robot[key]) and robot[key] > 0):
-            raise InputError(f"[robot] {key} must be a positive number")
-    if "tcp_offset" in robot:
-        offset = _numbers("tcp_offset", robot["tcp_offset"], (6,), "robot")
-        if np.linalg.norm(offset[:3]) > _LONGEST_OFFSET_M:
-            raise InputError(
-                f"[robot] tcp_offset is {np.linalg.norm(offset[:3]):g} m long: is it in mm? It is "
-                "in m and rad, as at the pendant"
-            )
-        robot["tcp_offset"] = tuple(offset.tolist())
-    if "model" in robot:
-        robot["model"] = _arm_name(robot["model"])
+    robot = _robot(found["robot"])
     housing = found["probe"].pop("housing_mm", None)
     if housing is not None:
         housing = tuple(_numbers("housing_mm", housing, (3,), "probe").tolist())
@@ -301,6 +280,39 @@ def _setup(tables: dict[str, Any]) -> Setup:
         raise InputError("[scene] looking is a direction: it cannot be all zero")
     _check_lengths(setup, scene.get("tip_at_tcp", False))
     return setup
+
+
+def _ultrasound(table: dict[str, Any]) -> tuple[str, int] | None:
+    """Host and port of the machine; None where none is described."""
+    if not table:
+        return None
+    if "host" not in table:
+        raise InputError("[ultrasound] needs host")
+    host, port = table["host"], table.get("port", PORT)
+    check_host(host, "[ultrasound] host")
+    if not 1 <= port <= 65535:
+        raise InputError("[ultrasound] port must be 1 to 65535")
+    return host, port
+
+
+def _robot(table: dict[str, Any]) -> dict[str, Any]:
+    """What a setup takes of the robot's table, by the names that it has there."""
+    check_host(table["host"], "[robot] host")
+    robot = {{"host": "robot_host"}.get(key, key): value for key, value in table.items()}
+    for key in ("settle_s", "frequency_hz"):
+        if key in robot and not (np.isfinite(robot[key]) and robot[key] > 0):
+            raise InputError(f"[robot] {key} must be a positive number")
+    if "tcp_offset" in robot:
+        offset = _numbers("tcp_offset", robot["tcp_offset"], (6,), "robot")
+        if np.linalg.norm(offset[:3]) > _LONGEST_OFFSET_M:
+            raise InputError(
+                f"[robot] tcp_offset is {np.linalg.norm(offset[:3]):g} m long: is it in mm? It is "
+                "in m and rad, as at the pendant"
+            )
+        robot["tcp_offset"] = tuple(offset.tolist())
+    if "model" in robot:
+        robot["model"] = _arm_name(robot["model"])
+    return robot
 
 
 def _check_lengths(setup: Setup, tip_at_tcp: bool) -> None:

@@ -31,8 +31,9 @@ from hw.midplane.bracket import Bracket, Placement
 from hw.poses import plan_poses
 from hw.recorder import Recorder
 from hw.recording_layout import RecordingHeader
+from hw.robot.confirmation import confirm_unattended
 from hw.robot.motion import Motion
-from hw.robot.safety import MotionPlan, confirm_unattended
+from hw.robot.motion_plan import MotionPlan
 from hw.session import Session
 from hw.view.feed import LiveView, watched
 

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from hw.midplane.pattern_injection import Operator
     from hw.midplane.terminal_image import Screen
     from hw.request import AcquisitionRequest
-    from hw.robot.safety import Confirmation, MotionPlan
+    from hw.robot.confirmation import Confirmation
+    from hw.robot.motion_plan import MotionPlan
     from hw.setup import Setup
     from hw.view.feed import LiveView
 

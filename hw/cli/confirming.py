@@ -8,7 +8,8 @@ import click
 
 if TYPE_CHECKING:
     from hw.acquire import Confirm
-    from hw.robot.safety import Confirmation, MotionPlan
+    from hw.robot.confirmation import Confirmation
+    from hw.robot.motion_plan import MotionPlan
     from hw.setup import Setup
 
 
@@ -16,7 +17,7 @@ def confirming_by(setup: Setup, emulated: bool, unattended: str | None) -> Confi
     """Who confirms a plan: a person, or ``--unattended``; nobody on the emulated bench."""
 
     def ask(plan: MotionPlan) -> Confirmation:
-        from hw.robot.safety import Challenge, confirm, confirm_unattended
+        from hw.robot.confirmation import Challenge, confirm, confirm_unattended
 
         if emulated:
             return confirm_unattended(plan, plan.digest, clock=setup.clock)
@@ -41,7 +42,7 @@ def confirming_by(setup: Setup, emulated: bool, unattended: str | None) -> Confi
 
 def plan_page(plan: MotionPlan) -> list[str]:
     """Everything that a person must know of a plan to confirm it."""
-    from hw.robot.safety import plan_lines
+    from hw.robot.motion_plan import plan_lines
 
     lines = [
         f"{len(plan.targets)} poses for robot {plan.serial}",

@@ -19,6 +19,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from hw.interrupts import heed_interrupt
 from hw.midplane.pattern_injection import LONGEST, Decision, View, middle_of, sides_seen
 from hw.midplane.terminal_image import COLUMNS, ROWS, Screen, picture
 from jaxcal import InputError
@@ -203,6 +204,7 @@ class WindowOperator:
         """Show, keep the frame up to date, and wait for a key that decides."""
         while True:
             self._show(view)
+            heed_interrupt()
             if not self._pressed:
                 self._figure.canvas.start_event_loop(_REFRESH_S)
                 continue

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.errors import RefusedError
+from hw.errors import RefusedError, refused
 from hw.rigid import cross_matrix, rotation_vector, straight_way
 from hw.robot.kinematics import (
     ANGLE_MM,
@@ -49,10 +49,6 @@ _PROVEN = 0.5
 _MODEL_DEG = 3.0
 """If the controller's joints differ by more than this from those that the model gives for its pose,
 the arm is another one. The factory calibration accounts for tenths of a degree."""
-
-
-def _refuse(text: str) -> RefusedError:
-    return RefusedError(text, device="robot")
 
 
 @dataclass(frozen=True)
@@ -120,7 +116,7 @@ def check_model(arm: Arm, pose: Float[np.ndarray, "4 4"], joints: Float[np.ndarr
     off = np.degrees(np.abs(wanted - joints).max()) if found.reached[branch] else math.inf
     if not off <= _MODEL_DEG:
         text = f"by {off:.1f} deg" if math.isfinite(off) else "at all"
-        raise _refuse(
+        raise refused(
             f"the controller's joints and pose do not fit a {arm.model.name} ({text}): is the "
             "arm's model, or the TCP offset, another?"
         )
@@ -185,7 +181,7 @@ def follow(
         count = max(count + 1, min(2 + math.ceil(0.55 / float(enough.min())), 8 * count))
         if count > _MOST_SAMPLES:
             where = int(np.argmin(enough))
-            raise _refuse(
+            raise refused(
                 f"{what} passes too near a singularity of the arm ({_share(parts[where])}; "
                 f"{nearest_singularity(arm.model, path[where])})"
             )
@@ -234,11 +230,11 @@ def follow_all(
     assert failure is not None
     if joints is not None:
         stands = ", ".join(f"{angle:.0f}" for angle in np.degrees(reference))
-        raise _refuse(
+        raise refused(
             f"{failure.args[0]}; that is from where the arm stands now (joints at {stands} deg): "
             "turn a joint that is wound up back by hand, or take other poses (--seed)"
         )
-    raise _refuse(f"{failure.args[0]}; no other branch of the arm's joints gets further")
+    raise refused(f"{failure.args[0]}; no other branch of the arm's joints gets further")
 
 
 def _follow_branch(
@@ -252,14 +248,14 @@ def _follow_branch(
     stage = 0
     try:
         if np.isnan(first).any():
-            raise _refuse(f"pose 0 of the plan is out of the reach of a {arm.model.name}")
+            raise refused(f"pose 0 of the plan is out of the reach of a {arm.model.name}")
         here = follow(arm, poses[0], poses[0], nearest_turn(first, reference), "pose 0 of the plan")
         path, dexterity, speed = [here.joints[-1]], here.dexterity_mm, 0.0
         for stage in range(1, len(poses)):
             at = f"pose {stage} of the plan"
             flange = flange_of(poses[stage], arm.tcp_offset)
             if not inverse(arm.model, flange).reached[here.branch]:
-                raise _refuse(f"{at} is out of the reach of a {arm.model.name}")
+                raise refused(f"{at} is out of the reach of a {arm.model.name}")
             what = f"the way from pose {stage - 1} to pose {stage}"
             duration = float(durations_s[stage - 1])
             course = follow(arm, poses[stage - 1], poses[stage], path[-1], what, duration)
@@ -288,13 +284,13 @@ def _joints_along(
     path, reached = found.joints[:, branch], found.reached[:, branch]
     if not reached.all():
         where = parts[int(np.argmin(reached))]
-        raise _refuse(f"{what} is out of the reach of a {arm.model.name} ({_share(where)})")
+        raise refused(f"{what} is out of the reach of a {arm.model.name} ({_share(where)})")
     path = np.unwrap(path, axis=0)
     path += nearest_turn(path[0], joints) - path[0]
     room = np.minimum(path - arm.joint_min, arm.joint_max - path)
     if not room.min() >= 0.0:
         where, joint = np.unravel_index(int(np.argmin(room)), room.shape)
-        raise _refuse(
+        raise refused(
             f"{what} turns joint {joint + 1} ({JOINT_NAMES[joint]}) to "
             f"{math.degrees(path[where, joint]):.1f} deg, over its limits of "
             f"{math.degrees(arm.joint_min[joint]):g} to {math.degrees(arm.joint_max[joint]):g} deg "
@@ -312,7 +308,7 @@ def _check_dexterity(
 ) -> None:
     where = int(np.argmin(dexterity))
     if not dexterity[where] >= arm.least_dexterity_mm:
-        raise _refuse(
+        raise refused(
             f"{what} comes too near a singularity of the arm ({_share(parts[where])}; "
             f"{nearest_singularity(arm.model, path[where])}): smallest singular value "
             f"{dexterity[where]:.1f} mm/rad, at least {arm.least_dexterity_mm:g}"
@@ -335,7 +331,7 @@ def _check_speed(
         # Base and wrist 3 often turn alike: not rounding, but the order decides which is named.
         first = int(np.argmax(~(speeds < (1 - 1e-6) * fastest)))
         where, joint = np.unravel_index(first, speeds.shape)
-        raise _refuse(
+        raise refused(
             f"{what} turns joint {joint + 1} ({JOINT_NAMES[joint]}) at "
             f"{math.degrees(fastest):.0f} deg/s, over the cap of "
             f"{math.degrees(arm.joint_speed):g} deg/s ({_share(parts[where])}): lower the speed"
@@ -359,7 +355,7 @@ def _check_links(
     room = np.minimum(points - arm.box_min_mm, arm.box_max_mm - points) - margin[..., None]
     if not room.min() >= 0.0:
         where, point, axis = np.unravel_index(int(np.argmin(room)), room.shape)
-        raise _refuse(
+        raise refused(
             f"{what} takes the arm's {POINT_NAMES[point]} {-room.min():.0f} mm out of the arm's "
             f"box along {'xyz'[axis]} ({_share(parts[where])})"
         )

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hw.errors import RefusedError
+from hw.errors import RefusedError, refused
 from hw.robot.kinematics import model_named
 from hw.shapes import Float
 from jaxcal import FormatError
@@ -52,10 +52,6 @@ _MOST_CORNERS = 64
 
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
-
-
-def _refuse(text: str) -> RefusedError:
-    return RefusedError(text, device="robot")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,25 +124,25 @@ class Limits:
         for name in ("box", "arm_box"):
             low, high = getattr(self, f"{name}_min_mm"), getattr(self, f"{name}_max_mm")
             if max(map(abs, low + high)) > FURTHEST_MM:
-                raise _refuse(
+                raise refused(
                     f"{name}_min_mm and {name}_max_mm must lie within {FURTHEST_MM:g} mm of the "
                     "base along every axis"
                 )
             if any(a >= b for a, b in zip(low, high, strict=True)):
-                raise _refuse(f"{name}_min_mm must lie below {name}_max_mm on every axis")
+                raise refused(f"{name}_min_mm must lie below {name}_max_mm on every axis")
             if max(b - a for a, b in zip(low, high, strict=True)) < _LEAST_BOX_MM:
-                raise _refuse(
+                raise refused(
                     f"{name}_min_mm and {name}_max_mm are less than {_LEAST_BOX_MM:g} mm apart "
                     "along every axis: are they in metres? They are in mm"
                 )
         for point in (self.tip_mm, *self.hull_mm):
             if math.hypot(*point) > FURTHEST_TIP_MM:
-                raise _refuse(
+                raise refused(
                     f"a point of the probe is {math.hypot(*point):g} mm from the TCP, over "
                     f"{FURTHEST_TIP_MM:g} mm: is its position in mm?"
                 )
         if not 0.99 < math.hypot(*self.cone_axis) < 1.01:
-            raise _refuse("cone_axis must be a unit vector")
+            raise refused("cone_axis must be a unit vector")
         between("cone_deg", self.cone_deg, 0.0, 90.0)
         between("max_turn_deg", self.max_turn_deg, 0.0, 120.0)
         between("max_step_mm", self.max_step_mm, 0.0, 500.0)
@@ -160,15 +156,15 @@ class Limits:
         between("max_joint_speed_deg_s", self.max_joint_speed_deg_s, 0.0, 180.0)
         between("min_singular_value_mm", self.min_singular_value_mm, 0.999, 100.0)
         if self.max_force_n > FORCE_WITHOUT_REASON_N and len(self.force_reason.strip()) < 10:
-            raise _refuse(
+            raise refused(
                 f"max_force_n of {self.max_force_n:g} N, above {FORCE_WITHOUT_REASON_N:g} N, needs "
                 "a sentence why: force_reason"
             )
         if self.search_mm < 0 or self.search_deg < 0:
-            raise _refuse("search_mm and search_deg cannot be negative")
+            raise refused("search_mm and search_deg cannot be negative")
         for low, high in zip(self.joint_min_deg, self.joint_max_deg, strict=True):
             if not -360.0 <= low < high <= 360.0:
-                raise _refuse("joint_min_deg and joint_max_deg must be in order, within 360 deg")
+                raise refused("joint_min_deg and joint_max_deg must be in order, within 360 deg")
         if self.arm_model:
             object.__setattr__(self, "arm_model", model_named(self.arm_model).name)
 
@@ -182,13 +178,13 @@ class Limits:
         try:
             table = load_toml(path).get("limits")
         except FormatError as error:
-            raise _refuse(str(error)) from None
+            raise refused(str(error)) from None
         if not isinstance(table, dict):
-            raise _refuse(f"{path}: there is no table [limits]")
+            raise refused(f"{path}: there is no table [limits]")
         try:
             return cls.from_mapping(table)
         except RefusedError as error:
-            raise _refuse(f"{path}: {error.args[0]}") from None
+            raise refused(f"{path}: {error.args[0]}") from None
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, object]) -> Limits:
@@ -200,10 +196,10 @@ class Limits:
         known = {item.name for item in fields(cls)}
         unknown = sorted(set(values) - known)
         if unknown:
-            raise _refuse(f"unknown limit {unknown[0]}")
+            raise refused(f"unknown limit {unknown[0]}")
         for item in fields(cls):
             if item.name not in values and item.default is MISSING:
-                raise _refuse(f"the limit {item.name} is missing")
+                raise refused(f"the limit {item.name} is missing")
         checked = {name: _checked(name, value) for name, value in values.items()}
         return cls(**checked)  # pyright: ignore[reportArgumentType]
 
@@ -211,12 +207,12 @@ class Limits:
 def _checked(name: str, value: object) -> float | str | tuple | None:
     if name in _TEXTS:
         if not isinstance(value, str) or len(value) > _MOST_TEXT:
-            raise _refuse(f"{name} must be text of at most {_MOST_TEXT} letters")
+            raise refused(f"{name} must be text of at most {_MOST_TEXT} letters")
         return value
     if name == "hull_mm":
         rows = value if isinstance(value, list | tuple) else [value]
         if len(rows) > _MOST_CORNERS:
-            raise _refuse(f"hull_mm has more than {_MOST_CORNERS} corners")
+            raise refused(f"hull_mm has more than {_MOST_CORNERS} corners")
         return tuple(numbers(row, 3, "every corner of hull_mm") for row in rows)
     if name in ("arm_box_min_mm", "arm_box_max_mm") and value is None:
         return None
@@ -237,7 +233,7 @@ def numbers(value: object, size: int, name: str) -> tuple[float, ...]:
     good = [number for item in items if (number := _finite(item)) is not None]
     if len(good) != len(items) or len(good) != size:
         count = "a finite number" if size == 1 else f"{size} finite numbers"
-        raise _refuse(f"{name} must be {count}")
+        raise refused(f"{name} must be {count}")
     return tuple(good)
 
 
@@ -275,4 +271,4 @@ def hull_of(
 def between(name: str, value: float, low: float, high: float) -> None:
     """Refuse a value that is not above ``low`` and at most ``high``."""
     if not low < value <= high:
-        raise _refuse(f"{name} must be above {low:g} and at most {high:g}, not {value:g}")
+        raise refused(f"{name} must be above {low:g} and at most {high:g}, not {value:g}")

@@ -6,12 +6,12 @@ anything that ends motion (a stop, a protective stop, a reset connection, a stop
 confirmation is needed. A protective stop is reported; this software never releases it.
 
 A stop is latched on both sides of the pipe: here in :attr:`Motion._stop`, in the other process as
-described in :mod:`hw.robot._mover`. There are two kinds of stops.
+described in :mod:`hw.robot.mover.control_loop`. There are two kinds of stops.
 
-- A *stop* (:meth:`Motion.stop`, a guard that reports danger or fails, an interrupt such as Ctrl-C,
-  force, the box, a protective stop, a motion that does not arrive) ends motion:
-  :attr:`Motion.ended` is true, every later move is refused, and only a new confirmation lets the
-  robot move again.
+- A *stop* (:meth:`Motion.stop`, a guard that reports danger or fails, a log that fails, an
+  interrupt such as Ctrl-C, force, the box, a protective stop, a motion that does not arrive) ends
+  motion: :attr:`Motion.ended` is true, every later move is refused, and only a new confirmation
+  lets the robot move again.
 - A *hesitation* (StaleError: poses, echo frames, images or this process were silent for a moment)
   stops the robot in the same way, but the same move may be asked for again. Nothing said that
   moving was dangerous; for a moment the software could not know that it was safe.
@@ -30,14 +30,17 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 
 import numpy as np
 
 from hw.clock import REAL, Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
+from hw.interrupts import heed_interrupt
 from hw.robot._process import spawn
-from hw.robot.safety import Confirmation, MotionPlan, check_plan
+from hw.robot.confirmation import Confirmation
+from hw.robot.motion_plan import MotionPlan
+from hw.robot.mover.messages import Setup, error_of, line_of, sample_of, told
+from hw.robot.path_checks import check_plan
 from hw.robot.stream import PoseSample
 
 Log = Callable[[float, str, dict[str, object]], None]
@@ -46,7 +49,6 @@ Guard = Callable[[], str | StaleError | None]
 """Called before a motion is requested and at every tick of it. A returned reason (str) stops the
 robot and ends motion; a returned StaleError stops the robot as a hesitation."""
 
-_KINDS = {kind.__name__: kind for kind in (LostError, RefusedError, StaleError, StoppedError)}
 _TICK_S = 0.02
 _START_PATIENCE_S = 30.0
 # The controller's watchdog has stopped the robot long before; a busy machine gets time to answer.
@@ -63,7 +65,7 @@ class Motion:
         clock: bench time.
         dry_run: check and log, but send nothing to the robot.
         log: called with every command before it is sent (of the watchdog's kicks only with their
-            number), every refusal and every stop.
+            number), every refusal and every stop. If it fails, the robot is stopped.
         guard: see :data:`Guard`; may be set at any time.
         caller_s: bench seconds that this process may be silent during a motion, e.g. held up by
             another thread, before the motion is stopped: while it is silent, no guard is called.
@@ -125,20 +127,26 @@ class Motion:
         if self._stop is not None:
             self._ended = self._stop
             raise RefusedError(f"motion was stopped ({self._stop.args[0]})", device="robot")
-        self._process = spawn("hw.robot._mover", stdin=True)
-        self._thread = threading.Thread(target=self._receive, name="motion", daemon=True)
-        self._thread.start()
+        setup = Setup(
+            self.host, self.plan, given, self.clock, self.dry_run, self._caller_s
+        ).message()
         try:
-            self._send(self._setup())
+            with self._sending:
+                # The setup must come first: a stop that is asked for now waits until it is sent.
+                self._process = spawn("hw.robot.mover", stdin=True)
+                self._write(setup)
+            self._thread = threading.Thread(target=self._receive, name="motion", daemon=True)
+            self._thread.start()
             try:
                 answer = self._answers.get(timeout=_START_PATIENCE_S)
             except queue.Empty:
                 answer = {}
         except BaseException:
-            self._kill(RefusedError("motion was interrupted at its start", device="robot"))
+            if self._process is not None:
+                self._kill(RefusedError("motion was interrupted at its start", device="robot"))
             raise
         if answer.get("what") != "ready":
-            error = _error(answer) or LostError(
+            error = error_of(answer) or LostError(
                 f"the controller at {self.host} did not accept the connection within "
                 f"{_START_PATIENCE_S:g} s",
                 device="robot",
@@ -149,30 +157,6 @@ class Motion:
         offset = answer["tcp_offset"]
         self.tcp_offset = None if offset is None else tuple(offset)
         return self
-
-    def _setup(self) -> dict:
-        given = self._confirmation
-        return {
-            "host": self.host,
-            "clock": [self.clock.speed, self.clock.origin_s],
-            "dry_run": self.dry_run,
-            "caller_s": self._caller_s,
-            "plan": {
-                "targets": self.plan.targets.tolist(),
-                "limits": asdict(self.plan.limits),
-                "tcp_offset": self.plan.tcp_offset,
-                "serial": self.plan.serial,
-                "pendant": asdict(self.plan.pendant),
-            },
-            "confirmation": None
-            if given is None
-            else {
-                "digest": given.digest,
-                "serial": given.serial,
-                "issued_s": given.issued_s,
-                "expires_s": given.expires_s,
-            },
-        }
 
     def __enter__(self) -> Motion:
         return self.start()
@@ -201,8 +185,6 @@ class Motion:
         """
         with self._one_at_a_time:
             self.check()
-            while not self._answers.empty():
-                self._answers.get()
             asked = np.asarray(pose).tolist()
             self._count += 1
             self._in_motion = True
@@ -240,7 +222,7 @@ class Motion:
         with contextlib.suppress(queue.Empty):
             while not answer.get("ended", False):
                 answer = self._answers.get(timeout=max(0.0, deadline - time.monotonic()))
-        self._kill(_error(answer) or LostError("the motion process hangs", device="robot"))
+        self._kill(error_of(answer) or LostError("the motion process hangs", device="robot"))
 
     def _wait(self, count: int) -> PoseSample:
         """Wait for a move's answer; a stop is sent again until the other process confirms it."""
@@ -252,15 +234,14 @@ class Motion:
                 answer = self._answers.get(timeout=tick)
             except queue.Empty:
                 answer = {}
-            error = _error(answer)
+            error = error_of(answer)
             match answer.get("what"):
                 case "arrived" if answer["move"] == count and self._stop is None:
                     # The robot arrived. Once a stop was asked for, this answer does not count.
                     self._in_motion = False
                     if hesitation is not None:
                         raise hesitation
-                    t_host, t_device, raw, *rest = answer["sample"]
-                    return PoseSample(t_host, t_device, tuple(raw), *rest)
+                    return sample_of(answer["sample"])
                 case "error" if error is not None and answer["ended"]:
                     self._in_motion = False
                     self._kill(error)
@@ -272,7 +253,9 @@ class Motion:
                         raise error if hesitation is None else hesitation
                 case "stopping":
                     stopping = error
-            hesitation = hesitation or self._ask_guard()
+            # Asked also while the robot brakes for a hesitation: it may tell of a danger now.
+            told_now = self._ask_guard()
+            hesitation = hesitation or told_now
             if self._stop is not None and type(stopping) is not StoppedError:
                 self._send_stop(self._stop)
             elif hesitation is not None and stopping is None:
@@ -293,6 +276,7 @@ class Motion:
 
     def _ask_guard(self) -> StaleError | None:
         """Ask the guard; a danger is latched and sent, a hesitation is returned."""
+        heed_interrupt()
         if self.guard is None or self._stop is not None:
             return None
         reason = self.guard()
@@ -303,8 +287,7 @@ class Motion:
         return None
 
     def _send_stop(self, error: DeviceError) -> None:
-        kind, reason = type(error).__name__, error.args[0]
-        self._send({"request": "stop", "kind": kind, "reason": reason, "move": self._count})
+        self._send({"request": "stop", "move": self._count, **told(error)})
 
     @property
     def ended(self) -> bool:
@@ -345,7 +328,7 @@ class Motion:
             )
         while not self._answers.empty():
             answer = self._answers.get()
-            error = _error(answer)
+            error = error_of(answer)
             if error is not None and answer.get("ended"):
                 self._kill(error)
                 raise error
@@ -363,11 +346,15 @@ class Motion:
             self._thread.join()
 
     def _send(self, message: dict) -> None:
+        with self._sending:
+            self._write(message)
+
+    def _write(self, message: dict) -> None:
         process = self._process
         if process is None or process.stdin is None:
             return
-        with self._sending, contextlib.suppress(OSError, ValueError):
-            process.stdin.write(json.dumps(message).encode() + b"\n")
+        with contextlib.suppress(OSError, ValueError):
+            process.stdin.write(line_of(message))
             process.stdin.flush()
 
     def _receive(self) -> None:
@@ -382,20 +369,21 @@ class Motion:
             text = "the motion process ended; the robot's own watchdog stops it"
             self._answers.put({"what": "error", "kind": "LostError", "text": text, "ended": True})
 
+    def _note(self, t: float, command: str, values: dict[str, object]) -> None:
+        try:
+            self._log(t, command, values)
+        except Exception as error:
+            # It runs in a thread that must go on: here nobody would see the exception.
+            self.stop(f"the log failed: {type(error).__name__}: {error}")
+
     def _hear(self, message: dict) -> None:
         match message["what"]:
             case "log":
-                self._log(message["t"], message["command"], message["numbers"])
+                self._note(message["t"], message["command"], message["numbers"])
             case "stopping":
-                self._log(self.clock.now(), "stop", {"why": message["text"]})
+                self._note(self.clock.now(), "stop", {"why": message["text"]})
                 self._answers.put(message)
             case "alive" | "closed":
                 pass
             case _:
                 self._answers.put(message)
-
-
-def _error(answer: dict) -> DeviceError | None:
-    if "kind" not in answer:
-        return None
-    return _KINDS.get(str(answer["kind"]), LostError)(str(answer["text"]), device="robot")

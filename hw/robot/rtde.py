@@ -3,7 +3,7 @@
 ur_rtde keeps only the newest packet, and skips packets whenever its thread is late: on two busy
 cores it skipped a tenth of 500 packets/s. A tracker must not lose poses, so they are read here
 from the socket, where no packet is lost or mixed with another. Commands go through ur_rtde
-(:mod:`hw.robot.motion`).
+(:mod:`hw.robot.mover.controller`).
 
 Data from the socket are untrusted: a message is at most 64 KiB by its format, and anything that
 does not fit the recipe ends the connection.
@@ -184,6 +184,21 @@ class Packet:
     pendant: PendantSettings
     joints: tuple[float, ...] | None = None
     """Angles of the joints, rad."""
+
+    @property
+    def speed_mm_s(self) -> float:
+        """Of the TCP."""
+        return 1000.0 * math.hypot(*self.tcp_speed[:3])
+
+    @property
+    def turning_rad_s(self) -> float:
+        """Of the TCP."""
+        return math.hypot(*self.tcp_speed[3:])
+
+    @property
+    def force_n(self) -> float:
+        """At the TCP."""
+        return math.hypot(*self.tcp_force[:3])
 
     @property
     def program(self) -> bool:

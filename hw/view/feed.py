@@ -23,7 +23,7 @@ import numpy as np
 from hw.errors import DeviceError
 from hw.extras import missing
 from hw.midplane.bracket import Placement
-from hw.robot.safety import MotionPlan
+from hw.robot.motion_plan import MotionPlan
 from hw.session import Session
 from hw.setup import Setup
 from jaxcal import InputError

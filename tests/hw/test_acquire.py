@@ -36,7 +36,8 @@ from hw.outcome import share_inside
 from hw.poses import Extent
 from hw.request import AcquisitionRequest, request_in
 from hw.resuming import check_same_robot
-from hw.robot.safety import MotionPlan, confirm_unattended
+from hw.robot.confirmation import confirm_unattended
+from hw.robot.motion_plan import MotionPlan
 from hw.session import Watch
 from hw.setup import Setup
 from jaxcal import InputError

@@ -90,7 +90,8 @@ def test_where_the_robot_extra_installs_something(version, system, machine, monk
 
 def test_device_processes_do_not_load_the_engine():
     program = (
-        "import sys, hw.robot._mover, hw.robot._reader, hw.bench.robot, hw.recorder_process; "
+        "import sys, hw.robot.mover.__main__, hw.robot._reader, hw.bench.robot; "
+        "import hw.recorder_process; "
         "print({'jax', 'jaxtyping', 'scipy', 'asyncio'} & set(sys.modules))"
     )
     run = subprocess.run(

@@ -14,6 +14,7 @@ from hw.clock import Clock
 from hw.errors import RefusedError
 from hw.rigid import straight_way
 from hw.robot.feasibility import Arm, check_model, follow, follow_all
+from hw.robot.gate import Gate
 from hw.robot.kinematics import (
     MODELS,
     branch_of,
@@ -27,8 +28,9 @@ from hw.robot.kinematics import (
     wrapped,
 )
 from hw.robot.limits import Limits
+from hw.robot.motion_plan import MotionPlan, plan_lines
+from hw.robot.path_checks import check_plan
 from hw.robot.pose import pose_to_ur
-from hw.robot.safety import Gate, MotionPlan, check_plan, plan_lines
 from hw.robot.stream import PoseSample
 
 UR5 = MODELS["UR5"]

@@ -20,7 +20,7 @@ from hw.recording_check import read_progress
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import RecordingHeader
 from hw.robot.limits import Limits
-from hw.robot.safety import MotionPlan
+from hw.robot.motion_plan import MotionPlan
 
 
 @pytest.mark.parametrize(

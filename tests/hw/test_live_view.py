@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import itertools
+import signal
 from collections.abc import Iterable
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from matplotlib.figure import Figure
 from hw.bench.frames import Camera
 from hw.bench.stage import WorldStage
 from hw.bench.world import make_world
+from hw.interrupts import as_interrupts
 from hw.midplane.live_view import Keys, TerminalOperator, WindowOperator, advice
 from hw.midplane.pattern_injection import (
     LONGEST,
@@ -154,6 +156,20 @@ def test_a_person_before_a_window_finds_the_mid_plane():
     assert placement.bracket.contains(bench.elevation_mm)
     assert figure.axes[0].images
     assert "of" in figure.axes[1].get_title()
+
+
+def test_an_interrupt_that_the_window_drops_ends_the_wait():
+    """Tk prints exceptions of its callbacks, e.g. of one that draws, and goes on."""
+
+    def frame() -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    figure = Figure()
+    FigureCanvasAgg(figure)
+    view = View(5, 10, 1.0, 0.25, 900.0, ((1.0, 5),), frame=frame)
+    with as_interrupts(), pytest.raises(KeyboardInterrupt):
+        WindowOperator(figure)(view)
 
 
 def test_s_skips_the_pose():

@@ -25,12 +25,14 @@ from robots import CB_SERIES, E_SERIES, START, EmulatedRobot
 import hw
 from hw.clock import REAL
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
+from hw.interrupts import as_interrupts
+from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity, stop_program
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
+from hw.robot.motion_plan import MotionPlan
 from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import PacketReader, state_text
-from hw.robot.safety import MotionPlan, confirm_unattended
 from jaxcal.runtime.isolated import import_path
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
@@ -197,13 +199,16 @@ def test_nothing_but_the_mover_commands_a_robot():
     package = Path(hw.__file__).parent
     for path in package.rglob("*.py"):
         text = path.read_text()
-        if path.name != "_mover.py":
+        if path.name != "connection.py":
             assert "RTDEControlInterface" not in text, path
+        if path.name != "controller.py":
+            assert '"moveL"' not in text, path
         for forbidden in ("moveJ(", "speedL(", "servoL(", "setTcp", "unlockProtective"):
             assert forbidden not in text, path
         if "bench" not in path.parts:
             assert "unlock protective" not in text, path
-    assert (package / "robot" / "_mover.py").read_text().count('"moveL"') == 1
+    controller = package / "robot" / "mover" / "controller.py"
+    assert controller.read_text().count('"moveL"') == 1
 
 
 def test_a_guard_that_fails_stops_the_robot():
@@ -536,31 +541,40 @@ def test_a_reset_control_connection_is_not_used_again():
 
 
 _CALLER = """
-import json, sys, time
+import json, os, sys, time
 import numpy as np
 from hw.clock import Clock
 from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
-from hw.robot.safety import MotionPlan, confirm_unattended
+from hw.robot.confirmation import confirm_unattended
+from hw.robot.motion_plan import MotionPlan
 host, origin, targets, limits, offset, serial = json.loads(sys.argv[1])
 clock = Clock(1.0, origin)
 plan = MotionPlan.from_poses(targets, Limits.from_mapping(limits), offset, serial)
 given = confirm_unattended(plan, plan.digest, clock=clock)
 with Motion(host, plan, given, clock=clock, dry_run=False) as motion:
+    caller = os.getpid()
+    if sys.argv[2] == "with a child" and os.fork() == 0:
+        while os.getppid() == caller:
+            time.sleep(0.02)
+        time.sleep(5.0)
+        os._exit(0)
     print("ready", flush=True)
     motion.move_to(plan.targets[2])
 """
 
 
-def test_killing_the_caller_stops_the_robot():
+@pytest.mark.parametrize("caller_is", ["alone", "with a child"])
+def test_killing_the_caller_stops_the_robot(caller_is):
+    """Also where a child of the caller holds its end of the pipe, which then stays open."""
     with EmulatedRobot() as robot:
         values = [
             robot.host, robot.clock.origin_s, PLAN.targets.tolist(), asdict(LIMITS), OFFSET,
             read_identity(robot.host).name,
         ]  # fmt: skip
         caller = subprocess.Popen(
-            [sys.executable, "-c", _CALLER, json.dumps(values)],
+            [sys.executable, "-c", _CALLER, json.dumps(values), caller_is],
             stdout=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(import_path())},
         )  # fmt: skip
@@ -580,14 +594,14 @@ def test_killing_the_caller_stops_the_robot():
         assert state["raw"][0] < START[0] + 0.049
         # Nobody is left to end the process that moves the robot: it ends by itself.
         assert len(children) >= 1
-        while any(map(is_mover, children)) and time.monotonic() < deadline + 10.0:
+        while any(map(is_mover, children)) and time.monotonic() < deadline - 1.0:
             time.sleep(0.05)
         assert not any(map(is_mover, children))
 
 
 def is_mover(process: str) -> bool:
     try:
-        return b"hw.robot._mover" in Path(f"/proc/{process}/cmdline").read_bytes()
+        return b"hw.robot.mover" in Path(f"/proc/{process}/cmdline").read_bytes()
     except OSError:
         return False
 
@@ -718,3 +732,98 @@ def test_no_thread_of_the_emulated_controller_waits_behind_other_programs():
 
 def test_closing_what_was_not_started_does_nothing():
     Motion("127.0.0.1", PLAN, None).close()
+
+
+def test_a_safety_stop_that_is_over_when_the_mover_looks_ends_motion():
+    """A gate that was open for a moment; the robot would go on by itself."""
+    with EmulatedRobot() as robot, moving(robot, caller_s=2.0) as motion:
+        assert motion._process is not None
+        os.kill(motion._process.pid, signal.SIGSTOP)
+        robot.enter(7, 5)
+        time.sleep(0.05)
+        robot.enter(7, 1)
+        time.sleep(0.05)
+        os.kill(motion._process.pid, signal.SIGCONT)
+        with pytest.raises(StoppedError, match="safeguard stop: close the gate"):
+            until_ended(motion)
+        with pytest.raises(RefusedError, match="confirm the plan again"):
+            motion.move_to(HOME)
+
+
+def test_a_stop_while_it_connects_is_heard():
+    """At once after the setup, so that both may be read together."""
+    with EmulatedRobot(version=CB_SERIES) as robot, ThreadPoolExecutor(1) as pool:
+        plan = replace(PLAN, serial=read_identity(robot.host).name)
+        given = confirm_unattended(plan, plan.digest, clock=robot.clock)
+        motion = Motion(robot.host, plan, given, clock=robot.clock, dry_run=False)
+        with closing(motion):
+            started = pool.submit(motion.start)
+            while motion._process is None:
+                time.sleep(0.001)
+            motion.stop("the operator")
+            started.result()
+            assert motion._process.wait(timeout=5.0) == 1
+            with pytest.raises(RefusedError, match="the operator"):
+                motion.check()
+        assert sent(robot, 3) == []
+
+
+def test_a_danger_told_after_a_hesitation_ends_motion():
+    """The robot still brakes for the hesitation when the guard tells of the danger."""
+    told: list[str | StaleError] = []
+
+    def guard() -> str | StaleError | None:
+        if robot.state()["velocity"][0] < 0.04 and not told:
+            return None
+        told.append("danger" if told else StaleError("no frame", device="active echo"))
+        return told[-1]
+
+    with (
+        EmulatedRobot(version=CB_SERIES) as robot,
+        moving(robot, guard=guard, caller_s=2.0) as motion,
+    ):
+        with pytest.raises(StoppedError, match="danger"):
+            motion.move_to(PLAN.targets[2])
+        assert motion.ended
+
+
+def test_an_interrupt_that_was_dropped_stops_the_robot():
+    """As it would be in a callback of the garbage collector that runs meanwhile."""
+    times: list[float] = []
+
+    def guard() -> None:
+        if not times and robot.state()["velocity"][0] > 0.04:
+            times.append(robot.state()["t"])
+            with suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGTERM)
+
+    with (
+        EmulatedRobot(version=CB_SERIES) as robot,
+        as_interrupts(),
+        moving(robot, guard=guard, caller_s=2.0) as motion,
+    ):
+        with pytest.raises(KeyboardInterrupt):
+            motion.move_to(PLAN.targets[2])
+        assert motion.ended
+        assert robot.state()["rest_since"] - times[0] <= STOP_WITHIN_S
+
+
+def test_a_log_that_fails_stops_the_robot():
+    times: list[float] = []
+
+    def log(t: float, command: str, numbers: dict[str, object]) -> None:
+        if command == "moveL":
+            times.append(t)
+            raise OSError("no space left on device")
+
+    with EmulatedRobot(version=CB_SERIES) as robot:
+        plan = replace(PLAN, serial=read_identity(robot.host).name)
+        given = confirm_unattended(plan, plan.digest, clock=robot.clock)
+        named = {"clock": robot.clock, "dry_run": False, "caller_s": 2.0}
+        with Motion(robot.host, plan, given, log=log, **named) as motion:
+            with pytest.raises(StoppedError, match="the log failed: OSError: no space left"):
+                motion.move_to(PLAN.targets[2])
+            assert motion.ended
+        state = robot.state()
+    assert state["rest_since"] - times[0] <= STOP_WITHIN_S
+    assert state["reason"] == "the client stopped the script"

@@ -13,7 +13,7 @@ from hw.pool import allowed_by, plan_pool
 from hw.poses import Extent, plan_poses, preview
 from hw.rigid import turn_deg
 from hw.robot.kinematics import flange_of, inverse, model_named
-from hw.robot.safety import out_of_box_mm
+from hw.robot.path_checks import out_of_box_mm
 from hw.scene import Scene
 from hw.setup import Setup
 from jaxcal import InputError

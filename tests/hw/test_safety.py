@@ -13,19 +13,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from hw.clock import Clock
 from hw.errors import RefusedError, StaleError
+from hw.robot.confirmation import Challenge, Confirmation, confirm, confirm_unattended
+from hw.robot.gate import Command, Gate
 from hw.robot.limits import Limits
+from hw.robot.motion_plan import MotionPlan
+from hw.robot.path_checks import check_plan
 from hw.robot.pose import pose_to_ur, ur_to_pose
 from hw.robot.rtde import PendantSettings
-from hw.robot.safety import (
-    Challenge,
-    Command,
-    Confirmation,
-    Gate,
-    MotionPlan,
-    check_plan,
-    confirm,
-    confirm_unattended,
-)
 from hw.robot.stream import PoseSample
 
 SERIAL = "20195500042"

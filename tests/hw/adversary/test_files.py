@@ -36,7 +36,7 @@ HEADER = RecordingHeader(kind="time_of_flight", probe=PROBE)
 EVIL = "open({mark!r}, 'a').write(__name__ + chr(10))\nraise SystemExit('a stranger ran')\n"
 SHADOWED = (
     "h5py", "queue", "select", "json", "runpy", "numpy", "subprocess", "hw/__init__",
-    "hw/robot/__init__", "hw/robot/_mover", "hw/recorder_process", "jaxcal/__init__",
+    "hw/robot/__init__", "hw/robot/mover/__init__", "hw/recorder_process", "jaxcal/__init__",
 )  # fmt: skip
 
 
@@ -63,7 +63,7 @@ from hw.robot._process import spawn
 probe = {"kind": "linear", "elements": 8, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
 with Recorder("rec.h5", RecordingHeader(kind="time_of_flight", probe=probe)) as recorder:
     recorder.finish()
-mover = spawn("hw.robot._mover", stdin=True)
+mover = spawn("hw.robot.mover", stdin=True)
 mover.communicate()
 reader = spawn("hw.robot._reader")
 reader.communicate()

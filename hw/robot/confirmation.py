@@ -1,0 +1,125 @@
+"""The operator's permission for one plan: typed by a person, or given beforehand by its digest."""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import threading
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from hw.clock import Clock
+from hw.errors import refused
+from hw.robot.limits import between
+from hw.robot.motion_plan import MotionPlan
+from hw.robot.path_checks import check_plan
+
+_VALID_S = 600.0
+LEAST_DIGEST_DIGITS = 16
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """Permission for one plan on one robot over one connection, which must be made in time.
+
+    Attributes:
+        digest: of the plan.
+        serial: of the robot.
+        issued_s: bench time.
+        expires_s: bench time by which the connection must be made; later motions are not limited.
+        unattended: whether it was given without asking a person.
+        used: set when motion is started with it; every start needs a new confirmation.
+    """
+
+    digest: str
+    serial: str
+    issued_s: float
+    expires_s: float
+    unattended: bool = False
+    used: threading.Event = field(default_factory=threading.Event, compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class Challenge:
+    """A code for a person to type. It confirms one plan, once; the next challenge has another code.
+
+    Attributes:
+        plan: the plan to confirm; it is checked first.
+        nonce: random.
+        used: set once it was answered correctly.
+
+    Raises:
+        RefusedError: the plan is not allowed.
+    """
+
+    plan: MotionPlan
+    nonce: bytes = field(default_factory=lambda: secrets.token_bytes(16))
+    used: threading.Event = field(default_factory=threading.Event, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        check_plan(self.plan)
+
+    @cached_property
+    def code(self) -> str:
+        """What must be typed: eight hexadecimal digits."""
+        return hashlib.sha256(self.nonce + self.plan.digest.encode()).hexdigest()[:8]
+
+
+def confirm(
+    challenge: Challenge, answer: str, *, clock: Clock, valid_s: float = _VALID_S
+) -> Confirmation:
+    """Take the operator's confirmation of a plan.
+
+    Args:
+        challenge: the one that the operator was shown.
+        answer: what the operator typed; must be ``challenge.code``.
+        clock: bench time.
+        valid_s: bench seconds within which motion must be started.
+
+    Raises:
+        RefusedError: another answer, or a challenge that was answered before.
+    """
+    if challenge.used.is_set():
+        raise refused("this code was typed before; each run has a code of its own")
+    if answer.strip().lower() != challenge.code:
+        raise refused("not confirmed: the code typed is not the one shown")
+    challenge.used.set()
+    return _confirmation(challenge.plan, clock, valid_s, unattended=False)
+
+
+def confirm_unattended(
+    plan: MotionPlan, digest: str, *, clock: Clock, valid_s: float = _VALID_S
+) -> Confirmation:
+    """Confirm a plan that somebody has named beforehand; nobody is asked, now or later.
+
+    What is lost: no person who sees the robot says, just before it moves, that nobody and nothing
+    is in its way. What is kept: only the plan that was named can move the robot.
+
+    Args:
+        plan: the plan to confirm; it is checked first.
+        digest: the plan's, at least its first :data:`LEAST_DIGEST_DIGITS` digits.
+        clock: bench time.
+        valid_s: bench seconds within which motion must be started.
+
+    Raises:
+        RefusedError: the plan is not allowed, or is not the one named.
+    """
+    check_plan(plan)
+    given = digest.strip().lower()
+    if len(given) < LEAST_DIGEST_DIGITS:
+        raise refused(f"name the plan by at least {LEAST_DIGEST_DIGITS} digits of its digest")
+    if not plan.digest.startswith(given):
+        raise refused(
+            f"another plan was named: this one's digest begins with "
+            f"{plan.digest[:LEAST_DIGEST_DIGITS]} (poses, limits, robot, TCP offset, payload and "
+            "speed slider are part of it)"
+        )
+    return _confirmation(plan, clock, valid_s, unattended=True)
+
+
+def _confirmation(
+    plan: MotionPlan, clock: Clock, valid_s: float, *, unattended: bool
+) -> Confirmation:
+    between("valid_s", valid_s, 0.0, 24 * 3600.0)
+    now = clock.now()
+    return Confirmation(plan.digest, plan.serial, now, now + valid_s, unattended)

@@ -1,0 +1,75 @@
+"""The process that moves the robot, from its first line of input to its end."""
+
+from __future__ import annotations
+
+import os
+from typing import NoReturn
+
+from hw.errors import DeviceError, LostError, StoppedError
+from hw.robot._process import ASKS, be_prompt
+from hw.robot.gate import Gate
+from hw.robot.mover.connection import Connection
+from hw.robot.mover.control_loop import ControlLoop
+from hw.robot.mover.controller import Controller
+from hw.robot.mover.inputs import Inputs
+from hw.robot.mover.messages import Caller, Setup, told
+from hw.robot.mover.stop_latch import Ended, Stop
+
+
+def main() -> NoReturn:
+    """Move until the caller closes the input, or motion ends."""
+    caller = Caller(0, os.dup(1))
+    library, end = os.pipe()
+    os.dup2(end, 1)
+    os.dup2(end, 2)
+    try:
+        message = caller.first()
+        be_prompt(ASKS)
+        if message is not None:
+            _serve(Setup.of(message), caller, library)
+    except Exception as error:
+        cause = LostError(f"{type(error).__name__}: {error}", device="robot")
+        caller.tell("error", ended=True, **told(cause))
+        os._exit(1)
+    os._exit(0)
+
+
+def _serve(setup: Setup, caller: Caller, library: int) -> NoReturn:
+    """Move, and end the process: at once, so that ur_rtde can neither reconnect nor wait.
+
+    To return would call its destructor, which takes half a second.
+    """
+    inputs = Inputs(caller, library, setup.clock)
+    gate = Gate(setup.plan, setup.confirmation, setup.clock)
+    controller = Controller(setup, inputs, caller)
+    connection = Connection(setup, gate, inputs, controller)
+    loop = ControlLoop(setup, gate, inputs, controller, connection, caller)
+    try:
+        connection.open()
+        caller.tell("ready", serial=controller.serial, tcp_offset=inputs.tcp_offset)
+        loop.run()
+        connection.close()
+    except (Ended, DeviceError) as error:
+        cause = error.cause if isinstance(error, Ended) else error
+        cause = combined(inputs.latch.stop, cause)
+        answer = told(cause)
+        answer["text"] += connection.end_paused()
+        caller.tell("error", ended=True, **answer)
+        os._exit(1)
+    caller.tell("closed")
+    os._exit(0)
+
+
+def combined(stop: Stop | None, error: DeviceError) -> DeviceError:
+    """Why motion has ended: the stop that was latched, if any, and what came after it."""
+    if stop is None or stop.error.args == error.args:
+        return error
+    kind = type(error)
+    # A stop for good stays one, whatever comes after it.
+    if stop.for_good and kind is not StoppedError:
+        kind = type(stop.error)
+    return kind(f"{stop.error.args[0]}; {error.args[0]}", device="robot")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""Opening the connection that commands the robot, and ending it in order."""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+
+from hw.errors import LostError, RefusedError
+from hw.extras import require
+from hw.robot._process import ASKS, RECEIVES, be_prompt
+from hw.robot.gate import Gate
+from hw.robot.identity import LOCAL, read_identity, stop_program, until_local
+from hw.robot.limits import numbers
+from hw.robot.mover.controller import IDLE_WATCHDOG_HZ, STOP_PATIENCE_S, Controller, said
+from hw.robot.mover.inputs import Inputs
+from hw.robot.mover.messages import Setup
+from hw.robot.path_checks import check_plan
+from hw.robot.rtde import PROGRAM_RUNS, PacketReader, safety_text, state_text, too_late
+from hw.robot.stream import Lag
+
+_END_S = 5.0
+"""Longest time for the end of the script and of the connection."""
+_DASHBOARD_S = 0.3
+"""Longest wait (wall s) for the dashboard; the caller waits for the end of this process."""
+_CONTROL_S = 0.2
+"""The dashboard is asked so often (wall s) whether the robot is still in remote control."""
+
+
+class Connection:
+    """The life of the connection to one controller.
+
+    Args:
+        setup: what the caller asks for.
+        gate: asked before the controller is commanded.
+        inputs: takes the controller's packets.
+        controller: given the control connection, except in a dry run.
+    """
+
+    def __init__(self, setup: Setup, gate: Gate, inputs: Inputs, controller: Controller) -> None:
+        self._setup, self._gate = setup, gate
+        self._clock, self._inputs, self._controller = setup.clock, inputs, controller
+
+    def open(self) -> None:
+        """Connect: to the poses alone in a dry run.
+
+        Raises:
+            DeviceError: the robot is another, cannot take a program now, or does not answer.
+            Ended: a connection was lost.
+        """
+        setup, inputs, controller = self._setup, self._inputs, self._controller
+        check_plan(setup.plan)
+        identity = read_identity(setup.host)
+        controller.serial = identity.name
+        self._read_packets()
+        if setup.dry_run:
+            return
+        offset = inputs.tcp_offset or setup.plan.tcp_offset
+        self._gate.check_start(identity.name, offset, inputs.pendant)
+        self._check_state(identity.remote)
+        module = require("rtde_control", extra="robot")
+        controller.log("connect", host=setup.host, serial=identity.name)
+        try:
+            # The thread that ur_rtde starts inherits this priority.
+            be_prompt(RECEIVES)
+            controller.rtde_control = module.RTDEControlInterface(setup.host)
+        except RuntimeError as error:
+            raise LostError(said(error), device="robot") from None
+        finally:
+            be_prompt(ASKS)
+        controller.watch_rest()
+        if inputs.tcp_offset is None:
+            inputs.tcp_offset = numbers(controller.command("getTCPOffset"), 6, "TCP offset")
+        self._gate.check_authority(identity.name, inputs.tcp_offset, inputs.pendant)
+        self._wait_for_packet(running=True)
+        inputs.program_started = True
+        # What they tell of was before our program.
+        inputs.unseen()
+        if identity.remote:
+            threading.Thread(target=self._watch_control, name="control", daemon=True).start()
+
+    def _read_packets(self) -> None:
+        reader = PacketReader(self._setup.host)
+        asked_s, stamp_s = reader.bound
+        lag = Lag(self._clock.at(asked_s), stamp_s) if math.isfinite(asked_s) else Lag()
+        oldest = self._clock.patience(self._setup.plan.limits.max_pose_age_s)
+        problem = too_late(reader.latency_s * self._clock.speed, oldest)
+        if problem is not None:
+            raise problem
+        self._inputs.attach(reader, lag)
+        self._wait_for_packet()
+
+    def _wait_for_packet(self, *, running: bool = False) -> None:
+        give_up = self._clock.now() + 2.0 + self._clock.speed
+        while self._clock.now() < give_up:
+            self._inputs.read(self._clock.wall(0.01))
+            self._controller.kick()
+            if self._inputs.connected and (
+                not running or self._inputs.packet.status_bits & PROGRAM_RUNS
+            ):
+                return
+        raise LostError("the controller sends no poses, or runs no program", device="robot")
+
+    def _check_state(self, remote: bool | None) -> None:
+        """Whether the robot can take a program now: ur_rtde would stop whatever runs, unasked."""
+        packet = self._inputs.packet
+        problem = LOCAL if remote is False else ""
+        problem = problem or state_text(packet.robot_mode, packet.safety_bits)
+        # The program of a connection that was lost ends by its watchdog.
+        give_up = self._clock.now() + self._clock.patience(1.1 / IDLE_WATCHDOG_HZ)
+        while not problem and self._inputs.packet.program:
+            if self._clock.now() > give_up:
+                problem = "a program runs on the robot, or is paused: stop it at the pendant"
+            self._inputs.read(self._clock.wall(0.01))
+        if problem:
+            raise RefusedError(problem, device="robot")
+
+    def _watch_control(self) -> None:
+        """In a thread of its own: no packet tells whether the robot is in remote control."""
+        be_prompt(0)
+        until_local(self._setup.host, period_s=_CONTROL_S)
+        self._controller.local = True
+
+    def close(self) -> None:
+        """Stop, end the script in order (its watchdog must not trip), then disconnect.
+
+        Raises:
+            Ended: the robot does not stop, or is lost.
+        """
+        _end_within(2 * STOP_PATIENCE_S + _END_S)
+        self._controller.brake()
+        if self._controller.usable():
+            self.end_script()
+            self._controller.log("disconnect")
+            self._controller.rtde_control.disconnect()
+        self.end_paused()
+
+    def end_script(self) -> None:
+        """End our program; the robot must rest."""
+        self._controller.log("kickWatchdog", times=self._controller.kicks)
+        # Calls to a controller that is gone may hang, and nobody kills this process if the caller
+        # is gone, too. The robot rests by now.
+        _end_within(_END_S)
+        self._controller.command("stopScript")
+
+    def end_paused(self) -> str:
+        """End a program that a safety stop has paused: it might go on when the stop is released.
+
+        A paused program reads no commands, so the dashboard is asked.
+
+        Returns:
+            What a person must do if it could not be ended.
+        """
+        if self._controller.rtde_control is None or self._inputs.program_ended:
+            return ""
+        packet = self._inputs.packet
+        if not packet.program or not safety_text(packet.safety_bits):
+            return ""
+        self._controller.log("dashboard: stop")
+        if stop_program(self._setup.host, timeout_s=_DASHBOARD_S):
+            return ""
+        return "; the program may be paused: stop it at the pendant before you reset the robot"
+
+
+def _end_within(seconds: float) -> None:
+    """Let the system end this process after so long, whatever it hangs in."""
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, seconds)

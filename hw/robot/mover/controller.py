@@ -1,0 +1,204 @@
+"""The robot's controller: the only commands that are sent to it, its watchdog, and braking.
+
+How ur_rtde behaves, and what is done about it (each measured):
+
+- A getter of a lost connection returns the last values, so freshness comes from
+  :class:`hw.robot.rtde.PacketReader`.
+- Calls to a silent controller hang, so the caller kills this process after a while, and the
+  controller's own watchdog stops the robot 0.1 s after the last sign of life.
+- A connection that was reset is opened again, and the script sent again, without asking; so the
+  text that ur_rtde prints is watched, and a reset ends the motion for good.
+- A motion goes on after a disconnect, so the robot is stopped first.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from hw.errors import DeviceError, LostError, StoppedError
+from hw.robot._process import ASKS, be_prompt
+from hw.robot.mover.inputs import Inputs, lost
+from hw.robot.mover.messages import Caller, Setup
+from hw.robot.mover.stop_latch import Ended
+from hw.robot.rtde import PROGRAM_RUNS, Packet, safety_text, state_text
+
+_WATCHDOG_HZ, IDLE_WATCHDOG_HZ = 10.0, 0.5
+"""The controller stops its program, and the robot, when it hears nothing for 0.1 s during a motion;
+at rest it waits for 2 s."""
+_KICK_S = 0.02
+_STOP_M_S2 = 2.0
+_STOPPED_MM_S, _STOPPED_RAD_S = 1.0, 0.01
+"""Below these speeds the TCP counts as at rest; a real arm's reading is never quite zero."""
+_REST_SEEN_S = 0.03
+"""A stop is done when the poses have shown rest for so long after stopL (4 poses at 125 Hz)."""
+_STOP_AGAIN_S = 0.05
+"""stopL is sent again to a robot that still moves after this time."""
+STOP_PATIENCE_S = 2.0
+_CAUSE_S = 0.1
+"""The poses tell of a safety stop by so much later than the controller's program ends."""
+
+
+class Controller:
+    """Sends commands, and knows whether the controller takes them.
+
+    Args:
+        setup: clock and limits.
+        inputs: the controller's packets; read while it brakes.
+        caller: told of every command before it is sent.
+    """
+
+    def __init__(self, setup: Setup, inputs: Inputs, caller: Caller) -> None:
+        self.serial = ""
+        """Which robot is connected: :attr:`hw.robot.identity.Identity.name`."""
+        self.rtde_control: Any = None
+        """ur_rtde's interface; None before motion may begin, and in a dry run."""
+        self.local = False
+        """Whether a person has switched the robot to local control."""
+        self.kicks = 0
+        self._kicked = -math.inf
+        self._clock, self._inputs, self._caller = setup.clock, inputs, caller
+        self._max_age_s = setup.plan.limits.max_pose_age_s
+
+    # Commands
+
+    def command(self, name: str, *values: object) -> object:
+        """One command to the controller; every one is logged before it is sent.
+
+        Raises:
+            Ended: the controller's program has stopped.
+        """
+        self.log(name, values=values)
+        return self._call(name, *values)
+
+    def _call(self, name: str, *values: object) -> object:
+        if self._inputs.sample.age_s(self._clock.now()) > self._max_age_s:
+            # The controller is silent: ur_rtde would spin for seconds at real-time priority.
+            be_prompt(0)
+        try:
+            return getattr(self.rtde_control, name)(*values)
+        except RuntimeError as error:
+            raise Ended(self.program_stopped(said(error))) from None
+        finally:
+            be_prompt(ASKS)
+
+    def log(self, command: str, **numbers: object) -> None:
+        """Tell the caller of a command, or of what stands for one."""
+        self._caller.tell("log", t=self._clock.now(), command=command, numbers=numbers)
+
+    def move(self, raw: list[float], speed_m_s: float, acceleration_m_s2: float) -> None:
+        """Begin a motion, and return at once.
+
+        Raises:
+            Ended: the controller did not take it.
+        """
+        if not self.command("moveL", raw, speed_m_s, acceleration_m_s2, True):
+            raise Ended(lost("the controller did not take the motion"))
+        self._kicked = self._clock.now()
+
+    # The watchdog
+
+    def watch_motion(self) -> None:
+        """Let the controller's watchdog wait for as long as it may during a motion."""
+        self.command("setWatchdog", _WATCHDOG_HZ / self._clock.patience(1.0))
+
+    def watch_rest(self) -> None:
+        """Let the controller's watchdog wait for as long as it may at rest."""
+        self.command("setWatchdog", IDLE_WATCHDOG_HZ)
+
+    def kick(self) -> None:
+        """Give the watchdog a sign of life, if it is due.
+
+        Raises:
+            Ended: the controller's program has stopped.
+        """
+        now = self._clock.now()
+        if self.rtde_control is None or self._inputs.program_ended:
+            return
+        if now - self._kicked > _KICK_S:
+            self._kicked = now
+            self.kicks += 1
+            if not self._call("kickWatchdog"):
+                raise Ended(self.program_stopped())
+
+    # Stopping
+
+    def brake(self) -> None:
+        """Send stopL until the poses show rest, as long as the controller takes commands.
+
+        Raises:
+            Ended: the robot does not stop, or is lost.
+        """
+        give_up = self._clock.now() + self._clock.patience(STOP_PATIENCE_S)
+        while self.usable():
+            # Asynchronous: a call that waits for rest would hold the watchdog's kicks back, and
+            # braking may take longer than the watchdog waits. The poses show what stopL did.
+            self.command("stopL", _STOP_M_S2, True)
+            if self._rests():
+                return
+            if self._clock.now() > give_up:
+                text = "the robot was told to stop and still moves: press the emergency stop"
+                raise Ended(LostError(text, device="robot"))
+
+    def _rests(self) -> bool:
+        """Whether the poses show rest for :data:`_REST_SEEN_S`; False: send stopL again."""
+        sent = since = self._inputs.packet.timestamp_s
+        give_up = self._clock.now() + self._clock.patience(10 * _REST_SEEN_S)
+        while self._clock.now() < give_up:
+            # A stop for good that comes now replaces a hesitation.
+            self._inputs.read(self._clock.wall(_REST_SEEN_S / 4))
+            self.kick()
+            packet = self._inputs.packet
+            if packet.timestamp_s > since and (
+                packet.speed_mm_s > _STOPPED_MM_S or packet.turning_rad_s > _STOPPED_RAD_S
+            ):
+                since = packet.timestamp_s
+                if since - sent > _STOP_AGAIN_S:
+                    return False
+            if packet.timestamp_s - since >= _REST_SEEN_S:
+                return True
+        return False
+
+    # State
+
+    def usable(self) -> bool:
+        """Whether the controller takes commands; if not, calls of ur_rtde hang or reconnect."""
+        return bool(
+            self.rtde_control is not None
+            and self.rtde_control.isConnected()
+            and self._inputs.packet.status_bits & PROGRAM_RUNS
+            and not self._inputs.program_ended
+            and not safety_text(self._inputs.packet.safety_bits)
+        )
+
+    def program_stopped(self, what: str = "the controller's program stopped") -> DeviceError:
+        """Why the controller takes no commands: a safety stop if one is told of, else ``what``.
+
+        Raises:
+            Ended: the connection is lost.
+        """
+        inputs = self._inputs
+        give_up = self._clock.now() + self._clock.patience(_CAUSE_S)
+        while self._clock.now() < give_up:
+            inputs.read(self._clock.wall(_CAUSE_S / 10))
+            for packet in inputs.unseen():
+                stopped = unfit(packet)
+                if stopped is not None:
+                    return stopped
+        if inputs.program_ended and inputs.packet.program:
+            text = "another program was started on the robot: stop it at the pendant"
+            return StoppedError(f"{text}, then confirm the plan again", device="robot")
+        return lost(what)
+
+
+def unfit(packet: Packet) -> StoppedError | None:
+    """The stop if the robot is not fit to move: a safety stop, or a mode other than running."""
+    problem = state_text(packet.robot_mode, packet.safety_bits)
+    if not problem:
+        return None
+    return StoppedError(f"{problem}; then confirm the plan again", device="robot")
+
+
+def said(error: RuntimeError) -> str:
+    """An error of ur_rtde; some of its texts begin with its name."""
+    return f"ur_rtde: {str(error).removeprefix('ur_rtde: ')}"

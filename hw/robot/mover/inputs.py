@@ -1,0 +1,163 @@
+"""Everything that comes in: the caller's requests, the controller's packets, ur_rtde's messages.
+
+A stop cannot be lost: each line of input is handled as soon as it is read, whatever the process
+waits for. A request to stop is latched at once; a request to move waits in a queue. Only a
+hesitation whose move was already answered is ignored.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+from collections import deque
+
+from hw.clock import Clock
+from hw.errors import LostError, RefusedError, StaleError, StoppedError
+from hw.robot.mover.messages import Caller
+from hw.robot.mover.stop_latch import Ended, Stop, StopLatch
+from hw.robot.rtde import Packet, PacketReader, PendantSettings
+from hw.robot.stream import Lag, PoseSample, offset_changed
+
+_RECONNECTS = ("econnect", "Lost connection", "Could not receive", "closed the connection")
+
+
+class Inputs:
+    """What has come, and the latch that a stop among it sets.
+
+    Args:
+        caller: sends requests.
+        library: descriptor from which the text that ur_rtde prints is read.
+        clock: bench time.
+    """
+
+    def __init__(self, caller: Caller, library: int, clock: Clock) -> None:
+        self._caller, self._library, self._clock = caller, library, clock
+        self._reader: PacketReader | None = None
+        self._lag = Lag()
+        self._packet: Packet | None = None
+        self._sample: PoseSample | None = None
+        self._unseen: list[Packet] = []
+        self._pendant: PendantSettings | None = None
+        self.latch = StopLatch()
+        self.moves: deque[dict] = deque()
+        """Requests to move that wait."""
+        self.answered = 0
+        """Number of the newest request to move that was answered."""
+        self.heard_s = -math.inf
+        """Bench time of the caller's last sign of life."""
+        self.tcp_offset: tuple[float, ...] | None = None
+        """Of the controller (m, rad); None where it was not told."""
+        self.program_started = False
+        """Whether our program has run; from then on a packet without a program means its end."""
+        self.program_ended = False
+        """Whether our program has ended, whatever runs now."""
+        for request in caller.read_so_far():
+            self._take_request(request)
+
+    def attach(self, reader: PacketReader, lag: Lag) -> None:
+        """Take the controller's packets from now on."""
+        self._reader, self._lag = reader, lag
+
+    @property
+    def connected(self) -> bool:
+        """Whether a packet has come."""
+        return self._packet is not None
+
+    @property
+    def packet(self) -> Packet:
+        """The newest packet."""
+        assert self._packet is not None
+        return self._packet
+
+    @property
+    def sample(self) -> PoseSample:
+        """The newest pose."""
+        assert self._sample is not None
+        return self._sample
+
+    @property
+    def pendant(self) -> PendantSettings | None:
+        """The newest settings at the pendant."""
+        return self._pendant
+
+    def unseen(self) -> list[Packet]:
+        """Packets since the last call, in order; the newest one if none has come."""
+        packets, self._unseen = self._unseen, []
+        return packets or [self.packet]
+
+    def read(self, timeout_s: float) -> None:
+        """Wait for any input, and handle everything that has come.
+
+        Raises:
+            Ended: a connection to the controller is lost.
+        """
+        assert self._reader is not None
+        sources = [self._reader, self._library]
+        if not self._caller.left:
+            sources.append(self._caller)
+        ready = select.select(sources, [], [], timeout_s)[0]
+        if self._reader in ready:
+            try:
+                packets = self._reader.read()
+            except LostError as error:
+                raise Ended(lost(error.args[0])) from None
+            for packet in packets:
+                self._take_packet(packet)
+        if self._library in ready:
+            # A connection that was reset is opened again by ur_rtde, which asks nobody.
+            text = os.read(self._library, 65536).decode("utf-8", "replace")
+            if any(word in text for word in _RECONNECTS):
+                raise Ended(lost("the control connection was reset"))
+        if self._caller in ready:
+            for request in self._caller.read():
+                self._take_request(request)
+
+    def _take_packet(self, packet: Packet) -> None:
+        self._packet = packet
+        self._unseen.append(packet)
+        # In every packet: the newest one may already tell of another program.
+        self.program_ended |= self.program_started and not packet.program
+        t_host = self._clock.at(packet.monotonic_s)
+        self._sample = PoseSample(
+            t_host,
+            packet.timestamp_s,
+            packet.tcp_pose,
+            packet.safety_bits,
+            packet.robot_mode,
+            packet.runtime_state,
+            self._lag.of(t_host, packet.timestamp_s),
+            packet.joints,
+        )
+        changed = "" if self._pendant is None else self._pendant.changed(packet.pendant)
+        if changed:
+            self._refuse(f"changed at the pendant: {changed}")
+        self._pendant = packet.pendant
+        if packet.tcp_offset is not None:
+            if self.tcp_offset is not None and offset_changed(self.tcp_offset, packet.tcp_offset):
+                self._refuse("the controller's TCP offset was changed")
+            self.tcp_offset = packet.tcp_offset
+
+    def _refuse(self, text: str) -> None:
+        self.latch.set(Stop(RefusedError(text, device="robot"), True))
+
+    def _take_request(self, request: dict) -> None:
+        match request["request"]:
+            case "move":
+                self.moves.append(request)
+            case "stop":
+                kind = StaleError if request["kind"] == StaleError.__name__ else StoppedError
+                hesitation = kind is StaleError
+                # A hesitation is about one move: once that is answered, there is nothing to stop.
+                if not hesitation or request["move"] > self.answered:
+                    self.latch.set(Stop(kind(request["text"], device="robot"), not hesitation))
+            case "heard":
+                self.heard_s = self._clock.now()
+            case "close":
+                self._caller.closed = True
+
+
+def lost(what: str) -> LostError:
+    """The error of a connection or a program that is gone."""
+    reason = "; the robot's own watchdog stops it. Motion needs a new confirmation"
+    return LostError(what + reason, device="robot")

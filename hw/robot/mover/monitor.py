@@ -1,0 +1,77 @@
+"""What must stop the robot: its own state, the program's, the connection's, force, box, silence."""
+
+from __future__ import annotations
+
+from hw.errors import StaleError, StoppedError
+from hw.robot.identity import LOCAL
+from hw.robot.mover.controller import Controller, unfit
+from hw.robot.mover.inputs import Inputs, lost
+from hw.robot.mover.messages import Setup
+from hw.robot.mover.stop_latch import Stop
+from hw.robot.path_checks import out_of_box_mm
+from hw.robot.rtde import PROGRAM_RUNS
+
+_BOX_MARGIN_MM = 1.0
+
+
+class Monitor:
+    """Looks for trouble in what has come.
+
+    Args:
+        setup: limits, clock, and how long the caller may be silent.
+        inputs: packets and the caller's signs of life.
+        controller: its connection, and whether the robot is in local control.
+    """
+
+    def __init__(self, setup: Setup, inputs: Inputs, controller: Controller) -> None:
+        self._limits, self._clock, self._caller_s = setup.plan.limits, setup.clock, setup.caller_s
+        self._inputs, self._controller = inputs, controller
+
+    def trouble(self, *, moving: bool) -> Stop | None:
+        """Why the robot must stop, and whether that ends motion for good; None: it may go on.
+
+        Every packet since the last call counts: a gate may have been open only for a moment.
+
+        Raises:
+            Ended: the connection is lost.
+        """
+        inputs = self._inputs
+        packets = inputs.unseen()
+        if self._controller.rtde_control is None:
+            return None
+        for packet in packets:
+            stopped = unfit(packet)
+            if stopped is not None:
+                return Stop(stopped, True)
+        if self._controller.local:
+            return _for_good(f"{LOCAL}; then confirm the plan again")
+        if inputs.program_ended or not inputs.packet.status_bits & PROGRAM_RUNS:
+            return Stop(self._controller.program_stopped(), True)
+        if not self._controller.rtde_control.isConnected():
+            return Stop(lost("the control connection is gone"), True)
+        if not moving:
+            return None
+        sample, limits, now = inputs.sample, self._limits, self._clock.now()
+        if sample.age_s(now) > self._clock.patience(limits.max_pose_age_s):
+            return _hesitation(
+                f"no fresh pose: the newest is {sample.age_text(now)}; the motion was stopped"
+            )
+        force = max(packet.force_n for packet in packets)
+        if force > limits.max_force_n:
+            return _for_good(f"a force of {force:.1f} N, over the cap of {limits.max_force_n:g} N")
+        out = out_of_box_mm(sample.pose, limits)
+        if out > _BOX_MARGIN_MM:
+            return _for_good(f"the probe is {out:.1f} mm out of the box")
+        silent = now - inputs.heard_s
+        if silent > self._clock.patience(self._caller_s):
+            # A fault of this software, like a silent stream: nothing says that motion is dangerous.
+            return _hesitation(f"the caller was silent for {silent:.2f} s")
+        return None
+
+
+def _for_good(text: str) -> Stop:
+    return Stop(StoppedError(text, device="robot"), True)
+
+
+def _hesitation(text: str) -> Stop:
+    return Stop(StaleError(text, device="robot"), False)

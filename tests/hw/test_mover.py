@@ -1,0 +1,150 @@
+"""The process that moves the robot, in pieces: its messages, what it reads, and its latch."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from hw.clock import Clock
+from hw.errors import LostError, RefusedError, StaleError, StoppedError
+from hw.robot.confirmation import Confirmation
+from hw.robot.limits import Limits
+from hw.robot.motion_plan import MotionPlan
+from hw.robot.mover.__main__ import combined
+from hw.robot.mover.inputs import Inputs
+from hw.robot.mover.messages import (
+    Caller,
+    Setup,
+    error_of,
+    line_of,
+    plain,
+    sample_of,
+    told,
+)
+from hw.robot.mover.stop_latch import Stop, StopLatch
+from hw.robot.rtde import PendantSettings
+from hw.robot.stream import PoseSample
+
+CLOCK = Clock()
+PLAN = MotionPlan(
+    np.eye(4)[None],
+    Limits(
+        box_min_mm=(-50.0, -50.0, -150.0),
+        box_max_mm=(50.0, 50.0, 150.0),
+        tip_mm=(0.0, 0.0, 50.0),
+        cone_axis=(0.0, 0.0, 1.0),
+        cone_deg=20.0,
+        max_step_mm=60.0,
+        max_turn_deg=20.0,
+        max_speed_mm_s=50.0,
+    ),
+    (0.0, 0.0, 0.1, 0.0, 0.0, 0.0),
+    "20195500042",
+    pendant=PendantSettings(1.5, (0.0, 0.01, 0.02), 0.5),
+)
+DANGER = Stop(StoppedError("danger", device="robot"), True)
+SILENCE = Stop(StaleError("no frame", device="robot"), False)
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[Caller, int]]:
+    """The process's view of its caller, and the caller's end of the requests."""
+    requests, write = os.pipe()
+    answers, output = os.pipe()
+    try:
+        yield Caller(requests, output), write
+    finally:
+        for number in (requests, write, answers, output):
+            with suppress(OSError):
+                os.close(number)
+
+
+def stop_of(kind: type, move: int) -> dict:
+    return {"request": "stop", "move": move, **told(kind("enough", device="robot"))}
+
+
+def test_the_latch_keeps_the_first_stop_and_one_for_good():
+    latch = StopLatch()
+    for stop, kept in [(SILENCE, SILENCE), (DANGER, DANGER), (SILENCE, DANGER)]:
+        latch.set(stop)
+        assert latch.stop is kept
+    with pytest.raises(AssertionError):
+        latch.release()
+    assert latch.stop is DANGER
+
+
+def test_a_setup_and_a_pose_arrive_as_they_were_sent():
+    given = Confirmation(PLAN.digest, PLAN.serial, 1.0, 2.0)
+    sent = Setup("127.0.0.1", PLAN, given, CLOCK, False, 0.15)
+    came = Setup.of(json.loads(line_of(sent.message())))
+    assert came.plan.digest == PLAN.digest
+    assert came.plan.limits == PLAN.limits
+    assert (came.host, came.confirmation, came.clock) == (sent.host, given, CLOCK)
+    assert (came.dry_run, came.caller_s) == (False, 0.15)
+    sample = PoseSample(1.0, 2.0, (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), 1, 7, 2, 0.003)
+    assert sample_of(json.loads(json.dumps(plain(sample)))) == sample
+    error = RefusedError("not allowed", device="robot")
+    assert str(error_of(told(error))) == str(error)
+
+
+def test_a_stop_that_is_read_with_the_setup_is_latched(pipe):
+    caller, write = pipe
+    later = line_of(stop_of(StoppedError, 0)) + line_of({"request": "heard"})
+    os.write(write, line_of({"setup": True}) + later[:-5])
+    assert caller.first() == {"setup": True}
+    inputs = Inputs(caller, 0, CLOCK)
+    assert inputs.latch.stop is not None
+    assert inputs.latch.stop.for_good
+    os.write(write, later[-5:])
+    assert caller.read() == [{"request": "heard"}]
+    assert not caller.left
+    os.close(write)
+    assert caller.read() == []
+    assert caller.left
+
+
+def test_an_input_that_ends_before_the_setup_is_no_request(pipe):
+    caller, write = pipe
+    os.write(write, b'{"half')
+    os.close(write)
+    assert caller.first() is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "move", "latched"),
+    [(StaleError, 0, False), (StaleError, 1, True), (StoppedError, 0, True)],
+)
+def test_only_a_hesitation_about_an_answered_move_is_ignored(pipe, kind, move, latched):
+    """Before the first move, number 0 stands for one that was answered."""
+    caller, write = pipe
+    os.write(write, line_of({"setup": True}) + line_of(stop_of(kind, move)))
+    caller.first()
+    stop = Inputs(caller, 0, CLOCK).latch.stop
+    assert (stop is not None) == latched
+    assert stop is None or type(stop.error) is kind
+
+
+def test_a_caller_that_listens_no_more_has_left():
+    answers, output = os.pipe()
+    caller = Caller(0, output)
+    caller.tell("alive")
+    os.close(answers)
+    assert not caller.left
+    caller.tell("alive")
+    assert caller.left
+    os.close(output)
+
+
+def test_what_follows_a_stop_for_good_does_not_replace_it():
+    lost = LostError("the program stopped", device="robot")
+    assert combined(None, lost) is lost
+    assert combined(Stop(lost, True), lost) is lost
+    both = combined(DANGER, lost)
+    assert type(both) is StoppedError
+    assert both.args[0] == "danger; the program stopped"
+    assert type(combined(SILENCE, lost)) is LostError
