@@ -125,7 +125,7 @@ def run_study(
             missing, done = _missing(store, watcher)
             watcher.begin(spec.condition_count * spec.trials, done)
             trials = 0
-            with closing(_computed(spec, missing, workers, client)) as results:
+            with closing(_computed(spec, missing, workers, client, watcher)) as results:
                 for chunk, arrays, maker in results:
                     store.write(chunk, arrays, maker)
                     trials += chunk.stop - chunk.start
@@ -156,12 +156,12 @@ def _missing(store: Store, watcher: Watcher) -> tuple[list[Chunk], int]:
 
 
 def _computed(
-    spec: Study, missing: list[Chunk], workers: int, client: Client | None
+    spec: Study, missing: list[Chunk], workers: int, client: Client | None, watcher: Watcher
 ) -> Generator[Computed]:
     if not missing:
         return
     if client is not None:
-        yield from compute_on_cluster(client, spec, missing)
+        yield from compute_on_cluster(client, spec, missing, watcher.note)
     elif workers:
         from jaxcal.study.workers import compute_on_workers, core_groups
 

@@ -67,7 +67,7 @@ class Store(Generic[S]):
             OutputError: the folder cannot be made or written to. Nothing was written then.
         """
         store = cls(folder, spec)
-        if store._spec_path.exists():
+        if store.is_begun():
             found = read_spec(folder, type(spec))
             if found.sha256 != spec.sha256:
                 raise InputError(
@@ -95,6 +95,10 @@ class Store(Generic[S]):
             FormatError: there is none.
         """
         return Store(folder, read_spec(folder))
+
+    def is_begun(self) -> bool:
+        """Whether the folder holds a study."""
+        return self._spec_path.exists()
 
     def path(self, chunk: Chunk) -> Path:
         """The file of a chunk."""
