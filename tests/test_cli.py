@@ -4,11 +4,14 @@ One calibration runs in a process of its own, as a user's; the others share its 
 this one.
 """
 
+import gc
 import io
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import click
@@ -523,6 +526,31 @@ def test_ctrl_c_while_importing_leaves_at_once():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (130, "jaxcal: interrupted\n")
+
+
+def test_ctrl_c_where_python_cannot_raise_it_is_not_lost(capfd):
+    """In a destructor or a callback of the garbage collection, whose exceptions Python drops."""
+    times = []
+
+    def callback(phase, _):
+        if len(times) < 3:
+            times.append(phase)
+            signal.raise_signal(signal.SIGINT)
+
+    @click.command()
+    def command():
+        gc.callbacks.append(callback)
+        gc.collect()
+        # Waiting is ended as well.
+        time.sleep(60)
+
+    before = sys.unraisablehook
+    try:
+        assert run(click.Group(commands=[command]), "jaxcal", ["command"]) == 130
+    finally:
+        gc.callbacks.remove(callback)
+    assert capfd.readouterr() == ("", "jaxcal: interrupted\n")
+    assert sys.unraisablehook is before
 
 
 def test_a_bug_is_one_line_too(capfd, monkeypatch):

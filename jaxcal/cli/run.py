@@ -12,6 +12,7 @@ import click
 
 from jaxcal import CalibrationError
 from jaxcal.cli.common import ExitCode
+from jaxcal.cli.interrupts import no_interrupt_lost
 
 
 def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None) -> int:
@@ -101,7 +102,7 @@ def _invoke(commands: click.Group, name: str, arguments: Sequence[str]) -> int:
     # Not click's own main(): it prints a blank line when interrupted, and ends the process itself
     # when a pipe was closed early.
     try:
-        with commands.make_context(name, list(arguments)) as context:
+        with no_interrupt_lost(), commands.make_context(name, list(arguments)) as context:
             return commands.invoke(context) or 0
     except click.exceptions.Exit as done:
         return done.exit_code
