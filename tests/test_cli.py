@@ -24,11 +24,11 @@ import jaxcal
 from hw.cli.main import commands as bench_commands
 from hw.cli.main import main as bench_main
 from hw.errors import DeviceError
-from jaxcal.cli import cache, common, demo, plan
+from jaxcal.cli import common, demo, plan
 from jaxcal.cli.main import commands, main
 from jaxcal.cli.run import run
 from jaxcal.data.recording import Recording, make_images
-from jaxcal.runtime import program_cache
+from jaxcal.runtime import jax_cache, program_cache
 from jaxcal.study.simulation import Protocol
 
 FIGURES = ("residuals", "offsets", "accuracy", "influence", "limits")
@@ -650,7 +650,7 @@ def test_cache_that_cannot_be_trusted_is_not_used(spoil, tmp_path, monkeypatch, 
     else:
         monkeypatch.setenv("JAXCAL_NO_CACHE", "1")
     before = jax.config.jax_compilation_cache_dir
-    cache.enable_compilation_cache()
+    jax_cache.enable_compilation_cache()
     assert jax.config.jax_compilation_cache_dir == before
     assert capfd.readouterr() == ("", "")
 
@@ -661,8 +661,44 @@ def test_cache_keeps_the_newest(tmp_path):
         os.utime(tmp_path / name, (0, -age))
     (tmp_path / "e").symlink_to("nowhere")
     os.utime(tmp_path / "e", (0, -9), follow_symlinks=False)
-    cache._prune(tmp_path, 2)
+    jax_cache.prune(tmp_path, 2)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
+
+
+DAMAGED_ENTRIES = """
+import jax, resource
+from jaxcal.runtime.jax_cache import enable_compilation_cache, folder
+enable_compilation_cache()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+def compiled(*names):
+    for name in names:
+        def function(x):
+            return x + 1
+        function.__name__ = name
+        jax.jit(function)(1.0)
+    jax.clear_caches()
+    found = {path.name.split("-")[0]: path for path in folder().iterdir()}
+    return {name: found.get(f"jit_{name}") for name in names}
+
+for path in compiled("f", "g").values():
+    path.write_bytes(path.read_bytes()[:100])
+for path in compiled("f", "g").values():
+    assert path.stat().st_size > 100
+soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+assert compiled("h") == {"h": None}
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="limits of files are POSIX's")
+def test_a_damaged_entry_of_jaxs_cache_is_replaced_without_a_word(tmp_path):
+    """A full disk leaves half an entry, which JAX neither uses nor replaces."""
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    del environment["JAX_COMPILATION_CACHE_DIR"]
+    run = [sys.executable, "-c", DAMAGED_ENTRIES]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_cache_clear_removes_what_jax_keeps_there(tmp_path, monkeypatch):
@@ -748,7 +784,7 @@ def test_plans_that_cannot_be(capfd, tmp_path):
 
 SLOW_COMPILE = """
 import sys, jax
-from jaxcal.cli.cache import enable_compilation_cache
+from jaxcal.runtime.jax_cache import enable_compilation_cache
 if sys.argv[1] == "quiet":
     enable_compilation_cache()
 jax.devices()

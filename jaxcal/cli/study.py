@@ -52,7 +52,7 @@ def run(spec: str, out: str, resume: bool, workers: int | None, dask: str | None
     from jaxcal.study.spec import load_spec
 
     checked = load_spec(spec)
-    from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.runtime.jax_cache import enable_compilation_cache
     from jaxcal.study.run import run_study
     from jaxcal.study.store import Store
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from jaxcal import CalibrationError
 from jaxcal.io.readable import one_line
+from jaxcal.runtime import jax_cache
 from jaxcal.runtime.isolated import python_command
 from jaxcal.study.own import Study, study_from, where_defined
 from jaxcal.study.spec import Chunk
@@ -42,9 +43,9 @@ class Worker:
     """
 
     def __init__(self, spec: Study, cores: set[int]) -> None:
+        # Workers keep compiled programs in the same folder as this process.
         cache = None
-        if "jax" in sys.modules:
-            # Workers keep compiled programs in the same folder as this process.
+        if "jax" in sys.modules and not jax_cache.is_wanted():
             cache = getattr(sys.modules["jax"].config, "jax_compilation_cache_dir", None)
         environment = {**os.environ, **_ONE_THREAD}
         if cache is not None:
@@ -66,6 +67,7 @@ class Worker:
                     "spec": spec.canonical(),
                     "where": where_defined(spec),
                     "cores": sorted(cores),
+                    "cache": jax_cache.is_wanted(),
                 }
             )
 
@@ -202,6 +204,8 @@ def main() -> None:
     if given["cores"] and hasattr(os, "sched_setaffinity"):
         # Before JAX is imported, since JAX counts the cores.
         os.sched_setaffinity(0, given["cores"])
+    if given["cache"]:
+        jax_cache.enable_compilation_cache()
     spec = study_from(given["where"], given["spec"])
     try:
         for line in requests:
