@@ -553,6 +553,21 @@ def test_ctrl_c_where_python_cannot_raise_it_is_not_lost(capfd):
     assert sys.unraisablehook is before
 
 
+def test_a_home_that_cannot_be_written_is_not_talked_about():
+    """Matplotlib would, in two lines, though the figure is made."""
+    code = (
+        "import click; from jaxcal.cli.run import run; "
+        "draw = click.Command('draw', callback=lambda: __import__('matplotlib').get_configdir()); "
+        "run(click.Group(commands=[draw]), 'jaxcal', ['draw'])"
+    )
+    names = ("MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME")
+    environment = {name: value for name, value in os.environ.items() if name not in names}
+    environment["HOME"] = "/proc/nowhere"
+    run = [sys.executable, "-c", code]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_a_bug_is_one_line_too(capfd, monkeypatch):
     def fail():
         raise ZeroDivisionError("a\nb")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -35,6 +36,8 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
                 ExitCode.BAD_INPUT,
             )
         _print_anything()
+    # It warns of a home that is read-only, and makes its folder elsewhere; nothing is to be done.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         if arguments is None and (instruction := os.environ.get(_completion_variable(name))):
             from click.shell_completion import shell_complete
