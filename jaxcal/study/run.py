@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from jaxcal import FormatError, InputError
+from jaxcal import FormatError, InputError, OutputError
 from jaxcal.calibration.inputs import whole_number
-from jaxcal.io.readable import shown
+from jaxcal.io.readable import one_line, shown
 from jaxcal.study.cluster import compute_on_cluster, connected
 from jaxcal.study.own import Study
 from jaxcal.study.spec import Chunk
@@ -184,7 +184,12 @@ def _locked(folder: Path) -> Iterator[None]:
     if fcntl is None:
         yield
         return
-    with (folder / ".lock").open("wb") as lock:
+    path = folder / ".lock"
+    try:
+        lock = path.open("wb")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {one_line(error)}") from error
+    with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -29,7 +29,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import atomic_path, write_text
-from jaxcal.io.readable import check_readable, one_line
+from jaxcal.io.readable import check_readable, one_line, path_name
 from jaxcal.io.untrusted import array, child, number, open_root, text
 from jaxcal.study.own import Study
 from jaxcal.study.spec import MAXIMUM_BYTES, Chunk, Spec
@@ -50,7 +50,7 @@ class Store(Generic[S]):
     """
 
     def __init__(self, folder: str | os.PathLike[str], spec: S) -> None:
-        self.folder = Path(folder)
+        self.folder = Path(path_name(folder))
         self.spec = spec
 
     @classmethod
@@ -81,9 +81,9 @@ class Store(Generic[S]):
                 )
             store._make_folder()
             return store
-        if any(store.folder.glob("chunks/chunk-*.h5")):
-            raise InputError(f"{folder}: holds results but no spec.json: choose another folder")
         store._make_folder()
+        if store.present():
+            raise InputError(f"{folder}: holds results but no spec.json: choose another folder")
         write_text(store._spec_path, spec.canonical() + "\n")
         return store
 
@@ -98,7 +98,8 @@ class Store(Generic[S]):
 
     def is_begun(self) -> bool:
         """Whether the folder holds a study."""
-        return self._spec_path.exists()
+        # Not Path.exists, which fails where a folder above may not be looked into.
+        return os.path.exists(self._spec_path)
 
     def path(self, chunk: Chunk) -> Path:
         """The file of a chunk."""
@@ -111,7 +112,7 @@ class Store(Generic[S]):
             names = os.listdir(folder)
         except FileNotFoundError:
             return []
-        except OSError as error:
+        except (OSError, ValueError) as error:
             raise FormatError(f"{folder}: cannot be read: {one_line(error)}") from None
         found = [re.fullmatch(r"chunk-(\d{6,7})\.h5", name) for name in names]
         indices = {int(match[1]) for match in found if match}
@@ -251,10 +252,10 @@ def read_spec(folder: str | os.PathLike[str], kind: type[Any] = Spec) -> Any:
     Raises:
         FormatError: there is none, or it is damaged.
     """
-    path = Path(folder) / "spec.json"
-    if not Path(folder).is_dir():
+    path = Path(path_name(folder)) / "spec.json"
+    if not os.path.isdir(folder):
         raise FormatError(f"{folder}: no such folder")
-    if not path.exists():
+    if not os.path.exists(path):
         raise FormatError(f"{folder}: holds no study (no spec.json)")
     check_readable(path, maximum_bytes=8 * MAXIMUM_BYTES)
     try:
