@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import subprocess
 import sys
 from subprocess import PIPE
@@ -11,7 +12,7 @@ from subprocess import PIPE
 import numpy as np
 import pytest
 
-from jaxcal import FormatError, InputError
+from jaxcal import CalibrationError, FormatError, InputError
 from jaxcal.runtime import jax_cache
 from jaxcal.runtime.isolated import python_command
 from jaxcal.study import run_study
@@ -113,6 +114,33 @@ def test_the_class_must_be_one_that_a_worker_can_import(squares):
         study_from({"module": "no_such_module", "name": "Squares"}, "{}")
     with pytest.raises(InputError, match="not of this study"):
         study_from(where, '{"colour": 1}')
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"square": np.zeros((1, 5))}, r"square is float64 \(1, 5\) in what .* floats \(2, 5\)"),
+        ({"square": np.full((2, 5), None)}, r"square is object \(2, 5\)"),
+        ({"count": np.array(1.5)}, r"count is float64 \(\) in what .* integers \(\)"),
+        ({"count": None}, "count is missing"),
+    ],
+)
+def test_a_chunk_of_other_arrays_is_not_written(squares, tmp_path, change, said):
+    """It could not be read, which would be found out when all is computed."""
+    kind = type("Wrong", (squares,), {"compute": lambda *given: squares.compute(*given) | change})
+    with pytest.raises(InputError, match=said):
+        run_study(kind(), tmp_path / "study")
+    assert not list((tmp_path / "study" / "chunks").iterdir())
+
+
+def test_a_module_that_a_worker_cannot_import_is_told_of(tmp_path, monkeypatch, capfd):
+    begin = f"import os\nif os.getpid() != {os.getpid()}: raise RuntimeError('no licence here')\n"
+    (tmp_path / "loose_licensed.py").write_text(begin + MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    study = importlib.import_module("loose_licensed").Squares(condition_count=1)
+    with pytest.raises(CalibrationError, match=r"chunk 0 could not be computed: .*no licence here"):
+        run_study(study, tmp_path / "study", workers=1)
+    assert capfd.readouterr().err == ""
 
 
 FOLDERS = """

@@ -31,7 +31,7 @@ import numpy as np
 
 from jaxcal import CalibrationError, InputError, MissingExtraError, __version__
 from jaxcal.io.readable import one_line, quoted
-from jaxcal.study.own import Study, study_from, where_defined
+from jaxcal.study.own import Study, computed, study_from, where_defined
 from jaxcal.study.spec import Chunk
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def compute_from_text(
     from jaxcal.study.pipeline import made_by
 
     spec = _spec(canonical, where)
-    return spec.compute(spec.chunk(index)), made_by()
+    return computed(spec, spec.chunk(index)), made_by()
 
 
 def prepare(canonical: str, where: tuple[tuple[str, str], ...]) -> None:

@@ -16,7 +16,7 @@ from jaxcal import FormatError, InputError, OutputError
 from jaxcal.calibration.inputs import whole_number
 from jaxcal.io.readable import one_line, shown
 from jaxcal.study.cluster import compute_on_cluster, connected
-from jaxcal.study.own import Study
+from jaxcal.study.own import Study, computed
 from jaxcal.study.spec import Chunk
 from jaxcal.study.store import Store
 
@@ -175,7 +175,7 @@ def _compute_here(spec: Study, missing: Iterable[Chunk]) -> Iterator[Computed]:
     from jaxcal.study.pipeline import made_by
 
     for chunk in missing:
-        yield chunk, spec.compute(chunk), made_by()
+        yield chunk, computed(spec, chunk), made_by()
 
 
 @contextmanager

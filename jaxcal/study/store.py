@@ -123,7 +123,7 @@ class Store(Generic[S]):
 
         Args:
             chunk: which.
-            results: as :meth:`jaxcal.study.Study.compute` returns them.
+            results: of :func:`jaxcal.study.own.computed`.
             maker: what computed it, as :func:`jaxcal.study.pipeline.made_by` says it.
 
         Raises:
@@ -131,14 +131,8 @@ class Store(Generic[S]):
         """
         path = self.path(chunk)
         start = chunk.condition * self.spec.trials
-        # JAX may have been told to run in 32 bits; the file's types do not depend on it.
         wanted = self.spec.arrays(chunk)
-        results = {
-            name: results[name].astype(np.float64, copy=False)
-            if results[name].dtype.kind == "f"
-            else results[name]
-            for name in wanted
-        }
+        results = {name: results[name] for name in wanted}
         with atomic_path(path) as temporary:
             # HDF5 notices a full disk only when it closes the file, and then loses the reason. A
             # file that is made in memory and written in one go reports it.

@@ -15,7 +15,8 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -24,7 +25,7 @@ from jaxcal import CalibrationError
 from jaxcal.io.readable import one_line
 from jaxcal.runtime import jax_cache
 from jaxcal.runtime.isolated import python_command
-from jaxcal.study.own import Study, study_from, where_defined
+from jaxcal.study.own import Study, computed, study_from, where_defined
 from jaxcal.study.spec import Chunk
 
 MOST_DEATHS = 3
@@ -44,12 +45,12 @@ class Worker:
 
     def __init__(self, spec: Study, cores: set[int]) -> None:
         # Workers keep compiled programs in the same folder as this process.
-        cache = None
+        folder = None
         if "jax" in sys.modules and not jax_cache.is_wanted():
-            cache = getattr(sys.modules["jax"].config, "jax_compilation_cache_dir", None)
+            folder = getattr(sys.modules["jax"].config, "jax_compilation_cache_dir", None)
         environment = {**os.environ, **_ONE_THREAD}
-        if cache is not None:
-            environment.setdefault("JAX_COMPILATION_CACHE_DIR", cache)
+        if folder is not None:
+            environment.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
         # In a session of its own: Ctrl-C reaches the parent, which ends its workers.
         self.process = subprocess.Popen(
             python_command("jaxcal.study.workers"),
@@ -206,7 +207,11 @@ def main() -> None:
         os.sched_setaffinity(0, given["cores"])
     if given["cache"]:
         jax_cache.enable_compilation_cache()
-    spec = study_from(given["where"], given["spec"])
+
+    @cache
+    def spec() -> Study:
+        return study_from(given["where"], given["spec"])
+
     try:
         for line in requests:
             _answer(answers, spec, json.loads(line)["chunk"])
@@ -215,11 +220,13 @@ def main() -> None:
         os._exit(1)
 
 
-def _answer(answers: BinaryIO, spec: Study, index: int) -> None:
-    from jaxcal.study.pipeline import made_by
-
+def _answer(answers: BinaryIO, spec: Callable[[], Study], index: int) -> None:
     try:
-        arrays = spec.compute(spec.chunk(index))
+        # What cannot be imported is told as what cannot be computed is.
+        from jaxcal.study.pipeline import made_by
+
+        study = spec()
+        arrays = computed(study, study.chunk(index))
         found = {name: np.asarray(values, order="C") for name, values in arrays.items()}
         described = [[name, values.dtype.str, list(values.shape)] for name, values in found.items()]
         header: dict[str, Any] = {"arrays": described, "maker": made_by()}
