@@ -49,6 +49,9 @@ MOST_NAMED = 3
 """Workers named of those with the same reason."""
 
 _VERSION = "jaxcal:__version__"
+_TALKING = ("distributed", "distributed.client")
+"""Dask's logs that have a level of their own."""
+
 _LOST = "the cluster was lost: its scheduler no longer answers"
 
 # Others than these, such as inproc://, are Dask's own affair.
@@ -85,14 +88,15 @@ def connected(scheduler: Any) -> Iterator[Client]:
         client.status = "closed"
         raise InputError(f"no Dask scheduler answers at {scheduler}: {one_line(error)}") from None
     # A lost scheduler is an error of ours; Dask would add tracebacks of what it was doing.
-    log = logging.getLogger("distributed.client")
-    level = log.level
-    log.setLevel(logging.CRITICAL)
+    logs = {log: log.level for log in map(logging.getLogger, _TALKING)}
+    for log in logs:
+        log.setLevel(logging.CRITICAL)
     try:
         with client:
             yield client
     finally:
-        log.setLevel(level)
+        for log, level in logs.items():
+            log.setLevel(level)
 
 
 def compute_from_text(
