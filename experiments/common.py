@@ -73,7 +73,7 @@ def open_study(name: str, *, trials: int | None, quick: bool):
         trials: in each condition, instead of the spec's.
         quick: the quick one has a folder of its own.
     """
-    from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.runtime.jax_cache import enable_compilation_cache
     from jaxcal.study import load_spec, open_results, run_study
 
     here = Path(__file__).parent

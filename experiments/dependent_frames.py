@@ -29,9 +29,9 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from jaxcal.calibration.dependence import independent
 from jaxcal.calibration.result import Calibration
-from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.data.recording import make_images
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM
+from jaxcal.runtime.jax_cache import enable_compilation_cache
 
 SEED = 20261122
 JITTER_MM = 0.05

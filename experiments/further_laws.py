@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from auto_grid import COMPARED, SUBSET, Cell, run_cell, write
 from common import LAWS, arguments, machine, results_folder
 
-from jaxcal.cli.cache import enable_compilation_cache
+from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.study.laws import OFFSET_LAWS
 
 TRIALS, AGAIN = 400, 4000

@@ -25,8 +25,8 @@ from common import arguments, machine, results_folder, write_table
 from jaxtyping import Array
 
 from jaxcal import Protocol, calibrate_batch, reconstruction_precision, simulate
-from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.io.atomic import atomic_path
+from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.study.contamination import OutlierKind, contaminate
 from jaxcal.study.offsets import OffsetLaw
 

@@ -19,10 +19,10 @@ from unmodelled import CURVE_MM, judged
 
 import jaxcal
 from jaxcal import design
-from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.design.greedy import Rules
 from jaxcal.diagnostics.unmodelled import SIDE_MM
+from jaxcal.runtime.jax_cache import enable_compilation_cache
 
 SEED = 20261123
 IMAGES, SHARES, TRIALS = (12, 30, 60), (0.0, 0.1, 0.2, 0.4), 400

@@ -53,12 +53,12 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal import design
-from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.design.candidates import sobol_poses
 from jaxcal.design.greedy import Rules
 from jaxcal.design.predict import curve
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.text import read_crosswire
+from jaxcal.runtime.jax_cache import enable_compilation_cache
 
 SEED = 20261129
 LAWS = ("uniform", "normal", "one-sided", "heavy-tailed", "triangular")

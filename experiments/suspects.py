@@ -22,9 +22,9 @@ from common import arguments, machine, results_folder, write_table
 from jaxtyping import Array
 
 import jaxcal
-from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.outliers import outliers, suspects
+from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.study.laws import OffsetLaw
 
 SEED = 20261124

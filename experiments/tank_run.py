@@ -10,7 +10,7 @@ import numpy as np
 from common import Lines, results_folder, write_table
 from tank_grid import Grid, read_all
 
-from jaxcal.cli.cache import enable_compilation_cache
+from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.study import run_study
 
 SEED = 20261122

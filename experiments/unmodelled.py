@@ -32,11 +32,11 @@ from common import arguments, machine, results_folder, write_table
 from jaxtyping import Array
 
 import jaxcal
-from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.diagnostics.unmodelled import SIDE_MM
 from jaxcal.report.accuracy import FAIR_MM, region_of
 from jaxcal.report.record import calibration_record
+from jaxcal.runtime.jax_cache import enable_compilation_cache
 
 SEED = 20261123
 FAULTS = ("none", "scale", "skew", "beside", "slip", "second echo", "curve")

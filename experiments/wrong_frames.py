@@ -26,12 +26,12 @@ from dependent_frames import placed, seen
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.cli.common import ExitCode, exit_code
 from jaxcal.data.poses import inverse_poses
 from jaxcal.data.recording import Images, make_images
 from jaxcal.report.record import calibration_record
 from jaxcal.report.verdict import verdict
+from jaxcal.runtime.jax_cache import enable_compilation_cache
 
 SEED = 20261123
 SPACING_MM = (0.10, 0.12)

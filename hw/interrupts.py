@@ -58,7 +58,8 @@ def heed_interrupt() -> None:
 
     The first one may have been dropped: Python only reports exceptions of finalisers and of
     callbacks of the garbage collector (JAX has one), Tk those of its callbacks, and both go on.
-    Whatever moves the robot, or waits for a person in a window, calls this.
+    Whatever moves the robot, or waits for a person in a window, calls this: a stop must not depend
+    on the command line's own remedy (:mod:`jaxcal.cli.interrupts`).
     """
     if _asked:
         raise KeyboardInterrupt

@@ -4,11 +4,14 @@ One calibration runs in a process of its own, as a user's; the others share its 
 this one.
 """
 
+import gc
 import io
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import click
@@ -21,11 +24,11 @@ import jaxcal
 from hw.cli.main import commands as bench_commands
 from hw.cli.main import main as bench_main
 from hw.errors import DeviceError
-from jaxcal.cli import cache, common, demo, plan
+from jaxcal.cli import common, demo, plan
 from jaxcal.cli.main import commands, main
 from jaxcal.cli.run import run
 from jaxcal.data.recording import Recording, make_images
-from jaxcal.runtime import program_cache
+from jaxcal.runtime import jax_cache, program_cache
 from jaxcal.study.simulation import Protocol
 
 FIGURES = ("residuals", "offsets", "accuracy", "influence", "limits")
@@ -525,6 +528,46 @@ def test_ctrl_c_while_importing_leaves_at_once():
     assert (done.returncode, done.stderr) == (130, "jaxcal: interrupted\n")
 
 
+def test_ctrl_c_where_python_cannot_raise_it_is_not_lost(capfd):
+    """In a destructor or a callback of the garbage collection, whose exceptions Python drops."""
+    times = []
+
+    def callback(phase, _):
+        if len(times) < 3:
+            times.append(phase)
+            signal.raise_signal(signal.SIGINT)
+
+    @click.command()
+    def command():
+        gc.callbacks.append(callback)
+        gc.collect()
+        # Waiting is ended as well.
+        time.sleep(60)
+
+    before = sys.unraisablehook
+    try:
+        assert run(click.Group(commands=[command]), "jaxcal", ["command"]) == 130
+    finally:
+        gc.callbacks.remove(callback)
+    assert capfd.readouterr() == ("", "jaxcal: interrupted\n")
+    assert sys.unraisablehook is before
+
+
+def test_a_home_that_cannot_be_written_is_not_talked_about():
+    """Matplotlib would, in two lines, though the figure is made."""
+    code = (
+        "import click; from jaxcal.cli.run import run; "
+        "draw = click.Command('draw', callback=lambda: __import__('matplotlib').get_configdir()); "
+        "run(click.Group(commands=[draw]), 'jaxcal', ['draw'])"
+    )
+    names = ("MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME")
+    environment = {name: value for name, value in os.environ.items() if name not in names}
+    environment["HOME"] = "/proc/nowhere"
+    run = [sys.executable, "-c", code]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_a_bug_is_one_line_too(capfd, monkeypatch):
     def fail():
         raise ZeroDivisionError("a\nb")
@@ -622,7 +665,7 @@ def test_cache_that_cannot_be_trusted_is_not_used(spoil, tmp_path, monkeypatch, 
     else:
         monkeypatch.setenv("JAXCAL_NO_CACHE", "1")
     before = jax.config.jax_compilation_cache_dir
-    cache.enable_compilation_cache()
+    jax_cache.enable_compilation_cache()
     assert jax.config.jax_compilation_cache_dir == before
     assert capfd.readouterr() == ("", "")
 
@@ -633,8 +676,44 @@ def test_cache_keeps_the_newest(tmp_path):
         os.utime(tmp_path / name, (0, -age))
     (tmp_path / "e").symlink_to("nowhere")
     os.utime(tmp_path / "e", (0, -9), follow_symlinks=False)
-    cache._prune(tmp_path, 2)
+    jax_cache.prune(tmp_path, 2)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
+
+
+DAMAGED_ENTRIES = """
+import jax, resource
+from jaxcal.runtime.jax_cache import enable_compilation_cache, folder
+enable_compilation_cache()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+def compiled(*names):
+    for name in names:
+        def function(x):
+            return x + 1
+        function.__name__ = name
+        jax.jit(function)(1.0)
+    jax.clear_caches()
+    found = {path.name.split("-")[0]: path for path in folder().iterdir()}
+    return {name: found.get(f"jit_{name}") for name in names}
+
+for path in compiled("f", "g").values():
+    path.write_bytes(path.read_bytes()[:100])
+for path in compiled("f", "g").values():
+    assert path.stat().st_size > 100
+soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+assert compiled("h") == {"h": None}
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="limits of files are POSIX's")
+def test_a_damaged_entry_of_jaxs_cache_is_replaced_without_a_word(tmp_path):
+    """A full disk leaves half an entry, which JAX neither uses nor replaces."""
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    del environment["JAX_COMPILATION_CACHE_DIR"]
+    run = [sys.executable, "-c", DAMAGED_ENTRIES]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_cache_clear_removes_what_jax_keeps_there(tmp_path, monkeypatch):
@@ -720,7 +799,7 @@ def test_plans_that_cannot_be(capfd, tmp_path):
 
 SLOW_COMPILE = """
 import sys, jax
-from jaxcal.cli.cache import enable_compilation_cache
+from jaxcal.runtime.jax_cache import enable_compilation_cache
 if sys.argv[1] == "quiet":
     enable_compilation_cache()
 jax.devices()

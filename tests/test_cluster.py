@@ -10,10 +10,12 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
+import distributed
 import pytest
 
-from jaxcal import InputError
+from jaxcal import InputError, __version__
 from jaxcal.cli.main import main
 from jaxcal.study import run_study
 from jaxcal.study.spec import parse_spec
@@ -86,23 +88,105 @@ def same_files(one, two):
     return first == second
 
 
-@pytest.mark.slow
-def test_a_scheduler_and_two_workers_of_which_one_is_killed(here, started, tmp_path, capfd):
-    scheduler = started(
+def said(child, pattern):
+    """What matches in the log of a process of Dask's, once it is there."""
+    while True:
+        line = child.stderr.readline()
+        assert line, "the process is gone"
+        if found := re.search(pattern, line):
+            # Else the pipe fills up, and the process waits.
+            threading.Thread(target=child.stderr.read, daemon=True).start()
+            return found[1]
+
+
+@pytest.fixture
+def scheduler(started):
+    """A process and its address."""
+    child = started(
         "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0",
         "--no-dashboard",
     )  # fmt: skip
-    found = None
-    while found is None:
-        line = scheduler.stderr.readline()
-        assert line, "the scheduler is gone"
-        found = re.search(rf"Scheduler at:\s+({ADDRESS})", line)
-    address = found[1]
-    workers = [
-        started("-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny",
-                "--host", "127.0.0.1", "--no-dashboard")
-        for _ in range(2)
-    ]  # fmt: skip
+    return child, said(child, rf"Scheduler at:\s+({ADDRESS})")
+
+
+AS_WORKER = ("--nthreads", "1", "--no-nanny", "--host", "127.0.0.1", "--no-dashboard")
+
+
+@pytest.fixture
+def other_worker(started, tmp_path):
+    """Start a worker that can import what is installed here, and only that jaxcal, if any."""
+
+    def start(address, version=None):
+        folder = tmp_path / f"packages of {version}"
+        folder.mkdir()
+        for package in Path(distributed.__file__).parents[1].iterdir():
+            if "jaxcal" not in package.name:
+                (folder / package.name).symlink_to(package)
+        if version is not None:
+            (folder / "jaxcal.py").write_text(f"__version__ = {version!r}")
+        code = f"import sys; sys.path.append({str(folder)!r}); "
+        code += "from distributed.cli.dask_worker import main; main()"
+        child = started("-I", "-S", "-c", code, address, *AS_WORKER)
+        return said(child, rf"Start worker at:\s+({ADDRESS})")
+
+    return start
+
+
+def test_workers_that_cannot_compute(scheduler, other_worker, tmp_path, capfd):
+    """Without jaxcal a worker cannot read what is sent to it: Dask would never answer."""
+    address = scheduler[1]
+    without, older = other_worker(address), other_worker(address, "0.0.9")
+    spec, folder = tmp_path / "spec.toml", tmp_path / "out"
+    spec.write_text(SPEC)
+    with distributed.Client(address, set_as_default=False) as client:
+        client.wait_for_workers(2)
+    run = ["study", "run", str(spec), "--out", str(folder), "--dask", address]
+    assert main(run) == 2
+    line = capfd.readouterr().err
+    assert line.count("\n") == 1
+    assert "no worker of the cluster can compute this study: " in line
+    assert f"{without} (No module named 'jaxcal')" in line
+    assert f"{older} (jaxcal 0.0.9, this is {__version__})" in line
+    assert "0 of 80 chunks are done; continue with: jaxcal study run" in line
+
+
+@pytest.mark.slow
+def test_the_other_workers_compute_and_a_killed_scheduler_is_told_of(
+    here, scheduler, other_worker, started, tmp_path
+):
+    process, address = scheduler
+    without = other_worker(address)
+    started("-m", "distributed.cli.dask_worker", address, *AS_WORKER)
+    with distributed.Client(address, set_as_default=False) as client:
+        client.wait_for_workers(2)
+    spec, folder = tmp_path / "spec.toml", tmp_path / "out"
+    spec.write_text(SPEC)
+    store = Store(folder, parse_spec(SPEC))
+    run = ["-m", "jaxcal.cli.main", "study", "run", spec, "--out", folder]
+    study = started(*run, "--dask", address)
+    wait_for(lambda: len(store.present()) >= 5 or study.poll() is not None)
+    process.kill()
+    out, err = study.communicate(timeout=20)
+    done = len(store.present())
+    assert 5 <= done < 80
+    assert (study.returncode, out) == (2, "")
+    again = f"jaxcal study run {spec} --out {folder} --dask {address} --resume"
+    assert err.splitlines() == [
+        f"jaxcal: note: workers left out: {without} (No module named 'jaxcal')",
+        "jaxcal: error: the cluster was lost: its scheduler no longer answers; "
+        f"{done} of 80 chunks are done; continue with: {again}",
+    ]
+    finish = started(*run, "--resume")
+    assert finish.communicate()[0].startswith(f"{folder}: 80 chunks are done, {80 - done} of them")
+    assert same_files(folder, here)
+
+
+@pytest.mark.slow
+def test_a_scheduler_and_two_workers_of_which_one_is_killed(
+    here, scheduler, started, tmp_path, capfd
+):
+    address = scheduler[1]
+    workers = [started("-m", "distributed.cli.dask_worker", address, *AS_WORKER) for _ in range(2)]
     spec, folder = tmp_path / "spec.toml", tmp_path / "out"
     spec.write_text(SPEC)
     store, left = Store(folder, parse_spec(SPEC)), []

@@ -410,6 +410,8 @@ def test_programs_of_jaxs_own_cache_are_not_kept_as_ours(tmp_path):
     assert program_cache.clear() == 1
     assert answer_of(child(env=environment)) == 1
     assert answer_of(child(env=environment)) == 0
+    # Nor ours there as JAX's: under a name of its own nothing would find it again.
+    assert not list((tmp_path / "xla").glob("jit_kept_*"))
 
 
 def test_a_program_that_loads_and_does_not_run_is_compiled_anew(monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import subprocess
 import sys
 from subprocess import PIPE
@@ -11,7 +12,8 @@ from subprocess import PIPE
 import numpy as np
 import pytest
 
-from jaxcal import FormatError, InputError
+from jaxcal import CalibrationError, FormatError, InputError
+from jaxcal.runtime import jax_cache
 from jaxcal.runtime.isolated import python_command
 from jaxcal.study import run_study
 from jaxcal.study.own import Study, study_from, where_defined
@@ -114,11 +116,63 @@ def test_the_class_must_be_one_that_a_worker_can_import(squares):
         study_from(where, '{"colour": 1}')
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"square": np.zeros((1, 5))}, r"square is float64 \(1, 5\) in what .* floats \(2, 5\)"),
+        ({"square": np.full((2, 5), None)}, r"square is object \(2, 5\)"),
+        ({"count": np.array(1.5)}, r"count is float64 \(\) in what .* integers \(\)"),
+        ({"count": None}, "count is missing"),
+    ],
+)
+def test_a_chunk_of_other_arrays_is_not_written(squares, tmp_path, change, said):
+    """It could not be read, which would be found out when all is computed."""
+    kind = type("Wrong", (squares,), {"compute": lambda *given: squares.compute(*given) | change})
+    with pytest.raises(InputError, match=said):
+        run_study(kind(), tmp_path / "study")
+    assert not list((tmp_path / "study" / "chunks").iterdir())
+
+
+def test_a_module_that_a_worker_cannot_import_is_told_of(tmp_path, monkeypatch, capfd):
+    begin = f"import os\nif os.getpid() != {os.getpid()}: raise RuntimeError('no licence here')\n"
+    (tmp_path / "loose_licensed.py").write_text(begin + MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    study = importlib.import_module("loose_licensed").Squares(condition_count=1)
+    with pytest.raises(CalibrationError, match=r"chunk 0 could not be computed: .*no licence here"):
+        run_study(study, tmp_path / "study", workers=1)
+    assert capfd.readouterr().err == ""
+
+
+FOLDERS = """
+
+class Folders(Squares):
+    def compute(self, chunk):
+        import jax
+
+        folder = str(jax.config.jax_compilation_cache_dir)
+        return super().compute(chunk) | {"count": np.array(int(folder.endswith("xla")))}
+"""
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_workers_keep_programs_where_the_command_line_does(wanted, tmp_path, monkeypatch):
+    """Though the command line itself need not import JAX."""
+    (tmp_path / "loose_folders.py").write_text(MODULE + FOLDERS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setattr(jax_cache, "_wanted", wanted)
+    study = importlib.import_module("loose_folders").Folders(condition_count=1)
+    run_study(study, tmp_path / "study", workers=1)
+    found = Store(tmp_path / "study", study).read(study.chunk(0))["count"]
+    assert bool(found) is wanted
+
+
 def test_a_worker_whose_parent_is_gone_ends_without_a_word(squares):
     command = python_command("jaxcal.study.workers")
     worker = subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True)
     study = squares(trials=100_000)
-    given = {"spec": study.canonical(), "where": where_defined(study), "cores": []}
+    given = {"spec": study.canonical(), "where": where_defined(study), "cores": [], "cache": False}
     worker.stdout.close()
     worker.stdin.write(f'{json.dumps(given)}\n{{"chunk": 0}}\n')
     worker.stdin.close()

@@ -332,6 +332,7 @@ def test_a_sequence_with_any_name_goes_on(tmp_path):
     [
         ('b "1", c.png', True),
         ("#1;2 \N{LATIN SMALL LETTER U WITH DIAERESIS}.png", True),
+        ("form\ffeed.png", True),
         ("line\nbreak.png", False),
         ("return\r.png", False),
         (" blank.png", False),
@@ -350,6 +351,15 @@ def test_a_name_that_the_table_cannot_hold_is_refused_before_any_click(tmp_path,
     again = Picks(path, "images", (COLUMNS, ROWS), 2, [0, 1], names)
     assert again.points == {1: (1.0, 2.0)}
     assert list(read_pose_table(path).file or ()) == [name]
+    again.skip(1)
+    again.skip(0)
+    doubled = name.replace('"', '""')
+    assert f'# skipped: "a.png" "{doubled}"' in path.read_text().split("\n")
+    again = Picks(path, "images", (COLUMNS, ROWS), 2, [0, 1], names)
+    assert (again.points, again.skipped) == ({}, {0, 1})
+    path.write_text(path.read_text().replace('"a.png"', '"another.png"'))
+    with pytest.raises(FormatError, match="names a frame that the sequence has not"):
+        Picks(path, "images", (COLUMNS, ROWS), 2, [0, 1], names)
 
 
 def test_two_pages_do_not_lose_each_others_points(tmp_path):

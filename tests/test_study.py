@@ -458,6 +458,20 @@ def test_unwritable_folder(tmp_path, capsys):
         assert "cannot be made or written to" in line
         assert line.count("\n") == 1
     assert occupied.read_text() == "mine"
+    if os.geteuid() != 0:
+        hidden = tmp_path / "hidden"
+        hidden.mkdir(mode=0)
+        assert main(["study", "run", str(path), "--out", str(hidden / "study")]) == 2
+        assert f"{hidden / 'study'}" in capsys.readouterr().err
+    # Somebody else's lock.
+    (tmp_path / "shared" / ".lock").mkdir(parents=True)
+    assert main(["study", "run", str(path), "--out", str(tmp_path / "shared")]) == 2
+    assert "shared/.lock: cannot be written: Is a directory; 0 of" in capsys.readouterr().err
+    # An unset variable of a shell would be the current folder.
+    assert main(["study", "run", str(path), "--out", ""]) == 2
+    assert capsys.readouterr().err == "jaxcal: error: the name of a file or folder is empty\n"
+    with pytest.raises(jaxcal.OutputError, match="null byte"):
+        run_study(parse_spec(small()), "a\0b")
 
 
 @pytest.mark.slow

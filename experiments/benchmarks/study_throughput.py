@@ -29,8 +29,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import study_peer
 from common import arguments, machine, results_folder, write_table
 
-from jaxcal.cli.cache import enable_compilation_cache
 from jaxcal.io.atomic import atomic_path
+from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.study.cluster import compute_from_text
 from jaxcal.study.spec import Spec, parse_spec
 from jaxcal.study.workers import core_groups

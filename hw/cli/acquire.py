@@ -170,7 +170,7 @@ def acquire(
         if (cure := missing(module, extra=extra)) is not None:
             raise InputError(cure)
     path = recording or f"acquisition-{datetime.now():%Y%m%d-%H%M%S}.h5"
-    from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     enable_compilation_cache()
 

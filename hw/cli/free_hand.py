@@ -134,7 +134,7 @@ def free_hand(
             acquire_free_hand(path, asked, person, resume=resume)
         screen.clear()
     from hw.outcome import calibrate_and_print
-    from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     enable_compilation_cache()
     return exit_code([calibrate_and_print(path)])

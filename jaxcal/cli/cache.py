@@ -7,11 +7,7 @@ turns it off.
 
 from __future__ import annotations
 
-import os
 import time
-import warnings
-from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import click
@@ -19,14 +15,10 @@ import click
 from jaxcal import InputError, OutputError
 from jaxcal.calibration.names import Method
 from jaxcal.cli.common import Commands, ExitCode, print_json, print_page, progress
-from jaxcal.runtime import program_cache
-from jaxcal.runtime.when_jax import when_jax_is_imported
+from jaxcal.runtime import jax_cache, program_cache
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
-
-KEPT_PROGRAMS = 256
-"""Newest programs of JAX's own cache to keep; one is about 0.4 MB."""
 
 WARMED_IMAGES = (16, 32, 64)
 """Numbers of images that ``warm`` prepares for, unless it is told others."""
@@ -134,7 +126,7 @@ def clear() -> int:
     """Remove all kept programs."""
     try:
         removed = program_cache.clear()
-        _prune(program_cache.private_folder("xla"), 0)
+        jax_cache.prune(jax_cache.folder(), 0)
     except (OSError, RuntimeError) as error:
         raise OutputError(f"the cache cannot be cleared: {error}") from error
     print_page(f"{removed} programs removed")
@@ -195,47 +187,3 @@ def _repeated(problem: Problem, count: int) -> Problem:
     from jaxcal.runtime import buckets
 
     return buckets.taken(problem, [k % problem.images for k in range(count)])
-
-
-def enable_compilation_cache() -> None:
-    """Let JAX keep what :mod:`jaxcal.runtime.executables` does not; without a word if it cannot.
-
-    Done when JAX is imported, which not every calibration needs.
-
-    And silence the compiler, whose alarms ("Very slow compile?") ask users of XLA to file bugs. It
-    has no option for that but the level of its log, which is the whole process': so only the
-    command line does it, not the library, and not by an environment that other programs inherit.
-    """
-    when_jax_is_imported(_enable_compilation_cache)
-
-
-def _enable_compilation_cache() -> None:
-    # "1" is what importing JAX puts there; anything else is somebody's wish.
-    wished = os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") != "1"
-    if not wished and "JAX_LOGGING_LEVEL" not in os.environ:
-        from jaxlib import utils  # pyright: ignore[reportAttributeAccessIssue]
-
-        with suppress(AttributeError):  # not part of jaxlib's public interface
-            utils.absl_set_min_log_level(3)
-    if not program_cache.is_on():
-        return
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
-    try:
-        folder = program_cache.private_folder("xla")
-        _prune(folder)
-    except (OSError, RuntimeError):
-        return
-    import jax
-
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-    # A damaged entry is compiled anew; that is nothing that a user of the command line can mend.
-    warnings.filterwarnings("ignore", message=".*persistent compilation cache.*")
-
-
-def _prune(folder: Path, kept: int = KEPT_PROGRAMS) -> None:
-    # Not stat: a link that leads nowhere would end it, and nothing would be removed any more.
-    programs = sorted(folder.iterdir(), key=lambda path: path.lstat().st_mtime)
-    for path in programs[: max(len(programs) - kept, 0)]:
-        path.unlink(missing_ok=True)

@@ -206,11 +206,11 @@ def calibrate(
         robust=robust,
     )
     check_request(request)
-    from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.io.hdf5 import load
     from jaxcal.report.accuracy import settle
     from jaxcal.report.next_poses import next_poses_record
     from jaxcal.report.record import calibration_record, check_test_images
+    from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     measured, notes = _segmented(load(recording))
     test_data = None if test is None else _segmented(load(test))[0]

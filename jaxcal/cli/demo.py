@@ -42,10 +42,10 @@ def demo(out: str | None, seed: int, as_json: bool) -> int:
     compiles for a while; later ones take seconds.
     """
     import_engine()
-    from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.io.outputs import check_output, is_simulated
     from jaxcal.report.record import calibration_record
     from jaxcal.report.write import prepare_folder
+    from jaxcal.runtime.jax_cache import enable_compilation_cache
     from jaxcal.study.simulation import Protocol, simulate_recording
 
     with nullcontext() if out is None else prepare_folder(out) as folder:

@@ -24,8 +24,8 @@ def pivot(poses: str, no_robust: bool, as_json: bool) -> int:
     """
     import_engine()
     from jaxcal.calibration.pivot import calibrate_pivot
-    from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.io.text import read_poses
+    from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     measured = read_poses(poses)
     enable_compilation_cache()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ import click
 
 from jaxcal import CalibrationError
 from jaxcal.cli.common import ExitCode
+from jaxcal.cli.interrupts import no_interrupt_lost
 
 
 def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None) -> int:
@@ -34,6 +36,8 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
                 ExitCode.BAD_INPUT,
             )
         _print_anything()
+    # It warns of a home that is read-only, and makes its folder elsewhere; nothing is to be done.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         if arguments is None and (instruction := os.environ.get(_completion_variable(name))):
             from click.shell_completion import shell_complete
@@ -101,7 +105,7 @@ def _invoke(commands: click.Group, name: str, arguments: Sequence[str]) -> int:
     # Not click's own main(): it prints a blank line when interrupted, and ends the process itself
     # when a pipe was closed early.
     try:
-        with commands.make_context(name, list(arguments)) as context:
+        with no_interrupt_lost(), commands.make_context(name, list(arguments)) as context:
             return commands.invoke(context) or 0
     except click.exceptions.Exit as done:
         return done.exit_code

@@ -112,12 +112,12 @@ def segment(
     if sound_speed is not None and temperature is not None:
         raise InputError("--sound-speed and --temperature exclude each other")
     import_engine()
-    from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.data.segmentation.segment import segment_recording
     from jaxcal.io.atomic import check_writable
     from jaxcal.io.hdf5 import load, save
     from jaxcal.io.outputs import check_output, is_recording
     from jaxcal.io.readable import naming
+    from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     target = _default_out(recording) if out is None else out
     # REC itself may be replaced: all of it is in the output.

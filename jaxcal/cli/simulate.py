@@ -79,9 +79,9 @@ def simulate(
 
     check_output(out, "a simulated recording", is_simulated)
     import_engine()
-    from jaxcal.cli.cache import enable_compilation_cache
     from jaxcal.data.probe import PRESETS
     from jaxcal.io.hdf5 import save
+    from jaxcal.runtime.jax_cache import enable_compilation_cache
     from jaxcal.study.simulation import Protocol, simulate_recording
 
     protocol = Protocol(

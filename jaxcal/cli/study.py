@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from jaxcal import CalibrationError, InputError, MissingExtraError
 from jaxcal.cli.common import Commands, ExitCode, print_json, print_page
 
 if TYPE_CHECKING:
@@ -51,22 +52,28 @@ def run(spec: str, out: str, resume: bool, workers: int | None, dask: str | None
     from jaxcal.study.spec import load_spec
 
     checked = load_spec(spec)
-    from jaxcal.cli.cache import enable_compilation_cache
+    from jaxcal.runtime.jax_cache import enable_compilation_cache
     from jaxcal.study.run import run_study
     from jaxcal.study.store import Store
 
     enable_compilation_cache()
-    again = _command(spec, out, workers, dask)
+    store, again = Store(out, checked), _command(spec, out, workers, dask)
+
+    def kept() -> str:
+        done = len(store.present())
+        return f"{done} of {checked.chunk_count} chunks are done; continue with: {again}"
+
     try:
         with _watching() as watcher:
             summary = run_study(
                 checked, out, resume=resume, workers=workers or 0, scheduler=dask, watcher=watcher
             )
     except KeyboardInterrupt:
-        done = len(Store(out, checked).present())
-        raise KeyboardInterrupt(
-            f"interrupted: {done} of {checked.chunk_count} chunks are done; continue with: {again}"
-        ) from None
+        raise KeyboardInterrupt(f"interrupted: {kept()}") from None
+    except (InputError, MissingExtraError):
+        raise
+    except CalibrationError as error:
+        raise CalibrationError(f"{error}; {kept()}" if store.is_begun() else str(error)) from error
     rate = summary.trials / max(summary.seconds, 1e-9)
     click.echo(
         f"{out}: {summary.chunks} chunks are done, {summary.computed} of them now "

@@ -14,11 +14,14 @@ def path_name(path: object) -> str:
     """A path as text.
 
     Raises:
-        InputError: it is neither text nor a ``pathlib.Path``.
+        InputError: it is neither text nor a ``pathlib.Path``, or it is empty, which Python takes
+            for the current folder.
     """
     name = os.fspath(path) if isinstance(path, str | os.PathLike) else None
     if not isinstance(name, str):
         raise InputError(f"the name of a file must be text or a pathlib.Path, not {shown(path)}")
+    if not name:
+        raise InputError("the name of a file or folder is empty")
     return name
 
 
@@ -84,7 +87,7 @@ def shown(value: object) -> str:
 @contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
     """Put a file's name in front of the messages of errors that do not begin with it."""
-    name = os.fspath(path)
+    name = path_name(path)
     try:
         yield
     except InputError as error:

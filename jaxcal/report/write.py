@@ -19,7 +19,7 @@ from jaxcal.calibration.result import Calibration
 from jaxcal.calibration.saved import is_calibration_record
 from jaxcal.data.recording import Recording
 from jaxcal.io.atomic import STAGED, replace_files, write_text
-from jaxcal.io.readable import one_line
+from jaxcal.io.readable import one_line, path_name
 from jaxcal.report.convergence import Curve
 from jaxcal.report.verdict import verdict
 
@@ -61,7 +61,7 @@ def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         InputError: files of a report's names are there, but no report.
         OutputError: it cannot be made or written to.
     """
-    folder = Path(path)
+    folder = Path(path_name(path))
     made: list[Path] = []
     try:
         try:

@@ -28,6 +28,7 @@ import sys
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from importlib import metadata
@@ -260,6 +261,7 @@ def _compile(
     known = compiler.known(device.platform, flags)
     lowered = jax.jit(flat, keep_unused=True).lower(*shapes)
     executable = lowered.compile(compiler_options=known).runtime_executable()
+    _remove_from_jaxs_cache(flat.__name__)
     program = _Program(executable, device, results[0], from_disk=False)
     if "custom_call" in lowered.as_text():
         return program
@@ -276,6 +278,14 @@ def _compile(
         return program
     program_cache.write(key, header, content)
     return program
+
+
+def _remove_from_jaxs_cache(name: str) -> None:
+    """Remove what JAX has kept under a unique name: nobody finds it again, and it would pile up."""
+    folder: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    with suppress(OSError):
+        for path in Path(folder).glob(f"jit_{name}-*") if folder else ():
+            path.unlink()
 
 
 def _device(leaves: list[Any]) -> Any:

@@ -124,3 +124,27 @@ def study_from(where: dict[str, str], canonical: str) -> Study:
     except (ImportError, AttributeError, KeyError) as error:
         raise InputError(f"the study's class cannot be imported: {error}") from None
     return kind.from_canonical(canonical)
+
+
+def computed(study: Study, chunk: Chunk) -> dict[str, np.ndarray]:
+    """What a study computes of a chunk, checked: a file of anything else could not be read.
+
+    Raises:
+        InputError: it is not what the study says that a chunk holds.
+    """
+    results, wanted = study.compute(chunk), study.arrays(chunk)
+    return {name: _as_wanted(name, results.get(name), wanted[name]) for name in wanted}
+
+
+def _as_wanted(name: str, values: object, wanted: ArraySpec) -> np.ndarray:
+    found = np.asarray(values)
+    if wanted.kind == "f" and found.dtype.kind in "iuf":
+        # JAX may have been told to run in 32 bits; the file's types do not depend on it.
+        found = found.astype(np.float64, copy=False)
+    if found.dtype.kind != wanted.kind or found.shape != wanted.shape:
+        has = "is missing" if values is None else f"is {found.dtype} {found.shape}"
+        raise InputError(
+            f"{name} {has} in what the study's compute returned; its arrays say "
+            f"{'floats' if wanted.kind == 'f' else 'integers'} {wanted.shape}"
+        )
+    return found

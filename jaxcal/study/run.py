@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from jaxcal import FormatError, InputError
+from jaxcal import FormatError, InputError, OutputError
 from jaxcal.calibration.inputs import whole_number
-from jaxcal.io.readable import shown
+from jaxcal.io.readable import one_line, shown
 from jaxcal.study.cluster import compute_on_cluster, connected
-from jaxcal.study.own import Study
+from jaxcal.study.own import Study, computed
 from jaxcal.study.spec import Chunk
 from jaxcal.study.store import Store
 
@@ -125,7 +125,7 @@ def run_study(
             missing, done = _missing(store, watcher)
             watcher.begin(spec.condition_count * spec.trials, done)
             trials = 0
-            with closing(_computed(spec, missing, workers, client)) as results:
+            with closing(_computed(spec, missing, workers, client, watcher)) as results:
                 for chunk, arrays, maker in results:
                     store.write(chunk, arrays, maker)
                     trials += chunk.stop - chunk.start
@@ -156,12 +156,12 @@ def _missing(store: Store, watcher: Watcher) -> tuple[list[Chunk], int]:
 
 
 def _computed(
-    spec: Study, missing: list[Chunk], workers: int, client: Client | None
+    spec: Study, missing: list[Chunk], workers: int, client: Client | None, watcher: Watcher
 ) -> Generator[Computed]:
     if not missing:
         return
     if client is not None:
-        yield from compute_on_cluster(client, spec, missing)
+        yield from compute_on_cluster(client, spec, missing, watcher.note)
     elif workers:
         from jaxcal.study.workers import compute_on_workers, core_groups
 
@@ -175,7 +175,7 @@ def _compute_here(spec: Study, missing: Iterable[Chunk]) -> Iterator[Computed]:
     from jaxcal.study.pipeline import made_by
 
     for chunk in missing:
-        yield chunk, spec.compute(chunk), made_by()
+        yield chunk, computed(spec, chunk), made_by()
 
 
 @contextmanager
@@ -184,7 +184,12 @@ def _locked(folder: Path) -> Iterator[None]:
     if fcntl is None:
         yield
         return
-    with (folder / ".lock").open("wb") as lock:
+    path = folder / ".lock"
+    try:
+        lock = path.open("wb")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {one_line(error)}") from error
+    with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

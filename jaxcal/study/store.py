@@ -29,7 +29,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import atomic_path, write_text
-from jaxcal.io.readable import check_readable, one_line
+from jaxcal.io.readable import check_readable, one_line, path_name
 from jaxcal.io.untrusted import array, child, number, open_root, text
 from jaxcal.study.own import Study
 from jaxcal.study.spec import MAXIMUM_BYTES, Chunk, Spec
@@ -50,7 +50,7 @@ class Store(Generic[S]):
     """
 
     def __init__(self, folder: str | os.PathLike[str], spec: S) -> None:
-        self.folder = Path(folder)
+        self.folder = Path(path_name(folder))
         self.spec = spec
 
     @classmethod
@@ -67,7 +67,7 @@ class Store(Generic[S]):
             OutputError: the folder cannot be made or written to. Nothing was written then.
         """
         store = cls(folder, spec)
-        if store._spec_path.exists():
+        if store.is_begun():
             found = read_spec(folder, type(spec))
             if found.sha256 != spec.sha256:
                 raise InputError(
@@ -81,9 +81,9 @@ class Store(Generic[S]):
                 )
             store._make_folder()
             return store
-        if any(store.folder.glob("chunks/chunk-*.h5")):
-            raise InputError(f"{folder}: holds results but no spec.json: choose another folder")
         store._make_folder()
+        if store.present():
+            raise InputError(f"{folder}: holds results but no spec.json: choose another folder")
         write_text(store._spec_path, spec.canonical() + "\n")
         return store
 
@@ -96,6 +96,11 @@ class Store(Generic[S]):
         """
         return Store(folder, read_spec(folder))
 
+    def is_begun(self) -> bool:
+        """Whether the folder holds a study."""
+        # Not Path.exists, which fails where a folder above may not be looked into.
+        return os.path.exists(self._spec_path)
+
     def path(self, chunk: Chunk) -> Path:
         """The file of a chunk."""
         return self.folder / "chunks" / f"chunk-{chunk.index:06d}.h5"
@@ -107,7 +112,7 @@ class Store(Generic[S]):
             names = os.listdir(folder)
         except FileNotFoundError:
             return []
-        except OSError as error:
+        except (OSError, ValueError) as error:
             raise FormatError(f"{folder}: cannot be read: {one_line(error)}") from None
         found = [re.fullmatch(r"chunk-(\d{6,7})\.h5", name) for name in names]
         indices = {int(match[1]) for match in found if match}
@@ -118,7 +123,7 @@ class Store(Generic[S]):
 
         Args:
             chunk: which.
-            results: as :meth:`jaxcal.study.Study.compute` returns them.
+            results: of :func:`jaxcal.study.own.computed`.
             maker: what computed it, as :func:`jaxcal.study.pipeline.made_by` says it.
 
         Raises:
@@ -126,14 +131,8 @@ class Store(Generic[S]):
         """
         path = self.path(chunk)
         start = chunk.condition * self.spec.trials
-        # JAX may have been told to run in 32 bits; the file's types do not depend on it.
         wanted = self.spec.arrays(chunk)
-        results = {
-            name: results[name].astype(np.float64, copy=False)
-            if results[name].dtype.kind == "f"
-            else results[name]
-            for name in wanted
-        }
+        results = {name: results[name] for name in wanted}
         with atomic_path(path) as temporary:
             # HDF5 notices a full disk only when it closes the file, and then loses the reason. A
             # file that is made in memory and written in one go reports it.
@@ -247,10 +246,10 @@ def read_spec(folder: str | os.PathLike[str], kind: type[Any] = Spec) -> Any:
     Raises:
         FormatError: there is none, or it is damaged.
     """
-    path = Path(folder) / "spec.json"
-    if not Path(folder).is_dir():
+    path = Path(path_name(folder)) / "spec.json"
+    if not os.path.isdir(folder):
         raise FormatError(f"{folder}: no such folder")
-    if not path.exists():
+    if not os.path.exists(path):
         raise FormatError(f"{folder}: holds no study (no spec.json)")
     check_readable(path, maximum_bytes=8 * MAXIMUM_BYTES)
     try:

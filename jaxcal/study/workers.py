@@ -15,15 +15,17 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from jaxcal import CalibrationError
 from jaxcal.io.readable import one_line
+from jaxcal.runtime import jax_cache
 from jaxcal.runtime.isolated import python_command
-from jaxcal.study.own import Study, study_from, where_defined
+from jaxcal.study.own import Study, computed, study_from, where_defined
 from jaxcal.study.spec import Chunk
 
 MOST_DEATHS = 3
@@ -42,13 +44,13 @@ class Worker:
     """
 
     def __init__(self, spec: Study, cores: set[int]) -> None:
-        cache = None
-        if "jax" in sys.modules:
-            # Workers keep compiled programs in the same folder as this process.
-            cache = getattr(sys.modules["jax"].config, "jax_compilation_cache_dir", None)
+        # Workers keep compiled programs in the same folder as this process.
+        folder = None
+        if "jax" in sys.modules and not jax_cache.is_wanted():
+            folder = getattr(sys.modules["jax"].config, "jax_compilation_cache_dir", None)
         environment = {**os.environ, **_ONE_THREAD}
-        if cache is not None:
-            environment.setdefault("JAX_COMPILATION_CACHE_DIR", cache)
+        if folder is not None:
+            environment.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
         # In a session of its own: Ctrl-C reaches the parent, which ends its workers.
         self.process = subprocess.Popen(
             python_command("jaxcal.study.workers"),
@@ -66,6 +68,7 @@ class Worker:
                     "spec": spec.canonical(),
                     "where": where_defined(spec),
                     "cores": sorted(cores),
+                    "cache": jax_cache.is_wanted(),
                 }
             )
 
@@ -202,7 +205,13 @@ def main() -> None:
     if given["cores"] and hasattr(os, "sched_setaffinity"):
         # Before JAX is imported, since JAX counts the cores.
         os.sched_setaffinity(0, given["cores"])
-    spec = study_from(given["where"], given["spec"])
+    if given["cache"]:
+        jax_cache.enable_compilation_cache()
+
+    @cache
+    def spec() -> Study:
+        return study_from(given["where"], given["spec"])
+
     try:
         for line in requests:
             _answer(answers, spec, json.loads(line)["chunk"])
@@ -211,11 +220,13 @@ def main() -> None:
         os._exit(1)
 
 
-def _answer(answers: BinaryIO, spec: Study, index: int) -> None:
-    from jaxcal.study.pipeline import made_by
-
+def _answer(answers: BinaryIO, spec: Callable[[], Study], index: int) -> None:
     try:
-        arrays = spec.compute(spec.chunk(index))
+        # What cannot be imported is told as what cannot be computed is.
+        from jaxcal.study.pipeline import made_by
+
+        study = spec()
+        arrays = computed(study, study.chunk(index))
         found = {name: np.asarray(values, order="C") for name, values in arrays.items()}
         described = [[name, values.dtype.str, list(values.shape)] for name, values in found.items()]
         header: dict[str, Any] = {"arrays": described, "maker": made_by()}

@@ -5,7 +5,8 @@
     frame,u,v
     0,123.25,45.5
 
-For a folder of images the first column is ``file``, the image's name in quotes.
+For a folder of images the first column is ``file``, and images are named, in quotes, wherever a
+frame of a sequence has its number.
 
 ``jaxcal import`` reads it as any other table of points. The two comments make it possible to
 continue later: the first says which sequence the points belong to, the second which frames have no
@@ -136,7 +137,7 @@ class Picks:
             points[frame] = point
         others = {k for k in self.skipped if k != frame} | ({frame} if skipped else set())
         rows = [f"{self._named(k)},{points[k][0]!r},{points[k][1]!r}" for k in sorted(points)]
-        told = " ".join(map(str, sorted(others)))
+        told = " ".join(map(self._named, sorted(others)))
         column = "file" if self.files else "frame"
         head = [self._head, f"{_SKIPPED} {told}".rstrip(), f"{column},u,v"]
         # Points that a second page or an editor has put there must not be lost.
@@ -162,7 +163,8 @@ class Picks:
         return f'"{doubled}"'
 
     def _load(self, content: str, count: int) -> None:
-        lines = content.splitlines()
+        # Not splitlines: an image's name may hold what that takes for the end of a line.
+        lines = re.split(r"\r?\n", content.rstrip("\r\n"))
         if not lines[0].startswith(_HEAD):
             raise FormatError(f"{self.path}: exists and was not made by jaxcal pick: name another")
         if lines[0] != self._head:
@@ -171,17 +173,19 @@ class Picks:
                 f"{self._head.removeprefix(_HEAD)!r}: name another file"
             )
         told = lines[1].removeprefix(_SKIPPED) if len(lines) > 1 else ""
-        if not re.fullmatch(r"[\d ]*", told):
+        one = r'"(?:[^"]|"")*"' if self.files else r"\d{1,9}"
+        if not re.fullmatch(rf" *({one}( +{one})*)? *", told):
             raise FormatError(f"{self.path}: line 2 does not list skipped frames")
-        self.skipped = {int(number) for number in told.split() if len(number) < 10}
+        numbers = {self._named(k): k for k in range(count)}
+        self.skipped = {numbers.get(named, count) for named in re.findall(one, told)}
         if len(lines) > 3:
             table = read_pose_table(self.path)
             frames = table.file if self.files else table.frame
             if frames is None or table.points is None:
                 column = "file" if self.files else "frame"
                 raise FormatError(f"{self.path}: has no columns {column}, u and v")
-            places = {name: k for k, name in enumerate(self.files)}
             if self.files:
+                places = {name: k for k, name in enumerate(self.files)}
                 frames = [places.get(str(name), count) for name in frames]
             self.points = {
                 int(frame): (float(u), float(v))
