@@ -394,16 +394,16 @@ def test_derivatives_of_planes_leave_out_what_vanishes():
         return [x * y + 3.0, jnp.sin(z), 2.0 * x - z, jnp.ones_like(x)]
 
     x, y, z = (jnp.asarray([[value]]) for value in (2.0, 5.0, 0.3))
-    assert derivatives.depends(function, [x, y, z]) == [{0, 1}, {2}, {0, 2}, set()]
-    values, rows = derivatives.first(function, [x, y, z])
-    np.testing.assert_allclose(np.ravel(values), [13, np.sin(0.3), 3.7, 1])
+    traced = jax.make_jaxpr(function)(x, y, z)
+    assert derivatives.depends(traced) == [{0, 1}, {2}, {0, 2}, set()]
+    rows = derivatives.first(traced, [x, y, z])
     zeros = [[unrolled.is_zero(entry) for entry in row] for row in rows]
     assert zeros == [[False, False, True], [True, True, False], [False, True, False], [True] * 3]
     np.testing.assert_allclose(
         [rows[0][0][0, 0], rows[0][1][0, 0], rows[1][2][0, 0], rows[2][0][0, 0], rows[2][2][0, 0]],
         [5, 2, np.cos(0.3), 2, -1],
     )
-    bends = derivatives.second(function, [x, y, z])
+    bends = derivatives.second(traced, [x, y, z])
     assert set(bends) == {(0, 0, 1), (1, 2, 2)}
     np.testing.assert_allclose(bends[0, 0, 1], [[1]])
     np.testing.assert_allclose(bends[1, 2, 2], [[-np.sin(0.3)]])

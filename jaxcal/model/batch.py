@@ -294,7 +294,7 @@ def _sums(planes: tuple[Array, ...]) -> tuple[Array, ...]:
 @jax.jit
 def _reduced(planes: tuple[Array, ...], zero: Array) -> tuple[Array, ...]:
     def plus(a: tuple, b: tuple) -> tuple:
-        return tuple(x + y for x, y in zip(a, b, strict=True))
+        return tuple(jax.lax.add(x, y) for x, y in zip(a, b, strict=True))
 
     return tuple(jax.lax.reduce(planes, (zero,) * len(planes), plus, (planes[0].ndim - 1,)))
 

@@ -1,4 +1,4 @@
-"""Flags with which XLA compiles our programs on a CPU; elsewhere its defaults apply.
+"""How our programs are traced and compiled: XLA's flags on a CPU; elsewhere its defaults apply.
 
 Two aims contradict each other. Plain batches hold millions of problems, and their inner loops
 should run as fast as the hardware allows: :func:`fast_to_run`. For one problem, a person waits for
@@ -148,6 +148,25 @@ def computed_once(make: Callable[[], T], witness: ArrayLike) -> T:
     return jax.lax.cond(
         taken, make, lambda: jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), nothing)
     )
+
+
+def traced_once(function: Callable[..., T], *arguments: Any) -> tuple[Callable[..., T], T]:
+    """A function as JAX traces it with these arguments, and zeros like its result.
+
+    A loop that begins without a result needs its shapes before the loop calls the function; tracing
+    it for each of the two would take twice as long.
+    """
+    import jax
+    import jax.numpy as jnp
+    from jax.extend.core import jaxpr_as_fun
+
+    traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+
+    def again(*arguments: Any) -> T:
+        found = jaxpr_as_fun(traced)(*jax.tree.leaves(arguments))
+        return jax.tree.unflatten(jax.tree.structure(shapes), found)
+
+    return again, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 def is_whole_program(*arguments: object) -> bool:

@@ -90,12 +90,15 @@ def solve_some_chunks(
     def solved(index: Array) -> Calibration:
         return solve_problems(jax.tree.map(lambda leaf: leaf[index], parts), given, plan)
 
+    solved, nothing = compiler.traced_once(solved, used)
+
     def body(index: Array, found: Calibration) -> Calibration:
         one = solved(index)
         return jax.tree.map(lambda all_of, part: all_of.at[index].set(part), found, one)
 
-    shapes = jax.eval_shape(solved, used)
-    empty = jax.tree.map(lambda leaf: jnp.zeros((count // chunk, *leaf.shape), leaf.dtype), shapes)
+    empty = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (count // chunk, *leaf.shape)), nothing
+    )
     found = jax.lax.fori_loop(0, used, body, empty)
     return jax.tree.map(lambda leaf: leaf.reshape((count, *leaf.shape[2:])), found)
 

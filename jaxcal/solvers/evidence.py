@@ -31,6 +31,7 @@ from jaxtyping import Array, Float
 
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, picked
 from jaxcal.model.observations import MediumPrior, Observation
+from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
 from jaxcal.solvers.normal_equations import (
     ComponentSums,
@@ -199,6 +200,8 @@ def tune(
         sigma, step = jax.lax.fori_loop(0, UPDATES, update, (sigma, none))
         return barrier((place.moved(step[:-1]), mean + step[-1], sigma, trust))
 
+    sums_at, none = traced_once(sums_at, place)
+
     # The code of the sums appears once, for the rounds and the result: it is half of the program.
     def one_round(index: Array, state: tuple) -> tuple:
         place, mean, sigma, trust, _ = state
@@ -211,8 +214,6 @@ def tune(
         return place, mean, sigma, trust, sums
 
     zero = jnp.zeros_like(start[0])
-    shapes = jax.eval_shape(sums_at, place)
-    none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     state = (place, zero, start, zero + 1, none)
     place, mean, sigma, trust, sums = jax.lax.fori_loop(0, rounds + 1, one_round, state)
     return NoiseModel(place, mean, sigma, sums, trust)

@@ -48,6 +48,7 @@ from jaxcal.model import unrolled
 from jaxcal.model.batch import RIGID_UNKNOWNS, barrier, picked, total
 from jaxcal.model.shapes import Family, Moments, tilted
 from jaxcal.model.unrolled import Matrix, Vector
+from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
 from jaxcal.solvers.normal_equations import pairs, square_places, stacked
 
@@ -274,15 +275,14 @@ def propagate(
     parts: list[_Found] = []
     if turns:
         family, law, fresh = (jnp.asarray(column) for column in zip(*turns, strict=True))
+        # The first turn starts afresh, so it does not use this state.
+        gaussian, start = traced_once(under.gaussian, sd[0])
 
         def one(state: _State, turn: tuple) -> tuple[_State, _Found]:
             family, sd, fresh = turn
-            state = jax.lax.cond(fresh, lambda: under.gaussian(sd), lambda: state)
+            state = jax.lax.cond(fresh, lambda: gaussian(sd), lambda: state)
             return under.swept(family, sd, state, sweeps)
 
-        # The first turn starts afresh, so it does not use this state.
-        shape = jax.eval_shape(under.gaussian, sd[0])
-        start = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
         parts.append(jax.lax.scan(one, start, (family, sd[law], fresh))[1])
     for k in exact:
         last.append((k, len(turns) + exact.index(k)))

@@ -32,6 +32,7 @@ from __future__ import annotations
 from functools import cache
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -128,15 +129,20 @@ def _derive(
             return observation.components_at(here, at[-1], beside, images)
         return observation.components(here, beside, images)
 
-    components = evaluate(*arguments)
-    slopes, bends = [], []
-    for k in range(len(components)):
+    def errors(*at: Array) -> Vector:
+        return [plane for component in evaluate(*at) for plane in component.errors]
 
-        def errors(*at: Array, k=k) -> Vector:
-            return evaluate(*at)[k].errors
-
-        slopes.append(derivatives.first(errors, arguments)[1])
-        bends.append(derivatives.second(errors, arguments) if exact else {})
+    components, traced = evaluate(*arguments), jax.make_jaxpr(errors)(*arguments)
+    rows = derivatives.first(traced, arguments)
+    bent = derivatives.second(traced, arguments) if exact else {}
+    slopes, bends, start = [], [], 0
+    for component in components:
+        stop = start + len(component.errors)
+        slopes.append(rows[start:stop])
+        bends.append(
+            {(row - start, *by): bend for (row, *by), bend in bent.items() if start <= row < stop}
+        )
+        start = stop
     return _Derived(unknowns, components, slopes, bends, free)
 
 

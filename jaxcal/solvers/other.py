@@ -17,6 +17,7 @@ from jaxcal.calibration.options import Options
 from jaxcal.model.batch import ImagePlanes, Iterate, choose, targets
 from jaxcal.model.observations import Further, MediumPrior, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
+from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate, component_sums
 from jaxcal.solvers.reml import update_at, with_floor
@@ -143,6 +144,8 @@ def self_tuned_with(
         updated = update_at(fit.place, sigma, observation, images, medium)[1]
         return eqx.tree_at(lambda f: f.updated, fit, updated)
 
+    solve, empty = traced_once(solve, start, first)
+
     def unfinished(state: tuple) -> Array:
         _, _, rounds, change, _ = state
         return jnp.any(change > tolerance) & (rounds < max_rounds)
@@ -161,8 +164,6 @@ def self_tuned_with(
         )
         return after, sigma, rounds + 1, change, taken
 
-    shapes = jax.eval_shape(solve, start, first)
-    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     empty = eqx.tree_at(lambda fit: fit.place, empty, start)
     one = jnp.ones_like(first[0])
     state = (empty, first, jnp.zeros((), jnp.int32), one, jnp.zeros(one.shape, jnp.int32))

@@ -40,6 +40,7 @@ from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose, total
 from jaxcal.model.observations import InPlane
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.unknowns import EXTRA, TABLE, Blocks
+from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
 from jaxcal.solvers.levenberg_marquardt import Descent, minimise
 
@@ -279,6 +280,7 @@ def conventional(
         minimise, damping=0.0 if undamped else 1e-3, max_steps=max_steps, trace=trace
     )
     observation = InPlane.of(images)
+    fit_from, empty = traced_once(fit_from, start, observation, images)
 
     # The loop's first round starts in closed form. It has further rounds only where some lane's
     # start was unsound, so the search costs nothing where it is not needed.
@@ -296,8 +298,6 @@ def conventional(
         once = fitted & (state[0] == 0)
         return once | (jnp.any(~sound) & (state[0] <= len(cubes)))
 
-    shapes = jax.eval_shape(fit_from, start, observation, images)
-    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     _, fit = jax.lax.while_loop(unfinished, one_round, (jnp.zeros((), jnp.int32), empty))
     if not fitted:
         # A sound lane keeps its start, even if other lanes needed the search.
