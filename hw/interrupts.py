@@ -59,7 +59,7 @@ def heed_interrupt() -> None:
     The first one may have been dropped: Python only reports exceptions of finalisers and of
     callbacks of the garbage collector (JAX has one), Tk those of its callbacks, and both go on.
     Whatever moves the robot, or waits for a person in a window, calls this: a stop must not depend
-    on the command line's own remedy (:mod:`jaxcal.cli.interrupts`).
+    on the remedy of the command line (:mod:`jaxcal.runtime.interrupts`).
     """
     if _asked:
         raise KeyboardInterrupt

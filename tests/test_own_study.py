@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from subprocess import PIPE
 
 import numpy as np
@@ -17,6 +19,7 @@ from jaxcal.runtime import jax_cache
 from jaxcal.runtime.isolated import python_command
 from jaxcal.study import run_study
 from jaxcal.study.own import Study, study_from, where_defined
+from jaxcal.study.run import Silence
 from jaxcal.study.store import Store
 
 MODULE = """
@@ -189,3 +192,22 @@ def test_a_file_names_the_versions_that_computed_it_not_those_that_wrote_it(tmp_
     maker = {"jaxcal": "9.9.9", "jax": "8.8.8", "device": "4 x gpu"}
     store.write(chunk, study.compute(chunk), maker)
     assert store.versions(chunk) == "jaxcal 9.9.9, jax 8.8.8, 4 x gpu"
+
+
+def test_ctrl_c_in_a_destructor_interrupts_a_study_called_from_python(squares, tmp_path):
+    """Python drops what destructors raise; the study is interrupted all the same, and resumed."""
+
+    class Interrupted:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    class Watcher(Silence):
+        def advance(self, trials):
+            Interrupted()
+            # Waiting is ended.
+            time.sleep(60)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_study(squares(), tmp_path / "out", watcher=Watcher())
+    assert len(Store(tmp_path / "out", squares()).present()) == 1
+    assert run_study(squares(), tmp_path / "out", resume=True).computed == 2

@@ -13,7 +13,7 @@ import click
 
 from jaxcal import CalibrationError
 from jaxcal.cli.common import ExitCode
-from jaxcal.cli.interrupts import no_interrupt_lost
+from jaxcal.runtime.interrupts import no_interrupt_lost
 
 
 def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None) -> int:

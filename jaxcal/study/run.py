@@ -15,6 +15,7 @@ import numpy as np
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.calibration.inputs import whole_number
 from jaxcal.io.readable import one_line, shown
+from jaxcal.runtime.interrupts import no_interrupt_lost
 from jaxcal.study.cluster import compute_on_cluster, connected
 from jaxcal.study.own import Study, computed
 from jaxcal.study.spec import Chunk
@@ -118,7 +119,10 @@ def run_study(
     watcher = Silence() if watcher is None else watcher
     begun = time.monotonic()
     # First of all, so that no folder is made where nothing can be computed.
-    with nullcontext() if scheduler is None else connected(scheduler) as client:
+    with (
+        no_interrupt_lost(),
+        nullcontext() if scheduler is None else connected(scheduler) as client,
+    ):
         store = Store.create(folder, spec, resume=resume)
         with _locked(store.folder):
             store.sweep()
