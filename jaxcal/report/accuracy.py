@@ -178,7 +178,8 @@ def _influence(
     found: Influence, weight: Float[np.ndarray, "p p"], used: np.ndarray
 ) -> dict[str, Any]:
     moved, expected = in_image(found, weight)
-    strongest = [int(k) for k in np.argsort(-moved)[:_MOST_NAMED] if used[k]]
+    known = used & np.isfinite(moved)
+    strongest = [int(k) for k in np.argsort(-moved)[:_MOST_NAMED] if known[k]]
     return {
         "moved_mm": np.where(used, moved, np.nan),
         "expected_mm": np.where(used, expected, np.nan),

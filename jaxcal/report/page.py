@@ -469,9 +469,10 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
     ]
     influence = record["influence"]
     if influence is not None:
-        moved = [influence["moved_mm"][int(k)] or 0.0 for k in used]
+        moved = influence["moved_mm"]
+        shown = [int(k) for k in used if moved[int(k)] is not None]
         third = svg.series(
-            [("moves it (mm)", images, moved, svg.BLUE)],
+            [("moves it (mm)", shown, [moved[k] for k in shown], svg.BLUE)],
             influence["most"][:3],
             "How far leaving out an image would move the calibration, mm at the image",
             height=120.0,
