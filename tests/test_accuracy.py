@@ -185,6 +185,9 @@ def test_an_image_that_alone_determines_a_direction_does_not_multiply_the_error(
     assert record["influence"]["moved_mm"][0] is None
     assert 0 not in record["influence"]["most"]
     assert record["tre"]["rms_mm"] == pytest.approx(record["tre"]["stated_mm"])
+    # Its offsets fit themselves, so it predicts no image more closely than the conventional fit.
+    assert record["comparison"]["log_density_gain"] is None
+    assert not any("log density" in line for line in result.verdict())
     assert "<svg" in result._repr_html_()
 
 

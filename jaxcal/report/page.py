@@ -525,7 +525,7 @@ def _comparison(record: dict[str, Any]) -> str:
         ("residual, root mean square (mm)", "conventional_rms_mm", "rms_mm", ".3f"),
         ("error at the image by the noise found (mm)", "conventional_tre_mm", "tre_mm", ".3f"),
     )
-    gain = (
+    gain = beside["log_density_gain"] is not None and (
         "<tr><td>images left out, log density</td><td class='n'>0</td><td class='n'>"
         f"{_number(record, 'comparison.log_density_gain', '+.1f')} ± "
         f"{_number(record, 'comparison.log_density_gain_sd', '.1f')}</td></tr>"
@@ -538,7 +538,7 @@ def _comparison(record: dict[str, Any]) -> str:
     return _section(
         "Beside the conventional fit",
         '<div class="wide"><table><tr><th></th><th class="n">conventional</th><th class="n">'
-        f"{escape(record['method'])}</th></tr>{cells}{gain}</table></div>",
+        f"{escape(record['method'])}</th></tr>{cells}{gain or ''}</table></div>",
         _paragraphs(believe(record)),
     )
 
