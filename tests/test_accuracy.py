@@ -172,6 +172,25 @@ def test_leaving_an_image_out_is_foretold(result):
     np.testing.assert_allclose(found.shares.sum(axis=0), found.model_covariance, rtol=1e-6)
 
 
+def test_an_image_that_alone_determines_a_direction_does_not_multiply_the_error():
+    """Only image 0 rests on its bound. Its leverage is 1, and the alternation stops early."""
+    simulated = jaxcal.simulate_recording(jaxcal.Protocol(images=20), 3).calibration
+    problem = jaxcal.Problem.from_arrays(simulated.poses, simulated.measurements)
+    result = jaxcal.calibrate(problem, "alternating")
+    assert np.flatnonzero(result.at_bound).tolist() == [0]
+    found = influence_of(result)
+    assert np.isnan(found.moved[0]).all()
+    assert np.isfinite(found.moved[1:]).all()
+    record = result.record()
+    assert record["influence"]["moved_mm"][0] is None
+    assert 0 not in record["influence"]["most"]
+    assert record["tre"]["rms_mm"] == pytest.approx(record["tre"]["stated_mm"])
+    # Its offsets fit themselves, so it predicts no image more closely than the conventional fit.
+    assert record["comparison"]["log_density_gain"] is None
+    assert not any("log density" in line for line in result.verdict())
+    assert "<svg" in result._repr_html_()
+
+
 @pytest.mark.parametrize("tracker_sd", [None, 0.2])
 def test_whitened_errors_are_those_of_the_solve(tracker_sd):
     """Their normal matrix is the solve's information, and their gradient vanishes there."""

@@ -60,8 +60,9 @@ class Influence:
     """The effect of images and kinds of errors on the unknowns of one calibration.
 
     Attributes:
-        moved: by how much the unknowns move if the image is left out; 0 where it is not in use.
-        expected: covariance of ``moved``, if the model holds.
+        moved: by how much the unknowns move if the image is left out; 0 where it is not in use, NaN
+            where the other images do not determine all unknowns.
+        expected: covariance of ``moved``, if the model holds; NaN where ``moved`` is.
         shares: the part of the covariance that comes from each of :data:`KINDS`.
         residual_covariance: covariance of the unknowns, estimated from the residuals.
         residual_rows: R_i S^-1: how far each error moves the unknowns per SD.
@@ -117,7 +118,8 @@ def influence_of(calibration: Calibration) -> Influence:
         found = _whitened(alone, alone.problem)
         information = np.asarray(alone.linearisation.information)
         information = information / np.asarray(alone.linearisation.variance)[:, None, None]
-        settled = calibration.offset_law is None or not bool(calibration.offset_law.weighed)
+        averaged = calibration.offset_law is not None and bool(calibration.offset_law.weighed)
+        settled = not averaged and calibration.method != "alternating"
         return _influence(found, information[0], settled=settled)
 
 
@@ -134,7 +136,8 @@ def _influence(
     components = rows.shape[1]
     inverse = inverses(information[None], np.finfo(float).eps)[0]
     if not settled:
-        # An answer averaged over laws does not minimise these errors: take them at the minimum.
+        # An answer averaged over laws, or an alternation that stopped early, does not minimise
+        # these errors: take them at the minimum.
         gradient = np.einsum("mkp,mk->p", rows, errors)
         errors = errors - np.einsum("mkp,p->mk", rows, inverse @ gradient)
     each = np.swapaxes(rows, 1, 2) @ rows
@@ -150,6 +153,9 @@ def _influence(
 
     leverage = rows @ inverse @ np.swapaxes(rows, 1, 2)
     values, vectors = np.linalg.eigh(np.eye(components) - 0.5 * (leverage + leverage.mT))
+    # Without an image that alone determines a direction there is no answer to move to.
+    alone = (values <= _LEAST_LEFT).any(axis=1)
+    moved[alone], without[alone] = np.nan, np.nan
     values = np.maximum(values, _LEAST_LEFT)
     turned = np.einsum("mkl,mk->ml", vectors, errors)
     unbiased = np.einsum("mkl,ml->mk", vectors, turned / np.sqrt(values))
@@ -331,7 +337,8 @@ def in_image(
     """How far leaving each image out moves image points (root mean square over W's points, mm).
 
     Returns:
-        The move, and the move expected if the model holds; both 0 where an image is not in use.
+        The move, and the move expected if the model holds; both 0 where an image is not in use, and
+        NaN where the other images do not determine all unknowns.
     """
     moved = quadratic(found.moved[None], weight[None])[0]
     expected = np.einsum("npq,pq->n", found.expected, weight)

@@ -178,7 +178,8 @@ def _influence(
     found: Influence, weight: Float[np.ndarray, "p p"], used: np.ndarray
 ) -> dict[str, Any]:
     moved, expected = in_image(found, weight)
-    strongest = [int(k) for k in np.argsort(-moved)[:_MOST_NAMED] if used[k]]
+    known = used & np.isfinite(moved)
+    strongest = [int(k) for k in np.argsort(-moved)[:_MOST_NAMED] if known[k]]
     return {
         "moved_mm": np.where(used, moved, np.nan),
         "expected_mm": np.where(used, expected, np.nan),
@@ -268,14 +269,18 @@ def _comparison(
     apart = distance(np.asarray(answer.image_to_probe), x, scale / mine, grid)
     density = found.log_density - fit.log_density
     count = int(used.sum())
+    # Within a bound, offsets fit themselves: their errors are zero, and have no density.
+    dense = answer.prior != "bounded"
     return {
         "conventional_rms_mm": float(other.rms_mm),
         "rms_mm": float(answer.rms),
         "apart_mm": apart,
         "conventional_tre_mm": math.sqrt(error) if error > 0 else None,
         "tre_mm": math.sqrt(gaussian) if gaussian > 0 else None,
-        "log_density_gain": float(density.sum()),
-        "log_density_gain_sd": float(np.std(density[used], ddof=1) * math.sqrt(count)),
+        "log_density_gain": float(density.sum()) if dense else None,
+        "log_density_gain_sd": float(np.std(density[used], ddof=1) * math.sqrt(count))
+        if dense
+        else None,
         "conventional_image_plane_to_probe": x,
     }
 

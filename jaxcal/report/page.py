@@ -469,9 +469,10 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
     ]
     influence = record["influence"]
     if influence is not None:
-        moved = [influence["moved_mm"][int(k)] or 0.0 for k in used]
+        moved = influence["moved_mm"]
+        shown = [int(k) for k in used if moved[int(k)] is not None]
         third = svg.series(
-            [("moves it (mm)", images, moved, svg.BLUE)],
+            [("moves it (mm)", shown, [moved[k] for k in shown], svg.BLUE)],
             influence["most"][:3],
             "How far leaving out an image would move the calibration, mm at the image",
             height=120.0,
@@ -524,7 +525,7 @@ def _comparison(record: dict[str, Any]) -> str:
         ("residual, root mean square (mm)", "conventional_rms_mm", "rms_mm", ".3f"),
         ("error at the image by the noise found (mm)", "conventional_tre_mm", "tre_mm", ".3f"),
     )
-    gain = (
+    gain = beside["log_density_gain"] is not None and (
         "<tr><td>images left out, log density</td><td class='n'>0</td><td class='n'>"
         f"{_number(record, 'comparison.log_density_gain', '+.1f')} ± "
         f"{_number(record, 'comparison.log_density_gain_sd', '.1f')}</td></tr>"
@@ -537,7 +538,7 @@ def _comparison(record: dict[str, Any]) -> str:
     return _section(
         "Beside the conventional fit",
         '<div class="wide"><table><tr><th></th><th class="n">conventional</th><th class="n">'
-        f"{escape(record['method'])}</th></tr>{cells}{gain}</table></div>",
+        f"{escape(record['method'])}</th></tr>{cells}{gain or ''}</table></div>",
         _paragraphs(believe(record)),
     )
 

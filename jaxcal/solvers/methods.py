@@ -304,7 +304,11 @@ def _averaged(found: Solution, images: ImagePlanes, problems: Problem, plan: Sol
     """The average over the laws that the plan has."""
     variances = None
     if problems.covariance is not None and not plan.channels:
-        variances = variance_planes(problems.covariance)
+        # In mm: the noise model of the images' own covariances compares lateral SDs with ranges'.
+        size = problems.spacing * found.place.parameters().scale
+        variances = variance_planes(
+            problems.covariance * (size[:, None, :, None] * size[:, None, None])
+        )
     over = average_over_laws(
         found.place,
         found.observation,
