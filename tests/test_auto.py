@@ -414,21 +414,22 @@ def test_own_covariances_are_used_where_they_are_right():
 @pytest.mark.slow
 def test_own_covariances_mean_the_same_in_pixels_that_are_not_square():
     """Own covariances fix the ratio of lateral and range SDs, in mm."""
-    images = jaxcal.simulate_recording(jaxcal.Protocol(images=20), 3).calibration
+    images = jaxcal.simulate_recording(jaxcal.Protocol(images=50), 3).calibration
     assert images.covariance is not None
 
-    def solved(size: np.ndarray) -> jaxcal.Calibration:
-        pixels = jaxcal.Problem.from_arrays(
+    def of_size(size: np.ndarray) -> jaxcal.Problem:
+        return jaxcal.Problem.from_arrays(
             images.poses,
             images.measurements / size,
             covariance=images.covariance / np.outer(size, size),
             kind="pixel",
             spacing_mm=size,
         )
-        return jaxcal.calibrate(pixels, prior="uniform")
 
-    square, other = solved(np.array([0.2, 0.2])), solved(np.array([0.3, 0.1]))
-    assert square.offset_law is not None
-    assert square.offset_law.own_probability > 0.5
+    sizes = np.array([[0.2, 0.2], [0.3, 0.1]])
+    found = jaxcal.calibrate_batch(jaxcal.stack([of_size(size) for size in sizes]))
+    assert found.offset_law is not None
+    assert (found.offset_law.own_probability > 0.5).all()
+    square, other = found[0], found[1]
     np.testing.assert_allclose(other.image_to_probe, square.image_to_probe, atol=1e-9)
     np.testing.assert_allclose(other.covariance, square.covariance, rtol=1e-6, atol=1e-12)
