@@ -470,7 +470,7 @@ def test_unwritable_folder(tmp_path, capsys):
     # An unset variable of a shell would be the current folder.
     assert main(["study", "run", str(path), "--out", ""]) == 2
     assert capsys.readouterr().err == "jaxcal: error: the name of a file or folder is empty\n"
-    with pytest.raises(jaxcal.OutputError, match="cannot be made or written to: .*null"):
+    with pytest.raises(jaxcal.OutputError, match=r"cannot be made or written to: .*null"):
         run_study(parse_spec(small()), "a\0b")
 
 
