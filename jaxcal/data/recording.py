@@ -8,7 +8,7 @@ rely on shapes, units and finite values.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -235,55 +235,10 @@ def _make_images(
         )
     _check_magnitude("pose", poses, used)
     checked = check_poses(poses, used)
-
-    if kind == "time_of_flight":
-        bad = np.isinf(values).any(axis=1) & used
-        values[~used] = np.nan
-    else:
-        values[~used] = 1.0
-        bad = ~np.isfinite(values).all(axis=1)
-    if bad.any():
-        raise InputError(f"{kind} {np.flatnonzero(bad)[0]} holds NaN or Inf")
-    if kind != "time_of_flight":
-        _check_magnitude(kind, values, used)
-    if kind == "point" and used.any():
-        bad = (values[:, 1] <= 0) & used
-        if bad.any():
-            raise InputError(f"point {np.flatnonzero(bad)[0]} has a range that is not positive")
-    if kind == "pixel" and used.any():
-        bad = (values[:, 1] < 0) & used
-        if bad.any():
-            first = np.flatnonzero(bad)[0]
-            raise InputError(
-                f"pixel {first} has row v = {values[first, 1]:g}: rows count from the top of the "
-                "image, where v = 0; are u and v exchanged, or counted from the image's middle?"
-            )
-
-    spacing = None
-    if spacing_mm is not None:
-        spacing = real_array(spacing_mm, "spacing_mm")
-        if spacing.shape != (2,) or not (np.isfinite(spacing).all() and (spacing > 0).all()):
-            raise InputError("spacing_mm must be two positive numbers [lateral, axial] in mm/px")
-        if kind != "pixel":
-            raise InputError(f"spacing_mm belongs to pixels, not to {kind} data")
-    face = real_array(face_offset_mm, "face_offset_mm")
-    if face.ndim or not np.isfinite(face):
-        raise InputError("face_offset_mm must be finite, and one number")
+    values = _used_values(kind, values, used)
+    spacing, face_mm = _spacing(spacing_mm, kind), _face_offset(face_offset_mm)
     if kind == "pixel":
-        # Without a spacing, any positive one will do: rows are not negative.
-        along = 1.0 if spacing is None else spacing[1]
-        bad = (along * values[:, 1] + face_offset_mm <= 0) & used
-        if bad.any() and (spacing is not None or face_offset_mm == 0):
-            raise InputError(
-                f"pixel {np.flatnonzero(bad)[0]} has a range that is not positive: its row lies at "
-                "or above the transducer's face (face_offset_mm is the range of row 0)"
-            )
-    bound = max_elevation
-    if bound is not None and np.ndim(bound) == 0:
-        bound = np.full(count, real_array(bound, "max_elevation"))
-    bound = _per_image("max_elevation", bound, count, used, fill=1.0)
-    if bound is not None and (bound < 0).any():
-        raise InputError(f"max_elevation {np.flatnonzero(bound < 0)[0]} is negative")
+        _check_below_face(values, spacing, face_mm, used)
 
     images = Images(
         poses=checked,
@@ -291,15 +246,90 @@ def _make_images(
         kind=kind,
         mask=used,
         covariance=_covariance(covariance, count, used),
-        max_elevation=bound,
+        max_elevation=_bound(max_elevation, count, used),
         amplitude=_per_image("amplitude", amplitude, count, used, fill=0.0),
         time=_per_image("time", time, count, used, fill=0.0),
         spacing_mm=spacing,
-        face_offset_mm=float(face_offset_mm),
+        face_offset_mm=face_mm,
         time_of_flight=_raw_times(time_of_flight, kind, count, used),
     )
     _check_units(images)
     return images
+
+
+def _used_values(
+    kind: Kind, values: np.ndarray, used: np.ndarray
+) -> Float[np.ndarray, "n components"]:
+    """The measurements, checked in used images and replaced in the others."""
+    if kind == "time_of_flight":
+        # NaN is an element that saw nothing.
+        bad = np.isinf(values).any(axis=1) & used
+        values[~used] = np.nan
+    else:
+        values[~used] = 1.0
+        bad = ~np.isfinite(values).all(axis=1)
+    if bad.any():
+        raise InputError(f"{kind} {np.flatnonzero(bad)[0]} holds NaN or Inf")
+    if kind == "time_of_flight":
+        return values
+    _check_magnitude(kind, values, used)
+    if kind == "point":
+        bad = (values[:, 1] <= 0) & used
+        if bad.any():
+            raise InputError(f"point {np.flatnonzero(bad)[0]} has a range that is not positive")
+    if kind == "pixel":
+        bad = (values[:, 1] < 0) & used
+        if bad.any():
+            first = np.flatnonzero(bad)[0]
+            raise InputError(
+                f"pixel {first} has row v = {values[first, 1]:g}: rows count from the top of the "
+                "image, where v = 0; are u and v exchanged, or counted from the image's middle?"
+            )
+    return values
+
+
+def _spacing(spacing_mm: Any, kind: Kind) -> Float[np.ndarray, 2] | None:
+    if spacing_mm is None:
+        return None
+    spacing = real_array(spacing_mm, "spacing_mm")
+    if spacing.shape != (2,) or not (np.isfinite(spacing).all() and (spacing > 0).all()):
+        raise InputError("spacing_mm must be two positive numbers [lateral, axial] in mm/px")
+    if kind != "pixel":
+        raise InputError(f"spacing_mm belongs to pixels, not to {kind} data")
+    return spacing
+
+
+def _face_offset(face_offset_mm: Any) -> float:
+    face = real_array(face_offset_mm, "face_offset_mm")
+    if face.ndim or not np.isfinite(face):
+        raise InputError("face_offset_mm must be finite, and one number")
+    return float(face)
+
+
+def _check_below_face(
+    pixels: np.ndarray, spacing: np.ndarray | None, face_offset_mm: float, used: np.ndarray
+) -> None:
+    """Every used pixel lies below the transducer's face."""
+    if spacing is None and face_offset_mm != 0:
+        return
+    # Without a spacing, any positive one will do: rows are not negative.
+    along = 1.0 if spacing is None else spacing[1]
+    bad = (along * pixels[:, 1] + face_offset_mm <= 0) & used
+    if bad.any():
+        raise InputError(
+            f"pixel {np.flatnonzero(bad)[0]} has a range that is not positive: its row lies at "
+            "or above the transducer's face (face_offset_mm is the range of row 0)"
+        )
+
+
+def _bound(max_elevation: Any, count: int, used: np.ndarray) -> Float[np.ndarray, " n"] | None:
+    """Every image's bound on its offset, from one or from as many as there are images."""
+    if max_elevation is not None and np.ndim(max_elevation) == 0:
+        max_elevation = np.full(count, real_array(max_elevation, "max_elevation"))
+    bound = _per_image("max_elevation", max_elevation, count, used, fill=1.0)
+    if bound is not None and (bound < 0).any():
+        raise InputError(f"max_elevation {np.flatnonzero(bound < 0)[0]} is negative")
+    return bound
 
 
 def _raw_times(

@@ -30,39 +30,70 @@ WEAK_SHARE = 0.7
 
 def warnings(result: Calibration) -> list[str]:
     """Everything that a person should know before using the answer, most important first."""
-    found: list[str] = []
-    status = result.status
-    sight = observability(result)
-    weakest, from_prior = sight["weakest_direction"], sight["known_only_from_prior"]
-    bounded = result.prior == "bounded"
-    resting = int(np.sum(result.at_bound > 0))
-    used = int(result.images_used)
-    if status == "failed":
-        found.append("the solve failed: its result holds no usable numbers")
-        return found
+    if result.status == "failed":
+        return ["the solve failed: its result holds no usable numbers"]
     if result.wrong_frames is not None:
         # The answer has no meaning, so no other warning is of use.
         return [result.wrong_frames]
-    if status == "unobservable":
-        found.append(f"not observable: these images do not determine {weakest}; {sight['advice']}")
-    if status == "max_iterations":
-        found.append(
+    converged = result.status == "converged"
+    return [
+        *_without_convergence(result),
+        *result.notes,
+        *_implausible_residuals(result),
+        *_weak_direction(result),
+        *_only_the_bound(result),
+        *_odd_start_or_end(result),
+        *_bound_not_kept(result),
+        *_sds_not_tuned(result),
+        *_weak_elevation(result),
+        *_medium_warnings(result),
+        *_unusual_pixels(result),
+        *(f"noise model: {text}" for text in (misfits(result) if converged else [])),
+        *(suspects_in_words(result) if converged else []),
+        *_misfitting_images(result),
+    ]
+
+
+def _without_convergence(result: Calibration) -> list[str]:
+    """Whether the images do not determine the answer, or the solver has not reached it."""
+    if result.status == "unobservable":
+        sight = observability(result)
+        weakest, advice = sight["weakest_direction"], sight["advice"]
+        return [f"not observable: these images do not determine {weakest}; {advice}"]
+    if result.status == "max_iterations":
+        return [
             "not converged: the iteration limit was reached "
             f"(scaled KKT residual {float(result.stationarity):.1e})"
-        )
-    found += result.notes
+        ]
+    return []
+
+
+def _implausible_residuals(result: Calibration) -> list[str]:
+    """Residuals that no ultrasound beam explains."""
     rms = float(result.rms)
-    if rms > IMPLAUSIBLE_RMS_MM:
-        found.append(
-            f"residuals of {rms:.1f} mm are larger than a beam is thick: either some images are "
-            "far off, or the poses are wrong (order or signs of their numbers, units, direction)"
-        )
-    found += _weak_direction(result)
-    if bounded and from_prior:
-        held = f"{resting} of {used} images rest on it"
-        if resting == 0:
-            held = "no image rests on it, so any value in an interval fits equally well"
-        found.append(f"{from_prior} is fixed by nothing but the bound on the offsets: {held}")
+    if not rms > IMPLAUSIBLE_RMS_MM:
+        return []
+    return [
+        f"residuals of {rms:.1f} mm are larger than a beam is thick: either some images are "
+        "far off, or the poses are wrong (order or signs of their numbers, units, direction)"
+    ]
+
+
+def _only_the_bound(result: Calibration) -> list[str]:
+    """A direction that only the bound on the offsets determines."""
+    from_prior = observability(result)["known_only_from_prior"]
+    if result.prior != "bounded" or not from_prior:
+        return []
+    resting = int(np.sum(result.at_bound > 0))
+    held = f"{resting} of {int(result.images_used)} images rest on it"
+    if resting == 0:
+        held = "no image rests on it, so any value in an interval fits equally well"
+    return [f"{from_prior} is fixed by nothing but the bound on the offsets: {held}"]
+
+
+def _odd_start_or_end(result: Calibration) -> list[str]:
+    """A start that had to be searched for, and an alternation that ended before its minimum."""
+    found = []
     if result.searched_start:
         found.append(
             "the closed-form start was unusable (degenerate poses or points, or too few images for "
@@ -73,56 +104,51 @@ def warnings(result: Calibration) -> list[str]:
             "the alternation stopped on its tolerance while its objective was still falling "
             f"(scaled KKT residual {float(result.stationarity):.1e})"
         )
-    found += _bound_not_kept(result)
-    if result.prior in TUNED and not result.sigma_tuned:
-        found.append(
-            "noise SDs were held fixed, not estimated"
-            + (
-                f": {used} images are fewer than the {MINIMUM_SELF_TUNING} that it takes"
-                if used < MINIMUM_SELF_TUNING
-                else ""
-            )
-        )
-    if np.any(result.sigma_floored):
-        names = [
-            name
-            for name, floored in zip(
-                ("lateral", "range", "elevational"), result.sigma_floored, strict=True
-            )
-            if floored
-        ]
-        found.append(
-            f"the {' and '.join(names)} error is too small to estimate; its SD rests on its floor"
-        )
-    if result.prior in TUNED and status == "converged":
-        sd = float(np.sqrt(result.covariance[1, 1]))
-        if sd > WEAK_TRANSLATION_MM:
-            law = result.offset_law
-            on = "a mean of the offsets that the data hardly show"
-            if law is None or not law.mean_probability > 0.5:
-                on = "offsets that average zero"
-            found.append(
-                "translation along the elevational axis is weakly seen "
-                f"(SD {sd:.2f} mm) and rests on {on}"
-            )
-    found += _medium_warnings(result)
-    found += _unusual_pixels(result)
-    if status == "converged":
-        found += [f"noise model: {text}" for text in misfits(result)]
-    if status == "converged":
-        found += suspects_in_words(result)
-    named = outliers(result)
-    if named and result.robust:
-        found.append(
-            f"left out {len(named)} of {used + len(named)} images that do not fit the rest: "
-            f"{listed_departures(result)}"
-        )
-    elif named:
-        found.append(
-            f"images that do not fit the rest: {listed_departures(result)}; a robust solve "
-            "(--robust) leaves them out"
-        )
     return found
+
+
+def _sds_not_tuned(result: Calibration) -> list[str]:
+    """SDs that the data were not asked for, or that they could not tell."""
+    found = []
+    used = int(result.images_used)
+    if result.prior in TUNED and not result.sigma_tuned:
+        text = "noise SDs were held fixed, not estimated"
+        if used < MINIMUM_SELF_TUNING:
+            text += f": {used} images are fewer than the {MINIMUM_SELF_TUNING} that it takes"
+        found.append(text)
+    if np.any(result.sigma_floored):
+        errors = zip(("lateral", "range", "elevational"), result.sigma_floored, strict=True)
+        names = " and ".join(name for name, floored in errors if floored)
+        found.append(f"the {names} error is too small to estimate; its SD rests on its floor")
+    return found
+
+
+def _weak_elevation(result: Calibration) -> list[str]:
+    """Translation along the elevational axis that only the offsets' law determines."""
+    if result.prior not in TUNED or result.status != "converged":
+        return []
+    sd = float(np.sqrt(result.covariance[1, 1]))
+    if not sd > WEAK_TRANSLATION_MM:
+        return []
+    law = result.offset_law
+    on = "a mean of the offsets that the data hardly show"
+    if law is None or not law.mean_probability > 0.5:
+        on = "offsets that average zero"
+    return [
+        f"translation along the elevational axis is weakly seen (SD {sd:.2f} mm) and rests on {on}"
+    ]
+
+
+def _misfitting_images(result: Calibration) -> list[str]:
+    """Images that were left out, or had better be."""
+    named = outliers(result)
+    if not named:
+        return []
+    listed = listed_departures(result)
+    if result.robust:
+        count = len(named) + int(result.images_used)
+        return [f"left out {len(named)} of {count} images that do not fit the rest: {listed}"]
+    return [f"images that do not fit the rest: {listed}; a robust solve (--robust) leaves them out"]
 
 
 def _bound_not_kept(result: Calibration) -> list[str]:

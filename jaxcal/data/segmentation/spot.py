@@ -140,40 +140,93 @@ def fit_spot(
     margin: float,
 ) -> Spot:
     """Least squares of the spot on a window, and its covariance from the background's speckle."""
+
+    def not_found(why: str) -> NotFoundError:
+        return NotFoundError(why, contrast, margin)
+
     rows, columns = np.nonzero(shape)
     weights = envelope[rows, columns]
     start = np.array([np.average(columns, weights=weights), np.average(rows, weights=weights)])
-    high, wide = envelope.shape
-    half = [int(np.clip(np.ceil(_WINDOW * sd), 3, _LARGEST_WINDOW)) for sd in extent]
-    middle_v, middle_u = round(start[1]), round(start[0])
-    v = np.arange(max(middle_v - half[0], 0), min(middle_v + half[0] + 1, high))
-    u = np.arange(max(middle_u - half[1], 0), min(middle_u + half[1] + 1, wide))
-    window = envelope[v[0] : v[-1] + 1, u[0] : u[-1] + 1]
-    use = ~saturated[v[0] : v[-1] + 1, u[0] : u[-1] + 1]
-    grid_v, grid_u = np.meshgrid(v, u, indexing="ij")
     top = float(envelope[shape].max())
+    window = _Window.around(start, extent, envelope, ~saturated)
+    first = _first_guess(start, extent, speckle, target, top)
+    if np.sum(window.pixels[window.use] > 0.1 * top) < len(first):
+        raise not_found("the display is saturated: only the spot's outline is left")
 
-    # The envelope's square falls as exp(-|L d|^2), so L is the inverse of the envelope's SD.
-    across, along = 1 / extent[1], 1 / extent[0]
-    if target == "echo":
-        first = [*start, np.log(speckle.sigma), np.log(top), np.log(across), np.log(along), 0.0]
-    else:
-        # Two wires, one leaning each way.
-        lean = 0.5 * min(across, along)
-        one = [np.log(top / np.sqrt(2)), np.log(across), np.log(along)]
-        first = [*start, np.log(speckle.sigma), *one, lean, *one, -lean]
-    first = np.array(first)
-    if np.sum(window[use] > 0.1 * top) < len(first):
-        raise NotFoundError(
-            "the display is saturated: only the spot's outline is left", contrast, margin
-        )
+    fit = _Fit(window, first, _steps(first, extent), top)
+    unknowns = fit.solve()
+    if unknowns is None:
+        raise not_found("no spot could be fitted")
+    if (np.abs(unknowns[:2] - start) > 1 + np.array([extent[1], extent[0]])).any():
+        raise not_found("the fit left the bright spot")
+
+    value, _ = window.model(unknowns)
+    if not np.isfinite(value).all():
+        raise not_found("no spot could be fitted")
+    width = _width(unknowns)
+    misfit = float(np.mean((window.pixels - value)[window.use] ** 2))
+    jacobian = fit.slope(unknowns)
+    inverse = np.linalg.pinv(jacobian, rcond=1e-9)[:2]
+    if np.abs(inverse @ jacobian - np.eye(2, len(first))).max() > 1e-3:
+        raise not_found("the position is not determined")
+    by_pixel = np.zeros((2, *value.shape))
+    by_pixel[:, window.use] = inverse[:, : window.use.sum()] / top
+    across = (width[1], width[0])
+    covariance = _propagate(by_pixel, value, misfit, speckle, across, window.v, window.u)
+    if not np.isfinite(covariance).all():
+        raise not_found("the position is not determined")
+    # The centre must have converged. The shape need not, where the data hardly determine it.
+    left = np.abs(inverse @ fit.residual(unknowns))
+    if (left > 0.1 * np.sqrt(np.diag(covariance))).any():
+        raise not_found("no spot could be fitted")
+    height = float(np.sqrt(np.sum(np.exp(2 * unknowns[3::4]))))
+    return Spot(
+        position=unknowns[:2],
+        covariance=covariance,
+        contrast_db=decibel(max(height, top) / (np.sqrt(2.0) * speckle.sigma)),
+        margin_db=margin,
+        residual=float(np.sqrt(misfit) / height),
+        width=width,
+    )
+
+
+@dataclass(frozen=True)
+class _Window:
+    """The part of the image to which the spot is fitted.
+
+    Attributes:
+        v: rows, px.
+        u: columns, px.
+        pixels: the envelope there.
+        use: False where the display is saturated.
+    """
+
+    v: Int[np.ndarray, " rows"]
+    u: Int[np.ndarray, " columns"]
+    pixels: Float[np.ndarray, "rows columns"]
+    use: Bool[np.ndarray, "rows columns"]
+
+    @classmethod
+    def around(
+        cls, centre: np.ndarray, extent: tuple[float, float], envelope: np.ndarray, use: np.ndarray
+    ) -> _Window:
+        """As many times the spot's SDs (along v and u) to each side as :data:`_WINDOW` says."""
+        high, wide = envelope.shape
+        half = [int(np.clip(np.ceil(_WINDOW * sd), 3, _LARGEST_WINDOW)) for sd in extent]
+        middle_v, middle_u = round(centre[1]), round(centre[0])
+        v = np.arange(max(middle_v - half[0], 0), min(middle_v + half[0] + 1, high))
+        u = np.arange(max(middle_u - half[1], 0), min(middle_u + half[1] + 1, wide))
+        part = slice(v[0], v[-1] + 1), slice(u[0], u[-1] + 1)
+        return cls(v, u, envelope[part], use[part])
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-    def model(unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def model(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The envelope of speckle and spot, and its derivatives, last axis."""
+        grid_v, grid_u = np.meshgrid(self.v, self.u, indexing="ij")
         du, dv = grid_u - unknowns[0], grid_v - unknowns[1]
         floor = np.exp(2 * unknowns[2])
-        power = np.full(window.shape, floor)
-        slopes = [np.zeros(window.shape), np.zeros(window.shape), np.full(window.shape, 2 * floor)]
+        power, none = np.full(du.shape, floor), np.zeros(du.shape)
+        slopes = [none.copy(), none.copy(), np.full(du.shape, 2 * floor)]
         for log_height, log_a, log_b, c in unknowns[3:].reshape(-1, 4):
             a, b = np.exp(log_a), np.exp(log_b)
             p, q = a * du + c * dv, b * dv
@@ -185,67 +238,64 @@ def fit_spot(
         value = np.sqrt(power)
         return value, np.stack(slopes, axis=-1) / (2 * value[..., None])
 
-    # The unknowns are scaled to order 1. The shape is held near its start, but so weakly that this
-    # only matters where two components make one spot and only their sum is seen.
-    steps = _steps(first, extent)
-    hold = np.diag(_HOLD / steps)[3:]
 
-    def residual(unknowns: np.ndarray) -> np.ndarray:
-        pixels = (model(unknowns)[0] - window)[use] / top
-        return np.concatenate([pixels, hold @ (unknowns - first)])
+def _first_guess(
+    start: np.ndarray, extent: tuple[float, float], speckle: Speckle, target: Target, top: float
+) -> Float[np.ndarray, " unknowns"]:
+    """Centre, log of the speckle's level, and log height, two log widths and lean of each part."""
+    # The envelope's square falls as exp(-|L d|^2), so L is the inverse of the envelope's SD.
+    across, along = 1 / extent[1], 1 / extent[0]
+    if target == "echo":
+        parts = [np.log(top), np.log(across), np.log(along), 0.0]
+    else:
+        # Two wires, one leaning each way.
+        lean = 0.5 * min(across, along)
+        one = [np.log(top / np.sqrt(2)), np.log(across), np.log(along)]
+        parts = [*one, lean, *one, -lean]
+    return np.array([*start, np.log(speckle.sigma), *parts])
 
-    def slope(unknowns: np.ndarray) -> np.ndarray:
-        return np.concatenate([model(unknowns)[1][use] / top, hold])
 
-    derivative: Any = slope  # scipy's types know only the names of difference schemes
-    with np.errstate(over="ignore", invalid="ignore"):
-        try:
-            fit = least_squares(
-                residual,
-                first,
-                jac=derivative,
-                method="trf",
-                x_scale=steps,
-                ftol=1e-8,
-                xtol=1e-6,
-                gtol=1e-8,
-                max_nfev=40,
-            )
-        except (ValueError, np.linalg.LinAlgError):
-            raise NotFoundError("no spot could be fitted", contrast, margin) from None
-    unknowns = fit.x
-    moved = np.abs(unknowns[:2] - start)
-    if not np.isfinite(unknowns).all():
-        raise NotFoundError("no spot could be fitted", contrast, margin)
-    if (moved > 1 + np.array([extent[1], extent[0]])).any():
-        raise NotFoundError("the fit left the bright spot", contrast, margin)
+class _Fit:
+    """The least squares problem; the unknowns are scaled to order 1.
 
-    value, _ = model(unknowns)
-    if not np.isfinite(value).all():
-        raise NotFoundError("no spot could be fitted", contrast, margin)
-    width = _width(unknowns)
-    misfit = float(np.mean((window - value)[use] ** 2))
-    weights = np.zeros((2, *window.shape))
-    jacobian = slope(unknowns)
-    inverse = np.linalg.pinv(jacobian, rcond=1e-9)[:2]
-    if np.abs(inverse @ jacobian - np.eye(2, len(first))).max() > 1e-3:
-        raise NotFoundError("the position is not determined", contrast, margin)
-    weights[:, use] = inverse[:, : use.sum()] / top
-    covariance = _propagate(weights, value, misfit, speckle, (width[1], width[0]), v, u)
-    if not np.isfinite(covariance).all():
-        raise NotFoundError("the position is not determined", contrast, margin)
-    # The centre must have converged. The shape need not, where the data hardly determine it.
-    if (np.abs(inverse @ residual(unknowns)) > 0.1 * np.sqrt(np.diag(covariance))).any():
-        raise NotFoundError("no spot could be fitted", contrast, margin)
-    height = float(np.sqrt(np.sum(np.exp(2 * unknowns[3::4]))))
-    return Spot(
-        position=unknowns[:2],
-        covariance=covariance,
-        contrast_db=decibel(max(height, top) / (np.sqrt(2.0) * speckle.sigma)),
-        margin_db=margin,
-        residual=float(np.sqrt(misfit) / height),
-        width=width,
-    )
+    The shape is held near its start, but so weakly that this only matters where two components make
+    one spot and only their sum is seen.
+    """
+
+    def __init__(self, window: _Window, first: np.ndarray, steps: np.ndarray, top: float) -> None:
+        self._window, self._first, self._steps, self._top = window, first, steps, top
+        self._hold = np.diag(_HOLD / steps)[3:]
+
+    def residual(self, unknowns: np.ndarray) -> np.ndarray:
+        """Pixels, as shares of the brightest, and what holds the shape."""
+        window = self._window
+        pixels = (window.model(unknowns)[0] - window.pixels)[window.use] / self._top
+        return np.concatenate([pixels, self._hold @ (unknowns - self._first)])
+
+    def slope(self, unknowns: np.ndarray) -> np.ndarray:
+        """Derivatives of :meth:`residual`."""
+        window = self._window
+        return np.concatenate([window.model(unknowns)[1][window.use] / self._top, self._hold])
+
+    def solve(self) -> Float[np.ndarray, " unknowns"] | None:
+        """The unknowns, or None where there is no solution."""
+        derivative: Any = self.slope  # scipy's types know only the names of difference schemes
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                found = least_squares(
+                    self.residual,
+                    self._first,
+                    jac=derivative,
+                    method="trf",
+                    x_scale=self._steps,
+                    ftol=1e-8,
+                    xtol=1e-6,
+                    gtol=1e-8,
+                    max_nfev=40,
+                ).x
+            except (ValueError, np.linalg.LinAlgError):
+                return None
+        return found if np.isfinite(found).all() else None
 
 
 def _steps(first: np.ndarray, extent: tuple[float, float]) -> np.ndarray:
