@@ -177,6 +177,16 @@ def test_many_images_stay_small(result, recording):
     assert len(drawn) < 6e5
 
 
+@pytest.mark.parametrize("largest", [0.2, 0.45, 0.8, 0.99, 1.3, 2.1, 70.0])
+def test_axes_of_images_tell_a_scale_and_only_images_that_exist(largest):
+    values = [-0.4 * largest, 0.0, 0.9 * largest, largest]
+    drawn = svg.series([("x (mm)", [0, 1, 2, 3], values, svg.BLUE)], [], "few", height=78.0)
+    down = re.findall(r'text-anchor="end" class="tick">([^<]*)<', drawn)
+    along = re.findall(r'text-anchor="middle" class="tick">([^<]*)<', drawn)
+    assert len(down) >= 2
+    assert along == ["0", "1", "2", "3"]
+
+
 @pytest.mark.parametrize(("low", "high"), [(0.2, 0.58), (-3.1, 2.2), (0.0, 1e-4), (-71.0, 88.0)])
 def test_ticks_are_round_and_inside(low, high):
     found = svg.ticks(low, high, 5)

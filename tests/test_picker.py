@@ -13,6 +13,7 @@ import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -123,7 +124,10 @@ def test_a_person_in_a_browser(tmp_path, sequence):
             click(browser, 1.0, 1.0)
             trouble = "return document.getElementById('trouble').textContent.slice(0, 22)"
             wait_until(browser, trouble, "jaxcal does not answer")
-        with picking(sequence) as (process, url):
+        with picking(sequence, "--port", str(urlsplit(url).port)) as (process, url):
+            click(browser, 1.0, 1.0)  # the old page, whose token no longer holds
+            trouble = "return document.getElementById('trouble').textContent.slice(0, 30)"
+            wait_until(browser, trouble, "this page is of an earlier run")
             open_page(browser, url)
             wait_until(browser, SHOWN_FRAME, "4")
             from selenium.webdriver.common.action_chains import ActionChains

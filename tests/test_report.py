@@ -19,6 +19,7 @@ from jaxcal.calibration.result import Status
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.report.convergence import KEPT, Curve, bounded_curves
 from jaxcal.report.figures import convergence_figure
+from jaxcal.report.next_poses import next_poses_sentences
 from jaxcal.report.paragraphs import laid_out, listed
 from jaxcal.report.plots import plot_offsets, plot_residuals
 from jaxcal.report.record import calibration_record, check_test_images, plain, truth_error
@@ -431,3 +432,12 @@ def test_prepare_folder_refuses(tmp_path, path):
     with pytest.raises(OutputError, match=r"^[^\n]+$"), prepare_folder(tmp_path / path):
         pass
     assert [item.name for item in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(("count", "words"), [(1, "1 more image,"), (2, "2 more images,")])
+def test_one_more_image_is_not_called_images(count, words):
+    found = {
+        "poses": [{"words": "tilt"}], "tre_now_mm": 2.0, "tre_then_mm": 1.0,
+        "images_to_half": count,
+    }  # fmt: skip
+    assert words in next_poses_sentences({"next_poses": found})[-1]

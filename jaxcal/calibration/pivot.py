@@ -44,6 +44,8 @@ BLOCKS = ("translation", "point")
 AXES = ("x", "y", "z")
 """Axes of the tool's frame, along which the components of a departure are."""
 _SUBSET = 4
+_LARGEST_RMS_MM = 5.0
+"""A tip that stays in a dimple does not move by so much."""
 
 
 class Pivot(eqx.Module):
@@ -116,6 +118,12 @@ class Pivot(eqx.Module):
             found.append(
                 f"not observable: these poses do not determine the tip along ({direction}) of the "
                 "tool's frame; tilt the tool about a further axis"
+            )
+        if float(self.rms) > _LARGEST_RMS_MM:
+            found.append(
+                f"errors of {float(self.rms):.1f} mm are too large for a tip that stays in place: "
+                "either it slipped in most poses, or the poses are wrong (order or signs of their "
+                "numbers, units, direction)"
             )
         named = images_that_stand_out(self)
         if named:

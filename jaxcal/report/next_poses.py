@@ -79,7 +79,7 @@ def next_poses_sentences(record: dict[str, Any]) -> list[str]:
         [pose["words"] for pose in found["poses"]],
     )
     if found["images_to_half"] is not None:
-        lines.append(
-            f"Halving the error takes {found['images_to_half']} more images, chosen like these."
-        )
+        more = found["images_to_half"]
+        images = "image" if more == 1 else "images"
+        lines.append(f"Halving the error takes {more} more {images}, chosen like these.")
     return lines

@@ -123,16 +123,34 @@ class Panel:
         share = (y - self.y[0]) / (self.y[1] - self.y[0])
         return across, top + (bottom - top) * (share if self.down else 1 - share)
 
-    def axes(self, x_label: str = "", y_label: str = "", *, most: int = 6) -> list[str]:
-        """Grid, ticks and labels; without an x label the numbers of x are left out, too."""
+    def axes(
+        self,
+        x_label: str = "",
+        y_label: str = "",
+        *,
+        most: int = 6,
+        x_ticks: tuple[Number, Number] | None = None,
+    ) -> list[str]:
+        """Grid, ticks and labels; without an x label the numbers of x are left out, too.
+
+        Args:
+            x_label: of the horizontal axis.
+            y_label: of the vertical axis.
+            most: ticks along x.
+            x_ticks: where the ticks along x begin and end, if not at the edges.
+        """
         left, top, right, bottom = self.box
         parts = []
-        for value in ticks(*self.x, most):
+        for value in ticks(*(x_ticks or self.x), most):
             across = self.place(value, self.y[0])[0]
             parts.append(line(across, top, across, bottom, "var(--grid)", 0.6))
             if x_label:
                 parts.append(text(across, bottom + 12, number(value), kind="tick"))
-        for value in ticks(*self.y, max(int((bottom - top) / 19), 3)):
+        most_down = max(int((bottom - top) / 19), 3)
+        down_ticks = ticks(*self.y, most_down)
+        if len(down_ticks) < 2:  # a single number tells no scale
+            down_ticks = ticks(*self.y, most_down + 2)
+        for value in down_ticks:
             down = self.place(self.x[0], value)[1]
             parts.append(line(left, down, right, down, "var(--grid)", 0.6))
             parts.append(text(left - 5, down + 3.2, number(value), "end", "tick"))
@@ -213,7 +231,8 @@ def series(
     for k, (name, x, y, colour) in enumerate(panels):
         top = 8.0 + k * (height + 12.0)
         panel = Panel((48.0, top, 374.0, top + height), (first - 1, last + 1), scale)
-        parts += panel.axes(x_label if k == len(panels) - 1 else "", name)
+        below = x_label if k == len(panels) - 1 else ""
+        parts += panel.axes(below, name, x_ticks=(first, last))
         zero = panel.place(first, 0.0)[1]
         parts.append(line(48.0, zero, 374.0, zero, "var(--text)", 0.6))
         titles = None

@@ -109,6 +109,9 @@ function ask(what, body) {
   const asked = busy.then(async () => {
     const answer = await fetch(what, { method: "POST", body: JSON.stringify(body || {}),
       headers: { "Content-Type": "application/json" } });
+    // Whoever has another run's address is refused without a word of why.
+    if (answer.status === 404)
+      throw new Error("this page is of an earlier run: open the address that jaxcal printed last");
     const told = await answer.json();
     if (!answer.ok) throw new Error(told.error || answer.statusText);
     trouble("");
