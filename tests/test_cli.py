@@ -777,8 +777,10 @@ def test_a_plan_is_tried_in_simulated_recordings(capfd):
     assert f"image {normal['tre_mm']:.2g} mm" in words
 
 
-def test_a_plan_has_no_more_poses_than_its_error_takes(capfd):
-    errors = json.loads(told(capfd, "plan", "--until-tre", "0.3", "--json"))["tre_mm"]
+@pytest.mark.parametrize("criterion", ["tre", "d"])
+def test_a_plan_has_as_many_poses_as_its_error_takes_and_no_more(capfd, criterion):
+    arguments = ["plan", "--until-tre", "0.3", "--criterion", criterion, "--json"]
+    errors = json.loads(told(capfd, *arguments))["tre_mm"]
     assert errors[-1] <= 0.3 < errors[-2]
 
 

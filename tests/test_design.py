@@ -251,6 +251,12 @@ for call, said in (
     (lambda: design.Region.of_probe(None), "probe must be a jaxcal.LinearProbe"),
     (lambda: design.Noise(np.ones((2, 4))), "the noise model's coefficients must have shape"),
     (lambda: design.Model(np.eye(3)), "image_to_probe of the model must be an array of shape"),
+    (lambda: design.Model(point="abc"), "point of the model must be an array of shape"),
+    (lambda: design.Model(scale="no"), "scale of the model must be True or False"),
+    (lambda: design.Model(face_offset_mm="a"), "face_offset_mm of the model must be a number"),
+    (lambda: design.Noise(np.full((3, 4), "a")), "the noise model's coefficients must be an array"),
+    (lambda: design.plan(candidates, 8, prior=1j * np.eye(9)), "information must be an array"),
+    (lambda: design.pose_in_words(np.eye(4), None, np.eye(4), np.zeros(3)), "constraints must be"),
 ):
     try:
         call()
@@ -293,9 +299,52 @@ def test_what_cannot_be_asked():
         (lambda: design.images_to(design.plan(candidates, 5), -1.0), "positive"),
         (lambda: design.images_to(design.plan(candidates, 5), 1e-4), "more than 1000"),
         (lambda: some(50, box_mm=((0.0,) * 3, (1.0,) * 3)), "widen"),
+        (lambda: some(50, model=Model(2 * MOUNT, TARGET, EQUAL)), "not a rigid transform"),
+        (lambda: some(50, model=Model(MOUNT, TARGET * np.nan, EQUAL)), "must be finite"),
+        (lambda: some(50, model=Model(MOUNT, TARGET, EQUAL, False, np.nan)), "number of mm"),
+        (lambda: Noise.constant((1e-30, 1.0, 1.0)), "three positive mm between"),
+        (lambda: Noise.of_probe(jaxcal.LinearProbe(), channel_mm=0.0), "channel_mm must be an SD"),
+        (lambda: Noise.of_probe(jaxcal.LinearProbe(), focus_mm=np.nan), "focus_mm must be"),
+        (lambda: design.plan(some(50, model=Model(noise=Noise(np.full((3, 4), 300.0)))), 8),
+         "SDs must be 1e-06 to 1e.06 mm at all"),
+        (lambda: design.plan(candidates, 8, cost_s=np.full(50, np.inf)), "positive number of sec"),
+        (lambda: design.plan(candidates, 8, prior=Known(np.eye(11))), "9 x 9"),
+        (lambda: design.plan(candidates, 8, prior=Known(np.eye(9) * np.nan)), "finite 9 x 9"),
+        (lambda: replace(candidates, taken=np.full((1, 4, 4), np.nan), _checked=False),
+         "taken pose 0"),
+        (lambda: design.plan(candidates, 8, polish=False).first(-1), "between 0 and 8"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=match):
             call()
+
+
+@pytest.mark.parametrize("model", [MODEL, Model()])
+def test_metres_taken_for_mm_are_noticed(model):
+    poses = some(50, model=model).poses.copy()
+    poses[:, :3, 3] /= 1000
+    with pytest.raises(InputError, match=r"none of the candidate poses .* in mm"):
+        design.Candidates(poses, model, Constraints())
+
+
+def test_polish_makes_no_pose_outside_the_constraints_worse():
+    wide = some(cone_deg=60.0, turn_deg=170.0)
+    narrow = design.Candidates(wide.poses, MODEL, Constraints(cone_deg=15.0, turn_deg=20.0))
+    alone, polished = (design.plan(narrow, 6, polish=moved) for moved in (False, True))
+    assert polished.tre_mm[-1] <= alone.tre_mm[-1]
+
+
+def test_a_calibration_of_other_images_is_no_prior(flat):
+    recording, result = flat
+    around = design.candidates_around(recording, result, count=50)
+    fewer = replace(around, taken=around.taken[:-1])
+    with pytest.raises(InputError, match=r"the calibration is of \d+ images, \d+ poses"):
+        design.next_poses(result, fewer)
+    other = jaxcal.simulate_recording(jaxcal.Protocol(images=4), seed=1)
+    with pytest.raises(InputError, match=r"the calibration is of \d+ images, 4 poses"):
+        design.candidates_around(other, result)
+    scaled = replace(around, model=replace(around.model, scale=True))
+    with pytest.raises(InputError, match="pixel scales are unknown"):
+        design.next_poses(result, scaled)
 
 
 def test_with_sds_wrong_by_three_a_plan_is_nearly_as_good():

@@ -167,6 +167,10 @@ def plan(
             else:
                 count = max(design.images_to(result, until_tre, candidates), 1)
         found = design.plan(candidates, min(count, MOST_IMAGES), criterion, result)
+        # A plan by another criterion, or one whose poses fill space, may need more than counted.
+        while until_tre is not None and found.tre_mm[-1] > until_tre:
+            count = len(found) + max(design.images_to(found, until_tre) - len(found), 1)
+            found = design.plan(candidates, count, criterion, result)
         if until_tre is not None:
             # Exchange and polish may have made fewer poses enough.
             enough = (k for k, error in enumerate(found.tre_mm) if error <= until_tre)

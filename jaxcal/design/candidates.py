@@ -19,7 +19,7 @@ from jaxcal.data.probe import Probe
 from jaxcal.data.recording import check_recording
 from jaxcal.design.constraints import Constraints, Region
 from jaxcal.design.information import Model, check_result
-from jaxcal.design.noise import Noise
+from jaxcal.design.noise import Noise, used_images
 from jaxcal.runtime.array_types import Float
 
 if TYPE_CHECKING:
@@ -45,6 +45,8 @@ SOBOL_BITS = 30
 _TRIES_PER_POSE = 50
 _LEAST_CONE_DEG, _LEAST_TURN_DEG = 30.0, 60.0
 _WIDER = 0.15
+_NEAR_MM = 10.0
+"""A mount or a target known by eye may be wrong by this much; poses in metres are farther off."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,17 @@ class Candidates:
         object.__setattr__(self, "poses", poses)
         check_made("model", self.model, Model, "jaxcal.design.Model")
         check_made("constraints", self.constraints, Constraints, "jaxcal.design.Constraints")
+        if self.taken is not None:
+            object.__setattr__(self, "taken", check_poses(self.taken, what="taken pose"))
+        seen = self.model.targets(poses)
+        region = self.constraints.region
+        nearest = region.place(np.clip(region.unit(seen), -1, 1))
+        if np.linalg.norm(seen - nearest, axis=1).min() > _NEAR_MM:
+            raise InputError(
+                f"at none of the candidate poses is the target within {_NEAR_MM:g} mm of the "
+                "image region: are they probe -> tracker, in mm, and do the model's X and target "
+                "go with them?"
+            )
         # Copies with other SDs, or with some of the poses, need no new check.
         object.__setattr__(self, "_checked", True)
 
@@ -238,7 +251,7 @@ def candidates_around(
     if not (np.isfinite(x).all() and np.isfinite(point).all()):
         raise InputError("the calibration failed: there is nothing to plan from")
     poses = recording.calibration.poses
-    used = np.asarray(answer.mask) > 0
+    used = used_images(result, len(poses))
     face = float(recording.calibration.face_offset_mm)
     model = Model(x, point, scale="scale" in result.blocks, face_offset_mm=face)
     targets = model.targets(poses)

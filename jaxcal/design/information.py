@@ -20,11 +20,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import check_made
-from jaxcal.data.poses import targets_in_images
-from jaxcal.design.noise import Noise
+from jaxcal.calibration.inputs import check_flag, check_made
+from jaxcal.data.poses import check_poses, targets_in_images
+from jaxcal.design.noise import Noise, used_images
 from jaxcal.model.unknowns import RIGID, block_slice
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import is_number, is_traced, real_array
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
@@ -58,9 +59,22 @@ class Model:
 
     def __post_init__(self) -> None:
         for name, shape in (("image_to_probe", (4, 4)), ("point", (3,))):
-            if np.shape(getattr(self, name)) != shape:
+            value = getattr(self, name)
+            if np.shape(value) != shape:
                 raise InputError(f"{name} of the model must be an array of shape {shape}")
+            if not is_traced(value):
+                value = real_array(value, f"{name} of the model")
+                if not np.isfinite(value).all():
+                    raise InputError(f"{name} of the model must be finite")
+                object.__setattr__(self, name, value)
+        if not is_traced(self.image_to_probe):
+            check_poses(self.image_to_probe[None], what="image_to_probe of the model")
         check_made("noise", self.noise, Noise, "jaxcal.design.Noise")
+        check_flag("scale of the model", self.scale)
+        if not (is_traced(self.face_offset_mm) or is_number(self.face_offset_mm)):
+            raise InputError(
+                f"face_offset_mm of the model must be a number of mm, not {self.face_offset_mm!r}"
+            )
 
     @property
     def size(self) -> int:
@@ -141,10 +155,8 @@ def known_information(
     """
     check_result(result)
     check_made("model", model, Model, "jaxcal.design.Model")
-    answer = result.numpy()
-    used = np.asarray(answer.mask) > 0
-    if len(used) != len(poses):
-        raise InputError(f"the calibration is of {len(used)} images, {len(poses)} poses were given")
+    poses = check_poses(poses)
+    used = used_images(result, len(poses))
     covariance = _of_model(result, model)
     if covariance is None:
         return model.information(poses[used]) + model.beliefs()
@@ -153,6 +165,11 @@ def known_information(
 
 def _of_model(result: Calibration, model: Model) -> Float[np.ndarray, "p p"] | None:
     """The calibration's covariance of a model's unknowns; None where it is not known."""
+    if not set(model.blocks) <= set(result.blocks):
+        raise InputError(
+            "the model's pixel scales are unknown, but the calibration did not estimate them: make "
+            "the candidates with candidates_around(recording, result)"
+        )
     rows = np.concatenate([np.r_[block_slice(result.blocks, name)] for name in model.blocks])
     covariance = np.asarray(result.numpy().unknowns_covariance, float)[rows[:, None], rows]
     if not np.isfinite(covariance).all():
@@ -180,9 +197,8 @@ def effective_elevational(
         poses: of the images.
         weight: W of the criterion.
     """
-    answer = result.numpy()
     covariance = _of_model(result, model)
-    used = np.asarray(answer.mask) > 0
+    used = used_images(result, len(poses))
     if covariance is None:
         return 1.0
     said = float(np.sum(weight * covariance))

@@ -17,8 +17,8 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.probe import Probe, check_probe
 from jaxcal.diagnostics.sd_by_place import basis_at, log_sd_slopes
-from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import is_number, real_array
+from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.arrays import is_number, is_traced, real_array
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 FEWEST_TO_LEARN = 20
 """Fewest images from which SDs are learned as functions of the place."""
 
+SD_RANGE_MM = (1e-6, 1e6)
+"""SDs beyond these are a mistake, and their squares may leave no digits."""
 _LEAST_SD_MM = 1e-3
 UNKNOWN_BY = 3.0
 """A factor by which SDs that are not tuned to data may be wrong."""
@@ -44,11 +46,13 @@ class Noise:
     doubt: float = UNKNOWN_BY
 
     def __post_init__(self) -> None:
-        given = isinstance(self.coefficients, np.ndarray)
-        if given and not np.isfinite(self.coefficients).all():
-            raise InputError("the noise model's coefficients must be finite")
         if np.shape(self.coefficients) != (3, 4):
             raise InputError("the noise model's coefficients must have shape (3, 4)")
+        if not is_traced(self.coefficients):
+            coefficients = real_array(self.coefficients, "the noise model's coefficients")
+            if not np.isfinite(coefficients).all():
+                raise InputError("the noise model's coefficients must be finite")
+            object.__setattr__(self, "coefficients", coefficients)
         if not (is_number(self.doubt) and 1 <= self.doubt <= 100):
             raise InputError(f"doubt is a factor between 1 and 100, not {self.doubt!r}")
 
@@ -58,8 +62,11 @@ class Noise:
     ) -> Noise:
         """The same SDs everywhere: lateral, range, elevational, mm."""
         sigma = real_array(sigma_mm, "SDs")
-        if sigma.shape != (3,) or not (np.isfinite(sigma).all() and (sigma > 0).all()):
-            raise InputError(f"SDs must be three positive mm, not {sigma_mm}")
+        low, high = SD_RANGE_MM
+        if sigma.shape != (3,) or not ((low <= sigma) & (sigma <= high)).all():
+            raise InputError(
+                f"SDs must be three positive mm between {low:g} and {high:g}, not {sigma_mm}"
+            )
         coefficients = np.zeros((3, 4))
         coefficients[:, 0] = np.log(sigma)
         return cls(coefficients, doubt)
@@ -86,6 +93,12 @@ class Noise:
             doubt: see the class.
         """
         check_probe(probe)
+        low, high = SD_RANGE_MM
+        for name, value in (("channel_mm", channel_mm), ("elevational_mm", elevational_mm)):
+            if not (is_number(value) and low <= value <= high):
+                raise InputError(f"{name} must be an SD of {low:g} to {high:g} mm, not {value!r}")
+        if not is_number(focus_mm):
+            raise InputError(f"focus_mm must be a number of mm, not {focus_mm!r}")
         lateral, depth = np.meshgrid(
             np.linspace(-0.4, 0.4, 9) * probe.width_mm, np.linspace(15.0, 90.0, 12)
         )
@@ -124,7 +137,7 @@ class Noise:
         sigma = np.maximum(np.asarray(answer.sigma, float), _LEAST_SD_MM)
         if not np.isfinite(sigma).all():
             raise InputError("this calibration has no SDs: plan with a noise model of your own")
-        used = np.asarray(answer.mask) > 0
+        used = used_images(result, len(targets))
         count = int(used.sum())
         if result.method != "joint":
             # These methods weigh all errors alike, so the prediction must do the same.
@@ -146,4 +159,20 @@ class Noise:
     def sigma(self, target: Float[Any, "*n 3"]) -> Float[Any, "*n 3"]:
         """SDs (lateral, range, elevational; mm) of targets in the image frame (traceable)."""
         xp = target.__array_namespace__()
-        return xp.exp(basis_at(target) @ self.coefficients.T)
+        return xp.exp(self.log_sigma(target))
+
+    def log_sigma(self, target: Float[Any, "*n 3"]) -> Float[Any, "*n 3"]:
+        """The natural logarithms of :meth:`sigma` (traceable)."""
+        return basis_at(target) @ self.coefficients.T
+
+
+def used_images(result: Calibration, count: int) -> Bool[np.ndarray, " n"]:
+    """Which images a calibration used.
+
+    Raises:
+        InputError: the calibration is not of ``count`` images.
+    """
+    used = np.asarray(result.numpy().mask) > 0
+    if len(used) != count:
+        raise InputError(f"the calibration is of {len(used)} images, {count} poses were given")
+    return used

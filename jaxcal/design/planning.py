@@ -27,7 +27,7 @@ from jaxcal.design.information import (
     effective_elevational,
     known_information,
 )
-from jaxcal.design.noise import Noise
+from jaxcal.design.noise import SD_RANGE_MM, Noise
 from jaxcal.diagnostics.directions import direction_in_words
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import real_array
@@ -89,6 +89,7 @@ class Plan:
 
     def first(self, count: int) -> Plan:
         """The plan's first poses alone."""
+        whole_number("count", count, 0, len(self))
         return replace(
             self,
             poses=self.poses[:count],
@@ -148,7 +149,7 @@ def plan(
     whole_number("the number of poses", n, least, MOST_POSES)
     if cost_s is not None:
         cost_s = real_array(cost_s, "cost_s")
-        if cost_s.shape != (len(candidates),) or not (cost_s > 0).all():
+        if cost_s.shape != (len(candidates),) or not ((cost_s > 0) & np.isfinite(cost_s)).all():
             raise InputError("cost_s must have a positive number of seconds for each candidate")
     check_candidates(candidates)
     rules = Rules() if rules is None else rules
@@ -209,16 +210,12 @@ def known_before(
     if prior is None:
         return Known(candidates.model.beliefs())
     if isinstance(prior, Known):
-        return prior
+        return replace(prior, information=_checked_information(prior.information, size))
     if isinstance(prior, Plan):
-        return Known(prior.information, prior.known.images + len(prior), prior.known.tuned)
+        information = _checked_information(prior.information, size)
+        return Known(information, prior.known.images + len(prior), prior.known.tuned)
     if isinstance(prior, np.ndarray):
-        if prior.shape != (size, size) or not np.isfinite(prior).all():
-            raise InputError(f"information must be a finite {size} x {size} matrix")
-        values = np.linalg.eigvalsh(prior)
-        if not np.allclose(prior, prior.T) or values[0] < -_SINGULAR * abs(values[-1]):
-            raise InputError("information must be a symmetric matrix without negative eigenvalues")
-        return Known(prior + candidates.model.beliefs())
+        return Known(_checked_information(prior, size) + candidates.model.beliefs())
     check_result(prior)
     if candidates.taken is None:
         raise InputError(
@@ -231,6 +228,20 @@ def known_before(
     used = int(np.sum(np.asarray(answer.mask) > 0))
     information = known_information(prior, model, candidates.taken)
     return Known(information, used, bool(answer.sigma_tuned))
+
+
+def _checked_information(value: object, size: int) -> Float[np.ndarray, "p p"]:
+    """A caller's information about the unknowns of a model."""
+    found = real_array(value, "information")
+    if found.shape != (size, size) or not np.isfinite(found).all():
+        raise InputError(
+            f"information must be a finite {size} x {size} matrix, as the candidates' model has "
+            f"{size} unknowns"
+        )
+    values = np.linalg.eigvalsh(found)
+    if not np.allclose(found, found.T) or values[0] < -_SINGULAR * abs(values[-1]):
+        raise InputError("information must be a symmetric matrix without negative eigenvalues")
+    return found
 
 
 def with_effective_noise(prior: object, candidates: Candidates) -> Candidates:
@@ -320,6 +331,12 @@ def check_candidates(candidates: Candidates) -> None:
     every = candidates.poses
     if candidates.taken is not None:
         every = np.concatenate([every, candidates.taken])
+    log_sd = candidates.model.noise.log_sigma(model.targets(candidates.poses))
+    low, high = SD_RANGE_MM
+    if log_sd.min() < np.log(low) or log_sd.max() > np.log(high):
+        raise InputError(
+            f"the noise model's SDs must be {low:g} to {high:g} mm at all candidate poses"
+        )
     lever = float(np.sqrt(np.mean(np.sum(model.targets(every) ** 2, axis=1))))
     scale = np.repeat([1.0, lever, 1.0, lever], (3, 3, 3, 2))[: model.size]
     found = model.information(every) / (scale[:, None] * scale)

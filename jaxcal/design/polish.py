@@ -103,7 +103,9 @@ def _cut_off(numbers: Float[np.ndarray, 5], candidates: Candidates) -> Float[np.
 def polish(
     search: Search, candidates: Candidates, chosen: Chosen
 ) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "k p p"]]:
-    """Move the chosen poses, one after the other; those that fill space stay.
+    """Move the chosen poses, one after the other.
+
+    Those that fill space stay, and so do a caller's own that are outside the constraints.
 
     Args:
         search: the search that chose the poses.
@@ -147,8 +149,10 @@ def polish(
         ).sum()
         return bool(near >= search.rules.replicates)
 
+    # From outside the constraints, the way into them may cost more than the gradient gives.
+    inside = bounds.keeps(poses, x, point)
     for k, filling in enumerate(chosen.filling):
-        if filling:
+        if filling or not inside[k]:
             continue
         own = _outer(model, poses[k], search.factors)
         known = covariance_of(information - own)

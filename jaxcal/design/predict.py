@@ -92,9 +92,11 @@ def images_to(
         )
     assert candidates is not None
     candidates = replace(candidates, poses=candidates.poses[:: -(-len(candidates) // _ENOUGH)])
+    # A plan is continued by its own criterion, which may need more images.
+    criterion = result.criterion if isinstance(result, Plan) else "tre"
     size, now = 16, math.inf
     while size <= min(MOST_IMAGES, MOST_POSES):
-        more = next_poses(result, candidates, size)
+        more = next_poses(result, candidates, size, criterion)
         reached = np.flatnonzero(more.tre_mm <= tre_mm)
         if len(reached):
             return first + int(reached[0])

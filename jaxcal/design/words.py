@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaxcal.calibration.inputs import check_made
 from jaxcal.data.poses import check_poses
 from jaxcal.design.constraints import Constraints
+from jaxcal.design.information import Model
 from jaxcal.runtime.array_types import Float
 
 _LEAST_TILT_DEG, _LEAST_TURN_DEG = 3.0, 5.0
@@ -39,7 +41,9 @@ def pose_in_words(
         e.g. "tilt 20 degrees towards the marker, target in the lower left corner".
     """
     pose = check_poses(np.asarray(pose)[None])
-    s1, s2, w1, w2, turn = constraints.coordinates(pose, image_to_probe, point)[0]
+    check_made("constraints", constraints, Constraints, "jaxcal.design.Constraints")
+    model = Model(image_to_probe, point)
+    s1, s2, w1, w2, turn = constraints.coordinates(pose, model.image_to_probe, model.point)[0]
     parts = []
     tilt, turned = float(np.degrees(np.hypot(w1, w2))), float(np.degrees(turn))
     if tilt >= _LEAST_TILT_DEG:
