@@ -194,3 +194,16 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
     ):
         with pytest.raises(jaxcal.InputError, match=said):
             call()
+
+
+def test_local_unknowns_reach_their_minimum_where_the_shared_gradient_is_zero():
+    """At s = 0 the gradient of s is zero from the start, but l = ln 2 is far away."""
+
+    def residual(shared, local, args):
+        del args
+        return jnp.stack([jnp.exp(local) - 2 + shared, 3 * shared + 0 * local], axis=1)
+
+    solution = arrow_least_squares(residual, jnp.asarray(0.0), np.zeros(4))
+    shared, local = solution.value
+    np.testing.assert_allclose(shared, 0, atol=1e-12)
+    np.testing.assert_allclose(local, np.log(2), atol=1e-9)

@@ -34,6 +34,8 @@ from jaxcal import InputError
 from jaxcal.model import unrolled
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.solvers.levenberg_marquardt import (
+    IDLE,
+    LARGEST_DAMPING,
     Descent,
     Rounding,
     default_tolerance,
@@ -51,6 +53,8 @@ class Flat(eqx.Module):
         slope: how the local unknowns follow a step: by dy = -(rest + slope dx).
         rest: the part of -dy that does not depend on dx.
         limit: largest magnitude of the local unknowns.
+        local_cosine: gradient cosine of the local unknowns, the largest of all rows, where the
+            derivatives were last taken.
     """
 
     shared: Float[Array, "p 1"]
@@ -58,6 +62,7 @@ class Flat(eqx.Module):
     slope: Float[Array, "n p 1"] | None = None
     rest: Float[Array, "n 1"] | None = None
     limit: Float[Array, "n 1"] | None = None
+    local_cosine: Float[Array, " 1"] | None = None
 
     def moved(self, step: Float[Array, "p 1"]) -> Flat:
         """After a step of the shared unknowns."""
@@ -68,7 +73,7 @@ class Flat(eqx.Module):
             assert self.limit is not None
             along = local - self.rest - jnp.sum(self.slope * step, axis=1)
             local = jnp.clip(along, -self.limit, self.limit)
-        return Flat(self.shared + step, local, self.slope, self.rest, self.limit)
+        return Flat(self.shared + step, local, self.slope, self.rest, self.limit, self.local_cosine)
 
 
 class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
@@ -240,6 +245,18 @@ class _ArrowSolver(LevenbergMarquardt):
             descent, lambda place, exact: normal, rounding, self.tolerance, 2**30, exact_below=0.0
         )
         place = after.place
+        # A step knows of the shared unknowns' gradient alone. Where that is zero, the local ones
+        # may be far from their minimum still.
+        still = place.local_cosine
+        stuck = (after.idle >= IDLE) | (after.damping > LARGEST_DAMPING)
+        after = eqx.tree_at(
+            lambda state: (state.active, state.settled),
+            after,
+            (
+                after.active | (still > self.tolerance) & jnp.logical_not(stuck),
+                after.settled & ((still <= 10 * self.tolerance) | (after.idle >= IDLE)),
+            ),
+        )
         return (place.shared[:, 0], place.local[:, 0]), (after, rounding, aux), aux
 
     def _at(self, fn: Any, y: tuple[Array, Array], args: Any) -> tuple[Flat, Normal]:
@@ -260,10 +277,13 @@ class _ArrowSolver(LevenbergMarquardt):
         give = jnp.where(held | (diagonal <= 0), 0.0, 1 / jnp.where(diagonal > 0, diagonal, 1.0))
         shared = jnp.einsum("anm,bnm->ab", jacobian, jacobian)
         gradient = jnp.einsum("anm,nm->a", jacobian, value)
+        cost = jnp.sum(value**2)
+        length = jnp.sqrt(diagonal * cost)
+        cosine = jnp.abs(jnp.where(held, 0.0, pull)) / jnp.where(length > 0, length, 1.0)
         normal = _packed(
             shared - (coupling * give[:, None]).T @ coupling,
             gradient - (give * pull) @ coupling,
-            jnp.sum(value**2),
+            cost,
             jnp.diagonal(shared),
         )
         place = Flat(
@@ -272,5 +292,6 @@ class _ArrowSolver(LevenbergMarquardt):
             (give[:, None] * coupling)[..., None],
             (give * pull)[:, None],
             self.limit[:, None],
+            jnp.max(cosine, initial=0.0)[None],
         )
         return place, normal
