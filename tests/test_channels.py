@@ -148,6 +148,29 @@ def test_missing_and_late_lines_do_no_harm():
     assert precision(result, data) < 1.5 * precision(jaxcal.calibrate(data, prior="gaussian"), data)
 
 
+def test_distances_that_no_element_heard_are_never_read():
+    problem = jaxcal.Problem.from_recording(recording(CURVED))
+    # One pose twice: such frames count as one image, the mean of their distances.
+    poses = np.array(problem.poses)
+    poses[1] = poses[0]
+    channels = problem.channels
+    assert channels is not None
+    lost = np.random.default_rng(1).random(channels.distances.shape) < 0.2
+
+    def solved(instead: float) -> jaxcal.Calibration:
+        distances = np.where(lost, instead, channels.distances)
+        heard = np.where(lost, 0.0, channels.heard)
+        changed = replace(channels, distances=jnp.asarray(distances), heard=jnp.asarray(heard))
+        told = replace(problem, poses=jnp.asarray(poses), channels=changed)
+        return jaxcal.calibrate(told, prior="gaussian")
+
+    plain, rubbish = solved(0.0), solved(np.nan)
+    assert plain.status == rubbish.status == "converged"
+    assert int(plain.images_used) == 19
+    np.testing.assert_array_equal(rubbish.image_to_probe, plain.image_to_probe)
+    assert rubbish.verdict() == plain.verdict()
+
+
 @pytest.mark.slow
 def test_derivative_matches_finite_differences():
     problem = jaxcal.Problem.from_recording(recording(CURVED, noise=0.2))

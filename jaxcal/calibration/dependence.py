@@ -293,7 +293,7 @@ def _joined(data: Any, found: Independent) -> Any:
         if channels is not None:
             weight = before["heard"][rows]
             total = weight.sum(axis=0)
-            sums = (weight * before["distances"][rows]).sum(axis=0)
+            sums = (weight * np.where(weight > 0, before["distances"][rows], 0.0)).sum(axis=0)
             values["distances"][kept] = sums / np.where(total > 0, total, 1.0)
             values["heard"][kept] = total >= 0.5 * len(rows)
     if channels is not None:

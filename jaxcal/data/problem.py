@@ -30,7 +30,8 @@ class Channels:
     """The distances that every element measured, for solvers that use times of flight directly.
 
     Attributes:
-        distances: one-way distances at the nominal sound speed and delay, mm; 0 without one.
+        distances: one-way distances at the nominal sound speed and delay, mm; any value where an
+            element did not hear.
         heard: 1 where an element's time of flight is used, 0 where it is missing or rejected.
         elements: positions in the image frame [lateral, elevational, axial], mm.
     """
@@ -92,7 +93,8 @@ class Problem:
     def cleared(self, used: Float[AnyArray, "*batch n"]) -> Problem:
         """The problem with harmless values in images that are not used: NaN times 0 is NaN, not 0.
 
-        The mask and all shapes stay as they are.
+        So are the distances of elements that heard nothing. The mask and all shapes stay as they
+        are.
 
         Args:
             used: 0 for images whose values are not to be read.
@@ -105,9 +107,9 @@ class Problem:
 
         channels = self.channels
         if channels is not None:
-            channels = Channels(
-                keep(channels.distances, 0.0), keep(channels.heard, 0.0), channels.elements
-            )
+            heard = keep(channels.heard, 0.0)
+            distances = xp.where(heard > 0, channels.distances, xp.zeros_like(channels.distances))
+            channels = Channels(distances, heard, channels.elements)
         return replace(
             self,
             poses=keep(self.poses, np.eye(4)),
