@@ -66,7 +66,6 @@ def test_a_third_of_the_poses_may_be_anything():
     assert np.linalg.norm(plain.tip - TIP) > 20 * np.linalg.norm(robust.tip - TIP)
 
 
-@pytest.mark.slow
 def test_errors_that_no_tip_in_a_dimple_has_are_told():
     poses = swung(random_rotations(60))
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
@@ -76,6 +75,7 @@ def test_errors_that_no_tip_in_a_dimple_has_are_told():
     assert jaxcal.calibrate_pivot(swung(random_rotations(60), noise=0.5)).warnings == []
 
 
+@pytest.mark.slow
 def test_batches_and_masks():
     poses = np.stack([swung(random_rotations(300, seed), 0.1, seed) for seed in range(3)])
     masks = np.ones((3, 300))
