@@ -213,7 +213,7 @@ def calibrate_batch(
         delay_sd: see there.
         options: see there.
         robust: see there; it takes longer than the solve.
-        chunk: lanes solved side by side; by default 64 on a processor (on channels 8), and on a GPU
+        chunk: lanes solved side by side; by default 32 on a processor (on channels 8), and on a GPU
             as many as have a million images together.
 
     Returns:

@@ -21,6 +21,7 @@ from scipy.stats import theilslopes
 
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
+from jaxcal.runtime.arrays import is_number, real_array
 
 MINIMUM_MOTION_MM = 8.0
 """Least motion from which a latency is estimated."""
@@ -33,7 +34,7 @@ _PARABOLA_S = 0.005
 
 
 def _increasing(t: np.ndarray, what: str, minimum: int = 2) -> Float[np.ndarray, " n"]:
-    times = np.asarray(t, dtype=np.float64)
+    times = real_array(t, f"each {what}")
     if times.ndim != 1 or len(times) < minimum:
         raise InputError(f"{what} must be a row of {minimum} times or more, not {times.shape}")
     if not np.isfinite(times).all():
@@ -63,7 +64,7 @@ def can_interpolate(
         InputError: times out of order or not numbers.
     """
     times = _increasing(t, "time of pose")
-    asked = np.asarray(query, dtype=np.float64)
+    asked = _queries(query)
     usable = np.ones(len(times), bool) if valid is None else np.asarray(valid, bool)
     if usable.shape != times.shape:
         raise InputError(f"valid must have one value for each of {len(times)} poses")
@@ -74,6 +75,13 @@ def can_interpolate(
     near = times[before + 1] - times[before] <= max_gap_s
     between = usable[before] & usable[before + 1] & near
     return inside & (between | (on_sample & usable[before]) | (on_next & usable[before + 1]))
+
+
+def _queries(query: np.ndarray) -> Float[np.ndarray, " m"]:
+    asked = real_array(query, "the times asked for")
+    if asked.ndim != 1:
+        raise InputError(f"the times asked for must be a row of numbers, not {asked.shape}")
+    return asked
 
 
 def _interval(times: np.ndarray, asked: np.ndarray) -> np.ndarray:
@@ -105,7 +113,7 @@ def interpolate_poses(
             that cannot be used; the time is named. :func:`can_interpolate` checks it beforehand.
     """
     times = _increasing(t, "time of pose")
-    asked = np.asarray(query, dtype=np.float64)
+    asked = _queries(query)
     if np.shape(poses)[:1] != times.shape:
         raise InputError(f"there are {np.shape(poses)[0]} poses and {len(times)} times")
     refused = np.flatnonzero(~can_interpolate(times, asked, max_gap_s=max_gap_s, valid=valid))
@@ -181,7 +189,7 @@ def fit_clock(
         InputError: fewer than two samples, device times out of order, or values not finite.
     """
     device = _increasing(t_device, "device time")
-    host = np.asarray(t_host, dtype=np.float64)
+    host = real_array(t_host, "host times")
     if host.shape != device.shape or not np.isfinite(host).all():
         raise InputError(f"host times must be {len(device)} numbers, one for each device time")
     # Seconds since 1970 have few digits left for microseconds: count from the first sample.
@@ -225,8 +233,11 @@ def motion_along_main_axis(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarra
     """Position (mm) along the direction in which a probe moved most, for :func:`estimate_latency`.
 
     The sign of the direction is arbitrary.
+
+    Raises:
+        InputError: what is not poses, see :func:`jaxcal.data.poses.check_poses`.
     """
-    return along_main_axis(np.asarray(poses, dtype=np.float64)[:, :3, 3])
+    return along_main_axis(check_poses(poses)[:, :3, 3])
 
 
 def along_main_axis(positions: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
@@ -285,11 +296,20 @@ def estimate_latency(
         _increasing(t_video, "time of image", 8),
         _increasing(t_tracker, "time of pose", 8),
     )
-    video, tracker = np.asarray(video, float), np.asarray(tracker_mm, float)
+    video = real_array(video, "the images' motion")
+    tracker = real_array(tracker_mm, "the probe's motion")
     if video.shape != t_video.shape or tracker.shape != t_tracker.shape:
         raise InputError("each motion must have one value for each of its times")
     if not (np.isfinite(video).all() and np.isfinite(tracker).all()):
         raise InputError("a motion holds NaN or Inf: leave those samples out")
+    limits = {
+        "max_lag_s": max_lag_s,
+        "step_s": step_s,
+        "minimum_motion_mm": minimum_motion_mm,
+    }
+    for name, value in limits.items():
+        if not is_number(value) or value < 0:
+            raise InputError(f"{name} must be a number of at least 0, not {value!r}")
     if not (0 < step_s <= max_lag_s and max_lag_s / step_s <= _MOST_STEPS):
         raise InputError(f"the step ({step_s:g} s) must be small against {max_lag_s:g} s")
     # The same images are used at every lag: a lag with fewer images could win by chance.

@@ -79,8 +79,8 @@ JAX_SETTINGS = (
 Description = Any
 """The description of a tree, which JSON can hold."""
 
-Hold = Callable[[list[np.ndarray]], list[Any]]
-"""Makes of numpy arrays those that a caller wants."""
+Hold = Callable[[list[jax.Array]], list[Any]]
+"""Makes of a program's arrays, as soon as they are there, those that a caller wants."""
 
 _log = logging.getLogger(__name__)
 
@@ -108,7 +108,12 @@ class _Program:
     def __call__(self, leaves: list[Any], hold: Hold) -> Any:
         arrays = jax.device_put(leaves, self.device)
         pieces = self.executable.execute_sharded(arrays).disassemble_into_single_device_arrays()
-        return rebuild(self.result, hold([np.asarray(shards[0]) for shards in pieces]))
+        return rebuild(self.result, hold(jax.block_until_ready([shards[0] for shards in pieces])))
+
+
+def in_numpy(arrays: list[jax.Array]) -> list[np.ndarray]:
+    """A result that JAX need not compile anything for: it compiles every operation on its own."""
+    return [np.asarray(array) for array in arrays]
 
 
 _loaded: OrderedDict[str, _Program] = OrderedDict()
@@ -123,7 +128,7 @@ def run(
     *,
     flags: compiler.Flags,
     label: dict[str, Any],
-    hold: Hold = list,
+    hold: Hold = in_numpy,
 ) -> Any:
     """Call ``function(*arguments, plan)``, compiled; by the kept program if there is one.
 
@@ -134,8 +139,7 @@ def run(
         plan: everything static about it.
         flags: wished for; those unknown to the compiler are left out.
         label: what the program is, for ``jaxcal cache show``.
-        hold: what to make of the result's arrays. By default they are numpy's, since JAX would
-            compile every operation on its own.
+        hold: what to make of the result's arrays; by default numpy's.
 
     Returns:
         The function's result.
