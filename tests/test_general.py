@@ -173,6 +173,15 @@ def test_what_the_pieces_cannot_take_is_said_in_a_sentence():
             lambda: backend.arrow_least_squares(lambda s, y, d: d, np.zeros(2, int), np.zeros(3)),
             "floating arrays",
         ),
+        *(
+            (
+                lambda made=made: backend.arrow_least_squares(
+                    lambda s, y, d: made, jnp.asarray(1.0), np.zeros(4)
+                ),
+                r"residual must return a \(4, columns\) array, not",
+            )
+            for made in (None, jnp.zeros(4), jnp.zeros((3, 2)), jnp.zeros((4, 0)))
+        ),
         (lambda: backend.size(("rotation", "angle")), "'angle' is no unknown: choose from trans"),
         (
             lambda: backend.retract(backend.initial_fit(one), jnp.zeros(6), backend.RIGID),

@@ -75,6 +75,22 @@ def test_errors_that_no_tip_in_a_dimple_has_are_told():
     assert jaxcal.calibrate_pivot(swung(random_rotations(60), noise=0.5)).warnings == []
 
 
+def test_a_tool_that_is_hardly_turned_is_told():
+    turns = Rotation.from_rotvec(0.002 * np.random.default_rng(1).normal(size=(60, 3)))
+    result = jaxcal.calibrate_pivot(swung(turns, noise=0.05))
+    worst = np.sqrt(np.linalg.eigvalsh(np.asarray(result.covariance)[:3, :3])[-1])
+    assert worst > 1
+    assert f"known to {worst:.1f} mm (SD)" in result.warnings[0]
+    assert "turn the tool farther" in result.warnings[0]
+
+
+def test_metres_are_refused():
+    poses = swung(random_rotations(60))
+    poses[:, :3, 3] /= 1000
+    with pytest.raises(jaxcal.InputError, match="look like metres"):
+        jaxcal.calibrate_pivot(poses)
+
+
 @pytest.mark.slow
 def test_batches_and_masks():
     poses = np.stack([swung(random_rotations(300, seed), 0.1, seed) for seed in range(3)])

@@ -212,6 +212,35 @@ def test_lags_that_cannot_be_told(video, tracker, message: str) -> None:
         estimate_latency(t_video, video(t_video), t_tracker, tracker(t_tracker))
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"max_lag_s": np.inf}, "max_lag_s must be a number"),
+        ({"step_s": np.nan}, "step_s must be a number"),
+        ({"minimum_motion_mm": np.nan}, "minimum_motion_mm must be a number"),
+        ({"video": np.full(400, "one")}, "the images' motion must be an array of real numbers"),
+        ({"video": np.full(400, 1j)}, "the images' motion must be an array of real numbers"),
+        ({"t_video": np.full(400, "now")}, "time of image must be an array of real numbers"),
+    ],
+)
+def test_what_is_no_number_is_said(change, message: str) -> None:
+    t = np.linspace(0, 8, 400)
+    given = {"t_video": t, "video": np.sin(t), "t_tracker": t, "tracker_mm": 20 * np.sin(t)}
+    with pytest.raises(InputError, match=message):
+        estimate_latency(**(given | change))
+
+
+def test_queries_and_poses_that_are_none_are_said() -> None:
+    t = np.linspace(0, 2, 23)
+    poses = screw(t, np.ones(3), np.ones(3))
+    for query in (["soon"], [1j], 0.5, [[0.5]]):
+        with pytest.raises(InputError, match="the times asked for must be"):
+            interpolate_poses(t, poses, np.array(query), max_gap_s=1.0)
+    poses[4, 0, 3] = np.nan
+    with pytest.raises(InputError, match="pose 4 holds NaN"):
+        motion_along_main_axis(poses)
+
+
 def test_too_short_an_overlap() -> None:
     t = np.arange(0, 1.5, 0.008)
     with pytest.raises(InputError, match="overlap"):

@@ -23,7 +23,7 @@ from jaxcal.calibration.answer import covariance_and_observability
 from jaxcal.calibration.result import Status
 from jaxcal.data.poses import check_poses
 from jaxcal.data.problem import Problem
-from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.data.recording import MINIMUM_IMAGES, MetresError
 from jaxcal.diagnostics.outliers import images_that_stand_out, listed_departures
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.parameters import Parameters, retract
@@ -46,6 +46,10 @@ AXES = ("x", "y", "z")
 _SUBSET = 4
 _LARGEST_RMS_MM = 5.0
 """A tip that stays in a dimple does not move by so much."""
+_LEAST_REACH_MM = 5.0
+"""No tracker sees a tool nearer than that in all poses; see ``check_pose_units`` of recordings."""
+_LARGEST_SD_MM = 1.0
+"""A tip known less well serves no calibration; a tool that is hardly turned has such a one."""
 
 
 class Pivot(eqx.Module):
@@ -125,6 +129,15 @@ class Pivot(eqx.Module):
                 "either it slipped in most poses, or the poses are wrong (order or signs of their "
                 "numbers, units, direction)"
             )
+        covariance = np.asarray(self.covariance)[:3, :3]
+        if np.isfinite(covariance).all():
+            variances, directions = np.linalg.eigh(covariance)
+            if variances[-1] > _LARGEST_SD_MM**2:
+                direction = ", ".join(f"{value:.2f}" for value in directions[:, -1])
+                found.append(
+                    f"the tip is known to {variances[-1] ** 0.5:.1f} mm (SD) along ({direction}) "
+                    "of the tool's frame: turn the tool farther, about further axes"
+                )
         named = images_that_stand_out(self)
         if named:
             told = listed_departures(self, AXES)
@@ -150,8 +163,8 @@ def calibrate_pivot(
             wrong, and leave the others out.
 
     Raises:
-        InputError: poses or a mask of another shape, concrete poses that are not rigid transforms,
-            or fewer than 4 used ones.
+        InputError: poses or a mask of another shape, concrete poses that are not rigid transforms
+            or look like metres, or fewer than 4 used ones.
     """
     shape = np.shape(poses)
     if len(shape) < 3 or shape[-2:] not in ((4, 4), (3, 4)):
@@ -164,6 +177,12 @@ def calibrate_pivot(
         if used.sum() < MINIMUM_IMAGES:
             raise InputError(
                 f"{int(used.sum())} used poses are too few: at least {MINIMUM_IMAGES} are needed"
+            )
+        reach = float(np.linalg.norm(poses[used, :3, 3], axis=1).max())
+        if 0 < reach < _LEAST_REACH_MM:
+            raise MetresError(
+                f"every position lies within {reach:.3g} mm of the tracker's origin: the poses "
+                "look like metres; give them in mm"
             )
     require_float64("jaxcal.calibrate_pivot")
     array = jnp.asarray(poses, np.float64)

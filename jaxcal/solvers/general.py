@@ -197,8 +197,8 @@ def arrow_least_squares(
         optimistix's solution; its ``value`` is (shared, local).
 
     Raises:
-        InputError: shared unknowns that are integers, local ones that are not one a row; a
-            ``tolerance`` or ``damping`` below zero.
+        InputError: shared unknowns that are integers, local ones that are not one a row, residuals
+            of another shape; a ``tolerance`` or ``damping`` below zero.
     """
     flat, unravel = ravel_pytree(shared)
     if not jnp.issubdtype(flat.dtype, jnp.floating):
@@ -206,6 +206,11 @@ def arrow_least_squares(
     if jnp.ndim(local) != 1:
         raise InputError(f"local must be one number a row, not of shape {jnp.shape(local)}")
     first = (flat, jnp.asarray(local, flat.dtype))
+    made = jax.eval_shape(lambda s, y: residual(s, y, args), unravel(flat), first[1])
+    shape, rows = getattr(made, "shape", None), len(first[1])
+    if shape is None or len(shape) != 2 or shape[0] != rows or not rows or not shape[1]:
+        got = f"an array of shape {shape}" if shape is not None else f"a {type(made).__name__}"
+        raise InputError(f"residual must return a ({rows or 'n'}, columns) array, not {got}")
     bound = jnp.broadcast_to(jnp.asarray(limit, flat.dtype), first[1].shape)
 
     def function(unknowns: tuple[Array, Array], args: Any) -> Float[Array, "n columns"]:
