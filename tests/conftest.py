@@ -50,14 +50,14 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # One cache of compiled programs for all workers and for every process that a test starts, ours and
-# JAX's own: each program is compiled once. It is new for each run, so that a run never depends on
-# the last one.
+# JAX's own: a program is compiled once, unless compiling it is as cheap as keeping it. It is new
+# for each run, so that a run never depends on the last one.
 if "JAXCAL_TEST_CACHE" not in os.environ:
     os.environ["JAXCAL_TEST_CACHE"] = tempfile.mkdtemp(prefix="jaxcal-tests-")
     atexit.register(shutil.rmtree, os.environ["JAXCAL_TEST_CACHE"], ignore_errors=True)
 os.environ["XDG_CACHE_HOME"] = os.environ["JAXCAL_TEST_CACHE"]
 os.environ["JAX_COMPILATION_CACHE_DIR"] = os.path.join(os.environ["JAXCAL_TEST_CACHE"], "jax")
-os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 os.environ.pop("JAXCAL_NO_CACHE", None)
 
