@@ -213,8 +213,8 @@ def calibrate_batch(
         delay_sd: see there.
         options: see there.
         robust: see there; it takes longer than the solve.
-        chunk: lanes solved side by side; by default 32 on a processor (on channels 8), and on a GPU
-            as many as have a million images together.
+        chunk: lanes solved side by side; by default 32 on a processor (64 where laws are weighed, 8
+            on channels), and on a GPU as many as have a million images together.
 
     Returns:
         A :class:`Calibration` whose arrays have the problems' leading axes.
