@@ -23,7 +23,7 @@ from jaxcal.calibration.answer import covariance_and_observability
 from jaxcal.calibration.result import Status
 from jaxcal.data.poses import check_poses
 from jaxcal.data.problem import Problem
-from jaxcal.data.recording import MINIMUM_IMAGES, MetresError
+from jaxcal.data.recording import LEAST_REACH_MM, MINIMUM_IMAGES, MetresError
 from jaxcal.diagnostics.outliers import images_that_stand_out, listed_departures
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.parameters import Parameters, retract
@@ -46,8 +46,6 @@ AXES = ("x", "y", "z")
 _SUBSET = 4
 _LARGEST_RMS_MM = 5.0
 """A tip that stays in a dimple does not move by so much."""
-_LEAST_REACH_MM = 5.0
-"""No tracker sees a tool nearer than that in all poses; see ``check_pose_units`` of recordings."""
 _LARGEST_SD_MM = 1.0
 """A tip known less well serves no calibration; a tool that is hardly turned has such a one."""
 
@@ -179,7 +177,7 @@ def calibrate_pivot(
                 f"{int(used.sum())} used poses are too few: at least {MINIMUM_IMAGES} are needed"
             )
         reach = float(np.linalg.norm(poses[used, :3, 3], axis=1).max())
-        if 0 < reach < _LEAST_REACH_MM:
+        if 0 < reach < LEAST_REACH_MM:
             raise MetresError(
                 f"every position lies within {reach:.3g} mm of the tracker's origin: the poses "
                 "look like metres; give them in mm"

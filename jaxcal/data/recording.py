@@ -24,6 +24,9 @@ MINIMUM_IMAGES = 4
 LARGEST = 1e7
 """Largest coordinate accepted, in mm or px, and largest variance of one: ten kilometres."""
 
+LEAST_REACH_MM = 5.0
+"""No tracker sees a tool nearer to its origin than this in all poses."""
+
 LARGEST_PIXEL_MM = 10.0
 """Largest pixel accepted; a size in micrometres is larger."""
 
@@ -477,7 +480,7 @@ def check_pose_units(translations: Float[np.ndarray, "n 3"], extent_mm: float = 
     """
     spread, reach = _spread_and_reach(translations)
     # A probe that does not move has no unit; what is left of its moves is rounding.
-    if _AT_REST_MM < spread < 0.02 * extent_mm and reach < 5.0:
+    if _AT_REST_MM < spread < 0.02 * extent_mm and reach < LEAST_REACH_MM:
         raise MetresError(
             f"pose translations reach only {reach:.3g} mm while the target moves over about "
             f"{extent_mm:.0f} mm of the image: the poses look like metres; give them in mm"

@@ -34,7 +34,7 @@ _PARABOLA_S = 0.005
 
 
 def _increasing(t: np.ndarray, what: str, minimum: int = 2) -> Float[np.ndarray, " n"]:
-    times = real_array(t, f"each {what}")
+    times = real_array(t, what)
     if times.ndim != 1 or len(times) < minimum:
         raise InputError(f"{what} must be a row of {minimum} times or more, not {times.shape}")
     if not np.isfinite(times).all():
