@@ -184,76 +184,113 @@ def run(
     plan: SolvePlan,
 ) -> Solution:
     """The plan's method from conventional fits."""
-    options, other = plan.options, plan.other_solver
     observation, medium = observe(problems, images, given, plan)
-    zero = jnp.zeros_like(images.mask[:, 0])
-    components = observation.sigma.shape[0]
-
-    def solution(found: Any, arrived: Array, **others: Any) -> Solution:
-        common = {
-            "place": found.place,
-            "observation": observation,
-            "medium": medium,
-            "offset": None,
-            "cost": found.cost,
-            "cosine": found.cosine,
-            "arrived": arrived,
-            "iterations": found.iterations,
-            "variance_rounds": jnp.zeros(zero.shape, jnp.int32),
-            "sigma_floored": jnp.zeros((components, *zero.shape), bool),
-            "rotation_change": zero,
-            "translation_change": zero,
-            "trace": getattr(found, "trace", None),
-            "searched": begun.searched,
-        }
-        return Solution(**(common | others))
-
     start = begun.place
     if plan.method == "conventional":
         assert isinstance(begun, ConventionalStart)
-        fit = begun.fit
-        if options.solver == "gradient":
-            fit = pairwise_gradient(begun.start, images, options)
-        if other is not None:
-            fit = minimise_with(other, begun.start, observation, images, None, options)
-        return solution(fit, fit.settled)
-    if isinstance(observation, BoundedOffsets):
-        if plan.method == "alternating":
-            done = alternate(
-                start,
-                observation,
-                images,
-                tolerance_rad=options.tolerance_rad,
-                tolerance_mm=options.tolerance_mm,
-                max_rounds=options.max_rounds,
-                inner_steps=options.inner_steps,
-                trace=options.trace,
-            )
-            return solution(
-                done,
-                done.tolerance_met,
-                offset=done.offset,
-                rotation_change=done.rotation_change,
-                translation_change=done.translation_change,
-            )
-        fit = bounded(
-            start, observation, images, max_steps=options.max_iterations, trace=options.trace
+        found, own = _conventional(begun, observation, images, plan)
+    elif isinstance(observation, BoundedOffsets):
+        solved = _alternating if plan.method == "alternating" else _bounded
+        found, own = solved(start, observation, images, plan)
+    elif plan.self_tuning:
+        found, own = _self_tuned(start, observation, images, medium, plan)
+    else:
+        found, own = _with_given_sds(start, observation, images, medium, plan)
+    zero = jnp.zeros_like(images.mask[:, 0])
+    common = {
+        "place": found.place,
+        "observation": observation,
+        "medium": medium,
+        "offset": None,
+        "cost": found.cost,
+        "cosine": found.cosine,
+        "iterations": found.iterations,
+        "variance_rounds": jnp.zeros(zero.shape, jnp.int32),
+        "sigma_floored": jnp.zeros((observation.sigma.shape[0], *zero.shape), bool),
+        "rotation_change": zero,
+        "translation_change": zero,
+        "trace": getattr(found, "trace", None),
+        "searched": begun.searched,
+    }
+    return Solution(**(common | own))
+
+
+# Each of the following returns where a method stopped, and the fields of the solution that only it
+# can fill.
+
+
+def _conventional(
+    begun: ConventionalStart, observation: Observation, images: ImagePlanes, plan: SolvePlan
+) -> tuple[Any, dict[str, Any]]:
+    fit = begun.fit
+    if plan.options.solver == "gradient":
+        fit = pairwise_gradient(begun.start, images, plan.options)
+    if plan.other_solver is not None:
+        fit = minimise_with(plan.other_solver, begun.start, observation, images, None, plan.options)
+    return fit, {"arrived": fit.settled}
+
+
+def _alternating(
+    start: Iterate, observation: BoundedOffsets, images: ImagePlanes, plan: SolvePlan
+) -> tuple[Any, dict[str, Any]]:
+    done = alternate(
+        start,
+        observation,
+        images,
+        tolerance_rad=plan.options.tolerance_rad,
+        tolerance_mm=plan.options.tolerance_mm,
+        max_rounds=plan.options.max_rounds,
+        inner_steps=plan.options.inner_steps,
+        trace=plan.options.trace,
+    )
+    return done, {
+        "arrived": done.tolerance_met,
+        "offset": done.offset,
+        "rotation_change": done.rotation_change,
+        "translation_change": done.translation_change,
+    }
+
+
+def _bounded(
+    start: Iterate, observation: BoundedOffsets, images: ImagePlanes, plan: SolvePlan
+) -> tuple[Any, dict[str, Any]]:
+    limits = {"max_steps": plan.options.max_iterations, "trace": plan.options.trace}
+    fit = bounded(start, observation, images, **limits)
+    offset = local_unknowns(fit.place, observation, images)
+    return fit, {"arrived": fit.settled, "offset": offset}
+
+
+def _with_given_sds(
+    start: Iterate,
+    observation: Observation,
+    images: ImagePlanes,
+    medium: MediumPrior | None,
+    plan: SolvePlan,
+) -> tuple[Any, dict[str, Any]]:
+    other, options = plan.other_solver, plan.options
+    if other is not None:
+        fit = minimise_with(other, start, observation, images, medium, options)
+    else:
+        fit = minimise(
+            start,
+            observation,
+            images,
+            medium=medium,
+            damping=1e-6,
+            max_steps=options.max_iterations,
+            trace=options.trace,
         )
-        return solution(fit, fit.settled, offset=local_unknowns(fit.place, observation, images))
-    if not plan.self_tuning:
-        if other is not None:
-            fit = minimise_with(other, start, observation, images, medium, options)
-        else:
-            fit = minimise(
-                start,
-                observation,
-                images,
-                medium=medium,
-                damping=1e-6,
-                max_steps=options.max_iterations,
-                trace=options.trace,
-            )
-        return solution(fit, fit.settled)
+    return fit, {"arrived": fit.settled}
+
+
+def _self_tuned(
+    start: Iterate,
+    observation: Observation,
+    images: ImagePlanes,
+    medium: MediumPrior | None,
+    plan: SolvePlan,
+) -> tuple[Any, dict[str, Any]]:
+    other, options = plan.other_solver, plan.options
     if other is not None:
         tuned = self_tuned_with(other, start, observation, images, medium, options)
     else:
@@ -265,13 +302,12 @@ def run(
             max_rounds=options.max_iterations,
             trace=options.trace,
         )
-    return solution(
-        tuned,
-        tuned.settled,
-        observation=observation.with_sigma(tuned.updated),
-        sigma_floored=floored(tuned.updated),
-        variance_rounds=tuned.iterations,
-    )
+    return tuned, {
+        "arrived": tuned.settled,
+        "observation": observation.with_sigma(tuned.updated),
+        "sigma_floored": floored(tuned.updated),
+        "variance_rounds": tuned.iterations,
+    }
 
 
 def _attached(

@@ -47,6 +47,7 @@ from jaxcal.solvers.levenberg_marquardt import (
     LARGEST_DAMPING,
     LEAST_DAMPING,
     MORE,
+    Judged,
     Rounding,
     default_tolerance,
     gradient_cosine,
@@ -181,6 +182,30 @@ class SelfTuned(eqx.Module):
         )
 
 
+class Proposal(eqx.Module):
+    """What is to be tried next, from the sums at one place.
+
+    Attributes:
+        move: the step.
+        sigma: the SDs after it, mm.
+        weighed: the SDs for which the step was computed, mm.
+        first: the SDs after one update at the place itself, mm.
+        exact: 1 where exact second derivatives were used.
+        indefinite: no step: the matrix was indefinite.
+        half: half the cost at the place, with ``weighed``.
+        predicted: predicted decrease of ``half``.
+    """
+
+    move: Float[Array, "p lanes"]
+    sigma: Float[Array, "k lanes"]
+    weighed: Float[Array, "k lanes"]
+    first: Float[Array, "k lanes"]
+    exact: Float[Array, " lanes"]
+    indefinite: Bool[Array, " lanes"]
+    half: Float[Array, " lanes"]
+    predicted: Float[Array, " lanes"]
+
+
 def damped_step(
     normal: Normal, rest: Float[Array, "triangle lanes"], damping: Array, exact: Array
 ) -> Float[Array, "p lanes"]:
@@ -233,6 +258,165 @@ def updated(
     return with_floor(helmert(left, leverage, count, sigma))
 
 
+class Tuning(eqx.Module):
+    """What every pass over a batch has in common.
+
+    Attributes:
+        observation: the objective.
+        images: the data.
+        medium: what is known of sound speed and delay beforehand, or None.
+        held: the SDs of lanes with too few images to estimate them, mm.
+        count: numbers of residuals.
+        enough: lanes with enough images.
+        coordinates: size of the coordinates that rounding acts on, mm.
+        standing: gradient cosine at which the unknowns stand still.
+        tolerance: relative change at which the SDs stand still.
+        max_rounds: most passes.
+    """
+
+    observation: Observation
+    images: ImagePlanes
+    medium: MediumPrior | None
+    held: Float[Array, "k lanes"]
+    count: Float[Array, "k lanes"]
+    enough: Bool[Array, " lanes"]
+    coordinates: Float[Array, " lanes"]
+    standing: float = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+    max_rounds: int = eqx.field(static=True)
+
+    def update(
+        self, sums: ComponentSums, sigma: Array, damping: Array, exact: Array
+    ) -> tuple[Array, Array, Array]:
+        """The step for given SDs, the SDs after it, and where the matrix was indefinite."""
+        normal = sums.weighed(1 / sigma**2)
+        move = damped_step(normal, sums.rest, damping, exact)
+        lost = jnp.logical_not(jnp.all(jnp.isfinite(move), axis=0))
+        move = jnp.where(lost, 0.0, move)
+        after = barrier(updated(sums, normal, sigma, move, self.count))
+        tuned = jnp.where(jnp.isfinite(after), after, sigma)
+        return move, jnp.where(self.enough, tuned, self.held), lost
+
+    def propose(self, sums: ComponentSums, sigma: Array, damping: Array, exact: Array) -> Proposal:
+        """From the sums at a place, a few updates of the SDs and the step for the new SDs."""
+
+        def again(carry: tuple) -> tuple:
+            count, sigma, _, _, first, exact, _ = carry
+            move, after, lost = self.update(sums, sigma, damping, exact)
+            first = jnp.where(count == 0, after, first)
+            return count + 1, after, sigma, move, first, jnp.where(lost, 0.0, exact), lost
+
+        none = jnp.zeros_like(sums.gradient[0])
+        carry = (jnp.zeros((), jnp.int32), sigma, sigma, none, sigma, exact, exact > 1)
+        carry = jax.lax.while_loop(lambda carry: carry[0] < UPDATES, again, carry)
+        _, after, weighed, move, first, exact, lost = carry
+        normal = sums.weighed(1 / weighed**2)
+        held_back = damping * normal.diagonal() * move
+        return Proposal(
+            move=move,
+            sigma=after,
+            weighed=weighed,
+            first=first,
+            exact=exact,
+            indefinite=lost,
+            half=0.5 * normal.cost,
+            predicted=0.5 * jnp.sum(move * (held_back - normal.gradient), axis=0),
+        )
+
+    def judge(self, state: SelfTuned, sums: ComponentSums, rounding: Rounding) -> Judged:
+        """Whether the step to the candidate is accepted."""
+        # New SDs may change the units of the residuals, and so the cost, without any step.
+        whitened = sums.squares / state.weighed**2
+        growth = self.observation.growth(state.units, state.proposed, whitened)
+        return judge_step(
+            state.half - 0.5 * sums.weighed(1 / state.weighed**2).cost,
+            state.predicted,
+            state.half,
+            rounding.residual,
+            state.damping,
+            state.idle,
+            exact=state.exact_used > 0,
+            retry=state.retry,
+            allowance=growth,
+        )
+
+    def iterate_once(self, state: SelfTuned) -> SelfTuned:
+        """One pass over the images at the candidate, and the next candidate."""
+        observed = self.observation.in_units(state.proposed)
+        sums = barrier(
+            component_sums(state.candidate, observed, self.images, state.proposed, self.medium)
+        )
+        crude = with_floor(jnp.sqrt(sums.squares / self.count))
+        crude = jnp.where(self.enough, crude, self.held)
+        proposed = jnp.where(state.iterations == 0, crude, state.proposed)
+        normal = sums.weighed(1 / proposed**2)
+        rounding = Rounding.at(self.coordinates, 1 / jnp.min(proposed, axis=0), self.images)
+        cosine = gradient_cosine(normal, rounding.vanished)
+        judged = self.judge(state, sums, rounding)
+        place, sigma, cost, cosine = barrier(
+            choose(
+                judged.accept & state.active,
+                (state.candidate, proposed, normal.cost, cosine),
+                (state.place, state.sigma, state.cost, state.cosine),
+            )
+        )
+        # Where the candidate is refused, the proposal from its sums is not used.
+        exact = jnp.where(cosine <= EXACT_BELOW, 1.0, 0.0).astype(self.coordinates.dtype)
+        damping = judged.damping + 16 * jnp.finfo(self.held.dtype).eps
+        found = self.propose(sums, sigma, damping, exact)
+        new = self.next_state(state, judged, found, place, sigma, cost, cosine)
+        return choose(state.active, new, state)
+
+    def next_state(
+        self,
+        state: SelfTuned,
+        judged: Judged,
+        found: Proposal,
+        place: Iterate,
+        sigma: Float[Array, "k lanes"],
+        cost: Float[Array, " lanes"],
+        cosine: Float[Array, " lanes"],
+    ) -> SelfTuned:
+        """The state after a pass, with the best place so far and what was proposed from there."""
+        accept, damping, idle = judged.accept, judged.damping, judged.idle
+        change = jnp.max(jnp.abs(jnp.log(found.first / sigma)), axis=0)
+        change = jnp.where(accept, change, state.change)
+        there = (cosine <= self.standing) | (idle >= IDLE)
+        done = there & (change <= self.tolerance) & accept
+        more = jnp.maximum(MORE * damping, LEAST_DAMPING)
+        damping = jnp.where(found.indefinite & accept, more, damping)
+        iterations = state.iterations + 1
+        over = (damping > LARGEST_DAMPING) | (iterations >= self.max_rounds)
+        over = over | jnp.logical_not(jnp.isfinite(cost))
+        retry = found.indefinite | jnp.logical_not(accept)
+        recorded = state.trace
+        if recorded is not None:
+            rows = jnp.arange(recorded.shape[0])[:, None]
+            recorded = jnp.where(rows == state.iterations, cost, recorded)
+        return SelfTuned(
+            place=place,
+            sigma=sigma,
+            updated=jnp.where(accept, found.first, state.updated),
+            cost=cost,
+            change=change,
+            cosine=cosine,
+            candidate=choose(retry, place, place.moved(barrier(found.move))),
+            proposed=jnp.where(retry, sigma, found.sigma),
+            units=state.proposed,
+            retry=retry,
+            weighed=found.weighed,
+            half=found.half,
+            predicted=found.predicted,
+            exact_used=found.exact,
+            damping=damping,
+            idle=idle,
+            iterations=iterations,
+            settled=done,
+            active=jnp.logical_not(done | over),
+            trace=recorded,
+        )
+
+
 def self_tuned(
     start: Iterate,
     observation: Observation,
@@ -257,120 +441,34 @@ def self_tuned(
     """
     held, count = observation.sigma, observation.count(images)
     enough = images.used >= MINIMUM_SELF_TUNING
-    eps = jnp.finfo(held.dtype).eps
     standing = default_tolerance(images.mask.dtype)
     if tolerance is None:
         tolerance = 10 * standing if standing < 1e-9 else standing
     images, observation = barrier((images.padded(), observation.padded()))
     # Values of a lane are computed once, and not again for every image.
     coordinates, held, count, enough = barrier((reach(start, images), held, count, enough))
+    tuning = Tuning(
+        observation=observation,
+        images=images,
+        medium=medium,
+        held=held,
+        count=count,
+        enough=enough,
+        coordinates=coordinates,
+        standing=standing,
+        tolerance=tolerance,
+        max_rounds=max_rounds,
+    )
+    begun = SelfTuned.before(barrier(start), held, trace)
 
-    def update(
-        sums: ComponentSums, sigma: Array, damping: Array, exact: Array
-    ) -> tuple[Array, Array, Array]:
-        """The step for given SDs, the SDs after it, and where the matrix was indefinite."""
-        normal = sums.weighed(1 / sigma**2)
-        move = damped_step(normal, sums.rest, damping, exact)
-        lost = jnp.logical_not(jnp.all(jnp.isfinite(move), axis=0))
-        move = jnp.where(lost, 0.0, move)
-        after = barrier(updated(sums, normal, sigma, move, count))
-        after = jnp.where(enough & jnp.isfinite(after), after, jnp.where(enough, sigma, held))
-        return move, after, lost
-
-    def propose(sums: ComponentSums, sigma: Array, damping: Array, exact: Array) -> tuple:
-        """From the sums at a place, a few updates of the SDs and the step for the new SDs."""
-
-        def again(carry: tuple) -> tuple:
-            count, sigma, _, _, first, exact, _ = carry
-            move, after, lost = update(sums, sigma, damping, exact)
-            first = jnp.where(count == 0, after, first)
-            return count + 1, after, sigma, move, first, jnp.where(lost, 0.0, exact), lost
-
-        none = jnp.zeros_like(sums.gradient[0])
-        carry = (jnp.zeros((), jnp.int32), sigma, sigma, none, sigma, exact, exact > 1)
-        carry = jax.lax.while_loop(lambda carry: carry[0] < UPDATES, again, carry)
-        _, after, weighed, move, first, exact, lost = carry
-        normal = sums.weighed(1 / weighed**2)
-        held_back = damping * normal.diagonal() * move
-        predicted = 0.5 * jnp.sum(move * (held_back - normal.gradient), axis=0)
-        return move, after, weighed, first, exact, lost, 0.5 * normal.cost, predicted
+    def going_on(state: SelfTuned) -> Array:
+        return jnp.any(state.active)
 
     def iterate_once(state: SelfTuned) -> SelfTuned:
-        observed = observation.in_units(state.proposed)
-        sums = barrier(component_sums(state.candidate, observed, images, state.proposed, medium))
-        crude = jnp.where(enough, with_floor(jnp.sqrt(sums.squares / count)), held)
-        proposed = jnp.where(state.iterations == 0, crude, state.proposed)
-        normal = sums.weighed(1 / proposed**2)
-        rounding = Rounding.at(coordinates, 1 / jnp.min(proposed, axis=0), images)
-        cosine = gradient_cosine(normal, rounding.vanished)
+        # Not the bound method itself: JAX hashes what it loops over, and arrays have no hash.
+        return tuning.iterate_once(state)
 
-        # New SDs may change the units of the residuals, and so the cost, without any step.
-        whitened = sums.squares / state.weighed**2
-        growth = observation.growth(state.units, state.proposed, whitened)
-        judged = judge_step(
-            state.half - 0.5 * sums.weighed(1 / state.weighed**2).cost,
-            state.predicted,
-            state.half,
-            rounding.residual,
-            state.damping,
-            state.idle,
-            exact=state.exact_used > 0,
-            retry=state.retry,
-            allowance=growth,
-        )
-        accept, damping, idle = judged.accept, judged.damping, judged.idle
-        place, sigma, cost, cosine = barrier(
-            choose(
-                accept & state.active,
-                (state.candidate, proposed, normal.cost, cosine),
-                (state.place, state.sigma, state.cost, state.cosine),
-            )
-        )
-
-        # Where the candidate is refused, the proposal from its sums is not used.
-        exact = jnp.where(cosine <= EXACT_BELOW, 1.0, 0.0).astype(coordinates.dtype)
-        move, after, weighed, first, exact, bad, half, predicted = propose(
-            sums, sigma, damping + 16 * eps, exact
-        )
-        change = jnp.where(accept, jnp.max(jnp.abs(jnp.log(first / sigma)), axis=0), state.change)
-        there = (cosine <= standing) | (idle >= IDLE)
-        done = there & (change <= tolerance) & accept
-        more = jnp.maximum(MORE * damping, LEAST_DAMPING)
-        damping = jnp.where(bad & accept, more, damping)
-        iterations = state.iterations + 1
-        over = (damping > LARGEST_DAMPING) | (iterations >= max_rounds)
-        over = over | jnp.logical_not(jnp.isfinite(cost))
-        retry = bad | jnp.logical_not(accept)
-        recorded = state.trace
-        if recorded is not None:
-            rows = jnp.arange(recorded.shape[0])[:, None]
-            recorded = jnp.where(rows == state.iterations, cost, recorded)
-        new = SelfTuned(
-            place=place,
-            sigma=sigma,
-            updated=jnp.where(accept, first, state.updated),
-            cost=cost,
-            change=change,
-            cosine=cosine,
-            candidate=choose(retry, place, place.moved(barrier(move))),
-            proposed=jnp.where(retry, sigma, after),
-            units=state.proposed,
-            retry=retry,
-            weighed=weighed,
-            half=half,
-            predicted=predicted,
-            exact_used=exact,
-            damping=damping,
-            idle=idle,
-            iterations=iterations,
-            settled=done,
-            active=jnp.logical_not(done | over),
-            trace=recorded,
-        )
-        return choose(state.active, new, state)
-
-    begun = SelfTuned.before(barrier(start), held, trace)
-    return jax.lax.while_loop(lambda state: jnp.any(state.active), iterate_once, begun)
+    return jax.lax.while_loop(going_on, iterate_once, begun)
 
 
 def update_at(
