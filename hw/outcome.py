@@ -23,7 +23,7 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
         The calibration's record (:func:`jaxcal.report.record.calibration_record`).
     """
     from jaxcal.calibration.calibrate import calibrate
-    from jaxcal.cli.common import print_page
+    from jaxcal.cli.common import Verbatim, print_page
     from jaxcal.data.segmentation.segment import segment_recording
     from jaxcal.io.hdf5 import load
     from jaxcal.report.record import calibration_record
@@ -38,8 +38,8 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
     record = calibration_record(calibrate(recording, estimate=scale), recording)
     hint = " --estimate scale" if scale else ""
     again = f"jaxcal calibrate {shlex.quote(path)}{hint} --report report.html"
-    last = f"{path}: again, with a report: {again}"
-    print_page(calibration_table(record), *verdict(record), "", *lines, last)
+    last = (f"{path}: again, with a report:", Verbatim(f"  {again}"))
+    print_page(calibration_table(record), *verdict(record), "", *lines, *last)
     return record
 
 

@@ -644,6 +644,14 @@ def test_messages_are_not_markup(capfd):
     assert lines[2].startswith("  word")
 
 
+def test_commands_and_paths_are_not_broken(capfd):
+    path = "/home/lab" + "/2026-11-24" * 12 + "/rec.h5"
+    command = f"jaxcal calibrate {path} --report report.html"
+    common.print_page(f"the images are in {path} as before", common.Verbatim(command), "end")
+    lines = capfd.readouterr().out.splitlines()
+    assert lines == ["the images are in", path, "as before", command, "end"]
+
+
 @pytest.mark.parametrize("spoil", ["open", "open_parent", "link", "file", "unwritable", "off"])
 def test_cache_that_cannot_be_trusted_is_not_used(spoil, tmp_path, monkeypatch, capfd):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)

@@ -96,8 +96,12 @@ def print_json(record: dict[str, Any]) -> None:
     click.echo(json.dumps(record, allow_nan=False))
 
 
+class Verbatim(str):
+    """A line that is not wrapped, so that it can be copied: a command."""
+
+
 def print_page(*parts: RenderableType) -> None:
-    """Print tables, and sentences wrapped to the page, on standard output."""
+    """Print tables, sentences wrapped to the page, and verbatim lines, on standard output."""
     from rich.console import Console
 
     from jaxcal.report.paragraphs import laid_out
@@ -107,9 +111,12 @@ def print_page(*parts: RenderableType) -> None:
     # Nothing in a message or a file's name is to be taken for markup.
     page = Console(markup=False, highlight=False, emoji=False, width=width)
     with page.capture() as captured:
-        for words, group in groupby(parts, key=lambda part: isinstance(part, str)):
-            if words:
-                page.print(laid_out([str(part) for part in group], page.width))
+        for kind, group in groupby(parts, key=type):
+            if kind is Verbatim:
+                for line in group:
+                    page.print(line, soft_wrap=True)
+            elif kind is str:
+                page.print(laid_out([str(part) for part in group], page.width), soft_wrap=True)
             else:
                 page.print(*group)
     # Not straight from rich, which leaves the process when the pipe is closed early.

@@ -24,5 +24,14 @@ def laid_out(lines: Sequence[str], width: int) -> str:
         if told and here.endswith(":") and after.startswith(BULLET):
             told.append("")
         indent = " " * len(BULLET) if here.startswith(BULLET) else ""
-        told.append(textwrap.fill(here, width, subsequent_indent=indent))
+        # Paths and options stay whole, so that they can be copied.
+        told.append(
+            textwrap.fill(
+                here,
+                width,
+                subsequent_indent=indent,
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+        )
     return "\n".join(told)

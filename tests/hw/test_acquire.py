@@ -178,7 +178,7 @@ def fault_in_the_middle(tmp_path, name: str, speed: float, rest_s: float | None)
         line = str(caught.value)
         assert what in line
         assert "\n" not in line
-        assert f"--resume {path}" in line
+        assert f"acquire {path} --resume" in line
         deadline = time.monotonic() + 30
         while (rest := bench.rest_since()) is None:
             assert time.monotonic() < deadline
