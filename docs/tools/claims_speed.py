@@ -69,8 +69,8 @@ claim(
 )
 
 
-def _accelerator(method: str, prior: str) -> float:
-    found = only("accelerator", "problems_per_s", method=method, prior=prior, images="20")
+def _accelerator(method: str, prior: str, images: int = 20) -> float:
+    found = only("accelerator", "problems_per_s", method=method, prior=prior, images=str(images))
     return round(found, -3)
 
 
@@ -78,13 +78,18 @@ claim(
     SPEED,
     "batches of {:,.0f} problems of {:.0f} images in float64 on an NVIDIA H100: {:,.0f} "
     "conventional calibrations a second, {:,.0f} self-tuned Gaussian ones, {:,.0f} with prior "
-    "auto. That is {:.1f} to {:.1f} times what all {:.0f} cores",
+    "auto; with {:.0f} images {:,.0f}, {:,.0f} and {:,.0f}. That is {:.1f} to {:.1f} times what all "
+    "{:.0f} cores",
     lambda: (
         max(column("accelerator", "problems")),
         min(column("accelerator", "images")),
         _accelerator("conventional", "auto"),
         _accelerator("joint", "gaussian"),
         _accelerator("joint", "auto"),
+        max(column("accelerator", "images")),
+        _accelerator("conventional", "auto", 50),
+        _accelerator("joint", "gaussian", 50),
+        _accelerator("joint", "auto", 50),
         *span(column("accelerator", "ratio")),
         max(column("accelerator", "cores")),
     ),

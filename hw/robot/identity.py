@@ -20,6 +20,7 @@ import re
 import socket
 import struct
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from hw.errors import LostError
@@ -34,6 +35,9 @@ KINEMATICS = struct.Struct(">6I24dI")
 _MOST_MESSAGE = 1 << 16
 _REMOTE = "is in remote control"
 LOCAL = "the robot is in local control: switch it to remote control at the pendant"
+
+Connect = Callable[[tuple[str, int], float], socket.socket]
+"""Takes an address and a timeout (s), like :func:`socket.create_connection`."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,13 @@ def read_identity(host: str, *, timeout_s: float = 3.0) -> Identity:
     )
 
 
-def until_local(host: str, *, period_s: float, timeout_s: float = 3.0) -> None:
+def until_local(
+    host: str,
+    *,
+    period_s: float,
+    timeout_s: float = 3.0,
+    connect: Connect = socket.create_connection,
+) -> None:
     """Ask the dashboard again and again; returns once it says that the robot is in local control.
 
     A dashboard that is silent or gone says nothing about that, and is connected to again.
@@ -116,7 +126,7 @@ def until_local(host: str, *, period_s: float, timeout_s: float = 3.0) -> None:
     while True:
         with (
             contextlib.suppress(OSError),
-            socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection,
+            connect((host, DASHBOARD_PORT), timeout_s) as connection,
         ):
             stream = _Lines(connection, time.monotonic() + timeout_s)
             stream.line()
@@ -127,10 +137,12 @@ def until_local(host: str, *, period_s: float, timeout_s: float = 3.0) -> None:
         time.sleep(period_s)
 
 
-def stop_program(host: str, *, timeout_s: float) -> bool:
+def stop_program(
+    host: str, *, timeout_s: float, connect: Connect = socket.create_connection
+) -> bool:
     """Ask the dashboard to stop the program; returns whether it says that it did."""
     try:
-        with socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection:
+        with connect((host, DASHBOARD_PORT), timeout_s) as connection:
             stream = _Lines(connection, time.monotonic() + timeout_s)
             stream.line()
             return stream.ask("stop").startswith("Stopped")

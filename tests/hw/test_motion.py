@@ -540,6 +540,57 @@ def test_a_reset_control_connection_is_not_used_again():
         assert len(sent(robot, 3)) == moves + 1
 
 
+_CONNECTS_AGAIN = """
+import sys, time
+import rtde_control
+from hw.robot.mover.no_reconnect import NoReconnect
+host, denied = sys.argv[1], sys.argv[2] == "denied"
+no_reconnect = NoReconnect(host)
+control = rtde_control.RTDEControlInterface(host)
+if denied:
+    no_reconnect.begin()
+print("connected", flush=True)
+sys.stdin.readline()
+if denied:
+    assert not control.isConnected()
+    no_reconnect.connect((host, 29999), 2.0).close()
+    try:
+        open("/dev/null").close()
+    except OSError:
+        print("denied still", flush=True)
+sys.stdin.readline()
+"""
+
+
+@pytest.mark.parametrize("case", ["denied", "free"])
+def test_ur_rtde_sends_no_program_after_a_reset(case):
+    """However late the text that it prints is read; left to itself, it sends one."""
+    with (
+        EmulatedRobot(version=E_SERIES) as robot,
+        subprocess.Popen(
+            [sys.executable, "-c", _CONNECTS_AGAIN, robot.host, case], text=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(import_path())},
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+        ) as process,
+    ):  # fmt: skip
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stdout.readline() == "connected\n"
+        assert robot.state()["running"]
+        robot.ask("drop")
+        assert stop_program(robot.host, timeout_s=2.0)
+        deadline = time.monotonic() + (10.0 if case == "free" else 1.5)
+        while not (runs := robot.state()["running"]) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert runs == (case == "free")
+        if case == "denied":
+            # ur_rtde has given up, and the process can still ask the dashboard.
+            process.stdin.write("\n")
+            process.stdin.flush()
+            assert "denied still\n" in process.stdout
+        process.kill()
+
+
 _CALLER = """
 import json, os, sys, time
 import numpy as np

@@ -15,6 +15,7 @@ from hw.robot.limits import numbers
 from hw.robot.mover.controller import IDLE_WATCHDOG_HZ, STOP_PATIENCE_S, Controller, said
 from hw.robot.mover.inputs import Inputs
 from hw.robot.mover.messages import Setup
+from hw.robot.mover.no_reconnect import NoReconnect
 from hw.robot.path_checks import check_plan
 from hw.robot.rtde import PROGRAM_RUNS, PacketReader, safety_text, state_text, too_late
 from hw.robot.stream import Lag
@@ -40,6 +41,7 @@ class Connection:
     def __init__(self, setup: Setup, gate: Gate, inputs: Inputs, controller: Controller) -> None:
         self._setup, self._gate = setup, gate
         self._clock, self._inputs, self._controller = setup.clock, inputs, controller
+        self._no_reconnect: NoReconnect | None = None
 
     def open(self) -> None:
         """Connect: to the poses alone in a dry run.
@@ -59,6 +61,7 @@ class Connection:
         self._gate.check_start(identity.name, offset, inputs.pendant)
         self._check_state(identity.remote)
         module = require("rtde_control", extra="robot")
+        self._no_reconnect = NoReconnect(setup.host)
         controller.log("connect", host=setup.host, serial=identity.name)
         try:
             # The thread that ur_rtde starts inherits this priority.
@@ -68,6 +71,7 @@ class Connection:
             raise LostError(said(error), device="robot") from None
         finally:
             be_prompt(ASKS)
+        self._no_reconnect.begin()
         controller.watch_rest()
         if inputs.tcp_offset is None:
             inputs.tcp_offset = numbers(controller.command("getTCPOffset"), 6, "TCP offset")
@@ -118,7 +122,8 @@ class Connection:
     def _watch_control(self) -> None:
         """In a thread of its own: no packet tells whether the robot is in remote control."""
         be_prompt(0)
-        until_local(self._setup.host, period_s=_CONTROL_S)
+        assert self._no_reconnect is not None
+        until_local(self._setup.host, period_s=_CONTROL_S, connect=self._no_reconnect.connect)
         self._controller.local = True
 
     def close(self) -> None:
@@ -157,7 +162,9 @@ class Connection:
         if not packet.program or not safety_text(packet.safety_bits):
             return ""
         self._controller.log("dashboard: stop")
-        if stop_program(self._setup.host, timeout_s=_DASHBOARD_S):
+        assert self._no_reconnect is not None
+        connect = self._no_reconnect.connect
+        if stop_program(self._setup.host, timeout_s=_DASHBOARD_S, connect=connect):
             return ""
         return "; the program may be paused: stop it at the pendant before you reset the robot"
 

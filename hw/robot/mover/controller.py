@@ -6,8 +6,9 @@ How ur_rtde behaves, and what is done about it (each measured):
   :class:`hw.robot.rtde.PacketReader`.
 - Calls to a silent controller hang, so the caller kills this process after a while, and the
   controller's own watchdog stops the robot 0.1 s after the last sign of life.
-- A connection that was reset is opened again, and the script sent again, without asking; so the
-  text that ur_rtde prints is watched, and a reset ends the motion for good.
+- A connection that was reset is opened again, and the script sent again, without asking; so it is
+  kept from that (:mod:`hw.robot.mover.no_reconnect`), the text that it prints is watched, and a
+  reset ends the motion for good.
 - A motion goes on after a disconnect, so the robot is stopped first.
 """
 

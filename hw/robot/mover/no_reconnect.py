@@ -1,0 +1,68 @@
+"""ur_rtde must not connect again: it would send its script again, and nobody would watch that.
+
+ur_rtde opens a connection that was reset again, in a thread of its own, and starts its program on
+the robot anew. That program has no watchdog yet, so it would stay on the robot when this process
+has ended. The text that ur_rtde prints meanwhile may be read too late: a command that waits for the
+controller holds the interpreter's lock. A connection needs a file descriptor, so this process is
+denied new ones while ur_rtde is connected, and ur_rtde's thread ends with an error instead.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import socket
+import threading
+
+
+class NoReconnect:
+    """Denies new file descriptors; made before ur_rtde opens its own.
+
+    The limit is the lowest descriptor that was free then, so what ur_rtde closes lies above it and
+    cannot be opened again. What is open already goes on working.
+
+    Args:
+        host: the controller's address; looked up now, because that takes descriptors.
+
+    Raises:
+        OSError: the address is not known.
+    """
+
+    def __init__(self, host: str) -> None:
+        self._found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+        self._lowest = os.dup(0)
+        os.close(self._lowest)
+        self._opening = threading.Lock()
+        self._before = resource.getrlimit(resource.RLIMIT_NOFILE)
+        self._begun = False
+
+    def begin(self) -> None:
+        """Deny new descriptors from now on, but to :meth:`connect`."""
+        with self._opening:
+            self._begun = True
+            self._deny()
+
+    def connect(self, address: tuple[str, int], timeout_s: float) -> socket.socket:
+        """A connection of our own to the controller; descriptors are free for microseconds.
+
+        Raises:
+            OSError: nothing answers there.
+        """
+        family, kind, protocol, _, found = self._found
+        with self._opening:
+            resource.setrlimit(resource.RLIMIT_NOFILE, self._before)
+            try:
+                opened = socket.socket(family, kind, protocol)
+            finally:
+                if self._begun:
+                    self._deny()
+        try:
+            opened.settimeout(timeout_s)
+            opened.connect((found[0], address[1], *found[2:]))
+        except BaseException:
+            opened.close()
+            raise
+        return opened
+
+    def _deny(self) -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (self._lowest, self._before[1]))
