@@ -78,8 +78,8 @@ claim(
     SPEED,
     "batches of {:,.0f} problems of {:.0f} images in float64 on an NVIDIA H100: {:,.0f} "
     "conventional calibrations a second, {:,.0f} self-tuned Gaussian ones, {:,.0f} with prior "
-    "auto; with {:.0f} images {:,.0f}, {:,.0f} and {:,.0f}. That is {:.1f} to {:.1f} times what all "
-    "{:.0f} cores",
+    "auto; with {:.0f} images {:,.0f}, {:,.0f} and {:,.0f}. That is {:.1f} to {:.1f} times what "
+    "all {:.0f} cores",
     lambda: (
         max(column("accelerator", "problems")),
         min(column("accelerator", "images")),
