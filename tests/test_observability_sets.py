@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -25,6 +27,18 @@ FEW_POSES = {"one-pose": 1, "two-poses": 2}
 kinds = st.sampled_from(DEGENERATE + WEAK)
 elevations = st.one_of(st.just(0.0), st.floats(0.05, 5.0))
 noises = st.one_of(st.just(0.0), st.floats(0.02, 2.0))
+
+
+def together(sets: list[PoseSet]) -> jaxcal.Problem:
+    """A batch of sets as they are drawn; to check each would take longer than to solve it."""
+    first = jaxcal.Problem.from_arrays(sets[0].poses, sets[0].points, mask=sets[0].mask)
+    data = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(sets), *np.shape(leaf))), first)
+    return replace(
+        data,
+        poses=np.stack([s.poses for s in sets]),
+        measurements=np.stack([s.points for s in sets]),
+        mask=np.stack([s.mask for s in sets]).astype(float),
+    )
 
 
 def solve(posed: PoseSet, method: Method = "joint") -> jaxcal.Calibration:
@@ -144,7 +158,7 @@ def test_two_hundred_and_fifty_sets_in_a_batch():
              float(rng.choice([0.0, 0.05, 0.5, 2.0])))
         for kind in DEGENERATE + WEAK for seed in range(1000, 1028)
     ]  # fmt: skip
-    data = jaxcal.stack([jaxcal.Problem.from_arrays(s.poses, s.points, mask=s.mask) for s in sets])
+    data = together(sets)
     status = jaxcal.calibrate_batch(data).status
     for posed, found in zip(sets, status, strict=True):
         if posed.deficient:
@@ -164,14 +178,14 @@ def test_two_thousand_weak_sets_by_the_conventional_method():
              float(rng.choice([0.0, 0.05, 0.5, 2.0])))
         for kind in WEAK for seed in range(3000, 3512)
     ]  # fmt: skip
-    data = jaxcal.stack([jaxcal.Problem.from_arrays(s.poses, s.points, mask=s.mask) for s in sets])
+    data = together(sets)
     one = jax.jit(lambda p: jaxcal.calibrate(p, "conventional", robust=False))
     each = jax.lax.map(one, data)
     # A batch descends as one traced problem does, so its slow lanes are those that are slow here.
     slowest = np.argsort(np.asarray(each.iterations))[-128:]
     hardest = jax.tree.map(lambda leaf: leaf[slowest], data)
-    together = jaxcal.calibrate_batch(hardest, "conventional")
-    np.testing.assert_array_equal(together.status, np.asarray(each.status)[slowest])
+    batch = jaxcal.calibrate_batch(hardest, "conventional")
+    np.testing.assert_array_equal(batch.status, np.asarray(each.status)[slowest])
     # The descent may crawl along a flat valley; one problem begins at the closed form.
     unfinished = np.flatnonzero(np.asarray(each.status) == "max_iterations")
     assert len(unfinished) <= len(sets) / 1000

@@ -361,17 +361,23 @@ def parse_spec(text: str) -> Spec:
 
 def _spec(content: dict[str, Any]) -> Spec:
     _known(content, {"name", "seed", "trials", "chunk_trials", "conditions", "probe", "methods"})
+    head = _head(content)
+    axes, listed = _axes(_table(content, "conditions"))
+    probe = _probe(_table(content, "probe"))
+    spec = Spec(*head, axes, listed, probe, _methods(content))
+    _check_size(spec)
+    return spec
+
+
+def _head(content: dict[str, Any]) -> tuple[str, int, int, int]:
+    """Name, seed, trials of a condition, and trials of a chunk."""
     name = _required(content, "name")
     if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z0-9_-]{1,100}", name)):
         raise InputError("name must be 1 to 100 letters, digits, - and _")
     seed = whole_number("seed", _required(content, "seed"), 0, 2**63 - 1)
     trials = whole_number("trials", _required(content, "trials"), 1, MAXIMUM_EXPERIMENTS)
     chunk = whole_number("chunk_trials", content.get("chunk_trials", 512), 1, 2**20)
-    axes, listed = _axes(_table(content, "conditions"))
-    probe = _probe(_table(content, "probe"))
-    spec = Spec(name, seed, trials, min(chunk, trials), axes, listed, probe, _methods(content))
-    _check_size(spec)
-    return spec
+    return name, seed, trials, min(chunk, trials)
 
 
 def spec_from_canonical(text: str) -> Spec:
@@ -386,10 +392,7 @@ def spec_from_canonical(text: str) -> Spec:
         axes = tuple((name, tuple(given[name])) for name in AXES)
         methods = tuple(MethodSpec(**method) for method in content["methods"])
         spec = Spec(
-            content["name"],
-            content["seed"],
-            content["trials"],
-            content["chunk_trials"],
+            *_head(content),
             axes,
             tuple(content["listed"]),
             LinearProbe(**content["probe"]),
@@ -399,6 +402,7 @@ def spec_from_canonical(text: str) -> Spec:
         raise InputError(f"is not a study's canonical spec: {error}") from None
     if spec.canonical() != text:
         raise InputError("is not a study's canonical spec")
+    _check_size(spec)
     return spec
 
 
