@@ -114,6 +114,8 @@ if TYPE_CHECKING:
     from jaxcal.study.simulation import simulate as simulate
     from jaxcal.study.simulation import simulate_recording as simulate_recording
 
+__all__ = [*_ERRORS, *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
+
 
 def __getattr__(name: str) -> object:
     if name not in _HOME:

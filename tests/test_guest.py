@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import subprocess
@@ -336,6 +337,14 @@ def test_an_alternation_that_stops_short_has_no_derivative():
     value, constant = both(batch, Options(differentiate=False))
     assert np.isfinite(value)
     assert not np.any(constant.measurements)
+
+
+@pytest.mark.parametrize("module", ["jaxcal", "jaxcal.study", "jaxcal.design"])
+def test_a_star_imports_every_public_name(module):
+    names: dict[str, object] = {}
+    exec(f"from {module} import *", names)
+    public = {name for name in dir(importlib.import_module(module)) if not name.startswith("_")}
+    assert public <= set(names)
 
 
 def test_public_names_are_there_and_listed():

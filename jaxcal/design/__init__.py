@@ -68,6 +68,8 @@ _HOME = {
     "simulate_errors": "simulated",
 }
 
+__all__ = [*_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
+
 
 def __getattr__(name: str) -> object:
     if name not in _HOME:

@@ -33,6 +33,8 @@ _HOME = {
     "run_study": "jaxcal.study.run",
 }
 
+__all__ = [*_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
+
 
 def __getattr__(name: str) -> object:
     if name not in _HOME:
