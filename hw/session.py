@@ -90,6 +90,8 @@ class Session:
         self._changed = threading.Condition()
         self._echo_frames: deque[EchoFrame] = deque(maxlen=_KEPT_FRAMES)
         self._image: Image | None = None
+        self._shown: tuple[str, bool] | None = None
+        """Device of the images, and whether they are RF channel data."""
         self._failure: Exception | None = None
         self._bad: deque[tuple[float, str]] = deque(maxlen=_KEPT_FRAMES)
         self._stamps: dict[str, list[tuple[float, float]]] = {}
@@ -332,7 +334,7 @@ class Session:
 
     def _empty(self) -> None:
         frames = self.echo.drain()
-        images = [] if self.images is None else self.images.drain()
+        images = [] if self.images is None else self._of_one_device(self.images.drain())
         poses = self.poses.drain()
         now, counts = self.clock.now(), self.echo.statistics()
         with self._changed:
@@ -361,6 +363,16 @@ class Session:
             self._recorder.add_images(images)
         if time.monotonic() - self._handed_over > _BATCH_WALL_S:
             self._hand_over()
+
+    def _of_one_device(self, images: list[Image]) -> list[Image]:
+        """Those that are shown and recorded: of the first device, RF only where nothing else is.
+
+        Frames of several devices do not fit into one recording.
+        """
+        for image in images:
+            if self._shown is None or (self._shown[1] and not image.is_rf):
+                self._shown = image.device, image.is_rf
+        return [image for image in images if (image.device, image.is_rf) == self._shown]
 
     def _hand_over(self) -> None:
         self._handed_over = time.monotonic()
