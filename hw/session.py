@@ -32,9 +32,8 @@ _PERIOD_WALL_S = 0.005
 # Rows are written in batches: a write costs a millisecond, however many rows it has.
 _BATCH_WALL_S = 0.25
 _KEPT_FRAMES = 256
-_DELAY_S = 10.0
+DELAY_S = 10.0
 """After so many bench seconds the delay of the echo frames is measured again."""
-
 _LEAST_STAMPS, _MOST_STAMPS = 20, 20_000
 
 
@@ -260,7 +259,7 @@ class Session:
             DeviceError: trouble while waiting.
         """
         began = self.clock.now()
-        if began - self._delay_measured > _DELAY_S:
+        if began - self._delay_measured > DELAY_S:
             self._measure_echo_delay()
         found: list[EchoFrame] = []
         with self._changed:
