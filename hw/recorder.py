@@ -173,14 +173,18 @@ class Recorder:
         )
 
     def add_event(self, kind: str, text: str, t_host: float) -> None:
-        """Append a line of the acquisition's diary; text beyond 480 bytes is cut."""
+        """Append a line of the acquisition's diary; text beyond 480 bytes is cut.
+
+        What UTF-8 cannot encode (a path that is not UTF-8) becomes an escape sequence.
+        """
+        whole = text.encode(errors="backslashreplace")
         self._rows(
             "events",
             {
                 "t_host": np.array([t_host]),
                 "utc": np.array([utc_now().encode()]),
                 "kind": np.array([kind.encode()[:32]]),
-                "text": np.array([text.encode()[:480].decode(errors="ignore").encode()]),
+                "text": np.array([whole[:480].decode(errors="ignore").encode()]),
             },
         )
 

@@ -32,9 +32,8 @@ _PERIOD_WALL_S = 0.005
 # Rows are written in batches: a write costs a millisecond, however many rows it has.
 _BATCH_WALL_S = 0.25
 _KEPT_FRAMES = 256
-_DELAY_S = 10.0
+DELAY_S = 10.0
 """After so many bench seconds the delay of the echo frames is measured again."""
-
 _LEAST_STAMPS, _MOST_STAMPS = 20, 20_000
 
 
@@ -90,6 +89,8 @@ class Session:
         self._changed = threading.Condition()
         self._echo_frames: deque[EchoFrame] = deque(maxlen=_KEPT_FRAMES)
         self._image: Image | None = None
+        self._shown: tuple[str, bool] | None = None
+        """Device of the images, and whether they are RF channel data."""
         self._failure: Exception | None = None
         self._bad: deque[tuple[float, str]] = deque(maxlen=_KEPT_FRAMES)
         self._stamps: dict[str, list[tuple[float, float]]] = {}
@@ -258,7 +259,7 @@ class Session:
             DeviceError: trouble while waiting.
         """
         began = self.clock.now()
-        if began - self._delay_measured > _DELAY_S:
+        if began - self._delay_measured > DELAY_S:
             self._measure_echo_delay()
         found: list[EchoFrame] = []
         with self._changed:
@@ -332,7 +333,7 @@ class Session:
 
     def _empty(self) -> None:
         frames = self.echo.drain()
-        images = [] if self.images is None else self.images.drain()
+        images = [] if self.images is None else self._of_one_device(self.images.drain())
         poses = self.poses.drain()
         now, counts = self.clock.now(), self.echo.statistics()
         with self._changed:
@@ -361,6 +362,16 @@ class Session:
             self._recorder.add_images(images)
         if time.monotonic() - self._handed_over > _BATCH_WALL_S:
             self._hand_over()
+
+    def _of_one_device(self, images: list[Image]) -> list[Image]:
+        """Those that are shown and recorded: of the first device, RF only where nothing else is.
+
+        Frames of several devices do not fit into one recording.
+        """
+        for image in images:
+            if self._shown is None or (self._shown[1] and not image.is_rf):
+                self._shown = image.device, image.is_rf
+        return [image for image in images if (image.device, image.is_rf) == self._shown]
 
     def _hand_over(self) -> None:
         self._handed_over = time.monotonic()

@@ -20,6 +20,7 @@ from hw.robot.stream import PoseSample
 from hw.session import Session
 from hw.shapes import Float
 from hw.ultrasound.receiver import Image
+from jaxcal.data.segmentation.image import localise
 
 _MOST_HESITATIONS = 10
 IMAGE_AGE_S = 0.2
@@ -141,26 +142,32 @@ class ProbeStage:
             row: of the plan; it says where the target should be.
             credible: respond only where the segmentation finds the target.
         """
-        image = self.whole_frame()
+        place, within = self._expected_px(row, self.whole_frame())
+        return ImageBench(self, lambda: self.whole_frame().array, place, within, credible=credible)
+
+    def _expected_px(self, row: int, image: Image) -> tuple[tuple[float, float], float]:
+        """Where the target should be in an image, and how far from there to look, px."""
         expected = self._session.setup.scene.expected(self._targets[row])[[0, 2]]
         place = pixel_of(expected, image.spacing_mm, image.array.shape[1])
-        within = _NEAR_MM / max(image.spacing_mm)
-        return ImageBench(self, lambda: self.whole_frame().array, place, within, credible=credible)
+        return place, _NEAR_MM / max(image.spacing_mm)
 
     def locate(self, row: int) -> tuple[Float[np.ndarray, 2], float]:
         """[lateral, range] (mm) of the target in a frame where the probe stands, and its contrast.
 
+        Size and pixels are those of the same frame: the machine's depth may be changed any time.
+
         Raises:
             PlacementError: no credible target in several frames.
         """
-        bench, spacing = self.image_bench(row), self.whole_frame().spacing_mm
-        columns = self.whole_frame().array.shape[1]
         reason = ""
         for _ in range(_LOOKS):
-            found = bench.locate()
+            image = self.whole_frame()
+            place, within = self._expected_px(row, image)
+            found = localise(image.array, "cross", near=place, within_px=within)
             if found.found[0]:
                 contrast = float(found.contrast_db[0])
-                return place_of(found.position[0], spacing, columns), contrast
+                columns = image.array.shape[1]
+                return place_of(found.position[0], image.spacing_mm, columns), contrast
             reason = found.reason[0]
         raise PlacementError(
             f"no credible target in {_LOOKS} frames: {reason}", device="ultrasound"

@@ -290,8 +290,9 @@ class RtdeServer:
                     act()
                     done.set()
                 now = self.clock.now()
-                if now - woken > _HELD_S:
-                    # A real controller is never held up: what came meanwhile came in time.
+                if now - min(woken, due) > _HELD_S:
+                    # A real controller is never held up, neither as it wakes nor as it works: what
+                    # came meanwhile came in time.
                     for key, _ in self._selector.select(0.0):
                         self._ready(key.fileobj, key.data)
                 # Muted or not, the program goes on.

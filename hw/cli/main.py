@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 
@@ -40,8 +41,23 @@ for _command in (setup, check, acquire, free_hand, bench):
     commands.add_command(_command)
 
 
+def _open_standard_error() -> None:
+    """Discard what is told there where it is closed, as in some jobs without a terminal.
+
+    The processes that are started inherit it.
+    """
+    number = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.fstat(2)
+    except OSError:
+        os.dup2(number, 2)
+    sys.stderr = open(number, "w", encoding="utf-8")  # noqa: SIM115
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``jaxcal-hw``; see :func:`jaxcal.cli.run.run`."""
+    if sys.stderr is None:
+        _open_standard_error()
     with as_interrupts():
         return run(commands, "jaxcal-hw", arguments)
 

@@ -31,6 +31,8 @@ _LEAST_FOR_ESTIMATE = 6
 _STANDS_OUT = 4.0
 """An image whose residual is more than so many times the median residual is named."""
 _LEAST_MM = 1.0
+_SAME_SPACING = 1e-5
+"""Relative difference of single-precision numbers that mean the same."""
 
 
 def acquire_free_hand(
@@ -54,9 +56,11 @@ def acquire_free_hand(
         OutputError: the recording cannot be made.
     """
     guide, kept = Guide(asked.rules), KeptImages()
+    spacing = None
     if resume:
-        asked, _ = recorded_request(path, _KIND, asked)
+        asked, told = recorded_request(path, _KIND, asked)
         guide, kept = _resumed(path, asked)
+        spacing = _pair(told.get("image_spacing_mm"))
     with UltrasoundStream(asked.host, asked.port, device=asked.device) as stream:
         posed = PosedImages(stream, asked.source, asked.target_frame, asked.lag_s)
         check_region(asked.rules.region, posed.shape)
@@ -65,11 +69,14 @@ def acquire_free_hand(
         if resume:
             recorder = Recorder(path)
         else:
-            known = json.dumps({_KIND: asked.settings(posed.pair)})
-            recorder = Recorder(path, RecordingHeader("pixel", {}, 0, None, known))
+            known = {**asked.settings(posed.pair), "image_spacing_mm": posed.spacing_mm}
+            header = RecordingHeader("pixel", {}, 0, None, json.dumps({_KIND: known}))
+            recorder = Recorder(path, header)
+        # Recordings of older versions do not tell it.
+        run = _Run(asked, guide, person, posed, recorder, kept, spacing or posed.spacing_mm)
         try:
             with recorder:
-                return _Run(asked, guide, person, posed, recorder, kept).go()
+                return run.go()
         except KeyboardInterrupt:
             reason, interrupted = "interrupted", True
         except (DeviceError, CalibrationError) as error:
@@ -88,9 +95,11 @@ class _Run:
         posed: PosedImages,
         recorder: Recorder,
         kept: KeptImages,
+        spacing_mm: tuple[float, float],
     ) -> None:
         self._asked, self._guide, self._person = asked, guide, person
         self._posed, self._recorder, self._kept = posed, recorder, kept
+        self._spacing_mm = spacing_mm
         self._size = (0, 0)
 
     def go(self) -> int:
@@ -120,6 +129,7 @@ class _Run:
 
     def _keep(self, taken: Taken) -> None:
         assert taken.posed is not None
+        self._check_spacing(taken.posed.image.spacing_mm)
         self._kept.check_unit(taken.pose, self._recorder)
         self._recorder.add_images([taken.posed.image])
         self._recorder.add_pixel(taken.pose, taken.pixel, taken.covariance, taken.time)
@@ -129,6 +139,20 @@ class _Run:
         count = len(self._kept)
         at = f"{taken.pixel[0]:.1f}, {taken.pixel[1]:.1f}"
         self._person.say(f"image {count}/{self._asked.images}: target at {at} px{self._estimate()}")
+
+    def _check_spacing(self, now: tuple[float, float]) -> None:
+        """Refuse an image of another depth: its pixels do not fit together with those before.
+
+        Raises:
+            DeviceError: the sender says that they have another size.
+        """
+        before = self._spacing_mm
+        if not np.allclose(now, before, rtol=_SAME_SPACING, atol=0.0):
+            raise DeviceError(
+                f"an image with pixels of {now[0]:g} x {now[1]:g} mm does not fit this recording, "
+                f"whose images have {before[0]:g} x {before[1]:g} mm: set the machine as before",
+                device="ultrasound",
+            )
 
     def _take_back(self) -> None:
         if not self._guide.taken:
@@ -181,6 +205,14 @@ def _found(posed: PosedImages, stream: UltrasoundStream) -> list[str]:
             "arrival; --lag states how late images arrive"
         )
     return lines
+
+
+def _pair(value: object) -> tuple[float, float] | None:
+    """Two numbers of a file that is not trusted."""
+    if not isinstance(value, list) or len(value) != 2:
+        return None
+    numbers = [float(each) for each in value if isinstance(each, int | float)]
+    return (numbers[0], numbers[1]) if len(numbers) == 2 else None
 
 
 def _resumed(path: str | os.PathLike[str], asked: FreeHand) -> tuple[Guide, KeptImages]:

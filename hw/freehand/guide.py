@@ -110,7 +110,8 @@ class Guide:
             moment.clear()
             return Look(f"not tracked: {posed.why}")
         if moment and posed.time <= moment[-1].time:
-            moment.clear()
+            # The sender's clock was set back.
+            self.forget()
         moment.append(posed)
         while moment[-1].time - moment[0].time > rules.hold_s * 1.2:
             moment.popleft()

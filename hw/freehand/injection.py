@@ -39,7 +39,7 @@ from hw.recorder import Recorder
 from hw.recording_check import probe_of
 from hw.recording_layout import RecordingHeader
 from hw.resuming import check_same, described_probe
-from hw.session import median_times
+from hw.session import DELAY_S, Watch, median_times
 from hw.setup import HandHeldSetup
 from hw.shapes import Float
 from hw.ultrasound.receiver import UltrasoundStream
@@ -60,6 +60,8 @@ _ANOTHER_DEG = 5.0
 _FASTEST_MM_S = 6.0
 """Fastest motion of a hand whose frames are used: image, pose and echo are known to belong together
 to some 50 ms, which at this speed is 0.3 mm, as much as the element's own accuracy."""
+_LATEST_S = Watch.echo_late_s
+"""Frames of the element that are later are not used: the probe was elsewhere then."""
 _RECENT = 32
 _SHOW_PERIOD_S = 0.1
 _KEPT_S = 60.0
@@ -194,6 +196,8 @@ class _Run:
         self._pattern: tuple[int, int] | None = None
         self._patterned = 0.0
         self._heard, self._shown = time.monotonic(), 0.0
+        self._delay_measured = -np.inf
+        self._late_s = 0.0
         self._begin()
 
     @property
@@ -246,7 +250,12 @@ class _Run:
                 device="active echo",
             )
         self._recorder.add_echo(frames)
-        self._waiting += frames
+        if frames:
+            self._late_s = frames[-1].late_s
+        if now - self._delay_measured > DELAY_S:
+            self._delay_measured = now
+            self._echo.measure_delay()
+        self._waiting += [frame for frame in frames if not frame.late_s > _LATEST_S]
         later = []
         for frame in self._waiting:
             pose = self._pose_at(frame.t_host)
@@ -355,13 +364,18 @@ class _Run:
         frame = self._images[-1].image.array
         title = f"image {self.count + 1} of {self._asked.images}"
         view = self._view()
+        late = ""
+        if self._late_s > _LATEST_S:
+            late = f"the element's frames are {self._late_s:.1f} s late: look at the link to it"
         if view is None:
             reason = self._images[-1].why or "the element is not heard"
-            words = f"{title}: {reason}: bring the probe over it"
+            words = f"{title}: {late or f'{reason}: bring the probe over it'}"
             self._person.show(frame, words, "nothing heard yet")
             return
         rows = [f"{title}: {describe(view, 0.0).rpartition(',')[0]}", *profile(view)]
-        if self._hurried:
+        if late:
+            rows.append(late)
+        elif self._hurried:
             rows.append(f"too fast: at most {_FASTEST_MM_S:g} mm a second")
         elif self._in_metres(view):
             rows.append("the poses look like metres: let the server send them in mm")

@@ -64,12 +64,14 @@ class PosedImages:
     Attributes:
         pair: the frames of the poses.
         names: of all transforms that came.
-        device: of the images.
+        device: of the images; those of other devices are not read.
         shape: (rows, columns) of the first image.
+        spacing_mm: [lateral, axial] mm per pixel of the first image, as the sender says.
         by_arrival: whether times of arrival are used.
 
     Raises:
-        DeviceError: no images, no transforms, or none that lead from ``source`` to ``target``.
+        DeviceError: no images, or of several devices; no transforms, or none that lead from
+            ``source`` to ``target``.
     """
 
     def __init__(
@@ -82,10 +84,19 @@ class PosedImages:
         self._stream, self._lag = stream, lag_s
         self._samples: dict[str, deque[Transform]] = {}
         self._waiting: deque[tuple[Image, float]] = deque()
+        self.device: str | None = None
         self._listen()
         self.names = sorted(self._samples)
-        self.device = self._waiting[0][0].device
+        devices = sorted({image.device for image, _ in self._waiting})
+        if len(devices) > 1:
+            raise DeviceError(
+                f"name the device of the images (--device); there are "
+                f"{', '.join(map(repr, devices))}",
+                device="ultrasound",
+            )
+        self.device = devices[0]
         self.shape = self._waiting[0][0].array.shape
+        self.spacing_mm = self._waiting[0][0].spacing_mm
         pairs = {name: pair for name in self.names if (pair := split_name(name)) is not None}
         self.pair = _chosen(pairs, source, target)
         self._steps = path_between(list(pairs.values()), *self.pair) or []
@@ -166,7 +177,11 @@ class PosedImages:
         # Leave the images in the stream's own queue while too many wait here.
         if self._waiting and len(self._waiting) > 64:
             return
-        self._waiting.extend((image, now) for image in self._stream.drain() if not image.is_rf)
+        self._waiting.extend(
+            (image, now)
+            for image in self._stream.drain()
+            if not image.is_rf and self.device in (None, image.device)
+        )
 
     def _posed(self, image: Image, late: bool) -> PosedImage | None:
         """The image with its pose or the reason why it has none; None where it must wait."""

@@ -21,7 +21,7 @@ from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
 from hw.midplane.search import Echoes, Settings
 from hw.shapes import Float, UInt8
-from jaxcal.data.segmentation.image import Localisation, localise
+from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.speckle import SMALLEST_REGION, NotFoundError, envelope_of
 from jaxcal.data.segmentation.spot import brightest
 
@@ -89,10 +89,6 @@ class ImageBench:
         told = [self._intensity(self._see()) for _ in range(-(-frames // 3))]
         amplitude = np.repeat(np.array(told)[:, None], LINES, axis=1)
         return Echoes(amplitude, amplitude > 0)
-
-    def locate(self) -> Localisation:
-        """The target in the next frame."""
-        return localise(self._see(), self._target, near=self._expected, within_px=self._within)
 
     def _intensity(self, frame: np.ndarray) -> float:
         if self._credible:

@@ -171,6 +171,8 @@ class TerminalOperator:
 class WindowOperator:
     """A person before a window: frame with the injected bar, and the bar's length by place.
 
+    Keys pressed while the robot moves do not count, as at a terminal.
+
     Args:
         figure: a matplotlib figure with a canvas that takes keys; by default a new window.
         spacing_mm: [lateral, axial] of the frames, mm per px.
@@ -198,21 +200,35 @@ class WindowOperator:
         self._keys = Keys()
         self._pressed: deque[str] = deque(maxlen=64)
         figure.canvas.mpl_connect("key_press_event", lambda e: self._pressed.append(e.key or ""))
-        figure.canvas.mpl_connect("close_event", lambda _: self._pressed.append("escape"))
+        self._closed = False
+        figure.canvas.mpl_connect("close_event", self._close)
+
+    def _close(self, _event: object) -> None:
+        self._closed = True
 
     def __call__(self, view: View) -> Decision:
-        """Show, keep the frame up to date, and wait for a key that decides."""
+        """Show, keep the frame up to date, and wait for a key that decides.
+
+        Raises:
+            InputError: the window was closed.
+        """
+        self._show(view)
+        # Showing has delivered the keys that were pressed before anything could be seen.
+        self._pressed.clear()
         while True:
-            self._show(view)
             heed_interrupt()
-            if not self._pressed:
+            decision = None
+            if self._pressed:
+                decision = self._keys.decide(self._pressed.popleft(), view)
+            elif not self._closed:
                 self._figure.canvas.start_event_loop(_REFRESH_S)
-                continue
-            decision = self._keys.decide(self._pressed.popleft(), view)
             if decision is not None:
                 return decision
+            self._show(view)
 
     def _show(self, view: View) -> None:
+        if self._closed:
+            raise InputError("the window was closed")
         frame = view.frame()
         if frame is not None:
             if self._picture is None:

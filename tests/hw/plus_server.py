@@ -117,23 +117,31 @@ def messages(asked: dict):
     Args:
         asked: as of :func:`stream`; ``mode``: ``tracked`` or ``separate`` messages; ``metres``:
             send translations in m; ``cut_after``: number of the frame from which on frames are
-            smaller.
+            smaller; ``deeper_after``: from which on their pixels are larger; ``back_after``: from
+            which on the server's clock is an hour behind; ``second``: name of a further device,
+            whose images nothing shows.
     """
     number = 0
     for stamp, array, transforms in stream(asked):
         number += 1
+        spacing = (2.0, 2.0) if number > asked.get("deeper_after", number) else (1.0, 1.0)
+        stamp -= 3600.0 if number > asked.get("back_after", number) else 0.0
         if number > asked.get("cut_after", number):
             array = array[:100, :140]
         if asked.get("metres"):
             for each in transforms:
                 each.matrix[:3, 3] *= 1e-3
         if asked.get("mode") == "tracked":
-            content = TrackedFrame(Picture(array, (1.0, 1.0)), transforms)
+            content = TrackedFrame(Picture(array, spacing), transforms)
             yield encode(Message("TRACKEDFRAME", "TrackedFrame", stamp, content, number))
             continue
         # The image first, as PlusServer sends them where its configuration names IMAGE first.
-        picture = Picture(array, (1.0, 1.0))
-        parts = [encode(Message("IMAGE", "Image_Reference", stamp, picture, number))]
+        parts = [
+            encode(Message("IMAGE", "Image_Reference", stamp, Picture(array, spacing), number))
+        ]
+        if asked.get("second"):
+            picture = Picture(np.zeros_like(array), spacing)
+            parts.append(encode(Message("IMAGE", asked["second"], stamp, picture, number)))
         parts += [encode(Message("TRANSFORM", t.name, stamp, (t,), number)) for t in transforms]
         yield b"".join(parts)
 

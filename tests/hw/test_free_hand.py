@@ -224,6 +224,53 @@ def test_an_image_that_was_not_written_is_not_counted(tmp_path):
     )
 
 
+def test_an_image_with_pixels_of_another_size_ends_the_run(tmp_path):
+    """The machine's depth was changed: the frames have as many pixels as before."""
+    path = tmp_path / "r.h5"
+    with plus_server(mode="separate", deeper_after=70) as port:
+        asked = FreeHand("127.0.0.1", port, images=7)
+        with pytest.raises(FreeHandStopped, match="of 2 x 2 mm does not") as told:
+            acquire_free_hand(path, asked, Scripted())
+    with h5py.File(path) as file:
+        count = len(file["calibration/mask"])
+    assert count in (2, 3)
+    assert f"; {count} of 7 images are in " in str(told.value)
+    with plus_server(mode="separate", deeper_after=0) as port:
+        asked = FreeHand("127.0.0.1", port)
+        with pytest.raises(FreeHandStopped, match=f"1 x 1 mm: set .*; {count} of 7 images"):
+            acquire_free_hand(path, asked, Scripted(), resume=True)
+    with plus_server(mode="separate", first=count) as port:
+        asked = FreeHand("127.0.0.1", port)
+        assert acquire_free_hand(path, asked, Scripted(), resume=True) == 7
+
+
+def test_images_are_of_one_device(tmp_path):
+    with plus_server(mode="separate", second="Overview") as port:
+        asked = FreeHand("127.0.0.1", port, images=4)
+        message = r"name the device of the images \(--device\); .*'Image_Reference', 'Overview'"
+        with pytest.raises(DeviceError, match=message):
+            acquire_free_hand(tmp_path / "r.h5", asked, Scripted())
+        assert not list(tmp_path.iterdir())
+        named = FreeHand("127.0.0.1", port, images=4, device="Image_Reference")
+        assert acquire_free_hand(tmp_path / "r.h5", named, Scripted()) == 4
+    check(tmp_path / "r.h5", [0, 1, 2, 3])
+
+
+def test_a_servers_clock_that_is_set_back_is_no_end(tmp_path):
+    """For an hour no image was taken after one that was judged and not taken."""
+
+    class Impatient(Scripted):
+        def show(self, frame: np.ndarray, words: str, advice: str) -> None:
+            seen.append(words)
+            assert len(seen) < 400, words
+
+    seen: list[str] = []
+    with plus_server(mode="tracked", hidden=[3], back_after=86, rate_hz=40.0) as port:
+        asked = FreeHand("127.0.0.1", port, images=4)
+        assert acquire_free_hand(tmp_path / "r.h5", asked, Impatient()) == 4
+    check(tmp_path / "r.h5", [0, 1, 2, 4])
+
+
 @pytest.mark.parametrize(
     "option",
     [

@@ -8,10 +8,12 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import h5py
 import numpy as np
 import pytest
+from echo_bridge import Bridge
 
 pytest.importorskip("serial", reason="pyserial is not installed (jaxcal[serial])")
 
@@ -76,7 +78,7 @@ class Hand:
 class Bench:
     """Element, machine and tracker, which see one hand."""
 
-    def __init__(self) -> None:
+    def __init__(self, link: Literal["pty", "tcp"] = "pty") -> None:
         self.hand, self.unit_mm = Hand(), 1.0
         rng, camera = np.random.default_rng(1), Camera(WORLD, seed=0)
 
@@ -85,8 +87,9 @@ class Bench:
             return times + 0.25 / WORLD.clock_hz, amplitude
 
         self.echo = AuspisEmulator(
-            hear, clock=REAL, rate_hz=30.0, lines=WORLD.probe.elements, clock_hz=WORLD.clock_hz
-        )
+            hear, clock=REAL, rate_hz=30.0, lines=WORLD.probe.elements, clock_hz=WORLD.clock_hz,
+            link=link,
+        )  # fmt: skip
 
         def see(t: float) -> np.ndarray:
             injection = self.echo.injection
@@ -275,6 +278,29 @@ def test_an_element_that_falls_silent_ends_the_run(tmp_path, bench, monkeypatch)
     person = Unplugging(bench.hand)
     with pytest.raises(FreeHandStopped, match="active echo: no frame for"):
         acquire_by_injection(tmp_path / "r.h5", bench.asked, bench.setup, person)
+
+
+def test_frames_of_the_element_that_are_late_are_not_used_and_told_of(tmp_path):
+    """The probe was elsewhere when they were heard: at 6 mm/s by 5 mm, with this link."""
+
+    class Waiting(Person):
+        def show(self, frame: np.ndarray, words: str, advice: str) -> None:
+            super().show(frame, words, "nothing heard: to and fro")
+            shown.append(words)
+            between.delay_s = 0.8
+            if len(shown) == 60:
+                self._keys.append("q")
+
+    shown: list[str] = []
+    bench = Bench("tcp")
+    with bench.echo, bench.images:
+        between = Bridge(bench.echo.path)
+        setup = replace(bench.setup, active_echo_url=between.url)
+        with pytest.raises(FreeHandStopped, match="0 images are too few"):
+            acquire_by_injection(tmp_path / "r.h5", bench.asked, setup, Waiting(bench.hand))
+        between.close()
+    told = r"the element's frames are 0\.[89] s late: look at the link to it"
+    assert re.search(told, "\n".join(shown))
 
 
 SETUP = """

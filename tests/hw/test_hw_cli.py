@@ -224,3 +224,14 @@ def test_who_confirms_is_told_of_an_arm_that_nothing_identifies():
     assert "NOTHING IDENTIFIES" not in page
     unknown = MotionPlan(poses, limits, (0.0,) * 6, "UR5@192.168.1.10")
     assert "NOTHING IDENTIFIES THIS ARM" in "\n".join(plan_page(unknown))
+
+
+def test_a_closed_standard_error_is_no_failure(tmp_path):
+    """As in some jobs without a terminal; what runs then has no other complaint either."""
+    code = "import sys; from hw.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    for arguments, status in ((["free-hand", "127.0.0.1:1"], 4), (["setup", "b.toml"], 0)):
+        done = subprocess.run(
+            ["sh", "-c", 'exec "$@" 2>&-', "sh", sys.executable, "-c", code, *arguments],
+            cwd=tmp_path, capture_output=True, timeout=120, check=False,
+        )  # fmt: skip
+        assert done.returncode == status

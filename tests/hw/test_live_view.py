@@ -10,7 +10,7 @@ from contextlib import nullcontext, suppress
 
 import numpy as np
 import pytest
-from matplotlib.backend_bases import KeyEvent
+from matplotlib.backend_bases import CloseEvent, KeyEvent
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -146,8 +146,21 @@ def test_a_person_before_a_window_finds_the_mid_plane():
     figure = Figure()
     canvas = FigureCanvasAgg(figure)
     window = WindowOperator(figure, camera.spacing_mm)
-    for key in sweep_then_middle():
+    keys = iter(sweep_then_middle())
+
+    def press(key: str) -> None:
         canvas.callbacks.process("key_press_event", KeyEvent("key_press_event", canvas, key))
+
+    canvas.start_event_loop = lambda timeout: press(next(keys))
+    go = bench.move
+
+    def move(offset_mm: float) -> float:
+        # Too early: the result of the move is not seen yet.
+        for key in ("pageup", "enter", "escape"):
+            press(key)
+        return go(offset_mm)
+
+    bench.move = move
 
     def frame() -> np.ndarray:
         return camera.frame(bench.true_pose, rng, pattern=bench.pattern, pattern_delay_s=4e-6)
@@ -156,6 +169,19 @@ def test_a_person_before_a_window_finds_the_mid_plane():
     assert placement.bracket.contains(bench.elevation_mm)
     assert figure.axes[0].images
     assert "of" in figure.axes[1].get_title()
+
+
+def test_a_closed_window_ends_the_run():
+    """The robot must not go on to the next pose where nobody sees the bar."""
+    figure = Figure()
+    canvas = FigureCanvasAgg(figure)
+    window = WindowOperator(figure)
+    view = View(5, 10, 1.0, 0.25, 900.0, ((1.0, 5),), frame=lambda: None)
+    closed = CloseEvent("close_event", canvas)
+    canvas.start_event_loop = lambda timeout: canvas.callbacks.process("close_event", closed)
+    for _ in range(2):
+        with pytest.raises(InputError, match="the window was closed"):
+            window(view)
 
 
 def test_an_interrupt_that_the_window_drops_ends_the_wait():

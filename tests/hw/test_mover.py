@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 from collections.abc import Iterator
 from contextlib import suppress
 
 import numpy as np
 import pytest
+from robots import address
 
 from hw.clock import Clock
 from hw.errors import LostError, RefusedError, StaleError, StoppedError
@@ -26,6 +28,7 @@ from hw.robot.mover.messages import (
     sample_of,
     told,
 )
+from hw.robot.mover.no_reconnect import NoReconnect
 from hw.robot.mover.stop_latch import Stop, StopLatch
 from hw.robot.rtde import PendantSettings
 from hw.robot.stream import PoseSample
@@ -148,3 +151,18 @@ def test_what_follows_a_stop_for_good_does_not_replace_it():
     assert type(both) is StoppedError
     assert both.args[0] == "danger; the program stopped"
     assert type(combined(SILENCE, lost)) is LostError
+
+
+def test_a_name_with_several_addresses_is_reached_at_the_one_that_answers(monkeypatch):
+    """As ``localhost``, which often is ::1 first: else local control would never be noticed."""
+    with socket.create_server((address(), 0)) as server:
+        host, port = server.getsockname()
+        stream = (socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP, "")
+        found = [(*stream, (silent, 0)) for silent in (address(), host)]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *args, **named: found)
+        no_reconnect = NoReconnect("robot")
+        with no_reconnect.connect(("robot", port), 2.0) as connection:
+            assert connection.getpeername() == (host, port)
+        del found[1]
+        with pytest.raises(ConnectionRefusedError):
+            NoReconnect("robot").connect(("robot", port), 2.0)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import subprocess
 import sys
 from dataclasses import asdict, replace
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -19,6 +21,7 @@ from hw.bench.phantoms import ActiveEcho, Hydrophone, phantom_named
 from hw.bench.stage import WorldStage
 from hw.bench.world import make_world
 from hw.choices import PHANTOMS
+from hw.clock import Clock
 from hw.midplane.amplitude_scan import amplitude_scan, fit_peak
 from hw.midplane.image_scan import ImageBench, image_scan, pixel_of, place_of
 from hw.poses import plan_poses
@@ -26,6 +29,10 @@ from hw.recorder import Recorder
 from hw.recording_check import check_resumable, read_progress, settings_of
 from hw.recording_layout import RecordingHeader
 from hw.request import AcquisitionRequest
+from hw.robot.motion import Motion
+from hw.session import Session
+from hw.stage import ProbeStage
+from hw.ultrasound.receiver import Image
 from jaxcal import InputError
 from jaxcal.data.segmentation.image import localise
 
@@ -163,7 +170,8 @@ def test_the_image_scan_puts_the_crossing_into_the_plane_and_locates_it():
         truth = world.truth(stage.true_pose)
         offsets.append(truth.elevation_mm)
         inside.append(placement.bracket.contains(truth.elevation_mm))
-        found = bench.locate()
+        seen = camera.frame(stage.true_pose, rng)
+        found = localise(seen, "cross", near=expected, within_px=120.0)
         assert found.found[0], found.reason
         place = place_of(found.position[0], camera.spacing_mm, COLUMNS)
         errors.append(place - [truth.lateral_mm, truth.range_mm])
@@ -266,3 +274,39 @@ def test_frames_behind_the_probe_show_nothing():
         pose = placed(world, 0.0, 0.0, -30.0, (0.0, 0.0, 0.3))
         frame = Camera(world, Look(wire=0.25)).frame(pose, np.random.default_rng(0))
         assert not localise(frame).found[0]
+
+
+def test_a_depth_that_is_changed_between_two_frames_does_not_move_the_target():
+    """Size of the frame and of its pixels are taken from the frame in which it is found."""
+    world = make_world(0, phantom="cross-wire", response_mm=0.0)
+    camera, pose = Camera(world, QUIET), placed(world, 3.0, 0.0, 45.0)
+    frame = camera.frame(pose, np.random.default_rng(0))
+    seen = [(frame, 1.0), (np.ascontiguousarray(frame[::2, ::2]), 2.0)]
+    count, truth = itertools.count(), world.target(pose)
+
+    class Seen(Session):
+        def __init__(self) -> None:
+            scene = SimpleNamespace(elevational=[0.0, 1.0, 0.0], expected=lambda _: truth)
+            self.setup, self.clock = SimpleNamespace(scene=scene), Clock()
+
+        def image_after(self, since: float) -> Image:
+            number = next(count)
+            array, times = seen[number % 2]
+            lateral, axial = camera.spacing_mm
+            return Image(0.0, 0.0, number, array, (times * lateral, times * axial), "Image")
+
+        def close(self) -> None:
+            pass
+
+    class Resting(Motion):
+        def __init__(self) -> None:
+            pass
+
+        def check(self) -> None:
+            pass
+
+    stage = ProbeStage(Seen(), Resting(), pose[None], lambda kind, text: None)
+    for _ in seen:
+        place, _ = stage.locate(0)
+        np.testing.assert_allclose(place, [3.0, 45.0], atol=0.3)
+        next(count)

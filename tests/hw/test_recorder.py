@@ -96,6 +96,16 @@ def wait_until_closed(path) -> None:
             time.sleep(0.05)
 
 
+def test_an_event_may_name_a_path_that_is_not_utf_8(tmp_path):
+    """As the last words of a run, where its disk is full, do."""
+    path = tmp_path / os.fsdecode(b"r\xff.h5")
+    recorder = Recorder(path, HEADER)
+    recorder.add_event("stopped", f"{path.name}: the disk is nearly full", 1.0)
+    recorder.finish()
+    with h5py.File(os.fsencode(path)) as file:
+        assert file["events/text"][0] == rb"r\udcff.h5: the disk is nearly full"
+
+
 def test_a_finished_recording_is_what_calibrate_takes(tmp_path, capsys):
     path, recording = tmp_path / "rec.h5", simulated()
     with Recorder(path, HEADER) as recorder:

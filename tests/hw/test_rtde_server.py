@@ -153,6 +153,47 @@ def test_the_program_s_handshake():
     assert program.reason == "movePath (command 45) is not emulated"
 
 
+@pytest.mark.parametrize("where", ["waiting", "working"])
+def test_what_came_while_the_controller_was_held_up_came_in_time(where):
+    """Its process lost the processor for longer than the watchdog waits; the client did not."""
+    seen: list[bool] = []
+    server = RtdeServer(Arm(START), address())
+    program = server.controller
+    select, step = server._selector.select, program.step
+
+    def hold_up() -> None:
+        program._watchdog_s = 0.1
+        program.kick(server.clock.now())
+        client.sendall(struct.pack(">HBBi", 8, ord("U"), 1, 0))
+        time.sleep(0.3)
+        program.step = stepped
+
+    def held_up(timeout: float | None = None) -> list:
+        found = select(timeout)
+        if not found and not seen and program.running and timeout:
+            server._selector.select = select
+            hold_up()
+        return found
+
+    def stepped(t: float) -> None:
+        step(t)
+        seen.append(program.running)
+        program._watchdog_s, program.step = None, step
+
+    with server, socket.create_connection((server.host, 30004)) as client:
+        client.sendall(struct.pack(">HB", 24, ord("I")) + b"input_int_register_0,")
+        assert client.recv(100)[3:] == b"\x01INT32"
+        with socket.create_connection((server.host, 30003)) as script:
+            script.sendall(b"def rtde_control():\nend\n")
+            until(lambda: program.running)
+        if where == "waiting":
+            server._selector.select = held_up
+        else:
+            server._call(hold_up)
+        until(lambda: seen)
+    assert seen == [True], program.reason
+
+
 def test_variables_depend_on_the_version():
     assert output_type("ft_raw_wrench", (5, 9)) == "VECTOR6D"
     assert output_type("ft_raw_wrench", (5, 8)) == "NOT_FOUND"

@@ -1,14 +1,24 @@
-"""The session's own reckoning: the period of the frames is the stream's, not a guess."""
+"""The session over its devices: the period of the frames, and which images count."""
 
 from __future__ import annotations
 
+import time
+
+import h5py
 import numpy as np
 import pytest
+from robots import EmulatedRobot
 
 from hw.active_echo.device import ActiveEcho
 from hw.bench.active_echo import AuspisEmulator
+from hw.bench.ultrasound import ImageServer
 from hw.clock import Clock
-from hw.session import frame_period
+from hw.recorder import Recorder
+from hw.recording_layout import RecordingHeader
+from hw.scene import Scene
+from hw.session import Session, frame_period
+from hw.setup import Setup
+from jaxcal.data.probe import LinearProbe
 
 pytest.importorskip("serial", reason="needs jaxcal[serial]")
 
@@ -31,3 +41,35 @@ def test_the_period_of_frames_is_the_devices(rate_hz, missed):
     assert frame_period(frames, hz) == pytest.approx(1.0 / rate_hz, rel=0.01)
     assert frame_period(frames[:1], hz) is None
     assert frame_period(frames[::-1], hz) is None
+
+
+def test_images_of_a_machine_that_also_sends_rf(tmp_path):
+    """RF channel data have another size: in one recording with the images they ended the run."""
+    path = tmp_path / "r.h5"
+    scene = Scene(np.eye(4), np.array([400.0, -100.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    with (
+        EmulatedRobot() as robot,
+        AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
+        ImageServer(
+            lambda t: np.full((40, 30), int(1000 * t) % 256, np.uint8),
+            rf=lambda t: np.full((200, 8), int(1000 * t), np.int16),
+        ) as machine,
+        Recorder(path, RecordingHeader("pixel", {}, 8, None, "{}")) as recorder,
+    ):
+        setup = Setup(
+            robot.host, emulator.path, scene, {}, (machine.host, machine.port),
+            probe=LinearProbe(elements=8), clock=robot.clock,
+        )  # fmt: skip
+        with Session(setup, recorder, every_frame=True) as session:
+            deadline = time.monotonic() + 60.0
+            shown = {}
+            while len(shown) < 10 and time.monotonic() < deadline:
+                image = session.latest_image()
+                if image is not None:
+                    shown[image.t_device] = image.array.dtype
+                time.sleep(0.005)
+        recorder.sync()
+    assert set(shown.values()) == {np.dtype(np.uint8)}
+    with h5py.File(path) as file:
+        assert file["us/frames"].shape[1:] == (40, 30)
+        assert len(file["us/frames"]) >= 10

@@ -22,14 +22,15 @@ class NoReconnect:
     cannot be opened again. What is open already goes on working.
 
     Args:
-        host: the controller's address; looked up now, because that takes descriptors.
+        host: the controller's address; looked up now, because that takes descriptors. A name may
+            stand for several addresses, of which not all answer (``localhost`` often is ::1, too).
 
     Raises:
         OSError: the address is not known.
     """
 
     def __init__(self, host: str) -> None:
-        self._found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+        self._found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
         self._lowest = os.dup(0)
         os.close(self._lowest)
         self._opening = threading.Lock()
@@ -43,26 +44,38 @@ class NoReconnect:
             self._deny()
 
     def connect(self, address: tuple[str, int], timeout_s: float) -> socket.socket:
-        """A connection of our own to the controller; descriptors are free for microseconds.
+        """A connection of our own to the controller, at the first of its addresses that answers.
+
+        Descriptors are free for microseconds.
 
         Raises:
             OSError: nothing answers there.
         """
-        family, kind, protocol, _, found = self._found
+        problem: OSError | None = None
+        for family, kind, protocol, _, found in self._found:
+            try:
+                opened = self._socket(family, kind, protocol)
+            except OSError as error:
+                problem = error
+                continue
+            try:
+                opened.settimeout(timeout_s)
+                opened.connect((found[0], address[1], *found[2:]))
+                return opened
+            except OSError as error:
+                opened.close()
+                problem = error
+        assert problem is not None
+        raise problem
+
+    def _socket(self, family: int, kind: int, protocol: int) -> socket.socket:
         with self._opening:
             resource.setrlimit(resource.RLIMIT_NOFILE, self._before)
             try:
-                opened = socket.socket(family, kind, protocol)
+                return socket.socket(family, kind, protocol)
             finally:
                 if self._begun:
                     self._deny()
-        try:
-            opened.settimeout(timeout_s)
-            opened.connect((found[0], address[1], *found[2:]))
-        except BaseException:
-            opened.close()
-            raise
-        return opened
 
     def _deny(self) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (self._lowest, self._before[1]))
