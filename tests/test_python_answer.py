@@ -142,6 +142,7 @@ def test_calls_as_users_make_them():
     """Without the type checks of these tests: an InputError, in a line, for whatever is given."""
     code = r"""
 import warnings
+import jax
 import numpy as np
 import jaxcal
 from jaxcal import backend
@@ -155,6 +156,10 @@ poses[:, :3, 3] = draws.uniform(-50, 50, (9, 3))
 points = draws.uniform(10, 50, (9, 2))
 problem = jaxcal.Problem.from_arrays(poses, points)
 result = jaxcal.calibrate(problem, "conventional")
+probe = jaxcal.LinearProbe(elements=16)
+raw = jaxcal.make_images(poses, np.full((9, 16), 2e-5), "time_of_flight")
+found = jaxcal.calibrate(jaxcal.simulate_recording(jaxcal.Protocol(images=9), 1), "conventional")
+skewed = np.eye(6) + np.eye(6, k=1)
 assert jaxcal.predicted_tre(result, [0.0, 50.0]).shape == ()
 for call, *given in (
     (jaxcal.calibrate, "rec.h5"), (jaxcal.calibrate, {}),
@@ -224,6 +229,47 @@ for call, *given in (
       for path in (None, 3, b"rec.h5")),
     (jaxcal.save, jaxcal.Recording(jaxcal.make_images(poses, points)), None),
     (backend.LevenbergMarquardt, "fast"),
+    *((lambda value, name=name: jaxcal.segment(raw, probe, **{name: value}), value)
+      for name, value in (
+        ("minimum_lines", "8"), ("minimum_lines", 8.5), ("minimum_lines", -3), ("robust", "no"),
+        ("interpolate", None), ("scale", np.array(["frame", "pooled"])), ("method", np.ones(2)),
+        ("minimum_amplitude", [1.0, 2.0]),
+    )),
+    (jaxcal.sound_speed_in_water, "20"), (jaxcal.sound_speed_in_water, [[1.0], [1.0, 2.0]]),
+    *((lambda value, name=name: jaxcal.LinearProbe(**{name: value}), None)
+      for name in ("elements", "pitch_mm", "sound_speed_m_s", "delay_s")),
+    (probe.contains, "abc", 30.0), (probe.image_to_cartesian, "a", 3.0),
+    (probe.one_way_range_mm, "a"),
+    (jaxcal.reconstruction_precision, np.eye(4), poses, points, ["a"] * 9),
+    (jaxcal.reconstruction_precision, np.eye(4), poses, points.astype(str)),
+    (jaxcal.calibration_reproducibility, [np.eye(4), np.eye(3)], [[0.0, 20.0]]),
+    (jaxcal.calibration_reproducibility, np.full((2, 4, 4), "a"), [[0.0, 20.0]]),
+    (jaxcal.cross_validate, None), (jaxcal.cross_validate, "rec.h5"), (jaxcal.bootstrap, None),
+    *((lambda given: jaxcal.cross_validate(problem, result=given), given)
+      for given in (3, jaxcal.calibrate_batch([problem, problem], "conventional"))),
+    (lambda given: jaxcal.bootstrap(problem, 4, result=given), 3),
+    *((jaxcal.bootstrap, problem, 4, key)
+      for key in (jax.numpy.array(1), jax.random.split(jax.random.key(1)))),
+    (jaxcal.calibrate_pivot, poses, ["a"] * 9),
+    (lambda robust: jaxcal.calibrate_pivot(poses, robust=robust), "no"),
+    (jaxcal.calibrate_pivot, [np.eye(4), np.eye(3)]),
+    (lambda mask: jaxcal.make_images(poses, points, mask=mask), [[1, 0], [1]]),
+    (lambda least: jaxcal.make_images(poses, points, minimum=least), "a"),
+    (lambda truth: jaxcal.Recording(jaxcal.make_images(poses, points), truth=truth), 3),
+    (lambda probe: jaxcal.Recording(jaxcal.make_images(poses, points), probe=probe), "linear"),
+    (jaxcal.ImageTransform, None),
+    *((lambda value, name=name: jaxcal.ImageTransform(np.eye(4), **{name: value}), value)
+      for name, value in (("converged", "no"), ("unknowns", 3), ("covariance", skewed))),
+    *((jaxcal.ImageTransform(np.eye(4)).with_pixels, *given) for given in (
+        ("a",), (0.1,), ((0.1,),), ((0.1, 0.1), "a"), ((0.1, 0.1), 3), ((0.1, 0.1), None),
+    )),
+    (result.save, "x.json", ["json"]), (found.record, 3), (found.record, ["abc"]),
+    (found.record, [[1.0, 2.0, 3.0]]), (result.plot_offsets, [1.0, 2.0]),
+    (lambda batch: batch.warnings, jaxcal.calibrate_batch([problem], "conventional")),
+    (lambda batch: batch.observability, jaxcal.calibrate_batch([problem], "conventional")),
+    (jaxcal.simulate, jax.random.key(1), None),
+    (jaxcal.simulate, jax.random.split(jax.random.key(1)), jaxcal.Protocol()),
+    (lambda clock: jaxcal.simulate_recording(jaxcal.Protocol(raw=True), clock_hz=clock), "fast"),
 ):
     try:
         call(*given)
@@ -235,7 +281,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 101
+    assert len(lines) == 157
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
