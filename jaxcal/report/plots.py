@@ -215,8 +215,14 @@ def plot_influence(calibration: Calibration) -> Figure:
 
 
 def plot_limits(calibration: Calibration) -> Figure:
-    """Where the errors come from: shares of mean squares, of the calibration and of the scatter."""
+    """Where the errors come from: shares of mean squares, of the calibration and of the scatter.
+
+    Raises:
+        InputError: X is not observable.
+    """
     answer, recording = _one(calibration)
+    if not np.isfinite(answer.unknowns_covariance).all():
+        raise InputError("these images do not determine the calibration: its error has no shares")
     weight = _weight(answer, recording)
     part = np.einsum("pq,kpq->k", weight, influence_of(answer).shares)
     residual = np.asarray(answer.residual)[np.asarray(answer.mask) > 0]
