@@ -105,8 +105,9 @@ def test_figures_have_units_and_the_datas_numbers(result):
     offsets = result.plot_offsets(np.zeros(24)).axes[0]
     assert "true" in offsets.get_legend_handles_labels()[1]
     lost = replace(result, unknowns_covariance=jnp.full((9, 9), jnp.nan))
-    with pytest.raises(jaxcal.InputError, match="do not determine"):
-        plots.plot_tre(lost)
+    for plot in (plots.plot_tre, plots.plot_influence, plots.plot_limits):
+        with pytest.raises(jaxcal.InputError, match="do not determine"):
+            plot(lost)
 
 
 @pytest.mark.parametrize(
@@ -159,6 +160,7 @@ result = jaxcal.calibrate(problem, "conventional")
 probe = jaxcal.LinearProbe(elements=16)
 raw = jaxcal.make_images(poses, np.full((9, 16), 2e-5), "time_of_flight")
 found = jaxcal.calibrate(jaxcal.simulate_recording(jaxcal.Protocol(images=9), 1), "conventional")
+of_one = backend.Parameters.of(jax.numpy.eye(3), jax.numpy.zeros(3), jax.numpy.zeros(3))
 skewed = np.eye(6) + np.eye(6, k=1)
 assert jaxcal.predicted_tre(result, [0.0, 50.0]).shape == ()
 for call, *given in (
@@ -270,6 +272,16 @@ for call, *given in (
     (jaxcal.simulate, jax.random.key(1), None),
     (jaxcal.simulate, jax.random.split(jax.random.key(1)), jaxcal.Protocol()),
     (lambda clock: jaxcal.simulate_recording(jaxcal.Protocol(raw=True), clock_hz=clock), "fast"),
+    (lambda watcher: run_study(parse_spec(START), "no-such-folder", watcher=watcher), 3),
+    (lambda resume: run_study(parse_spec(START), "no-such-folder", resume=resume), "yes"),
+    *((lambda value, name=name: backend.arrow_least_squares(
+        lambda s, y, d: d, np.zeros(2), np.zeros(9), points, **{name: value}), value)
+      for name, value in (
+        ("limit", -1.0), ("limit", np.nan), ("limit", np.ones(3)), ("limit", "a"),
+        ("max_steps", 0), ("max_steps", 2.5),
+    )),
+    (backend.Iterate.of, of_one, backend.RIGID),
+    (backend.circle_residual, of_one, np.zeros(3), problem),
 ):
     try:
         call(*given)
@@ -281,7 +293,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 157
+    assert len(lines) == 167
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
