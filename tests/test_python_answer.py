@@ -142,6 +142,7 @@ def test_lists_and_single_names(recording):
 def test_calls_as_users_make_them():
     """Without the type checks of these tests: an InputError, in a line, for whatever is given."""
     code = r"""
+import dataclasses
 import warnings
 import jax
 import numpy as np
@@ -280,6 +281,15 @@ for call, *given in (
         ("limit", -1.0), ("limit", np.nan), ("limit", np.ones(3)), ("limit", "a"),
         ("max_steps", 0), ("max_steps", 2.5),
     )),
+    *((lambda value, name=name: jaxcal.calibrate(
+        dataclasses.replace(problem, **{name: value}), "conventional"), value)
+      for name, value in (
+        ("spacing", np.array([np.nan, 1.0])), ("spacing", np.ones(3)), ("face_offset", 0.0),
+        ("mask", np.ones(5)), ("poses", poses[:, :3]), ("measurements", points.astype(str)),
+        ("measurements", points.tolist()), ("measurements", None), ("max_elevation", np.ones(3)),
+    )),
+    (lambda mask: jaxcal.calibrate_batch(
+        dataclasses.replace(jaxcal.stack([problem]), mask=mask), "conventional"), np.ones((2, 9))),
     (backend.Iterate.of, of_one, backend.RIGID),
     (backend.circle_residual, of_one, np.zeros(3), problem),
 ):
@@ -293,7 +303,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 167
+    assert len(lines) == 177
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"
