@@ -257,6 +257,8 @@ for call, said in (
     (lambda: design.Noise(np.full((3, 4), "a")), "the noise model's coefficients must be an array"),
     (lambda: design.plan(candidates, 8, prior=1j * np.eye(9)), "information must be an array"),
     (lambda: design.pose_in_words(np.eye(4), None, np.eye(4), np.zeros(3)), "constraints must be"),
+    (lambda: design.Noise.learned(None, np.zeros((9, 3))), "result must be made by"),
+    (lambda: design.simulate_errors(np.tile(np.eye(4), (3, 1, 1)), candidates=candidates), "3 pos"),
 ):
     try:
         call()
@@ -287,6 +289,8 @@ def test_what_cannot_be_asked():
         (lambda: design.pose_in_words(np.full((4, 4), np.nan), *pose_of(candidates)), "NaN"),
         (lambda: some(50, reference=-np.eye(3)), "3x3 rotation"),
         (lambda: some(50, box_mm=((1.0,) * 3, (0.0,) * 3)), "least and the largest corner"),
+        (lambda: some(50, allowed=lambda poses: np.ones(3, bool)), "allowed must return"),
+        (lambda: some(50, allowed=lambda poses: "yes"), "allowed must return .* not 'yes'"),
         (lambda: design.Rules(replicates=0), "replicates"),
         (lambda: design.Rules(space_filling=2.0), "space_filling"),
         (lambda: check_criterion("volume"), "criterion must be"),

@@ -39,3 +39,20 @@ def test_quantiles_of_an_error_against_bisection(freedom):
         found = intervals._length_quantile(variances, freedom, chance)
         expected = [bisected(row, freedom, chance) if row.any() else 0.0 for row in variances]
         np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("dimensions", [3, 6, 8, 10, 11])
+@pytest.mark.parametrize("freedom", [5.0, np.inf])
+def test_quantiles_are_as_right_as_their_module_says(dimensions, freedom):
+    """Errors alike along some of the axes and none along the others, whose law is known."""
+    middle, low = (0.002, 0.01) if dimensions == 3 else (0.013, 0.09)
+    for alike in range(1, dimensions + 1):
+        variances = np.where(np.arange(dimensions) < alike, 1.0, 0.0)[None]
+        for chance, right in ((0.025, low), (0.5, middle), (0.975, middle)):
+            square = special.chdtri(alike, 1 - chance)
+            if np.isfinite(freedom):
+                square = alike * special.fdtri(alike, freedom, chance)
+            if chance < 0.5 and alike == 1:
+                right = max(right, 0.06)
+            found = intervals._length_quantile(variances, freedom, chance)
+            np.testing.assert_allclose(found, np.sqrt(square), rtol=right)

@@ -22,6 +22,10 @@ def test_reconstruction_precision_is_the_norm_of_unbiased_sds():
     masked = reconstruction_precision(transform, poses, points, mask)
     expected = np.linalg.norm(np.std(cloud[mask > 0], axis=0, ddof=1))
     np.testing.assert_allclose(masked, expected)
+    # Images left out may hold anything.
+    poses[2], points[5] = np.nan, np.inf
+    masked = reconstruction_precision(transform, poses, points, mask > 0)
+    np.testing.assert_allclose(masked, expected)
 
 
 def test_a_single_image_has_no_scatter():

@@ -104,6 +104,16 @@ def test_batches_and_masks():
     np.testing.assert_allclose(plain(poses[1], masks[1]).tip, alone.tip, atol=1e-9)
 
 
+def test_a_batch_of_rows_without_the_last_one():
+    poses = np.stack([swung(random_rotations(12, seed), 0.1, seed) for seed in range(2)])
+    whole = jaxcal.calibrate_pivot(poses, robust=False)
+    found = jaxcal.calibrate_pivot(poses[:, :, :3], robust=False)
+    np.testing.assert_array_equal(found.tip, whole.tip)
+    np.testing.assert_array_equal(found.status, ["converged", "converged"])
+    with pytest.raises(jaxcal.InputError, match="a batch holds many"):
+        _ = found.warnings
+
+
 def test_bad_input_is_named():
     with pytest.raises(jaxcal.InputError, match="3 used poses are too few"):
         jaxcal.calibrate_pivot(swung(random_rotations(3)))

@@ -105,8 +105,9 @@ def test_figures_have_units_and_the_datas_numbers(result):
     offsets = result.plot_offsets(np.zeros(24)).axes[0]
     assert "true" in offsets.get_legend_handles_labels()[1]
     lost = replace(result, unknowns_covariance=jnp.full((9, 9), jnp.nan))
-    with pytest.raises(jaxcal.InputError, match="do not determine"):
-        plots.plot_tre(lost)
+    for plot in (plots.plot_tre, plots.plot_influence, plots.plot_limits):
+        with pytest.raises(jaxcal.InputError, match="do not determine"):
+            plot(lost)
 
 
 @pytest.mark.parametrize(
@@ -141,7 +142,9 @@ def test_lists_and_single_names(recording):
 def test_calls_as_users_make_them():
     """Without the type checks of these tests: an InputError, in a line, for whatever is given."""
     code = r"""
+import dataclasses
 import warnings
+import jax
 import numpy as np
 import jaxcal
 from jaxcal import backend
@@ -155,6 +158,11 @@ poses[:, :3, 3] = draws.uniform(-50, 50, (9, 3))
 points = draws.uniform(10, 50, (9, 2))
 problem = jaxcal.Problem.from_arrays(poses, points)
 result = jaxcal.calibrate(problem, "conventional")
+probe = jaxcal.LinearProbe(elements=16)
+raw = jaxcal.make_images(poses, np.full((9, 16), 2e-5), "time_of_flight")
+found = jaxcal.calibrate(jaxcal.simulate_recording(jaxcal.Protocol(images=9), 1), "conventional")
+of_one = backend.Parameters.of(jax.numpy.eye(3), jax.numpy.zeros(3), jax.numpy.zeros(3))
+skewed = np.eye(6) + np.eye(6, k=1)
 assert jaxcal.predicted_tre(result, [0.0, 50.0]).shape == ()
 for call, *given in (
     (jaxcal.calibrate, "rec.h5"), (jaxcal.calibrate, {}),
@@ -224,6 +232,66 @@ for call, *given in (
       for path in (None, 3, b"rec.h5")),
     (jaxcal.save, jaxcal.Recording(jaxcal.make_images(poses, points)), None),
     (backend.LevenbergMarquardt, "fast"),
+    *((lambda value, name=name: jaxcal.segment(raw, probe, **{name: value}), value)
+      for name, value in (
+        ("minimum_lines", "8"), ("minimum_lines", 8.5), ("minimum_lines", -3), ("robust", "no"),
+        ("interpolate", None), ("scale", np.array(["frame", "pooled"])), ("method", np.ones(2)),
+        ("minimum_amplitude", [1.0, 2.0]),
+    )),
+    (jaxcal.sound_speed_in_water, "20"), (jaxcal.sound_speed_in_water, [[1.0], [1.0, 2.0]]),
+    *((lambda value, name=name: jaxcal.LinearProbe(**{name: value}), None)
+      for name in ("elements", "pitch_mm", "sound_speed_m_s", "delay_s")),
+    (probe.contains, "abc", 30.0), (probe.image_to_cartesian, "a", 3.0),
+    (probe.one_way_range_mm, "a"),
+    (jaxcal.reconstruction_precision, np.eye(4), poses, points, ["a"] * 9),
+    (jaxcal.reconstruction_precision, np.eye(4), poses, points.astype(str)),
+    (jaxcal.calibration_reproducibility, [np.eye(4), np.eye(3)], [[0.0, 20.0]]),
+    (jaxcal.calibration_reproducibility, np.full((2, 4, 4), "a"), [[0.0, 20.0]]),
+    (jaxcal.cross_validate, None), (jaxcal.cross_validate, "rec.h5"), (jaxcal.bootstrap, None),
+    *((lambda given: jaxcal.cross_validate(problem, result=given), given)
+      for given in (3, jaxcal.calibrate_batch([problem, problem], "conventional"))),
+    (lambda given: jaxcal.bootstrap(problem, 4, result=given), 3),
+    *((jaxcal.bootstrap, problem, 4, key)
+      for key in (jax.numpy.array(1), jax.random.split(jax.random.key(1)))),
+    (jaxcal.calibrate_pivot, poses, ["a"] * 9),
+    (lambda robust: jaxcal.calibrate_pivot(poses, robust=robust), "no"),
+    (jaxcal.calibrate_pivot, [np.eye(4), np.eye(3)]),
+    (lambda mask: jaxcal.make_images(poses, points, mask=mask), [[1, 0], [1]]),
+    (lambda least: jaxcal.make_images(poses, points, minimum=least), "a"),
+    (lambda truth: jaxcal.Recording(jaxcal.make_images(poses, points), truth=truth), 3),
+    (lambda probe: jaxcal.Recording(jaxcal.make_images(poses, points), probe=probe), "linear"),
+    (jaxcal.ImageTransform, None),
+    *((lambda value, name=name: jaxcal.ImageTransform(np.eye(4), **{name: value}), value)
+      for name, value in (("converged", "no"), ("unknowns", 3), ("covariance", skewed))),
+    *((jaxcal.ImageTransform(np.eye(4)).with_pixels, *given) for given in (
+        ("a",), (0.1,), ((0.1,),), ((0.1, 0.1), "a"), ((0.1, 0.1), 3), ((0.1, 0.1), None),
+    )),
+    (result.save, "x.json", ["json"]), (found.record, 3), (found.record, ["abc"]),
+    (found.record, [[1.0, 2.0, 3.0]]), (result.plot_offsets, [1.0, 2.0]),
+    (lambda batch: batch.warnings, jaxcal.calibrate_batch([problem], "conventional")),
+    (lambda batch: batch.observability, jaxcal.calibrate_batch([problem], "conventional")),
+    (jaxcal.simulate, jax.random.key(1), None),
+    (jaxcal.simulate, jax.random.split(jax.random.key(1)), jaxcal.Protocol()),
+    (lambda clock: jaxcal.simulate_recording(jaxcal.Protocol(raw=True), clock_hz=clock), "fast"),
+    (lambda watcher: run_study(parse_spec(START), "no-such-folder", watcher=watcher), 3),
+    (lambda resume: run_study(parse_spec(START), "no-such-folder", resume=resume), "yes"),
+    *((lambda value, name=name: backend.arrow_least_squares(
+        lambda s, y, d: d, np.zeros(2), np.zeros(9), points, **{name: value}), value)
+      for name, value in (
+        ("limit", -1.0), ("limit", np.nan), ("limit", np.ones(3)), ("limit", "a"),
+        ("max_steps", 0), ("max_steps", 2.5),
+    )),
+    *((lambda value, name=name: jaxcal.calibrate(
+        dataclasses.replace(problem, **{name: value}), "conventional"), value)
+      for name, value in (
+        ("spacing", np.array([np.nan, 1.0])), ("spacing", np.ones(3)), ("face_offset", 0.0),
+        ("mask", np.ones(5)), ("poses", poses[:, :3]), ("measurements", points.astype(str)),
+        ("measurements", points.tolist()), ("measurements", None), ("max_elevation", np.ones(3)),
+    )),
+    (lambda mask: jaxcal.calibrate_batch(
+        dataclasses.replace(jaxcal.stack([problem]), mask=mask), "conventional"), np.ones((2, 9))),
+    (backend.Iterate.of, of_one, backend.RIGID),
+    (backend.circle_residual, of_one, np.zeros(3), problem),
 ):
     try:
         call(*given)
@@ -235,7 +303,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 101
+    assert len(lines) == 177
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"

@@ -400,6 +400,17 @@ def test_frames_without_answers_are_masked_and_counted():
     np.testing.assert_array_equal(np.flatnonzero(weak.failed), [0, 2, 4, 9])
 
 
+@pytest.mark.parametrize(
+    ("method", "least", "failed"),
+    [("least-squares", None, [4, 9]), ("shortest", None, [4]), ("shortest", 6, [4, 9])],
+)
+def test_the_fewest_lines_of_a_frame_hold_for_both_methods(method, least, failed):
+    _, distances = draw(L14_5, 12, 0.5)
+    distances[4], distances[9, 5:] = np.nan, np.nan
+    found = segment(raw(distances, L14_5), L14_5, method=method, minimum_lines=least)
+    np.testing.assert_array_equal(np.flatnonzero(found.failed), failed)
+
+
 def test_too_few_frames_are_an_error_of_the_recording():
     _, distances = draw(L14_5, 6, 0.5)
     distances[3:] = np.nan

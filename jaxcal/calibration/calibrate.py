@@ -30,6 +30,7 @@ from jaxcal.calibration.options import (
     PriorName,
     Request,
     SolvePlan,
+    check_shapes,
     check_values,
     options_of,
     prepare,
@@ -121,6 +122,7 @@ def calibrate(
     """
     assert isinstance(problem, Problem)  # converted
     estimate = unknown_names(estimate)
+    check_shapes(problem)
     problem = _in_asked_precision(problem, options, "jaxcal.calibrate")
     request = Request(
         method,
@@ -228,6 +230,7 @@ def calibrate_batch(
         raise InputError("calibrate_batch needs problems with a leading axis; use calibrate")
     if chunk is not None:
         chunk = whole_number("chunk", chunk, 1, LARGEST_CHUNK)
+    check_shapes(problems)
     problems = _in_asked_precision(problems, options, "jaxcal.calibrate_batch")
     request = Request(
         method,

@@ -400,11 +400,44 @@ def _check_size(name: str, value: Any, least: float, *, one: bool = True) -> Non
         raise InputError(f"{name} must be one number, not {shown(value)}")
 
 
+def check_shapes(problem: Problem) -> None:
+    """Refuse arrays that do not go together, as ``dataclasses.replace`` may leave a problem.
+
+    Raises:
+        InputError: what is no array of real numbers, or has another shape than the mask asks for.
+    """
+    shape = tuple(np.shape(problem.mask))
+    batch = shape[:-1]
+    if not shape:
+        raise InputError("mask of the problem must have an axis for the images")
+    for name, wanted, optional in (
+        ("mask", shape, False),
+        ("poses", (*shape, 4, 4), False),
+        ("measurements", (*shape, 2), False),
+        ("spacing", (*batch, 2), False),
+        ("face_offset", batch, False),
+        ("covariance", (*shape, 2, 2), True),
+        ("max_elevation", shape, True),
+    ):
+        value = getattr(problem, name)
+        if value is None and optional:
+            continue
+        kind = getattr(getattr(value, "dtype", None), "kind", "")
+        # bfloat16 and its like are of numpy's kind V.
+        if value is None or kind not in ("b", "i", "u", "f", "V"):
+            raise InputError(f"{name} of the problem must be an array of real numbers")
+        if np.shape(value) != wanted:
+            raise InputError(
+                f"{name} of the problem must have shape {wanted}, not {np.shape(value)}"
+            )
+
+
 def check_values(problem: Problem) -> None:
     """Refuse NaN, Inf and too few images, if the values are concrete.
 
     Raises:
-        InputError: NaN or Inf, with the number of the image, or too few images.
+        InputError: NaN or Inf, with the number of the image, too few images, or pixels without a
+            size.
     """
     if is_traced(problem):
         return
@@ -418,6 +451,11 @@ def check_values(problem: Problem) -> None:
         bad = ~np.isfinite(values).reshape(len(used), -1).all(axis=1) & used
         if bad.any():
             raise InputError(f"{name} of image {np.flatnonzero(bad)[0]} hold NaN or Inf")
+    spacing = np.asarray(problem.spacing)
+    if not (np.isfinite(spacing).all() and (spacing > 0).all()):
+        raise InputError(f"spacing of the problem must be two positive numbers, not {spacing}")
+    if not np.isfinite(np.asarray(problem.face_offset)):
+        raise InputError("face_offset of the problem must be finite")
 
 
 def with_bound(problem: Problem, given: Given) -> Problem:

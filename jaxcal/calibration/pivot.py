@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal import InputError
 from jaxcal.calibration.answer import covariance_and_observability
+from jaxcal.calibration.inputs import check_flag
 from jaxcal.calibration.result import Status
 from jaxcal.data.poses import check_poses
 from jaxcal.data.problem import Problem
@@ -87,9 +88,10 @@ class Pivot(eqx.Module):
         return jnp.asarray(self.status_code == Status.CONVERGED)
 
     @property
-    def status(self) -> str:
-        """converged, max_iterations, unobservable or failed (one calibration, concrete)."""
-        return Status(int(self.status_code)).name.lower()
+    def status(self) -> str | np.ndarray:
+        """converged, max_iterations, unobservable or failed; an array of these for a batch."""
+        chosen = np.array([status.name.lower() for status in Status])[np.asarray(self.status_code)]
+        return str(chosen) if chosen.ndim == 0 else chosen
 
     @property
     def weakest(self) -> Float[np.ndarray, "*batch 3"]:
@@ -111,7 +113,13 @@ class Pivot(eqx.Module):
 
     @property
     def warnings(self) -> list[str]:
-        """What a person should know before using this answer (one calibration, concrete)."""
+        """What a person should know before using this answer (one calibration, concrete).
+
+        Raises:
+            InputError: of a batch.
+        """
+        if np.ndim(self.status_code):
+            raise InputError("a batch holds many calibrations, each with warnings of its own")
         found = []
         if self.status == "failed":
             return ["the solve failed: its result holds no usable numbers"]
@@ -155,20 +163,26 @@ def calibrate_pivot(
 
     Args:
         poses: tool -> tracker, mm, (n, 4, 4) or (n, 3, 4); concrete ones are checked and their
-            rotations projected to SO(3). Leading axes make a batch.
+            rotations projected to SO(3). Leading axes make a batch, which is solved as it is.
         mask: 1 (or True) for poses to use; all by default.
         robust: find the poses that agree with each other, even if nearly half of all poses are
             wrong, and leave the others out.
 
     Raises:
-        InputError: poses or a mask of another shape, concrete poses that are not rigid transforms
-            or look like metres, or fewer than 4 used ones.
+        InputError: poses or a mask of another shape, or what are no numbers; concrete poses, not
+            of a batch, that are not rigid transforms or look like metres, or fewer than 4 used
+            ones.
     """
+    check_flag("robust", robust)
+    if not isinstance(poses, jax.Array):
+        poses = real_array(poses, "poses")
     shape = np.shape(poses)
     if len(shape) < 3 or shape[-2:] not in ((4, 4), (3, 4)):
         raise InputError(f"poses must have shape (n, 4, 4), not {shape}")
     if mask is not None and np.shape(mask) not in (shape[:-2], shape[-3:-2]):
         raise InputError(f"mask must have shape {shape[:-2]}, not {np.shape(mask)}")
+    if not (mask is None or is_traced(mask) or np.asarray(mask).dtype == bool):
+        mask = real_array(mask, "mask")
     if not is_traced(poses) and np.ndim(poses) == 3:
         used = np.ones(len(poses), bool) if mask is None else np.asarray(mask) > 0
         poses = check_poses(real_array(poses, "poses"), used)
@@ -184,6 +198,9 @@ def calibrate_pivot(
             )
     require_float64("jaxcal.calibrate_pivot")
     array = jnp.asarray(poses, np.float64)
+    if array.shape[-2] == 3:
+        last = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]), (*array.shape[:-2], 1, 4))
+        array = jnp.concatenate([array, last], axis=-2)
     weight = jnp.ones(array.shape[:-2]) if mask is None else jnp.asarray(mask)
     weight = jnp.broadcast_to(weight.astype(array.dtype), array.shape[:-2])
     alone = compiler.is_whole_program(array, weight)

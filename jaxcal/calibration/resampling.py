@@ -24,7 +24,13 @@ from jaxtyping import Array, Float, Int, Key
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import calibrate, calibrate_batch
 from jaxcal.calibration.dependence import independent
-from jaxcal.calibration.inputs import LARGEST_SEED, whole_number
+from jaxcal.calibration.inputs import (
+    LARGEST_SEED,
+    as_problem,
+    check_key,
+    check_made,
+    whole_number,
+)
 from jaxcal.calibration.result import Calibration
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
@@ -122,10 +128,10 @@ def cross_validate(
         InputError: too few images, folds that are not from 2 to the number of images, or options
             that contradict each other.
     """
-    problem = _one_problem(problem, arguments)
+    problem = _one_problem(problem, arguments, "jaxcal.cross_validate")
     count = problem.images
     folds = count if folds is None else whole_number("folds", folds, 2, count)
-    result = calibrate(problem, **arguments) if result is None else result
+    result = _of_all_images(problem, result, arguments)
     problem = replace(problem, mask=jnp.asarray(result.mask, problem.mask.dtype))
     fold = np.arange(count) % folds
     rest = jnp.asarray(fold[None, :] != np.arange(folds)[:, None], problem.mask.dtype)
@@ -196,12 +202,14 @@ def bootstrap(
     Raises:
         InputError: fewer than 2 resamples, or options that contradict each other.
     """
-    problem = _one_problem(problem, arguments)
+    problem = _one_problem(problem, arguments, "jaxcal.bootstrap")
     resamples = whole_number("resamples", resamples, 2, LARGEST_RESAMPLES)
-    root = key
-    if not isinstance(key, jax.Array):
+    if isinstance(key, jax.Array):
+        check_key("key", key)
+        root = key
+    else:
         root = jax.random.key(whole_number("key", key, 0, LARGEST_SEED))
-    result = calibrate(problem, **arguments) if result is None else result
+    result = _of_all_images(problem, result, arguments)
     mask = jnp.asarray(result.mask, problem.mask.dtype)
     problem = replace(problem, mask=mask)
     rows = _rows(root, mask, resamples)
@@ -288,10 +296,24 @@ def _apart(
     return jnp.sqrt(jnp.mean(jnp.sum(moved**2, axis=1), axis=1))
 
 
-def _one_problem(problem: Problem | Recording, arguments: dict[str, Any]) -> Problem:
+def _of_all_images(
+    problem: Problem, result: Calibration | None, arguments: dict[str, Any]
+) -> Calibration:
+    """The calibration of all images: the caller's, checked, or a new one."""
+    if result is None:
+        return calibrate(problem, **arguments)
+    check_made("result", result, Calibration, "jaxcal.calibrate")
+    if np.shape(result.mask) != (problem.images,):
+        raise InputError(
+            f"result must be the calibration of these {problem.images} images; its mask has shape "
+            f"{np.shape(result.mask)}"
+        )
+    return result
+
+
+def _one_problem(problem: Problem | Recording, arguments: dict[str, Any], name: str) -> Problem:
     """One problem; if its values are concrete, every pose counts once."""
-    if isinstance(problem, Recording):
-        problem = Problem.from_recording(problem)
+    problem = as_problem(problem, name)
     if problem.batch_shape:
         raise InputError("resampling takes one problem at a time, not a batch")
     if any(is_traced(leaf) for leaf in jax.tree.leaves(problem)):

@@ -76,7 +76,7 @@ def check_target(
     """
     name = path_name(path)
     chosen = _format_of(name) if format is None else format
-    extensions = _EXTENSIONS.get(chosen)
+    extensions = _EXTENSIONS.get(chosen) if isinstance(chosen, str) else None
     if extensions is None:
         raise InputError(f"{quoted(str(chosen))} is no format that is written")
     if not name.lower().endswith(extensions):

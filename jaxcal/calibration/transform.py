@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import InputError
+from jaxcal.calibration.inputs import check_flag
 from jaxcal.data.poses import check_affine, check_poses
 from jaxcal.data.recording import check_spacing_unit
 from jaxcal.diagnostics.image_points import point_jacobian
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 _ROUNDING = 1e-13
 _LARGEST = 1e9
 """Largest pixel; beyond it nothing is an image, and squares overflow."""
+_UNEQUAL = 1e-6
+"""Largest difference between a covariance's two halves, as a share of the SDs' product."""
 _SKEWED = 1e-3
 """Largest cosine between two columns of a matrix that count as orthogonal."""
 
@@ -74,7 +77,8 @@ class ImageTransform:
 
     Raises:
         InputError: wrong shapes or ``unknowns``; and, unless ``converged`` is False, NaN or Inf, a
-            matrix that is not rigid, sizes or a factor that are not positive, negative variances.
+            matrix that is not rigid, sizes or a factor that are not positive, a covariance that is
+            not symmetric or has negative variances.
     """
 
     image_plane_to_probe: Float[np.ndarray, "4 4"]
@@ -90,7 +94,7 @@ class ImageTransform:
 
     def __post_init__(self) -> None:
         moving = [name for name in TABLE if TABLE[name].in_image]
-        blocks = tuple(self.unknowns)
+        blocks = tuple(self.unknowns) if isinstance(self.unknowns, tuple | list) else ()
         if blocks[:2] != ("translation", "rotation") or not set(blocks) <= set(moving):
             raise InputError(f"unknowns must be translation, rotation and others of {moving}")
         size = len(tangent_names(blocks))
@@ -103,7 +107,11 @@ class ImageTransform:
             "image_covariance": (size, size),
             "error_mm": (),
         }
+        if self.converged is not None:
+            check_flag("converged", self.converged)
         given = {name: getattr(self, name) for name in shapes}
+        if given["image_plane_to_probe"] is None:
+            raise InputError("image_plane_to_probe must be an array of real numbers")
         checked = {
             name: _numbers(value, name, shapes[name])
             for name, value in given.items()
@@ -159,29 +167,30 @@ class ImageTransform:
         """
         if self.scale_mm_per_px is not None:
             raise InputError("the calibration has pixels of its own: no other size is needed")
-        scale = np.array(size_mm, dtype=np.float64)
-        if not ((scale > 0).all() and (np.abs(origin_px) <= _LARGEST).all()):
+        scale, origin = real_array(size_mm, "size_mm"), real_array(origin_px, "origin_px")
+        good = scale.shape == origin.shape == (2,)
+        if not (good and (scale > 0).all() and (np.abs(origin) <= _LARGEST).all()):
             raise InputError(
                 "a pixel's size must be two positive numbers, its origin two numbers up to "
                 f"{_LARGEST:g}"
             )
         check_spacing_unit(scale)
         moved = self.image_plane_to_probe.copy()
-        moved[:3, 3] -= moved[:3, 0] * scale[0] * origin_px[0]
+        moved[:3, 3] -= moved[:3, 0] * scale[0] * origin[0]
 
         def shifted(covariance: np.ndarray | None) -> np.ndarray | None:
             if covariance is None:
                 return None
             # X' = X T with T a shift by d along lateral moves the perturbation to the new origin.
             adjoint = np.eye(len(covariance))
-            adjoint[:3, 3:6] = -_cross(np.array([-scale[0] * origin_px[0], 0.0, 0.0]))
+            adjoint[:3, 3:6] = -_cross(np.array([-scale[0] * origin[0], 0.0, 0.0]))
             return adjoint @ covariance @ adjoint.T
 
         return replace(
             self,
             image_plane_to_probe=moved,
             scale_mm_per_px=scale,
-            face_offset_mm=self.face_offset_mm - self.range_factor * float(scale[1] * origin_px[1]),
+            face_offset_mm=self.face_offset_mm - self.range_factor * float(scale[1] * origin[1]),
             covariance=shifted(self.covariance),
             image_covariance=shifted(self.image_covariance),
         )
@@ -329,10 +338,18 @@ def _checked(values: dict[str, np.ndarray]) -> Float[np.ndarray, "4 4"]:
             raise InputError(f"{name} must be positive")
         if name in ("covariance", "image_covariance") and (np.diag(array) < 0).any():
             raise InputError(f"{name} holds a negative variance")
+        if name in ("covariance", "image_covariance") and not _is_symmetric(array):
+            raise InputError(f"{name} is not symmetric")
     matrix = values["image_plane_to_probe"]
     rigid = check_poses(matrix[None], what="the matrix", labels=["image_plane_to_probe"])[0]
     # What was rigid keeps every digit.
     return matrix if np.abs(rigid - matrix).max() < _ROUNDING else rigid
+
+
+def _is_symmetric(covariance: Float[np.ndarray, "q q"]) -> bool:
+    """Whether a covariance is symmetric as far as its SDs matter."""
+    sd = np.sqrt(np.diag(covariance))
+    return bool((np.abs(covariance - covariance.T) <= _UNEQUAL * np.outer(sd, sd)).all())
 
 
 def _cross(vector: np.ndarray) -> Float[np.ndarray, "3 3"]:

@@ -19,6 +19,7 @@ from jaxcal.data.sound import check_sound_speed
 from jaxcal.runtime.array_types import Bool, Float, Num
 from jaxcal.runtime.arrays import is_number, real_array
 
+MOST_ELEMENTS = 65536
 _LONGEST_DELAY_S = 1e-3
 
 
@@ -32,10 +33,10 @@ class _Array:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if real_array(value, name).ndim:
+            if value is None or real_array(value, name).ndim:
                 raise InputError(f"{name} must be one number, not {value}")
-        if not 2 <= self.elements <= 65536 or self.elements != int(self.elements):
-            raise InputError(f"a probe needs 2 to 65536 elements, not {self.elements}")
+        if not 2 <= self.elements <= MOST_ELEMENTS or self.elements != int(self.elements):
+            raise InputError(f"a probe needs 2 to {MOST_ELEMENTS} elements, not {self.elements}")
         if not (np.isfinite(self.pitch_mm) and 0 < self.pitch_mm < 100):
             raise InputError(f"probe pitch must be in mm between 0 and 100, not {self.pitch_mm}")
         check_sound_speed(self.sound_speed_m_s)
@@ -63,18 +64,18 @@ class _Array:
             delay_s: s, used instead of the probe's own delay.
         """
         delay = self.delay_s if delay_s is None else delay_s
-        return (np.asarray(times_s, dtype=np.float64) - delay) * (1e3 * self.sound_speed_m_s)
+        return (real_array(times_s, "times") - delay) * (1e3 * self.sound_speed_m_s)
 
     def time_of_flight_s(
         self, distances_mm: Float[np.ndarray, "*shape"]
     ) -> Float[np.ndarray, "*shape"]:
         """One-way times of flight (s) over distances (mm), the electronics' delay included."""
-        return np.asarray(distances_mm, np.float64) / (1e3 * self.sound_speed_m_s) + self.delay_s
+        return real_array(distances_mm, "distances") / (1e3 * self.sound_speed_m_s) + self.delay_s
 
 
 def _in_plane(points) -> tuple[np.ndarray, np.ndarray]:
     """Lateral and axial of points with two or three coordinates."""
-    points = np.asarray(points, dtype=np.float64)
+    points = real_array(points, "points")
     if points.ndim == 0 or points.shape[-1] not in (2, 3):
         raise InputError(f"points need 2 or 3 coordinates, their shape is {points.shape}")
     return points[..., 0], points[..., -1]
@@ -124,8 +125,8 @@ class LinearProbe(_Array):
         self, line: Num[np.ndarray, "*#batch"] | float, range_mm: Num[np.ndarray, "*#batch"] | float
     ) -> Float[np.ndarray, "*batch 2"]:
         """[lateral, axial] (mm) on scan line ``line`` (element number) at ``range_mm`` (Eq. 3)."""
-        lateral = (np.asarray(line, dtype=np.float64) - (self.elements - 1) / 2) * self.pitch_mm
-        lateral, axial = np.broadcast_arrays(lateral, np.asarray(range_mm, dtype=np.float64))
+        lateral = (real_array(line, "line") - (self.elements - 1) / 2) * self.pitch_mm
+        lateral, axial = np.broadcast_arrays(lateral, real_array(range_mm, "range_mm"))
         return np.stack([lateral, axial], axis=-1)
 
     def cartesian_to_image(
@@ -215,7 +216,7 @@ class CurvilinearProbe(_Array):
         range_mm: Num[np.ndarray, "*#batch"] | float,
     ) -> Float[np.ndarray, "*batch 2"]:
         """[lateral, axial] (mm) in the direction ``angle_rad`` at ``range_mm`` from the arc."""
-        angle, depth = np.asarray(angle_rad, np.float64), np.asarray(range_mm, np.float64)
+        angle, depth = real_array(angle_rad, "angle_rad"), real_array(range_mm, "range_mm")
         lateral = (self.radius_mm + depth) * np.sin(angle)
         # (R + d) cos(angle) - R without the cancellation.
         axial = depth * np.cos(angle) - 2.0 * self.radius_mm * np.sin(angle / 2) ** 2
@@ -225,7 +226,7 @@ class CurvilinearProbe(_Array):
         self, line: Num[np.ndarray, "*#batch"] | float, range_mm: Num[np.ndarray, "*#batch"] | float
     ) -> Float[np.ndarray, "*batch 2"]:
         """[lateral, axial] (mm) on scan line ``line`` (element number) at ``range_mm``."""
-        line = np.asarray(line, dtype=np.float64)
+        line = real_array(line, "line")
         angle = (line - (self.elements - 1) / 2) * self.pitch_mm / self.radius_mm
         return self.polar_to_cartesian(angle, range_mm)
 

@@ -14,9 +14,10 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
-from jaxcal.data.probe import Probe
+from jaxcal.data.probe import Probe, check_probe
+from jaxcal.io.readable import shown
 from jaxcal.runtime.array_types import Bool, Float
-from jaxcal.runtime.arrays import is_traced, real_array
+from jaxcal.runtime.arrays import is_number, is_traced, real_array
 
 MINIMUM_IMAGES = 4
 """With fewer used images nothing can be solved: 3 residuals an image against 9 unknowns."""
@@ -116,6 +117,10 @@ class Recording:
                     f"{name} takes images (jaxcal.make_images makes them), not "
                     f"{type(images).__name__}"
                 )
+        if not (self.truth is None or isinstance(self.truth, Truth)):
+            raise InputError(f"truth must be that of a simulation, not {shown(self.truth)}")
+        if self.probe is not None:
+            check_probe(self.probe)
 
     def __len__(self) -> int:
         return len(self.calibration)
@@ -232,6 +237,8 @@ def _make_images(
     if len(values) != count:
         raise InputError(f"{count} poses but {len(values)} rows of {kind}: they must match")
     used = _mask(mask, count)
+    if not (is_number(minimum) and minimum >= 0):
+        raise InputError(f"minimum must be a number of images, not {shown(minimum)}")
     if used.sum() < minimum:
         raise InputError(
             f"{int(used.sum())} used images are too few: at least {minimum} are needed"
@@ -370,7 +377,10 @@ def _check_magnitude(name: str, values: np.ndarray, used: np.ndarray) -> None:
 def _mask(mask: np.ndarray | None, count: int) -> Bool[np.ndarray, " n"]:
     if mask is None:
         return np.ones(count, bool)
-    mask = np.asarray(mask)
+    try:
+        mask = np.asarray(mask)
+    except ValueError:
+        raise InputError("mask must be an array of booleans (True = used)") from None
     if mask.shape != (count,):
         raise InputError(f"mask must have shape ({count},), it has {mask.shape}")
     if mask.dtype != bool and not np.isin(mask, (0, 1)).all():

@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import is_number, real_array
 
 # W. Marczak, "Water as a standard in the measurements of speed of sound in liquids",
 # J. Acoust. Soc. Am. 102 (1997) 2776-2779: fifth degree in degrees Celsius, lowest power first.
@@ -33,7 +34,7 @@ def sound_speed_in_water(
 
     Source: Marczak 1997, J. Acoust. Soc. Am. 102, 2776.
     """
-    temperature = np.asarray(temperature_celsius, dtype=np.float64)
+    temperature = real_array(temperature_celsius, "water temperature")
     if not ((temperature >= 0) & (temperature <= 95)).all():
         raise InputError("water temperature must be in degrees Celsius, from 0 to 95")
     speed = np.polynomial.polynomial.polyval(temperature, _MARCZAK)
@@ -46,7 +47,8 @@ def check_sound_speed(sound_speed_m_s: float) -> None:
     Raises:
         InputError: not between 100 and 10000, with a hint where it looks like mm/us.
     """
-    if SLOWEST_M_S < sound_speed_m_s < FASTEST_M_S:
+    if is_number(sound_speed_m_s) and SLOWEST_M_S < sound_speed_m_s < FASTEST_M_S:
         return
-    hint = f": {sound_speed_m_s} looks like mm/us" if 0.5 < sound_speed_m_s < 7 else ""
+    like = is_number(sound_speed_m_s) and 0.5 < sound_speed_m_s < 7
+    hint = f": {sound_speed_m_s} looks like mm/us" if like else ""
     raise InputError(f"sound speed must be in m/s (water: about 1490), not {sound_speed_m_s}{hint}")

@@ -24,6 +24,7 @@ from jaxcal import InputError
 from jaxcal.calibration.inputs import check_made
 from jaxcal.data.poses import rotations_from_vectors, targets_in_images
 from jaxcal.data.probe import CurvilinearProbe, Probe, check_probe
+from jaxcal.io.readable import shown
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import is_number, real_array
 
@@ -43,6 +44,16 @@ def _are_in_order(value: Any, shape: tuple[int, ...]) -> bool:
     except InputError:
         return False
     return numbers.shape == shape and bool((numbers[0] <= numbers[1]).all())
+
+
+def _said(answer: Any, count: int) -> Bool[np.ndarray, " n"]:
+    """What a caller's ``allowed`` says of as many poses."""
+    said = np.asarray(answer)
+    if said.dtype != bool or said.shape != (count,):
+        raise InputError(
+            f"allowed must return {count} truth values for {count} poses, not {shown(answer)}"
+        )
+    return said
 
 
 @dataclass(frozen=True)
@@ -193,7 +204,7 @@ class Constraints:
             distance = np.linalg.norm(poses[:, :3, 3], axis=1)
             good &= (self.reach_mm[0] <= distance) & (distance <= self.reach_mm[1])
         if self.allowed is not None and good.any():
-            good[good] = self.allowed(poses[good])
+            good[good] = _said(self.allowed(poses[good]), int(good.sum()))
         return good
 
     def poses(

@@ -132,7 +132,17 @@ class Noise:
         Args:
             result: of one problem.
             targets: (n, 3) where the target was in every image, mm.
+
+        Raises:
+            InputError: no calibration, one without SDs, or targets of another number of images.
         """
+        # Imported here, since the model's module imports this one.
+        from jaxcal.design.information import check_result
+
+        check_result(result)
+        targets = real_array(targets, "targets")
+        if targets.ndim != 2 or targets.shape[1] != 3:
+            raise InputError(f"targets must have shape (n, 3), not {targets.shape}")
         answer = result.numpy()
         sigma = np.maximum(np.asarray(answer.sigma, float), _LEAST_SD_MM)
         if not np.isfinite(sigma).all():

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.calibration.inputs import LARGEST_SEED, check_made, whole_number
+from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.planning import Plan
 from jaxcal.diagnostics.metrics import reconstruction_precision
@@ -90,7 +91,7 @@ def simulate_errors(
         seed: of the offsets and errors.
 
     Raises:
-        InputError: no candidates, an unknown law, or a wrong number of trials.
+        InputError: no candidates, fewer than 4 poses, an unknown law, or a wrong number of trials.
     """
     from jaxcal.calibration.calibrate import calibrate_batch
     from jaxcal.study.laws import check_law
@@ -105,6 +106,8 @@ def simulate_errors(
     poses = real_array(poses, "poses")
     if poses.ndim not in (3, 4) or poses.shape[-2:] != (4, 4):
         raise InputError(f"poses must be (n, 4, 4) or (trials, n, 4, 4), not {poses.shape}")
+    if poses.shape[-3] < MINIMUM_IMAGES:
+        raise InputError(f"{poses.shape[-3]} poses are too few: at least {MINIMUM_IMAGES}")
     if poses.ndim == 4:
         trials = len(poses)
     whole_number("trials", trials, 2, MOST_TRIALS)

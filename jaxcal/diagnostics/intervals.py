@@ -43,8 +43,10 @@ if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration
 
 DIRECTIONS = 1024
-"""Directions over which the distribution of an error is averaged. Quantiles are right to 0.5 %;
-the lower ends of intervals for errors along a single axis are right to 5 %."""
+"""Directions over which the distribution of an error is averaged. At a point of the
+image, medians and upper ends of intervals are right to 0.2 %, lower ends to 1 % (along a single
+axis 6 %). Over the image, in up to 11 dimensions, they are right to 1.3 and 9 %, which only errors
+along one or two axes reach."""
 
 _RADII = 4000
 """Number of values of rho^2 between which its distribution is interpolated."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.runtime.array_types import AnyArray, Float
-from jaxcal.runtime.arrays import array_module, is_traced, traceable
+from jaxcal.runtime.array_types import AnyArray, Bool, Float
+from jaxcal.runtime.arrays import array_module, is_traced, real_array, traceable
 
 
 @traceable
@@ -14,7 +16,7 @@ def reconstruction_precision(
     image_to_probe: Float[AnyArray, "4 4"],
     poses: Float[AnyArray, "n 4 4"],
     points: Float[AnyArray, "n columns"],
-    mask: Float[AnyArray, " n"] | None = None,
+    mask: Float[AnyArray, " n"] | Bool[AnyArray, " n"] | None = None,
 ) -> Float[AnyArray, ""]:
     """Point reconstruction precision, Eq. 8: norm of the SD of B_i X p_i over the images, mm.
 
@@ -22,16 +24,19 @@ def reconstruction_precision(
         image_to_probe: X.
         poses: B_i of the *test* images, probe -> tracker, mm.
         points: (n, 2) [lateral, range], assumed in the plane, or (n, 3) in the image frame, mm.
-        mask: (n,) 1 for images to count; all by default.
+        mask: (n,) 1 (or True) for images to count; all by default. The others may hold anything.
 
     Returns:
         sqrt(sum over x, y, z of the unbiased variance (n - 1)), mm.
 
     Raises:
-        InputError: shapes that do not agree, or fewer than two images to count.
+        InputError: shapes that do not agree, what are no numbers, or fewer than two images to
+            count.
     """
     xp = array_module(image_to_probe, poses, points, mask)
-    poses, points = xp.asarray(poses), xp.asarray(points)
+    image_to_probe = _numbers(image_to_probe, "image_to_probe")
+    poses, points = _numbers(poses, "poses"), _numbers(points, "points")
+    mask = None if mask is None else _numbers(mask, "mask")
     count = len(poses) if poses.ndim else 0
     for name, values, shapes in (
         ("image_to_probe", image_to_probe, [(4, 4)]),
@@ -42,8 +47,11 @@ def reconstruction_precision(
         if values is not None and np.shape(values) not in shapes:
             wanted = " or ".join(map(str, shapes))
             raise InputError(f"{name} must have shape {wanted}, not {np.shape(values)}")
+    if mask is not None:
+        poses = xp.where(mask[:, None, None] > 0, poses, 0.0)
+        points = xp.where(mask[:, None] > 0, points, 0.0)
     cloud = reconstruct(image_to_probe, poses, points)
-    weight = xp.ones(poses.shape[0], cloud.dtype) if mask is None else xp.asarray(mask)
+    weight = xp.ones(poses.shape[0], cloud.dtype) if mask is None else mask
     weight = weight.astype(cloud.dtype)[:, None]
     count = xp.sum(weight)
     if not is_traced(count) and count < 2:
@@ -67,6 +75,14 @@ def reconstruct(
     return _transformed(xp.asarray(poses), in_probe)
 
 
+def _numbers(value: Any, name: str) -> Any:
+    """A caller's array, checked as far as it has values; truth values are 0 and 1."""
+    if is_traced(value):
+        return array_module(value).asarray(value)
+    kind = getattr(getattr(value, "dtype", None), "kind", None)
+    return real_array(np.asarray(value, np.float64) if kind == "b" else value, name)
+
+
 def _transformed(transform: AnyArray, points: AnyArray) -> AnyArray:
     """Points (..., 3) by transforms (..., 4, 4)."""
     rotation, translation = transform[..., :3, :3], transform[..., :3, 3]
@@ -87,12 +103,13 @@ def calibration_reproducibility(
         For each point, mean over the calibrations of |X_k p - mean_k X_k p|, mm.
 
     Raises:
-        InputError: fewer than two calibrations, or other shapes.
+        InputError: fewer than two calibrations, other shapes, or what are no numbers.
 
     Source: calibration reproducibility, e.g. Hsu et al. 2009, section 6.2.
     """
     xp = array_module(transforms, image_points)
-    transforms, image_points = xp.asarray(transforms), xp.asarray(image_points)
+    transforms = _numbers(transforms, "transforms")
+    image_points = _numbers(image_points, "image_points")
     if transforms.ndim != 3 or transforms.shape[1:] != (4, 4) or len(transforms) < 2:
         raise InputError(
             f"transforms must have shape (k, 4, 4), at least two, not {transforms.shape}"

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.diagnostics.directions import observability
+from jaxcal.diagnostics.directions import check_one, observability
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.diagnostics.outliers import listed_departures, outliers, suspects_in_words
 from jaxcal.diagnostics.uncertainty import TUNED
@@ -29,7 +29,12 @@ WEAK_SHARE = 0.7
 
 
 def warnings(result: Calibration) -> list[str]:
-    """Everything that a person should know before using the answer, most important first."""
+    """Everything that a person should know before using the answer, most important first.
+
+    Raises:
+        InputError: of a batch.
+    """
+    check_one(result)
     if result.status == "failed":
         return ["the solve failed: its result holds no usable numbers"]
     if result.wrong_frames is not None:

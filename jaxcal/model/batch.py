@@ -170,7 +170,16 @@ class Iterate(eqx.Module):
 
     @classmethod
     def of(cls, parameters: Parameters, blocks: Blocks) -> Iterate:
-        """From parameters with a leading axis."""
+        """From parameters with a leading axis.
+
+        Raises:
+            InputError: parameters of one problem, or with more axes.
+        """
+        if parameters.point.ndim != 2:
+            raise InputError(
+                "parameters with one leading axis are needed, e.g. of jax.vmap(initial_fit); the "
+                f"target of these has the shape {parameters.point.shape}"
+            )
         none = jnp.zeros((0, parameters.point.shape[0]), parameters.point.dtype)
         free = [parameters.further(name).T for name in EXTRA if name in blocks]
         extras = jnp.concatenate([none, *free])

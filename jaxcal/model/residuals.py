@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxcal import InputError
 from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, Iterate, targets
 from jaxcal.model.observations import ChannelDistances, Further, Points, on_circle
@@ -60,7 +61,14 @@ def circle_residual(
         parameters: X, target and further unknowns.
         elevation: the offsets y_i, mm.
         problem: the data.
+
+    Raises:
+        InputError: not one offset for each image.
     """
+    if jnp.shape(elevation) != problem.mask.shape:
+        raise InputError(
+            f"elevation must have shape {problem.mask.shape}, not {jnp.shape(elevation)}"
+        )
     images, further, q = _one_lane(parameters, problem)
     return _rows(on_circle(q, elevation[None], further, images), problem)
 

@@ -45,6 +45,7 @@ from jaxcal.diagnostics.left_out import left_out
 from jaxcal.diagnostics.unmodelled import unmodelled
 from jaxcal.report.contradictions import contradictions
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import real_array
 from jaxcal.runtime.trees import map_arrays
 from jaxcal.solvers.closed_form.single import calibrate_closed_form
 
@@ -113,8 +114,10 @@ def _tre(
     unit = np.array([[0.0, 0.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
     places = region.place(unit)[:, [0, 2]]
     image = _to_image(answer, places)
-    if wanted:
-        given = np.array(wanted, float)
+    given = real_array(wanted, "tre_points")
+    if given.size:
+        if given.ndim != 2 or given.shape[1] != 2:
+            raise InputError(f"tre_points must be pairs of numbers, not of shape {given.shape}")
         if not (np.abs(given) <= LARGEST).all():
             raise InputError(f"points of --tre must be numbers up to {LARGEST:g}")
         names += ("asked for",) * len(given)

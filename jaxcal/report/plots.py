@@ -24,6 +24,7 @@ from jaxcal.diagnostics.outliers import outliers
 from jaxcal.report.accuracy import region_of
 from jaxcal.report.summary import recording_of
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import real_array
 
 COLUMN_MM, PAGE_MM = 88.0, 180.0
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
@@ -129,8 +130,15 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
     Args:
         calibration: of one problem.
         truth: true offsets, mm, where they are known.
+
+    Raises:
+        InputError: not one true offset for each image.
     """
     answer, _ = _one(calibration)
+    if truth is not None:
+        truth = real_array(truth, "truth")
+        if truth.shape != answer.mask.shape:
+            raise InputError(f"truth must have shape {answer.mask.shape}, not {truth.shape}")
     known = np.isfinite(np.asarray(answer.elevation))
     used = np.flatnonzero((np.asarray(answer.mask) > 0) & known)
     figure = canvas(PAGE_MM, 60.0)
@@ -162,7 +170,7 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
             label="at its bound",
         )
     if truth is not None:
-        panel.plot(used, np.asarray(truth)[used], "x", color="black", ms=3, mew=0.7, label="true")
+        panel.plot(used, truth[used], "x", color="black", ms=3, mew=0.7, label="true")
     panel.legend(fontsize=7, frameon=False, loc="best")
     panel.set(xlabel="image", ylabel="elevational offset (mm)")
     styled(side).hist(offset, bins="fd", orientation="horizontal", color=ORANGE, alpha=0.8)
@@ -207,8 +215,14 @@ def plot_influence(calibration: Calibration) -> Figure:
 
 
 def plot_limits(calibration: Calibration) -> Figure:
-    """Where the errors come from: shares of mean squares, of the calibration and of the scatter."""
+    """Where the errors come from: shares of mean squares, of the calibration and of the scatter.
+
+    Raises:
+        InputError: X is not observable.
+    """
     answer, recording = _one(calibration)
+    if not np.isfinite(answer.unknowns_covariance).all():
+        raise InputError("these images do not determine the calibration: its error has no shares")
     weight = _weight(answer, recording)
     part = np.einsum("pq,kpq->k", weight, influence_of(answer).shares)
     residual = np.asarray(answer.residual)[np.asarray(answer.mask) > 0]

@@ -31,8 +31,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxcal import InputError
+from jaxcal.calibration.inputs import whole_number
+from jaxcal.calibration.options import MOST_STEPS
 from jaxcal.model import unrolled
 from jaxcal.runtime.array_types import AnyArray
+from jaxcal.runtime.arrays import is_traced, real_array
 from jaxcal.solvers.levenberg_marquardt import (
     IDLE,
     LARGEST_DAMPING,
@@ -198,8 +201,10 @@ def arrow_least_squares(
 
     Raises:
         InputError: shared unknowns that are integers, local ones that are not one a row, residuals
-            of another shape; a ``tolerance`` or ``damping`` below zero.
+            of another shape; a ``limit``, ``tolerance`` or ``damping`` below zero; ``max_steps``
+            that is no whole number.
     """
+    whole_number("max_steps", max_steps, 1, MOST_STEPS)
     flat, unravel = ravel_pytree(shared)
     if not jnp.issubdtype(flat.dtype, jnp.floating):
         raise InputError("shared must hold floating arrays, e.g. 0.0 instead of 0")
@@ -211,7 +216,7 @@ def arrow_least_squares(
     if shape is None or len(shape) != 2 or shape[0] != rows or not rows or not shape[1]:
         got = f"an array of shape {shape}" if shape is not None else f"a {type(made).__name__}"
         raise InputError(f"residual must return a ({rows or 'n'}, columns) array, not {got}")
-    bound = jnp.broadcast_to(jnp.asarray(limit, flat.dtype), first[1].shape)
+    bound = _bound(limit, rows).astype(flat.dtype)
 
     def function(unknowns: tuple[Array, Array], args: Any) -> Float[Array, "n columns"]:
         return residual(unravel(unknowns[0]), unknowns[1], args)
@@ -224,6 +229,17 @@ def arrow_least_squares(
     solution = optx.least_squares(function, solver, first, args, max_steps=max_steps, throw=throw)
     found = solution.value
     return eqx.tree_at(lambda s: s.value, solution, (unravel(found[0]), found[1]))
+
+
+def _bound(limit: Any, rows: int) -> Float[Array, " n"]:
+    """The bound on every row's local unknown, checked as far as it has values."""
+    if not is_traced(limit):
+        limit = real_array(limit, "limit")
+        if not (limit >= 0).all():
+            raise InputError("limit must be a number of at least 0, or one for each row")
+    if jnp.shape(limit) not in ((), (rows,)):
+        raise InputError(f"limit must be one number or {rows}, not of shape {jnp.shape(limit)}")
+    return jnp.broadcast_to(jnp.asarray(limit), (rows,))
 
 
 class _ArrowSolver(LevenbergMarquardt):

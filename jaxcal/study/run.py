@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 from jaxcal import FormatError, InputError, OutputError
-from jaxcal.calibration.inputs import whole_number
+from jaxcal.calibration.inputs import check_flag, whole_number
 from jaxcal.io.readable import one_line, shown
 from jaxcal.runtime.interrupts import no_interrupt_lost
 from jaxcal.study.cluster import compute_on_cluster, connected
@@ -116,7 +116,10 @@ def run_study(
         )
     if whole_number("workers", workers, 0, _MOST_WORKERS) and scheduler is not None:
         raise InputError("workers must not be given beside a scheduler")
+    check_flag("resume", resume)
     watcher = Silence() if watcher is None else watcher
+    if not isinstance(watcher, Watcher):
+        raise InputError(f"watcher must have begin, advance and note, not {shown(watcher)}")
     begun = time.monotonic()
     # First of all, so that no folder is made where nothing can be computed.
     with (

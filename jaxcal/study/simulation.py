@@ -24,7 +24,13 @@ import numpy as np
 from jaxtyping import Array, Complex64, Float, Int, Key
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import LARGEST_SEED, check_flag, whole_number
+from jaxcal.calibration.inputs import (
+    LARGEST_SEED,
+    check_flag,
+    check_key,
+    check_made,
+    whole_number,
+)
 from jaxcal.data.geometry import matrix_from_rotation
 from jaxcal.data.probe import L14_5, CurvilinearProbe, Probe, check_probe
 from jaxcal.data.problem import Channels, Problem
@@ -34,7 +40,7 @@ from jaxcal.data.segmentation.time_of_flight import fit_in_plane
 from jaxcal.io.readable import shown
 from jaxcal.model import unrolled
 from jaxcal.runtime import executables
-from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.arrays import is_number, is_traced
 from jaxcal.runtime.compiler import ONE_PROBLEM, computed_once
 from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.study import draws
@@ -235,11 +241,11 @@ def simulate(key: Key[Array, ""], protocol: Protocol) -> Experiment:
         protocol: the distributions.
 
     Raises:
-        InputError: what is no key.
+        InputError: what is not one key, or no protocol.
     """
     require_float64("jaxcal.simulate")
-    if not hasattr(key, "shape"):
-        raise InputError(f"key must be a JAX key, e.g. jax.random.key(1), not {shown(key)}")
+    check_key("key", key)
+    check_made("protocol", protocol, Protocol, "jaxcal.Protocol")
     numbers, noise = draw(key, protocol), draw_noise(key, protocol)
     planes = arrange(numbers, protocol)
     distances = _distances(planes, noise, protocol)
@@ -436,8 +442,8 @@ def times_of_flight(
     times = probe.time_of_flight_s(np.where(np.asarray(distances) > 0, distances, np.nan))
     if clock_hz is None:
         return times
-    if not (np.isfinite(clock_hz) and clock_hz > 0):
-        raise InputError(f"the clock needs a positive frequency in Hz, not {clock_hz}")
+    if not (is_number(clock_hz) and clock_hz > 0):
+        raise InputError(f"the clock needs a positive frequency in Hz, not {shown(clock_hz)}")
     counted = np.round(times * clock_hz)
     if (counted == 0).any():
         raise InputError(f"a clock of {clock_hz:g} Hz is too slow: it counts no period of a time")

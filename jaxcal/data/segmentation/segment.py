@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxcal import InputError
-from jaxcal.data.probe import CurvilinearProbe, Probe, check_probe
+from jaxcal.calibration.inputs import check_flag, whole_number
+from jaxcal.data.probe import MOST_ELEMENTS, CurvilinearProbe, Probe, check_probe
 from jaxcal.data.recording import (
     MINIMUM_IMAGES,
     Images,
@@ -31,8 +32,10 @@ from jaxcal.data.segmentation.time_of_flight import (
     fit_out_of_plane,
     shortest,
 )
+from jaxcal.io.readable import shown
 from jaxcal.runtime import buckets, executables
 from jaxcal.runtime.array_types import AnyArray
+from jaxcal.runtime.arrays import is_number
 from jaxcal.runtime.compiler import ONE_PROBLEM, batch_wishes, fast_to_run
 from jaxcal.runtime.precision import in_own_modes
 
@@ -42,6 +45,8 @@ Scale = Literal["frame", "pooled"]
 MINIMUM_LINES = 8
 """With fewer answers a frame's noise cannot be estimated and an outlier cannot be seen."""
 
+# Least squares have two or three unknowns and a noise.
+_FEWEST_LINES: dict[Method, int] = {"least-squares": 4, "shortest": 1}
 _LONGEST_S = 2e-3
 # |elevation| is determined where its square lies this many SDs above zero.
 _SIGNIFICANT = 3.0
@@ -120,7 +125,7 @@ def segment(
     robust: bool = True,
     scale: Scale = "frame",
     interpolate: bool = False,
-    minimum_lines: int = MINIMUM_LINES,
+    minimum_lines: int | None = None,
     minimum_amplitude: float | None = None,
 ) -> Segmentation:
     """Segment the target in every frame of times of flight.
@@ -141,19 +146,29 @@ def segment(
         scale: noise of each ``frame`` by itself, or ``pooled``: the median over the frames, better
             where all are alike and few lines answer.
         interpolate: between elements, for ``shortest``.
-        minimum_lines: frames with fewer answers are left out.
+        minimum_lines: frames with fewer answers are left out; by default 8, and 1 with
+            ``shortest``. Least squares need at least 4.
         minimum_amplitude: frames with less are left out; data without amplitudes are refused then.
 
     Raises:
         InputError: no times of flight, no probe, times for another number of elements, negative
-            times, microseconds; for a recording, fewer than 4 frames that can be segmented.
+            times, microseconds, options of another kind; for a recording, fewer than 4 frames that
+            can be segmented.
     """
     images = images_of(data, "jaxcal.segment")
     probe = data.probe if probe is None and isinstance(data, Recording) else probe
-    if method not in ("least-squares", "shortest"):
-        raise InputError(f"method must be least-squares or shortest, not {method!r}")
-    if scale not in ("frame", "pooled"):
-        raise InputError(f"scale must be frame or pooled, not {scale!r}")
+    for name, value, names in (("method", method, Method), ("scale", scale, Scale)):
+        if not (isinstance(value, str) and value in get_args(names)):
+            raise InputError(f"{name} must be {' or '.join(get_args(names))}, not {shown(value)}")
+    check_flag("robust", robust)
+    check_flag("interpolate", interpolate)
+    floor = _FEWEST_LINES[method]
+    if minimum_lines is not None:
+        floor = max(floor, whole_number("minimum_lines", minimum_lines, 1, MOST_ELEMENTS))
+    elif method == "least-squares":
+        floor = MINIMUM_LINES
+    if minimum_amplitude is not None and not is_number(minimum_amplitude):
+        raise InputError(f"minimum_amplitude must be one number, not {shown(minimum_amplitude)}")
     times = images.measurements if images.kind == "time_of_flight" else images.time_of_flight
     if times is None:
         raise InputError(f"there are no times of flight to segment, only {images.kind}s")
@@ -167,7 +182,6 @@ def segment(
     distances = np.where(used[:, None], probe.one_way_range_mm(times), np.nan)
     lines = (np.isfinite(distances) & (distances > 0)).sum(axis=1)
 
-    floor = max(minimum_lines, 4) if method == "least-squares" else 1
     failed = used & (lines < floor)
     if minimum_amplitude is not None:
         if images.amplitude is None:
