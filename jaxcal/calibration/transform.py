@@ -264,8 +264,8 @@ class ImageTransform:
         if self.scale_mm_per_px is None:
             raise InputError(
                 f"{self.source}: knows no pixel size, so that there is no Image frame in pixels: "
-                "give the size of a pixel and the pixel of lateral 0, range 0 (--pixel-size, "
-                "--origin)"
+                "give the size of a pixel and the pixel of lateral 0, range 0 (jaxcal export with "
+                "--pixel-size and --origin; in Python with_pixels)"
             )
         return self.scale_mm_per_px
 
