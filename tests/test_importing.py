@@ -703,5 +703,10 @@ def test_only_recordings_are_replaced(tmp_path, capsys):
     assert main(["import", str(table), str(other)]) == 2
     assert "is not a recording" in capsys.readouterr().err
     assert other.read_bytes() == before
+    # A scan of TUS-REC is HDF5, too: what makes a recording of it is said.
+    assert main(["calibrate", str(other)]) == 2
+    assert "no attribute format, 'jaxcal-recording' is needed (jaxcal import makes" in (
+        capsys.readouterr().err
+    )
     assert main(["import", str(table), str(tmp_path / "own.h5")]) == 0
     assert main(["import", str(table), str(tmp_path / "own.h5")]) == 0

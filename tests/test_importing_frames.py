@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import struct
 import warnings
 import zlib
@@ -21,6 +22,7 @@ from scipy.spatial.transform import Rotation, Slerp
 import jaxcal
 from jaxcal import FormatError, InputError, MissingExtraError
 from jaxcal.cli.main import main
+from jaxcal.cli.segment import _default_out
 from jaxcal.io.dicom import read_pixel_size
 from jaxcal.io.folder import read_folder
 from jaxcal.io.import_options import ImportOptions
@@ -67,6 +69,30 @@ def sequence(request, tmp_path):
     assert text.count(old) == 1
     path.write_bytes(text.replace(old, old[:-2] + b"INVALID"))
     return path
+
+
+def test_names_with_dots_have_outputs_of_their_own(tmp_path):
+    """Recordings of depths 4.5 and 4.0 cm went into one file; a folder's name has no extension."""
+    (tmp_path / "PNG of 2024.05").mkdir()
+    for name, stem in (
+        ("f 4.5 cm.igs.mha", "f 4.5 cm"),
+        ("f 4.0 cm.seq.NRRD", "f 4.0 cm"),
+        ("a.b.mhd", "a.b"),
+        ("PNG of 2024.05", "PNG of 2024.05"),
+    ):
+        assert _default_out(str(tmp_path / name)) == str(tmp_path / f"{stem}-segmented.h5")
+
+
+def test_where_few_targets_are_found_the_next_command_can_be_copied(tmp_path, capsys):
+    """One line, and with the options that chose the poses."""
+    frames = [FRAMES[k] for k in FOUND[:4]] + [FRAMES[HIDDEN]] * 5
+    path = tmp_path / "a sweep that was recorded in the tank with the long name.igs.mha"
+    write_sequence(path, {PAIR: POSES}, np.arange(COUNT) / 20, images=frames)
+    given = ["--poses", str(path), "--from", "Probe", "--to", "Tracker"]
+    assert main(["segment", str(path), *given]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-2].endswith("hand:")
+    assert shlex.split(lines[-1]) == ["jaxcal", "pick", str(path), *given]
 
 
 def test_segment_a_sequence(tmp_path, sequence, capsys):

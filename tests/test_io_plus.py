@@ -237,8 +237,11 @@ def test_stale_pixel_size_is_told():
     scaled = OTHER.replace("StylusTip", "TransducerOriginPixel").replace(
         '"Stylus"', '"TransducerOrigin"'
     )
-    _, notes = patched_configuration(configuration(OLD, scaled), IMAGE, MATRIX)
+    new, notes = patched_configuration(configuration(OLD, scaled), IMAGE, MATRIX)
     assert "still has pixels of 1 x 1 mm" in notes[0]
+    # The line is that of the file as it is now: one line of ours has become five.
+    line = int(notes[0].split(":")[0].removeprefix("line "))
+    assert "TransducerOriginPixel" in new.decode().splitlines()[line - 1]
 
 
 def test_pixel_sizes_that_fcal_itself_wrote_are_not_stale():

@@ -233,3 +233,11 @@ def test_missing_directory_and_device(tmp_path):
     ):
         with pytest.raises(FormatError, match=message):
             read_csv(path)
+
+
+def test_hdf5_in_the_place_of_text_is_told_as_what_it_is(tmp_path):
+    """A recording that was given a name without .h5; an editor can save no such file as text."""
+    path = tmp_path / "rec"
+    path.write_bytes(b"\x89HDF\r\n\x1a\n\0\0")
+    with pytest.raises(FormatError, match=r"rec: is HDF5, not text .*\.h5\)$"):
+        read_pose_table(path)

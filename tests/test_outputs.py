@@ -133,6 +133,23 @@ def test_the_page_goes_into_the_folder_that_the_report_makes(folder):
     assert (folder / "new/report/p.html").is_file()
 
 
+@pytest.mark.parametrize(
+    "named",
+    [
+        "--export tusrec:new/residuals.csv",
+        "--export slicer:new/verdict.txt",
+        "--report new/../new/limits.svg",
+        "--export slicer:a.tfm --export itk:./a.tfm",
+        "--report p.csv --export tusrec:p.csv",
+    ],
+)
+def test_two_files_of_one_name_are_refused_before_the_solve(folder, named, capsys):
+    before = sorted(folder.rglob("*"))
+    assert main(["calibrate", "rec.h5", "--out", "new", *named.split()]) == 2
+    assert "the same command writes another file of this name" in capsys.readouterr().err
+    assert sorted(folder.rglob("*")) == before
+
+
 @pytest.mark.parametrize("target", ["numpy:x.npy", "itk:x.tfm", "tusrec:x.csv", "plus:config.xml"])
 def test_pixels_are_missed_before_the_solve(folder, target, capsys):
     """A recording of points in mm, unusable beyond that: no work begins."""

@@ -190,8 +190,9 @@ def test_ctrl_c_keeps_what_was_picked(sequence):
 
 def test_the_next_command_can_be_copied(tmp_path, sequence):
     """Whatever blanks are in the names, and with the options that choose the poses."""
-    renamed = sequence.rename(tmp_path / "Sonde 1.igs.mha")
-    out = tmp_path / "Sonde 1-picks.csv"
+    renamed = sequence.rename(tmp_path / "Sonde 1.5 cm.igs.mha")
+    # A name's own dots stay, so that Sonde 1.0 cm has another file of points.
+    out = tmp_path / "Sonde 1.5 cm-picks.csv"
     Picks(out, renamed.name, (COLUMNS, ROWS), len(FRAMES), range(len(FRAMES))).pick(0, 1.0, 2.0)
     # Without the lag the import would take other poses.
     given = ["--poses", str(renamed), "--from", "Probe", "--to", "Reference", "--lag", "-0.05"]

@@ -19,7 +19,7 @@ from jaxcal.calibration.result import Status
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.report.convergence import KEPT, Curve, bounded_curves
 from jaxcal.report.figures import convergence_figure
-from jaxcal.report.next_poses import next_poses_sentences
+from jaxcal.report.next_poses import next_poses_record, next_poses_sentences
 from jaxcal.report.paragraphs import laid_out, listed
 from jaxcal.report.plots import plot_offsets, plot_residuals
 from jaxcal.report.record import calibration_record, check_test_images, plain, truth_error
@@ -265,6 +265,28 @@ def test_verdict_gives_zero_no_sign(record):
     points = [point | {"position_mm": [-0.2, 37.0]} for point in record["tre"]["points"]]
     said = verdict(record | {"tre": record["tre"] | {"points": points}})
     assert sum("(lateral 0, depth 37 mm)" in line for line in said) == 1
+
+
+def test_the_middle_is_not_called_the_best_place(record):
+    """The error may be smaller elsewhere, as the map beside these words shows."""
+    said = next(line for line in verdict(record) if line.startswith("The middle (lateral "))
+    middle = next(point for point in record["tre"]["points"] if point["name"] == "middle")
+    assert f" mm): {middle['tre_mm']:.2f} mm. Worst: the " in said
+    assert not any("Best" in line for line in verdict(record))
+
+
+def test_scatter_says_that_images_left_out_count(record):
+    record = {**record, "reconstruction_precision_set": "calibration"}
+    for robust, outliers, told in ((True, [3], True), (True, [], False), (False, [3], False)):
+        said = "\n".join(verdict({**record, "robust": robust, "outliers": outliers}))
+        assert ("by Eq. 8 over the calibration images (those left out included)" in said) == told
+
+
+def test_no_poses_are_named_where_a_delay_was_estimated(result, recording):
+    """The plan does not know it, and would promise an error that the images have already."""
+    assert next_poses_record(result, recording) is not None
+    delayed = dataclasses.replace(result, blocks=(*result.blocks, "delay"))
+    assert next_poses_record(delayed, recording) is None
 
 
 def test_verdict_names_outliers_and_out_of_plane_errors(record):

@@ -211,8 +211,8 @@ def test_ros_is_rigid_and_in_metres(tmp_path):
     (tmp_path / "cal.yaml").write_text(edited.replace("qw: 1.0", "qw: 1.0#"))
     with pytest.raises(FormatError, match=r"qw is not a number: '1\.0#'"):
         read_ros_yaml(tmp_path / "cal.yaml")
-    # No pixels are needed, unlike everywhere else.
-    with pytest.raises(InputError, match="--pixel-size"):
+    # No pixels are needed, unlike everywhere else; the image may have had them.
+    with pytest.raises(InputError, match=r"knows no pixel size, .* \(jaxcal export with --pixel"):
         tiny.plus_matrix()
 
 
@@ -556,6 +556,14 @@ def test_apply_to_a_table(saved, tmp_path, capsys):
     (tmp_path / "p.csv").write_text("lateral,range\n1,2\n")
     assert main(["apply", str(saved), str(tmp_path / "p.csv")]) == 2
     assert "the calibration takes pixels" in capsys.readouterr().err
+
+
+def test_apply_refuses_options_of_a_table_where_none_is_read(saved, tmp_path, capsys):
+    rest = ["--pose-units", "m", "--quaternion", "wxyz", "--skip-invalid"]
+    for source in (["--pixel", "1", "2"], [str(tmp_path / "rec.h5")]):
+        assert main(["apply", str(saved), *source, *rest]) == 2
+        told = "--quaternion, --pose-units, --skip-invalid: for tables, and none is read"
+        assert told in capsys.readouterr().err
 
 
 def test_served_to_another_client():

@@ -141,7 +141,8 @@ class ImageTransform:
         """PLUS's ImageToProbe: (u, v, 0, 1), px, to the probe, mm.
 
         Raises:
-            InputError: the calibration was made from points in mm, which have no pixels.
+            InputError: the calibration knows no pixel size: it was made from points in mm, or read
+                from a file that holds none.
         """
         s_u, s_v = self._scale() * [1.0, self.range_factor]
         lateral, elevational, axial, origin = self.image_plane_to_probe[:3].T
@@ -271,9 +272,9 @@ class ImageTransform:
     def _scale(self) -> Float[np.ndarray, 2]:
         if self.scale_mm_per_px is None:
             raise InputError(
-                f"{self.source}: was made from points in mm, so that there is no Image frame in "
-                "pixels: give the size of a pixel and the pixel of lateral 0, range 0 "
-                "(--pixel-size, --origin)"
+                f"{self.source}: knows no pixel size, so that there is no Image frame in pixels: "
+                "give the size of a pixel and the pixel of lateral 0, range 0 (jaxcal export with "
+                "--pixel-size and --origin; in Python with_pixels)"
             )
         return self.scale_mm_per_px
 

@@ -77,6 +77,14 @@ def apply(
 
     if (source is None) == (not pixel):
         raise click.UsageError("name SOURCE, or points by --pixel U V")
+    stated = {
+        "--quaternion": quaternion is not None,
+        "--pose-units": pose_units is not None,
+        "--skip-invalid": skip_invalid,
+    }
+    unused = [option for option, given in stated.items() if given]
+    if unused and (source is None or _is_recording(source)):
+        raise click.UsageError(f"{', '.join(unused)}: for tables, and none is read")
     if out is not None:
         inputs = [calibration] if source is None else [calibration, source]
         check_output(out, "such a table", begins_with(",".join(_COLUMNS).encode()), inputs)
@@ -109,9 +117,13 @@ def apply(
     return ExitCode.CONVERGED
 
 
+def _is_recording(source: str) -> bool:
+    return source.lower().endswith((".h5", ".hdf5"))
+
+
 def _read(source: str, quaternion, pose_units, skip_invalid: bool):
     """Points, poses or None, the points' kind, and the images or lines that they are of."""
-    if source.lower().endswith((".h5", ".hdf5")):
+    if _is_recording(source):
         from jaxcal.io.hdf5 import load
 
         images = load(source).calibration

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
@@ -206,6 +207,7 @@ def calibrate(
         robust=robust,
     )
     check_request(request)
+    _check_apart(targets, report, out)
     from jaxcal.io.hdf5 import load
     from jaxcal.report.accuracy import settle
     from jaxcal.report.next_poses import next_poses_record
@@ -279,6 +281,22 @@ def _export_target(text: str, inputs: list[str], out: str | None) -> tuple[SaveF
     if out is None or Path(path).parent != Path(out):
         check_writable(path)
     return format, path
+
+
+def _check_apart(
+    targets: list[tuple[SaveFormat, str]], report: str | None, out: str | None
+) -> None:
+    """Refuse to write two files of one name, before other work begins."""
+    from jaxcal.report.write import NAMES
+
+    taken = [] if out is None else [os.path.realpath(os.path.join(out, name)) for name in NAMES]
+    wanted = [] if report is None else [(f"--report {report}", report)]
+    wanted += [(f"--export {format}:{path}", path) for format, path in targets]
+    for option, path in wanted:
+        place = os.path.realpath(path)
+        if place in taken:
+            raise InputError(f"{option}: the same command writes another file of this name")
+        taken.append(place)
 
 
 def _check_pixels(recording: Recording, targets: list[tuple[SaveFormat, str]]) -> None:

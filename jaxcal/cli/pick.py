@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from jaxcal.cli.common import ExitCode
-from jaxcal.cli.sequence_options import tracking_options
+from jaxcal.cli.sequence_options import beside, given_options, tracking_options
 
 
 @click.command(short_help="Place the target's point in each frame by a click.")
@@ -48,7 +48,7 @@ def pick(frames: str, picks: str | None, every: int, port: int, **options: Any) 
 
     asked = ImportOptions(**options)
     name = Path(os.path.abspath(frames)).name
-    out = str(Path(frames).parent / f"{name.split('.')[0]}-picks.csv") if picks is None else picks
+    out = beside(frames, "-picks.csv") if picks is None else picks
     sequence, _ = open_sequence(frames, asked)
     shown, size, notes = frames_to_show(sequence, asked, every)
     check_writable(out)
@@ -80,15 +80,5 @@ def _tell(placed: Any, source: str, out: str, options: dict[str, Any]) -> None:
         + (f", {left} still to do (the same command goes on)" if left else "")
     )
     if count:
-        given = [
-            part
-            for name, key in (
-                ("poses", "poses"),
-                ("from", "source"),
-                ("to", "target"),
-                ("lag", "lag_s"),
-            )
-            if options[key]
-            for part in (f"--{name}", str(options[key]))
-        ]
-        click.echo(f"next: {shlex.join(['jaxcal', 'import', source, out, 'OUT.h5', *given])}")
+        import_them = ["jaxcal", "import", source, out, "OUT.h5", *given_options(options)]
+        click.echo(f"next: {shlex.join(import_them)}")

@@ -95,7 +95,9 @@ _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"%PDF", b"%!PS", b"<?xml", b"RIFF", b
     "those that the probe's geometry gives]",
 )
 @click.option(
-    "--estimate", metavar="LIST", help="With REC: further unknowns (scale), as for calibrate."
+    "--estimate",
+    metavar="LIST",
+    help="With REC: further unknowns (scale, sound-speed), as for calibrate.",
 )
 @click.option(
     "--seed",
@@ -237,12 +239,21 @@ def _from_recording(
     from jaxcal.calibration.calibrate import calibrate
     from jaxcal.calibration.inputs import unknown_names
     from jaxcal.io.hdf5 import load
+    from jaxcal.report.next_poses import NOT_PLANNED
 
+    names = unknown_names(estimate)
+    if NOT_PLANNED in names:
+        raise InputError(
+            f"--estimate {NOT_PLANNED}: no plan is made with it, since its predictions would be "
+            "wrong: leave it out here"
+        )
     measured, _ = _segmented(load(path))
     with progress("calibrating"):
-        result = calibrate(measured, estimate=unknown_names(estimate))
+        result = calibrate(measured, estimate=names)
     if result.status == "failed":
         raise InputError(f"{path}: the calibration failed: there is nothing to plan from")
+    if result.wrong_frames is not None:
+        raise InputError(f"{path}: {result.wrong_frames}")
     candidates = design.candidates_around(
         measured, result, region=region, cone_deg=cone, turn_deg=turn, seed=seed
     )

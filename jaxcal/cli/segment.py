@@ -14,12 +14,18 @@ from jaxcal import InputError
 from jaxcal.cli.common import (
     POSITIVE,
     ExitCode,
+    Verbatim,
     import_engine,
     print_json,
     print_page,
     progress,
 )
-from jaxcal.cli.sequence_options import search_options, tracking_options
+from jaxcal.cli.sequence_options import (
+    beside,
+    given_options,
+    search_options,
+    tracking_options,
+)
 
 if TYPE_CHECKING:
     from jaxcal.data.probe import Probe
@@ -157,9 +163,9 @@ def _is_of_frames(source: str) -> bool:
 
 def _default_out(source: str) -> str:
     """Beside the source: ``a.h5`` and ``a.igs.mha`` become ``a-segmented.h5``."""
-    path = Path(os.path.abspath(source)) if Path(source).is_dir() else Path(source)
-    stem = path.name.split(".")[0] if _is_of_frames(source) else path.stem
-    return str(path.with_name(f"{stem}-segmented.h5"))
+    if _is_of_frames(source):
+        return beside(source, "-segmented.h5")
+    return str(Path(source).with_name(f"{Path(source).stem}-segmented.h5"))
 
 
 def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[str, Any]) -> int:
@@ -212,12 +218,14 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     )
     lines = [first, *([f"- other frames: {others}"] if others else [])]
     lines += [f"- not credible: {count} x {why}" for why, count in found.reasons.items()]
+    lines += [f"- {note}" for note in notes if "left out" not in note]
     if counts["not credible"] > counts["found"]:
-        lines.append(
-            f"- few show a credible target: look at --region and --target, or place the points by "
-            f"hand: jaxcal pick {shlex.quote(source)}"
-        )
-    print_page(*lines, *(f"- {note}" for note in notes if "left out" not in note))
+        lines += [
+            "- few show a credible target: look at --region and --target, or place the points by "
+            "hand:",
+            Verbatim("  " + shlex.join(["jaxcal", "pick", source, *given_options(options)])),
+        ]
+    print_page(*lines)
     return ExitCode.CONVERGED
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import click
@@ -11,6 +14,8 @@ import click
 from jaxcal.cli.common import POSITIVE
 
 Command = Callable[..., Any]
+
+_EXTENSION = re.compile(r"(?:\.(?:igs|seq))?\.[^.]*$", re.I)
 
 
 class _Lag(click.ParamType):
@@ -108,6 +113,31 @@ def tracking_options(command: Command) -> Command:
 def search_options(command: Command) -> Command:
     """Add the options that say what to look for, where, and how large a pixel is."""
     return _with(command, _SEARCH)
+
+
+def given_options(options: dict[str, Any]) -> list[str]:
+    """The tracking options that were given, to type them again with ``jaxcal pick`` or import."""
+    names = {"poses": "poses", "from": "source", "to": "target", "lag": "lag_s"}
+    given = {name: options[key] for name, key in names.items() if options[key]}
+    # Nothing is estimated where points are yet to be placed.
+    return [
+        part
+        for name, value in given.items()
+        if value != "auto"
+        for part in (f"--{name}", f"{value}")
+    ]
+
+
+def beside(frames: str, ending: str) -> str:
+    """Where a command writes by default: ``a.igs.mha``, or a folder ``a``, becomes ``a`` + ending.
+
+    Only the sequence's own extension goes: what is before it may hold dots, as dates and depths do.
+    """
+    path = Path(frames)
+    if path.name in ("", ".."):
+        path = Path(os.path.abspath(frames))
+    name = path.name if path.is_dir() else _EXTENSION.sub("", path.name)
+    return str(path.with_name(name + ending))
 
 
 def _with(command: Command, options: tuple[Callable[[Command], Command], ...]) -> Command:

@@ -157,7 +157,10 @@ def _check_header(root: Node) -> None:
     found = text(root, "format")
     if found != FORMAT:
         what = "it has no attribute format" if found is None else f"its format is {quoted(found)}"
-        raise FormatError(f"is not a recording: {what}, {FORMAT!r} is needed")
+        raise FormatError(
+            f"is not a recording: {what}, {FORMAT!r} is needed (jaxcal import makes one of other "
+            "programs' files)"
+        )
     version = number(root, "version")
     if version is None or version < 1 or not version.is_integer():
         raise FormatError("attribute version must be a whole number from 1")

@@ -14,6 +14,8 @@ from jaxcal.io.readable import check_readable, one_line
 # Spreadsheets' errors, in English and German, are #N/A, #NV and words like #NAME? and #DIV/0!.
 _COMMENT = re.compile(r"\s*#(?!(?:N/A|NV|[A-Z/0]+[!?])[,;\t])")
 
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+"""How such a file begins."""
 MAXIMUM_BYTES = 64 * 2**20
 """Largest text file that is read."""
 
@@ -37,6 +39,8 @@ def text_lines(
         content = Path(path).read_bytes()
     except OSError as error:
         raise FormatError(f"{name}: cannot be read: {one_line(error)}") from None
+    if content.startswith(_HDF5):
+        raise FormatError(f"{name}: is HDF5, not text (a recording's name ends in .h5)")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

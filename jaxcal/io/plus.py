@@ -271,13 +271,34 @@ def patched_configuration(
         date: stated in PLUS's form.
 
     Returns:
-        The new content, and notes for the user.
+        The new content, and notes for the user, with lines of the new content.
 
     Raises:
         FormatError: not a configuration, or a new one that PLUS would refuse: several transforms
             between the frames, or another path from one to the other.
         InputError: a matrix or names that cannot be written.
     """
+    wanted = capitalised(frames[0]), capitalised(frames[1])
+    new = _replaced(content, wanted, matrix, error_mm, date)
+    # The notes name lines of the new content, which is what their reader opens.
+    root = parse_xml(new)
+    others = [
+        element
+        for place in root.all(_COORDINATES)
+        for element in _transforms(place)
+        if set(_frames(element)) != set(wanted)
+    ]
+    return new, _stale_scale(others, wanted, matrix) + _other_sources(root, others, wanted)
+
+
+def _replaced(
+    content: bytes,
+    wanted: FramePair,
+    matrix: Float[np.ndarray, "4 4"],
+    error_mm: float | None,
+    date: datetime.datetime | None,
+) -> bytes:
+    """The content of :func:`patched_configuration`."""
     root = parse_xml(content)
     if root.tag != _ROOT:
         raise FormatError(f"is not a configuration of PLUS: its root is {quoted(root.tag)}")
@@ -287,7 +308,6 @@ def patched_configuration(
             f"lines {places[0].line} and {places[1].line}: two {_COORDINATES}; PLUS reads one: put "
             "the transforms together"
         )
-    wanted = capitalised(frames[0]), capitalised(frames[1])
     elements = [] if not places else _transforms(places[0])
     between = [element for element in elements if set(_frames(element)) == set(wanted)]
     if len(between) > 1:
@@ -299,7 +319,6 @@ def patched_configuration(
     _check_other_paths([element for element in elements if element not in between], wanted)
     newline = "\r\n" if b"\r\n" in content else "\n"
     stated = {"error_mm": error_mm, "date": date, "newline": newline}
-    notes = _stale_scale(elements, wanted, matrix) + _other_sources(root, elements, wanted)
     if between:
         old = between[0]
         others = {
@@ -309,7 +328,7 @@ def patched_configuration(
         }
         indent = _indent(content, old.start)
         text = transform_element(wanted, matrix, others=others, indent=indent, **stated)
-        return content[: old.start] + _ascii(text) + content[old.end :], notes
+        return content[: old.start] + _ascii(text) + content[old.end :]
     parent = places[0] if places else root
     if parent.content_end == parent.end and not places:
         raise FormatError(f"line {parent.line}: <{parent.tag}/> is empty: there is no device in it")
@@ -320,7 +339,7 @@ def patched_configuration(
         text = transform_element(wanted, matrix, indent=inner, **stated)
         opened = content[parent.start : parent.end].removesuffix(b"/>").rstrip() + b">"
         text = f"{newline}{inner}{text}{newline}{outer}</{_COORDINATES}>"
-        return content[: parent.start] + opened + _ascii(text) + content[parent.end :], notes
+        return content[: parent.start] + opened + _ascii(text) + content[parent.end :]
     outer = _indent(content, parent.content_end)
     inner = outer + "  "
     if places:
@@ -332,7 +351,7 @@ def patched_configuration(
         parts = (f"  <{_COORDINATES}>", f"{deeper}{text}", f"{inner}</{_COORDINATES}>", outer)
         text = newline.join(parts)
     at = parent.content_end
-    return content[:at] + _ascii(text) + content[at:], notes
+    return content[:at] + _ascii(text) + content[at:]
 
 
 def patch_configuration(
@@ -412,13 +431,13 @@ def _stale_scale(
     return []
 
 
-def _other_sources(root: Element, elements: list[Element], wanted: FramePair) -> list[str]:
+def _other_sources(root: Element, others: list[Element], wanted: FramePair) -> list[str]:
     """Notes on transforms of the first frame that PLUS gets only while it runs, and that conflict.
 
     Source: PlusLib, vtkPlusUsDevice; IGSIO, vtkIGSIOTransformRepository::SetTransform.
     """
     notes = []
-    pairs = [_frames(element) for element in elements if set(_frames(element)) != set(wanted)]
+    pairs = [_frames(element) for element in others]
     for device in root.all("DataCollection/Device"):
         name = device.attributes.get("ImageToTransducerTransformName", "")
         sent = split_name(name)
@@ -434,7 +453,7 @@ def _other_sources(root: Element, elements: list[Element], wanted: FramePair) ->
             f"line {device.line}: while it runs, the device sends {name} by itself, which {what}: "
             "take ImageToTransducerTransformName out, or give it another name"
         )
-    for element in elements:
+    for element in others:
         if _frames(element) in ((wanted[0], "Reference"), (wanted[0], "Tracker")):
             notes.append(
                 f"line {element.line}: {wanted[0]} to {_frames(element)[1]} is a second path from "

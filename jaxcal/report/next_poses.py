@@ -13,6 +13,9 @@ from jaxcal.report.paragraphs import listed
 
 COUNT = 3
 _CANDIDATES = 2000
+NOT_PLANNED = "delay"
+"""The unknown without which a plan is wrong: it and the axial translation make up for each other,
+so that both have a large SD, and an image point a small one."""
 
 
 def next_poses_record(result: Calibration, recording: Recording) -> dict[str, Any] | None:
@@ -29,6 +32,8 @@ def next_poses_record(result: Calibration, recording: Recording) -> dict[str, An
         ``fills_space`` and ``tre_mm``, the error with this pose and those before it.
     """
     if result.status == "failed" or result.wrong_frames is not None:
+        return None
+    if NOT_PLANNED in result.blocks:
         return None
     try:
         candidates = design.candidates_around(recording, result, count=_CANDIDATES)

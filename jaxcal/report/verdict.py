@@ -99,16 +99,16 @@ def why_larger(record: dict[str, Any]) -> list[str]:
 
 
 def where(record: dict[str, Any]) -> list[str]:
-    """Where in the image the error is smallest and largest, and the error at requested points."""
+    """The error in the middle, where it is largest, and at requested points."""
     tre = record.get("tre")
     if tre is None or tre.get("rms_mm") is None:
         return []
-    corners = [point for point in tre["points"] if point["name"] != "asked for"]
-    best = min(corners, key=lambda point: point["tre_mm"])
-    worst = max(corners, key=lambda point: point["tre_mm"])
+    named = {point["name"]: point for point in tre["points"] if point["name"] != "asked for"}
+    # The mean square error is convex, so that it is largest in a corner; it is smallest anywhere.
+    worst = max(named.values(), key=lambda point: point["tre_mm"])
     lines = [
-        f"Best: {_place(best)}, {_mm(best['tre_mm'])}. Worst: {_place(worst)}, "
-        f"{_mm(worst['tre_mm'])}."
+        f"{_place(named['middle']).capitalize()}: {_mm(named['middle']['tre_mm'])}. Worst: "
+        f"{_place(worst)}, {_mm(worst['tre_mm'])}."
     ]
     for point in tre["points"]:
         if point["name"] == "asked for":
@@ -160,11 +160,15 @@ def scatter(record: dict[str, Any]) -> list[str]:
     if found is None or record.get("tre") is None:
         return []
     precision = record["reconstruction_precision_mm"]
+    left_out = record["robust"] and record["outliers"]
+    of_calibration = record["reconstruction_precision_set"] == "calibration"
+    counted = " (those left out included)" if left_out and of_calibration else ""
     shown = (
         ""
         if precision is None
         else (
             f", {_mm(precision)} by Eq. 8 over the {record['reconstruction_precision_set']} images"
+            f"{counted}"
         )
     )
     ranked = sorted(found["scatter_share"].items(), key=lambda item: -(item[1] or 0.0))
