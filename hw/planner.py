@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hw.pool import BENCH_RULES, BENCH_SDS_MM, constraints_of
+from hw.pool import BENCH_RULES, BENCH_SDS_MM
+from hw.poses import constraints_of
 from hw.rigid import turn_deg
 from hw.setup import Setup
 from hw.shapes import Float
