@@ -20,7 +20,7 @@ from hw.shapes import Float
 from jaxcal import InputError
 from jaxcal.calibration.result import Calibration
 from jaxcal.design import Candidates, Model, Noise, images_to, next_poses
-from jaxcal.design.planning import Known
+from jaxcal.design.information import Known
 
 FEWEST_TO_TRUST = 8
 """With at least so many images a calibration's own covariance is used."""

@@ -54,7 +54,7 @@ _HOME = {
     "bootstrap": "jaxcal.calibration.resampling",
     "calibrate": "jaxcal.calibration.calibrate",
     "calibrate_batch": "jaxcal.calibration.calibrate",
-    "calibrate_closed_form": "jaxcal.solvers.closed_form.single",
+    "calibrate_closed_form": "jaxcal.solvers.closed_form.calibrate",
     "calibrate_pivot": "jaxcal.calibration.pivot",
     "calibration_reproducibility": "jaxcal.diagnostics.metrics",
     "certify": "jaxcal.solvers.closed_form.certificate",
@@ -106,10 +106,10 @@ if TYPE_CHECKING:
     from jaxcal.diagnostics.metrics import reconstruction_precision as reconstruction_precision
     from jaxcal.io.hdf5 import load as load
     from jaxcal.io.hdf5 import save as save
+    from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form as calibrate_closed_form
     from jaxcal.solvers.closed_form.certificate import Certificate as Certificate
     from jaxcal.solvers.closed_form.certificate import certify as certify
     from jaxcal.solvers.closed_form.single import ClosedForm as ClosedForm
-    from jaxcal.solvers.closed_form.single import calibrate_closed_form as calibrate_closed_form
     from jaxcal.study.simulation import Protocol as Protocol
     from jaxcal.study.simulation import simulate as simulate
     from jaxcal.study.simulation import simulate_recording as simulate_recording

@@ -25,8 +25,9 @@ from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, t
 from jaxcal.model.unknowns import EXTRA, Blocks, block_slice, size
 from jaxcal.runtime.array_types import Bool, Float, HeldArray
 from jaxcal.runtime.trees import array_tree, assembled, map_arrays
+from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS
-from jaxcal.solvers.closed_form.single import ClosedForm, calibrate_closed_form
+from jaxcal.solvers.closed_form.single import ClosedForm
 
 
 @array_tree

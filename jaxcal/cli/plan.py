@@ -145,7 +145,7 @@ def plan(
         raise InputError("--sigma does not go with a recording: its images tell the SDs")
     import_engine()
     from jaxcal import design
-    from jaxcal.design.predict import MOST_IMAGES
+    from jaxcal.design.count import MOST_IMAGES
     from jaxcal.io.outputs import begins_with, check_output
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 

@@ -24,14 +24,8 @@ from jaxcal.calibration.result import Calibration
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import Criterion, check_criterion, weight_of
 from jaxcal.design.greedy import MOST_POSES
-from jaxcal.design.information import covariance_of
-from jaxcal.design.planning import (
-    Known,
-    Plan,
-    check_candidates,
-    known_before,
-    with_effective_noise,
-)
+from jaxcal.design.information import Known, covariance_of
+from jaxcal.design.planning import Plan, check_candidates, known_before, with_effective_noise
 from jaxcal.design.predict import tuned_factor
 
 NEAR = 1e-3

@@ -40,6 +40,21 @@ _HALVINGS = 22
 
 
 @dataclass(frozen=True)
+class Known:
+    """The information before a plan.
+
+    Attributes:
+        information: (p, p) about the unknowns, including the prior with which every plan begins.
+        images: number of images from which it comes.
+        tuned: whether the SDs were tuned to these images.
+    """
+
+    information: Float[np.ndarray, "p p"]
+    images: int = 0
+    tuned: bool = False
+
+
+@dataclass(frozen=True)
 class Model:
     """Everything that the Jacobian of a pose depends on, except the pose.
 

@@ -21,6 +21,7 @@ from jaxcal.design.criteria import (
 from jaxcal.design.exchange import exchange
 from jaxcal.design.greedy import MOST_POSES, Chosen, Rules, Search, choose, space_features
 from jaxcal.design.information import (
+    Known,
     Model,
     check_result,
     covariance_of,
@@ -28,6 +29,7 @@ from jaxcal.design.information import (
     known_information,
 )
 from jaxcal.design.noise import SD_RANGE_MM, Noise
+from jaxcal.design.predict import curve
 from jaxcal.diagnostics.directions import direction_in_words
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import real_array
@@ -38,21 +40,6 @@ if TYPE_CHECKING:
 _SINGULAR = 1e-10
 """Eigenvalue ratio (scaled units, equal SDs) below which a direction is not determined."""
 _TRIED_RAD, _TRIED_SHARE = 0.4, 0.6
-
-
-@dataclass(frozen=True)
-class Known:
-    """The information before a plan.
-
-    Attributes:
-        information: (p, p) about the unknowns, including the prior with which every plan begins.
-        images: number of images from which it comes.
-        tuned: whether the SDs were tuned to these images.
-    """
-
-    information: Float[np.ndarray, "p p"]
-    images: int = 0
-    tuned: bool = False
 
 
 @dataclass(frozen=True)
@@ -304,8 +291,6 @@ def _finished(
     chosen: Chosen,
     poses: Float[np.ndarray, "n 4 4"],
 ) -> Plan:
-    from jaxcal.design.predict import curve
-
     tre, rp = curve(candidates, known, poses)
     return Plan(
         poses,

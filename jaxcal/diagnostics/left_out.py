@@ -17,7 +17,8 @@ from jaxcal.data.poses import targets_in_images
 from jaxcal.data.problem import Problem
 from jaxcal.diagnostics.image_points import distance
 from jaxcal.runtime.array_types import Float
-from jaxcal.solvers.closed_form.single import ClosedForm, calibrate_closed_form
+from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
+from jaxcal.solvers.closed_form.single import ClosedForm
 
 if TYPE_CHECKING:
     from jaxcal.calibration.result import Calibration

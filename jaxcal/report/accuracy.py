@@ -46,7 +46,7 @@ from jaxcal.diagnostics.unmodelled import unmodelled
 from jaxcal.report.contradictions import contradictions
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.trees import map_arrays
-from jaxcal.solvers.closed_form.single import calibrate_closed_form
+from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 
 GOOD_MM = 0.5
 """Largest error to expect at the image (root mean square) that is called good."""

@@ -17,8 +17,7 @@ from jaxcal.calibration.inputs import whole_number
 from jaxcal.io.readable import one_line, shown
 from jaxcal.runtime.interrupts import no_interrupt_lost
 from jaxcal.study.cluster import compute_on_cluster, connected
-from jaxcal.study.own import Study, computed
-from jaxcal.study.spec import Chunk
+from jaxcal.study.own import Chunk, Study, computed
 from jaxcal.study.store import Store
 
 if TYPE_CHECKING:

@@ -75,7 +75,7 @@ from jaxcal.data.probe import LinearProbe
 from jaxcal.io.readable import naming, quoted, shown
 from jaxcal.io.toml import load_toml, parse_toml
 from jaxcal.study.laws import OffsetLaw, check_law
-from jaxcal.study.own import ArraySpec
+from jaxcal.study.own import ArraySpec, Chunk
 
 MAXIMUM_BYTES = 2**20
 """Largest spec that is read."""
@@ -216,16 +216,6 @@ class MethodSpec:
         return check_request(
             Request(self.method, self.prior, self.bound_given, options=self.options)
         )
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """Trials ``start`` to ``stop`` (exclusive) of one condition; ``index`` names the file."""
-
-    index: int
-    condition: int
-    start: int
-    stop: int
 
 
 @dataclass(frozen=True)
