@@ -18,9 +18,9 @@ from hw.rigid import turn_deg
 from hw.setup import Setup
 from hw.shapes import Float
 from jaxcal import InputError
-from jaxcal.calibration.result import Calibration
 from jaxcal.design import Candidates, Model, Noise, images_to, next_poses
 from jaxcal.design.information import Known
+from jaxcal.result.calibration import Calibration
 
 FEWEST_TO_TRUST = 8
 """With at least so many images a calibration's own covariance is used."""

@@ -13,7 +13,7 @@ from hw.poses import PosePlan, plan_poses
 from hw.recording_check import settings_of
 from hw.setup import Setup
 from jaxcal import InputError
-from jaxcal.calibration.inputs import LARGEST_SEED, whole_number
+from jaxcal.io.given_values import LARGEST_SEED, whole_number
 from jaxcal.io.readable import naming
 
 MOST_IMAGES = 1000

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from jaxcal import InputError, OutputError
-from jaxcal.calibration.names import Method
 from jaxcal.cli.common import Commands, ExitCode, print_json, print_page, progress
 from jaxcal.runtime import jax_cache, program_cache
+from jaxcal.solvers.names import Method
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
@@ -184,6 +184,6 @@ def _problem(recording: str | None, pixels: bool) -> Problem:
 
 def _repeated(problem: Problem, count: int) -> Problem:
     """As many images as that: the first ones over and over."""
-    from jaxcal.runtime import buckets
+    from jaxcal.data.problem import taken
 
-    return buckets.taken(problem, [k % problem.images for k in range(count)])
+    return taken(problem, [k % problem.images for k in range(count)])

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from jaxcal.calibration.names import Method
 from jaxcal.cli.common import exit_code, import_engine, print_json, print_page, progress
+from jaxcal.solvers.names import Method
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from jaxcal.calibration.result import Calibration
     from jaxcal.data.recording import Recording
+    from jaxcal.result.calibration import Calibration
 
 _METHODS: tuple[Method, ...] = ("conventional", "alternating", "joint")
 IMAGES, ELEVATION_MM, NOISE_MM = 50, 2.0, 0.5

@@ -15,7 +15,7 @@ from jaxcal.design.planning import Plan, next_poses
 from jaxcal.runtime.arrays import is_number
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 MOST_IMAGES = 1000
 _ENOUGH = 1000

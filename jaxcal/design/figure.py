@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import check_made
 from jaxcal.design.planning import Plan
+from jaxcal.io.given_values import check_made
 from jaxcal.runtime.arrays import is_number
 
 if TYPE_CHECKING:

@@ -20,15 +20,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import check_flag, check_made
 from jaxcal.data.poses import check_poses, targets_in_images
 from jaxcal.design.noise import Noise, used_images
+from jaxcal.io.given_values import check_flag, check_made
 from jaxcal.model.unknowns import RIGID, block_slice
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import is_number, is_traced, real_array
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 BELIEVED_SD = (50.0, 0.5, 50.0, 0.3)
 """Prior SDs before any image (our choice): of X's translation (mm) and rotation (rad), of the
@@ -146,7 +146,7 @@ def covariance_of(information: Float[np.ndarray, "*k p p"]) -> Float[np.ndarray,
 
 def check_result(result: object) -> None:
     """Raise InputError if what a caller gave is not the calibration of one problem."""
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
     check_made("result", result, Calibration, "jaxcal.calibrate")
     assert isinstance(result, Calibration)

@@ -21,7 +21,7 @@ from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import is_number, is_traced, real_array
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 FEWEST_TO_LEARN = 20
 """Fewest images from which SDs are learned as functions of the place."""

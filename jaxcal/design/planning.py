@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import check_flag, check_made, whole_number
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import (
@@ -31,11 +30,12 @@ from jaxcal.design.information import (
 from jaxcal.design.noise import SD_RANGE_MM, Noise
 from jaxcal.design.predict import curve
 from jaxcal.diagnostics.directions import direction_in_words
+from jaxcal.io.given_values import check_flag, check_made, whole_number
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import real_array
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 _SINGULAR = 1e-10
 """Eigenvalue ratio (scaled units, equal SDs) below which a direction is not determined."""
@@ -233,7 +233,7 @@ def _checked_information(value: object, size: int) -> Float[np.ndarray, "p p"]:
 
 def with_effective_noise(prior: object, candidates: Candidates) -> Candidates:
     """Candidates whose elevational SD is the calibration's effective one."""
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
     if not isinstance(prior, Calibration) or candidates.taken is None:
         return candidates

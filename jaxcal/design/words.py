@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxcal.calibration.inputs import check_made
 from jaxcal.data.poses import check_poses
 from jaxcal.design.constraints import Constraints
 from jaxcal.design.information import Model
+from jaxcal.io.given_values import check_made
 from jaxcal.runtime.array_types import Float
 
 _LEAST_TILT_DEG, _LEAST_TURN_DEG = 3.0, 5.0

@@ -11,7 +11,7 @@ from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 MISFIT_SCORE = 3.3
 """A standard normal score beyond this contradicts the noise model. Where the model holds, one data

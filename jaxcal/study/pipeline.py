@@ -28,11 +28,11 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
 import jaxcal
-from jaxcal.calibration.options import Options
 from jaxcal.data.probe import LinearProbe
 from jaxcal.model.batch import Iterate
 from jaxcal.runtime.compiler import fast_to_run, single_threaded
 from jaxcal.runtime.precision import in_own_modes
+from jaxcal.solvers.plan import Options
 from jaxcal.solvers.start import ConventionalStart
 from jaxcal.study.laws import OffsetLaw
 from jaxcal.study.lean import Experiments, Kind, Measured, begin, experiments, solve

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 from jaxcal import FormatError, InputError, OutputError
-from jaxcal.calibration.inputs import whole_number
+from jaxcal.io.given_values import whole_number
 from jaxcal.io.readable import one_line, shown
 from jaxcal.runtime.interrupts import no_interrupt_lost
 from jaxcal.study.cluster import compute_on_cluster, connected

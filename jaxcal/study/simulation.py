@@ -24,13 +24,13 @@ import numpy as np
 from jaxtyping import Array, Complex64, Float, Int, Key
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import LARGEST_SEED, check_flag, whole_number
 from jaxcal.data.geometry import matrix_from_rotation
 from jaxcal.data.probe import L14_5, CurvilinearProbe, Probe, check_probe
 from jaxcal.data.problem import Channels, Problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, Truth, make_images
 from jaxcal.data.segmentation.deviations import fit_deviations, halves
 from jaxcal.data.segmentation.time_of_flight import fit_in_plane
+from jaxcal.io.given_values import LARGEST_SEED, check_flag, whole_number
 from jaxcal.io.readable import shown
 from jaxcal.model import unrolled
 from jaxcal.runtime import executables

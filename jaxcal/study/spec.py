@@ -60,20 +60,13 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import whole_number
-from jaxcal.calibration.names import Method, PriorName
-from jaxcal.calibration.options import (
-    ALTERNATION,
-    DEFAULT_MAX_ELEVATION_MM,
-    Options,
-    Prior,
-    Request,
-    check_alternation,
-    check_request,
-)
+from jaxcal.calibration.options import ALTERNATION, Request, check_alternation, check_request
 from jaxcal.data.probe import LinearProbe
+from jaxcal.io.given_values import whole_number
 from jaxcal.io.readable import naming, quoted, shown
 from jaxcal.io.toml import load_toml, parse_toml
+from jaxcal.solvers.names import Method, PriorName
+from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Options, Prior
 from jaxcal.study.laws import OffsetLaw, check_law
 from jaxcal.study.own import ArraySpec, Chunk
 

@@ -1,0 +1,35 @@
+"""Checks of single values that a caller gave, with errors that say what was given."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxcal import InputError
+from jaxcal.io.readable import shown
+
+LARGEST_SEED = 2**63 - 1
+
+
+def whole_number(name: str, value: object, least: int, most: int) -> int:
+    """A whole number that a caller gave.
+
+    Raises:
+        InputError: something else, or a number out of these bounds.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise InputError(f"{name} must be a whole number, not {shown(value)}")
+    if not least <= value <= most:
+        raise InputError(f"{name} must be between {least} and {most}, not {value}")
+    return int(value)
+
+
+def check_flag(name: str, value: object) -> None:
+    """Raise InputError if what a caller gave is not True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} must be True or False, not {shown(value)}")
+
+
+def check_made(name: str, value: object, kind: type, by: str) -> None:
+    """Raise InputError, which names what makes such an object, if a caller gave something else."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name} must be made by {by}, not {shown(value)}")
