@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from jaxcal import InputError, OutputError
-from jaxcal.cli.common import Commands, ExitCode, print_json, print_page, progress
+from jaxcal.cli.common import Commands, ExitCode, json_option, print_json, print_page, progress
 from jaxcal.runtime import jax_cache, program_cache
 from jaxcal.solvers.names import Method
 
@@ -32,7 +32,7 @@ def cache() -> None:
 
 
 @cache.command(short_help="List the programs that are kept.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@json_option
 def show(as_json: bool) -> int:
     """List the programs: plan, number of images, size, time to compile, last use."""
     try:

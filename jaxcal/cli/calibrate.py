@@ -15,6 +15,7 @@ from jaxcal import InputError
 from jaxcal.cli.common import (
     POSITIVE,
     import_engine,
+    json_option,
     print_json,
     print_page,
     progress,
@@ -157,7 +158,7 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
 )
 @click.option("--report", type=click.Path(), metavar="HTML", help="Write a page for a browser.")
 @click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@json_option
 def calibrate(
     recording: str,
     method: Method,

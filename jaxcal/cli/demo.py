@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from jaxcal.cli.common import exit_code, import_engine, print_json, print_page, progress
+from jaxcal.cli.common import (
+    exit_code,
+    import_engine,
+    json_option,
+    print_json,
+    print_page,
+    progress,
+    seed_option,
+)
 from jaxcal.solvers.names import Method
 
 if TYPE_CHECKING:
@@ -25,15 +33,8 @@ RECORDING = "recording.h5"
 
 @click.command(short_help="Try it: simulate an experiment and calibrate it three ways.")
 @click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")
-@click.option(
-    "--seed",
-    type=click.IntRange(0, 2**63 - 1),
-    default=0,
-    show_default=True,
-    metavar="N",
-    help="Seed of the simulation.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@seed_option("Seed of the simulation.")
+@json_option
 def demo(out: str | None, seed: int, as_json: bool) -> int:
     """Simulate an experiment, calibrate it three ways, and compare them.
 

@@ -15,6 +15,7 @@ from jaxcal.cli.common import (
     POSITIVE,
     ExitCode,
     import_engine,
+    json_option,
     print_json,
     print_page,
     progress,
@@ -70,7 +71,7 @@ if TYPE_CHECKING:
 )
 @tracking_options
 @search_options
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@json_option
 @click.pass_context
 def segment(
     context: click.Context,
