@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -28,9 +28,6 @@ from jaxcal.solvers.plan import (
     is_one_of,
     is_optimistix,
 )
-
-if TYPE_CHECKING:
-    pass
 
 PRIORS: dict[str, tuple[PriorName, ...]] = {
     "joint": get_args(PriorName),
