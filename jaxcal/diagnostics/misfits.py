@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK, MISFITS
+from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
+from jaxcal.result.findings import MISFITS
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
 

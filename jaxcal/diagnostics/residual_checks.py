@@ -39,14 +39,8 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-MISFITS = ("tails", "skewness", "depth", "drift", "trend")
-"""Rows of ``misfit``."""
-
 FEWEST_TO_CHECK = 20
 """With fewer used images the noise model is not checked."""
-
-ADDITIONS = ("tilt lateral", "tilt elevational", "tilt axial", "depth", "sideways")
-"""Kinds of further images: tilted about an image axis, or with the target elsewhere in them."""
 
 TILT_RAD = 0.4363
 SIDEWAYS_MM = 25.0
@@ -163,7 +157,7 @@ def stands_out(departure: Float[Array, "k n 3"], kept: Float[Array, "k n"]) -> B
 def check_noise_model(
     residual: Float[Array, "k n 3"], distance: Float[Array, "k n"], mask: Float[Array, "k n"]
 ) -> tuple[Float[Array, "k 3"], Float[Array, "k 5 3"]]:
-    """Kurtosis of standardised residuals, and the scores of :data:`MISFITS`.
+    """Kurtosis of standardised residuals, and the scores of :attr:`Inspection.misfit`.
 
     Args:
         residual: of lateral position, range and offset, each in SDs of its own or of one SD.
@@ -238,7 +232,7 @@ def gains(
     problem: Problem,
     uncertainty: Uncertainty,
 ) -> Float[Array, "k 5"]:
-    """By how many SDs the weakest direction would change one more image of each :data:`ADDITIONS`.
+    """By how many SDs the weakest direction would change one more image: :attr:`Inspection.gain`.
 
     The first three kinds are tilts of 25 degrees either way about the image's axes, from the pose
     nearest to the mean of those in use, with the target at the middle of the used points. The other

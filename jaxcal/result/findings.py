@@ -10,6 +10,12 @@ from jaxcal.runtime.array_types import Float
 
 Array = np.ndarray
 
+MISFITS = ("tails", "skewness", "depth", "drift", "trend")
+"""Rows of ``misfit``."""
+
+ADDITIONS = ("tilt lateral", "tilt elevational", "tilt axial", "depth", "sideways")
+"""Kinds of further images: tilted about an image axis, or with the target elsewhere in them."""
+
 
 @dataclass(frozen=True)
 class Inspection:
