@@ -30,11 +30,11 @@ from jaxtyping import Array
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision
 from jaxcal.backend import RIGID, BoundedOffsets, ImagePlanes, Iterate, Parameters
-from jaxcal.calibration.options import Options
 from jaxcal.io.atomic import atomic_path
 from jaxcal.runtime.compiler import fast_to_run
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.solvers.alternating import alternate
+from jaxcal.solvers.plan import Options
 from jaxcal.study.offsets import OffsetLaw, nominal_bound
 from jaxcal.study.simulation import Experiment, simulate
 

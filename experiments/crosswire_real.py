@@ -21,12 +21,12 @@ import numpy as np
 from common import machine, results_folder, write_table
 
 import jaxcal
-from jaxcal.calibration.options import Method
 from jaxcal.calibration.resampling import CrossValidation
 from jaxcal.diagnostics.misfits import misfits
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.text import read_crosswire, read_poses
 from jaxcal.runtime.jax_cache import enable_compilation_cache
+from jaxcal.solvers.names import Method
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "crosswire"
 UNKNOWNS = 11

@@ -28,9 +28,9 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal.calibration.dependence import independent
-from jaxcal.calibration.result import Calibration
 from jaxcal.data.recording import make_images
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 
 SEED = 20261122

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hw.bench.frames import DEPTH_MM, Camera, Look
+from hw.bench.frames import DEPTH_MM, Camera
+from hw.bench.look import Look
 from hw.bench.world import World, make_world
 from hw.choices import PHANTOMS
 from hw.rigid import rotation_matrix

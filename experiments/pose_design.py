@@ -398,8 +398,8 @@ def benches(count: int) -> list[list[object]]:
     from hw.bench.world import make_world
     from hw.midplane.amplitude_scan import amplitude_scan
     from hw.midplane.search import PlacementError
-    from hw.pool import BENCH_RULES, BENCH_SDS_MM, constraints_of
-    from hw.poses import Extent, plan_poses
+    from hw.pool import BENCH_RULES, BENCH_SDS_MM
+    from hw.poses import Extent, constraints_of, plan_poses
 
     # All benches share one drawing, and so one plan.
     scene, extent = make_world(0).scene, Extent()

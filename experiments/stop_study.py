@@ -40,8 +40,8 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from hw.bench.arm import Motion as ArmMotion
 from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
+from hw.bench.travel import Motion as ArmMotion
 from hw.clock import Clock
 from hw.errors import DeviceError
 from hw.robot.confirmation import confirm_unattended

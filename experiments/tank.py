@@ -18,10 +18,10 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from hw.bench.frames import Look
+from hw.bench.look import Look
 from hw.bench.phantoms.cross_wire import SCATTER_MM, WIRE_MM
-from hw.bench.phantoms.phantom import ELEMENT_MM
-from hw.bench.world import DRAWN, TANK_MM, Beam, Noise
+from hw.bench.tank import ELEMENT_MM, Beam, Noise
+from hw.bench.world import DRAWN, TANK_MM
 from hw.poses import Extent, plan_poses
 from hw.rigid import looking_rotation, rotation_matrix
 from hw.scene import Scene

@@ -22,7 +22,8 @@ from tank import Tank
 from tank_grid import Grid
 from tank_run import SEED, Run
 
-from hw.bench.frames import Camera, Look
+from hw.bench.frames import Camera
+from hw.bench.look import Look
 from hw.bench.phantoms import CrossWire
 from hw.bench.stage import Pace, WorldStage
 from hw.bench.world import World, make_world

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from tank import Tank
 from tank_placements import part
 
-from hw.bench.world import Beam, Noise
+from hw.bench.tank import Beam, Noise
 from hw.midplane.search import Settings
 from jaxcal import Problem
 from jaxcal.backend import RIGID, Component, Further, ImagePlanes, Observation, minimise

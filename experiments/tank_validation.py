@@ -20,7 +20,8 @@ from common import write_table
 from tank import FWHM, PICK, QUALITIES, Tank
 from tank_run import SEED, Run
 
-from hw.bench.frames import COLUMNS, DECIBELS, Camera, Look
+from hw.bench.frames import COLUMNS, DECIBELS, Camera
+from hw.bench.look import Look
 from hw.bench.phantoms import ActiveEcho, CrossWire, Hydrophone
 from hw.bench.stage import WorldStage
 from hw.bench.world import World, make_world

@@ -35,11 +35,11 @@ from common import LAWS, arguments, machine, results_folder, write_table
 from jaxtyping import Array
 
 from jaxcal import Calibration, Problem, Protocol, calibrate_batch, predicted_tre, simulate
-from jaxcal.calibration.options import Method, PriorName
 from jaxcal.data.probe import L14_5
 from jaxcal.diagnostics.intervals import tre_at, tre_over
 from jaxcal.io.atomic import atomic_path
 from jaxcal.model import unknowns
+from jaxcal.solvers.names import Method, PriorName
 from jaxcal.study.offsets import OffsetLaw
 
 SEED = 20261126

@@ -9,8 +9,8 @@ from hw.midplane.bracket import Placement
 from hw.recording_check import Progress
 from hw.setup import Setup
 from jaxcal import InputError
-from jaxcal.calibration.result import Calibration
 from jaxcal.data.recording import Kind
+from jaxcal.result.calibration import Calibration
 
 
 class Estimator:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from jaxcal import InputError
-from jaxcal.io.readable import quoted
+from jaxcal.runtime.messages import quoted
 
 
 def check_host(host: str, what: str = "host") -> None:

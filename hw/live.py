@@ -10,12 +10,12 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import calibrate
-from jaxcal.calibration.result import Calibration
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import Probe
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Kind, Recording, make_images
 from jaxcal.data.segmentation.segment import MINIMUM_LINES, check_times_of_flight
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.buckets import cut
 
 

@@ -12,14 +12,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hw.pool import BENCH_RULES, BENCH_SDS_MM, constraints_of
+from hw.pool import BENCH_RULES, BENCH_SDS_MM
+from hw.poses import constraints_of
 from hw.rigid import turn_deg
 from hw.setup import Setup
 from hw.shapes import Float
 from jaxcal import InputError
-from jaxcal.calibration.result import Calibration
 from jaxcal.design import Candidates, Model, Noise, images_to, next_poses
-from jaxcal.design.planning import Known
+from jaxcal.design.information import Known
+from jaxcal.result.calibration import Calibration
 
 FEWEST_TO_TRUST = 8
 """With at least so many images a calibration's own covariance is used."""

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.poses import Extent, PosePlan, in_order, plan_poses
-from hw.rigid import looking_rotation
+from hw.poses import Extent, PosePlan, constraints_of, in_order, plan_poses
 from hw.robot.kinematics import dexterity_mm, flange_of, inverse, model_named
 from hw.robot.limits import Limits
 from hw.scene import Scene
 from hw.shapes import Bool, Float
 from jaxcal.data.poses import check_poses
-from jaxcal.design import Constraints, Model, Noise, Region, Rules, make_candidates, plan
+from jaxcal.design import Model, Noise, Rules, make_candidates, plan
 from jaxcal.design.constraints import Allowed
 
 BENCH_SDS_MM = (0.15, 0.12, 0.35)
@@ -56,19 +55,6 @@ def plan_pool(
     best = plan(candidates, 2 * count, rules=BENCH_RULES).poses
     between = spread.poses[bounds.keeps(spread.poses, nominal, model.point)]
     return in_order(np.concatenate([best, between]), scene, extent, spread.passed_over)
-
-
-def constraints_of(scene: Scene, extent: Extent, allowed: Allowed | None = None) -> Constraints:
-    """An extent about the direction in which a scene's probe looks."""
-    return Constraints(
-        region=Region((-extent.lateral_mm, extent.lateral_mm), extent.depth_mm),
-        reference=looking_rotation(scene.looking),
-        cone_deg=extent.cone_deg,
-        turn_deg=extent.turn_deg,
-        box_mm=extent.box_mm,
-        reach_mm=extent.reach_mm,
-        allowed=allowed,
-    )
 
 
 def allowed_by(limits: Limits, tcp_offset: tuple[float, ...] | None) -> Allowed:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,6 +28,9 @@ from hw.shapes import Float
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.io.atomic import save_figure
+
+if TYPE_CHECKING:
+    from jaxcal.design.constraints import Allowed, Constraints
 
 MOST_POSES = 10_000
 # A turn of one degree takes the arm about as long as this many mm.
@@ -131,7 +135,6 @@ def plan_poses(count: int, scene: Scene, extent: Extent | None = None, seed: int
     if looking.shape != (3,) or not np.linalg.norm(looking) > 0:
         raise InputError("the looking direction must be three numbers, not all zero")
 
-    from hw.pool import constraints_of
     from jaxcal.design.candidates import sobol_poses
     from jaxcal.design.information import Model
 
@@ -143,6 +146,21 @@ def plan_poses(count: int, scene: Scene, extent: Extent | None = None, seed: int
             "narrow the cone"
         )
     return in_order(poses, scene, extent, passed)
+
+
+def constraints_of(scene: Scene, extent: Extent, allowed: Allowed | None = None) -> Constraints:
+    """An extent about the direction in which a scene's probe looks."""
+    from jaxcal.design.constraints import Constraints, Region
+
+    return Constraints(
+        region=Region((-extent.lateral_mm, extent.lateral_mm), extent.depth_mm),
+        reference=looking_rotation(scene.looking),
+        cone_deg=extent.cone_deg,
+        turn_deg=extent.turn_deg,
+        box_mm=extent.box_mm,
+        reach_mm=extent.reach_mm,
+        allowed=allowed,
+    )
 
 
 def in_order(poses: np.ndarray, scene: Scene, extent: Extent, passed: int) -> PosePlan:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from hw.pipes import exactly
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import RecordingHeader
 from jaxcal import CalibrationError
@@ -109,24 +110,12 @@ def _serve(writer: RecordingWriter, source: RawIOBase, answer) -> None:
                 return
 
 
-def _exactly(source: RawIOBase, size: int) -> bytes:
-    """``size`` bytes, or fewer where the pipe ends."""
-    parts, missing = [], size
-    while missing:
-        part = source.read(min(missing, 2**20))
-        if not part:
-            break
-        parts.append(part)
-        missing -= len(part)
-    return b"".join(parts)
-
-
 def _read(source: RawIOBase) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
     """The next message; None at the end of the pipe, also if a message is cut off there."""
-    start = _exactly(source, 4)
+    start = exactly(source, 4)
     if len(start) < 4:
         return None
-    text = _exactly(source, int.from_bytes(start, "big"))
+    text = exactly(source, int.from_bytes(start, "big"))
     try:
         message = json.loads(text)
     except ValueError:
@@ -137,7 +126,7 @@ def _read(source: RawIOBase) -> tuple[dict[str, Any], dict[str, np.ndarray]] | N
         size = int(np.prod(shape, dtype=object)) * kind.itemsize
         if size > _LARGEST:
             raise CalibrationError(f"{name}: {size} bytes in one message")
-        body = _exactly(source, size)
+        body = exactly(source, size)
         if len(body) < size:
             return None
         columns[name] = np.frombuffer(body, kind).reshape(shape)

@@ -13,8 +13,8 @@ from hw.poses import PosePlan, plan_poses
 from hw.recording_check import settings_of
 from hw.setup import Setup
 from jaxcal import InputError
-from jaxcal.calibration.inputs import LARGEST_SEED, whole_number
 from jaxcal.io.readable import naming
+from jaxcal.runtime.given_values import LARGEST_SEED, whole_number
 
 MOST_IMAGES = 1000
 

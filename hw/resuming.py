@@ -20,7 +20,7 @@ from hw.robot.stream import offset_changed
 from hw.setup import Setup
 from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
-from jaxcal.io.readable import quoted
+from jaxcal.runtime.messages import quoted
 
 _SAME = 1e-9
 """Relative difference below which two numbers are the same."""

@@ -94,23 +94,6 @@ def quaternion_to_matrix(quaternion: Float[np.ndarray, "*n 4"]) -> Float[np.ndar
     return np.eye(3) + 2.0 * quaternion[..., :1, None] * skew + 2.0 * (skew @ skew)
 
 
-def multiply(
-    first: Float[np.ndarray, "*n 4"], second: Float[np.ndarray, "*n 4"]
-) -> Float[np.ndarray, "*n 4"]:
-    """Quaternion of the rotation ``second`` followed by ``first``."""
-    a, b, c, d = np.moveaxis(np.asarray(first, dtype=np.float64), -1, 0)
-    e, f, g, h = np.moveaxis(np.asarray(second, dtype=np.float64), -1, 0)
-    return np.stack(
-        [
-            a * e - b * f - c * g - d * h,
-            a * f + b * e + c * h - d * g,
-            a * g - b * h + c * e + d * f,
-            a * h + b * g - c * f + d * e,
-        ],
-        axis=-1,
-    )
-
-
 def turn_deg(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> float:
     """Angle (deg) between the rotations of two transforms."""
     relative = np.asarray(first)[:3, :3].T @ np.asarray(second)[:3, :3]

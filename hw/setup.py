@@ -27,8 +27,9 @@ from hw.ultrasound.receiver import PORT
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import LinearProbe
-from jaxcal.io.readable import naming, quoted
+from jaxcal.io.readable import naming
 from jaxcal.io.toml import load_toml
+from jaxcal.runtime.messages import quoted
 
 _LARGEST_BYTES = 2**18
 _LEAST_TIP_MM = 5.0

@@ -37,30 +37,30 @@ class MissingExtraError(CalibrationError, ImportError):
 
 _ERRORS = ("CalibrationError", "FormatError", "InputError", "MissingExtraError", "OutputError")
 _HOME = {
-    "Calibration": "jaxcal.calibration.result",
+    "Calibration": "jaxcal.result.calibration",
     "Certificate": "jaxcal.solvers.closed_form.certificate",
     "ClosedForm": "jaxcal.solvers.closed_form.single",
     "CurvilinearProbe": "jaxcal.data.probe",
-    "ImageTransform": "jaxcal.calibration.transform",
+    "ImageTransform": "jaxcal.result.transform",
     "Images": "jaxcal.data.recording",
     "LinearProbe": "jaxcal.data.probe",
     "Problem": "jaxcal.data.problem",
     "Protocol": "jaxcal.study.simulation",
     "Recording": "jaxcal.data.recording",
     "Segmentation": "jaxcal.data.segmentation.segment",
-    "Status": "jaxcal.calibration.result",
-    "Options": "jaxcal.calibration.options",
+    "Status": "jaxcal.result.calibration",
+    "Options": "jaxcal.solvers.plan",
     "Pivot": "jaxcal.calibration.pivot",
     "bootstrap": "jaxcal.calibration.resampling",
     "calibrate": "jaxcal.calibration.calibrate",
     "calibrate_batch": "jaxcal.calibration.calibrate",
-    "calibrate_closed_form": "jaxcal.solvers.closed_form.single",
+    "calibrate_closed_form": "jaxcal.solvers.closed_form.calibrate",
     "calibrate_pivot": "jaxcal.calibration.pivot",
     "calibration_reproducibility": "jaxcal.diagnostics.metrics",
     "certify": "jaxcal.solvers.closed_form.certificate",
     "cross_validate": "jaxcal.calibration.resampling",
     "load": "jaxcal.io.hdf5",
-    "load_calibration": "jaxcal.calibration.saved",
+    "load_calibration": "jaxcal.result.saved",
     "make_images": "jaxcal.data.recording",
     "predicted_tre": "jaxcal.diagnostics.intervals",
     "reconstruction_precision": "jaxcal.diagnostics.metrics",
@@ -78,15 +78,10 @@ _HOME = {
 if TYPE_CHECKING:
     from jaxcal.calibration.calibrate import calibrate as calibrate
     from jaxcal.calibration.calibrate import calibrate_batch as calibrate_batch
-    from jaxcal.calibration.options import Options as Options
     from jaxcal.calibration.pivot import Pivot as Pivot
     from jaxcal.calibration.pivot import calibrate_pivot as calibrate_pivot
     from jaxcal.calibration.resampling import bootstrap as bootstrap
     from jaxcal.calibration.resampling import cross_validate as cross_validate
-    from jaxcal.calibration.result import Calibration as Calibration
-    from jaxcal.calibration.result import Status as Status
-    from jaxcal.calibration.saved import load_calibration as load_calibration
-    from jaxcal.calibration.transform import ImageTransform as ImageTransform
     from jaxcal.data.probe import CurvilinearProbe as CurvilinearProbe
     from jaxcal.data.probe import LinearProbe as LinearProbe
     from jaxcal.data.problem import Problem as Problem
@@ -106,10 +101,15 @@ if TYPE_CHECKING:
     from jaxcal.diagnostics.metrics import reconstruction_precision as reconstruction_precision
     from jaxcal.io.hdf5 import load as load
     from jaxcal.io.hdf5 import save as save
+    from jaxcal.result.calibration import Calibration as Calibration
+    from jaxcal.result.calibration import Status as Status
+    from jaxcal.result.saved import load_calibration as load_calibration
+    from jaxcal.result.transform import ImageTransform as ImageTransform
+    from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form as calibrate_closed_form
     from jaxcal.solvers.closed_form.certificate import Certificate as Certificate
     from jaxcal.solvers.closed_form.certificate import certify as certify
     from jaxcal.solvers.closed_form.single import ClosedForm as ClosedForm
-    from jaxcal.solvers.closed_form.single import calibrate_closed_form as calibrate_closed_form
+    from jaxcal.solvers.plan import Options as Options
     from jaxcal.study.simulation import Protocol as Protocol
     from jaxcal.study.simulation import simulate as simulate
     from jaxcal.study.simulation import simulate_recording as simulate_recording

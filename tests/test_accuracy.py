@@ -15,12 +15,9 @@ from rich.console import Console
 
 import jaxcal
 from jaxcal.calibration.resampling import relative_twist
-from jaxcal.calibration.saved import load_calibration
-from jaxcal.calibration.transform import ImageTransform
 from jaxcal.cli.main import main
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.diagnostics import influence as influences
-from jaxcal.diagnostics.image_points import point_jacobian
 from jaxcal.diagnostics.influence import excess, in_image, influence_of
 from jaxcal.diagnostics.intervals import (
     _length_quantile,
@@ -29,10 +26,13 @@ from jaxcal.diagnostics.intervals import (
     tre_at,
     tre_over,
 )
+from jaxcal.model.image_points import point_jacobian
 from jaxcal.report.accuracy import FAIR_MM, GOOD_MM, settle
 from jaxcal.report.record import calibration_record
 from jaxcal.report.tables import calibration_table
 from jaxcal.report.verdict import headline, limits, verdict
+from jaxcal.result.saved import load_calibration
+from jaxcal.result.transform import ImageTransform
 
 POINTS = np.array([[5.0, 30.0], [55.0, 80.0], [30.0, 50.0]])
 

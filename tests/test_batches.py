@@ -81,7 +81,7 @@ def test_compiler_flags_change_rounding_only(monkeypatch):
     fast = jaxcal.calibrate_batch(problems, method="conventional")
     again = jaxcal.calibrate_batch(problems, method="conventional")
     assert np.array_equal(fast.image_to_probe, again.image_to_probe)
-    from jaxcal.runtime import programs
+    from jaxcal.calibration import programs
 
     programs.chunks.cache_clear()
     monkeypatch.setenv(compiler.SWITCH, "0")

@@ -14,8 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxcal
+from jaxcal.calibration import programs
 from jaxcal.calibration.options import Request, prepare
-from jaxcal.runtime import buckets, executables, programs
+from jaxcal.data.problem import fill_up, taken
+from jaxcal.runtime import buckets, executables
 
 METHODS: dict[str, dict] = {
     "alternating": {"method": "alternating", "max_elevation": 2.0},
@@ -52,7 +54,7 @@ def test_every_axis_of_images_is_known(problems):
     assert cut.residual.shape == (9, 3)
     assert cut.inspection.outlier.shape == (9,)
     raw = jaxcal.simulate_recording(jaxcal.Protocol(images=9, raw=True), 1)
-    channels = buckets.padded(jaxcal.Problem.from_recording(raw)).channels
+    channels = fill_up(jaxcal.Problem.from_recording(raw)).channels
     assert channels is not None
     assert channels.distances.shape == channels.heard.shape == (12, 128)
     assert channels.elements.shape == (128, 3)
@@ -70,7 +72,7 @@ def shapes(tree, prefix=""):
 def with_garbage(problem: jaxcal.Problem, more: int) -> jaxcal.Problem:
     """Further images, masked, that hold no numbers."""
     count = problem.images
-    longer = buckets.taken(problem, [*range(count), *[0] * more])
+    longer = taken(problem, [*range(count), *[0] * more])
     mask = np.concatenate([np.asarray(problem.mask), np.zeros(more)])
     used = (mask > 0) | (np.arange(count + more) < count)
 
@@ -116,7 +118,7 @@ def test_masked_images_beyond_the_bucket_change_nothing(name, problems):
     smaller = simulated(3, images=8, elevation_mm=2.0, noise_mm=0.5, test_images=4)
     sources = [
         *problems,
-        jax.tree.map(jnp.asarray, buckets.taken(smaller, [*range(8), 0])),
+        jax.tree.map(jnp.asarray, taken(smaller, [*range(8), 0])),
     ]  # nine: one comes twice
 
     @settings(max_examples=12)

@@ -24,8 +24,7 @@ from jaxcal.design import Constraints, Model, Noise, Region
 from jaxcal.design.candidates import sobol_poses, sobol_sequence
 from jaxcal.design.criteria import check_criterion, gains, rp_weight, tre_weight, weight_of
 from jaxcal.design.greedy import Rules, are_alike
-from jaxcal.design.information import covariance_of, known_information
-from jaxcal.design.planning import Known
+from jaxcal.design.information import Known, covariance_of, known_information
 from jaxcal.design.predict import curve
 from jaxcal.diagnostics.sd_by_place import basis_at, log_sd_slopes
 

@@ -15,12 +15,7 @@ import jaxcal
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.misfits import MISFIT_SCORE, noise_model
 from jaxcal.diagnostics.outliers import suspects
-from jaxcal.diagnostics.residual_checks import (
-    MISFITS,
-    check_noise_model,
-    kurtosis_score,
-    skewness_score,
-)
+from jaxcal.diagnostics.residual_checks import check_noise_model, kurtosis_score, skewness_score
 from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import inverses, quadratic
 from jaxcal.model.batch import ImagePlanes, Iterate
@@ -28,6 +23,7 @@ from jaxcal.model.observations import Points
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import target_in_image
 from jaxcal.model.unknowns import RIGID
+from jaxcal.result.findings import MISFITS
 from jaxcal.solvers.levenberg_marquardt import minimise
 
 SIGMA = np.array([0.4, 0.3, 1.0])

@@ -13,7 +13,7 @@ from pose_sets import DEGENERATE, WEAK, PoseSet, make
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal.calibration.options import Method
+from jaxcal.solvers.names import Method
 
 KNOWN = 0.25
 """Relative SD of the weakest direction (to the lever arm) below which a set must be solved; the

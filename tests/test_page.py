@@ -15,10 +15,10 @@ import pytest
 from conftest import experiment
 
 import jaxcal
-from jaxcal.calibration.saved import load_calibration
 from jaxcal.report import svg
 from jaxcal.report.page import page, write_page
 from jaxcal.report.record import calibration_record
+from jaxcal.result.saved import load_calibration
 
 sys.path.insert(0, str(Path(__file__).parent / "hw"))
 from browser import browsing, open_page

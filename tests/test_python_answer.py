@@ -15,9 +15,9 @@ from conftest import experiment
 
 import jaxcal
 from jaxcal.calibration.inputs import as_problem
-from jaxcal.calibration.saved import load_calibration
 from jaxcal.report import plots
 from jaxcal.report.record import calibration_record
+from jaxcal.result.saved import load_calibration
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,6 @@ from rich.console import Console
 
 import jaxcal
 from jaxcal import InputError, OutputError
-from jaxcal.calibration.options import Options
-from jaxcal.calibration.result import Status
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.report.convergence import KEPT, Curve, bounded_curves
 from jaxcal.report.figures import convergence_figure
@@ -26,6 +24,8 @@ from jaxcal.report.record import calibration_record, check_test_images, plain, t
 from jaxcal.report.tables import calibration_table, comparison_table
 from jaxcal.report.verdict import verdict
 from jaxcal.report.write import COLUMNS, prepare_folder, write_report
+from jaxcal.result.calibration import Status
+from jaxcal.solvers.plan import Options
 from jaxcal.study.simulation import Protocol, simulate_recording
 
 LEFT_OUT = 5

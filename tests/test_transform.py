@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 
 from jaxcal import FormatError, InputError
-from jaxcal.calibration.saved import load_calibration
-from jaxcal.calibration.transform import ImageTransform, transform_from_plus_matrix
 from jaxcal.cli.main import main
 from jaxcal.data.poses import check_affine, quaternion_from_rotation, rotations_from_quaternions
 from jaxcal.io.itk import itk_from_matrix, itk_text, matrix_from_itk, read_itk, write_itk
 from jaxcal.io.ros import read_ros_yaml
 from jaxcal.io.serving import TransformServer
 from jaxcal.io.tus_rec import read_scan
+from jaxcal.result.saved import load_calibration
+from jaxcal.result.transform import ImageTransform, transform_from_plus_matrix
 
 
 def random_transform(seed: int = 0, scale=(0.148, 0.14), offset: float = 1.5) -> ImageTransform:

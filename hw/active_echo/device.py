@@ -76,11 +76,6 @@ class EchoFrame:
     amplitude: UInt16[np.ndarray, " lines"]
     late_s: float = float("nan")
 
-    @property
-    def responses(self) -> int:
-        """Lines on which something was heard."""
-        return int(np.count_nonzero(self.tof_ticks != NO_RESPONSE))
-
 
 @dataclass(frozen=True)
 class EchoStatistics:

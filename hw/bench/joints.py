@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hw.bench.travel import Motion
 from hw.rigid import quaternion_to_matrix, rigid
 from hw.robot.kinematics import (
     ANGLE_MM,
@@ -27,9 +27,6 @@ from hw.robot.kinematics import (
 )
 from hw.robot.pose import ur_to_pose
 from hw.shapes import Float
-
-if TYPE_CHECKING:
-    from hw.bench.arm import Motion
 
 LEAST_DEXTERITY_MM = 1.0
 """Smallest singular value (mm per rad, :func:`hw.robot.kinematics.dexterity_mm`) at which the

@@ -20,8 +20,9 @@ import threading
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from hw.bench.arm import Arm, Motion
+from hw.bench.arm import Arm
 from hw.bench.rtde import RtdeServer
+from hw.bench.travel import Motion
 from hw.clock import REAL, Clock
 from hw.robot._process import ANSWERS, be_prompt
 from jaxcal.runtime.isolated import python_command

@@ -17,16 +17,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hw.clock import REAL, Clock
-from jaxcal.io.openigtlink import (
-    HEADER_SIZE,
-    RF_DEVICE,
-    Content,
-    Message,
-    Picture,
-    StatusMessage,
-    Tracked,
-    encode,
-)
+from jaxcal.io.message_content import Content, Picture, StatusMessage, Tracked
+from jaxcal.io.openigtlink import HEADER_SIZE, RF_DEVICE, Message, encode
 
 _MOST_CLIENTS = 8
 _MOST_PENDING = 16 << 20

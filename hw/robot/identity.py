@@ -24,7 +24,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hw.errors import LostError
-from jaxcal.io.readable import quoted
+from jaxcal.runtime.messages import quoted
 
 DASHBOARD_PORT, PRIMARY_PORT = 29999, 30001
 

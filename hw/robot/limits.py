@@ -15,15 +15,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
-from pathlib import Path
 
 import numpy as np
 
-from hw.errors import RefusedError, refused
+from hw.errors import refused
 from hw.robot.kinematics import model_named
 from hw.shapes import Float
-from jaxcal import FormatError
-from jaxcal.io.toml import load_toml
 
 _VECTORS = {
     "box_min_mm": 3,
@@ -167,24 +164,6 @@ class Limits:
                 raise refused("joint_min_deg and joint_max_deg must be in order, within 360 deg")
         if self.arm_model:
             object.__setattr__(self, "arm_model", model_named(self.arm_model).name)
-
-    @classmethod
-    def from_toml(cls, path: Path | str) -> Limits:
-        """Read the table ``[limits]``.
-
-        Raises:
-            RefusedError: no such file or table, unknown or missing keys, or values out of bounds.
-        """
-        try:
-            table = load_toml(path).get("limits")
-        except FormatError as error:
-            raise refused(str(error)) from None
-        if not isinstance(table, dict):
-            raise refused(f"{path}: there is no table [limits]")
-        try:
-            return cls.from_mapping(table)
-        except RefusedError as error:
-            raise refused(f"{path}: {error.args[0]}") from None
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, object]) -> Limits:

@@ -82,8 +82,6 @@ class SteadyPose:
     count: int
     scatter_mm: float
     """Root mean square distance from the average position."""
-    scatter_deg: float
-    """Root mean square angle from the average orientation."""
 
 
 class Lag:
@@ -367,7 +365,6 @@ def average(samples: Sequence[PoseSample]) -> SteadyPose:
     position = poses[:, :3, 3].mean(axis=0)
     u, _, vt = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    turns = rotation_vector(rotation.T @ poses[:, :3, :3])
     last = samples[-1]
     raw = (*(position / 1000.0), *rotation_vector(rotation))
     mean = PoseSample(
@@ -384,7 +381,6 @@ def average(samples: Sequence[PoseSample]) -> SteadyPose:
         sample=mean,
         count=len(samples),
         scatter_mm=float(np.sqrt(distances.mean())),
-        scatter_deg=float(np.degrees(np.sqrt(np.sum(turns**2, axis=1).mean()))),
     )
 
 

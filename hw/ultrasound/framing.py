@@ -14,11 +14,13 @@ from dataclasses import dataclass
 
 from fastcrc import crc64
 
+from jaxcal.io.message_content import (
+    ContentError,
+)
 from jaxcal.io.openigtlink import (
     BEGINNING,
     HEADER_SIZE,
     MAXIMUM_BODY,
-    ContentError,
     Header,
     Message,
     decode_body,

@@ -20,15 +20,8 @@ from hw.clock import REAL, Clock
 from hw.errors import Device, DeviceError, LostError, StaleError
 from hw.shapes import Float
 from hw.ultrasound.framing import MessageDecoder
-from jaxcal.io.openigtlink import (
-    RF_DEVICE,
-    Message,
-    Picture,
-    Pixels,
-    StatusMessage,
-    Tracked,
-    TrackedFrame,
-)
+from jaxcal.io.message_content import Picture, Pixels, StatusMessage, Tracked, TrackedFrame
+from jaxcal.io.openigtlink import RF_DEVICE, Message
 from jaxcal.io.readable import one_line
 
 DEVICE: Device = "ultrasound"

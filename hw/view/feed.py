@@ -27,7 +27,7 @@ from hw.robot.motion_plan import MotionPlan
 from hw.session import Session
 from hw.setup import Setup
 from jaxcal import InputError
-from jaxcal.calibration.result import Calibration
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.isolated import python_command
 

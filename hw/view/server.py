@@ -22,6 +22,8 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
+from hw.pipes import exactly
+
 HOST = "127.0.0.1"
 _OWN_NAMES = (HOST, "localhost")
 """As a browser names this machine, also at the end of an ssh tunnel."""
@@ -137,11 +139,11 @@ def ignore_browsers(server: Any) -> None:
 def messages(source: RawIOBase) -> Iterator[tuple[dict[str, Any], np.ndarray | None]]:
     """The feed's messages until the pipe ends; a message that is cut off there is dropped."""
     while True:
-        start = _exactly(source, 8)
+        start = exactly(source, 8)
         sizes = int.from_bytes(start[:4], "big"), int.from_bytes(start[4:], "big")
         if len(start) < 8 or max(sizes) > _LARGEST:
             return
-        text, pixels = _exactly(source, sizes[0]), _exactly(source, sizes[1])
+        text, pixels = exactly(source, sizes[0]), exactly(source, sizes[1])
         if len(text) < sizes[0] or len(pixels) < sizes[1]:
             return
         told = json.loads(text)
@@ -150,18 +152,6 @@ def messages(source: RawIOBase) -> Iterator[tuple[dict[str, Any], np.ndarray | N
             rows, columns = told["frame"][:2]
             frame = np.frombuffer(pixels, np.uint8).reshape(rows, columns)
         yield told, frame
-
-
-def _exactly(source: RawIOBase, size: int) -> bytes:
-    """``size`` bytes, or fewer where the pipe ends."""
-    parts, missing = [], size
-    while missing:
-        part = source.read(missing)
-        if not part:
-            break
-        parts.append(part)
-        missing -= len(part)
-    return b"".join(parts)
 
 
 if __name__ == "__main__":

@@ -23,8 +23,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.calibration.options import Given, SolvePlan
-from jaxcal.calibration.result import Calibration, Convergence, Linearisation, Medium, Status
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.diagnostics.uncertainty import AT_BOUND, LARGEST_SD, mm_at_target, threshold
@@ -33,8 +31,10 @@ from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
 from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, block_slice, measured, size
+from jaxcal.result.calibration import Calibration, Convergence, Linearisation, Medium, Status
 from jaxcal.solvers.dense import inverse_lanes_last
 from jaxcal.solvers.methods import nominal_sound_speed
+from jaxcal.solvers.plan import Given, SolvePlan
 
 LEAST_GAP_MM = 1e-6
 """An offset is about to reach its bound if it is nearer to it than this."""

@@ -4,7 +4,7 @@
 closed form, which needs numpy only (:mod:`jaxcal.calibration.conventional`). Everything else, and
 everything inside a caller's jit, vmap or grad, is solved by the engine:
 :mod:`jaxcal.calibration.pipeline` solves every problem there, as one pure function of arrays, which
-:mod:`jaxcal.runtime.programs` compiles.
+:mod:`jaxcal.calibration.programs` compiles.
 """
 
 from __future__ import annotations
@@ -19,34 +19,39 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.calibration.conventional import closed_form_answer
 from jaxcal.calibration.dependence import independent
-from jaxcal.calibration.inputs import as_batch, converting, unknown_names, whole_number
+from jaxcal.calibration.inputs import as_batch, converting, unknown_names
 from jaxcal.calibration.options import (
     DELAY_SD_S,
     SOUND_SPEED_SD_M_S,
-    Data,
-    Given,
-    Method,
-    Options,
-    PriorName,
     Request,
-    SolvePlan,
     check_shapes,
     check_values,
     options_of,
     prepare,
     with_bound,
 )
-from jaxcal.calibration.result import Calibration
 from jaxcal.calibration.serial_correlation import widened
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.given_values import whole_number
 from jaxcal.runtime.precision import (
     importing_jax,
     in_own_modes,
     inside_transformation,
     require_float64,
     with_dtype,
+)
+from jaxcal.solvers.names import (
+    Data,
+    Method,
+    PriorName,
+)
+from jaxcal.solvers.plan import (
+    Given,
+    Options,
+    SolvePlan,
 )
 
 if TYPE_CHECKING:
@@ -139,7 +144,7 @@ def calibrate(
     )
     plan, given = prepare(problem, request)
     if problem.batch_shape:
-        from jaxcal.runtime.engine import solve_batch
+        from jaxcal.calibration.engine import solve_batch
 
         return solve_batch(problem, given, plan, None)
     check_values(problem)
@@ -164,11 +169,11 @@ def _solve_alone(problem: Problem, given: Given, plan: SolvePlan) -> Calibration
     if not inside_transformation(problem, given):
         found = closed_form_answer(problem, plan)
     if found is None:
-        from jaxcal.runtime.engine import solve_problem
+        from jaxcal.calibration.engine import solve_problem
 
         return solve_problem(problem, given, plan)
     if "jax" in sys.modules:
-        from jaxcal.runtime.engine import as_jax_holds
+        from jaxcal.calibration.engine import as_jax_holds
 
         return as_jax_holds(found, problem)
     return found
@@ -246,7 +251,7 @@ def calibrate_batch(
         robust,
     )
     plan, given = prepare(problems, request)
-    from jaxcal.runtime.engine import solve_batch
+    from jaxcal.calibration.engine import solve_batch
 
     return solve_batch(problems, given, plan, chunk)
 

@@ -16,40 +16,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxcal.calibration.options import SolvePlan
-from jaxcal.calibration.result import Calibration, Convergence, Linearisation, Medium, Status
 from jaxcal.data.problem import Problem
 from jaxcal.data.sound import WATER_M_S
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, threshold
-from jaxcal.model.unknowns import EXTRA, Blocks, block_slice, size
-from jaxcal.runtime.array_types import Bool, Float, HeldArray
-from jaxcal.runtime.trees import array_tree, assembled, map_arrays
+from jaxcal.model.unknowns import EXTRA, block_slice, size
+from jaxcal.result.calibration import Calibration, Convergence, Linearisation, Medium, Status
+from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.trees import map_arrays
+from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS
-from jaxcal.solvers.closed_form.single import ClosedForm, calibrate_closed_form
-
-
-@array_tree
-class Start:
-    """The start of methods that begin at the conventional fit: Eq. 7's minimum of one problem.
-
-    Attributes:
-        rotation: of X.
-        translation: of X, mm.
-        point: the target in the tracker's frame, mm.
-        scale: factors on the problem's [lateral, axial] spacing.
-        sound_speed: factor on the nominal one.
-        searched: the minimum is not proved to be the only one; descents from many rotations found
-            it.
-    """
-
-    rotation: Float[HeldArray, "*batch 3 3"]
-    translation: Float[HeldArray, "*batch 3"]
-    point: Float[HeldArray, "*batch 3"]
-    scale: Float[HeldArray, "*batch 2"]
-    sound_speed: Float[HeldArray, "*batch"]
-    searched: Bool[HeldArray, "*batch"]
-
+from jaxcal.solvers.closed_form.single import ClosedForm
+from jaxcal.solvers.plan import SolvePlan
 
 STATIONARY = 1e-6
 """Largest gradient cosine of an answer through which derivatives are valid."""
@@ -75,32 +53,6 @@ def closed_form_answer(problem: Problem, plan: SolvePlan) -> Calibration | None:
     if not (found.certified and found.unique):
         return None
     return _with_uncertainty(found, problem, plan)
-
-
-def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
-    """The start of a method, from the closed form of Eq. 7.
-
-    Args:
-        problem: one problem with concrete, finite values and at least 4 used images.
-        blocks: the free unknowns; those without a closed form begin at their nominal values.
-
-    Returns:
-        The start in the problem's own precision.
-    """
-    known = replace(problem, spacing_known=True, channels=None)
-    found = calibrate_closed_form(known, estimate=("scale",) if "scale" in blocks else ())
-    unknowns = _unknowns(found, problem)
-    parts = {
-        "rotation": unknowns.rotation[0],
-        "translation": unknowns.translation[0],
-        "point": unknowns.point[0],
-        "scale": np.ravel(unknowns.further.get("scale", np.ones(2))),
-        "sound_speed": np.asarray(found.sound_speed_factor),
-    }
-    dtype = np.asarray(problem.mask).dtype
-    parts = {name: np.asarray(value, dtype) for name, value in parts.items()}
-    parts["searched"] = np.asarray(not (found.certified and found.unique))
-    return assembled(Start, parts)
 
 
 def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> Calibration | None:

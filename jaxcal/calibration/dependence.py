@@ -404,7 +404,7 @@ def conventional_errors(
     Returns:
         The errors of the conventional fit in closed form; None where there is no such fit.
     """
-    from jaxcal.solvers.closed_form.single import calibrate_closed_form
+    from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 
     known = getattr(data, "spacing_known", True)
     if getattr(data, "kind", "point") == "pixel":

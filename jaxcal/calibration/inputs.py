@@ -7,12 +7,10 @@ from collections.abc import Callable, Iterable
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
-import numpy as np
-
 from jaxcal import InputError
 from jaxcal.data.problem import Problem, stack
 from jaxcal.data.recording import Images, Recording
-from jaxcal.io.readable import shown
+from jaxcal.runtime.messages import shown
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -21,52 +19,6 @@ _HOW = (
     "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "
     "a recording"
 )
-
-LARGEST_SEED = 2**63 - 1
-_KEY_DATA = ((2,), (4,))
-"""Shapes of an old-style key, by JAX's generators."""
-
-
-def whole_number(name: str, value: object, least: int, most: int) -> int:
-    """A whole number that a caller gave.
-
-    Raises:
-        InputError: something else, or a number out of these bounds.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise InputError(f"{name} must be a whole number, not {shown(value)}")
-    if not least <= value <= most:
-        raise InputError(f"{name} must be between {least} and {most}, not {value}")
-    return int(value)
-
-
-def check_flag(name: str, value: object) -> None:
-    """Raise InputError if what a caller gave is not True or False."""
-    if not isinstance(value, bool | np.bool_):
-        raise InputError(f"{name} must be True or False, not {shown(value)}")
-
-
-def check_key(name: str, value: object) -> None:
-    """Raise InputError if what a caller gave is not one JAX key (of the new or the old style)."""
-    import jax
-
-    if isinstance(value, jax.Array):
-        if jax.numpy.issubdtype(value.dtype, jax.dtypes.prng_key):
-            good = value.ndim == 0
-        else:
-            good = value.dtype == np.uint32 and value.shape in _KEY_DATA
-        if good:
-            return
-        value = f"an array of {value.dtype}, shape {value.shape}"
-    else:
-        value = shown(value)
-    raise InputError(f"{name} must be a JAX key, e.g. jax.random.key(1), not {value}")
-
-
-def check_made(name: str, value: object, kind: type, by: str) -> None:
-    """Raise InputError, which names what makes such an object, if a caller gave something else."""
-    if not isinstance(value, kind):
-        raise InputError(f"{name} must be made by {by}, not {shown(value)}")
 
 
 def as_problem(value: Any, name: str) -> Problem:

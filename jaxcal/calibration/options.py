@@ -1,38 +1,33 @@
-"""The options of a solve, and the checks that a request must pass.
-
-Everything static about a solve is a :class:`SolvePlan`, so that each combination is compiled once.
-The numbers in the request are a :class:`Given`, which is traced.
-"""
+"""A caller's request, the checks that it must pass, and the plan that it becomes."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, TypeGuard, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import check_flag, whole_number
-from jaxcal.calibration.names import Data, Method, PriorName, SolverName
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES
-from jaxcal.io.readable import shown
-from jaxcal.model.distributions import SHAPES, UNIFORM, Shape
-from jaxcal.model.unknowns import EXTRA, MEDIUM, RIGID, Blocks
-from jaxcal.runtime.array_types import AnyArray, Array, Float
-from jaxcal.runtime.arrays import array_module, is_traced, real_array
-from jaxcal.runtime.trees import array_tree
-
-if TYPE_CHECKING:
-    import optimistix as optx
-
-Precision = Literal["float64", "float32"]
-
-Prior = Literal["none", "gaussian", "bounded"]
-"""What is assumed about the offsets: in the image plane, Gaussian (or weighed laws), bounded."""
+from jaxcal.model.distributions import Shape
+from jaxcal.model.unknowns import EXTRA, MEDIUM, RIGID
+from jaxcal.runtime.array_types import AnyArray, Array
+from jaxcal.runtime.arrays import array_module, is_traced
+from jaxcal.runtime.given_values import check_flag
+from jaxcal.runtime.messages import shown
+from jaxcal.solvers.names import Data, Method, PriorName
+from jaxcal.solvers.plan import (
+    LAWS,
+    Given,
+    Options,
+    Prior,
+    SolvePlan,
+    check_size,
+    is_one_of,
+    is_optimistix,
+)
 
 PRIORS: dict[str, tuple[PriorName, ...]] = {
     "joint": get_args(PriorName),
@@ -40,12 +35,6 @@ PRIORS: dict[str, tuple[PriorName, ...]] = {
     "conventional": (),
 }
 """The priors that go with each method, beside ``auto``."""
-
-LAWS: dict[str, tuple[Shape, ...]] = {"auto": SHAPES, "uniform": UNIFORM}
-"""The priors of the joint method that weigh laws of the offsets, each with its laws."""
-
-DEFAULT_MAX_ELEVATION_MM = 1.0
-"""The bound on the offsets if none is given; it is that of the paper."""
 
 SOUND_SPEED_SD_M_S = 20.0
 """Prior SD of the sound speed about its nominal value, m/s: some seven kelvin of water."""
@@ -55,69 +44,6 @@ DELAY_SD_S = 1e-6
 
 ALTERNATION = ("tolerance_rad", "tolerance_mm", "max_rounds", "inner_steps")
 """The options that the alternation alone has."""
-
-MOST_STEPS = 10**7
-"""Most rounds, steps and kept values that can be asked for."""
-
-_UNITS = {
-    "sound_speed_sd": "m/s",
-    "delay_sd": "s",
-    "tolerance_rad": "rad",
-    "gradient_tolerance": "",
-}
-"""Units of numbers of a request that are not in mm."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """How to solve; static, so each combination is compiled once.
-
-    Attributes:
-        solver: ``lm`` is jaxcal's own. The conventional method also has ``gauss-newton`` and
-            ``gradient``. An optimistix least-squares solver, e.g.
-            ``optimistix.Dogleg(1e-10, 1e-10)``, replaces ``lm`` in the conventional method and in
-            the joint one (except for its prior ``bounded``). It has the same start, stops by its
-            own rule, and takes longer in a batch.
-        gradient_tolerance: relative tolerance at which ``gradient`` stops.
-        tolerance_rad: the alternation stops when a round turns X by less than this, rad, and also
-            moves its origin by less than ``tolerance_mm``. The paper does not state these limits.
-        tolerance_mm: see ``tolerance_rad``; mm.
-        max_rounds: most rounds of the alternation.
-        inner_steps: Gauss-Newton steps on X and c in each round of the alternation.
-        max_iterations: most linearisations of the other solvers.
-        trace: how many values of the objective to keep in the result.
-        differentiate: False if the answer will not be differentiated. Inside a caller's grad it is
-            then a constant, and derivatives are neither traced nor compiled.
-        precision: ``float64``, whatever the dtype of the problem's arrays, or ``float32``, which is
-            faster on some devices and loses six digits.
-    """
-
-    solver: SolverName | optx.AbstractLeastSquaresSolver = "lm"
-    gradient_tolerance: float = 1e-6
-    tolerance_rad: float = 1e-3
-    tolerance_mm: float = 0.1
-    max_rounds: int = 1000
-    inner_steps: int = 2
-    max_iterations: int = 100
-    trace: int = 0
-    differentiate: bool = True
-    precision: Precision = "float64"
-
-    def __post_init__(self) -> None:
-        if _is_optimistix(self.solver):
-            _check_static(self.solver)
-        elif not _is_one_of(self.solver, SolverName):
-            raise InputError(
-                "solver must be lm, gauss-newton, gradient or an optimistix least-squares solver, "
-                f"not {shown(self.solver)}"
-            )
-        if not _is_one_of(self.precision, Precision):
-            raise InputError(f"precision must be float64 or float32, not {shown(self.precision)}")
-        check_flag("differentiate", self.differentiate)
-        for name in ("gradient_tolerance", "tolerance_rad", "tolerance_mm"):
-            _check_size(name, getattr(self, name), np.finfo(float).tiny)
-        for name in ("max_rounds", "inner_steps", "max_iterations", "trace"):
-            whole_number(name, getattr(self, name), int(name != "trace"), MOST_STEPS)
 
 
 def options_of(options: Options | None) -> Options:
@@ -145,79 +71,6 @@ def check_alternation(names: Iterable[str], method: str) -> None:
     """
     if (given := " and ".join(names)) and method != "alternating":
         raise InputError(f"only the alternating method has {given}")
-
-
-def _is_one_of(value: object, names: Any) -> bool:
-    """Whether a value is one of a Literal's names; comparing an array would give an array."""
-    return isinstance(value, str) and value in get_args(names)
-
-
-def _is_optimistix(solver: Any) -> TypeGuard[optx.AbstractLeastSquaresSolver]:
-    """Whether this is a least-squares solver of optimistix, without the slow import of it."""
-    found = sys.modules.get("optimistix")
-    return found is not None and isinstance(solver, found.AbstractLeastSquaresSolver)
-
-
-def _check_static(solver: optx.AbstractLeastSquaresSolver) -> None:
-    """Check that a solver's settings are plain numbers, since a solver is part of the program."""
-    try:
-        hash(solver)
-    except TypeError:
-        raise InputError(
-            f"the settings of {type(solver).__name__} must be plain numbers, not arrays"
-        ) from None
-
-
-@dataclass(frozen=True)
-class SolvePlan:
-    """Everything static about a solve: method, belief about the offsets, data, unknowns.
-
-    ``laws`` are weighed after the self-tuned Gaussian solve; if there are none, the Gaussian solve
-    is the answer. ``robust``: find the images that agree first, and leave the others out.
-    """
-
-    method: Method
-    prior: Prior
-    self_tuning: bool
-    laws: tuple[Shape, ...]
-    channels: bool
-    blocks: Blocks
-    options: Options
-    robust: bool = False
-
-    @property
-    def other_solver(self) -> optx.AbstractLeastSquaresSolver | None:
-        """The caller's own solver; None if there is none."""
-        solver = self.options.solver
-        return solver if _is_optimistix(solver) else None
-
-    @property
-    def one_by_one(self) -> bool:
-        """Whether problems are solved one at a time, as a caller's solver and ``gradient`` do."""
-        return self.other_solver is not None or self.options.solver == "gradient"
-
-    @property
-    def reported_prior(self) -> str:
-        """The prior's name in the result: if laws were weighed, the name of their prior."""
-        names = [name for name, laws in LAWS.items() if laws == self.laws]
-        return names[0] if names else self.prior
-
-
-@array_tree
-class Given:
-    """Numbers that the caller gave in addition to the problem.
-
-    Attributes:
-        sigma: SDs of (lateral, range, offset), or of (element distance, offset) on channels, mm.
-        tracker_sd: SD of the tracked position, mm.
-        max_elevation: bound on the offsets, mm.
-        medium_sd: prior SDs of the sound speed (m/s) and the delay (s).
-    """
-
-    sigma: Float[AnyArray, " components"] | None
-    tracker_sd: Float[AnyArray, ""] | None
-    max_elevation: Float[AnyArray, "*images"] | None
-    medium_sd: Float[AnyArray, 2] | None
 
 
 @dataclass(frozen=True)
@@ -307,14 +160,14 @@ def check_request(request: Request) -> Prior:
     ):
         value = getattr(request, name)
         if value is not getattr(Request, name):  # the default
-            _check_size(name, value, least, one=one)
+            check_size(name, value, least, one=one)
     return prior
 
 
 def _check_names(request: Request) -> None:
     for name, names in (("method", Method), ("prior", PriorName), ("data", Data)):
         value = getattr(request, name)
-        if not _is_one_of(value, names):
+        if not is_one_of(value, names):
             listed = ", ".join(get_args(names))
             raise InputError(f"{name} must be one of {listed}, not {shown(value)}")
     check_flag("robust", request.robust)
@@ -343,7 +196,7 @@ def _check_combination(request: Request, kind: Prior) -> None:
             "uniform (without given sigma) and bounded"
         )
     solver = options_of(request.options).solver
-    if _is_optimistix(solver) and kind == "bounded":
+    if is_optimistix(solver) and kind == "bounded":
         raise InputError(
             "another solver would not keep the offsets within their bounds: it goes with the "
             "conventional method and the joint one's priors auto, uniform and gaussian"
@@ -383,21 +236,6 @@ def _uses_channels(problem: Problem, request: Request, kind: str) -> bool:
     wanted = problem.curved or any(name in request.estimate for name in MEDIUM)
     three = request.sigma is not None and np.size(request.sigma) == 3
     return wanted and request.tracker_sd is None and not three
-
-
-def _check_size(name: str, value: Any, least: float, *, one: bool = True) -> None:
-    """Check one number, or several; of traced ones, that it is one."""
-    numbers = np.array(np.nan)
-    if not is_traced(value):
-        with suppress(InputError):
-            numbers = real_array(value, name)
-        if not (np.isfinite(numbers).all() and (numbers >= least).all()):
-            unit = _UNITS.get(name, "mm")
-            unit = f", in {unit}" if unit else ""
-            wanted = "positive" if least > 0 else "not negative"
-            raise InputError(f"{name} must be finite and {wanted}{unit}, not {shown(value)}")
-    if one and np.shape(value) != ():
-        raise InputError(f"{name} must be one number, not {shown(value)}")
 
 
 def check_shapes(problem: Problem) -> None:

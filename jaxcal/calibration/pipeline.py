@@ -2,7 +2,7 @@
 
 If the plan is robust, the images that do not agree are found first. Then the plan's method solves
 the problems (:mod:`jaxcal.solvers.methods`), and the answer is put together
-(:mod:`jaxcal.calibration.answer`). :mod:`jaxcal.runtime.programs` compiles this function.
+(:mod:`jaxcal.calibration.answer`). :mod:`jaxcal.calibration.programs` compiles this function.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxcal.calibration.answer import Average, Solved, assemble
-from jaxcal.calibration.options import Given, SolvePlan
-from jaxcal.calibration.result import Calibration, Convergence
 from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, barrier
 from jaxcal.model.observations import BoundedOffsets, LocalUnknown, local_unknowns
 from jaxcal.model.unknowns import Blocks
+from jaxcal.result.calibration import Calibration, Convergence
 from jaxcal.runtime.precision import in_standard_promotion
 from jaxcal.solvers import methods
 from jaxcal.solvers.consensus import find_consensus, rigid_model
 from jaxcal.solvers.methods import Solution
 from jaxcal.solvers.normal_equations import accumulate, information_and_design
+from jaxcal.solvers.plan import Given, SolvePlan
 from jaxcal.solvers.start import ConventionalStart, GivenStart
 
 

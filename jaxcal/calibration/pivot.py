@@ -20,8 +20,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxcal import InputError
 from jaxcal.calibration.answer import covariance_and_observability
-from jaxcal.calibration.inputs import check_flag
-from jaxcal.calibration.result import Status
 from jaxcal.data.poses import check_poses
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LEAST_REACH_MM, MINIMUM_IMAGES, MetresError
@@ -29,8 +27,10 @@ from jaxcal.diagnostics.outliers import images_that_stand_out, listed_departures
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
+from jaxcal.result.calibration import Status
 from jaxcal.runtime import buckets, compiler, executables
 from jaxcal.runtime.arrays import is_traced, real_array
+from jaxcal.runtime.given_values import check_flag
 from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import (
@@ -64,7 +64,7 @@ class Pivot(eqx.Module):
         mask: 1 for used poses.
         outlier: 1 where a pose does not fit the rest; a robust solve leaves it out.
         departure: errors of all poses, in robust SDs of the used poses' errors.
-        status_code: a :class:`jaxcal.calibration.result.Status`.
+        status_code: a :class:`jaxcal.result.calibration.Status`.
         information: of (tip, point) for errors with an SD of 1 mm.
         robust: poses that do not fit the rest were left out (static).
     """

@@ -24,20 +24,15 @@ from jaxtyping import Array, Float, Int, Key
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import calibrate, calibrate_batch
 from jaxcal.calibration.dependence import independent
-from jaxcal.calibration.inputs import (
-    LARGEST_SEED,
-    as_problem,
-    check_key,
-    check_made,
-    whole_number,
-)
-from jaxcal.calibration.result import Calibration
+from jaxcal.calibration.inputs import as_problem
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
 from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points, measurement_residual
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.arrays import is_traced
+from jaxcal.runtime.given_values import LARGEST_SEED, check_key, check_made, whole_number
 from jaxcal.runtime.precision import in_own_modes
 from jaxcal.solvers import dense
 from jaxcal.solvers.methods import nominal_sound_speed

@@ -32,7 +32,7 @@ from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.trees import map_arrays
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 CHANCE = 2.1
 """SDs that the correlation of successive residuals must exceed to be believed."""

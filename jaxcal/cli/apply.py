@@ -71,9 +71,9 @@ def apply(
     """
     import numpy as np
 
-    from jaxcal.calibration.saved import load_calibration
     from jaxcal.io.atomic import write_text
     from jaxcal.io.outputs import begins_with, check_output
+    from jaxcal.result.saved import load_calibration
 
     if (source is None) == (not pixel):
         raise click.UsageError("name SOURCE, or points by --pixel U V")

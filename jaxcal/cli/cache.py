@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from jaxcal import InputError, OutputError
-from jaxcal.calibration.names import Method
-from jaxcal.cli.common import Commands, ExitCode, print_json, print_page, progress
+from jaxcal.cli.common import Commands, ExitCode, json_option, print_json, print_page, progress
 from jaxcal.runtime import jax_cache, program_cache
+from jaxcal.solvers.names import Method
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
@@ -32,7 +32,7 @@ def cache() -> None:
 
 
 @cache.command(short_help="List the programs that are kept.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@json_option
 def show(as_json: bool) -> int:
     """List the programs: plan, number of images, size, time to compile, last use."""
     try:
@@ -184,6 +184,6 @@ def _problem(recording: str | None, pixels: bool) -> Problem:
 
 def _repeated(problem: Problem, count: int) -> Problem:
     """As many images as that: the first ones over and over."""
-    from jaxcal.runtime import buckets
+    from jaxcal.data.problem import taken
 
-    return buckets.taken(problem, [k % problem.images for k in range(count)])
+    return taken(problem, [k % problem.images for k in range(count)])

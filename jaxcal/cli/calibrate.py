@@ -13,22 +13,23 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from jaxcal import InputError
-from jaxcal.calibration.names import Data, Method, PriorName, SolverName
 from jaxcal.cli.common import (
     POSITIVE,
     import_engine,
+    json_option,
     print_json,
     print_page,
     progress,
     verdict_code,
 )
+from jaxcal.solvers.names import Data, Method, PriorName, SolverName
 
 if TYPE_CHECKING:
     from jaxcal.calibration.options import Request
-    from jaxcal.calibration.result import Calibration
-    from jaxcal.calibration.saved import SaveFormat
     from jaxcal.data.recording import Recording
     from jaxcal.report.convergence import Curve
+    from jaxcal.result.calibration import Calibration
+    from jaxcal.result.transform import SaveFormat
 
 MOST_FOLDS = 100
 """With more images than this, cross-validation holds out several at a time."""
@@ -158,7 +159,7 @@ EXPORTS: tuple[SaveFormat, ...] = ("plus", "slicer", "itk", "ros", "tusrec", "nu
 )
 @click.option("--report", type=click.Path(), metavar="HTML", help="Write a page for a browser.")
 @click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@json_option
 def calibrate(
     recording: str,
     method: Method,
@@ -187,7 +188,8 @@ def calibrate(
     targets = [_export_target(export, inputs, out) for export in exports]
     import_engine()
     from jaxcal.calibration.inputs import unknown_names
-    from jaxcal.calibration.options import Options, Request, check_alternation, check_request
+    from jaxcal.calibration.options import Request, check_alternation, check_request
+    from jaxcal.solvers.plan import Options
 
     alternation = {
         "tolerance_mm": tolerance_mm,
@@ -262,9 +264,9 @@ def _prepared(out: str) -> AbstractContextManager[Path]:
 
 
 def _export_target(text: str, inputs: list[str], out: str | None) -> tuple[SaveFormat, str]:
-    from jaxcal.calibration.saved import check_target
     from jaxcal.cli.export import check_configuration
     from jaxcal.io.atomic import check_writable
+    from jaxcal.result.saved import check_target
 
     name, colon, path = text.partition(":")
     known: dict[str, SaveFormat] = {each: each for each in EXPORTS}
@@ -301,7 +303,7 @@ def _check_apart(
 
 def _check_pixels(recording: Recording, targets: list[tuple[SaveFormat, str]]) -> None:
     """Refuse exports that need the size of a pixel, where only points in mm were recorded."""
-    from jaxcal.calibration.saved import needs_pixels
+    from jaxcal.result.saved import needs_pixels
 
     if recording.calibration.kind == "pixel":
         return
@@ -319,8 +321,8 @@ def _export(
     """Write the transform for other programs; nothing of a calibration that did not converge."""
     if not targets:
         return []
-    from jaxcal.calibration.saved import transform_from_record
     from jaxcal.cli.export import patched, written
+    from jaxcal.result.saved import transform_from_record
 
     if not record["converged"] or record["wrong_frames"]:
         return ["exported: nothing, since the calibration is not to be used"]
@@ -356,8 +358,8 @@ def _solve(recording: Recording, request: Request, *, traced: bool) -> Calibrati
 
     arguments: dict[str, Any] = dict(vars(request))
     if traced:
-        from jaxcal.calibration.options import Options
         from jaxcal.report.convergence import KEPT
+        from jaxcal.solvers.plan import Options
 
         arguments["options"] = replace(request.options or Options(), trace=KEPT)
     return solve(recording, **arguments)

@@ -64,6 +64,22 @@ class Number(click.ParamType):
 POSITIVE = Number()
 NOT_NEGATIVE = Number(zero=True)
 
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print one JSON object and nothing else."
+)
+
+
+def seed_option(what: str):
+    """--seed, with what it is the seed of."""
+    return click.option(
+        "--seed",
+        type=click.IntRange(0, 2**63 - 1),
+        default=0,
+        show_default=True,
+        metavar="N",
+        help=what,
+    )
+
 
 def exit_code(records: Iterable[dict[str, Any]]) -> ExitCode:
     """0 where every calibration converged, on data in the right frames; else 3."""

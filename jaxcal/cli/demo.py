@@ -9,14 +9,22 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from jaxcal.calibration.names import Method
-from jaxcal.cli.common import exit_code, import_engine, print_json, print_page, progress
+from jaxcal.cli.common import (
+    exit_code,
+    import_engine,
+    json_option,
+    print_json,
+    print_page,
+    progress,
+    seed_option,
+)
+from jaxcal.solvers.names import Method
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from jaxcal.calibration.result import Calibration
     from jaxcal.data.recording import Recording
+    from jaxcal.result.calibration import Calibration
 
 _METHODS: tuple[Method, ...] = ("conventional", "alternating", "joint")
 IMAGES, ELEVATION_MM, NOISE_MM = 50, 2.0, 0.5
@@ -25,15 +33,8 @@ RECORDING = "recording.h5"
 
 @click.command(short_help="Try it: simulate an experiment and calibrate it three ways.")
 @click.option("--out", type=click.Path(), metavar="DIR", help="Write a report to this folder.")
-@click.option(
-    "--seed",
-    type=click.IntRange(0, 2**63 - 1),
-    default=0,
-    show_default=True,
-    metavar="N",
-    help="Seed of the simulation.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@seed_option("Seed of the simulation.")
+@json_option
 def demo(out: str | None, seed: int, as_json: bool) -> int:
     """Simulate an experiment, calibrate it three ways, and compare them.
 

@@ -12,8 +12,7 @@ import click
 from jaxcal.cli.common import POSITIVE, ExitCode
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.saved import SaveFormat
-    from jaxcal.calibration.transform import ImageTransform
+    from jaxcal.result.transform import ImageTransform, SaveFormat
 
 _TEXTS = {
     "plus": "PLUS's <Transform> to paste into CoordinateDefinitions.",
@@ -105,7 +104,7 @@ def export(
         raise click.UsageError(
             f"--{format} names no frames: leave --image-frame, --probe-frame out"
         )
-    from jaxcal.calibration.saved import check_target, load_calibration
+    from jaxcal.result.saved import check_target, load_calibration
 
     if plus_config is not None:
         check_configuration(plus_config, out, [calibration], (image_frame, probe_frame))

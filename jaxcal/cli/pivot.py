@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from jaxcal.cli.common import exit_code, import_engine, print_json, print_page, progress
+from jaxcal.cli.common import (
+    exit_code,
+    import_engine,
+    json_option,
+    print_json,
+    print_page,
+    progress,
+)
 
 if TYPE_CHECKING:
     from jaxcal.calibration.pivot import Pivot
@@ -15,7 +22,7 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("poses", type=click.Path(), metavar="POSES")
 @click.option("--no-robust", is_flag=True, help="Use every pose, those that do not fit as well.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@json_option
 def pivot(poses: str, no_robust: bool, as_json: bool) -> int:
     """Find the tip of a tracked tool that was turned about its tip.
 

@@ -14,6 +14,7 @@ from jaxcal.cli.common import (
     POSITIVE,
     ExitCode,
     import_engine,
+    json_option,
     print_json,
     print_page,
     progress,
@@ -116,7 +117,7 @@ _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"%PDF", b"%!PS", b"<?xml", b"RIFF", b
     f"LAW is that of the elevational offsets: {', '.join(OFFSET_LAWS)}. May be repeated.",
 )
 @click.option("--figure", type=click.Path(), metavar="PNG", help="Draw the plan.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@json_option
 def plan(
     recording: str | None,
     images: int | None,
@@ -147,7 +148,7 @@ def plan(
         raise InputError("--sigma does not go with a recording: its images tell the SDs")
     import_engine()
     from jaxcal import design
-    from jaxcal.design.predict import MOST_IMAGES
+    from jaxcal.design.count import MOST_IMAGES
     from jaxcal.io.outputs import begins_with, check_output
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 

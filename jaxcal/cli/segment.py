@@ -16,6 +16,7 @@ from jaxcal.cli.common import (
     ExitCode,
     Verbatim,
     import_engine,
+    json_option,
     print_json,
     print_page,
     progress,
@@ -76,7 +77,7 @@ if TYPE_CHECKING:
 )
 @tracking_options
 @search_options
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@json_option
 @click.pass_context
 def segment(
     context: click.Context,

@@ -26,8 +26,8 @@ def serve(calibration: str, host: str, port: int, rate: float, name: str) -> int
     In Slicer: OpenIGTLinkIF, a connector as client to this host and port. The matrix is PLUS's
     ImageToProbe, with the pixel size in it: leave the image's own spacing at 1.
     """
-    from jaxcal.calibration.saved import load_calibration
     from jaxcal.io.serving import TransformServer
+    from jaxcal.result.saved import load_calibration
 
     transform = load_calibration(calibration)
     transform.check_usable()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from jaxcal import InputError
-from jaxcal.cli.common import NOT_NEGATIVE, POSITIVE, ExitCode, import_engine, progress
+from jaxcal.cli.common import NOT_NEGATIVE, POSITIVE, ExitCode, import_engine, progress, seed_option
 
 
 @click.command(short_help="Simulate an experiment and write its recording.")
@@ -48,14 +48,7 @@ from jaxcal.cli.common import NOT_NEGATIVE, POSITIVE, ExitCode, import_engine, p
     metavar="MHZ",
     help="Round times of flight to a clock of this frequency.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(0, 2**63 - 1),
-    default=0,
-    show_default=True,
-    metavar="N",
-    help="Seed of the random draws.",
-)
+@seed_option("Seed of the random draws.")
 def simulate(
     out: str,
     images: int,

@@ -8,7 +8,7 @@ same class with leading axes on every array.
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,10 +16,11 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.probe import CurvilinearProbe
 from jaxcal.data.recording import Images, Kind, Recording, images_of, make_images
+from jaxcal.runtime import buckets
 from jaxcal.runtime.array_types import AnyArray, Float, HeldArray
 from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.precision import importing_jax, in_own_modes
-from jaxcal.runtime.trees import array_tree, static
+from jaxcal.runtime.trees import array_tree, assembled, static
 
 if TYPE_CHECKING:
     from jax.typing import DTypeLike
@@ -225,6 +226,33 @@ class Problem:
             spacing_mm=spacing_mm,
         )
         return cls.from_recording(images, dtype=dtype)
+
+
+def fill_up(problem: Problem) -> Problem:
+    """The problem filled up with masked images to its bucket's size; numpy arrays if it grows.
+
+    Args:
+        problem: one, or a batch.
+    """
+    more = buckets.size(problem.images) - problem.images
+    if not more:
+        return problem
+    rows = [*range(problem.images), *[problem.images - 1] * more]  # a masked pose must be rigid
+    mask = np.asarray(problem.mask)
+    mask = np.concatenate([mask, np.zeros((*mask.shape[:-1], more), mask.dtype)], axis=-1)
+    longer = taken(problem, rows)
+    parts = {field.name: getattr(longer, field.name) for field in fields(longer)}
+    return assembled(Problem, parts | {"mask": mask})
+
+
+def taken(problem: Problem, rows: list[int]) -> Problem:
+    """Some images of a problem, in numpy arrays.
+
+    Args:
+        problem: without leading axes.
+        rows: which images, in order; one may occur several times.
+    """
+    return buckets.each_image(problem, lambda values, axis: np.take(np.asarray(values), rows, axis))
 
 
 @importing_jax

@@ -7,6 +7,8 @@ rely on shapes, units and finite values.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -15,9 +17,9 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import Probe, check_probe
-from jaxcal.io.readable import shown
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import is_number, is_traced, real_array
+from jaxcal.runtime.messages import shown
 
 MINIMUM_IMAGES = 4
 """With fewer used images nothing can be solved: 3 residuals an image against 9 unknowns."""
@@ -193,78 +195,55 @@ def make_images(
             "grad: make the problem outside, and change its arrays inside "
             "(dataclasses.replace(problem, measurements=...))"
         )
-    try:
-        return _make_images(
-            poses,
-            measurements,
-            kind,
-            mask,
-            covariance,
-            max_elevation,
-            amplitude,
-            time,
-            spacing_mm,
-            face_offset_mm,
-            time_of_flight,
-            minimum,
+    with _prefixed(prefix):
+        if kind not in get_args(Kind):
+            raise InputError(f"kind must be one of {', '.join(get_args(Kind))}, not {kind!r}")
+        poses, values = real_array(poses, "poses"), real_array(measurements, "measurements")
+        count = len(poses) if poses.ndim else 0
+        if values.ndim != 2:
+            raise InputError(f"{kind} must have two axes, it has shape {values.shape}")
+        if kind != "time_of_flight" and values.shape[1] != 2:
+            raise InputError(f"{kind} must have shape (n, 2), it has {values.shape}")
+        if len(values) != count:
+            raise InputError(f"{count} poses but {len(values)} rows of {kind}: they must match")
+        used = _mask(mask, count)
+        if not (is_number(minimum) and minimum >= 0):
+            raise InputError(f"minimum must be a number of images, not {shown(minimum)}")
+        if used.sum() < minimum:
+            raise InputError(
+                f"{int(used.sum())} used images are too few: at least {minimum} are needed"
+            )
+        _check_magnitude("pose", poses, used)
+        checked = check_poses(poses, used)
+        values = _used_values(kind, values, used)
+        spacing, face_mm = _spacing(spacing_mm, kind), _face_offset(face_offset_mm)
+        if kind == "pixel":
+            _check_below_face(values, spacing, face_mm, used)
+
+        images = Images(
+            poses=checked,
+            measurements=values,
+            kind=kind,
+            mask=used,
+            covariance=_covariance(covariance, count, used),
+            max_elevation=_bound(max_elevation, count, used),
+            amplitude=_per_image("amplitude", amplitude, count, used, fill=0.0),
+            time=_per_image("time", time, count, used, fill=0.0),
+            spacing_mm=spacing,
+            face_offset_mm=face_mm,
+            time_of_flight=_raw_times(time_of_flight, kind, count, used),
         )
+        _check_units(images)
+    return images
+
+
+@contextmanager
+def _prefixed(prefix: str) -> Iterator[None]:
+    """Put a prefix in front of the messages of errors."""
+    try:
+        yield
     except InputError as error:
         raise type(error)(f"{prefix}{error}") from None
-
-
-def _make_images(
-    poses,
-    measurements,
-    kind,
-    mask,
-    covariance,
-    max_elevation,
-    amplitude,
-    time,
-    spacing_mm,
-    face_offset_mm,
-    time_of_flight,
-    minimum,
-) -> Images:
-    if kind not in get_args(Kind):
-        raise InputError(f"kind must be one of {', '.join(get_args(Kind))}, not {kind!r}")
-    poses, values = real_array(poses, "poses"), real_array(measurements, "measurements")
-    count = len(poses) if poses.ndim else 0
-    if values.ndim != 2:
-        raise InputError(f"{kind} must have two axes, it has shape {values.shape}")
-    if kind != "time_of_flight" and values.shape[1] != 2:
-        raise InputError(f"{kind} must have shape (n, 2), it has {values.shape}")
-    if len(values) != count:
-        raise InputError(f"{count} poses but {len(values)} rows of {kind}: they must match")
-    used = _mask(mask, count)
-    if not (is_number(minimum) and minimum >= 0):
-        raise InputError(f"minimum must be a number of images, not {shown(minimum)}")
-    if used.sum() < minimum:
-        raise InputError(
-            f"{int(used.sum())} used images are too few: at least {minimum} are needed"
-        )
-    _check_magnitude("pose", poses, used)
-    checked = check_poses(poses, used)
-    values = _used_values(kind, values, used)
-    spacing, face_mm = _spacing(spacing_mm, kind), _face_offset(face_offset_mm)
-    if kind == "pixel":
-        _check_below_face(values, spacing, face_mm, used)
-
-    images = Images(
-        poses=checked,
-        measurements=values,
-        kind=kind,
-        mask=used,
-        covariance=_covariance(covariance, count, used),
-        max_elevation=_bound(max_elevation, count, used),
-        amplitude=_per_image("amplitude", amplitude, count, used, fill=0.0),
-        time=_per_image("time", time, count, used, fill=0.0),
-        spacing_mm=spacing,
-        face_offset_mm=face_mm,
-        time_of_flight=_raw_times(time_of_flight, kind, count, used),
-    )
-    _check_units(images)
-    return images
 
 
 def _used_values(

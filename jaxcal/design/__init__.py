@@ -14,7 +14,8 @@ exchange.py     exchanges each chosen pose for the best candidate
 polish.py       moves poses along the gradient on SE(3), inside the constraints
 planning.py     plan, next_poses
 bound.py        an error that no choice among the candidates can go below
-predict.py      predicted errors of a plan; images_to
+predict.py      predicted errors of a plan
+count.py        images_to: how many images a wanted error takes
 simulated.py    errors of many simulated calibrations at given poses
 words.py        a pose in words, for a person who holds the probe
 figure.py       figure of the plan and of how many images are needed
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from jaxcal.design.candidates import make_candidates as make_candidates
     from jaxcal.design.constraints import Constraints as Constraints
     from jaxcal.design.constraints import Region as Region
+    from jaxcal.design.count import images_to as images_to
     from jaxcal.design.criteria import gain as gain
     from jaxcal.design.figure import plan_figure as plan_figure
     from jaxcal.design.greedy import Rules as Rules
@@ -41,7 +43,6 @@ if TYPE_CHECKING:
     from jaxcal.design.planning import Plan as Plan
     from jaxcal.design.planning import next_poses as next_poses
     from jaxcal.design.planning import plan as plan
-    from jaxcal.design.predict import images_to as images_to
     from jaxcal.design.simulated import SimulatedErrors as SimulatedErrors
     from jaxcal.design.simulated import simulate_errors as simulate_errors
     from jaxcal.design.words import pose_in_words as pose_in_words
@@ -57,7 +58,7 @@ _HOME = {
     "SimulatedErrors": "simulated",
     "candidates_around": "candidates",
     "gain": "criteria",
-    "images_to": "predict",
+    "images_to": "count",
     "known_information": "information",
     "least_error": "bound",
     "make_candidates": "candidates",

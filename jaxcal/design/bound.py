@@ -19,20 +19,14 @@ import math
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import whole_number
-from jaxcal.calibration.result import Calibration
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import Criterion, check_criterion, weight_of
 from jaxcal.design.greedy import MOST_POSES
-from jaxcal.design.information import covariance_of
-from jaxcal.design.planning import (
-    Known,
-    Plan,
-    check_candidates,
-    known_before,
-    with_effective_noise,
-)
+from jaxcal.design.information import Known, covariance_of
+from jaxcal.design.planning import Plan, check_candidates, known_before, with_effective_noise
 from jaxcal.design.predict import tuned_factor
+from jaxcal.result.calibration import Calibration
+from jaxcal.runtime.given_values import whole_number
 
 NEAR = 1e-3
 """The steps end when the bound is nearer than this share of the squared error."""

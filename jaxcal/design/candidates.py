@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import LARGEST_SEED, check_made, whole_number
 from jaxcal.data.poses import check_poses, nearest_rotations
 from jaxcal.data.probe import Probe
 from jaxcal.data.recording import check_recording
 from jaxcal.design.constraints import Constraints, Region
-from jaxcal.design.information import Model, check_result
-from jaxcal.design.noise import Noise, used_images
+from jaxcal.design.information import Model
+from jaxcal.design.noise import Noise, check_result, used_images
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.given_values import LARGEST_SEED, check_made, whole_number
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
     from jaxcal.data.recording import Recording
+    from jaxcal.result.calibration import Calibration
 
 COUNT = 5000
 """Number of candidates of a plan; twice as many change the predicted error by less than 1 %."""

@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import check_made
 from jaxcal.data.poses import rotations_from_vectors, targets_in_images
 from jaxcal.data.probe import CurvilinearProbe, Probe, check_probe
-from jaxcal.io.readable import shown
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import is_number, real_array
+from jaxcal.runtime.given_values import check_made
+from jaxcal.runtime.messages import shown
 
 _INSIDE = 1e-9
 """Numbers outside by less than this, due to rounding, count as inside."""

@@ -1,7 +1,7 @@
 """The criteria of a plan: the weight matrices W, and the gain of a further pose.
 
 TRE. At an image point p the error of X Exp(d) p is J_p d with J_p = [I, -[p]x] (mm); unknown pixel
-scales add two columns (:mod:`jaxcal.diagnostics.image_points`). So the mean square over an image
+scales add two columns (:mod:`jaxcal.model.image_points`). So the mean square over an image
 region is tr(W S), W = mean of J_p'J_p.
 
 RP (Eq. 8). The reconstructed points B_i X p_i scatter by J_i d about their mean, J_i = R_i R_X J_p;
@@ -26,11 +26,11 @@ from typing import Literal, get_args
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import check_made
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.information import Model
-from jaxcal.diagnostics.image_points import mean_of_squares, point_jacobian
+from jaxcal.model.image_points import mean_of_squares, point_jacobian
 from jaxcal.runtime.array_types import AnyArray, Array, Float
+from jaxcal.runtime.given_values import check_made
 
 Criterion = Literal["tre", "rp", "d"]
 _PIECE = 800

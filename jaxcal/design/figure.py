@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import check_made
 from jaxcal.design.planning import Plan
 from jaxcal.runtime.arrays import is_number
+from jaxcal.runtime.given_values import check_made
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

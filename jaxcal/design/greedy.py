@@ -17,12 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import whole_number
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import gains
 from jaxcal.design.information import covariance_of
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import is_number
+from jaxcal.runtime.given_values import whole_number
 
 MOST_POSES = 2000
 """Of one plan."""

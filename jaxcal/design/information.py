@@ -20,15 +20,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import check_flag, check_made
 from jaxcal.data.poses import check_poses, targets_in_images
-from jaxcal.design.noise import Noise, used_images
+from jaxcal.design.noise import Noise, check_result, used_images
 from jaxcal.model.unknowns import RIGID, block_slice
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import is_number, is_traced, real_array
+from jaxcal.runtime.given_values import check_flag, check_made
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 BELIEVED_SD = (50.0, 0.5, 50.0, 0.3)
 """Prior SDs before any image (our choice): of X's translation (mm) and rotation (rad), of the
@@ -37,6 +37,21 @@ target (mm) and of a pixel scale's logarithm. This prior is weak: five images te
 _EFFICIENCY = (0.2, 5.0)
 _HALVINGS = 22
 """So often the interval of the factor's logarithm is halved, which gives it to 1e-6."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """The information before a plan.
+
+    Attributes:
+        information: (p, p) about the unknowns, including the prior with which every plan begins.
+        images: number of images from which it comes.
+        tuned: whether the SDs were tuned to these images.
+    """
+
+    information: Float[np.ndarray, "p p"]
+    images: int = 0
+    tuned: bool = False
 
 
 @dataclass(frozen=True)
@@ -127,16 +142,6 @@ def covariance_of(information: Float[np.ndarray, "*k p p"]) -> Float[np.ndarray,
     inverse = np.linalg.inv(information * size[..., :, None] * size[..., None, :])
     found = inverse * size[..., :, None] * size[..., None, :]
     return 0.5 * (found + np.swapaxes(found, -1, -2))
-
-
-def check_result(result: object) -> None:
-    """Raise InputError if what a caller gave is not the calibration of one problem."""
-    from jaxcal.calibration.result import Calibration
-
-    check_made("result", result, Calibration, "jaxcal.calibrate")
-    assert isinstance(result, Calibration)
-    if np.ndim(result.image_to_probe) != 2:
-        raise InputError("poses are planned for one problem; the result is of a batch")
 
 
 def known_information(

@@ -19,9 +19,10 @@ from jaxcal.data.probe import Probe, check_probe
 from jaxcal.diagnostics.sd_by_place import basis_at, log_sd_slopes
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import is_number, is_traced, real_array
+from jaxcal.runtime.given_values import check_made
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 FEWEST_TO_LEARN = 20
 """Fewest images from which SDs are learned as functions of the place."""
@@ -31,6 +32,16 @@ SD_RANGE_MM = (1e-6, 1e6)
 _LEAST_SD_MM = 1e-3
 UNKNOWN_BY = 3.0
 """A factor by which SDs that are not tuned to data may be wrong."""
+
+
+def check_result(result: object) -> None:
+    """Raise InputError if what a caller gave is not the calibration of one problem."""
+    from jaxcal.result.calibration import Calibration
+
+    check_made("result", result, Calibration, "jaxcal.calibrate")
+    assert isinstance(result, Calibration)
+    if np.ndim(result.image_to_probe) != 2:
+        raise InputError("poses are planned for one problem; the result is of a batch")
 
 
 @dataclass(frozen=True)
@@ -136,9 +147,6 @@ class Noise:
         Raises:
             InputError: no calibration, one without SDs, or targets of another number of images.
         """
-        # Imported here, since the model's module imports this one.
-        from jaxcal.design.information import check_result
-
         check_result(result)
         targets = real_array(targets, "targets")
         if targets.ndim != 2 or targets.shape[1] != 3:

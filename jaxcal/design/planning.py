@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import check_flag, check_made, whole_number
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.criteria import (
@@ -21,38 +20,25 @@ from jaxcal.design.criteria import (
 from jaxcal.design.exchange import exchange
 from jaxcal.design.greedy import MOST_POSES, Chosen, Rules, Search, choose, space_features
 from jaxcal.design.information import (
+    Known,
     Model,
-    check_result,
     covariance_of,
     effective_elevational,
     known_information,
 )
-from jaxcal.design.noise import SD_RANGE_MM, Noise
+from jaxcal.design.noise import SD_RANGE_MM, Noise, check_result
+from jaxcal.design.predict import curve
 from jaxcal.diagnostics.directions import direction_in_words
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.arrays import real_array
+from jaxcal.runtime.given_values import check_flag, check_made, whole_number
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 _SINGULAR = 1e-10
 """Eigenvalue ratio (scaled units, equal SDs) below which a direction is not determined."""
 _TRIED_RAD, _TRIED_SHARE = 0.4, 0.6
-
-
-@dataclass(frozen=True)
-class Known:
-    """The information before a plan.
-
-    Attributes:
-        information: (p, p) about the unknowns, including the prior with which every plan begins.
-        images: number of images from which it comes.
-        tuned: whether the SDs were tuned to these images.
-    """
-
-    information: Float[np.ndarray, "p p"]
-    images: int = 0
-    tuned: bool = False
 
 
 @dataclass(frozen=True)
@@ -246,7 +232,7 @@ def _checked_information(value: object, size: int) -> Float[np.ndarray, "p p"]:
 
 def with_effective_noise(prior: object, candidates: Candidates) -> Candidates:
     """Candidates whose elevational SD is the calibration's effective one."""
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
     if not isinstance(prior, Calibration) or candidates.taken is None:
         return candidates
@@ -304,8 +290,6 @@ def _finished(
     chosen: Chosen,
     poses: Float[np.ndarray, "n 4 4"],
 ) -> Plan:
-    from jaxcal.design.predict import curve
-
     tre, rp = curve(candidates, known, poses)
     return Plan(
         poses,

@@ -14,19 +14,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import LARGEST_SEED, check_made, whole_number
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.design.candidates import Candidates
 from jaxcal.design.planning import Plan
 from jaxcal.diagnostics.metrics import reconstruction_precision
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import real_array
+from jaxcal.runtime.given_values import LARGEST_SEED, check_made, whole_number
 from jaxcal.runtime.precision import importing_jax, in_own_modes
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.options import Method, PriorName
     from jaxcal.data.problem import Problem
     from jaxcal.design.information import Model
+    from jaxcal.solvers.names import Method, PriorName
     from jaxcal.study.laws import OffsetLaw
 
 MOST_TRIALS = 100_000

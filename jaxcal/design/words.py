@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxcal.calibration.inputs import check_made
 from jaxcal.data.poses import check_poses
 from jaxcal.design.constraints import Constraints
 from jaxcal.design.information import Model
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.given_values import check_made
 
 _LEAST_TILT_DEG, _LEAST_TURN_DEG = 3.0, 5.0
 _DIAGONAL = float(np.tan(np.radians(67.5)))

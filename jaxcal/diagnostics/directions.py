@@ -12,7 +12,7 @@ from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import finite_or_none
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 WORTH = 0.7
 """A kind of further image is advised if it tells at least this share of what the best one tells."""

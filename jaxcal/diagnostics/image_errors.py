@@ -23,9 +23,9 @@ from jaxcal.model.unknowns import RIGID, TINY, further_derivatives, size, split_
 from jaxcal.runtime.array_types import Float
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
     from jaxcal.data.problem import Problem
     from jaxcal.model.unknowns import Blocks
+    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 

@@ -42,9 +42,9 @@ from jaxcal.runtime.array_types import Bool, Float, Int
 from jaxcal.runtime.trees import map_arrays
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
     from jaxcal.data.problem import Problem
     from jaxcal.model.unknowns import Blocks
+    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 

@@ -8,7 +8,7 @@ the unknowns. It is the usual small-sample approximation, and nothing more.
 The target registration error (TRE) at an image point is the distance between the places where the
 estimated and the true calibration put it. To first order it is |J d| with d ~ N(0, C), C the
 covariance of all unknowns that move the point and J the point's derivatives by them
-(:mod:`jaxcal.diagnostics.image_points`); its root mean square is sqrt(trace(J C J')).
+(:mod:`jaxcal.model.image_points`); its root mean square is sqrt(trace(J C J')).
 
 Its distribution: with J C J' = L L', the error is L u rho for a uniformly distributed direction u
 in k dimensions. rho^2 is chi squared, or k F(k, nu) if the SDs were tuned. So
@@ -33,14 +33,14 @@ from scipy import special
 
 from jaxcal import InputError
 from jaxcal.data.sound import WATER_M_S
-from jaxcal.diagnostics.image_points import mean_of_squares, point_jacobian
 from jaxcal.diagnostics.uncertainty import TUNED
+from jaxcal.model.image_points import mean_of_squares, point_jacobian
 from jaxcal.model.unknowns import in_image, size
 from jaxcal.runtime.array_types import AnyArray, Float
 from jaxcal.runtime.arrays import array_module, is_number, is_traced, real_array, traceable
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 DIRECTIONS = 1024
 """Directions over which the distribution of an error is averaged. At a point of the

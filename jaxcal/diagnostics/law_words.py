@@ -11,7 +11,7 @@ from jaxcal.diagnostics.residual_checks import FEWEST_TO_CHECK
 from jaxcal.model.distributions import FAMILIES
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 _FAMILY = {
     "uniform": "uniform between edges",

@@ -15,12 +15,13 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.poses import targets_in_images
 from jaxcal.data.problem import Problem
-from jaxcal.diagnostics.image_points import distance
+from jaxcal.model.image_points import distance
 from jaxcal.runtime.array_types import Float
-from jaxcal.solvers.closed_form.single import ClosedForm, calibrate_closed_form
+from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
+from jaxcal.solvers.closed_form.single import ClosedForm
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 FEWEST, LEAST_SHARE, AGREEING_TIMES, APART_TIMES = 8, 0.2, 2.0, 3.0
 """So many images that were left out, and at least this share of those in use, agree among

@@ -20,7 +20,6 @@ normality; Gelman et al. 2013, chapter 6 (posterior predictive checks).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,52 +28,22 @@ from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import TUNED, Uncertainty, Whitened, inverses, quadratic
 from jaxcal.model.outliers import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
+from jaxcal.result.findings import Inspection
 from jaxcal.runtime.array_types import Bool, Float
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
     from jaxcal.data.problem import Problem
     from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
     from jaxcal.model.unknowns import Blocks
+    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
-
-MISFITS = ("tails", "skewness", "depth", "drift", "trend")
-"""Rows of ``misfit``."""
 
 FEWEST_TO_CHECK = 20
 """With fewer used images the noise model is not checked."""
 
-ADDITIONS = ("tilt lateral", "tilt elevational", "tilt axial", "depth", "sideways")
-"""Kinds of further images: tilted about an image axis, or with the target elsewhere in them."""
-
 TILT_RAD = 0.4363
 SIDEWAYS_MM = 25.0
-
-
-@dataclass(frozen=True)
-class Inspection:
-    """What the residuals show.
-
-    Attributes:
-        outlier: 1 where an image does not fit the rest.
-        departure: errors of lateral position, range and elevational offset in robust SDs of the
-            images in use; 0 where the caller masked the image.
-        range_at_place: range errors of the images in use, in robust SDs of errors at the target's
-            place in the image; 0 with fewer than 20 images in use.
-        kurtosis: of the standardised residuals; 3 for Gaussian ones.
-        misfit: standard normal scores of :data:`MISFITS` for each component; 0 with fewer than 20
-            images in use.
-        gain: SDs by which one more image of each of :data:`ADDITIONS` would notice one unit (1 mm
-            at the lever arm) along the weakest direction.
-    """
-
-    outlier: Float[Array, "*batch n"]
-    departure: Float[Array, "*batch n 3"]
-    range_at_place: Float[Array, "*batch n"]
-    kurtosis: Float[Array, "*batch 3"]
-    misfit: Float[Array, "*batch 5 3"]
-    gain: Float[Array, "*batch 5"]
 
 
 def inspect(
@@ -188,7 +157,7 @@ def stands_out(departure: Float[Array, "k n 3"], kept: Float[Array, "k n"]) -> B
 def check_noise_model(
     residual: Float[Array, "k n 3"], distance: Float[Array, "k n"], mask: Float[Array, "k n"]
 ) -> tuple[Float[Array, "k 3"], Float[Array, "k 5 3"]]:
-    """Kurtosis of standardised residuals, and the scores of :data:`MISFITS`.
+    """Kurtosis of standardised residuals, and the scores of :attr:`Inspection.misfit`.
 
     Args:
         residual: of lateral position, range and offset, each in SDs of its own or of one SD.
@@ -263,7 +232,7 @@ def gains(
     problem: Problem,
     uncertainty: Uncertainty,
 ) -> Float[Array, "k 5"]:
-    """By how many SDs the weakest direction would change one more image of each :data:`ADDITIONS`.
+    """By how many SDs the weakest direction would change one more image: :attr:`Inspection.gain`.
 
     The first three kinds are tilts of 25 degrees either way about the image's axes, from the pose
     nearest to the mean of those in use, with the target at the middle of the used points. The other

@@ -2,51 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxcal import CalibrationError
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
-from jaxcal.diagnostics.residual_checks import Inspection, inspect
+from jaxcal.diagnostics.residual_checks import inspect
 from jaxcal.diagnostics.uncertainty import assess
-from jaxcal.runtime.array_types import Float
+from jaxcal.result.findings import Inspection, Summary
 from jaxcal.runtime.trees import map_arrays
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 
 CHUNK = 128
 """Problems computed at a time, so that their derivatives fit in the processor's caches."""
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Diagnostics of a calibration, or of a batch with leading axes.
-
-    Attributes:
-        elevation_sd: SDs of the offsets, mm; NaN where an offset is on its bound or not known.
-        at_bound: 1 where an offset rests on its bound.
-        residual: q_i - p_i with p_i in the plane, in the image frame, mm; 0 where left out.
-        condition: largest over smallest eigenvalue of the scaled information.
-        weakest: unit vector (scaled units) of the least known direction of all unknowns.
-        weakest_sd: SD along ``weakest``, mm at the lever arm; NaN where there is no finite SD.
-        prior_direction: unit vector (scaled units) that the measurements alone leave open; zeros
-            where there is none.
-        inspection: what the residuals show.
-    """
-
-    elevation_sd: Float[Array, "*batch n"]
-    at_bound: Float[Array, "*batch n"]
-    residual: Float[Array, "*batch n 3"]
-    condition: Float[Array, "*batch"]
-    weakest: Float[Array, "*batch p"]
-    weakest_sd: Float[Array, "*batch"]
-    prior_direction: Float[Array, "*batch p"]
-    inspection: Inspection
 
 
 def summarise(calibration: Calibration) -> Summary:

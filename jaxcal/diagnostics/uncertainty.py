@@ -1,6 +1,6 @@
 """How certain an answer is, and which directions the data do not determine.
 
-The information S of the shared unknowns (:class:`jaxcal.calibration.result.Linearisation`) tells
+The information S of the shared unknowns (:class:`jaxcal.result.calibration.Linearisation`) tells
 how well each direction is known: eigenvectors with small eigenvalues are directions that the images
 barely determine. To compare mm with rad and log units, rotations, scales and sound speed are
 multiplied by the lever arm, the root mean square distance of the measured points from the image
@@ -21,17 +21,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.calibration.options import DEFAULT_MAX_ELEVATION_MM
 from jaxcal.model.thresholds import LARGEST_ELEVATION
 from jaxcal.model.unknowns import TABLE, block_slice
 from jaxcal.runtime.array_types import AnyArray, Bool, Float
 from jaxcal.runtime.arrays import array_module
+from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
     from jaxcal.data.problem import Problem
     from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
     from jaxcal.model.unknowns import Blocks
+    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 

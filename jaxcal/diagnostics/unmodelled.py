@@ -34,8 +34,8 @@ from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.trees import map_arrays
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
     from jaxcal.model.unknowns import Blocks
+    from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
 

@@ -13,7 +13,7 @@ from jaxcal.diagnostics.uncertainty import TUNED
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.result import Calibration
+    from jaxcal.result.calibration import Calibration
 
 IMPLAUSIBLE_RMS_MM = 10.0
 """Residuals with a larger root mean square do not come from a target within the beam."""

@@ -12,7 +12,7 @@ from typing import Literal
 
 from jaxcal import FormatError
 from jaxcal.data.poses import QuaternionOrder
-from jaxcal.io.readable import quoted
+from jaxcal.runtime.messages import quoted
 
 LengthUnit = Literal["mm", "cm", "m"]
 LENGTHS_MM: dict[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0}

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import FormatError, MissingExtraError
-from jaxcal.io.readable import check_readable, naming, one_line, quoted
+from jaxcal.io.readable import check_readable, naming, one_line
+from jaxcal.runtime.messages import quoted
 
 if TYPE_CHECKING:
     from pydicom import Dataset

@@ -11,10 +11,11 @@ import numpy as np
 
 from jaxcal import FormatError, InputError
 from jaxcal.io.png import png_size
-from jaxcal.io.readable import one_line, quoted
+from jaxcal.io.readable import one_line
 from jaxcal.io.sequence import FolderPixels, TrackedSequence
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Int
+from jaxcal.runtime.messages import quoted
 
 MOST_IMAGES = 100_000
 _OTHERS = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".tif", ".tiff"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from jaxcal import FormatError
-from jaxcal.io.readable import quoted
+from jaxcal.runtime.messages import quoted
 
 FramePair = tuple[str, str]
 """(from, to): the transform takes coordinates of the first frame to the second."""

@@ -11,11 +11,12 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.io.folder import rows_by_file
 from jaxcal.io.poses_by_time import times_of_table
-from jaxcal.io.readable import naming, quoted
+from jaxcal.io.readable import naming
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.slicer import pixels_from_markups, read_markups
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Float, Int
+from jaxcal.runtime.messages import quoted
 
 Assignment = Literal["order", "labels"]
 """How points without a time or a frame's number are assigned to frames: one for each frame in

@@ -11,10 +11,10 @@ from jaxcal.io.folder import PROBE_TO_TRACKER, with_pose_table
 from jaxcal.io.frame_names import FramePair, capitalised
 from jaxcal.io.import_options import ImportOptions, refuse
 from jaxcal.io.poses_by_time import Tracking, times_of_table, with_poses_by_time
-from jaxcal.io.readable import quoted
 from jaxcal.io.sequence import FolderPixels, TrackedSequence
 from jaxcal.io.sources import kind_of, read_rows, read_tracked
 from jaxcal.runtime.array_types import Bool, Float
+from jaxcal.runtime.messages import quoted
 
 
 def open_sequence(

@@ -43,7 +43,7 @@ from jaxcal.data.recording import (
     unit_of,
 )
 from jaxcal.io.atomic import atomic_path
-from jaxcal.io.readable import check_readable, naming, path_name, quoted
+from jaxcal.io.readable import check_readable, naming, path_name
 from jaxcal.io.target_search import FATES, FrameResults
 from jaxcal.io.untrusted import (
     Node,
@@ -57,6 +57,7 @@ from jaxcal.io.untrusted import (
     open_root,
     text,
 )
+from jaxcal.runtime.messages import quoted
 
 if TYPE_CHECKING:
     from jaxcal.data.segmentation.segment import Segmentation

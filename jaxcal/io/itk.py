@@ -18,9 +18,10 @@ from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_affine, rotations_from_quaternions
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.lines import text_lines
-from jaxcal.io.readable import check_readable, naming, one_line, quoted
+from jaxcal.io.readable import check_readable, naming, one_line
 from jaxcal.io.untrusted import Node, array, child, group, open_root
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import quoted
 
 _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 _KIND = "AffineTransform_double_3_3"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxcal import FormatError
-from jaxcal.io.readable import check_readable, quoted
+from jaxcal.io.readable import check_readable
 from jaxcal.io.sequence import Pixels, TrackedSequence
 from jaxcal.io.sequence_header import (
     SequenceHeader,
@@ -21,6 +21,7 @@ from jaxcal.io.sequence_header import (
     whole_numbers,
     written_orientation,
 )
+from jaxcal.runtime.messages import quoted
 
 _META_TYPES = {
     "MET_UCHAR": np.dtype("u1"),

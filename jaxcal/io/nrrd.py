@@ -11,7 +11,6 @@ import numpy as np
 
 from jaxcal import FormatError
 from jaxcal.io.pixel_stream import Packing
-from jaxcal.io.readable import quoted
 from jaxcal.io.sequence import Pixels, TrackedSequence
 from jaxcal.io.sequence_header import (
     SequenceHeader,
@@ -24,6 +23,7 @@ from jaxcal.io.sequence_header import (
     whole_numbers,
     written_orientation,
 )
+from jaxcal.runtime.messages import quoted
 
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _NRRD_TYPES = {

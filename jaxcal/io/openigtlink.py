@@ -26,7 +26,16 @@ import numpy as np
 from fastcrc import crc64
 
 from jaxcal.io.grey import grey_of
-from jaxcal.runtime.array_types import Float, Int16, UInt8
+from jaxcal.io.message_content import (
+    Content,
+    ContentError,
+    Picture,
+    StatusMessage,
+    Tracked,
+    TrackedFrame,
+)
+from jaxcal.io.tracked_frame import decode_tracked_frame, encode_tracked_frame
+from jaxcal.runtime.array_types import Float
 
 HEADER_SIZE = 58
 RF_DEVICE = "RF"
@@ -59,62 +68,6 @@ _BIG_ENDIAN, _LITTLE_ENDIAN = 1, 2
 _LPS = 2
 _BYTES = {2: 1, 3: 1, 4: 2, 5: 2, 6: 4, 7: 4, 10: 4, 11: 8}
 _TYPE_LETTERS = frozenset(b"ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_")
-
-Pixels = UInt8[np.ndarray, "height width"] | Int16[np.ndarray, "height width"]
-
-
-@dataclass(frozen=True)
-class Picture:
-    """Content of an IMAGE: a plane of pixels.
-
-    Attributes:
-        array: (height, width), rows downwards; not writable.
-        spacing_mm: [lateral, axial] mm per pixel.
-    """
-
-    array: Pixels
-    spacing_mm: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """A TRANSFORM, or one element of a TDATA.
-
-    Attributes:
-        name: by the convention ``<From>To<To>``, e.g. ``ProbeToTracker``.
-        matrix: (4, 4), mm, as sent: nothing says that it is rigid.
-        status: as PlusServer says it (``OK``, ``OUT_OF_VIEW``...); empty where nothing is said.
-    """
-
-    name: str
-    matrix: Float[np.ndarray, "4 4"]
-    status: str = ""
-
-
-@dataclass(frozen=True)
-class StatusMessage:
-    """Content of a STATUS: code 1 means OK, the others are listed in the protocol."""
-
-    code: int
-    subcode: int
-    name: str
-    text: str
-
-
-@dataclass(frozen=True)
-class TrackedFrame:
-    """Content of PlusServer's TRACKEDFRAME (:mod:`jaxcal.io.tracked_frame`).
-
-    Attributes:
-        picture: the image, turned to the orientation MF; its pixel size is not known (1, 1).
-        transforms: with their statuses.
-    """
-
-    picture: Picture
-    transforms: tuple[Tracked, ...]
-
-
-Content = Picture | tuple[Tracked, ...] | TrackedFrame | StatusMessage | None
 
 
 @dataclass(frozen=True)
@@ -157,10 +110,6 @@ class Message:
     content: Content
     message_id: int = 0
     t_host: float = math.nan
-
-
-class ContentError(ValueError):
-    """A body whose CRC is right and whose content cannot be used; says why."""
 
 
 def parse_header(data: bytes | bytearray | memoryview) -> Header | None:
@@ -239,9 +188,6 @@ def decode_body(header: Header, body: bytes, t_host: float = math.nan) -> Messag
         case "STATUS":
             found = _status(content)
         case "TRACKEDFRAME":
-            # Imported late, since that module imports this one.
-            from jaxcal.io.tracked_frame import decode_tracked_frame
-
             found = decode_tracked_frame(content)
     return Message(header.kind, header.device, header.t_device, found, message_id, t_host)
 
@@ -362,8 +308,6 @@ def encode(message: Message) -> bytes:
         case None:
             content = b""
         case TrackedFrame() if message.kind == "TRACKEDFRAME":
-            from jaxcal.io.tracked_frame import encode_tracked_frame
-
             content = encode_tracked_frame(message.content, message.t_device)
         case _:
             raise ValueError(f"{message.kind} cannot hold {type(message.content).__name__}")

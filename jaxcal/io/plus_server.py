@@ -21,9 +21,10 @@ from jaxcal import FormatError, InputError
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.openigtlink import HEADER_SIZE, Message, encode_header, parse_header
 from jaxcal.io.plus import update_transform_command
-from jaxcal.io.readable import one_line, quoted
+from jaxcal.io.readable import one_line
 from jaxcal.io.xml import parse_xml
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import quoted
 
 PORT = 18944
 

@@ -1,4 +1,4 @@
-"""Checks of a file before it is opened; values and contents of files, short, for messages."""
+"""Checks of a file before it is opened; its name and the words of errors, for messages."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from jaxcal import FormatError, InputError
+from jaxcal.runtime.messages import shown
 
 
 def path_name(path: object) -> str:
@@ -72,16 +73,6 @@ def one_line(error: Exception) -> str:
     elif isinstance(error, KeyError) and error.args:
         text = str(error.args[0])  # a KeyError's str is quoted
     return " ".join(text.split()) or type(error).__name__
-
-
-def quoted(text: str, limit: int = 40) -> str:
-    """Text of an untrusted file, short and with control characters escaped, for a message."""
-    return ascii(text if len(text) <= limit else f"{text[:limit]}...")
-
-
-def shown(value: object) -> str:
-    """What a caller gave, short, for a message."""
-    return quoted(value) if isinstance(value, str) else quoted(repr(value))[1:-1]
 
 
 @contextmanager

@@ -17,8 +17,8 @@ import numpy as np
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_poses, quaternion_from_rotation, rotations_from_quaternions
 from jaxcal.io.lines import text_lines
-from jaxcal.io.readable import quoted
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import quoted
 
 _KEYS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_/]*")

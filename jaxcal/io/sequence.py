@@ -20,8 +20,9 @@ from jaxcal.io.columns import LENGTHS_MM, LengthUnit
 from jaxcal.io.frame_names import FramePair, path_between
 from jaxcal.io.grey import grey_of
 from jaxcal.io.pixel_stream import Packing, PixelStream
-from jaxcal.io.readable import naming, quoted
+from jaxcal.io.readable import naming
 from jaxcal.runtime.array_types import Bool, Float, Int
+from jaxcal.runtime.messages import quoted
 
 Orientation = Literal["MF", "UF", "MN", "UN"]
 """Orientation of stored pixels. M or U: a row ends at the marked or the unmarked side. F or N: a

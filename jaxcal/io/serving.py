@@ -11,7 +11,8 @@ from collections.abc import Callable
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.io.openigtlink import Message, Tracked, encode
+from jaxcal.io.message_content import Tracked
+from jaxcal.io.openigtlink import Message, encode
 from jaxcal.runtime.array_types import Float
 
 PORT = 18945

@@ -18,8 +18,9 @@ import numpy as np
 
 from jaxcal import FormatError
 from jaxcal.io.lines import text_lines
-from jaxcal.io.readable import check_readable, naming, one_line, quoted
+from jaxcal.io.readable import check_readable, naming, one_line
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import quoted
 
 MAXIMUM_BYTES = 16 * 2**20
 MOST_POINTS = 100_000

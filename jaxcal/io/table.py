@@ -12,8 +12,8 @@ import numpy as np
 
 from jaxcal import FormatError
 from jaxcal.io.lines import text_lines
-from jaxcal.io.readable import quoted
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.messages import quoted
 
 _NUMBER = re.compile(
     r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.I

@@ -17,9 +17,10 @@ from jaxcal import FormatError, InputError
 from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quaternions
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
-from jaxcal.io.readable import naming, quoted
+from jaxcal.io.readable import naming
 from jaxcal.io.table import Table, read_table
 from jaxcal.runtime.array_types import Float, Int
+from jaxcal.runtime.messages import quoted
 
 _LATEST_S = 1e11
 """Latest time, s after any beginning: three thousand years. Stamps in ms or ns are beyond it."""

@@ -24,7 +24,7 @@ import numpy as np
 from jaxcal import FormatError
 from jaxcal.io.frame_names import split_name
 from jaxcal.io.grey import grey_of
-from jaxcal.io.openigtlink import ContentError, Picture, Tracked, TrackedFrame
+from jaxcal.io.message_content import ContentError, Picture, Tracked, TrackedFrame
 from jaxcal.io.xml import parse_xml
 
 _HEAD = struct.Struct(">HHH3HIIH64s")

@@ -21,9 +21,10 @@ from jaxcal.data.poses import rotations_from_quaternions
 from jaxcal.io.columns import LENGTHS_MM, LengthUnit
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.lines import text_lines
-from jaxcal.io.readable import naming, quoted
+from jaxcal.io.readable import naming
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.table import parse_number
+from jaxcal.runtime.messages import quoted
 
 TRACKER = "Tracker"
 _BEGINNING = re.compile(r"(Tools|Format Version)\s*[,;\t]")

@@ -21,7 +21,8 @@ from h5py import h5a, h5d, h5g, h5l, h5o, h5s, h5t, h5z  # pyright: ignore[repor
 
 from jaxcal import CalibrationError, FormatError
 from jaxcal.io.heap import CheckedFile
-from jaxcal.io.readable import one_line, quoted
+from jaxcal.io.readable import one_line
+from jaxcal.runtime.messages import quoted
 
 MAXIMUM_BYTES = 2**28
 """Largest array, and largest chunk of one, that is read: 256 MiB."""

@@ -15,7 +15,8 @@ from pathlib import Path
 from xml.parsers import expat
 
 from jaxcal import FormatError
-from jaxcal.io.readable import check_readable, naming, one_line, quoted
+from jaxcal.io.readable import check_readable, naming, one_line
+from jaxcal.runtime.messages import quoted
 
 MAXIMUM_BYTES = 8 * 2**20
 """Largest file that is read; a configuration of PLUS has some 10 kB, a result of fCal 1 MB."""

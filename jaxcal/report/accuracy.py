@@ -19,14 +19,12 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.result import Calibration
 from jaxcal.data.poses import targets_in_images
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LARGEST, Recording
 from jaxcal.design.candidates import seen_region
 from jaxcal.design.constraints import Region
 from jaxcal.diagnostics.image_errors import Unknowns
-from jaxcal.diagnostics.image_points import distance, mean_of_squares
 from jaxcal.diagnostics.influence import (
     KINDS,
     Influence,
@@ -43,11 +41,13 @@ from jaxcal.diagnostics.intervals import (
 )
 from jaxcal.diagnostics.left_out import left_out
 from jaxcal.diagnostics.unmodelled import unmodelled
+from jaxcal.model.image_points import distance, mean_of_squares
 from jaxcal.report.contradictions import contradictions
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import real_array
 from jaxcal.runtime.trees import map_arrays
-from jaxcal.solvers.closed_form.single import calibrate_closed_form
+from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 
 GOOD_MM = 0.5
 """Largest error to expect at the image (root mean square) that is called good."""

@@ -9,11 +9,11 @@ import numpy as np
 
 from jaxcal import InputError
 from jaxcal.calibration.dependence import independent
-from jaxcal.calibration.result import Calibration
 from jaxcal.data.recording import Images, Recording
 from jaxcal.model.unknowns import EXTRA
+from jaxcal.result.calibration import Calibration
+from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 from jaxcal.solvers.closed_form.certificate import Certificate, certify
-from jaxcal.solvers.closed_form.single import calibrate_closed_form
 
 
 def certificate_record(result: Calibration, recording: Recording) -> dict[str, Any]:

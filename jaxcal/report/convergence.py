@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxcal.calibration.calibrate import calibrate
-from jaxcal.calibration.options import Options
-from jaxcal.calibration.result import Calibration
 from jaxcal.data.problem import Problem
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import AnyArray, Float
+from jaxcal.solvers.plan import Options
 
 KEPT = 200
 """Number of iterations that are drawn."""

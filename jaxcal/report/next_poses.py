@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError, design
-from jaxcal.calibration.result import Calibration
 from jaxcal.data.recording import Recording
 from jaxcal.report.paragraphs import listed
+from jaxcal.result.calibration import Calibration
 
 COUNT = 3
 _CANDIDATES = 2000

@@ -19,8 +19,6 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.result import Calibration
-from jaxcal.calibration.saved import SaveFormat, transform_from_record
 from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Recording
 from jaxcal.diagnostics.metrics import reconstruct
@@ -42,6 +40,9 @@ from jaxcal.report.verdict import (
     where,
     why_larger,
 )
+from jaxcal.result.calibration import Calibration
+from jaxcal.result.saved import transform_from_record
+from jaxcal.result.transform import SaveFormat
 from jaxcal.runtime.array_types import Float
 
 MOST_POSES, MOST_PLANES = 300, 60

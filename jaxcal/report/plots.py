@@ -15,14 +15,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from jaxcal import InputError
-from jaxcal.calibration.result import Calibration
 from jaxcal.data.poses import targets_in_images
-from jaxcal.diagnostics.image_points import mean_of_squares
 from jaxcal.diagnostics.influence import KINDS, in_image, influence_of
 from jaxcal.diagnostics.intervals import image_jacobian, tre_at
 from jaxcal.diagnostics.outliers import outliers
+from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.accuracy import region_of
 from jaxcal.report.summary import recording_of
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import real_array
 

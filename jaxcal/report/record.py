@@ -9,8 +9,6 @@ import numpy as np
 
 import jaxcal
 from jaxcal import InputError
-from jaxcal.calibration.result import Calibration
-from jaxcal.calibration.saved import FORMAT, VERSION
 from jaxcal.data.poses import rotation_angle
 from jaxcal.data.recording import Images, Recording, Truth
 from jaxcal.diagnostics.law_words import offset_law
@@ -20,6 +18,8 @@ from jaxcal.diagnostics.outliers import outlier_reasons, outliers, suspects
 from jaxcal.model.unknowns import in_image, tangent_names
 from jaxcal.report.accuracy import accuracy_record, settle
 from jaxcal.report.certified import certificate_record
+from jaxcal.result.calibration import Calibration
+from jaxcal.result.saved import FORMAT, VERSION
 from jaxcal.runtime.array_types import Float
 
 CONVENTION = {

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.calibration.result import Calibration
 from jaxcal.report.accuracy import stated_at
 from jaxcal.report.record import plain
+from jaxcal.result.calibration import Calibration
 
 if TYPE_CHECKING:
     from jaxcal.calibration.resampling import Bootstrap, CrossValidation

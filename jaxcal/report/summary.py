@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from jaxcal import CalibrationError
-from jaxcal.calibration.result import Calibration
 from jaxcal.data.poses import targets_in_images
 from jaxcal.data.recording import Images, Recording
 from jaxcal.report.record import calibration_record
+from jaxcal.result.calibration import Calibration
 
 
 def recording_of(calibration: Calibration) -> Recording:

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from jaxcal import CalibrationError, FormatError, InputError, OutputError
-from jaxcal.calibration.result import Calibration
-from jaxcal.calibration.saved import is_calibration_record
 from jaxcal.data.recording import Recording
 from jaxcal.io.atomic import STAGED, replace_files, write_text
 from jaxcal.io.readable import one_line, path_name
 from jaxcal.report.convergence import Curve
 from jaxcal.report.verdict import verdict
+from jaxcal.result.calibration import Calibration
+from jaxcal.result.saved import is_calibration_record
 
 COLUMNS = (
     "image",

@@ -13,9 +13,6 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any, TypeVar
 
-import numpy as np
-
-from jaxcal.data.problem import Problem
 from jaxcal.runtime.trees import assembled
 
 T = TypeVar("T")
@@ -35,31 +32,18 @@ def size(count: int) -> int:
     return bucket
 
 
-def padded(problem: Problem) -> Problem:
-    """The problem filled up with masked images to its bucket's size; numpy arrays if it grows.
-
-    Args:
-        problem: one, or a batch.
-    """
-    more = size(problem.images) - problem.images
-    if not more:
-        return problem
-    rows = [*range(problem.images), *[problem.images - 1] * more]  # a masked pose must be rigid
-    mask = np.asarray(problem.mask)
-    mask = np.concatenate([mask, np.zeros((*mask.shape[:-1], more), mask.dtype)], axis=-1)
-    longer = taken(problem, rows)
-    parts = {field.name: getattr(longer, field.name) for field in fields(longer)}
-    return assembled(Problem, parts | {"mask": mask})
-
-
-def taken(problem: Problem, rows: list[int]) -> Problem:
-    """Some images of a problem, in numpy arrays.
-
-    Args:
-        problem: without leading axes.
-        rows: which images, in order; one may occur several times.
-    """
-    return _each_image(problem, lambda values, axis: np.take(np.asarray(values), rows, axis))
+def each_image(tree: Any, change: Callable[[Any, int], Any]) -> Any:
+    """The tree with ``change`` applied to every array that has an axis of images."""
+    changed: dict[str, Any] = {}
+    for field in fields(tree):
+        value = getattr(tree, field.name)
+        axis = _axis_of_images(str(field.type))
+        if is_dataclass(value):
+            value = each_image(value, change)
+        elif value is not None and axis is not None:
+            value = change(value, axis)
+        changed[field.name] = value
+    return assembled(type(tree), changed)
 
 
 def cut(result: T, images: int) -> T:
@@ -75,21 +59,7 @@ def cut(result: T, images: int) -> T:
         rows[axis] = slice(0, images)
         return values[tuple(rows)]
 
-    return _each_image(result, first)
-
-
-def _each_image(tree: Any, change: Callable[[Any, int], Any]) -> Any:
-    """The tree with ``change`` applied to every array that has an axis of images."""
-    changed: dict[str, Any] = {}
-    for field in fields(tree):
-        value = getattr(tree, field.name)
-        axis = _axis_of_images(str(field.type))
-        if is_dataclass(value):
-            value = _each_image(value, change)
-        elif value is not None and axis is not None:
-            value = change(value, axis)
-        changed[field.name] = value
-    return assembled(type(tree), changed)
+    return each_image(result, first)
 
 
 @cache

@@ -31,11 +31,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import whole_number
-from jaxcal.calibration.options import MOST_STEPS
 from jaxcal.model import unrolled
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import is_traced, real_array
+from jaxcal.runtime.given_values import whole_number
 from jaxcal.solvers.levenberg_marquardt import (
     IDLE,
     LARGEST_DAMPING,
@@ -45,6 +44,7 @@ from jaxcal.solvers.levenberg_marquardt import (
     iterate_once,
 )
 from jaxcal.solvers.normal_equations import Normal
+from jaxcal.solvers.plan import MOST_STEPS
 
 
 class Flat(eqx.Module):

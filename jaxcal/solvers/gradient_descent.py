@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from jaxcal.calibration.options import Options
 from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import Further, InPlane
 from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate
 from jaxcal.solvers.other import Fit
+from jaxcal.solvers.plan import Options
 
 
 class SteepestDescent(optx.AbstractGradientDescent):

@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.calibration.options import DEFAULT_MAX_ELEVATION_MM, Given, Options, SolvePlan
 from jaxcal.data.problem import Problem
 from jaxcal.data.sound import WATER_M_S
 from jaxcal.model.batch import ImagePlanes, Iterate
@@ -40,6 +39,7 @@ from jaxcal.solvers.auto import average_over_laws
 from jaxcal.solvers.gradient_descent import pairwise_gradient
 from jaxcal.solvers.levenberg_marquardt import minimise
 from jaxcal.solvers.other import minimise_with, self_tuned_with
+from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Given, Options, SolvePlan
 from jaxcal.solvers.reml import floored, self_tuned
 from jaxcal.solvers.start import ConventionalStart, GivenStart, conventional
 

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxcal.calibration.options import Options
 from jaxcal.model.batch import ImagePlanes, Iterate, choose, targets
 from jaxcal.model.observations import Further, MediumPrior, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
 from jaxcal.solvers.normal_equations import accumulate, component_sums
+from jaxcal.solvers.plan import Options
 from jaxcal.solvers.reml import update_at, with_floor
 
 

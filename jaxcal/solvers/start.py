@@ -33,7 +33,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxcal.calibration.conventional import Start
 from jaxcal.data.geometry import orthonormal_pair
 from jaxcal.model import unrolled
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose, total
@@ -42,6 +41,7 @@ from jaxcal.model.parameters import Parameters
 from jaxcal.model.unknowns import EXTRA, TABLE, Blocks
 from jaxcal.runtime.compiler import traced_once
 from jaxcal.solvers import dense
+from jaxcal.solvers.closed_form.start import Start
 from jaxcal.solvers.levenberg_marquardt import Descent, minimise
 
 LEAST_PIVOT = 1e-10

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from jaxcal.study.own import ArraySpec as ArraySpec
+    from jaxcal.study.own import Chunk as Chunk
     from jaxcal.study.own import Study as Study
     from jaxcal.study.results import open_results as open_results
     from jaxcal.study.run import run_study as run_study
-    from jaxcal.study.spec import Chunk as Chunk
     from jaxcal.study.spec import Spec as Spec
     from jaxcal.study.spec import load_spec as load_spec
 
 _HOME = {
     "ArraySpec": "jaxcal.study.own",
-    "Chunk": "jaxcal.study.spec",
+    "Chunk": "jaxcal.study.own",
     "Spec": "jaxcal.study.spec",
     "Study": "jaxcal.study.own",
     "load_spec": "jaxcal.study.spec",

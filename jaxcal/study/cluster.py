@@ -30,9 +30,9 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from jaxcal import CalibrationError, InputError, MissingExtraError, __version__
-from jaxcal.io.readable import one_line, quoted
-from jaxcal.study.own import Study, computed, study_from, where_defined
-from jaxcal.study.spec import Chunk
+from jaxcal.io.readable import one_line
+from jaxcal.runtime.messages import quoted
+from jaxcal.study.own import Chunk, Study, computed, study_from, where_defined
 
 if TYPE_CHECKING:
     from distributed import Client, Future

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 from jaxcal import InputError
-from jaxcal.io.readable import shown
+from jaxcal.runtime.messages import shown
 
 OffsetLaw = Literal[
     "uniform",

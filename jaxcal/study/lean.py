@@ -15,14 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from jaxcal.calibration.options import (
-    Method,
-    Options,
-    PriorName,
-    Request,
-    prepare,
-    with_bound,
-)
+from jaxcal.calibration.options import Request, prepare, with_bound
 from jaxcal.calibration.pipeline import solve_problems
 from jaxcal.data.geometry import chord_angle
 from jaxcal.data.problem import Problem
@@ -30,6 +23,8 @@ from jaxcal.data.segmentation.deviations import fit_deviations
 from jaxcal.model import unrolled
 from jaxcal.model.batch import ImagePlanes, Iterate, targets, total
 from jaxcal.model.unknowns import RIGID
+from jaxcal.solvers.names import Method, PriorName
+from jaxcal.solvers.plan import Options
 from jaxcal.solvers.start import ConventionalStart, conventional
 from jaxcal.study.simulation import Protocol, arrange, draw, draw_noise
 

@@ -15,14 +15,21 @@ import importlib
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from jaxcal import InputError
 
-if TYPE_CHECKING:
-    from jaxcal.study.spec import Chunk
+
+@dataclass(frozen=True)
+class Chunk:
+    """Trials ``start`` to ``stop`` (exclusive) of one condition; ``index`` names the file."""
+
+    index: int
+    condition: int
+    start: int
+    stop: int
 
 
 @dataclass(frozen=True)

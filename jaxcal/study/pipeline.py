@@ -28,17 +28,18 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
 import jaxcal
-from jaxcal.calibration.options import Options
 from jaxcal.data.probe import LinearProbe
 from jaxcal.model.batch import Iterate
 from jaxcal.runtime.compiler import fast_to_run, single_threaded
 from jaxcal.runtime.precision import in_own_modes
+from jaxcal.solvers.plan import Options
 from jaxcal.solvers.start import ConventionalStart
 from jaxcal.study.laws import OffsetLaw
 from jaxcal.study.lean import Experiments, Kind, Measured, begin, experiments, solve
 from jaxcal.study.offsets import nominal_bound
+from jaxcal.study.own import Chunk
 from jaxcal.study.simulation import Protocol
-from jaxcal.study.spec import Chunk, Condition, MethodSpec, Spec
+from jaxcal.study.spec import Condition, MethodSpec, Spec
 
 LANES = {"cpu": 64}
 """Trials drawn or solved side by side on a device; on a CPU what they need stays in its caches."""

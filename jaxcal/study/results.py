@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import FormatError, MissingExtraError
-from jaxcal.calibration.result import Status
+from jaxcal.result.calibration import Status
 from jaxcal.study.pipeline import COMPONENTS, bound_mm
 from jaxcal.study.spec import UNITS, Spec
 from jaxcal.study.store import Store

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 from jaxcal import FormatError, InputError, OutputError
-from jaxcal.calibration.inputs import check_flag, whole_number
-from jaxcal.io.readable import one_line, shown
+from jaxcal.io.readable import one_line
+from jaxcal.runtime.given_values import check_flag, whole_number
 from jaxcal.runtime.interrupts import no_interrupt_lost
+from jaxcal.runtime.messages import shown
 from jaxcal.study.cluster import compute_on_cluster, connected
-from jaxcal.study.own import Study, computed
-from jaxcal.study.spec import Chunk
+from jaxcal.study.own import Chunk, Study, computed
 from jaxcal.study.store import Store
 
 if TYPE_CHECKING:

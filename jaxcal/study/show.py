@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.calibration.result import Status
+from jaxcal.result.calibration import Status
 from jaxcal.study.pipeline import bound_mm
 from jaxcal.study.spec import Condition, Spec
 from jaxcal.study.store import Store

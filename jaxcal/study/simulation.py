@@ -24,24 +24,24 @@ import numpy as np
 from jaxtyping import Array, Complex64, Float, Int, Key
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import (
-    LARGEST_SEED,
-    check_flag,
-    check_key,
-    check_made,
-    whole_number,
-)
 from jaxcal.data.geometry import matrix_from_rotation
 from jaxcal.data.probe import L14_5, CurvilinearProbe, Probe, check_probe
 from jaxcal.data.problem import Channels, Problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, Truth, make_images
 from jaxcal.data.segmentation.deviations import fit_deviations, halves
 from jaxcal.data.segmentation.time_of_flight import fit_in_plane
-from jaxcal.io.readable import shown
 from jaxcal.model import unrolled
 from jaxcal.runtime import executables
 from jaxcal.runtime.arrays import is_number, is_traced
 from jaxcal.runtime.compiler import ONE_PROBLEM, computed_once
+from jaxcal.runtime.given_values import (
+    LARGEST_SEED,
+    check_flag,
+    check_key,
+    check_made,
+    whole_number,
+)
+from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import in_own_modes, require_float64
 from jaxcal.study import draws
 from jaxcal.study.laws import OffsetLaw, check_law

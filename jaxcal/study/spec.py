@@ -60,22 +60,16 @@ from typing import Any
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import whole_number
-from jaxcal.calibration.names import Method, PriorName
-from jaxcal.calibration.options import (
-    ALTERNATION,
-    DEFAULT_MAX_ELEVATION_MM,
-    Options,
-    Prior,
-    Request,
-    check_alternation,
-    check_request,
-)
+from jaxcal.calibration.options import ALTERNATION, Request, check_alternation, check_request
 from jaxcal.data.probe import LinearProbe
-from jaxcal.io.readable import naming, quoted, shown
+from jaxcal.io.readable import naming
 from jaxcal.io.toml import load_toml, parse_toml
+from jaxcal.runtime.given_values import whole_number
+from jaxcal.runtime.messages import quoted, shown
+from jaxcal.solvers.names import Method, PriorName
+from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Options, Prior
 from jaxcal.study.laws import OffsetLaw, check_law
-from jaxcal.study.own import ArraySpec
+from jaxcal.study.own import ArraySpec, Chunk
 
 MAXIMUM_BYTES = 2**20
 """Largest spec that is read."""
@@ -216,16 +210,6 @@ class MethodSpec:
         return check_request(
             Request(self.method, self.prior, self.bound_given, options=self.options)
         )
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """Trials ``start`` to ``stop`` (exclusive) of one condition; ``index`` names the file."""
-
-    index: int
-    condition: int
-    start: int
-    stop: int
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,8 @@ from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.readable import check_readable, one_line, path_name
 from jaxcal.io.untrusted import array, child, number, open_root, text
-from jaxcal.study.own import Study
-from jaxcal.study.spec import MAXIMUM_BYTES, Chunk, Spec
+from jaxcal.study.own import Chunk, Study
+from jaxcal.study.spec import MAXIMUM_BYTES, Spec
 
 FORMAT = "jaxcal-study-chunk"
 VERSION = 1

@@ -25,8 +25,7 @@ from jaxcal import CalibrationError
 from jaxcal.io.readable import one_line
 from jaxcal.runtime import jax_cache
 from jaxcal.runtime.isolated import python_command
-from jaxcal.study.own import Study, computed, study_from, where_defined
-from jaxcal.study.spec import Chunk
+from jaxcal.study.own import Chunk, Study, computed, study_from, where_defined
 
 MOST_DEATHS = 3
 """Workers that may die over one chunk before the study gives up."""

@@ -18,7 +18,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from jaxcal.io.openigtlink import Message, Picture, Tracked, TrackedFrame, encode
+from jaxcal.io.message_content import Picture, Tracked, TrackedFrame
+from jaxcal.io.openigtlink import Message, encode
 
 ROWS, COLUMNS = 120, 160
 SPACING_MM = (0.25, 0.2)

@@ -14,16 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hw.ultrasound.framing import MessageDecoder
-from jaxcal.io.openigtlink import (
-    HEADER_SIZE,
-    MAXIMUM_BODY,
-    Message,
-    Picture,
-    StatusMessage,
-    Tracked,
-    encode,
-    parse_header,
-)
+from jaxcal.io.message_content import Picture, StatusMessage, Tracked
+from jaxcal.io.openigtlink import HEADER_SIZE, MAXIMUM_BODY, Message, encode, parse_header
 
 pyigtl = pytest.importorskip("pyigtl", reason="pyigtl, the independent implementation")
 

@@ -16,7 +16,8 @@ import pytest
 from test_world import placed
 
 import jaxcal
-from hw.bench.frames import COLUMNS, DECIBELS, Camera, Look
+from hw.bench.frames import COLUMNS, DECIBELS, Camera
+from hw.bench.look import Look
 from hw.bench.phantoms import ActiveEcho, Hydrophone, phantom_named
 from hw.bench.stage import WorldStage
 from hw.bench.world import make_world

@@ -13,7 +13,8 @@ pytest.importorskip("pyigtl", reason="pyigtl is not installed (jaxcal[test])")
 import pyigtl
 
 from hw.ultrasound.framing import MessageDecoder
-from jaxcal.io.openigtlink import Message, Picture, Tracked, TrackedFrame, encode
+from jaxcal.io.message_content import Picture, Tracked, TrackedFrame
+from jaxcal.io.openigtlink import Message, encode
 
 RNG = np.random.default_rng(0)
 IMAGE = RNG.integers(0, 256, (5, 7), np.uint8)

@@ -19,7 +19,8 @@ from hw.bench.ultrasound import ImageServer
 from hw.clock import Clock
 from hw.errors import DeviceError, LostError, StaleError
 from hw.ultrasound import Image, UltrasoundStream
-from jaxcal.io.openigtlink import HEADER_SIZE, Message, Picture, StatusMessage, encode
+from jaxcal.io.message_content import Picture, StatusMessage
+from jaxcal.io.openigtlink import HEADER_SIZE, Message, encode
 
 RNG = np.random.default_rng(11)
 PATIENCE_S = 600.0

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import jaxcal
-from hw.bench.frames import COLUMNS, ROWS, Camera, Look
+from hw.bench.frames import COLUMNS, ROWS, Camera
+from hw.bench.look import Look
 from hw.bench.world import FULL_SCALE, make_world
 from hw.midplane.pattern_injection import bar
 from hw.poses import plan_poses

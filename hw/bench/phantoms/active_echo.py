@@ -9,16 +9,13 @@ the sound (:meth:`hw.bench.world.World.shift_mm`), and its mark is wider than a 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hw.bench.phantoms.phantom import ELEMENT_MM, Mark, Sensor
+from hw.bench.look import Look
+from hw.bench.phantoms.phantom import Mark, Sensor
+from hw.bench.tank import ELEMENT_MM, Tank
 from hw.shapes import Float
-
-if TYPE_CHECKING:
-    from hw.bench.frames import Look
-    from hw.bench.world import World
 
 
 @dataclass(frozen=True)
@@ -37,7 +34,7 @@ class ActiveEcho(Sensor):
 
     def marks(
         self,
-        world: World,
+        world: Tank,
         pose: Float[np.ndarray, "4 4"],
         look: Look,
         rng: np.random.Generator,

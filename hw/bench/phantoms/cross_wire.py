@@ -13,16 +13,13 @@ by 0.6 to 0.8 px, about 0.1 mm (jaxcal.data.segmentation.image, measured on a re
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hw.bench.look import Look
 from hw.bench.phantoms.phantom import Mark, Phantom, two_way
+from hw.bench.tank import Tank
 from hw.shapes import Float
-
-if TYPE_CHECKING:
-    from hw.bench.frames import Look
-    from hw.bench.world import World
 
 WIRE_MM = 0.2
 """Diameter of the fishing lines (section 3.2)."""
@@ -57,13 +54,13 @@ class CrossWire(Phantom):
     answers = False
     target = "cross"
 
-    def loudness(self, world: World, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
+    def loudness(self, world: Tank, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
         """Silence: there is no sensor."""
         return np.zeros(world.probe.elements)
 
     def marks(
         self,
-        world: World,
+        world: Tank,
         pose: Float[np.ndarray, "4 4"],
         look: Look,
         rng: np.random.Generator,

@@ -8,16 +8,13 @@ that the sensor's noise is a hundredth of the peak. In the image its tip is a fa
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hw.bench.look import Look
 from hw.bench.phantoms.phantom import Mark, Sensor, two_way
+from hw.bench.tank import Tank
 from hw.shapes import Float
-
-if TYPE_CHECKING:
-    from hw.bench.frames import Look
-    from hw.bench.world import World
 
 APERTURE_MM = 0.01
 """Receiving aperture (section 3.2)."""
@@ -43,13 +40,13 @@ class Hydrophone(Sensor):
     answers = False
     target = "echo"
 
-    def noise_counts(self, world: World) -> float:
+    def noise_counts(self, world: Tank) -> float:
         """The amplitude in the mid-plane times least pressure over the pressure there, counts."""
         return world.beam.peak * LEAST_PRESSURE_MPA / PRESSURE_MPA
 
     def marks(
         self,
-        world: World,
+        world: Tank,
         pose: Float[np.ndarray, "4 4"],
         look: Look,
         rng: np.random.Generator,

@@ -3,7 +3,7 @@
 At a true pose of the probe, a phantom says two things: how loud each transmitted line is at its
 sensor (the electronics), and which marks it leaves in a B-mode frame (the image).
 
-The probe's field across the image plane is Gaussian. :class:`hw.bench.world.Beam` states the
+The probe's field across the image plane is Gaussian. :class:`hw.bench.tank.Beam` states the
 profile that the electronics of the paper's element report; that element averages over its own
 diameter, so the field itself is thinner:
 
@@ -17,18 +17,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
+from hw.bench.look import Look
+from hw.bench.tank import ELEMENT_MM, Tank
 from hw.shapes import Float
-
-if TYPE_CHECKING:
-    from hw.bench.frames import Look
-    from hw.bench.world import World
-
-ELEMENT_MM = 2.08
-"""Outer diameter of the paper's PZT5H tube, mm (section 3.2)."""
 
 _RANGE_OF_PEAK_MM = 20.0
 """Range at which the beam's peak amplitude is stated, mm."""
@@ -79,18 +74,18 @@ class Phantom(ABC):
         """SD of the mid-plane shift of its response, relative to that of the paper's element."""
         return 0.0
 
-    def noise_counts(self, world: World) -> float:
+    def noise_counts(self, world: Tank) -> float:
         """SD of the electronics' own noise with this sensor, counts."""
         return world.noise.amplitude_counts
 
     @abstractmethod
-    def loudness(self, world: World, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
+    def loudness(self, world: Tank, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
         """Amplitude of every line at its sensor, without noise or saturation, counts."""
 
     @abstractmethod
     def marks(
         self,
-        world: World,
+        world: Tank,
         pose: Float[np.ndarray, "4 4"],
         look: Look,
         rng: np.random.Generator,
@@ -124,11 +119,11 @@ class Sensor(Phantom):
         """In proportion to its size (assumption): a point hears the most in the mid-plane."""
         return self.size_mm / ELEMENT_MM
 
-    def width_mm(self, world: World, range_mm: np.ndarray | float) -> np.ndarray | float:
+    def width_mm(self, world: Tank, range_mm: np.ndarray | float) -> np.ndarray | float:
         """Elevational SD of the amplitude that it reports, mm."""
         return np.hypot(world.beam.field_mm(range_mm), self.size_mm / np.sqrt(12.0))
 
-    def loudness(self, world: World, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
+    def loudness(self, world: Tank, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
         """Amplitude of every line at it, counts; 0 behind the probe."""
         lateral, elevation, axial = world.target(pose)
         elements = world.elements
@@ -136,13 +131,15 @@ class Sensor(Phantom):
             return np.zeros(len(elements))
         across = lateral - elements
         distance = np.hypot(across, axial)
-        off = (elevation - world.shift_mm(pose)) / self.width_mm(world, distance)
+        off = (elevation - world.response_shift_mm(pose, self.response_scale)) / self.width_mm(
+            world, distance
+        )
         gain = world.beam.peak * np.sqrt(_RANGE_OF_PEAK_MM / distance)
         return gain * np.exp(-0.5 * off**2) * (axial / distance) ** world.beam.directivity
 
 
 def two_way(
-    world: World, elevation_mm: np.ndarray | float, range_mm: np.ndarray | float
+    world: Tank, elevation_mm: np.ndarray | float, range_mm: np.ndarray | float
 ) -> np.ndarray | float:
     """Echo of a passive point relative to the mid-plane: the square of the one-way field."""
     off = np.asarray(elevation_mm, float) / world.beam.field_mm(range_mm)

@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import check_flag, whole_number
 from jaxcal.data.probe import MOST_ELEMENTS, CurvilinearProbe, Probe, check_probe
 from jaxcal.data.recording import (
     MINIMUM_IMAGES,
@@ -32,11 +31,12 @@ from jaxcal.data.segmentation.time_of_flight import (
     fit_out_of_plane,
     shortest,
 )
-from jaxcal.io.readable import shown
 from jaxcal.runtime import buckets, executables
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import is_number
 from jaxcal.runtime.compiler import ONE_PROBLEM, batch_wishes, fast_to_run
+from jaxcal.runtime.given_values import check_flag, whole_number
+from jaxcal.runtime.messages import shown
 from jaxcal.runtime.precision import in_own_modes
 
 Method = Literal["least-squares", "shortest"]

@@ -24,8 +24,9 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import write_text
-from jaxcal.io.readable import check_readable, quoted
+from jaxcal.io.readable import check_readable
 from jaxcal.io.text import read_pose_table
+from jaxcal.runtime.messages import quoted
 
 _HEAD = "# jaxcal pick of "
 _SKIPPED = "# skipped:"

@@ -44,7 +44,7 @@ from jaxcal.solvers.closed_form.reduced_objective import (
     QuadraticConstraints,
     check_estimate,
 )
-from jaxcal.solvers.closed_form.single import ClosedForm, calibrate_closed_form
+from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 
 LANES = 256
 """Problems in one call of the compiled program."""
@@ -129,7 +129,7 @@ def _concrete(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
     for lane in np.flatnonzero(~answer.certified):
         one = jax.tree.map(lambda leaf, lane=lane: leaf[lane], problems)
         try:
-            alone = calibrate_closed_form(one, estimate=estimate)
+            alone = solve_problem(one, estimate)
         except InputError:
             continue
         for name in _FIELDS:

@@ -36,7 +36,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal.runtime.array_types import Float
-from jaxcal.runtime.arrays import is_traced
 from jaxcal.solvers.closed_form.certificate import Certificate, certify_point, tolerance
 from jaxcal.solvers.closed_form.reduced_objective import (
     ImageData,
@@ -96,31 +95,10 @@ class ClosedForm:
     unique: Numbers
 
 
-def calibrate_closed_form(
-    problem: Problem | Recording | Images, *, estimate: tuple[str, ...] = ()
+def solve_problem(
+    problem: Problem | Recording | Images, estimate: tuple[str, ...] = ()
 ) -> ClosedForm:
-    """Conventional calibration (Eq. 7) in closed form, with a certificate.
-
-    One problem is solved by numpy alone. A batch, and a problem that ``jax.jit``, ``jax.vmap`` or
-    ``jax.grad`` looks at, is solved by :mod:`jaxcal.solvers.closed_form.batch`.
-
-    Args:
-        problem: a problem or a batch of them, a recording, or one set of images; covariances and
-            bounds are not used, since Eq. 7 weighs all images equally.
-        estimate: what is unknown beside X and the target: ``()``, ``("scale",)`` (both pixel
-            scales), ``("common-scale",)`` (square pixels of unknown size) or ``("sound-speed",)``.
-
-    Returns:
-        The best answer found. Where ``certified`` is False it may not be the best there is; where
-        ``unique`` is False others may fit as well, and this is one of them.
-
-    Raises:
-        InputError: other names in ``estimate``, data that cannot be used, fewer than 4 images.
-    """
-    if np.ndim(getattr(problem, "mask", ())) > 1 or is_traced(problem):
-        from jaxcal.solvers.closed_form.batch import solve_batch
-
-        return solve_batch(problem, tuple(estimate))  # pyright: ignore[reportArgumentType]
+    """One problem by numpy alone; as :func:`jaxcal.calibrate_closed_form`."""
     data, constraints = image_data(problem, estimate)
     reduced = reduce(data, constraints)
     x, certificate = solve(reduced)

@@ -238,10 +238,6 @@ def test_a_toml_bomb_is_one_line_at_once(tmp_path, capsys, name):
         assert line.count("\n") == 1
         assert f"{path}: is not TOML" in line
         assert what in line
-    path.write_text(content + SETUP)
-    with pytest.raises(RefusedError, match="is not TOML") as caught:
-        Limits.from_toml(path)
-    assert what in str(caught.value)
     assert time.process_time() - began < 10.0
 
 

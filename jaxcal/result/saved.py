@@ -6,18 +6,19 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
 
 from jaxcal import FormatError, InputError
-from jaxcal.calibration.transform import ImageTransform, transform_from_plus_matrix
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.outputs import check_output
-from jaxcal.io.readable import check_readable, naming, one_line, path_name, quoted
+from jaxcal.io.readable import check_readable, naming, one_line, path_name
 from jaxcal.model.unknowns import TABLE, tangent_names
+from jaxcal.result.transform import ImageTransform, SaveFormat, transform_from_plus_matrix
+from jaxcal.runtime.messages import quoted
 
 FORMAT = "jaxcal-calibration"
 VERSION = 1
@@ -36,8 +37,6 @@ _NPZ = (
 )
 _NPZ_BYTES = 65536
 """Largest size of an ``.npz``, also unpacked."""
-
-SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
 
 _EXTENSIONS: dict[SaveFormat, tuple[str, ...]] = {
     "json": (".json",),

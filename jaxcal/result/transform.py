@@ -18,23 +18,22 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.inputs import check_flag
 from jaxcal.data.poses import check_affine, check_poses
 from jaxcal.data.recording import check_spacing_unit
-from jaxcal.diagnostics.image_points import point_jacobian
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.readable import naming
+from jaxcal.model.image_points import point_jacobian
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.arrays import real_array
+from jaxcal.runtime.given_values import check_flag
 
-if TYPE_CHECKING:
-    from jaxcal.calibration.saved import SaveFormat
+SaveFormat = Literal["json", "plus", "slicer", "itk", "ros", "tusrec", "numpy"]
 
 _ROUNDING = 1e-13
 _LARGEST = 1e9
@@ -257,7 +256,7 @@ class ImageTransform:
         scale: Float[np.ndarray, 2],
         pixel_sd: Float[np.ndarray, "*two"],
     ) -> Float[np.ndarray, "n 3 3"]:
-        """R (J C J' + S) R', in the probe's frame; J is :mod:`jaxcal.diagnostics.image_points`'."""
+        """R (J C J' + S) R', in the probe's frame; J is :mod:`jaxcal.model.image_points`'."""
         covariance, blocks = self.image_covariance, self.unknowns
         if covariance is None:
             covariance, blocks = self.covariance, ("translation", "rotation")
@@ -301,7 +300,7 @@ class ImageTransform:
                 ``json``, which says so.
             OutputError: the file could not be written and is unchanged.
         """
-        from jaxcal.calibration import saved
+        from jaxcal.result import saved
 
         saved.save(self, path, format, frames=frames)
 
@@ -312,13 +311,13 @@ class ImageTransform:
             InputError: an unknown format, an unknown pixel size, or a calibration that must not be
                 used, in any format but ``json``.
         """
-        from jaxcal.calibration import saved
+        from jaxcal.result import saved
 
         return saved.text_of(self, format, frames=frames)
 
     def left_out(self, format: SaveFormat) -> str | None:
         """What a format cannot hold and its user must do, in words; None where nothing is."""
-        from jaxcal.calibration import saved
+        from jaxcal.result import saved
 
         return saved.left_out(self, format)
 

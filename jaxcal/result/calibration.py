@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import CalibrationError, InputError
-from jaxcal.calibration.saved import SaveFormat, check_target
-from jaxcal.calibration.transform import AppliedPoints, ImageTransform
 from jaxcal.data.problem import Problem
 from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.unknowns import TABLE, Blocks, in_image
+from jaxcal.result.saved import check_target
+from jaxcal.result.transform import AppliedPoints, ImageTransform, SaveFormat
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
 from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.trees import array_tree, map_arrays, static
@@ -23,8 +23,7 @@ from jaxcal.runtime.trees import array_tree, map_arrays, static
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from jaxcal.diagnostics.residual_checks import Inspection
-    from jaxcal.diagnostics.summary import Summary
+    from jaxcal.result.findings import Inspection, Summary
 
 
 class Status(enum.IntEnum):

@@ -3,7 +3,7 @@
 On a CPU, machine code is kept between processes (:mod:`jaxcal.runtime.executables`) in sizes that
 serve many problems (:mod:`jaxcal.runtime.buckets`); a program that is found there is neither
 imported, traced nor compiled. On other devices, inside somebody's jit, vmap or grad, and with a
-solver of the caller's own, JAX compiles :mod:`jaxcal.runtime.programs` as it compiles anything.
+solver of the caller's own, JAX compiles :mod:`jaxcal.calibration.programs` as it compiles anything.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.conventional import closed_form_start
-from jaxcal.calibration.options import Given, SolvePlan, with_bound
-from jaxcal.calibration.result import Calibration
-from jaxcal.data.problem import Problem
+from jaxcal.calibration.options import with_bound
+from jaxcal.data.problem import Problem, fill_up
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import buckets, compiler, executables
 from jaxcal.runtime.precision import in_own_modes, inside_transformation
 from jaxcal.runtime.trees import map_arrays
+from jaxcal.solvers.closed_form.start import closed_form_start
+from jaxcal.solvers.plan import Given, SolvePlan
 
 T = TypeVar("T")
 
@@ -59,7 +60,7 @@ def solve_problem(problem: Problem, given: Given, plan: SolvePlan) -> Calibratio
 @in_own_modes
 def _solve_compiled(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """One problem by a program of JAX's own, which serves every method and prior."""
-    from jaxcal.runtime import programs
+    from jaxcal.calibration import programs
 
     platform = None
     if not inside_transformation(problem, given):
@@ -73,7 +74,7 @@ def _solve_compiled(problem: Problem, given: Given, plan: SolvePlan) -> Calibrat
 @in_own_modes
 def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """One problem by programs that are kept, which serve every number of images of a bucket."""
-    padded = buckets.padded(problem)
+    padded = fill_up(problem)
     given = replace(given, max_elevation=None)  # the problem has it
     run = partial(executables.run, flags=compiler.ONE_PROBLEM)
     label = _label(plan, padded.images)
@@ -87,7 +88,7 @@ def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
         used = replace(problem, mask=agreed[: problem.images])
     start = None if plan.method == "conventional" else closed_form_start(used, plan.blocks)
     arguments = (padded, given, agreed, start)
-    result = run("jaxcal.runtime.programs:solve_one", arguments, plan, label=label)
+    result = run("jaxcal.calibration.programs:solve_one", arguments, plan, label=label)
     return as_jax_holds(buckets.cut(result, problem.images), problem)
 
 
@@ -159,7 +160,7 @@ def _solve_chunks_kept(
     padded = problems
     if count <= FEW_PROBLEMS:
         # Here a person waits for the compiler; of thousands, masked images would cost run time.
-        padded = buckets.padded(problems)
+        padded = fill_up(problems)
     size = buckets.size(pieces) if pieces > 1 else 1
     done = last and size * chunk == count and padded.images == images
     if size * chunk != count:
@@ -168,7 +169,7 @@ def _solve_chunks_kept(
         padded = map_arrays(lambda leaf: np.asarray(leaf)[rows], padded)
     label = _label(plan, padded.images) | {"problems": size * chunk}
     result = executables.run(
-        "jaxcal.runtime.programs:solve_some_chunks",
+        "jaxcal.calibration.programs:solve_some_chunks",
         (padded, given, np.asarray(pieces, np.int32)),
         (plan, chunk),
         flags=compiler.batch_wishes(),
@@ -185,7 +186,7 @@ def _solve_chunks_compiled(
     import jax
     import jax.numpy as jnp
 
-    from jaxcal.runtime import programs
+    from jaxcal.calibration import programs
 
     count = problems.mask.shape[0]
     alone = not inside_transformation(problems, given)

@@ -1,7 +1,7 @@
 """The pure functions that are compiled, and their forms compiled by JAX.
 
-:mod:`jaxcal.runtime.engine` decides which of them solves a problem; on a CPU it keeps their machine
-code (:mod:`jaxcal.runtime.executables`) instead of compiling them here.
+:mod:`jaxcal.calibration.engine` decides which of them solves a problem; on a CPU it keeps their
+machine code (:mod:`jaxcal.runtime.executables`) instead of compiling them here.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-from jaxcal.calibration.conventional import Start
-from jaxcal.calibration.options import Given, SolvePlan
 from jaxcal.calibration.pipeline import agreed_images, solve_problems
-from jaxcal.calibration.result import Calibration
 from jaxcal.data.problem import Problem
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import compiler
+from jaxcal.solvers.closed_form.start import Start
+from jaxcal.solvers.plan import Given, SolvePlan
 from jaxcal.solvers.start import GivenStart
 
 

@@ -1,0 +1,68 @@
+"""What is found out about an answer when it is first asked for (:mod:`jaxcal.diagnostics`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxcal.runtime.array_types import Float
+
+Array = np.ndarray
+
+MISFITS = ("tails", "skewness", "depth", "drift", "trend")
+"""Rows of ``misfit``."""
+
+ADDITIONS = ("tilt lateral", "tilt elevational", "tilt axial", "depth", "sideways")
+"""Kinds of further images: tilted about an image axis, or with the target elsewhere in them."""
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What the residuals show.
+
+    Attributes:
+        outlier: 1 where an image does not fit the rest.
+        departure: errors of lateral position, range and elevational offset in robust SDs of the
+            images in use; 0 where the caller masked the image.
+        range_at_place: range errors of the images in use, in robust SDs of errors at the target's
+            place in the image; 0 with fewer than 20 images in use.
+        kurtosis: of the standardised residuals; 3 for Gaussian ones.
+        misfit: standard normal scores of :data:`MISFITS` for each component; 0 with fewer than 20
+            images in use.
+        gain: SDs by which one more image of each of :data:`ADDITIONS` would notice one unit (1 mm
+            at the lever arm) along the weakest direction.
+    """
+
+    outlier: Float[Array, "*batch n"]
+    departure: Float[Array, "*batch n 3"]
+    range_at_place: Float[Array, "*batch n"]
+    kurtosis: Float[Array, "*batch 3"]
+    misfit: Float[Array, "*batch 5 3"]
+    gain: Float[Array, "*batch 5"]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Diagnostics of a calibration, or of a batch with leading axes.
+
+    Attributes:
+        elevation_sd: SDs of the offsets, mm; NaN where an offset is on its bound or not known.
+        at_bound: 1 where an offset rests on its bound.
+        residual: q_i - p_i with p_i in the plane, in the image frame, mm; 0 where left out.
+        condition: largest over smallest eigenvalue of the scaled information.
+        weakest: unit vector (scaled units) of the least known direction of all unknowns.
+        weakest_sd: SD along ``weakest``, mm at the lever arm; NaN where there is no finite SD.
+        prior_direction: unit vector (scaled units) that the measurements alone leave open; zeros
+            where there is none.
+        inspection: what the residuals show.
+    """
+
+    elevation_sd: Float[Array, "*batch n"]
+    at_bound: Float[Array, "*batch n"]
+    residual: Float[Array, "*batch n 3"]
+    condition: Float[Array, "*batch"]
+    weakest: Float[Array, "*batch p"]
+    weakest_sd: Float[Array, "*batch"]
+    prior_direction: Float[Array, "*batch p"]
+    inspection: Inspection

@@ -1,0 +1,13 @@
+"""Values and texts that a caller or a file gave, short, for messages."""
+
+from __future__ import annotations
+
+
+def quoted(text: str, limit: int = 40) -> str:
+    """Text of an untrusted file, short and with control characters escaped, for a message."""
+    return ascii(text if len(text) <= limit else f"{text[:limit]}...")
+
+
+def shown(value: object) -> str:
+    """What a caller gave, short, for a message."""
+    return quoted(value) if isinstance(value, str) else quoted(repr(value))[1:-1]

@@ -1,0 +1,43 @@
+"""Conventional calibration in closed form, of one problem or of a batch."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxcal.runtime.arrays import is_traced
+from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
+
+if TYPE_CHECKING:
+    from jaxcal.data.problem import Problem
+    from jaxcal.data.recording import Images, Recording
+
+
+def calibrate_closed_form(
+    problem: Problem | Recording | Images, *, estimate: tuple[str, ...] = ()
+) -> ClosedForm:
+    """Conventional calibration (Eq. 7) in closed form, with a certificate.
+
+    One problem is solved by numpy alone (:mod:`jaxcal.solvers.closed_form.single`). A batch, and a
+    problem that ``jax.jit``, ``jax.vmap`` or ``jax.grad`` looks at, is solved by
+    :mod:`jaxcal.solvers.closed_form.batch`.
+
+    Args:
+        problem: a problem or a batch of them, a recording, or one set of images; covariances and
+            bounds are not used, since Eq. 7 weighs all images equally.
+        estimate: what is unknown beside X and the target: ``()``, ``("scale",)`` (both pixel
+            scales), ``("common-scale",)`` (square pixels of unknown size) or ``("sound-speed",)``.
+
+    Returns:
+        The best answer found. Where ``certified`` is False it may not be the best there is; where
+        ``unique`` is False others may fit as well, and this is one of them.
+
+    Raises:
+        InputError: other names in ``estimate``, data that cannot be used, fewer than 4 images.
+    """
+    if np.ndim(getattr(problem, "mask", ())) > 1 or is_traced(problem):
+        from jaxcal.solvers.closed_form.batch import solve_batch
+
+        return solve_batch(problem, tuple(estimate))  # pyright: ignore[reportArgumentType]
+    return solve_problem(problem, estimate)

@@ -1,0 +1,169 @@
+"""Modules import one way: no circles, and nothing in jaxcal imports a folder above its own.
+
+The sources are read, not imported. Imports within functions may close a circle or point upwards
+only where they are listed here.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+HOME = Path(__file__).parents[1]
+
+LAYERS = (
+    "runtime",
+    "data",
+    "io",
+    "model",
+    "solvers",
+    "result",
+    "diagnostics",
+    "calibration",
+    "study",
+    "design",
+    "report",
+    "cli",
+)
+"""Folders of jaxcal, the lowest first."""
+
+ANSWERS = {
+    # What a user asks of an answer is found out, told, drawn and written above it.
+    "jaxcal.result.calibration": {
+        "jaxcal.diagnostics.directions",
+        "jaxcal.diagnostics.frame_checks",
+        "jaxcal.diagnostics.intervals",
+        "jaxcal.diagnostics.summary",
+        "jaxcal.diagnostics.warnings",
+        "jaxcal.report.page",
+        "jaxcal.report.plots",
+        "jaxcal.report.summary",
+        "jaxcal.report.verdict",
+        "jaxcal.report.write",
+    },
+    # ImageTransform.save and .text write what load_calibration makes an ImageTransform of.
+    "jaxcal.result.transform": {"jaxcal.result.saved"},
+    # Any study computes its chunks; the pipeline computes those of a Spec.
+    "jaxcal.study.spec": {"jaxcal.study.pipeline"},
+}
+"""Imports within functions that close a circle, by module: methods that belong to the interface."""
+
+Imports = dict[str, set[str]]
+
+
+def sources() -> dict[str, Path]:
+    """All modules by their names."""
+    found = {}
+    for package in ("jaxcal", "hw"):
+        for path in (HOME / package).rglob("*.py"):
+            parts = path.relative_to(HOME).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imports_of(path: Path, modules: dict[str, Path]) -> tuple[set[str], set[str]]:
+    """Modules that a file imports at its head, TYPE_CHECKING included, and within functions."""
+    head: set[str] = set()
+    late: set[str] = set()
+
+    def visit(node: ast.AST, found: set[str]) -> None:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            found = late
+        elif isinstance(node, ast.Import):
+            found.update(each.name for each in node.names if each.name in modules)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            for each in node.names:
+                name = f"{node.module}.{each.name}"
+                if (name if name in modules else node.module) in modules:
+                    found.add(name if name in modules else str(node.module))
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.stmt | ast.ExceptHandler | ast.match_case):
+                visit(child, found)
+
+    visit(ast.parse(path.read_bytes()), head)
+    return head, late
+
+
+def public_names(path: Path) -> bool:
+    """Whether a file finds its names on first use and imports them for type checkers only."""
+    return path.name == "__init__.py" and "def __getattr__(" in path.read_text()
+
+
+@pytest.fixture(scope="module")
+def graph() -> tuple[Imports, Imports]:
+    """Imports at the head of every module, and those within its functions.
+
+    ``jaxcal``, ``jaxcal.design`` and ``jaxcal.study`` import nothing that they name.
+    """
+    modules = sources()
+    head, late = {}, {}
+    for name, path in modules.items():
+        head[name], late[name] = imports_of(path, modules)
+        if public_names(path):
+            head[name] = set()
+    return head, late
+
+
+def upwards(imports: Imports) -> list[str]:
+    """Imports within jaxcal of a folder above."""
+    found = []
+    for name, others in imports.items():
+        here = name.split(".")
+        for other in others:
+            there = other.split(".")
+            if here[0] == "jaxcal" == there[0] and len(here) > 1 and len(there) > 1:
+                both = here[1] in LAYERS and there[1] in LAYERS
+                if both and LAYERS.index(here[1]) < LAYERS.index(there[1]):
+                    found.append(f"{name} imports {other}")
+    return sorted(found)
+
+
+def circle(imports: Imports) -> str:
+    """A circle of modules, in words; empty if there is none."""
+    try:
+        TopologicalSorter(imports).prepare()
+    except CycleError as error:
+        return " imports ".join(reversed(error.args[1]))
+    return ""
+
+
+def test_every_folder_has_a_layer():
+    folders = {path.name for path in (HOME / "jaxcal").iterdir() if (path / "__init__.py").exists()}
+    assert folders == set(LAYERS)
+
+
+def test_no_module_imports_upwards(graph):
+    assert upwards(graph[0]) == []
+
+
+def test_no_circle_of_imports(graph):
+    assert circle(graph[0]) == ""
+
+
+def test_jaxcal_imports_neither_hw_nor_experiments(graph):
+    for imports in graph:
+        for name, others in imports.items():
+            if name.split(".")[0] == "jaxcal":
+                assert not [other for other in others if other.split(".")[0] != "jaxcal"], name
+
+
+def test_imports_within_functions_point_down_but_for_the_listed_ones(graph):
+    head, late = graph
+    for name, others in ANSWERS.items():
+        assert others <= late[name], f"{name} no longer imports {others - late[name]}"
+    listed: defaultdict[str, set[str]] = defaultdict(set, ANSWERS)
+    rest = {name: others - listed[name] for name, others in late.items()}
+    assert upwards(rest) == []
+    assert circle({name: head[name] | rest[name] for name in head}) == ""
+
+
+def test_a_circle_and_a_way_up_are_found():
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}}).count(" imports ") == 3
+    assert upwards({"jaxcal.data.probe": {"jaxcal.io.text", "jaxcal.runtime.arrays"}}) == [
+        "jaxcal.data.probe imports jaxcal.io.text"
+    ]
