@@ -81,7 +81,7 @@ def test_saved_and_loaded(result, tmp_path):
     np.testing.assert_allclose(mine.points, plane @ x[:3, :3].T + x[:3, 3] + pose[:3, 3])
     trace = np.trace(mine.covariance, axis1=1, axis2=2)
     np.testing.assert_allclose(np.sqrt(trace), jaxcal.predicted_tre(result, points), rtol=1e-9)
-    with pytest.raises(jaxcal.InputError, match="points in mm"):
+    with pytest.raises(jaxcal.InputError, match="no pixel size is known"):
         result.plus_matrix()
     with pytest.raises(jaxcal.InputError, match="no format"):
         result.save(tmp_path / "cal.nonsense")

@@ -271,7 +271,7 @@ class ImageTransform:
     def _scale(self) -> Float[np.ndarray, 2]:
         if self.scale_mm_per_px is None:
             raise InputError(
-                f"{self.source}: knows no pixel size, so that there is no Image frame in pixels: "
+                f"{self.source}: no pixel size is known, so there is no Image frame in pixels: "
                 "give the size of a pixel and the pixel of lateral 0, range 0 (jaxcal export with "
                 "--pixel-size and --origin; in Python with_pixels)"
             )

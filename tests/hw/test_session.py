@@ -52,7 +52,7 @@ def test_images_of_a_machine_that_also_sends_rf(tmp_path):
         AuspisEmulator(silence, clock=robot.clock, lines=8) as emulator,
         ImageServer(
             lambda t: np.full((40, 30), int(1000 * t) % 256, np.uint8),
-            rf=lambda t: np.full((200, 8), int(1000 * t), np.int16),
+            rf=lambda t: np.full((200, 8), int(1000 * t) % 1000, np.int16),
         ) as machine,
         Recorder(path, RecordingHeader("pixel", {}, 8, None, "{}")) as recorder,
     ):
