@@ -210,12 +210,14 @@ class Session:
             if self._failure is not None:
                 return self._failure
             now, watch = self.clock.now(), self.watch
-            recent = [what for t, what in self._bad if now - t <= watch.burst_s]
-            for what in set(recent):
+            # Where no good frame has come since, what came instead is the reason, however long ago.
+            window = now - min(now - watch.burst_s, self._echo_seen)
+            recent = [what for t, what in self._bad if now - t <= window]
+            for what in dict.fromkeys(recent):
                 count = recent.count(what)
                 if count > watch.burst:
                     return StaleError(
-                        f"{count} frames {what} within {watch.burst_s:g} s: look at its cable",
+                        f"{count} frames {what} within {window:.2g} s: look at its cable",
                         device="active echo",
                     )
             if now - self._echo_seen > self.clock.patience(watch.echo_age_s):

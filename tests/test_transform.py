@@ -212,7 +212,9 @@ def test_ros_is_rigid_and_in_metres(tmp_path):
     with pytest.raises(FormatError, match=r"qw is not a number: '1\.0#'"):
         read_ros_yaml(tmp_path / "cal.yaml")
     # No pixels are needed, unlike everywhere else; the image may have had them.
-    with pytest.raises(InputError, match=r"no pixel size is known, .* \(jaxcal export with --pixel"):
+    with pytest.raises(
+        InputError, match=r"no pixel size is known, .* \(jaxcal export with --pixel"
+    ):
         tiny.plus_matrix()
 
 
