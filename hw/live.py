@@ -11,12 +11,18 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import calibrate
 from jaxcal.data.poses import check_poses
-from jaxcal.data.probe import Probe
+from jaxcal.data.probe import Probe, check_probe
 from jaxcal.data.problem import Problem
-from jaxcal.data.recording import MINIMUM_IMAGES, Kind, Recording, make_images
+from jaxcal.data.recording import MINIMUM_IMAGES, Kind, Recording, make_images, used_values
 from jaxcal.data.segmentation.segment import MINIMUM_LINES, check_times_of_flight
 from jaxcal.result.calibration import Calibration
+from jaxcal.runtime.arrays import real_array
 from jaxcal.runtime.buckets import cut
+from jaxcal.runtime.given_values import whole_number
+from jaxcal.runtime.messages import shown
+
+MOST_IMAGES = 100_000
+"""Largest capacity: every solve takes time and memory for all of it."""
 
 
 class LiveCalibration:
@@ -30,7 +36,8 @@ class LiveCalibration:
         arguments: passed on to :func:`jaxcal.calibrate`, e.g. ``method="joint"``.
 
     Raises:
-        InputError: capacity below 4; times of flight without a probe.
+        InputError: capacity that is no whole number from 4 to 100,000; times of flight without a
+            probe, or something else in its place.
     """
 
     def __init__(
@@ -42,8 +49,9 @@ class LiveCalibration:
         probe: Probe | None = None,
         **arguments,
     ) -> None:
-        if capacity < MINIMUM_IMAGES:
-            raise InputError(f"capacity must be at least {MINIMUM_IMAGES}, not {capacity}")
+        capacity = whole_number("capacity", capacity, MINIMUM_IMAGES, MOST_IMAGES)
+        if probe is not None:
+            check_probe(probe)
         if kind == "time_of_flight" and probe is None:
             raise InputError("times of flight need a probe")
         self._probe = probe
@@ -102,16 +110,20 @@ class LiveCalibration:
         """Take one image without solving; arguments and errors as for :meth:`add`."""
         if self._count == self.capacity:
             raise InputError(f"the buffer is full at {self.capacity} images")
-        pose = check_poses(np.asarray(pose)[None], what="pose of the new image")[0]
-        values = np.asarray(measurement, dtype=float)
+        pose = check_poses(real_array(pose, "pose")[None], what="pose of the new image")[0]
+        values = real_array(measurement, "measurement")
         if self._kind == "time_of_flight":
             self._check_times(values)
         elif values.shape != (2,) or not np.isfinite(values).all():
             raise InputError("a measurement must be two finite numbers")
-        if not max_elevation >= 0:
+        else:
+            # Kept, it would be refused with every image to come.
+            used_values(self._kind, values[None].copy(), np.ones(1, bool))
+        bound = real_array(max_elevation, "max_elevation")
+        if bound.shape != () or not bound >= 0:
             raise InputError(f"max_elevation must not be negative or NaN, it is {max_elevation}")
         self._poses[self._count], self._measurements[self._count] = pose, values
-        self._bound[self._count] = max_elevation
+        self._bound[self._count] = bound
         self._mask[self._count] = True
         self._count += 1
 
@@ -134,8 +146,9 @@ class LiveCalibration:
         Raises:
             InputError: when there is no such image.
         """
-        if not 0 <= index < self._count:
-            raise InputError(f"there is no image {index}; {self._count} were taken")
+        if not self._count:
+            raise InputError(f"there is no image {shown(index)}: none were taken")
+        index = whole_number("index", index, 0, self._count - 1)
         self._mask[index] = False
 
     def problem(self) -> Problem:

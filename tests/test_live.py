@@ -38,11 +38,19 @@ def test_bad_images_are_refused_and_not_kept():
         live.add(np.diag([1.0, 1, -1, 1]), np.array([0.0, 50.0]))
     with pytest.raises(jaxcal.InputError, match="finite"):
         live.add(np.eye(4), np.array([np.nan, 50.0]))
+    with pytest.raises(jaxcal.InputError, match="range that is not positive"):
+        live.add(np.eye(4), np.array([0.0, -30.0]))
+    with pytest.raises(jaxcal.InputError, match="measurement must be an array of real numbers"):
+        live.add(np.eye(4), np.array(["0", "50"]))
     assert len(live) == 0
     with pytest.raises(jaxcal.InputError, match="no image 0"):
         live.leave_out(0)
-    with pytest.raises(jaxcal.InputError, match="capacity"):
-        LiveCalibration(capacity=3)
+    live.put(np.eye(4), np.array([0.0, 50.0]))
+    with pytest.raises(jaxcal.InputError, match="index must be between 0 and 0, not 5"):
+        live.leave_out(5)
+    for capacity in (3, 10**6):
+        with pytest.raises(jaxcal.InputError, match="capacity"):
+            LiveCalibration(capacity=capacity)
 
 
 def test_times_of_flight_come_to_what_the_file_comes_to():

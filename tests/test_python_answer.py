@@ -147,6 +147,7 @@ import warnings
 import jax
 import numpy as np
 import jaxcal
+from hw.live import LiveCalibration
 from jaxcal import backend
 from jaxcal.study import run_study
 from jaxcal.study.spec import parse_spec
@@ -292,6 +293,10 @@ for call, *given in (
         dataclasses.replace(jaxcal.stack([problem]), mask=mask), "conventional"), np.ones((2, 9))),
     (backend.Iterate.of, of_one, backend.RIGID),
     (backend.circle_residual, of_one, np.zeros(3), problem),
+    (LiveCalibration, 8.5), (LiveCalibration, "many"),
+    (lambda probe: LiveCalibration(probe=probe), "linear"),
+    (LiveCalibration().add, np.eye(4), "0 50"), (LiveCalibration().leave_out, "a"),
+    (lambda bound: LiveCalibration().put(np.eye(4), points[0], bound), "one"),
 ):
     try:
         call(*given)
@@ -303,7 +308,7 @@ for call, *given in (
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr == ""
     lines = done.stdout.splitlines()
-    assert len(lines) == 177
+    assert len(lines) == 183
     assert lines[0].startswith("jaxcal.calibrate takes a problem, not a path: ")
     assert lines[3].startswith("jaxcal.calibrate_batch takes a problem or a recording, not int: ")
     assert lines[4] == "points must have shape (..., 2), not (1, 3)"

@@ -215,7 +215,7 @@ def make_images(
             )
         _check_magnitude("pose", poses, used)
         checked = check_poses(poses, used)
-        values = _used_values(kind, values, used)
+        values = used_values(kind, values, used)
         spacing, face_mm = _spacing(spacing_mm, kind), _face_offset(face_offset_mm)
         if kind == "pixel":
             _check_below_face(values, spacing, face_mm, used)
@@ -246,10 +246,20 @@ def _prefixed(prefix: str) -> Iterator[None]:
         raise type(error)(f"{prefix}{error}") from None
 
 
-def _used_values(
+def used_values(
     kind: Kind, values: np.ndarray, used: np.ndarray
 ) -> Float[np.ndarray, "n components"]:
-    """The measurements, checked in used images and replaced in the others."""
+    """The measurements, checked in used images and replaced in the others.
+
+    Args:
+        kind: of the measurements.
+        values: (n, 2) or (n, elements); changed in place.
+        used: (n,) bool.
+
+    Raises:
+        InputError: NaN or Inf, numbers that no image has, or a place above the probe's face; the
+            row is named.
+    """
     if kind == "time_of_flight":
         # NaN is an element that saw nothing.
         bad = np.isinf(values).any(axis=1) & used
