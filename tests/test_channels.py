@@ -133,6 +133,21 @@ def test_what_points_cannot_tell_is_said_or_refused():
         jaxcal.calibrate(jaxcal.Problem.from_recording(data), "conventional", data="channels")
 
 
+@pytest.mark.parametrize(
+    ("method", "request_parts"),
+    [
+        ("joint", {"sound_speed_sd": 5.0}),
+        ("joint", {"delay_sd": 1e-7, "estimate": ("sound-speed",)}),
+        ("joint", {"sound_speed_sd": 5.0, "estimate": ("sound-speed",), "prior": "bounded"}),
+        ("conventional", {"sound_speed_sd": 5.0, "estimate": ("sound-speed",)}),
+    ],
+)
+def test_a_prior_sd_without_effect_is_refused(method, request_parts):
+    points = replace(jaxcal.Problem.from_recording(recording(STRAIGHT)), channels=None)
+    with pytest.raises(InputError, match=r"_sd is the prior SD of an estimated .*: it needs"):
+        jaxcal.calibrate(points, method, **request_parts)
+
+
 def test_missing_and_late_lines_do_no_harm():
     data = recording(CURVED, noise=0.05)
     times = np.array(data.calibration.measurements)

@@ -672,6 +672,8 @@ def test_import_calibrate_export(tmp_path, capsys):
         matrix = jaxcal.load_calibration(other).plus_matrix()
         np.testing.assert_allclose(matrix, found.plus_matrix(), rtol=0, atol=1e-11)
     record = json.loads((tmp_path / "cal.json").read_text())
+    assert record["exported"][0] == f"{config}: Image to Probe written"
+    assert record["exported"][-1] == f"{tmp_path / 'x.tfm'}: written"
     np.testing.assert_allclose(record["plus_image_to_probe"], found.plus_matrix(), atol=1e-12)
     # The error of X in its own frame, X Exp(d), against the stated covariance.
     error = np.linalg.inv(found.image_plane_to_probe) @ truth.image_plane_to_probe

@@ -556,8 +556,8 @@ def test_segment_command(raw_file, capfd):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--interpolate"], "needs --method shortest"),
-        (["--method", "shortest", "--scale", "pooled"], "needs --method least-squares"),
+        (["--interpolate"], "interpolate needs the method shortest"),
+        (["--method", "shortest", "--scale", "pooled"], "scale needs the method least-squares"),
         (["--temperature", "20", "--sound-speed", "1500"], "exclude each other"),
         (["--temperature", "293"], "degrees Celsius"),
         (["--sound-speed", "1.49"], "looks like mm/us"),

@@ -181,6 +181,14 @@ def _check_combination(request: Request, kind: Prior) -> None:
         raise InputError(f"the prior {request.prior} does not go with the method {request.method}")
     if kind != "gaussian" and (request.sigma is not None or request.tracker_sd is not None):
         raise InputError("sigma and tracker_sd belong to the joint method's gaussian prior")
+    for name, unknown in zip(("sound_speed_sd", "delay_sd"), MEDIUM, strict=True):
+        if getattr(request, name) is getattr(Request, name):  # the default
+            continue
+        if kind != "gaussian" or unknown not in request.estimate:
+            raise InputError(
+                f"{name} is the prior SD of an estimated {unknown}: it needs "
+                f"estimate=({unknown!r},) and the joint method's prior auto, uniform or gaussian"
+            )
     if request.tracker_sd is not None and request.sigma is None:
         raise InputError("tracker_sd needs given sigma: self-tuned SDs contain the tracker's noise")
     if request.sigma is not None and request.prior == "uniform":

@@ -250,7 +250,7 @@ def calibrate(
         write_page(report, record, result, measured)
     exported = _export(record, recording, targets)
     if as_json:
-        print_json(record)
+        print_json(record | ({"exported": exported} if targets else {}))
     else:
         _print(record, out)
         print_page(*exported)

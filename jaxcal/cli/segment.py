@@ -112,10 +112,6 @@ def segment(
             raise InputError(f"{recording}: {parameter.opts[0]} is an option for {kind}")
     if of_frames:
         return _segment_frames(recording, out, as_json, frames)
-    if interpolate and method != "shortest":
-        raise InputError("--interpolate needs --method shortest")
-    if method == "shortest" and scale != "frame":
-        raise InputError("--scale needs --method least-squares")
     if sound_speed is not None and temperature is not None:
         raise InputError("--sound-speed and --temperature exclude each other")
     import_engine()

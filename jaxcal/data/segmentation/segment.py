@@ -152,7 +152,7 @@ def segment(
 
     Raises:
         InputError: no times of flight, no probe, times for another number of elements, negative
-            times, microseconds, options of another kind; for a recording, fewer than 4 frames that
+            times, microseconds, options of another kind or of the other method; for a recording, fewer than 4 frames that
             can be segmented.
     """
     images = images_of(data, "jaxcal.segment")
@@ -162,6 +162,10 @@ def segment(
             raise InputError(f"{name} must be {' or '.join(get_args(names))}, not {shown(value)}")
     check_flag("robust", robust)
     check_flag("interpolate", interpolate)
+    if interpolate and method != "shortest":
+        raise InputError("interpolate needs the method shortest")
+    if scale != "frame" and method != "least-squares":
+        raise InputError("scale needs the method least-squares")
     floor = _FEWEST_LINES[method]
     if minimum_lines is not None:
         floor = max(floor, whole_number("minimum_lines", minimum_lines, 1, MOST_ELEMENTS))
