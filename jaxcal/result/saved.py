@@ -225,7 +225,10 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
     lower = name.lower()
     with naming(path):
         if lower.endswith(".xml"):
-            return _load_plus(path)
+            from jaxcal.io.plus import read_transform
+
+            found = read_transform(path)
+            return transform_from_plus_matrix(found.matrix, error_mm=found.error_mm, source=name)
         if lower.endswith((".tfm", ".txt", ".h5")):
             from jaxcal.io.itk import read_itk
 
@@ -245,24 +248,6 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
         if lower.endswith(".npz"):
             return _load_npz(path)
         return transform_from_record(_json_object(path), source=name)
-
-
-def _load_plus(path: str | os.PathLike[str]) -> ImageTransform:
-    from jaxcal.io.plus import read_configuration, read_result
-    from jaxcal.io.xml import read_xml
-
-    name = os.fspath(path)
-    root, _ = read_xml(path)
-    found, error = None, None
-    if root.tag == "ProbeCalibrationResult":
-        result = read_result(path)
-        found, error = result.find("Image", "Probe"), result.calibration_error_mm
-    else:
-        found = read_configuration(path).find("Image", "Probe")
-        error = None if found is None else found.error_mm
-    if found is None:
-        raise FormatError("holds no transform from Image to Probe")
-    return transform_from_plus_matrix(found.matrix, error_mm=error, source=name)
 
 
 def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
