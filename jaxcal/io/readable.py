@@ -62,6 +62,24 @@ def check_readable(path: str | os.PathLike[str], *, maximum_bytes: int | None = 
         )
 
 
+def read_bytes(path: str | os.PathLike[str], maximum_bytes: int) -> bytes:
+    """The content of a file that :func:`check_readable` accepts.
+
+    Raises:
+        FormatError: as there, or it cannot be read; one line that starts with the path.
+    """
+    check_readable(path, maximum_bytes=maximum_bytes)
+    try:
+        with open(path, "rb") as file:
+            content = file.read(maximum_bytes + 1)
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {one_line(error)}") from None
+    # It may have grown since it was looked at.
+    if len(content) > maximum_bytes:
+        raise FormatError(f"{path}: is too large (at most {maximum_bytes} bytes are read)")
+    return content
+
+
 def one_line(error: Exception) -> str:
     """An exception's own words on one line."""
     text = str(error)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
@@ -15,7 +14,7 @@ from jaxcal import FormatError, InputError
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.outputs import check_output
-from jaxcal.io.readable import check_readable, naming, one_line, path_name
+from jaxcal.io.readable import check_readable, naming, one_line, path_name, read_bytes
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.result.transform import ImageTransform, SaveFormat, transform_from_plus_matrix
 from jaxcal.runtime.messages import quoted
@@ -281,15 +280,12 @@ def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
 
 
 def _json_object(path: str | os.PathLike[str]) -> dict[str, Any]:
-    check_readable(path, maximum_bytes=MAXIMUM_BYTES)
+    content = read_bytes(path, MAXIMUM_BYTES)
+    if not content.lstrip().startswith(b"{"):
+        _format_of(os.fspath(path))
     try:
-        content = Path(path).read_bytes()
-        if not content.lstrip().startswith(b"{"):
-            _format_of(os.fspath(path))
         record = json.loads(content)
-    except (OSError, ValueError, RecursionError) as error:
-        if isinstance(error, FormatError):
-            raise
+    except (ValueError, RecursionError) as error:
         raise FormatError(f"is not JSON: {one_line(error)}") from None
     if not isinstance(record, dict):
         raise FormatError("is not a calibration: a JSON object is needed")
