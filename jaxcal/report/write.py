@@ -126,7 +126,6 @@ def write_report(
     """
     # Matplotlib takes half a second to import, so it is imported only here, to draw.
     from jaxcal.report import plots
-    from jaxcal.report.figures import convergence_figure
 
     truth = None if recording.truth is None else recording.truth.elevation
     figures = {
@@ -140,7 +139,7 @@ def write_report(
             "limits": plots.plot_limits(result),
         }
     if curves:
-        figures["convergence"] = convergence_figure(curves)
+        figures["convergence"] = plots.convergence_figure(curves)
     texts = {
         "calibration.json": _json(record),
         "verdict.txt": "\n".join(verdict(record)) + "\n",
