@@ -42,29 +42,17 @@ _UNIT = re.compile(
 )
 _CELL = re.compile(r"([a-z]*?)_?([0-4])[_,]?([0-4])")
 _NUMBERED = re.compile(r"([a-z]*?)_?(\d{1,2})")
-_UNITS = {
-    "mm": "mm",
-    "millimeter": "mm",
-    "millimeters": "mm",
-    "millimetre": "mm",
-    "millimetres": "mm",
-    "cm": "cm",
-    "m": "m",
-    "meter": "m",
-    "meters": "m",
-    "metre": "m",
-    "metres": "m",
-    "px": "px",
-    "pixel": "px",
-    "pixels": "px",
-    "s": "s",
-    "sec": "s",
-    "seconds": "s",
-    "ms": "ms",
-    "us": "us",
-    "µs": "us",
-    "ns": "ns",
+_SPELLINGS = {
+    "mm": ("millimeter", "millimeters", "millimetre", "millimetres"),
+    "cm": (),
+    "m": ("meter", "meters", "metre", "metres"),
+    "px": ("pixel", "pixels"),
+    "s": ("sec", "seconds"),
+    "ms": (),
+    "us": ("µs",),
+    "ns": (),
 }
+_UNITS = {name: unit for unit, others in _SPELLINGS.items() for name in (unit, *others)}
 
 
 @dataclass(frozen=True)

@@ -347,32 +347,9 @@ def _encode_image(picture: Picture) -> bytes:
     lateral, axial = picture.spacing_mm
     # Position is that of the image's centre; the first pixel is put at the origin.
     centre = ((width - 1) / 2 * lateral, (height - 1) / 2 * axial, 0.0)
-    head = _IMAGE.pack(
-        1,
-        1,
-        scalar,
-        _LITTLE_ENDIAN,
-        _LPS,
-        width,
-        height,
-        1,
-        lateral,
-        0.0,
-        0.0,
-        0.0,
-        axial,
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-        *centre,
-        0,
-        0,
-        0,
-        width,
-        height,
-        1,
-    )
+    axes = (lateral, 0.0, 0.0, 0.0, axial, 0.0, 0.0, 0.0, 1.0)
+    size = (width, height, 1)
+    head = _IMAGE.pack(1, 1, scalar, _LITTLE_ENDIAN, _LPS, *size, *axes, *centre, 0, 0, 0, *size)
     return head + picture.array.astype(picture.array.dtype.newbyteorder("<"), copy=False).tobytes()
 
 
