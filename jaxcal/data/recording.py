@@ -430,10 +430,7 @@ def _check_units(images: Images) -> None:
 
 
 def check_spacing_unit(spacing_mm: Float[np.ndarray, 2]) -> None:
-    """Refuse a pixel's size that cannot be in millimetres.
-
-    Args:
-        spacing_mm: [lateral, axial] per px, as if in mm.
+    """Refuse a pixel's size [lateral, axial] that cannot be in millimetres.
 
     Raises:
         InputError: it is far too large, or looks like metres.
@@ -454,11 +451,8 @@ def check_pose_units(translations: Float[np.ndarray, "n 3"], extent_mm: float = 
     """Refuse poses of different images whose translations are in metres in place of millimetres.
 
     A probe whose every position lies within 5 mm of the tracker's origin, and whose moves are
-    hundreds of times smaller than the target's path through the image, was recorded in metres.
-
-    Args:
-        translations: of the images' poses, as if in mm.
-        extent_mm: length of the target's path through the image, roughly.
+    hundreds of times smaller than the target's path through the image (roughly ``extent_mm``), was
+    recorded in metres.
 
     Raises:
         MetresError: they look like metres.

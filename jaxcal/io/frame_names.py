@@ -59,11 +59,6 @@ def check_frames(frames: FramePair) -> FramePair:
 def path_between(pairs: list[FramePair], start: str, end: str) -> list[tuple[int, bool]] | None:
     """The shortest way from one frame to another along transforms and their inverses.
 
-    Args:
-        pairs: the transforms' frames.
-        start: frame to begin at.
-        end: frame to arrive at.
-
     Returns:
         (index of the pair, whether it is inverted) for each step; None where there is no way.
     """

@@ -47,14 +47,9 @@ class PlusTransform(NamedTuple):
 def read_transform(
     path: str | os.PathLike[str], source: str = "Image", target: str = "Probe"
 ) -> PlusTransform:
-    """Read a transform from a configuration, an fCal result or a Transform element alone.
+    """Read the transform between two frames; the file is not trusted.
 
-    The file is not trusted.
-
-    Args:
-        path: of the file.
-        source: frame from which the transform leads.
-        target: frame to which it leads.
+    It is a configuration, an fCal result, or a Transform element alone.
 
     Raises:
         FormatError: not such a file, a DTD, a transform that is not 16 finite numbers, no such
@@ -199,14 +194,8 @@ def patched_configuration(
     """A configuration with one transform replaced; every other byte stays as it is.
 
     The element between the two frames, in either direction, is replaced (PLUS refuses a file with
-    both). If there is none, the transform is added at the end of CoordinateDefinitions.
-
-    Args:
-        content: of the configuration's file.
-        frames: (from, to).
-        matrix: of the transform.
-        error_mm: stated where it is positive.
-        date: stated in PLUS's form.
+    both). If there is none, the transform is added at the end of CoordinateDefinitions. The
+    arguments are those of :func:`transform_element`.
 
     Returns:
         The new content, and notes for the user, with lines of the new content.

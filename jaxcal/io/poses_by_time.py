@@ -150,11 +150,7 @@ def lag_of_points(
 ) -> tuple[float, str]:
     """By how much images lag behind poses, from the motion of a target at rest in the images.
 
-    Args:
-        images: with times.
-        rows: (n,) frames in which the target was found.
-        points: (n, 2) the target in them, px or mm.
-        tracking: with times on the same clock.
+    It was found at ``points`` (px or mm) in the frames ``rows``.
 
     Returns:
         The lag, s, and a note for the user.

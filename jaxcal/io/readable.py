@@ -27,11 +27,7 @@ def path_name(path: object) -> str:
 
 
 def check_readable(path: str | os.PathLike[str], *, maximum_bytes: int | None = None) -> None:
-    """Check that a path names an ordinary, readable, non-empty file.
-
-    Args:
-        path: the file.
-        maximum_bytes: largest size that is read, or None for any.
+    """Check that a path names an ordinary, readable, non-empty file of at most ``maximum_bytes``.
 
     Raises:
         FormatError: missing, a directory, a device or pipe (opening one may hang), not permitted,

@@ -47,10 +47,6 @@ def load_toml(
 ) -> dict[str, Any]:
     """The tables of a TOML file.
 
-    Args:
-        path: the file.
-        maximum_bytes: largest file that is read.
-
     Raises:
         FormatError: no such file, too large, not UTF-8, not TOML, or beyond the bounds of this
             module; one line that starts with the path.

@@ -191,11 +191,8 @@ def check_attributes(node: Node) -> None:
 def check_rows(node: Node, axes: int, most_bytes: int, kinds: str) -> tuple[int, ...]:
     """Check a dataset that will be read row by row because it is too large for :func:`array`.
 
-    Args:
-        node: the dataset.
-        axes: how many it must have.
-        most_bytes: of one row.
-        kinds: numpy's letters of the types that are taken.
+    It must have so many axes, rows of at most ``most_bytes``, and a type of ``kinds`` (numpy's
+    letters).
 
     Returns:
         Its shape.

@@ -64,10 +64,7 @@ def accuracy_record(
 ) -> dict[str, Any]:
     """``tre``, ``limits``, ``influence`` and ``comparison`` of a calibration's record.
 
-    Args:
-        result: of one problem, with concrete values.
-        recording: what was calibrated.
-        wanted: further image points for the error, in the images' own unit (px or mm).
+    ``wanted`` are further image points for the error, in the images' own unit (px or mm).
 
     Returns:
         Arrays and plain values; all of them None where X is not observable.

@@ -70,13 +70,7 @@ _FORMS: tuple[tuple[SaveFormat, str, str], ...] = (
 def write_page(
     path: str | os.PathLike[str], record: dict[str, Any], result: Calibration, recording: Recording
 ) -> None:
-    """Write the page, complete or not at all.
-
-    Args:
-        path: the file to make; only another page is replaced.
-        record: of :func:`jaxcal.report.record.calibration_record`, settled.
-        result: the calibration.
-        recording: what was calibrated.
+    """Write the page of a settled record, complete or not at all; only another page is replaced.
 
     Raises:
         InputError: the file exists and is no page.

@@ -254,8 +254,7 @@ def plot_limits(calibration: Calibration) -> Figure:
 def convergence_figure(curves: list[Curve]) -> Figure:
     """Objective less the lowest value of all curves (mm^2), against the iteration.
 
-    Args:
-        curves: of the same objective.
+    The curves must be of the same objective.
     """
     figure = canvas(PAGE_MM, 80.0)
     panel = styled(figure.subplots())

@@ -48,10 +48,9 @@ NAMES = (
 
 @contextmanager
 def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Make a folder, and check that a report can be written to it, before other work begins.
+    """Make a folder and its missing parents, and check that a report can be written to it.
 
-    Args:
-        path: the folder; missing parents are made.
+    This comes before other work begins.
 
     Yields:
         The folder. If the block raises an error, folders that were made here and are still empty
