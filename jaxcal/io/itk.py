@@ -25,7 +25,7 @@ from jaxcal.runtime.messages import quoted
 _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 _KIND = "AffineTransform_double_3_3"
 _HEAD = "#Insight Transform File V1.0"
-_AFFINE = ("AffineTransform", "MatrixOffsetTransformBase", "ScaleSkewVersor3DTransform")
+_AFFINE = ("AffineTransform", "MatrixOffsetTransformBase")
 
 
 def itk_from_matrix(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 12"]:
@@ -53,7 +53,7 @@ def matrix_from_itk(
     parameters, fixed = np.asarray(parameters, float), np.asarray(fixed, float)
     if not (np.isfinite(parameters).all() and np.isfinite(fixed).all()):
         raise FormatError("the transform holds NaN or Inf")
-    if name in _AFFINE[:2] and len(parameters) == 12:
+    if name in _AFFINE and len(parameters) == 12:
         linear, translation = parameters[:9].reshape(3, 3), parameters[9:]
     elif name == "Euler3DTransform" and len(parameters) == 6:
         linear, translation = _euler(parameters[:3], fixed), parameters[3:]
