@@ -238,10 +238,11 @@ def make_images(
         raise type(error)(f"{prefix}{error}") from None
 
 
-def _refuse(name: str, bad: Bool[np.ndarray, " n"], what: str) -> None:
-    """Refuse an array of which a row is bad; the first one is named."""
-    if bad.any():
-        raise InputError(f"{name} {np.flatnonzero(bad)[0]} {what}")
+def _refuse(name: str, bad: Any, what: str) -> None:
+    """Refuse an array of which a row is bad, by (n,) bool; the first one is named."""
+    rows = np.flatnonzero(bad)
+    if len(rows):
+        raise InputError(f"{name} {rows[0]} {what}")
 
 
 def _shaped(values: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:

@@ -96,12 +96,7 @@ def interpolate_poses(
 ) -> Float[np.ndarray, "m 4 4"]:
     """Poses at other times: translation linearly, rotation along the shortest arc (slerp).
 
-    Args:
-        t: (n,) times of the poses, s, increasing.
-        poses: (n, 4, 4), mm.
-        query: (m,) times asked for, s.
-        max_gap_s: longest time between neighbouring poses that is bridged.
-        valid: (n,) bool; False where a pose cannot be used. None: all can.
+    The arguments are those of :func:`can_interpolate`, and ``poses`` (n, 4, 4), mm.
 
     Returns:
         (m, 4, 4) poses, mm.
@@ -263,21 +258,15 @@ def estimate_latency(
         InputError: too little motion or overlap, signals that do not agree, a best lag at the edge
             of the search, or several that fit alike (a periodic motion).
     """
-    t_video, t_tracker = (
-        _increasing(t_video, "time of image", 8),
-        _increasing(t_tracker, "time of pose", 8),
-    )
+    t_video = _increasing(t_video, "time of image", 8)
+    t_tracker = _increasing(t_tracker, "time of pose", 8)
     video = real_array(video, "the images' motion")
     tracker = real_array(tracker_mm, "the probe's motion")
     if video.shape != t_video.shape or tracker.shape != t_tracker.shape:
         raise InputError("each motion must have one value for each of its times")
     if not (np.isfinite(video).all() and np.isfinite(tracker).all()):
         raise InputError("a motion holds NaN or Inf: leave those samples out")
-    limits = {
-        "max_lag_s": max_lag_s,
-        "step_s": step_s,
-        "minimum_motion_mm": minimum_motion_mm,
-    }
+    limits = {"max_lag_s": max_lag_s, "step_s": step_s, "minimum_motion_mm": minimum_motion_mm}
     for name, value in limits.items():
         if not is_number(value) or value < 0:
             raise InputError(f"{name} must be a number of at least 0, not {value!r}")

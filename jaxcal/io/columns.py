@@ -91,10 +91,8 @@ class Columns:
 def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> Columns:
     """The columns that a header names.
 
-    Args:
-        names: cells of the header.
-        quaternion: order of columns that are only numbered (q1 to q4, q0 to q3); it must not
-            contradict names.
+    ``quaternion`` is the order of columns that are only numbered (q1 to q4, q0 to q3); it must not
+    contradict names.
 
     Raises:
         FormatError: a name that is not known, twice, or missing beside others; units that differ.

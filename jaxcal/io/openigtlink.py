@@ -135,11 +135,8 @@ BEGINNING = _EXTENDED.size + _IMAGE.size
 def size_agrees(header: Header, beginning: bytes | bytearray | memoryview) -> bool:
     """Whether the size in a header agrees with the beginning of the body.
 
-    With a wrong bit in the size, we would wait for megabytes; an image itself states its size.
-
-    Args:
-        header: parsed.
-        beginning: the first :data:`BEGINNING` bytes of the body, or the whole if it is shorter.
+    With a wrong bit in the size, we would wait for megabytes; an image itself states its size. The
+    beginning is the first :data:`BEGINNING` bytes, or the whole body if it is shorter.
     """
     around = 0
     if header.version == 2:

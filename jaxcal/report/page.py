@@ -318,15 +318,8 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     wide = max(float(np.ptp(seen[:, 0])) / 2, 10.0)
     deep = float(seen[:, 2].max())
     middle = float(0.5 * (seen[:, 0].min() + seen[:, 0].max()))
-    corners = np.array(
-        [
-            [middle - wide, 0, 0],
-            [middle + wide, 0, 0],
-            [middle + wide, 0, deep],
-            [middle - wide, 0, deep],
-            [middle - wide, 0, 0],
-        ]
-    )
+    across, down = np.array([-1, 1, 1, -1, -1]), np.array([0, 0, 1, 1, 0])
+    corners = np.stack([middle + wide * across, 0.0 * down, deep * down], axis=-1)
     frames = images[:, None, :3, :3] @ corners[None, :, :, None]
     frames = frames[..., 0] + images[:, None, :3, 3]
     far = np.concatenate([frames.reshape(-1, 3), point[None]])
@@ -347,18 +340,17 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
         "dots": dots,
         "bar": _bar(float(np.linalg.norm(np.ptp(far, axis=0)))),
     }
-    close = _close_up(answer, cloud, shown)
     views = (
         (
-            "scene-all",
             whole,
+            "scene-all",
             "Planes of the images (blue) and the target (orange), in the tracker's frame.",
         ),
         (
+            _close_up(answer, cloud, shown),
             "scene-target",
-            close,
-            "The target as each image puts it (green; does not fit the rest: "
-            "orange), and the estimate with its 95 % ellipsoid (lines).",
+            "The target as each image puts it (green; does not fit the rest: orange), and the "
+            "estimate with its 95 % ellipsoid (lines).",
         ),
     )
     parts = [
@@ -366,7 +358,7 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
         f'tabindex="0" aria-label="{escape(words)}" data-scene="{name}"></svg>'
         f'<figcaption>{escape(words)} <span class="screen">Drag, or use the arrow keys, to turn.'
         "</span></figcaption></figure>"
-        for name, data, words in views
+        for data, name, words in views
     ]
     place = ", ".join(_number(record, f"point_mm.{k}", ".3f") for k in range(3))
     return _section(

@@ -316,8 +316,8 @@ def _determined(calibration: Calibration, otherwise: str) -> tuple[Calibration, 
     return answer, recording
 
 
-def _legend(panel: Axes, **place: Any) -> None:
-    panel.legend(fontsize=7, frameon=False, **({"loc": "best"} | place))
+def _legend(panel: Axes, loc: Any = "best", **place: Any) -> None:
+    panel.legend(loc=loc, fontsize=7, frameon=False, **place)
 
 
 def _scale_bar(axes: Axes, length: float) -> None:

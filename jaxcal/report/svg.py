@@ -149,10 +149,7 @@ class Panel:
     ) -> list[str]:
         """Grid, ticks and labels; without an x label the numbers of x are left out, too.
 
-        Args:
-            x_label: of the horizontal axis.
-            y_label: of the vertical axis.
-            x_ticks: where the ticks along x begin and end, if not at the edges.
+        Ticks along x are between ``x_ticks``, by default the edges.
         """
         left, top, right, bottom = self.box
         parts = []
@@ -320,9 +317,7 @@ def _colour_bar(left: Number, top: Number, height: Number, low: Number, high: Nu
 def stacked(rows: Sequence[tuple[str, Sequence[tuple[str, Any, str]]]], label: str) -> str:
     """Horizontal bars of shares that add up to one, with a legend.
 
-    Args:
-        rows: title of each bar, and name, share and colour of its parts.
-        label: of the figure.
+    Each bar has a title, and name, share and colour of its parts.
     """
     parts: list[str] = []
     for k, (title, shares) in enumerate(rows):

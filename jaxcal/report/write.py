@@ -105,15 +105,10 @@ def write_report(
     curves: list[Curve],
     comparison: dict[str, Any] | None = None,
 ) -> list[Path]:
-    """Write the report of one calibration.
+    """Write the report of one calibration; an earlier one in the folder is replaced as a whole.
 
-    Args:
-        folder: an existing folder; an earlier report in it is replaced as a whole.
-        record: of :func:`jaxcal.report.record.calibration_record`.
-        result: the calibration.
-        recording: what was calibrated.
-        curves: of the method's objective, for the figure convergence; empty: no such figure.
-        comparison: records of several methods, for comparison.json.
+    Curves of the method's objective make the figure convergence, and records of several methods
+    comparison.json.
 
     Returns:
         The files: calibration.json, verdict.txt, residuals.csv, and each figure as .png and .svg:
