@@ -74,25 +74,40 @@ def on_the_way(first: Problem, second: Problem, places: np.ndarray) -> Problem:
 def steps(problems: Problem, paths: int) -> tuple[np.ndarray, np.ndarray]:
     """Largest step from place to place, in SDs, (paths, places - 1); and where all converged."""
     result = calibrate_batch(problems)
-    x = np.asarray(result.image_to_probe).reshape(paths, -1, 4, 4)
     sd = np.sqrt(np.diagonal(np.asarray(result.covariance), axis1=1, axis2=2))
-    sd = sd.reshape(paths, -1, 6)
+    fine = np.asarray(result.status_code).reshape(paths, -1) == 0
+    return largest_steps(np.asarray(result.image_to_probe), sd, paths), fine.all(axis=1)
+
+
+def largest_steps(image_to_probe: np.ndarray, sd: np.ndarray, paths: int) -> np.ndarray:
+    """Largest step of X's six parameters from place to place, in SDs, (paths, places - 1)."""
+    x, sd = image_to_probe.reshape(paths, -1, 4, 4), sd.reshape(paths, -1, 6)
     relative = np.linalg.inv(x[:, :-1]) @ x[:, 1:]
     turn = Rotation.from_matrix(relative[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
     moved = np.concatenate([relative[..., :3, 3], turn.reshape(*relative.shape[:2], 3)], axis=-1)
-    fine = np.asarray(result.status_code).reshape(paths, -1) == 0
-    return np.abs(moved / sd[:, 1:]).max(axis=-1), fine.all(axis=1)
+    return np.abs(moved / sd[:, 1:]).max(axis=-1)
+
+
+def fine_places(first: Problem, second: Problem) -> np.ndarray:
+    """Places a thousandth of the path apart where X moves fastest, (paths, places)."""
+    paths = len(first.mask)
+    coarse = np.tile(np.linspace(0, 1, PLACES), (paths, 1))
+    found, _ = steps(on_the_way(first, second, coarse), paths)
+    begin = coarse[np.arange(paths), np.nanargmax(found, axis=1)]
+    return begin[:, None] + STEP * np.arange(PLACES)
+
+
+def keys_of(number: int, count: int) -> jax.Array:
+    """The keys of a condition's paths."""
+    root = jax.random.key(SEED)
+    return jax.vmap(lambda k: jax.random.fold_in(root, k))(number * 10**6 + jnp.arange(count))
 
 
 def run(kind: str, images: int, keys: jax.Array) -> dict[str, object]:
     """One row of the table."""
     first, second = ends(kind, images, keys)
     paths = len(keys)
-    coarse = np.tile(np.linspace(0, 1, PLACES), (paths, 1))
-    found, _ = steps(on_the_way(first, second, coarse), paths)
-    begin = coarse[np.arange(paths), np.nanargmax(found, axis=1)]
-    fine = begin[:, None] + STEP * np.arange(PLACES)
-    found, sound = steps(on_the_way(first, second, fine), paths)
+    found, sound = steps(on_the_way(first, second, fine_places(first, second)), paths)
     largest = found.max(axis=1)[sound]
     return {
         "path": kind,
@@ -110,10 +125,7 @@ def main() -> None:
     count = 40 if quick else PATHS
     rows: list[dict[str, object]] = []
     for number, (kind, images) in enumerate(CONDITIONS):
-        root = jax.random.key(SEED)
-        indices = number * 10**6 + jnp.arange(count)
-        keys = jax.vmap(lambda k, root=root: jax.random.fold_in(root, k))(indices)
-        rows.append(run(kind, images, keys))
+        rows.append(run(kind, images, keys_of(number, count)))
         print(rows[-1], flush=True)
         write_table(
             results_folder(quick) / "continuity.csv",

@@ -66,7 +66,7 @@ from jaxtyping import Float
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision, simulate
 from jaxcal.data.segmentation.image import localise
-from jaxcal.data.segmentation.time_of_flight import fit_distances
+from jaxcal.data.segmentation.time_of_flight import fit_in_plane
 from jaxcal.io.atomic import atomic_path
 
 SEED = 20261122
@@ -150,7 +150,8 @@ def ways_to_segment(
 
     probe = protocol.probe
     elements = probe.element_lateral()
-    fit = jax.jit(lambda distances: fit_distances(distances, elements)[0])
+    positions = probe.element_positions()
+    fit = jax.jit(lambda distances: fit_in_plane(distances, positions, steps=5).position)
     distances = np.hypot(exact[..., :1] - elements, exact[..., 1:])
     standard = rng.normal(size=distances.shape)
     for noise in NOISES_MM:

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from jaxcal.data.segmentation.deviations import fit_deviations, halves
-from jaxcal.data.segmentation.time_of_flight import fit_distances
+from jaxcal.data.segmentation.time_of_flight import fit_in_plane
 from jaxcal.study import draws
 
 KEY = jax.random.key(20261121)
@@ -95,7 +95,8 @@ def test_fit_in_deviations_is_the_plain_fit(count, noise_mm, within):
     found = fit(noise, jnp.asarray(noise_mm), jnp.asarray(lateral), jnp.asarray(distance))
     drawn = np.concatenate(halves(noise, count), axis=-1)
     exact = np.hypot(lateral[..., None] - elements, distance[..., None])
-    plainly = jax.jit(lambda distances: fit_distances(distances, elements, steps=25)[0])
+    positions = np.stack([elements, np.zeros(count), np.zeros(count)], axis=-1)
+    plainly = jax.jit(lambda distances: fit_in_plane(distances, positions, steps=25).position)
     plain = plainly(exact + noise_mm * drawn.astype(float))
     np.testing.assert_allclose(np.stack(found, axis=-1), plain, rtol=0, atol=within)
     exactly = fit(noise, jnp.asarray(0.0), jnp.asarray(lateral), jnp.asarray(distance))

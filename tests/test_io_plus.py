@@ -15,8 +15,7 @@ from jaxcal.cli.main import main
 from jaxcal.io.plus import (
     patch_configuration,
     patched_configuration,
-    read_configuration,
-    read_result,
+    read_transform,
     transform_element,
     update_transform_command,
 )
@@ -86,12 +85,11 @@ def test_only_the_element_changes(name, tmp_path):
     old = VARIANTS[name]
     new, _ = patched_configuration(old, IMAGE, MATRIX, error_mm=0.5, date=DATE)
     (tmp_path / "c.xml").write_bytes(new)
-    found = read_configuration(tmp_path / "c.xml").find(*IMAGE)
-    assert found is not None
+    found = read_transform(tmp_path / "c.xml", *IMAGE)
     np.testing.assert_array_equal(found.matrix, MATRIX)
     assert found.error_mm == 0.5
-    assert found.date == "2026.11.21 21:00:00"
     put = found_element(parse_xml(new))
+    assert put.attributes["Date"] == "2026.11.21 21:00:00"
     there = b"<CoordinateDefinitions>" in old
     replaced = [element for element in transforms(old) if is_between(element)] if there else []
     if replaced:
@@ -215,7 +213,7 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a
 def test_configuration_that_lies(content, message, tmp_path):
     (tmp_path / "c.xml").write_bytes(content)
     with pytest.raises(FormatError, match=re.escape(message)) as caught:
-        read_configuration(tmp_path / "c.xml")
+        read_transform(tmp_path / "c.xml")
     assert str(caught.value).startswith(str(tmp_path / "c.xml"))
     assert "\n" not in str(caught.value)
 
@@ -304,8 +302,8 @@ def test_paste_and_command():
 def test_real_configurations(real_data, name):
     path = real_data / "plus" / name
     old = path.read_bytes()
-    known = read_configuration(path)
-    assert known.transforms
+    first = next(parse_xml(old).all("CoordinateDefinitions/Transform")).attributes
+    assert read_transform(path, first["From"], first["To"]).matrix.shape == (4, 4)
     new, _ = patched_configuration(old, IMAGE, MATRIX)
     found = found_element(parse_xml(new))
     assert old.startswith(new[: found.start].rstrip())
@@ -353,8 +351,8 @@ def test_fcal_result_reproduces_its_errors(real_data):
     """Each error of PLUS's report from wires, points and poses alone: fixes every convention."""
     result_path = real_data / "plus" / "IPEA_OptimizationMethod_Calibration.results.xml"
     known_path = real_data / "plus" / "PlusDeviceSet_IPEA_OptimizationMethod.xml"
-    image_to_probe = read_result(result_path).find("Image", "Probe").matrix
-    phantom = read_configuration(known_path).find("Phantom", "Reference").matrix
+    image_to_probe = read_transform(result_path).matrix
+    phantom = read_transform(known_path, "Phantom", "Reference").matrix
     result, known = ElementTree.parse(result_path), ElementTree.parse(known_path)
     patterns = [
         {wire.get("Name"): [numbers(wire, f"EndPoint{end}") for end in ("Front", "Back")]

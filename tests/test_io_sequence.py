@@ -12,7 +12,7 @@ import pytest
 
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import rotations_from_quaternions
-from jaxcal.io.frame_names import check_frame, path_between, split_name
+from jaxcal.io.frame_names import check_frames, path_between, split_name
 from jaxcal.io.sequence_files import read_sequence, write_sequence
 
 PROBE, REFERENCE = ("Probe", "Tracker"), ("Reference", "Tracker")
@@ -207,10 +207,10 @@ def test_frame_names():
     assert split_name("Stylus") is None
     assert path_between([("A", "B"), ("C", "B")], "A", "C") == [(0, False), (1, True)]
     assert path_between([("A", "B")], "A", "C") is None
-    assert check_frame("image") == "Image"
+    assert check_frames(("image", "probe")) == ("Image", "Probe")
     for name in ("", "a b", "ProbeToTracker", "1x", 'x"y'):
         with pytest.raises(FormatError):
-            check_frame(name)
+            check_frames((name, "Other"))
 
 
 # Files that lie.

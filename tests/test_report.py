@@ -16,10 +16,9 @@ import jaxcal
 from jaxcal import InputError, OutputError
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.report.convergence import KEPT, Curve, bounded_curves
-from jaxcal.report.figures import convergence_figure
 from jaxcal.report.next_poses import next_poses_record, next_poses_sentences
 from jaxcal.report.paragraphs import laid_out, listed
-from jaxcal.report.plots import plot_offsets, plot_residuals
+from jaxcal.report.plots import convergence_figure, plot_offsets, plot_residuals
 from jaxcal.report.record import calibration_record, check_test_images, plain, truth_error
 from jaxcal.report.tables import calibration_table, comparison_table
 from jaxcal.report.verdict import verdict
@@ -344,7 +343,7 @@ def test_convergence_figure_shows_the_excess_over_the_best():
 
 
 def test_figures_leave_pyplot_alone():
-    code = "import jaxcal.report.figures, sys; sys.exit('matplotlib.pyplot' in sys.modules)"
+    code = "import jaxcal.report.plots, sys; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

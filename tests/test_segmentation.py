@@ -20,7 +20,6 @@ from jaxcal.data.probe import C5_2, L14_5, LinearProbe
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.data.segmentation.segment import OutOfPlane, compiled_fit, segment, segment_recording
 from jaxcal.data.segmentation.time_of_flight import (
-    fit_distances,
     fit_in_plane,
     fit_out_of_plane,
     shortest,
@@ -79,23 +78,21 @@ def raw(distances, probe, **others):
     return make_images(poses(len(times)), times, "time_of_flight", **others)
 
 
-# -- the plain fit of the simulations
-
-
 def test_distance_fit_agrees_with_scipy_and_its_covariance_holds():
     rng = np.random.default_rng(0)
     elements = L14_5.element_lateral()
     truth = np.stack([rng.uniform(-29, 29, 400), rng.uniform(10, 90, 400)], axis=1)
     exact = np.hypot(truth[:, :1] - elements, truth[:, 1:])
     distances = exact + 0.5 * rng.normal(size=exact.shape)
-    points, inverse = map(np.asarray, jax.jit(fit_distances)(distances, elements))
+    fit = compiled_fit(False, False)(distances, L14_5.element_positions())
+    points, inverse = np.asarray(fit.position), np.asarray(fit.inverse_normal)
     for k in range(0, 400, 40):
 
         def residual(p, k=k):
             return np.hypot(p[0] - elements, p[1]) - distances[k]
 
         np.testing.assert_allclose(points[k], least_squares(residual, truth[k]).x, atol=1e-5)
-    squared = squared_error(points - truth, 0.25 * np.asarray(inverse))
+    squared = squared_error(points - truth, 0.25 * inverse)
     # Mean of 400 chi-squares with 2 degrees of freedom: 2 with an SD of 0.1.
     assert 1.7 < squared.mean() < 2.3
 
@@ -105,7 +102,6 @@ def test_exact_distances_give_the_point_from_anywhere_in_the_field():
     x, r = np.meshgrid(np.linspace(-40, 40, 9), np.linspace(5, 120, 9))
     exact = np.hypot(x[..., None] - elements[:, 0], r[..., None])
     for points in (
-        jax.jit(fit_distances)(exact, elements[:, 0])[0],
         compiled_fit(False, False)(exact, elements).position,
         compiled_fit(False, True)(exact, elements).position,
     ):
@@ -122,11 +118,6 @@ def test_fused_fit_is_the_least_squares_solution(robust):
     distances = lose(distances, 0.3)
     positions = L14_5.element_positions()
     fit = compiled_fit(False, robust)(distances, positions)
-    if not robust:
-        complete = draw(L14_5, 60, 0.5)[1]
-        plain = jax.jit(fit_distances)(complete, positions[:, 0])[0]
-        fused = compiled_fit(False, False)(complete, positions).position
-        np.testing.assert_allclose(fused, plain, rtol=0, atol=1e-9)
     for k in range(0, 60, 15):
         there = np.isfinite(distances[k])
         scale = float(fit.noise[k])

@@ -340,6 +340,20 @@ def test_itk_text_that_lies(tmp_path, text, message):
     assert str(caught.value).startswith(str(tmp_path / "t.tfm"))
 
 
+def test_itk_hdf5_that_claims_a_gigabyte_of_text(tmp_path):
+    """A text of fixed size that is not stored is read as so many zeros."""
+    path = tmp_path / "t.h5"
+    write_itk(path, np.eye(4))
+    kind = h5py.h5t.C_S1.copy()
+    kind.set_size(2**30)
+    with h5py.File(path, "a") as file:
+        one = file["TransformGroup/0"]
+        del one["TransformType"]
+        h5py.h5d.create(one.id, b"TransformType", kind, h5py.h5s.create_simple((1,)))
+    with pytest.raises(FormatError, match="TransformType is too long"):
+        read_itk(path)
+
+
 # Applying.
 
 

@@ -9,6 +9,7 @@ import click
 
 from jaxcal import InputError
 from jaxcal.cli.common import NOT_NEGATIVE, ExitCode
+from jaxcal.cli.sequence_options import quaternion_option
 
 _COLUMNS = (
     "x_mm",
@@ -34,11 +35,7 @@ _COLUMNS = (
     metavar="PX",
     help="SD of the points in the image, px (mm without pixels).",
 )
-@click.option(
-    "--quaternion",
-    type=click.Choice(["xyzw", "wxyz"]),
-    help="Whether a quaternion's scalar is the last or the first of its numbers.",
-)
+@quaternion_option
 @click.option("--pose-units", type=click.Choice(["mm", "cm", "m"]), help="Unit of translations.")
 @click.option(
     "--skip-invalid",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -214,6 +214,7 @@ def calibrate(
     from jaxcal.report.accuracy import settle
     from jaxcal.report.next_poses import next_poses_record
     from jaxcal.report.record import calibration_record, check_test_images
+    from jaxcal.report.write import prepare_folder, write_report
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     measured, notes = _segmented(load(recording))
@@ -221,7 +222,7 @@ def calibrate(
     check_test_images(measured, test_data)
     _check_pixels(measured, targets)
     enable_compilation_cache()
-    with nullcontext() if out is None else _prepared(out) as folder:
+    with nullcontext() if out is None else prepare_folder(out) as folder:
         if report is not None:
             from jaxcal.report.page import check_page
 
@@ -240,8 +241,6 @@ def calibrate(
             settle(record)
         if folder is not None:
             with progress("drawing the report"):
-                from jaxcal.report.write import write_report
-
                 curves = _curves(measured, request, result)
                 write_report(folder, record, result, measured, curves)
     if report is not None:
@@ -255,12 +254,6 @@ def calibrate(
         _print(record, out)
         print_page(*exported)
     return verdict_code(record, require)
-
-
-def _prepared(out: str) -> AbstractContextManager[Path]:
-    from jaxcal.report.write import prepare_folder
-
-    return prepare_folder(out)
 
 
 def _export_target(text: str, inputs: list[str], out: str | None) -> tuple[SaveFormat, str]:

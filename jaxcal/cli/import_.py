@@ -8,7 +8,7 @@ import click
 
 from jaxcal import InputError, OutputError
 from jaxcal.cli.common import ExitCode, progress
-from jaxcal.cli.sequence_options import search_options, tracking_options
+from jaxcal.cli.sequence_options import quaternion_option, search_options, tracking_options
 from jaxcal.io.atomic import check_writable
 from jaxcal.io.outputs import check_output, is_recording
 
@@ -27,11 +27,7 @@ from jaxcal.io.outputs import check_output, is_recording
     type=click.Choice(["mm", "cm", "m"]),
     help="Unit of translations where the file of the poses does not say; mm by default.",
 )
-@click.option(
-    "--quaternion",
-    type=click.Choice(["xyzw", "wxyz"]),
-    help="Whether a quaternion's scalar is the last or the first of its numbers.",
-)
+@quaternion_option
 @click.option(
     "--skip-invalid",
     is_flag=True,

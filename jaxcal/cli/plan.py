@@ -18,6 +18,7 @@ from jaxcal.cli.common import (
     print_json,
     print_page,
     progress,
+    seed_option,
 )
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.study.laws import OFFSET_LAWS, OffsetLaw
@@ -100,14 +101,7 @@ _PICTURES = (b"\x89PNG", b"\xff\xd8\xff", b"%PDF", b"%!PS", b"<?xml", b"RIFF", b
     metavar="LIST",
     help="With REC: further unknowns (scale, sound-speed), as for calibrate.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    metavar="N",
-    help="Seed of the candidate poses.",
-)
+@seed_option("Seed of the candidate poses.")
 @click.option(
     "--simulate",
     type=click.Choice(OFFSET_LAWS),

@@ -17,15 +17,9 @@ from jaxcal.runtime.interrupts import no_interrupt_lost
 
 
 def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None) -> int:
-    """Run a command line.
+    """Run a command line, by default ``sys.argv``'s; returns the exit status.
 
-    Args:
-        commands: what there is.
-        name: of the program.
-        arguments: without the program's name; ``sys.argv``'s by default.
-
-    Returns:
-        The exit status. Errors have been reported on standard error by then, in one line.
+    Errors have been reported on standard error by then, in one line.
     """
     if arguments is None:
         if sys.stdout is None:

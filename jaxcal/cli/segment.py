@@ -141,14 +141,7 @@ def segment(
     return ExitCode.CONVERGED
 
 
-_TIMES = (
-    "method",
-    "robust",
-    "scale",
-    "interpolate",
-    "sound_speed",
-    "temperature",
-)
+_TIMES = ("method", "robust", "scale", "interpolate", "sound_speed", "temperature")
 """Options that belong to times of flight."""
 
 

@@ -69,6 +69,11 @@ _TRACKING = (
         help="Orientation of the frames, if their file does not say it.",
     ),
 )
+quaternion_option = click.option(
+    "--quaternion",
+    type=click.Choice(["xyzw", "wxyz"]),
+    help="Whether a quaternion's scalar is the last or the first of its numbers.",
+)
 spacing_option = click.option(
     "--spacing",
     "spacing_mm",

@@ -229,11 +229,7 @@ class Problem:
 
 
 def fill_up(problem: Problem) -> Problem:
-    """The problem filled up with masked images to its bucket's size; numpy arrays if it grows.
-
-    Args:
-        problem: one, or a batch.
-    """
+    """A problem or batch with masked images up to its bucket's size; numpy arrays if it grows."""
     more = buckets.size(problem.images) - problem.images
     if not more:
         return problem
@@ -246,12 +242,7 @@ def fill_up(problem: Problem) -> Problem:
 
 
 def taken(problem: Problem, rows: list[int]) -> Problem:
-    """Some images of a problem, in numpy arrays.
-
-    Args:
-        problem: without leading axes.
-        rows: which images, in order; one may occur several times.
-    """
+    """Some images of one problem, in numpy arrays; an image may be taken several times."""
     return buckets.each_image(problem, lambda values, axis: np.take(np.asarray(values), rows, axis))
 
 

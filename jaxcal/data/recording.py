@@ -7,8 +7,6 @@ rely on shapes, units and finite values.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -37,7 +35,8 @@ Kind = Literal["point", "pixel", "time_of_flight"]
 _EXTENT_MM = 50.0
 """Of a target's path through the image where nothing better is known."""
 _AT_REST_MM = 1e-6
-_UNIT = {"point": "mm", "pixel": "px", "time_of_flight": "s"}
+UNIT_OF: dict[Kind, str] = {"point": "mm", "pixel": "px", "time_of_flight": "s"}
+"""Unit in which measurements of a kind are given."""
 
 
 class MetresError(InputError):
@@ -195,7 +194,7 @@ def make_images(
             "grad: make the problem outside, and change its arrays inside "
             "(dataclasses.replace(problem, measurements=...))"
         )
-    with _prefixed(prefix):
+    try:
         if kind not in get_args(Kind):
             raise InputError(f"kind must be one of {', '.join(get_args(Kind))}, not {kind!r}")
         poses, values = real_array(poses, "poses"), real_array(measurements, "measurements")
@@ -234,16 +233,23 @@ def make_images(
             time_of_flight=_raw_times(time_of_flight, kind, count, used),
         )
         _check_units(images)
-    return images
-
-
-@contextmanager
-def _prefixed(prefix: str) -> Iterator[None]:
-    """Put a prefix in front of the messages of errors."""
-    try:
-        yield
+        return images
     except InputError as error:
         raise type(error)(f"{prefix}{error}") from None
+
+
+def _refuse(name: str, bad: Any, what: str) -> None:
+    """Refuse an array of which a row is bad, by (n,) bool; the first one is named."""
+    rows = np.flatnonzero(bad)
+    if len(rows):
+        raise InputError(f"{name} {rows[0]} {what}")
+
+
+def _shaped(values: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    values = real_array(values, name)
+    if values.shape != shape:
+        raise InputError(f"{name} must have shape {shape}, it has {values.shape}")
+    return values
 
 
 def used_values(
@@ -267,22 +273,18 @@ def used_values(
     else:
         values[~used] = 1.0
         bad = ~np.isfinite(values).all(axis=1)
-    if bad.any():
-        raise InputError(f"{kind} {np.flatnonzero(bad)[0]} holds NaN or Inf")
+    _refuse(kind, bad, "holds NaN or Inf")
     if kind == "time_of_flight":
         return values
     _check_magnitude(kind, values, used)
     if kind == "point":
-        bad = (values[:, 1] <= 0) & used
-        if bad.any():
-            raise InputError(f"point {np.flatnonzero(bad)[0]} has a range that is not positive")
+        _refuse(kind, (values[:, 1] <= 0) & used, "has a range that is not positive")
     if kind == "pixel":
-        bad = (values[:, 1] < 0) & used
-        if bad.any():
-            first = np.flatnonzero(bad)[0]
+        above = np.flatnonzero((values[:, 1] < 0) & used)
+        if len(above):
             raise InputError(
-                f"pixel {first} has row v = {values[first, 1]:g}: rows count from the top of the "
-                "image, where v = 0; are u and v exchanged, or counted from the image's middle?"
+                f"pixel {above[0]} has row v = {values[above[0], 1]:g}: rows count from the top of "
+                "the image, where v = 0; are u and v exchanged, or counted from the image's middle?"
             )
     return values
 
@@ -313,12 +315,12 @@ def _check_below_face(
         return
     # Without a spacing, any positive one will do: rows are not negative.
     along = 1.0 if spacing is None else spacing[1]
-    bad = (along * pixels[:, 1] + face_offset_mm <= 0) & used
-    if bad.any():
-        raise InputError(
-            f"pixel {np.flatnonzero(bad)[0]} has a range that is not positive: its row lies at "
-            "or above the transducer's face (face_offset_mm is the range of row 0)"
-        )
+    _refuse(
+        "pixel",
+        (along * pixels[:, 1] + face_offset_mm <= 0) & used,
+        "has a range that is not positive: its row lies at or above the transducer's face "
+        "(face_offset_mm is the range of row 0)",
+    )
 
 
 def _bound(max_elevation: Any, count: int, used: np.ndarray) -> Float[np.ndarray, " n"] | None:
@@ -326,8 +328,8 @@ def _bound(max_elevation: Any, count: int, used: np.ndarray) -> Float[np.ndarray
     if max_elevation is not None and np.ndim(max_elevation) == 0:
         max_elevation = np.full(count, real_array(max_elevation, "max_elevation"))
     bound = _per_image("max_elevation", max_elevation, count, used, fill=1.0)
-    if bound is not None and (bound < 0).any():
-        raise InputError(f"max_elevation {np.flatnonzero(bound < 0)[0]} is negative")
+    if bound is not None:
+        _refuse("max_elevation", bound < 0, "is negative")
     return bound
 
 
@@ -345,9 +347,7 @@ def _raw_times(
             f"time_of_flight must have shape ({count}, elements), it has {times.shape}"
         )
     infinite = np.isinf(times)
-    bad = infinite.any(axis=1) & used
-    if bad.any():
-        raise InputError(f"time_of_flight {np.flatnonzero(bad)[0]} holds Inf")
+    _refuse("time_of_flight", infinite.any(axis=1) & used, "holds Inf")
     times[infinite] = np.nan
     return times
 
@@ -356,11 +356,7 @@ def _check_magnitude(name: str, values: np.ndarray, used: np.ndarray) -> None:
     """Refuse numbers too large in any unit, before they overflow; NaN and Inf are checked later."""
     rows = np.abs(values.reshape(len(used), -1)) if len(used) else np.zeros((0, 1))
     bad = (np.isfinite(rows) & (rows > LARGEST)).any(axis=1) & used
-    if bad.any():
-        row = int(np.flatnonzero(bad)[0])
-        raise InputError(
-            f"{name} {row} holds a number beyond {LARGEST:g}: that cannot be a measure"
-        )
+    _refuse(name, bad, f"holds a number beyond {LARGEST:g}: that cannot be a measure")
 
 
 def _mask(mask: np.ndarray | None, count: int) -> Bool[np.ndarray, " n"]:
@@ -382,12 +378,9 @@ def _per_image(
 ) -> Float[np.ndarray, " n"] | None:
     if values is None:
         return None
-    values = real_array(values, name)
-    if values.shape != (count,):
-        raise InputError(f"{name} must have shape ({count},), it has {values.shape}")
+    values = _shaped(values, name, (count,))
     values[~used] = fill
-    if not np.isfinite(values).all():
-        raise InputError(f"{name} {np.flatnonzero(~np.isfinite(values))[0]} is NaN or Inf")
+    _refuse(name, ~np.isfinite(values), "is NaN or Inf")
     return values
 
 
@@ -396,22 +389,16 @@ def _covariance(
 ) -> Float[np.ndarray, "n 2 2"] | None:
     if covariance is None:
         return None
-    values = real_array(covariance, "covariance")
-    if values.shape != (count, 2, 2):
-        raise InputError(f"covariance must have shape ({count}, 2, 2), it has {values.shape}")
+    values = _shaped(covariance, "covariance", (count, 2, 2))
     values[~used] = np.eye(2)
     _check_magnitude("covariance", values, used)
-    bad = ~np.isfinite(values).all(axis=(1, 2))
-    if bad.any():
-        raise InputError(f"covariance {np.flatnonzero(bad)[0]} holds NaN or Inf")
+    _refuse("covariance", ~np.isfinite(values).all(axis=(1, 2)), "holds NaN or Inf")
     scale = np.abs(values).max(axis=(1, 2))
     bad = np.abs(values[:, 0, 1] - values[:, 1, 0]) > 1e-6 * scale
-    bad |= np.linalg.eigvalsh((values + values.swapaxes(1, 2)) / 2)[:, 0] <= 1e-12 * scale
-    if bad.any():
-        raise InputError(
-            f"covariance {np.flatnonzero(bad)[0]} is not symmetric and positive definite"
-        )
-    return (values + values.swapaxes(1, 2)) / 2
+    symmetric = (values + values.swapaxes(1, 2)) / 2
+    bad |= np.linalg.eigvalsh(symmetric)[:, 0] <= 1e-12 * scale
+    _refuse("covariance", bad, "is not symmetric and positive definite")
+    return symmetric
 
 
 def _check_units(images: Images) -> None:
@@ -420,7 +407,7 @@ def _check_units(images: Images) -> None:
     if not used.any():
         return
     translations = images.poses[used, :3, 3]
-    spread, _ = _spread_and_reach(translations)
+    spread = _spread(translations)
     if images.kind == "point":
         extent = float(np.abs(images.measurements[used]).max())
         if extent < 0.5 and spread > 1.0:
@@ -444,10 +431,7 @@ def _check_units(images: Images) -> None:
 
 
 def check_spacing_unit(spacing_mm: Float[np.ndarray, 2]) -> None:
-    """Refuse a pixel's size that cannot be in millimetres.
-
-    Args:
-        spacing_mm: [lateral, axial] per px, as if in mm.
+    """Refuse a pixel's size [lateral, axial] that cannot be in millimetres.
 
     Raises:
         InputError: it is far too large, or looks like metres.
@@ -468,16 +452,14 @@ def check_pose_units(translations: Float[np.ndarray, "n 3"], extent_mm: float = 
     """Refuse poses of different images whose translations are in metres in place of millimetres.
 
     A probe whose every position lies within 5 mm of the tracker's origin, and whose moves are
-    hundreds of times smaller than the target's path through the image, was recorded in metres.
-
-    Args:
-        translations: of the images' poses, as if in mm.
-        extent_mm: length of the target's path through the image, roughly.
+    hundreds of times smaller than the target's path through the image (roughly ``extent_mm``), was
+    recorded in metres.
 
     Raises:
         MetresError: they look like metres.
     """
-    spread, reach = _spread_and_reach(translations)
+    spread = _spread(translations)
+    reach = float(np.linalg.norm(translations, axis=1).max())
     # A probe that does not move has no unit; what is left of its moves is rounding.
     if _AT_REST_MM < spread < 0.02 * extent_mm and reach < LEAST_REACH_MM:
         raise MetresError(
@@ -486,14 +468,6 @@ def check_pose_units(translations: Float[np.ndarray, "n 3"], extent_mm: float = 
         )
 
 
-def _spread_and_reach(translations: Float[np.ndarray, "n 3"]) -> tuple[float, float]:
-    """Largest distance from the mean, and from the origin."""
-    away = translations - translations.mean(axis=0)
-    return float(np.linalg.norm(away, axis=1).max()), float(
-        np.linalg.norm(translations, axis=1).max()
-    )
-
-
-def unit_of(kind: Kind) -> str:
-    """The unit in which measurements of a kind are given."""
-    return _UNIT[kind]
+def _spread(translations: Float[np.ndarray, "n 3"]) -> float:
+    """Largest distance from the mean."""
+    return float(np.linalg.norm(translations - translations.mean(axis=0), axis=1).max())

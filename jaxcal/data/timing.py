@@ -12,12 +12,10 @@ Numpy and scipy throughout: this runs once a recording, on hundreds of samples a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation, Slerp
-from scipy.stats import theilslopes
 
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
@@ -98,12 +96,7 @@ def interpolate_poses(
 ) -> Float[np.ndarray, "m 4 4"]:
     """Poses at other times: translation linearly, rotation along the shortest arc (slerp).
 
-    Args:
-        t: (n,) times of the poses, s, increasing.
-        poses: (n, 4, 4), mm.
-        query: (m,) times asked for, s.
-        max_gap_s: longest time between neighbouring poses that is bridged.
-        valid: (n,) bool; False where a pose cannot be used. None: all can.
+    The arguments are those of :func:`can_interpolate`, and ``poses`` (n, 4, 4), mm.
 
     Returns:
         (m, 4, 4) poses, mm.
@@ -144,16 +137,13 @@ class ClockFit:
             alone cannot tell a late clock from a late message.
         drift: seconds per second by which the host's clock gains.
         reference_s: device time at which the offset holds.
-        delay_s: (n,) s, residuals: by how much each sample was later than the line (with
-            ``regression``, negative if earlier).
-        method: ``envelope`` or ``regression``.
+        delay_s: (n,) s, residuals: by how much each sample was later than the line.
     """
 
     offset_s: float
     drift: float
     reference_s: float
     delay_s: Float[np.ndarray, " n"]
-    method: str
 
     def to_host(self, t_device: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
         """Host times (s) of device times."""
@@ -161,29 +151,18 @@ class ClockFit:
         return device + self.offset_s + self.drift * (device - self.reference_s)
 
 
-def fit_clock(
-    t_device: np.ndarray,
-    t_host: np.ndarray,
-    *,
-    method: str = "envelope",
-) -> ClockFit:
+def fit_clock(t_device: np.ndarray, t_host: np.ndarray) -> ClockFit:
     """Offset and drift between a device's clock and the host's, from stamps of the same samples.
 
-    ``envelope``: messages come late, never early. The line lies below all samples (device,
-    host - device) and has the least sum of distances to them. It is the edge of their lower convex
-    hull at the mean device time (Moon, Skelly and Towsley 1999, "Estimation and removal of clock
-    skew from network delay measurements", INFOCOM, who solve a linear programme). Load on the
-    host, which delays many samples by much, does not move the line; a single stamp that is wrongly
-    early does.
-
-    ``regression``: the line for host stamps whose jitter is equal in both directions. Theil and
-    Sen's median of slopes makes it robust to outliers. It is for device stamps that are a frame
-    count times a period.
+    Messages come late, never early. The line lies below all samples (device, host - device) and
+    has the least sum of distances to them. It is the edge of their lower convex hull at the mean
+    device time (Moon, Skelly and Towsley 1999, "Estimation and removal of clock skew from network
+    delay measurements", INFOCOM, who solve a linear programme). Load on the host, which delays many
+    samples by much, does not move the line; a single stamp that is wrongly early does.
 
     Args:
         t_device: (n,) device times, s, increasing.
         t_host: (n,) host times of arrival, s.
-        method: ``envelope`` or ``regression``.
 
     Raises:
         InputError: fewer than two samples, device times out of order, or values not finite.
@@ -196,21 +175,8 @@ def fit_clock(
     reference = float(device[0])
     x, y = device - reference, host - device
     base = float(y[0])
-    if method == "envelope":
-        drift, level = _lower_envelope(x, y - base)
-    elif method == "regression":
-        drift = _theil_sen(x, y - base)
-        level = float(np.median(y - base - drift * x))
-    else:
-        raise InputError(f"method must be envelope or regression, not {method!r}")
-    return ClockFit(base + level, drift, reference, y - base - level - drift * x, method)
-
-
-def _theil_sen(x: np.ndarray, y: np.ndarray, most: int = 1000) -> float:
-    """Median of the slopes of all pairs. There are n^2, so long recordings are thinned out."""
-    step = -(-len(x) // most)
-    fit: Any = theilslopes(y[::step], x[::step])
-    return float(fit.slope)
+    drift, level = _lower_envelope(x, y - base)
+    return ClockFit(base + level, drift, reference, y - base - level - drift * x)
 
 
 def _lower_envelope(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
@@ -292,21 +258,15 @@ def estimate_latency(
         InputError: too little motion or overlap, signals that do not agree, a best lag at the edge
             of the search, or several that fit alike (a periodic motion).
     """
-    t_video, t_tracker = (
-        _increasing(t_video, "time of image", 8),
-        _increasing(t_tracker, "time of pose", 8),
-    )
+    t_video = _increasing(t_video, "time of image", 8)
+    t_tracker = _increasing(t_tracker, "time of pose", 8)
     video = real_array(video, "the images' motion")
     tracker = real_array(tracker_mm, "the probe's motion")
     if video.shape != t_video.shape or tracker.shape != t_tracker.shape:
         raise InputError("each motion must have one value for each of its times")
     if not (np.isfinite(video).all() and np.isfinite(tracker).all()):
         raise InputError("a motion holds NaN or Inf: leave those samples out")
-    limits = {
-        "max_lag_s": max_lag_s,
-        "step_s": step_s,
-        "minimum_motion_mm": minimum_motion_mm,
-    }
+    limits = {"max_lag_s": max_lag_s, "step_s": step_s, "minimum_motion_mm": minimum_motion_mm}
     for name, value in limits.items():
         if not is_number(value) or value < 0:
             raise InputError(f"{name} must be a number of at least 0, not {value!r}")

@@ -69,11 +69,7 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a UTF-8 text file, complete or not at all.
-
-    Args:
-        path: the file to make or replace.
-        text: its content; line ends are written as they are.
+    """Write a UTF-8 text file, complete or not at all; line ends are written as they are.
 
     Raises:
         OutputError: it could not be written; the file is as it was.

@@ -42,29 +42,17 @@ _UNIT = re.compile(
 )
 _CELL = re.compile(r"([a-z]*?)_?([0-4])[_,]?([0-4])")
 _NUMBERED = re.compile(r"([a-z]*?)_?(\d{1,2})")
-_UNITS = {
-    "mm": "mm",
-    "millimeter": "mm",
-    "millimeters": "mm",
-    "millimetre": "mm",
-    "millimetres": "mm",
-    "cm": "cm",
-    "m": "m",
-    "meter": "m",
-    "meters": "m",
-    "metre": "m",
-    "metres": "m",
-    "px": "px",
-    "pixel": "px",
-    "pixels": "px",
-    "s": "s",
-    "sec": "s",
-    "seconds": "s",
-    "ms": "ms",
-    "us": "us",
-    "µs": "us",
-    "ns": "ns",
+_SPELLINGS = {
+    "mm": ("millimeter", "millimeters", "millimetre", "millimetres"),
+    "cm": (),
+    "m": ("meter", "meters", "metre", "metres"),
+    "px": ("pixel", "pixels"),
+    "s": ("sec", "seconds"),
+    "ms": (),
+    "us": ("µs",),
+    "ns": (),
 }
+_UNITS = {name: unit for unit, others in _SPELLINGS.items() for name in (unit, *others)}
 
 
 @dataclass(frozen=True)
@@ -103,10 +91,8 @@ class Columns:
 def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> Columns:
     """The columns that a header names.
 
-    Args:
-        names: cells of the header.
-        quaternion: order of columns that are only numbered (q1 to q4, q0 to q3); it must not
-            contradict names.
+    ``quaternion`` is the order of columns that are only numbered (q1 to q4, q0 to q3); it must not
+    contradict names.
 
     Raises:
         FormatError: a name that is not known, twice, or missing beside others; units that differ.

@@ -26,29 +26,21 @@ def capitalised(name: str) -> str:
     return name[:1].upper() + name[1:]
 
 
-def check_frame(name: str) -> str:
-    """A frame's name that PLUS and Slicer accept, capitalised.
-
-    Raises:
-        FormatError: a name that is not letters and digits after a first letter, or in which "To"
-            stands before a capital letter: ``ProbeToTracker`` could not be split again.
-    """
-    capital = capitalised(name)
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*", name) or _SEPARATOR.search(capital):
-        raise FormatError(
-            f"{quoted(name)} cannot name a coordinate frame: letters and digits are needed, "
-            'without "To" before a capital letter'
-        )
-    return capital
-
-
 def check_frames(frames: FramePair) -> FramePair:
     """Two different frames' names that PLUS and Slicer accept, capitalised.
 
     Raises:
-        FormatError: see :func:`check_frame`; or one frame twice.
+        FormatError: a name that is not letters and digits after a first letter, or in which "To"
+            stands before a capital letter: ``ProbeToTracker`` could not be split again; or one
+            frame twice.
     """
-    source, target = check_frame(frames[0]), check_frame(frames[1])
+    source, target = capitalised(frames[0]), capitalised(frames[1])
+    for name, capital in zip(frames, (source, target), strict=True):
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*", name) or _SEPARATOR.search(capital):
+            raise FormatError(
+                f"{quoted(name)} cannot name a coordinate frame: letters and digits are needed, "
+                'without "To" before a capital letter'
+            )
     if source == target:
         raise FormatError(
             f"a transform leads from one frame to another, not from {source} to {target}"
@@ -58,11 +50,6 @@ def check_frames(frames: FramePair) -> FramePair:
 
 def path_between(pairs: list[FramePair], start: str, end: str) -> list[tuple[int, bool]] | None:
     """The shortest way from one frame to another along transforms and their inverses.
-
-    Args:
-        pairs: the transforms' frames.
-        start: frame to begin at.
-        end: frame to arrive at.
 
     Returns:
         (index of the pair, whether it is inverted) for each step; None where there is no way.

@@ -34,12 +34,14 @@ class FramePoints(NamedTuple):
         points: (m, 2): [u, v] px, or [lateral, range] mm.
         kind: of the points.
         notes: what was left out, in words.
+        covariance: (m, 2, 2) of the points, in their unit squared, or None.
     """
 
     rows: Int[np.ndarray, " m"]
     points: Float[np.ndarray, "m 2"]
     kind: Literal["pixel", "point"]
     notes: list[str]
+    covariance: Float[np.ndarray, "m 2 2"] | None = None
 
 
 def points_of_markups(

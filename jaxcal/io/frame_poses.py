@@ -22,10 +22,6 @@ def open_sequence(
 ) -> tuple[TrackedSequence, list[str]]:
     """A sequence of any kind with the poses that belong to it, and notes for the user.
 
-    Args:
-        source: a sequence, a folder of PNG, a tracker's export or a TUS-REC scan.
-        options: ``poses`` names the file of the poses where they are not in ``source``.
-
     Raises:
         InputError: files that cannot be read or do not belong together; one line.
     """
@@ -101,12 +97,9 @@ def tracked_poses(
 def frames_to_show(
     sequence: TrackedSequence, options: ImportOptions, every: int = 1
 ) -> tuple[list[int], tuple[int, int], list[str]]:
-    """Frames in which a person is to place points.
+    """Frames in which a person is to place points: every n-th of those that can be used.
 
-    Args:
-        sequence: with pixels; without any transforms every image is shown.
-        options: which poses are needed.
-        every: of the frames that can be used, every n-th.
+    Without any transforms every image can be used.
 
     Returns:
         Numbers of the frames, their columns and rows, and what was left out, in words.

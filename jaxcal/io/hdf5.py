@@ -34,13 +34,13 @@ from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import CurvilinearProbe, LinearProbe, Probe
 from jaxcal.data.recording import (
     MINIMUM_IMAGES,
+    UNIT_OF,
     Images,
     Kind,
     Recording,
     Truth,
     check_recording,
     make_images,
-    unit_of,
 )
 from jaxcal.io.atomic import atomic_path
 from jaxcal.io.readable import check_readable, naming, path_name
@@ -76,6 +76,8 @@ _SPELLINGS = {
 }
 # Dimensionless, or of any unit: written as "1" and not compared.
 _FREE = "1"
+_PER_IMAGE = {"amplitude": _FREE, "time": "s", "max_elevation": "mm"}
+"""Optional numbers, one an image, and their units."""
 
 
 def load(path: str | os.PathLike[str]) -> Recording:
@@ -211,7 +213,7 @@ def _read_images(root: Node, name: str, probe: Probe | None, minimum: int) -> Im
         raise FormatError(f"{node}/time_of_flight needs /probe, which is missing")
     columns = ELEMENTS if kind == "time_of_flight" else 2
     poses = _dataset(node, "pose", (IMAGES, 4, 4), "mm")
-    measurements = _dataset(node, kind, (IMAGES, columns), unit_of(kind))
+    measurements = _dataset(node, kind, (IMAGES, columns), UNIT_OF[kind])
     if poses is None or measurements is None:
         raise FormatError(f"{node}/pose is missing")
     times = measurements if kind == "time_of_flight" else None
@@ -223,22 +225,24 @@ def _read_images(root: Node, name: str, probe: Probe | None, minimum: int) -> Im
             f"{probe.elements} elements"
         )
     spacing, offset = _read_scale(node) if kind == "pixel" else (None, None)
-    area = "px^2" if kind == "pixel" else "mm^2"
     return make_images(
         poses,
         measurements,
         kind,
         mask=_dataset(node, "mask", (IMAGES,), _FREE, kinds="biu"),
-        covariance=_dataset(node, "covariance", (IMAGES, 2, 2), area),
-        max_elevation=_dataset(node, "max_elevation", (IMAGES,), "mm"),
-        amplitude=_dataset(node, "amplitude", (IMAGES,), _FREE),
-        time=_dataset(node, "time", (IMAGES,), "s"),
+        covariance=_dataset(node, "covariance", (IMAGES, 2, 2), _area(kind)),
         spacing_mm=spacing,
         face_offset_mm=0.0 if offset is None else offset,
         time_of_flight=times if kind == "point" else None,
         minimum=minimum,
         where=str(node),
+        **{name: _dataset(node, name, (IMAGES,), unit) for name, unit in _PER_IMAGE.items()},
     )
+
+
+def _area(kind: Kind) -> str:
+    """The unit of covariances."""
+    return "px^2" if kind == "pixel" else "mm^2"
 
 
 def _kind(node: Node) -> Kind:
@@ -314,10 +318,8 @@ def _write(file: h5py.File, recording: Recording) -> None:
     file.attrs["version"] = VERSION
     if recording.probe is not None:
         probe = file.create_group("probe")
-        probe.attrs["kind"] = recording.probe.kind
-        probe.attrs["elements"] = recording.probe.elements
-        probe.attrs["pitch_mm"] = recording.probe.pitch_mm
-        probe.attrs["sound_speed_m_s"] = recording.probe.sound_speed_m_s
+        for name in ("kind", "elements", "pitch_mm", "sound_speed_m_s"):
+            probe.attrs[name] = getattr(recording.probe, name)
         if isinstance(recording.probe, CurvilinearProbe):
             probe.attrs["radius_mm"] = recording.probe.radius_mm
         if recording.probe.delay_s:
@@ -327,29 +329,21 @@ def _write(file: h5py.File, recording: Recording) -> None:
         _write_images(file.create_group("test"), recording.test)
     if recording.truth is not None:
         truth = file.create_group("truth")
-        _put(truth, "image_to_probe", recording.truth.image_to_probe, "mm")
-        _put(truth, "point", recording.truth.point, "mm")
-        _put(truth, "elevation", recording.truth.elevation, "mm")
+        for name in ("image_to_probe", "point", "elevation"):
+            _put(truth, name, getattr(recording.truth, name), "mm")
     file.attrs["complete"] = True
 
 
 def _write_images(target: h5py.Group, images: Images) -> None:
     _put(target, "pose", images.poses, "mm")
-    measurements = _put(target, images.kind, images.measurements, unit_of(images.kind))
+    measurements = _put(target, images.kind, images.measurements, UNIT_OF[images.kind])
     if images.kind == "pixel":
         if images.spacing_mm is not None:
             measurements.attrs["spacing_mm"] = images.spacing_mm
         measurements.attrs["face_offset_mm"] = images.face_offset_mm
-    if images.time_of_flight is not None:
-        _put(target, "time_of_flight", images.time_of_flight, "s")
-    _put(target, "mask", images.mask, _FREE)
-    optional = {
-        "covariance": (images.covariance, "px^2" if images.kind == "pixel" else "mm^2"),
-        "amplitude": (images.amplitude, _FREE),
-        "time": (images.time, "s"),
-        "max_elevation": (images.max_elevation, "mm"),
-    }
-    for name, (values, unit) in optional.items():
+    optional = {"time_of_flight": "s", "mask": _FREE, "covariance": _area(images.kind)}
+    for name, unit in (optional | _PER_IMAGE).items():
+        values = getattr(images, name)
         if values is not None:
             _put(target, name, values, unit)
 
@@ -357,9 +351,8 @@ def _write_images(target: h5py.Group, images: Images) -> None:
 def _write_fate(target: h5py.Group, found: Segmentation) -> None:
     """What became of every calibration frame; curved arrays: [lateral, axial, elevation^2]."""
     target.attrs["method"] = found.method
-    _put(target, "missing", found.missing, _FREE)
-    _put(target, "rejected", found.rejected, _FREE)
-    _put(target, "failed", found.failed, _FREE)
+    for name in ("missing", "rejected", "failed"):
+        _put(target, name, getattr(found, name), _FREE)
     _put(target, "noise", found.noise_mm, "mm")
     if found.out_of_plane is not None:
         _put(target, "out_of_plane", found.out_of_plane.position, "mm, mm, mm^2")

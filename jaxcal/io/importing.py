@@ -9,7 +9,7 @@ in words what was assumed.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from jaxcal.io.poses_by_time import Tracking, lag_of_points, with_poses_by_time
 from jaxcal.io.sequence import Pixels, TrackedSequence
 from jaxcal.io.sources import SEQUENCES, kind_of, read_rows
 from jaxcal.io.target_search import FrameResults, search_target
-from jaxcal.io.text import PoseTable, read_crosswire, recording_of
+from jaxcal.io.text import read_crosswire, recording_of
 from jaxcal.runtime.array_types import Bool, Float, Int
 
 
@@ -88,9 +88,11 @@ def import_files(
         )
     table = read_rows(sources[0], options)
     notes = table.notes
-    table, said = _with_good_time(table, options)
+    if table.time is not None:
+        time, said = _good_time(table.time, lambda row: f"{table.name}:{table.lines[row]}", options)
+        table, notes = replace(table, time=time), notes + said
     with _naming_pose_units(options, table.length_stated):
-        return Imported(recording_of(table, options.spacing_mm), notes + said)
+        return Imported(recording_of(table, options.spacing_mm), notes)
 
 
 @contextmanager
@@ -104,26 +106,22 @@ def _naming_pose_units(options: ImportOptions, stated: bool = False) -> Iterator
         raise InputError(f"{error} (jaxcal import converts them with --pose-units m)") from None
 
 
-def _with_good_time(table: PoseTable, options: ImportOptions) -> tuple[PoseTable, list[str]]:
-    """Refuse time stamps that repeat or go back, which mostly are two recordings in one."""
-    if table.time is None:
-        return table, []
-    back = np.flatnonzero(np.diff(table.time) <= 0)
+def _good_time(
+    time: Float[np.ndarray, " n"], place: Callable[[int], str], options: ImportOptions
+) -> tuple[Float[np.ndarray, " n"] | None, list[str]]:
+    """The times, unless they repeat or go back, which mostly are two recordings in one; and notes.
+
+    ``place`` says where a row stands.
+    """
+    back = np.flatnonzero(np.diff(time) <= 0)
     if not len(back):
-        return table, []
-    where = f"{table.name}:{table.lines[int(back[0]) + 1]}"
-    return _without_time(table, where, options)
-
-
-def _without_time(
-    table: PoseTable, where: str, options: ImportOptions
-) -> tuple[PoseTable, list[str]]:
+        return time, []
     if not options.ignore_time:
         raise InputError(
-            f"{where}: the time stamp is not later than the one before: two recordings in one? "
-            "(--ignore-time imports without times)"
+            f"{place(int(back[0]) + 1)}: the time stamp is not later than the one before: two "
+            "recordings in one? (--ignore-time imports without times)"
         )
-    return replace(table, time=None), ["time stamps repeat or go back: not kept"]
+    return None, ["time stamps repeat or go back: not kept"]
 
 
 def _from_sequence(
@@ -151,11 +149,34 @@ def _from_sequence(
     notes += said
     spacing = _spacing(sequence, options)
     with _naming_pose_units(options, sequence.length_stated):
+        where = sequence.source
         if placed is None or points is None:
-            return _segmented(sequence, poses, valid, spacing, options, notes, results)
-        notes += placed.notes + _mirrored(sequence, points)
-        where = f"{sequence.source} with {os.fspath(points)}"
-        return _with_points(sequence, poses, valid, placed, spacing, options, notes, where)
+            results = (
+                _search(sequence, valid, options) if results is None else results.of_tracked(valid)
+            )
+            used = _found_points(sequence, results)
+        else:
+            where += f" with {os.fspath(points)}"
+            notes += placed.notes + _mirrored(sequence, points)
+            used = _usable_points(sequence, placed, valid)
+        time, said = None, []
+        if np.isfinite(sequence.time[used.rows]).all():
+            time, said = _good_time(
+                sequence.time[used.rows],
+                lambda row: f"{sequence.source}: {sequence.frame_name(int(used.rows[row]))}",
+                options,
+            )
+        images = make_images(
+            poses[used.rows],
+            used.points,
+            used.kind,
+            covariance=used.covariance,
+            time=time,
+            spacing_mm=spacing,
+            where=where,
+        )
+    notes += used.notes + said
+    return Imported(Recording(images, source=sequence.source), notes, results)
 
 
 def _estimated_lag(
@@ -189,36 +210,20 @@ def _refuse_unused(points: str | os.PathLike[str] | None, options: ImportOptions
         refuse(options, ("target_kind", "region", "orientation"), why)
 
 
-def _with_points(
-    sequence: TrackedSequence,
-    poses: Float[np.ndarray, "n 4 4"],
-    valid: Bool[np.ndarray, " n"],
-    placed: FramePoints,
-    spacing: tuple[float, float] | None,
-    options: ImportOptions,
-    notes: list[str],
-    where: str,
-) -> Imported:
-    """The target's points come from another file."""
-    # In the order of the frames, so that times do not go back.
+def _usable_points(
+    sequence: TrackedSequence, placed: FramePoints, valid: Bool[np.ndarray, " n"]
+) -> FramePoints:
+    """Points of another file, where their frames can be used, in the order of the frames."""
     order = np.argsort(placed.rows)
     rows = placed.rows[order]
     tracked, shown = valid[rows], _shown(sequence, rows)
-    for lost, what in ((~tracked, "tracking"), (tracked & ~shown, "image")):
-        if lost.any():
-            notes.append(f"{int(lost.sum())} points left out: their frame's {what} was not OK")
+    notes = [
+        f"{int(lost.sum())} points left out: their frame's {what} was not OK"
+        for lost, what in ((~tracked, "tracking"), (tracked & ~shown, "image"))
+        if lost.any()
+    ]
     used = tracked & shown
-    rows = rows[used]
-    time, said = _time(sequence, rows, options)
-    images = make_images(
-        poses[rows],
-        placed.points[order][used],
-        placed.kind,
-        time=time,
-        spacing_mm=spacing,
-        where=where,
-    )
-    return Imported(Recording(images, source=sequence.source), notes + said)
+    return FramePoints(rows[used], placed.points[order][used], placed.kind, notes)
 
 
 def _points(
@@ -273,25 +278,6 @@ def _spacing(
     return stated.spacing_mm
 
 
-def _time(
-    sequence: TrackedSequence, rows: Int[np.ndarray, " m"], options: ImportOptions
-) -> tuple[Float[np.ndarray, " m"] | None, list[str]]:
-    time = sequence.time[rows]
-    if not np.isfinite(time).all():
-        return None, []
-    order = np.argsort(rows, kind="stable")
-    back = np.flatnonzero(np.diff(time[order]) <= 0)
-    if not len(back):
-        return time, []
-    if options.ignore_time:
-        return None, ["time stamps repeat or go back: not kept"]
-    name = sequence.frame_name(int(rows[order][back[0] + 1]))
-    raise InputError(
-        f"{sequence.source}: {name}: the time stamp is not later than "
-        "the one before: two recordings in one? (--ignore-time imports without times)"
-    )
-
-
 def _search(
     sequence: TrackedSequence, tracked: Bool[np.ndarray, " n"], options: ImportOptions
 ) -> FrameResults:
@@ -304,21 +290,10 @@ def _search(
     )
 
 
-def _segmented(
-    sequence: TrackedSequence,
-    poses: Float[np.ndarray, "n 4 4"],
-    valid: Bool[np.ndarray, " n"],
-    spacing: tuple[float, float] | None,
-    options: ImportOptions,
-    notes: list[str],
-    results: FrameResults | None,
-) -> Imported:
-    """The target as it is found in every frame that was tracked, if it was not yet looked for."""
-    results = _search(sequence, valid, options) if results is None else results.of_tracked(valid)
+def _found_points(sequence: TrackedSequence, results: FrameResults) -> FramePoints:
+    """The target as it was found in the frames."""
     counts, used = results.counts, results.found
     blank, hidden = counts["image not OK"], counts["not credible"]
-    if blank:
-        notes.append(f"{blank} frames left out: their image was not OK")
     if len(used) < MINIMUM_IMAGES:
         most = next(iter(results.reasons), "there are no frames")
         raise InputError(
@@ -326,18 +301,9 @@ def _segmented(
             f"target, at least {MINIMUM_IMAGES} are needed (most often: {most}); place the points "
             "by hand: jaxcal pick"
         )
+    notes = [f"{blank} frames left out: their image was not OK"] if blank else []
     if hidden:
         notes.append(
             f"{hidden} of {len(used) + hidden} frames left out: no credible target in them"
         )
-    time, said = _time(sequence, used, options)
-    images = make_images(
-        poses[used],
-        results.position[used],
-        "pixel",
-        covariance=results.covariance[used],
-        time=time,
-        spacing_mm=spacing,
-        where=sequence.source,
-    )
-    return Imported(Recording(images, source=sequence.source), notes + said, results)
+    return FramePoints(used, results.position[used], "pixel", notes, results.covariance[used])

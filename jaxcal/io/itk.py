@@ -12,21 +12,20 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from h5py import h5d, h5t  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxcal import FormatError, InputError
 from jaxcal.data.poses import check_affine, rotations_from_quaternions
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.lines import text_lines
-from jaxcal.io.readable import check_readable, naming, one_line
-from jaxcal.io.untrusted import Node, array, child, group, open_root
+from jaxcal.io.readable import check_readable, naming
+from jaxcal.io.untrusted import Node, UpTo, array, child, group, open_root, string
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted
 
 _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 _KIND = "AffineTransform_double_3_3"
 _HEAD = "#Insight Transform File V1.0"
-_AFFINE = ("AffineTransform", "MatrixOffsetTransformBase", "ScaleSkewVersor3DTransform")
+_AFFINE = ("AffineTransform", "MatrixOffsetTransformBase")
 
 
 def itk_from_matrix(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 12"]:
@@ -54,7 +53,7 @@ def matrix_from_itk(
     parameters, fixed = np.asarray(parameters, float), np.asarray(fixed, float)
     if not (np.isfinite(parameters).all() and np.isfinite(fixed).all()):
         raise FormatError("the transform holds NaN or Inf")
-    if name in _AFFINE[:2] and len(parameters) == 12:
+    if name in _AFFINE and len(parameters) == 12:
         linear, translation = parameters[:9].reshape(3, 3), parameters[9:]
     elif name == "Euler3DTransform" and len(parameters) == 6:
         linear, translation = _euler(parameters[:3], fixed), parameters[3:]
@@ -189,31 +188,5 @@ def _read_hdf5(root: Node) -> tuple[str, np.ndarray, np.ndarray]:
     fixed = child(one, "TransformFixedParameters") or child(one, "TranformFixedParameters")
     if parameters is None or fixed is None or kind is None:
         raise FormatError(f"{one} is not whole")
-    count = {12: 12, 6: 6}.get(_length(parameters), 12)
-    return _text(kind), array(parameters, (count,)), array(fixed, (_length(fixed),))
-
-
-def _length(node: Node) -> int:
-    shape = getattr(node.item, "shape", None)
-    if shape is None or len(shape) != 1 or not 0 < shape[0] < 100:
-        raise FormatError(f"{node} has shape {shape}")
-    return shape[0]
-
-
-def _text(node: Node) -> str:
-    """The one string of a dataset; its type and storage are checked before it is read."""
-    try:
-        dataset = node.item
-        assert isinstance(dataset, h5py.Dataset)
-        plan = dataset.id.get_create_plist()
-        if plan.get_layout() == h5d.VIRTUAL or plan.get_external_count():
-            raise FormatError(f"{node} is stored in another file")
-        if dataset.id.get_type().get_class() != h5t.STRING or dataset.shape not in ((), (1,)):
-            raise FormatError(f"{node} must be one text")
-        value = dataset[()]
-        value = value[0] if dataset.shape else value
-        return value.decode("ascii", "replace") if isinstance(value, bytes) else str(value)
-    except FormatError:
-        raise
-    except Exception as error:
-        raise FormatError(f"{node} cannot be read: {one_line(error)}") from None
+    some = (UpTo(99, "numbers"),)
+    return string(kind), array(parameters, some), array(fixed, some)

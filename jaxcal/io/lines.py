@@ -6,10 +6,9 @@ import io
 import os
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 from jaxcal import FormatError
-from jaxcal.io.readable import check_readable, one_line
+from jaxcal.io.readable import read_bytes
 
 # Spreadsheets' errors, in English and German, are #N/A, #NV and words like #NAME? and #DIV/0!.
 _COMMENT = re.compile(r"\s*#(?!(?:N/A|NV|[A-Z/0]+[!?])[,;\t])")
@@ -34,11 +33,7 @@ def text_lines(
         FormatError: cannot be read, too large, not text; one line with path and line.
     """
     name = os.fspath(path)
-    check_readable(path, maximum_bytes=MAXIMUM_BYTES)
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise FormatError(f"{name}: cannot be read: {one_line(error)}") from None
+    content = read_bytes(path, MAXIMUM_BYTES)
     if content.startswith(_HDF5):
         raise FormatError(f"{name}: is HDF5, not text (a recording's name ends in .h5)")
     try:

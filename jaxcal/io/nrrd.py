@@ -27,26 +27,14 @@ from jaxcal.runtime.messages import quoted
 
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _NRRD_TYPES = {
-    "uchar": "u1",
-    "unsigned char": "u1",
-    "uint8": "u1",
-    "uint8_t": "u1",
-    "char": "i1",
-    "signed char": "i1",
-    "int8": "i1",
-    "int8_t": "i1",
-    "short": "i2",
-    "short int": "i2",
-    "signed short": "i2",
-    "int16": "i2",
-    "int16_t": "i2",
-    "ushort": "u2",
-    "unsigned short": "u2",
-    "uint16": "u2",
-    "uint16_t": "u2",
-    "float": "f4",
-    "double": "f8",
+    "u1": ("uchar", "unsigned char", "uint8", "uint8_t"),
+    "i1": ("char", "signed char", "int8", "int8_t"),
+    "i2": ("short", "short int", "signed short", "int16", "int16_t"),
+    "u2": ("ushort", "unsigned short", "uint16", "uint16_t"),
+    "f4": ("float",),
+    "f8": ("double",),
 }
+_DTYPES = {name: np.dtype(dtype) for dtype, names in _NRRD_TYPES.items() for name in names}
 
 
 def read_nrrd(path: Path, name: str) -> TrackedSequence:
@@ -153,7 +141,7 @@ def _nrrd_pixels(
 ) -> Pixels:
     fields = header.fields
     kind = fields.get("type", "").lower()
-    if kind not in _NRRD_TYPES:
+    if kind not in _DTYPES:
         raise FormatError(f"type {quoted(kind)} is not read")
     encoding = fields.get("encoding", "raw").lower()
     packings: dict[str, Packing] = {"raw": "raw", "gz": "gzip", "gzip": "gzip"}
@@ -169,7 +157,7 @@ def _nrrd_pixels(
             columns,
             rows,
             channels,
-            np.dtype(_NRRD_TYPES[kind]).newbyteorder(order),
+            _DTYPES[kind].newbyteorder(order),
             orientation_of(fields.get("ultrasound image orientation", "")),
             image_type_of(fields.get("ultrasound image type", "")),
         ),

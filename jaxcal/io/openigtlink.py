@@ -135,11 +135,8 @@ BEGINNING = _EXTENDED.size + _IMAGE.size
 def size_agrees(header: Header, beginning: bytes | bytearray | memoryview) -> bool:
     """Whether the size in a header agrees with the beginning of the body.
 
-    With a wrong bit in the size, we would wait for megabytes; an image itself states its size.
-
-    Args:
-        header: parsed.
-        beginning: the first :data:`BEGINNING` bytes of the body, or the whole if it is shorter.
+    With a wrong bit in the size, we would wait for megabytes; an image itself states its size. The
+    beginning is the first :data:`BEGINNING` bytes, or the whole body if it is shorter.
     """
     around = 0
     if header.version == 2:
@@ -347,32 +344,9 @@ def _encode_image(picture: Picture) -> bytes:
     lateral, axial = picture.spacing_mm
     # Position is that of the image's centre; the first pixel is put at the origin.
     centre = ((width - 1) / 2 * lateral, (height - 1) / 2 * axial, 0.0)
-    head = _IMAGE.pack(
-        1,
-        1,
-        scalar,
-        _LITTLE_ENDIAN,
-        _LPS,
-        width,
-        height,
-        1,
-        lateral,
-        0.0,
-        0.0,
-        0.0,
-        axial,
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-        *centre,
-        0,
-        0,
-        0,
-        width,
-        height,
-        1,
-    )
+    axes = (lateral, 0.0, 0.0, 0.0, axial, 0.0, 0.0, 0.0, 1.0)
+    size = (width, height, 1)
+    head = _IMAGE.pack(1, 1, scalar, _LITTLE_ENDIAN, _LPS, *size, *axes, *centre, 0, 0, 0, *size)
     return head + picture.array.astype(picture.array.dtype.newbyteorder("<"), copy=False).tobytes()
 
 

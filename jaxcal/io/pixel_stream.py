@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import zlib
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 from jaxcal import FormatError
@@ -33,7 +32,7 @@ class PixelStream:
     """
 
     def __init__(self, path: Path, start: int, packing: Packing, size: int) -> None:
-        self._size, self._packing = size, packing
+        self._size = size
         try:
             self._file = path.open("rb")
             self._file.seek(0, 2)
@@ -41,10 +40,11 @@ class PixelStream:
             self._file.seek(start)
         except OSError as error:
             raise FormatError(f"the pixels cannot be read: {one_line(error)}") from None
-        most = stored if packing == "raw" else stored * _MOST_INFLATION
+        most, packed = stored, ""
+        if packing != "raw":
+            most, packed = stored * _MOST_INFLATION, f", packed ({packing})"
         if size > most:
             self._file.close()
-            packed = "" if packing == "raw" else f", packed ({packing})"
             raise FormatError(
                 f"claims {size} bytes of pixels, the file holds {max(stored, 0)}{packed}"
             )
@@ -56,12 +56,7 @@ class PixelStream:
     def __enter__(self) -> PixelStream:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
     def read_at(self, offset: int, count: int) -> bytes:

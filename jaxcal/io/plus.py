@@ -12,7 +12,7 @@ from __future__ import annotations
 import datetime
 import math
 import os
-from dataclasses import dataclass
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -33,115 +33,54 @@ PIXELS_AGREE = 2e-3
 """Relative tolerance: fCal's own two statements of the pixel size differ by up to 7e-4."""
 
 
-@dataclass(frozen=True)
-class PlusTransform:
-    """One ``<Transform>``.
+class PlusTransform(NamedTuple):
+    """A transform as a file states it: mm, or mm per px where it begins in Image.
 
-    Attributes:
-        frames: (from, to), capitalised.
-        matrix: (4, 4), mm, or mm per px where it begins in Image.
-        error_mm: as stated, or None.
-        date: as stated, or None.
-        line: where it stands.
-        status: ``OK``, or the status that the file states instead.
+    ``error_mm`` is what an fCal result states for the calibration as a whole (mean of the lowest
+    95 % of its errors), and what a configuration states beside the transform; None without.
     """
 
-    frames: FramePair
     matrix: Float[np.ndarray, "4 4"]
     error_mm: float | None
-    date: str | None
-    line: int
-    status: str = "OK"
 
 
-@dataclass(frozen=True)
-class PlusConfiguration:
-    """What calibration needs of a device-set configuration.
+def read_transform(
+    path: str | os.PathLike[str], source: str = "Image", target: str = "Probe"
+) -> PlusTransform:
+    """Read the transform between two frames; the file is not trusted.
 
-    Attributes:
-        transforms: of CoordinateDefinitions, in their order.
+    It is a configuration, an fCal result, or a Transform element alone.
+
+    Raises:
+        FormatError: not such a file, a DTD, a transform that is not 16 finite numbers, no such
+            transform, or one that is marked as not valid; one line with path and line.
     """
-
-    transforms: tuple[PlusTransform, ...]
-
-    def find(self, source: str, target: str) -> PlusTransform | None:
-        """The transform between two frames as it is stated, or None.
-
-        Raises:
-            FormatError: it is marked as not valid.
-        """
-        return _find(self.transforms, source, target)
-
-
-@dataclass(frozen=True)
-class PlusResult:
-    """An fCal result (``ProbeCalibrationResult`` 2.0).
-
-    Attributes:
-        transforms: ``ImageToProbe`` and others, by their frames.
-        calibration_error_mm: mean of the lowest 95 % of the calibration's errors, by PLUS.
-    """
-
-    transforms: tuple[PlusTransform, ...]
-    calibration_error_mm: float | None
-
-    def find(self, source: str, target: str) -> PlusTransform | None:
-        """The transform between two frames, or None.
-
-        Raises:
-            FormatError: it is marked as not valid.
-        """
-        return _find(self.transforms, source, target)
-
-
-def _find(transforms: tuple[PlusTransform, ...], source: str, target: str) -> PlusTransform | None:
+    root, _ = read_xml(path)
     wanted = capitalised(source), capitalised(target)
-    found = next((each for each in transforms if each.frames == wanted), None)
-    if found is not None and found.status != "OK":
-        raise FormatError(
-            f"line {found.line}: the transform from {wanted[0]} to {wanted[1]} is marked as "
-            f"{quoted(found.status)}: calibrate again, or mark it as OK if it is right"
-        )
-    return found
-
-
-def read_configuration(path: str | os.PathLike[str]) -> PlusConfiguration:
-    """Read a device-set configuration, or a Transform element alone; the file is not trusted.
-
-    Raises:
-        FormatError: not such a file, a DTD, a transform that is not 16 finite numbers; one line
-            with path and line.
-    """
-    root, _ = read_xml(path)
     with naming(path):
-        if root.tag == "Transform":
-            return PlusConfiguration((_transform(root),))
-        if root.tag != _ROOT:
-            raise FormatError(f"is not a configuration of PLUS: its root is {quoted(root.tag)}")
-        return PlusConfiguration(
-            tuple(
-                _transform(element)
-                for place in root.all(_COORDINATES)
-                for element in _transforms(place)
-            ),
-        )
+        of_result = root.tag == "ProbeCalibrationResult"
+        if of_result:
+            elements = list(root.all("CalibrationResults/Transform"))
+        elif root.tag == "Transform":
+            elements = [root]
+        else:
+            _check_root(root)
+            elements = [each for place in root.all(_COORDINATES) for each in _transforms(place)]
+        # All are looked at: a file with a damaged transform is not to be trusted.
+        stated = [(_matrix(e), _frames(e), _optional_number(e, "Error"), e) for e in elements]
+        for matrix, frames, error_mm, element in stated:
+            if frames == wanted:
+                _check_status(element)
+                if of_result:
+                    errors = root.first("ErrorReport/ReprojectionError3DStatistics")
+                    error_mm = _optional_number(errors, "CalibrationMeanMm")
+                return PlusTransform(matrix, error_mm)
+        raise FormatError(f"holds no transform from {source} to {target}")
 
 
-def read_result(path: str | os.PathLike[str]) -> PlusResult:
-    """Read a result of fCal; the file is not trusted.
-
-    Raises:
-        FormatError: not such a file or not as it should be; one line with path and line.
-    """
-    root, _ = read_xml(path)
-    with naming(path):
-        if root.tag != "ProbeCalibrationResult":
-            raise FormatError(f"is not a result of fCal: its root is {quoted(root.tag)}")
-        errors = root.first("ErrorReport/ReprojectionError3DStatistics")
-        return PlusResult(
-            tuple(_transform(element) for element in root.all("CalibrationResults/Transform")),
-            _optional_number(errors, "CalibrationMeanMm"),
-        )
+def _check_root(root: Element) -> None:
+    if root.tag != _ROOT:
+        raise FormatError(f"is not a configuration of PLUS: its root is {quoted(root.tag)}")
 
 
 def _transforms(coordinates: Element) -> list[Element]:
@@ -149,26 +88,23 @@ def _transforms(coordinates: Element) -> list[Element]:
     return [element for element in coordinates.children if element.tag.lower() == "transform"]
 
 
-def _transform(element: Element) -> PlusTransform:
+def _matrix(element: Element) -> Float[np.ndarray, "4 4"]:
     matrix = _numbers(element, "Matrix", 16).reshape(4, 4)
     if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
         raise FormatError(f"line {element.line}: the matrix's last row is not 0 0 0 1")
-    return PlusTransform(
-        _frames(element),
-        matrix,
-        _optional_number(element, "Error"),
-        element.attributes.get("Date"),
-        element.line,
-        _status(element),
-    )
+    return matrix
 
 
-def _status(element: Element) -> str:
-    """PLUS reads ``Status``, and writes the same as ``Valid``."""
-    stated = (
-        element.attributes[name] for name in ("Status", "Valid") if name in element.attributes
-    )
-    return next((text for text in stated if text.upper() not in ("OK", "TRUE")), "OK")
+def _check_status(element: Element) -> None:
+    """Refuse a transform that is not valid; PLUS reads ``Status``, and writes ``Valid``."""
+    for name in ("Status", "Valid"):
+        stated = element.attributes.get(name, "OK")
+        if stated.upper() not in ("OK", "TRUE"):
+            source, target = _frames(element)
+            raise FormatError(
+                f"line {element.line}: the transform from {source} to {target} is marked as "
+                f"{quoted(stated)}: calibrate again, or mark it as OK if it is right"
+            )
 
 
 def _frames(element: Element) -> FramePair:
@@ -215,7 +151,6 @@ def transform_element(
     error_mm: float | None = None,
     date: datetime.datetime | None = None,
     others: dict[str, str] | None = None,
-    indent: str = "",
     newline: str = "\n",
 ) -> str:
     """A ``<Transform>`` to paste into CoordinateDefinitions, with every digit.
@@ -226,8 +161,7 @@ def transform_element(
         error_mm: stated where it is positive.
         date: stated in PLUS's form.
         others: further attributes.
-        indent: in front of every line but the first.
-        newline: of the file.
+        newline: between the lines, with the indentation of all but the first.
 
     Raises:
         InputError: a matrix or names that PLUS would not accept.
@@ -236,19 +170,17 @@ def transform_element(
     source, target = check_frames(frames)
     # Minus zero would be written as -0.0.
     rows = [" ".join(repr(value + 0.0) for value in row) for row in matrix.tolist()]
-    lines = [f'<Transform From="{source}" To="{target}"', f'  Matrix="{rows[0]}']
-    lines += [f"          {row}" for row in rows[1:]]
-    lines[-1] += '"'
+    first, *further, last = rows
+    lines = [f'<Transform From="{source}" To="{target}"', f'  Matrix="{first}']
+    lines += [f"          {row}" for row in [*further, f'{last}"']]
     stated = dict(others or {})
     if error_mm is not None and error_mm > 0:
         stated["Error"] = f"{error_mm:.6g}"
     if date is not None:
         stated["Date"] = date.strftime("%Y.%m.%d %X")
-    tail = "".join(f" {key}={quoteattr(value)}" for key, value in stated.items())
-    if tail:
-        lines.append(f" {tail}")
-    lines[-1] += " />"
-    return (newline + indent).join(lines)
+    if stated:
+        lines.append(" " + "".join(f" {key}={quoteattr(text)}" for key, text in stated.items()))
+    return newline.join(lines) + " />"
 
 
 def patched_configuration(
@@ -262,14 +194,8 @@ def patched_configuration(
     """A configuration with one transform replaced; every other byte stays as it is.
 
     The element between the two frames, in either direction, is replaced (PLUS refuses a file with
-    both). If there is none, the transform is added at the end of CoordinateDefinitions.
-
-    Args:
-        content: of the configuration's file.
-        frames: (from, to).
-        matrix: of the transform.
-        error_mm: stated where it is positive.
-        date: stated in PLUS's form.
+    both). If there is none, the transform is added at the end of CoordinateDefinitions. The
+    arguments are those of :func:`transform_element`.
 
     Returns:
         The new content, and notes for the user, with lines of the new content.
@@ -301,15 +227,14 @@ def _replaced(
 ) -> bytes:
     """The content of :func:`patched_configuration`."""
     root = parse_xml(content)
-    if root.tag != _ROOT:
-        raise FormatError(f"is not a configuration of PLUS: its root is {quoted(root.tag)}")
+    _check_root(root)
     places = list(root.all(_COORDINATES))
     if len(places) > 1:
         raise FormatError(
             f"lines {places[0].line} and {places[1].line}: two {_COORDINATES}; PLUS reads one: put "
             "the transforms together"
         )
-    elements = [] if not places else _transforms(places[0])
+    elements = _transforms(places[0]) if places else []
     between = [element for element in elements if set(_frames(element)) == set(wanted)]
     if len(between) > 1:
         lines = " and ".join(str(element.line) for element in between)
@@ -319,40 +244,42 @@ def _replaced(
         )
     _check_other_paths([element for element in elements if element not in between], wanted)
     newline = "\r\n" if b"\r\n" in content else "\n"
-    stated = {"error_mm": error_mm, "date": date, "newline": newline}
+
+    def element(indent: str, others: dict[str, str] | None = None) -> str:
+        return transform_element(
+            wanted, matrix, error_mm=error_mm, date=date, others=others, newline=newline + indent
+        )
+
+    def put(start: int, text: str, end: int) -> bytes:
+        # For a file of any encoding, characters beyond ASCII are written by number.
+        return content[:start] + text.encode("ascii", "xmlcharrefreplace") + content[end:]
+
     if between:
         old = between[0]
-        others = {
-            key: value
-            for key, value in old.attributes.items()
-            if key not in ("From", "To", "Matrix", "Error", "Date", "Valid", "Status")
-        }
-        indent = _indent(content, old.start)
-        text = transform_element(wanted, matrix, others=others, indent=indent, **stated)
-        return content[: old.start] + _ascii(text) + content[old.end :]
+        ours = ("From", "To", "Matrix", "Error", "Date", "Valid", "Status")
+        others = {key: value for key, value in old.attributes.items() if key not in ours}
+        return put(old.start, element(_indent(content, old.start), others), old.end)
     parent = places[0] if places else root
-    if parent.content_end == parent.end and not places:
+    closed = parent.content_end == parent.end  # <CoordinateDefinitions/> has no end tag
+    if closed and not places:
         raise FormatError(f"line {parent.line}: <{parent.tag}/> is empty: there is no device in it")
-    if parent.content_end == parent.end:
-        # <CoordinateDefinitions/>: it gets an end tag.
-        outer = _indent(content, parent.start)
-        inner = outer + "  "
-        text = transform_element(wanted, matrix, indent=inner, **stated)
-        opened = content[parent.start : parent.end].removesuffix(b"/>").rstrip() + b">"
-        text = f"{newline}{inner}{text}{newline}{outer}</{_COORDINATES}>"
-        return content[: parent.start] + opened + _ascii(text) + content[parent.end :]
-    outer = _indent(content, parent.content_end)
+    outer = _indent(content, parent.start if closed else parent.content_end)
     inner = outer + "  "
+    if closed:
+        start = parent.start + len(content[parent.start : parent.end].removesuffix(b"/>").rstrip())
+        text = f">{newline}{inner}{element(inner)}{newline}{outer}</{_COORDINATES}>"
+        return put(start, text, parent.end)
     if places:
-        text = transform_element(wanted, matrix, indent=inner, **stated)
-        text = f"  {text}{newline}{outer}"
+        parts = [f"  {element(inner)}", outer]
     else:
         deeper = inner + "  "
-        text = transform_element(wanted, matrix, indent=deeper, **stated)
-        parts = (f"  <{_COORDINATES}>", f"{deeper}{text}", f"{inner}</{_COORDINATES}>", outer)
-        text = newline.join(parts)
-    at = parent.content_end
-    return content[:at] + _ascii(text) + content[at:]
+        parts = [
+            f"  <{_COORDINATES}>",
+            deeper + element(deeper),
+            f"{inner}</{_COORDINATES}>",
+            outer,
+        ]
+    return put(parent.content_end, newline.join(parts), parent.content_end)
 
 
 def patch_configuration(
@@ -364,18 +291,7 @@ def patch_configuration(
     error_mm: float | None = None,
     date: datetime.datetime | None = None,
 ) -> list[str]:
-    """:func:`patched_configuration` of a file, which is replaced in one step, or not at all.
-
-    Args:
-        path: the configuration.
-        frames: (from, to).
-        matrix: of the transform.
-        out: where to write instead of in place.
-        error_mm: stated where it is positive.
-        date: stated in PLUS's form.
-
-    Returns:
-        Notes for the user.
+    """:func:`patched_configuration` of a file, in place or into ``out``; returns its notes.
 
     Raises:
         FormatError: see :func:`patched_configuration`; one line that starts with the path.
@@ -387,11 +303,6 @@ def patch_configuration(
     with atomic_path(path if out is None else out) as temporary:
         temporary.write_bytes(new)
     return notes
-
-
-def _ascii(text: str) -> bytes:
-    """An element for a file of any encoding: characters beyond ASCII are written by number."""
-    return text.encode("ascii", "xmlcharrefreplace")
 
 
 def _check_other_paths(others: list[Element], wanted: FramePair) -> None:
@@ -422,7 +333,7 @@ def _stale_scale(
     scale = np.linalg.norm(np.asarray(matrix)[:3, :2], axis=0)
     for element in elements:
         if _frames(element) == ("TransducerOriginPixel", "TransducerOrigin"):
-            kept = np.linalg.norm(_transform(element).matrix[:3, :2], axis=0)
+            kept = np.linalg.norm(_matrix(element)[:3, :2], axis=0)
             if np.abs(kept / scale - 1).max() > PIXELS_AGREE:
                 return [
                     f"line {element.line}: TransducerOriginPixel to TransducerOrigin still has "
@@ -464,11 +375,7 @@ def _other_sources(root: Element, others: list[Element], wanted: FramePair) -> l
 
 
 def update_transform_command(
-    frames: FramePair,
-    matrix: Float[np.ndarray, "4 4"],
-    *,
-    error_mm: float | None = None,
-    date: datetime.datetime | None = None,
+    frames: FramePair, matrix: Float[np.ndarray, "4 4"], *, error_mm: float | None = None
 ) -> str:
     """PlusServer's command that sets a transform while it runs, as XML.
 
@@ -477,8 +384,6 @@ def update_transform_command(
     source, target = check_frames(frames)
     numbers = " ".join(repr(value) for value in np.asarray(matrix, float).ravel().tolist())
     stated = "" if not error_mm else f' TransformError="{error_mm:.6g}"'
-    if date is not None:
-        stated += f' TransformDate="{date.strftime("%Y.%m.%d %X")}"'
     return (
         f'<Command Name="UpdateTransform" TransformName="{source}To{target}" '
         f'TransformValue="{numbers}" TransformPersistent="TRUE"{stated}/>'

@@ -42,15 +42,7 @@ def update_transform(
     error_mm: float | None = None,
     timeout_s: float = 10.0,
 ) -> str:
-    """Set a transform in a running PlusServer.
-
-    Args:
-        frames: (from, to).
-        matrix: (4, 4).
-        host: of the server.
-        port: of the server.
-        error_mm: stated with the transform.
-        timeout_s: longest time to wait for the connection and the reply.
+    """Set a transform in a running PlusServer, which has ``timeout_s`` to reply.
 
     Returns:
         What the server says. It keeps the transform until it ends, and only the command SaveConfig

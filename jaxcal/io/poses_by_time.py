@@ -72,12 +72,9 @@ def times_of_table(table: PoseTable, sequence: TrackedSequence) -> Float[np.ndar
 def with_poses_by_time(
     images: TrackedSequence, tracking: Tracking, lag_s: float = 0.0
 ) -> tuple[TrackedSequence, list[str]]:
-    """A sequence's frames with poses interpolated at their times.
+    """A sequence's frames with poses interpolated at their times, on the same clock.
 
-    Args:
-        images: with times; transforms of its own are dropped.
-        tracking: with times on the same clock.
-        lag_s: an image stamped t shows what was at t - lag.
+    An image stamped t shows what was at t - ``lag_s``. The sequence's own transforms are dropped.
 
     Returns:
         The sequence, valid where a pose could be interpolated; and notes for the user.
@@ -150,11 +147,7 @@ def lag_of_points(
 ) -> tuple[float, str]:
     """By how much images lag behind poses, from the motion of a target at rest in the images.
 
-    Args:
-        images: with times.
-        rows: (n,) frames in which the target was found.
-        points: (n, 2) the target in them, px or mm.
-        tracking: with times on the same clock.
+    It was found at ``points`` (px or mm) in the frames ``rows``.
 
     Returns:
         The lag, s, and a note for the user.

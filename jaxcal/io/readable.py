@@ -27,11 +27,7 @@ def path_name(path: object) -> str:
 
 
 def check_readable(path: str | os.PathLike[str], *, maximum_bytes: int | None = None) -> None:
-    """Check that a path names an ordinary, readable, non-empty file.
-
-    Args:
-        path: the file.
-        maximum_bytes: largest size that is read, or None for any.
+    """Check that a path names an ordinary, readable, non-empty file of at most ``maximum_bytes``.
 
     Raises:
         FormatError: missing, a directory, a device or pipe (opening one may hang), not permitted,
@@ -60,6 +56,24 @@ def check_readable(path: str | os.PathLike[str], *, maximum_bytes: int | None = 
         raise FormatError(
             f"{path}: is too large ({status.st_size} bytes; at most {maximum_bytes} are read)"
         )
+
+
+def read_bytes(path: str | os.PathLike[str], maximum_bytes: int) -> bytes:
+    """The content of a file that :func:`check_readable` accepts.
+
+    Raises:
+        FormatError: as there, or it cannot be read; one line that starts with the path.
+    """
+    check_readable(path, maximum_bytes=maximum_bytes)
+    try:
+        with open(path, "rb") as file:
+            content = file.read(maximum_bytes + 1)
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {one_line(error)}") from None
+    # It may have grown since it was looked at.
+    if len(content) > maximum_bytes:
+        raise FormatError(f"{path}: is too large (at most {maximum_bytes} bytes are read)")
+    return content
 
 
 def one_line(error: Exception) -> str:

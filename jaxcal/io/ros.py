@@ -46,12 +46,7 @@ def _checked_name(name: str) -> str:
 def static_transform_command(
     matrix: Float[np.ndarray, "4 4"], parent: str = "probe", child: str = "us_image"
 ) -> str:
-    """The command that publishes a transform, in one line.
-
-    Args:
-        matrix: rigid, mm, child -> parent.
-        parent: frame.
-        child: frame.
+    """The command that publishes a transform (rigid, mm, child -> parent), in one line.
 
     Raises:
         InputError: a matrix that is not rigid, or names that ROS does not take.
@@ -70,9 +65,7 @@ def static_transform_command(
 def range_note(range_factor: float, face_offset_mm: float) -> str | None:
     """What a rigid transform leaves to its user, in words; None where z is the measured range.
 
-    Args:
-        range_factor: the estimated sound speed over the nominal one.
-        face_offset_mm: z of a measured range of 0, mm.
+    ``range_factor`` is the estimated sound speed over the nominal one.
     """
     steps = []
     if range_factor != 1:
@@ -88,13 +81,9 @@ def ros_yaml(
     child: str = "us_image",
     note: str | None = None,
 ) -> str:
-    """The YAML of easy_handeye2, with the command of tf2 as a comment above it.
+    """The YAML of easy_handeye2 for a transform (rigid, mm, child -> parent).
 
-    Args:
-        matrix: rigid, mm, child -> parent.
-        parent: frame; easy_handeye2's ``robot_effector_frame``.
-        child: frame; easy_handeye2's ``tracking_base_frame``.
-        note: a further line of comment, as of :func:`range_note`.
+    The command of tf2 and a note, as of :func:`range_note`, are comments above it.
 
     Raises:
         InputError: a matrix that is not rigid, or names that ROS does not take.

@@ -147,9 +147,7 @@ class TrackedSequence:
     ) -> Int[np.ndarray, " m"]:
         """Places of frames in the sequence by the numbers that other files give them.
 
-        Args:
-            numbers: (m,) of frames.
-            labels: m texts that say where each stands, for messages.
+        ``labels`` say where each number stands, for messages.
 
         Raises:
             InputError: a number that no frame has, or that several have.
@@ -184,11 +182,7 @@ class TrackedSequence:
     def poses(
         self, source: str, target: str
     ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " n"]]:
-        """Poses from one frame to another, through all transforms that are needed.
-
-        Args:
-            source: frame, for instance ``Probe``.
-            target: frame, for instance ``Tracker`` or ``Reference``.
+        """Poses from one coordinate frame to another, through all transforms that are needed.
 
         Returns:
             (n, 4, 4) rigid poses, mm (the identity where not valid), and where every transform on

@@ -82,12 +82,7 @@ class TransformServer:
         return int(self._listener.getsockname()[1])
 
     def serve(self, period_s: float, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Send until stopped.
-
-        Args:
-            period_s: time between messages, s.
-            stopped: asked at least once a period, and once a minute.
-        """
+        """Send every ``period_s`` until ``stopped``, which is asked once a period and a minute."""
         due = time.monotonic()
         while not stopped():
             left = min(max(0.0, due - time.monotonic()), _LONGEST_WAIT_S)

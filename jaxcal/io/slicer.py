@@ -11,14 +11,13 @@ import json
 import math
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxcal import FormatError
 from jaxcal.io.lines import text_lines
-from jaxcal.io.readable import check_readable, naming, one_line
+from jaxcal.io.readable import naming, one_line, read_bytes
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted
 
@@ -60,10 +59,10 @@ def read_markups(path: str | os.PathLike[str]) -> Markups:
 
 
 def _read_json(path: str | os.PathLike[str]) -> Markups:
-    check_readable(path, maximum_bytes=MAXIMUM_BYTES)
+    content = read_bytes(path, MAXIMUM_BYTES)
     try:
-        document: Any = json.loads(Path(path).read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
+        document: Any = json.loads(content)
+    except (ValueError, RecursionError) as error:
         raise FormatError(f"is not JSON: {one_line(error)}") from None
     markups = document.get("markups") if isinstance(document, dict) else None
     if not isinstance(markups, list) or not markups:

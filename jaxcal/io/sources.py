@@ -56,9 +56,7 @@ def read_tracked(
 ) -> TrackedSequence:
     """A source of one of :data:`SEQUENCES`.
 
-    Args:
-        source: the file or folder.
-        pose_units: of translations where the file does not state it; mm by default.
+    ``pose_units`` are those of translations where the file does not state it; mm by default.
     """
     match kind_of(source):
         case "tracker":

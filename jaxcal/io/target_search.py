@@ -86,12 +86,7 @@ def search_target(
 ) -> FrameResults:
     """Look for the target in every frame that was tracked.
 
-    Args:
-        sequence: with pixels.
-        tracked: (n,) whether a frame's pose can be used.
-        target: ``echo``, one bright spot, or ``cross``, a crossing of wires.
-        region: (first column, first row, columns, rows) to look in, px.
-        orientation: of the stored pixels, where the file does not say.
+    The options are those of :class:`jaxcal.io.import_options.ImportOptions`.
 
     Raises:
         FormatError: pixels that cannot be read.

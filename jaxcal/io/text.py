@@ -117,15 +117,11 @@ def read_pose_table(
             raise FormatError("its poses are matrices: leave --quaternion out")
         rows, skipped = _used_rows(table, columns, skip_invalid)
         unit = _agreed(units, columns.point_unit)
-        points, kind = None, "pixel"
-        if columns.point is not None:
-            points = table.numbers(columns.point, rows)
-            if unit != "px":
-                points, kind = points * LENGTHS_MM[unit], "point"
+        points = None if columns.point is None else table.numbers(columns.point, rows)
+        if points is not None and unit != "px":
+            points *= LENGTHS_MM[unit]
         time, clock = _times(table, columns, rows)
-        frame = None
-        if columns.frame is not None:
-            frame = _whole_numbers(table, columns.frame, rows)
+        frame = None if columns.frame is None else _whole_numbers(table, columns.frame, rows)
         file = None
         if columns.file is not None:
             file = tuple(table.rows[row][columns.file].strip().strip('"') for row in rows)
@@ -134,7 +130,7 @@ def read_pose_table(
             lines=[table.lines[row] for row in rows],
             poses=_poses(table, columns, rows, pose_units),
             points=points,
-            kind="pixel" if kind == "pixel" else "point",
+            kind="pixel" if unit == "px" else "point",
             time=time,
             clock=clock,
             frame=frame,

@@ -13,7 +13,7 @@ import tomllib
 from typing import Any
 
 from jaxcal import FormatError
-from jaxcal.io.readable import check_readable, naming, one_line
+from jaxcal.io.readable import naming, one_line, read_bytes
 
 MAXIMUM_BYTES = 2**20
 """Largest file that is read."""
@@ -47,22 +47,11 @@ def load_toml(
 ) -> dict[str, Any]:
     """The tables of a TOML file.
 
-    Args:
-        path: the file.
-        maximum_bytes: largest file that is read.
-
     Raises:
         FormatError: no such file, too large, not UTF-8, not TOML, or beyond the bounds of this
             module; one line that starts with the path.
     """
-    check_readable(path, maximum_bytes=maximum_bytes)
-    try:
-        with open(path, "rb") as file:
-            content = file.read(maximum_bytes + 1)
-    except OSError as error:
-        raise FormatError(f"{path}: cannot be read: {one_line(error)}") from None
-    if len(content) > maximum_bytes:
-        raise FormatError(f"{path}: is too large (at most {maximum_bytes} bytes are read)")
+    content = read_bytes(path, maximum_bytes)
     try:
         # With the byte order mark of Windows' editors, or without.
         text = content.decode("utf-8-sig")

@@ -32,6 +32,7 @@ _UINT8 = 3
 _BRIGHTNESS, _COLOUR = 1, 5
 _ORIENTATIONS = {0: "", 1: "UF", 2: "UF", 3: "UN", 4: "UN", 5: "MF", 6: "MF", 8: "MN", 9: "MN"}
 """PLUS's numbers for the orientations of B-mode images; 0 is unknown to PLUS, MF here."""
+_MF = 5
 _MOST_XML = 2**18
 _MOST_TRANSFORMS = 256
 _TRANSFORM, _STATUS = "Transform", "TransformStatus"
@@ -71,7 +72,7 @@ def decode_tracked_frame(content: memoryview) -> TrackedFrame:
     return TrackedFrame(Picture(frame, (1.0, 1.0)), _transforms(xml.rstrip(b"\0")))
 
 
-def encode_tracked_frame(frame: TrackedFrame, t: float, orientation: int = 5) -> bytes:
+def encode_tracked_frame(frame: TrackedFrame, t: float) -> bytes:
     """The content of a message, as PlusServer sends it; the pixels are written as they are."""
     rows, columns = frame.picture.array.shape
     fields = []
@@ -88,19 +89,10 @@ def encode_tracked_frame(frame: TrackedFrame, t: float, orientation: int = 5) ->
         "</TrackedFrame>\n",
     ]
     xml = "\n".join(lines).encode()
-    head = _HEAD.pack(
-        _UINT8,
-        1,
-        _BRIGHTNESS,
-        columns,
-        rows,
-        1,
-        columns * rows,
-        len(xml),
-        orientation,
-        np.eye(4, dtype="<f4").tobytes(),
-    )
-    return head + xml + np.ascontiguousarray(frame.picture.array, np.uint8).tobytes()
+    pixels = np.ascontiguousarray(frame.picture.array, np.uint8).tobytes()
+    numbers = (_UINT8, 1, _BRIGHTNESS, columns, rows, 1, len(pixels), len(xml), _MF)
+    head = _HEAD.pack(*numbers, np.eye(4, dtype="<f4").tobytes())
+    return head + xml + pixels
 
 
 def _transforms(xml: bytes) -> tuple[Tracked, ...]:

@@ -13,6 +13,7 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -72,58 +73,83 @@ def read_tracker(
         )
 
 
-class _Tool:
-    """Poses of one tool, collected row by row."""
+class _Tool(NamedTuple):
+    """Columns of one tool; ``state`` says OK where it was seen, ``counter`` counts its frames."""
 
-    def __init__(self) -> None:
-        self.quaternions: list[list[float]] = []
-        self.positions: list[list[float]] = []
-        self.valid: list[bool] = []
-
-    def add(self, quaternion: list[float] | None, position: list[float] | None) -> None:
-        good = quaternion is not None and position is not None
-        self.quaternions.append(quaternion if quaternion and good else [0.0, 0.0, 0.0, 1.0])
-        self.positions.append(position if position and good else [0.0, 0.0, 0.0])
-        self.valid.append(good)
+    quaternion: list[int]
+    position: list[int]
+    state: int | None = None
+    counter: int | None = None
 
 
-def _sequence(
+Rows = Iterator[tuple[int, list[str]]]
+"""Numbers and cells of lines."""
+
+
+def _read_rows(
+    rows: Rows,
     tools: dict[str, _Tool],
-    time: list[float],
-    numbers: list[int],
-    lines: list[int],
+    stamp: int | None,
+    counters: list[int],
     factor: float,
     name: str,
 ) -> TrackedSequence:
+    """The poses of all tools, with times from the column ``stamp``.
+
+    ``counters`` are the columns of the frame's number where no tool that was seen has its own;
+    ``factor`` is the unit of translations, mm.
+    """
+    poses: dict[str, list[list[float]]] = {tool: [] for tool in tools}
+    time: list[float] = []
+    numbers: list[int] = []
+    labels: list[str] = []
+    for line, cells in rows:
+        if len(time) >= MOST_ROWS:
+            raise FormatError(f"line {line}: more than {MOST_ROWS} rows")
+        own: list[int] = []
+        for tool, columns in tools.items():
+            pose = [math.nan] * 7
+            if columns.state is None or _cell(cells, columns.state) == "OK":
+                quaternion = _numbers(cells, columns.quaternion, line)
+                position = _numbers(cells, columns.position, line)
+                if quaternion is not None and position is not None:
+                    pose = quaternion + position
+                # The counter of a tool that is not seen may stand still.
+                own += [] if columns.counter is None else [columns.counter]
+            poses[tool].append(pose)
+        numbers.append(_frame_number(cells, own or counters))
+        at = None if stamp is None else _numbers(cells, [stamp], line)
+        time.append(math.nan if at is None else at[0])
+        labels.append(f"in line {line}")
     if not time:
         raise FormatError("holds no rows")
     transforms: dict[FramePair, np.ndarray] = {}
     valid: dict[FramePair, np.ndarray] = {}
-    labels = [f"in line {line}" for line in lines]
-    for tool, found in tools.items():
-        poses = np.tile(np.eye(4), (len(time), 1, 1))
-        poses[:, :3, :3] = rotations_from_quaternions(
-            np.array(found.quaternions), "xyzw", labels=labels
-        )
-        poses[:, :3, 3] = factor * np.array(found.positions)
-        good = np.array(found.valid)
-        poses[~good] = np.nan
-        transforms[tool, TRACKER], valid[tool, TRACKER] = poses, good
+    for tool, found in poses.items():
+        values = np.array(found)
+        good = ~np.isnan(values[:, 0])
+        matrices = np.full((len(time), 4, 4), np.nan)
+        matrices[good] = np.eye(4)
+        values[~good, :4] = 0.0, 0.0, 0.0, 1.0
+        rotations = rotations_from_quaternions(values[:, :4], "xyzw", labels=labels)
+        matrices[good, :3, :3] = rotations[good]
+        matrices[good, :3, 3] = factor * values[good, 4:]
+        transforms[tool, TRACKER], valid[tool, TRACKER] = matrices, good
+    no_images = np.zeros(len(time), bool)
     return TrackedSequence(
-        transforms,
-        valid,
-        np.array(time),
-        np.zeros(len(time), bool),
-        source=name,
-        numbers=np.array(numbers),
+        transforms, valid, np.array(time), no_images, source=name, numbers=np.array(numbers)
     )
+
+
+def _cell(cells: list[str], column: int) -> str:
+    return cells[column].strip() if column < len(cells) else ""
 
 
 def _numbers(cells: list[str], columns: list[int], line: int) -> list[float] | None:
     """Numbers of some cells; None where one is blank or NDI's mark of a missing number."""
     values: list[float] = []
     for column in columns:
-        text = cells[column].strip() if column < len(cells) else ""
+        text = _cell(cells, column)
         if not text:
             return None
         value = parse_number(text)
@@ -137,62 +163,37 @@ def _numbers(cells: list[str], columns: list[int], line: int) -> list[float] | N
 
 def _frame_number(cells: list[str], columns: list[int]) -> int:
     """The frame's number, where all these columns that hold one agree; else -1."""
-    found = {cells[column].strip() for column in columns if column < len(cells)} - {""}
+    found = {_cell(cells, column) for column in columns} - {""}
     text = found.pop() if len(found) == 1 else ""
     return int(text) if re.fullmatch(r"\d{1,18}", text) else -1
 
 
-# NDI ToolBox: one row a frame; a group of columns for each tool, which begins with "Port ...".
-
-
-def _read_ndi(
-    line: int, header: list[str], rows: Iterator[tuple[int, list[str]]], name: str
-) -> TrackedSequence:
+def _read_ndi(line: int, header: list[str], rows: Rows, name: str) -> TrackedSequence:
+    """NDI ToolBox: one row a frame; a group of columns a tool, which begins with "Port ..."."""
     starts = [index for index, cell in enumerate(header) if cell.startswith("Port")]
     if not starts:
         raise FormatError(f"line {line}: the header names no port")
     tools: dict[str, _Tool] = {}
-    groups: list[tuple[_Tool, dict[str, int]]] = []
-    for start, end in zip(starts, [*starts[1:], len(header)], strict=True):
+    first: dict[str, int] = {}
+    for start, end in itertools.pairwise([*starts, len(header)]):
         columns: dict[str, int] = {}
         for index in range(start + 1, end):
             # State, Tx, Ty and Tz come again for every marker: the first ones are the tool's.
             columns.setdefault(header[index], index)
+        first = first or columns
         missing = {"State", "Q0", "Qx", "Qy", "Qz", "Tx", "Ty", "Tz"} - set(columns)
         if missing:
             raise FormatError(f"line {line}: {quoted(header[start])} has no {sorted(missing)[0]}")
-        tool = _Tool()
-        tools[_tool_name(header[start], set(tools))] = tool
-        groups.append((tool, columns))
-    time: list[float] = []
-    numbers: list[int] = []
-    lines: list[int] = []
-    first = groups[0][1]
-    for number, cells in rows:
-        if len(time) >= MOST_ROWS:
-            raise FormatError(f"line {number}: more than {MOST_ROWS} rows")
-        counters: list[int] = []
-        for tool, columns in groups:
-            state = columns["State"]
-            seen = state < len(cells) and cells[state].strip() == "OK"
-            quaternion = [columns[key] for key in ("Qx", "Qy", "Qz", "Q0")]
-            position = [columns[key] for key in ("Tx", "Ty", "Tz")]
-            tool.add(
-                _numbers(cells, quaternion, number) if seen else None,
-                _numbers(cells, position, number) if seen else None,
-            )
-            # The counter of a tool that is not seen may stand still.
-            counters += [columns["Frame"]] if seen and "Frame" in columns else []
-        every = [columns["Frame"] for _, columns in groups if "Frame" in columns]
-        numbers.append(_frame_number(cells, counters or every))
-        stamp = None
-        if "Time [sec]" in first:
-            stamp = _numbers(cells, [first["Time [sec]"]], number)
-        elif "Time [sec]" in header:
-            stamp = _numbers(cells, [header.index("Time [sec]")], number)
-        time.append(math.nan if stamp is None else stamp[0])
-        lines.append(number)
-    return _sequence(tools, time, numbers, lines, 1.0, name)
+        tools[_tool_name(header[start], set(tools))] = _Tool(
+            [columns[key] for key in ("Qx", "Qy", "Qz", "Q0")],
+            [columns[key] for key in ("Tx", "Ty", "Tz")],
+            columns["State"],
+            columns.get("Frame"),
+        )
+    stamps = [index for index, cell in enumerate(header) if cell == "Time [sec]"]
+    stamp = first.get("Time [sec]", next(iter(stamps), None))
+    counters = [tool.counter for tool in tools.values() if tool.counter is not None]
+    return _read_rows(rows, tools, stamp, counters, 1.0, name)
 
 
 def _tool_name(cell: str, taken: set[str]) -> str:
@@ -203,18 +204,12 @@ def _tool_name(cell: str, taken: set[str]) -> str:
     return name if name not in taken else cell.strip()
 
 
-# Motive: key,value pairs; rows Type, Name, ID, Parent; what a column is; its axis; then data.
-
-
 def _read_motive(
-    first: list[str],
-    rows: Iterator[tuple[int, list[str]]],
-    name: str,
-    pose_units: LengthUnit | None,
+    first: list[str], rows: Rows, name: str, pose_units: LengthUnit | None
 ) -> TrackedSequence:
-    cells = [cell.strip() for cell in first]
+    """Motive: key,value pairs; rows Type, Name, ID, Parent; what a column is; its axis; data."""
     # Not by pairs of cells: the take's name may have commas.
-    stated = dict(itertools.pairwise(cells))
+    stated = dict(itertools.pairwise(cell.strip() for cell in first))
     rotation = stated.get("Rotation Type", "Quaternion")
     if rotation != "Quaternion":
         raise FormatError(
@@ -228,55 +223,39 @@ def _read_motive(
     names: list[str] = []
     types: list[str] = []
     what: list[str] = []
-    for line, cells in rows:
-        label = cells[1].strip() if len(cells) > 1 and not cells[0].strip() else cells[0].strip()
+    for line, row in rows:
+        cells = [cell.strip() for cell in row]
+        label = cells[1] if len(cells) > 1 and not cells[0] else cells[0]
         if label == "Type":
             types = cells
         elif label == "Name":
             names = cells
         elif label == "Frame":
-            return _motive_rows(types, names, what, cells, line, rows, _METRES[unit], name)
+            tools = _motive_tools(list(zip(types, names, what, cells, strict=False)), line)
+            stamps = [index for index, cell in enumerate(cells) if cell.startswith("Time (")]
+            counters = [index for index, cell in enumerate(cells) if cell == "Frame"]
+            stamp = next(iter(stamps), None)
+            return _read_rows(rows, tools, stamp, counters, _METRES[unit], name)
         elif "Rotation" in cells or "Position" in cells:
             what = cells
     raise FormatError("has no row that begins with Frame: not a whole export of Motive")
 
 
-def _motive_rows(
-    types: list[str],
-    names: list[str],
-    what: list[str],
-    axes: list[str],
-    line: int,
-    rows: Iterator[tuple[int, list[str]]],
-    factor: float,
-    name: str,
-) -> TrackedSequence:
+def _motive_tools(header: list[tuple[str, str, str, str]], line: int) -> dict[str, _Tool]:
+    """Rigid bodies by type, name, quantity and axis of every column."""
     columns: dict[str, dict[tuple[str, str], int]] = {}
-    for index in range(min(map(len, (types, names, what, axes)))):
-        if types[index].strip() == "Rigid Body" and what[index].strip() in ("Rotation", "Position"):
-            key = what[index].strip(), axes[index].strip().upper()
-            columns.setdefault(names[index].strip(), {})[key] = index
-    wanted = [("Rotation", axis) for axis in "XYZW"], [("Position", axis) for axis in "XYZ"]
+    for index, (kind, tool, what, axis) in enumerate(header):
+        if kind == "Rigid Body" and what in ("Rotation", "Position"):
+            columns.setdefault(tool, {})[what, axis.upper()] = index
+    quaternion = [("Rotation", axis) for axis in "XYZW"]
+    position = [("Position", axis) for axis in "XYZ"]
     for tool, found in columns.items():
-        for key in (*wanted[0], *wanted[1]):
+        for key in quaternion + position:
             if key not in found:
                 raise FormatError(f"line {line}: {quoted(tool)} has no {' '.join(key)}")
     if not columns:
         raise FormatError(f"line {line}: names no rigid body")
-    stamps = [index for index, cell in enumerate(axes) if cell.strip().startswith("Time (")]
-    counters = [index for index, cell in enumerate(axes) if cell.strip() == "Frame"]
-    tools = {tool: _Tool() for tool in columns}
-    time: list[float] = []
-    numbers: list[int] = []
-    lines: list[int] = []
-    for number, cells in rows:
-        if len(time) >= MOST_ROWS:
-            raise FormatError(f"line {number}: more than {MOST_ROWS} rows")
-        for tool, found in columns.items():
-            quaternion, position = ([found[key] for key in part] for part in wanted)
-            tools[tool].add(_numbers(cells, quaternion, number), _numbers(cells, position, number))
-        numbers.append(_frame_number(cells, counters))
-        stamp = _numbers(cells, stamps[:1], number) if stamps else None
-        time.append(math.nan if stamp is None else stamp[0])
-        lines.append(number)
-    return _sequence(tools, time, numbers, lines, factor, name)
+    return {
+        tool: _Tool([found[key] for key in quaternion], [found[key] for key in position])
+        for tool, found in columns.items()
+    }

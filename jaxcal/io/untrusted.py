@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import h5py
 import numpy as np
@@ -190,11 +191,8 @@ def check_attributes(node: Node) -> None:
 def check_rows(node: Node, axes: int, most_bytes: int, kinds: str) -> tuple[int, ...]:
     """Check a dataset that will be read row by row because it is too large for :func:`array`.
 
-    Args:
-        node: the dataset.
-        axes: how many it must have.
-        most_bytes: of one row.
-        kinds: numpy's letters of the types that are taken.
+    It must have so many axes, rows of at most ``most_bytes``, and a type of ``kinds`` (numpy's
+    letters).
 
     Returns:
         Its shape.
@@ -202,13 +200,8 @@ def check_rows(node: Node, axes: int, most_bytes: int, kinds: str) -> tuple[int,
     Raises:
         FormatError: anything else, virtual, stored elsewhere, or packed by an unknown filter.
     """
-    dataset = node.item
-    if not isinstance(dataset, h5py.Dataset):
-        raise FormatError(f"{node} must be a dataset")
     with _reading(str(node)):
-        layout = dataset.id.get_create_plist()
-        if layout.get_layout() == h5d.VIRTUAL or layout.get_external_count():
-            raise FormatError(f"{node} is stored in another file: recordings must hold their data")
+        dataset, layout = _stored_here(node)
         shape = dataset.shape or ()
         if dataset.dtype.kind not in kinds or len(shape) != axes:
             raise FormatError(f"{node} has type {quoted(str(dataset.dtype))} and shape {shape}")
@@ -243,20 +236,13 @@ def array(node: Node, shape: tuple[int | UpTo, ...], kinds: str = "iuf") -> np.n
         FormatError: anything else: a group, virtual, stored elsewhere, of another type or shape,
             too large, packed by an unknown filter, or damaged.
     """
-    dataset = node.item
-    if not isinstance(dataset, h5py.Dataset):
-        raise FormatError(f"{node} must be a dataset")
     with _reading(str(node)):
-        layout = dataset.id.get_create_plist()
-        # The shape of a virtual dataset comes from its source files: ask for nothing before this.
-        if layout.get_layout() == h5d.VIRTUAL:
-            raise FormatError(f"{node} is a virtual dataset: recordings must hold their data")
-        if layout.get_external_count():
-            raise FormatError(f"{node} is stored in another file: recordings must hold their data")
+        dataset, layout = _stored_here(node)
         dtype = dataset.dtype
         if dtype.kind not in kinds or h5py.check_enum_dtype(dtype) is not None:
             raise FormatError(
-                f"{node} has type {quoted(str(dtype))}, numbers{_or_bool(kinds)} are needed"
+                f"{node} has type {quoted(str(dtype))}, numbers"
+                f"{' or booleans' if 'b' in kinds else ''} are needed"
             )
         _check_shape(node, dataset.shape, shape)
         _check_bytes(node, dataset.shape or (), dtype.itemsize)
@@ -269,15 +255,28 @@ def array(node: Node, shape: tuple[int | UpTo, ...], kinds: str = "iuf") -> np.n
         return values.astype(np.float64)
 
 
+def string(node: Node) -> str:
+    """The one short text of a dataset; FormatError for anything else."""
+    with _reading(str(node)):
+        dataset, _ = _stored_here(node)
+        kind = dataset.id.get_type()
+        if kind.get_class() != h5t.STRING or dataset.shape not in ((), (1,)):
+            raise FormatError(f"{node} must be one text")
+        if kind.get_size() > _MAXIMUM_TEXT:
+            raise FormatError(f"{node} is too long")
+        return _decoded(np.ravel(dataset[()])[0], str(node))
+
+
 def text(node: Node, name: str) -> str | None:
     """A text attribute, or None where there is none; FormatError for anything but short text."""
     value = _attribute(node, name, (h5t.STRING,), "text", 1)
-    if value is None:
-        return None
-    value = value[0]
+    return None if value is None else _decoded(value[0], f"{node}: attribute {name}")
+
+
+def _decoded(value: object, what: str) -> str:
     decoded = value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
     if len(decoded) > _MAXIMUM_TEXT:
-        raise FormatError(f"{node}: attribute {name} is too long")
+        raise FormatError(f"{what} is too long")
     return decoded
 
 
@@ -293,8 +292,7 @@ def numbers(node: Node, name: str, count: int) -> np.ndarray | None:
     Raises:
         FormatError: another length or type.
     """
-    classes = (h5t.INTEGER, h5t.FLOAT)
-    values = _attribute(node, name, classes, "a number", count)
+    values = _attribute(node, name, (h5t.INTEGER, h5t.FLOAT), "a number", count)
     if values is None:
         return None
     with np.errstate(over="ignore"):
@@ -321,6 +319,20 @@ def _reading(what: str) -> Iterator[None]:
     # more, without a common base. These blocks contain only its calls and our own checks.
     except Exception as error:
         raise FormatError(f"{what} cannot be read: {one_line(error)}") from None
+
+
+def _stored_here(node: Node) -> tuple[h5py.Dataset, Any]:
+    """A dataset that holds its own data, and HDF5's plan of how they are stored."""
+    dataset = node.item
+    if not isinstance(dataset, h5py.Dataset):
+        raise FormatError(f"{node} must be a dataset")
+    layout = dataset.id.get_create_plist()
+    # The shape of a virtual dataset comes from its source files: ask for nothing before this.
+    if layout.get_layout() == h5d.VIRTUAL:
+        raise FormatError(f"{node} is a virtual dataset: recordings must hold their data")
+    if layout.get_external_count():
+        raise FormatError(f"{node} is stored in another file: recordings must hold their data")
+    return dataset, layout
 
 
 def _open(parent: h5py.Group, component: bytes, location: str) -> h5py.Group | h5py.Dataset:
@@ -351,10 +363,6 @@ def _attribute(
         if kind.get_class() == h5t.STRING and kind.get_size() > _MAXIMUM_TEXT:
             raise FormatError(f"{label} is too long")
         return np.asarray(node.item.attrs[name]).reshape(count)
-
-
-def _or_bool(kinds: str) -> str:
-    return " or booleans" if "b" in kinds else ""
 
 
 def _check_shape(node: Node, found: tuple[int, ...] | None, agreed: tuple[int | UpTo, ...]) -> None:

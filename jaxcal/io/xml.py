@@ -11,11 +11,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from xml.parsers import expat
 
 from jaxcal import FormatError
-from jaxcal.io.readable import check_readable, naming, one_line
+from jaxcal.io.readable import naming, one_line, read_bytes
 from jaxcal.runtime.messages import quoted
 
 MAXIMUM_BYTES = 8 * 2**20
@@ -66,11 +65,7 @@ def read_xml(path: str | os.PathLike[str]) -> tuple[Element, bytes]:
         FormatError: no such file, too large, not XML, a DTD or an entity, nested too deep, or not
             in UTF-8 or another encoding that has ASCII in it; one line that starts with the path.
     """
-    check_readable(path, maximum_bytes=MAXIMUM_BYTES)
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise FormatError(f"{path}: cannot be read: {one_line(error)}") from None
+    content = read_bytes(path, MAXIMUM_BYTES)
     with naming(path):
         return parse_xml(content), content
 

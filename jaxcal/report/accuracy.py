@@ -64,10 +64,7 @@ def accuracy_record(
 ) -> dict[str, Any]:
     """``tre``, ``limits``, ``influence`` and ``comparison`` of a calibration's record.
 
-    Args:
-        result: of one problem, with concrete values.
-        recording: what was calibrated.
-        wanted: further image points for the error, in the images' own unit (px or mm).
+    ``wanted`` are further image points for the error, in the images' own unit (px or mm).
 
     Returns:
         Arrays and plain values; all of them None where X is not observable.
@@ -113,7 +110,13 @@ def _tre(
     names = ("middle", "near left", "near right", "far left", "far right")
     unit = np.array([[0.0, 0.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
     places = region.place(unit)[:, [0, 2]]
-    image = _to_image(answer, places)
+    # The image's own unit: its size and the place of its origin, mm, [lateral, axial].
+    transform = answer.image_transform()
+    pixels = transform.scale_mm_per_px is not None
+    scale = np.ones(2) if transform.scale_mm_per_px is None else transform.scale_mm_per_px
+    scale = scale * [1.0, transform.range_factor]
+    origin = np.array([0.0, transform.face_offset_mm])
+    image = (places - origin) / scale
     given = real_array(wanted, "tre_points")
     if given.size:
         if given.ndim != 2 or given.shape[1] != 2:
@@ -122,7 +125,7 @@ def _tre(
             raise InputError(f"points of --tre must be numbers up to {LARGEST:g}")
         names += ("asked for",) * len(given)
         image = np.concatenate([image, given])
-        places = np.concatenate([places, _from_image(answer, given)])
+        places = np.concatenate([places, given * scale + origin])
     at = tre_at(answer, places)
     side = np.linspace(-1.0, 1.0, _ACROSS)
     cells = region.place(np.stack(np.meshgrid(side, side), axis=-1))[..., [0, 2]]
@@ -133,7 +136,7 @@ def _tre(
             "depth_mm": region.depth_mm,
             "radius_mm": region.radius_mm,
         },
-        "unit": _unit(answer),
+        "unit": "px" if pixels else "mm",
         "stated_mm": over.rms,
         "stated_interval_mm": [over.lower, over.upper],
         "points": [
@@ -154,27 +157,6 @@ def _tre(
             "stated_upper_mm": mapped.upper,
         },
     }
-
-
-def _unit(answer: Calibration) -> str:
-    return "mm" if answer.scale_mm_per_px is None else "px"
-
-
-def _affine(answer: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    """Size of the image's unit, and position of the image's origin; both mm, [lateral, axial]."""
-    transform = answer.image_transform()
-    scale = np.ones(2) if transform.scale_mm_per_px is None else transform.scale_mm_per_px
-    return scale * [1.0, transform.range_factor], np.array([0.0, transform.face_offset_mm])
-
-
-def _to_image(answer: Calibration, places: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
-    scale, origin = _affine(answer)
-    return (places - origin) / scale
-
-
-def _from_image(answer: Calibration, image: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*m 2"]:
-    scale, origin = _affine(answer)
-    return image * scale + origin
 
 
 def _influence(
@@ -256,7 +238,7 @@ def _comparison(
     if other.scale_mm_per_px is not None:
         scale = np.asarray(other.scale_mm_per_px) / spacing
         further["scale"] = list(scale[:, None])
-    alone = _batch_of_one(problem)
+    alone = map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
     unknowns = Unknowns(x[None, :3, :3], x[None, :3, 3], point[None], further)
     sigma = np.asarray(answer.sigma, float)
     if not np.isfinite(sigma).all():
@@ -286,10 +268,6 @@ def _comparison(
         else None,
         "conventional_image_plane_to_probe": x,
     }
-
-
-def _batch_of_one(problem: Problem) -> Problem:
-    return map_arrays(lambda leaf: np.asarray(leaf, float)[None], problem)
 
 
 def settle(record: dict[str, Any]) -> None:

@@ -22,10 +22,6 @@ def certificate_record(result: Calibration, recording: Recording) -> dict[str, A
     For the conventional method they are those of the answer. The other methods minimise a different
     objective; for them they are those of the closed form on the same images. Both are None if there
     is no closed form (e.g. an estimated delay, raw times of flight) or no answer.
-
-    Args:
-        result: of one problem, with numpy arrays.
-        recording: what was calibrated.
     """
     nothing: dict[str, Any] = {"certified": None, "gap_mm2": None}
     images = recording.calibration
@@ -62,12 +58,7 @@ def _of_answer(
 
 
 def first_answer_words(images: Images, estimate: tuple[str, ...]) -> str | None:
-    """The conventional fit in one sentence, to be shown while another method runs.
-
-    Args:
-        images: the images to calibrate.
-        estimate: further unknowns; if there is no closed form for them, the result is None.
-    """
+    """The conventional fit in one sentence, to be shown meanwhile; None without a closed form."""
     if images.kind == "time_of_flight":
         return None
     try:
@@ -87,11 +78,7 @@ def first_answer_words(images: Images, estimate: tuple[str, ...]) -> str | None:
 
 
 def certificate_words(record: dict[str, Any]) -> str | None:
-    """One line about the certificate; None where the record has none.
-
-    Args:
-        record: of :func:`jaxcal.report.record.calibration_record`.
-    """
+    """One line about the certificate in a record; None where it has none."""
     certified, gap = record.get("certified"), record.get("gap_mm2")
     if certified is None:
         return None

@@ -40,9 +40,8 @@ _WAYS = {"lateral": "sideways", "range": "in depth"}
 def contradictions(record: dict[str, Any]) -> list[tuple[float, str]]:
     """How many times as large as stated each contradiction makes the error, and its words.
 
-    Args:
-        record: of :func:`jaxcal.report.record.calibration_record`, of a calibration that states an
-            error, with cross-validation and bootstrap if they were requested.
+    The record is of a calibration that states an error, with cross-validation and bootstrap if they
+    were requested.
     """
     checks = (
         _from_residuals,

@@ -50,11 +50,8 @@ def bounded_curves(
 ) -> list[Curve]:
     """Joint solver and alternation on the bounded objective, from the same start.
 
-    Args:
-        problem: one problem.
-        max_elevation: bound, mm; if it is None, the problem's own or 1 mm.
-        estimate: further unknowns.
-        alternating: an alternation that stopped by its own rule, to mark where it stopped.
+    The bound is ``max_elevation`` mm, or the problem's own, or 1 mm. ``alternating`` is an
+    alternation that stopped by its own rule, to mark where it stopped.
 
     Returns:
         Curves of the sum of squares, mm^2.

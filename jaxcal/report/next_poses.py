@@ -21,10 +21,6 @@ so that both have a large SD, and an image point a small one."""
 def next_poses_record(result: Calibration, recording: Recording) -> dict[str, Any] | None:
     """The three images that would help most; None where nothing can be said.
 
-    Args:
-        result: of one problem.
-        recording: what was calibrated, with points or pixels.
-
     Returns:
         ``tre_now_mm`` and ``tre_then_mm`` (predicted, root mean square over the image),
         ``images_to_half`` (how many would halve the error; None: over 1000) and ``poses``. Each

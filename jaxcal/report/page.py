@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -70,13 +70,7 @@ _FORMS: tuple[tuple[SaveFormat, str, str], ...] = (
 def write_page(
     path: str | os.PathLike[str], record: dict[str, Any], result: Calibration, recording: Recording
 ) -> None:
-    """Write the page, complete or not at all.
-
-    Args:
-        path: the file to make; only another page is replaced.
-        record: of :func:`jaxcal.report.record.calibration_record`, settled.
-        result: the calibration.
-        recording: what was calibrated.
+    """Write the page of a settled record, complete or not at all; only another page is replaced.
 
     Raises:
         InputError: the file exists and is no page.
@@ -187,6 +181,19 @@ def _section(title: str, *parts: str) -> str:
     return f"<section><h2>{escape(title)}</h2>{''.join(parts)}</section>"
 
 
+def _table(rows: Iterable[Sequence[str]], head: Sequence[str] = (), words: int = 1) -> str:
+    """A table of HTML; all columns after the first ones, of ``words``, hold numbers."""
+
+    def line(tag: str, cells: Sequence[str]) -> str:
+        kinds = [tag if k < words else f'{tag} class="n"' for k in range(len(cells))]
+        return "".join(f"<{kind}>{cell}</{tag}>" for kind, cell in zip(kinds, cells, strict=True))
+
+    lines = [line("th", head)] if head else []
+    lines += [line("td", row) for row in rows]
+    body = "".join(f"<tr>{cells}</tr>" for cells in lines)
+    return f'<div class="wide"><table>{body}</table></div>'
+
+
 def _head(record: dict[str, Any]) -> str:
     tre = record["tre"]
     word = record["verdict"] or "do not use"
@@ -246,19 +253,11 @@ def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording)
     rows = []
     for k, point in enumerate(tre["points"]):
         path = f"tre.points.{k}"
-        rows.append(
-            f"<tr><td>{escape(point['name'])}</td>"
-            f'<td class="n">{_number(record, path + ".image.0", ".1f")}, '
-            f"{_number(record, path + '.image.1', '.1f')}</td>"
-            f'<td class="n">{_number(record, path + ".tre_mm", ".2f")}</td>'
-            f'<td class="n">{_number(record, path + ".interval_95_mm.0", ".2f")} to '
-            f"{_number(record, path + '.interval_95_mm.1', '.2f')}</td></tr>"
-        )
-    table = (
-        f'<div class="wide"><table><tr><th>point</th><th class="n">image ({tre["unit"]})</th>'
-        '<th class="n">TRE (mm)</th><th class="n">95 % interval (mm)</th></tr>'
-        f"{''.join(rows)}</table></div>"
-    )
+        u, v = (_number(record, f"{path}.image.{axis}", ".1f") for axis in range(2))
+        low, high = (_number(record, f"{path}.interval_95_mm.{end}", ".2f") for end in range(2))
+        error = _number(record, f"{path}.tre_mm", ".2f")
+        rows.append((escape(point["name"]), f"{u}, {v}", error, f"{low} to {high}"))
+    head = ("point", f"image ({tre['unit']})", "TRE (mm)", "95 % interval (mm)")
     why = "".join(f"<li>{escape(text)}</li>" for text in tre["contradictions"])
     if why:
         why = (
@@ -272,7 +271,7 @@ def _accuracy(record: dict[str, Any], answer: Calibration, recording: Recording)
         drawn,
         "<figcaption>Distance to expect between the true and the calibrated place of what is seen "
         "at a point of the image. Dots: where the target was.</figcaption></figure><div>",
-        table,
+        _table(rows, head),
         why,
         '<p class="soft">Half of the intervals\' remaining 5 % lies below, half above. Errors of '
         "the tracker at the time of use, and of reading a point, come on top.</p></div></div>",
@@ -298,16 +297,11 @@ def _matrix(record: dict[str, Any]) -> str:
             f'class="soft">{escape(words)}</span><button type="button" data-copy="{name}">copy'
             f'</button></div><pre id="{name}">{escape(text)}</pre></details>'
         )
-    rows = "".join(
-        "<tr>"
-        + "".join(
-            f'<td class="n">{_number(record, f"image_plane_to_probe.{i}.{j}", ".6f")}</td>'
-            for j in range(4)
-        )
-        + "</tr>"
+    rows = [
+        [_number(record, f"image_plane_to_probe.{i}.{j}", ".6f") for j in range(4)]
         for i in range(4)
-    )
-    parts.append(f'<h3>image_plane_to_probe (mm)</h3><div class="wide"><table>{rows}</table></div>')
+    ]
+    parts += ["<h3>image_plane_to_probe (mm)</h3>", _table(rows, words=0)]
     return _section("The matrix", *parts)
 
 
@@ -324,15 +318,8 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
     wide = max(float(np.ptp(seen[:, 0])) / 2, 10.0)
     deep = float(seen[:, 2].max())
     middle = float(0.5 * (seen[:, 0].min() + seen[:, 0].max()))
-    corners = np.array(
-        [
-            [middle - wide, 0, 0],
-            [middle + wide, 0, 0],
-            [middle + wide, 0, deep],
-            [middle - wide, 0, deep],
-            [middle - wide, 0, 0],
-        ]
-    )
+    across, down = np.array([-1, 1, 1, -1, -1]), np.array([0, 0, 1, 1, 0])
+    corners = np.stack([middle + wide * across, 0.0 * down, deep * down], axis=-1)
     frames = images[:, None, :3, :3] @ corners[None, :, :, None]
     frames = frames[..., 0] + images[:, None, :3, 3]
     far = np.concatenate([frames.reshape(-1, 3), point[None]])
@@ -353,18 +340,17 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
         "dots": dots,
         "bar": _bar(float(np.linalg.norm(np.ptp(far, axis=0)))),
     }
-    close = _close_up(answer, cloud, shown)
     views = (
         (
-            "scene-all",
             whole,
+            "scene-all",
             "Planes of the images (blue) and the target (orange), in the tracker's frame.",
         ),
         (
+            _close_up(answer, cloud, shown),
             "scene-target",
-            close,
-            "The target as each image puts it (green; does not fit the rest: "
-            "orange), and the estimate with its 95 % ellipsoid (lines).",
+            "The target as each image puts it (green; does not fit the rest: orange), and the "
+            "estimate with its 95 % ellipsoid (lines).",
         ),
     )
     parts = [
@@ -372,7 +358,7 @@ def _scene(record: dict[str, Any], answer: Calibration, recording: Recording) ->
         f'tabindex="0" aria-label="{escape(words)}" data-scene="{name}"></svg>'
         f'<figcaption>{escape(words)} <span class="screen">Drag, or use the arrow keys, to turn.'
         "</span></figcaption></figure>"
-        for name, data, words in views
+        for data, name, words in views
     ]
     place = ", ".join(_number(record, f"point_mm.{k}", ".3f") for k in range(3))
     return _section(
@@ -458,7 +444,7 @@ def _residuals(record: dict[str, Any], answer: Calibration) -> str:
         [("offset (mm)", images, offset.tolist(), svg.ORANGE)],
         named,
         "Estimated offset of the target from the image plane with one standard deviation, mm",
-        spreads=[np.asarray(answer.elevation_sd)[used].tolist()],
+        spread=np.asarray(answer.elevation_sd)[used].tolist(),
         height=120.0,
     )
     parts = [
@@ -522,24 +508,24 @@ def _comparison(record: dict[str, Any]) -> str:
     beside = record["comparison"]
     if beside is None:
         return ""
-    rows = (
-        ("residual, root mean square (mm)", "conventional_rms_mm", "rms_mm", ".3f"),
-        ("error at the image by the noise found (mm)", "conventional_tre_mm", "tre_mm", ".3f"),
-    )
-    gain = beside["log_density_gain"] is not None and (
-        "<tr><td>images left out, log density</td><td class='n'>0</td><td class='n'>"
-        f"{_number(record, 'comparison.log_density_gain', '+.1f')} ± "
-        f"{_number(record, 'comparison.log_density_gain_sd', '.1f')}</td></tr>"
-    )
-    cells = "".join(
-        f'<tr><td>{escape(name)}</td><td class="n">{_number(record, "comparison." + other, form)}'
-        f'</td><td class="n">{_number(record, "comparison." + own, form)}</td></tr>'
-        for name, other, own, form in rows
-    )
+
+    def number(name: str, form: str = ".3f") -> str:
+        return _number(record, f"comparison.{name}", form)
+
+    rows = [
+        ("residual, root mean square (mm)", number("conventional_rms_mm"), number("rms_mm")),
+        (
+            "error at the image by the noise found (mm)",
+            number("conventional_tre_mm"),
+            number("tre_mm"),
+        ),
+    ]
+    if beside["log_density_gain"] is not None:
+        gain = f"{number('log_density_gain', '+.1f')} ± {number('log_density_gain_sd', '.1f')}"
+        rows.append(("images left out, log density", "0", gain))
     return _section(
         "Beside the conventional fit",
-        '<div class="wide"><table><tr><th></th><th class="n">conventional</th><th class="n">'
-        f"{escape(record['method'])}</th></tr>{cells}{gain or ''}</table></div>",
+        _table(rows, ("", "conventional", escape(record["method"]))),
         _paragraphs(believe(record)),
     )
 
@@ -557,22 +543,19 @@ def _observability(record: dict[str, Any]) -> str:
         covariance = np.array(record["image_covariance"], float)
         sd = np.sqrt(np.diagonal(covariance))
         names = record["image_unknowns"]
-        rows = "".join(
-            f'<tr><td>{k + 1}</td><td>{escape(_plain(name))}</td><td class="n">{value:.3g} {unit}'
-            "</td></tr>"
-            for k, (name, value, unit) in enumerate(
-                (name, *_in_unit(name, float(value))) for name, value in zip(names, sd, strict=True)
-            )
-        )
+        rows = [
+            (str(k), escape(_plain(name)), _in_unit(name, float(value)))
+            for k, (name, value) in enumerate(zip(names, sd, strict=True), start=1)
+        ]
         drawn = svg.matrix_map(
             [_plain(name) for name in names],
             covariance / np.outer(sd, sd),
             "Correlations of the unknowns",
         )
         parts.append(
-            '<div class="grid"><div class="wide"><table><tr><th></th><th>unknown</th>'
-            f'<th class="n">standard deviation</th></tr>{rows}</table></div><figure>{drawn}'
-            "<figcaption>Correlations: orange positive, blue negative.</figcaption></figure></div>"
+            f'<div class="grid">{_table(rows, ("", "unknown", "standard deviation"), 2)}'
+            f"<figure>{drawn}<figcaption>Correlations: orange positive, blue negative.</figcaption>"
+            "</figure></div>"
         )
     return _section("What the images determine", *parts)
 
@@ -587,10 +570,10 @@ def _plain(name: str) -> str:
     return body.replace("_", " ")
 
 
-def _in_unit(name: str, sd: float) -> tuple[float, str]:
+def _in_unit(name: str, sd: float) -> str:
     if name.endswith("_rad"):
-        return math.degrees(sd), "deg"
-    return (100 * sd, "%") if name.startswith("log_") else (sd, "mm")
+        return f"{math.degrees(sd):.3g} deg"
+    return f"{100 * sd:.3g} %" if name.startswith("log_") else f"{sd:.3g} mm"
 
 
 def _facts(record: dict[str, Any]) -> str:
@@ -603,12 +586,9 @@ def _facts(record: dict[str, Any]) -> str:
     scale = record["scale_mm_per_px"]
     if scale is not None:
         rows.append(("pixel size (mm)", f"{scale[0]:.6f} lateral, {scale[1]:.6f} axial"))
-    cells = "".join(
-        f"<tr><td>{escape(name)}</td><td>{escape(str(value))}</td></tr>" for name, value in rows
-    )
     return _section(
         "Facts",
-        f'<div class="wide"><table>{cells}</table></div>',
+        _table([(escape(name), escape(str(value))) for name, value in rows], words=2),
         '<p class="soft">The whole record of the calibration is inside this page '
         "(the element with the id record).</p>",
     )

@@ -16,11 +16,13 @@ from matplotlib.figure import Figure
 
 from jaxcal import InputError
 from jaxcal.data.poses import targets_in_images
+from jaxcal.data.recording import Recording
 from jaxcal.diagnostics.influence import KINDS, in_image, influence_of
 from jaxcal.diagnostics.intervals import image_jacobian, tre_at
 from jaxcal.diagnostics.outliers import outliers
 from jaxcal.model.image_points import mean_of_squares
 from jaxcal.report.accuracy import region_of
+from jaxcal.report.convergence import Curve
 from jaxcal.report.summary import recording_of
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float
@@ -29,6 +31,8 @@ from jaxcal.runtime.arrays import real_array
 COLUMN_MM, PAGE_MM = 88.0, 180.0
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 """Colours of Okabe and Ito, which the colour-blind can tell apart; each kind of error has one."""
+_ROUNDING = 3e-14
+"""An excess of the objective below this relative size is only rounding."""
 COLOURS = {"lateral": BLUE, "range": GREEN, "axial": GREEN, "elevational": ORANGE}
 
 
@@ -60,9 +64,7 @@ def plot_tre(calibration: Calibration, points: int = 61) -> Figure:
     Raises:
         InputError: X is not observable.
     """
-    answer, recording = _one(calibration)
-    if not np.isfinite(answer.unknowns_covariance).all():
-        raise InputError("these images do not determine the calibration: there is no error to map")
+    answer, recording = _determined(calibration, "there is no error to map")
     region = region_of(answer, recording)
     side = np.linspace(-1.0, 1.0, points)
     cells = region.place(np.stack(np.meshgrid(side, side), axis=-1))[..., [0, 2]]
@@ -119,7 +121,7 @@ def plot_residuals(calibration: Calibration) -> Figure:
             )
         panel.set_ylabel(f"{name} (mm)")
     if len(named):
-        panels[0].legend(fontsize=7, frameon=False, loc="best")
+        _legend(panels[0])
     panels[-1].set_xlabel("image")
     return figure
 
@@ -171,7 +173,7 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
         )
     if truth is not None:
         panel.plot(used, truth[used], "x", color="black", ms=3, mew=0.7, label="true")
-    panel.legend(fontsize=7, frameon=False, loc="best")
+    _legend(panel)
     panel.set(xlabel="image", ylabel="elevational offset (mm)")
     styled(side).hist(offset, bins="fd", orientation="horizontal", color=ORANGE, alpha=0.8)
     side.set_xlabel("images")
@@ -180,9 +182,7 @@ def plot_offsets(calibration: Calibration, truth: Float[np.ndarray, " n"] | None
 
 def plot_influence(calibration: Calibration) -> Figure:
     """How far leaving out each image moves image points, mm, and how far is expected."""
-    answer, recording = _one(calibration)
-    if not np.isfinite(answer.unknowns_covariance).all():
-        raise InputError("these images do not determine the calibration: nothing can be left out")
+    answer, recording = _determined(calibration, "nothing can be left out")
     weight = _weight(answer, recording)
     moved, expected = in_image(influence_of(answer), weight)
     used = np.flatnonzero(np.asarray(answer.mask) > 0)
@@ -210,7 +210,7 @@ def plot_influence(calibration: Calibration) -> Figure:
         )
     panel.set(xlabel="image", ylabel="moves the image by (mm)", ylim=(0.0, None))
     panel.margins(y=0.12)
-    panel.legend(fontsize=7, frameon=False, loc="best")
+    _legend(panel)
     return figure
 
 
@@ -220,9 +220,7 @@ def plot_limits(calibration: Calibration) -> Figure:
     Raises:
         InputError: X is not observable.
     """
-    answer, recording = _one(calibration)
-    if not np.isfinite(answer.unknowns_covariance).all():
-        raise InputError("these images do not determine the calibration: its error has no shares")
+    answer, recording = _determined(calibration, "its error has no shares")
     weight = _weight(answer, recording)
     part = np.einsum("pq,kpq->k", weight, influence_of(answer).shares)
     residual = np.asarray(answer.residual)[np.asarray(answer.mask) > 0]
@@ -249,17 +247,77 @@ def plot_limits(calibration: Calibration) -> Figure:
             left += share
     panel.set_yticks([0, 1], rows)
     panel.set(xlim=(0, 1), xlabel="share of the mean square")
-    panel.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    _legend(panel, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
-def _weight(answer: Calibration, recording: Any) -> Float[np.ndarray, "p p"]:
+def convergence_figure(curves: list[Curve]) -> Figure:
+    """Objective less the lowest value of all curves (mm^2), against the iteration.
+
+    The curves must be of the same objective.
+    """
+    figure = canvas(PAGE_MM, 80.0)
+    panel = styled(figure.subplots())
+    reached = [curve for curve in curves if np.isfinite(curve.objective).any()]
+    if reached:
+        best = min(float(np.nanmin(curve.objective)) for curve in reached)
+        floor = max(_ROUNDING * best, np.finfo(float).tiny)
+        styles = zip(reached, (ORANGE, BLUE, GREEN), ("s", "o", "^"), strict=False)
+        for curve, colour, marker in styles:
+            excess = np.maximum(curve.objective - best, floor)
+            # After the minimum the values vary only by rounding.
+            excess = excess[: int(np.nanargmin(excess)) + 1]
+            panel.plot(
+                np.arange(len(excess)),
+                excess,
+                marker=marker,
+                color=colour,
+                markersize=4,
+                linewidth=1.0,
+                label=curve.label,
+            )
+            if curve.stopped is not None and curve.stopped < len(excess):
+                panel.plot(
+                    curve.stopped,
+                    excess[curve.stopped],
+                    "o",
+                    color=colour,
+                    markersize=11,
+                    fillstyle="none",
+                    label=f"{curve.label}: stops here",
+                )
+        panel.set_yscale("log")
+        panel.axhline(floor, color=GREY, linewidth=0.8, linestyle=":", label="rounding")
+        _legend(panel)
+    else:
+        panel.text(
+            0.5, 0.5, "no objective values were kept", ha="center", transform=panel.transAxes
+        )
+    panel.set_title("Convergence on the same objective")
+    panel.set_xlabel("iteration")
+    panel.set_ylabel("objective above the best (mm²)")
+    return figure
+
+
+def _weight(answer: Calibration, recording: Recording) -> Float[np.ndarray, "p p"]:
     grid = region_of(answer, recording).grid()[:, [0, 2]]
     return mean_of_squares(image_jacobian(answer, grid))
 
 
-def _one(calibration: Calibration) -> tuple[Calibration, Any]:
+def _one(calibration: Calibration) -> tuple[Calibration, Recording]:
     return calibration.numpy(), recording_of(calibration)
+
+
+def _determined(calibration: Calibration, otherwise: str) -> tuple[Calibration, Recording]:
+    """A calibration and its data; refused where the images do not determine it."""
+    answer, recording = _one(calibration)
+    if not np.isfinite(answer.unknowns_covariance).all():
+        raise InputError(f"these images do not determine the calibration: {otherwise}")
+    return answer, recording
+
+
+def _legend(panel: Axes, loc: Any = "best", **place: Any) -> None:
+    panel.legend(loc=loc, fontsize=7, frameon=False, **place)
 
 
 def _scale_bar(axes: Axes, length: float) -> None:

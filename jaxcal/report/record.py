@@ -141,10 +141,6 @@ def calibration_record(
 def truth_error(result: Calibration, truth: Truth) -> dict[str, float]:
     """How far a calibration is from a simulation's truth.
 
-    Args:
-        result: one calibration.
-        truth: what the simulation knows.
-
     Returns:
         ``rotation_deg`` and ``translation_mm`` of X, ``point_mm`` of the target.
     """
@@ -160,10 +156,7 @@ def truth_error(result: Calibration, truth: Truth) -> dict[str, float]:
 def check_test_images(recording: Recording, test: Recording | None = None) -> Images | None:
     """The images of the independent test set, checked; None if there is no test set.
 
-    Args:
-        recording: what is to be calibrated.
-        test: another recording whose calibration images are the test set; if it is None, the
-            recording's own test set is used.
+    They are the calibration images of ``test``; without it, the recording's own test set.
 
     Raises:
         InputError: times of flight, pixels without a spacing beside points in mm, or images that

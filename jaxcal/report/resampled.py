@@ -19,12 +19,7 @@ INFLUENTIAL = 1.0
 
 
 def cross_validation_record(found: CrossValidation, result: Calibration) -> dict[str, Any]:
-    """Cross-validation as plain values, for ``calibration.json`` and ``--json``.
-
-    Args:
-        found: the cross-validation.
-        result: the calibration of all images.
-    """
+    """Cross-validation as plain values; ``result`` is the calibration of all images."""
     influence = np.asarray(found.influence, dtype=float)
     used = np.asarray(found.mask) > 0
     strongest = np.argsort(np.where(used & np.isfinite(influence), -influence, np.inf))[:5]
@@ -45,12 +40,7 @@ def cross_validation_record(found: CrossValidation, result: Calibration) -> dict
 
 
 def bootstrap_record(found: Bootstrap, result: Calibration) -> dict[str, Any]:
-    """The bootstrap as plain values, for ``calibration.json`` and ``--json``.
-
-    Args:
-        found: the bootstrap.
-        result: the calibration of all images.
-    """
+    """The bootstrap as plain values; ``result`` is the calibration of all images."""
     spread = np.asarray(found.spread, dtype=float)
     return plain(
         {

@@ -52,12 +52,7 @@ def recording_of(calibration: Calibration) -> Recording:
 def record_of(
     calibration: Calibration, tre_points: tuple[tuple[float, float], ...] = ()
 ) -> dict[str, Any]:
-    """What ``jaxcal calibrate --json`` prints, for a calibration in memory.
-
-    Args:
-        calibration: of one problem, with concrete values.
-        tre_points: further image points, in the images' unit, for which to give the error.
-    """
+    """What ``jaxcal calibrate --json`` prints, for a calibration in memory."""
     return calibration_record(calibration, recording_of(calibration), tre_points=tre_points)
 
 

@@ -88,6 +88,23 @@ def line(
     )
 
 
+def circle(x: Number, y: Number, radius: Number, style: str, title: str = "") -> str:
+    """A circle; ``style`` has its attributes, and a title is shown where the pointer rests."""
+    return _shape(f'circle cx="{_at(x)}" cy="{_at(y)}" r="{_at(radius)}"', style, title)
+
+
+def rect(x: Number, y: Number, wide: Number, high: Number, style: str, title: str = "") -> str:
+    """A rectangle, as :func:`circle`."""
+    size = f'width="{_at(wide)}" height="{_at(high)}"'
+    return _shape(f'rect x="{_at(x)}" y="{_at(y)}" {size}', style, title)
+
+
+def _shape(element: str, style: str, title: str) -> str:
+    if not title:
+        return f"<{element} {style}/>"
+    return f"<{element} {style}><title>{escape(title)}</title></{element.split()[0]}>"
+
+
 def figure(height: Number, parts: Iterable[str], label: str) -> str:
     """An SVG element with a label for screen readers."""
     return (
@@ -128,20 +145,15 @@ class Panel:
         x_label: str = "",
         y_label: str = "",
         *,
-        most: int = 6,
         x_ticks: tuple[Number, Number] | None = None,
     ) -> list[str]:
         """Grid, ticks and labels; without an x label the numbers of x are left out, too.
 
-        Args:
-            x_label: of the horizontal axis.
-            y_label: of the vertical axis.
-            most: ticks along x.
-            x_ticks: where the ticks along x begin and end, if not at the edges.
+        Ticks along x are between ``x_ticks``, by default the edges.
         """
         left, top, right, bottom = self.box
         parts = []
-        for value in ticks(*(x_ticks or self.x), most):
+        for value in ticks(*(x_ticks or self.x)):
             across = self.place(value, self.y[0])[0]
             parts.append(line(across, top, across, bottom, "var(--grid)", 0.6))
             if x_label:
@@ -159,33 +171,20 @@ class Panel:
         if y_label:
             middle = 0.5 * (top + bottom)
             parts.append(text(left - 34, middle, y_label, kind="label", turn=-90))
-        parts.append(
-            f'<rect x="{_at(left)}" y="{_at(top)}" width="{_at(right - left)}" '
-            f'height="{_at(bottom - top)}" fill="none" stroke="var(--line)" stroke-width="0.8"/>'
-        )
+        outline = 'fill="none" stroke="var(--line)" stroke-width="0.8"'
+        parts.append(rect(left, top, right - left, bottom - top, outline))
         return parts
 
     def stems(
-        self,
-        x: Sequence[Any],
-        y: Sequence[Any],
-        colour: str = BLUE,
-        titles: Sequence[str] | None = None,
-        *,
-        radius: Number = 1.9,
+        self, x: Sequence[Any], y: Sequence[Any], colour: str, titles: Sequence[str]
     ) -> list[str]:
-        """Points with a line to zero; all lines are one path, and a dot may have a title."""
+        """Points with a line to zero; all lines are one path, and a dot has a title."""
         zero = min(max(0.0, self.y[0]), self.y[1])
         moves, dots = [], []
-        for k, (a, b) in enumerate(zip(x, y, strict=True)):
+        for a, b, title in zip(x, y, titles, strict=True):
             across, down = self.place(a, b)
-            base = self.place(a, zero)[1]
-            moves.append(f"M{_at(across)} {_at(base)}V{_at(down)}")
-            title = "" if titles is None else f"<title>{escape(titles[k])}</title>"
-            dots.append(
-                f'<circle cx="{_at(across)}" cy="{_at(down)}" r="{radius}" fill="{colour}">'
-                f"{title}</circle>"
-            )
+            moves.append(f"M{_at(across)} {_at(self.place(a, zero)[1])}V{_at(down)}")
+            dots.append(circle(across, down, 1.9, f'fill="{colour}"', title))
         return [f'<path d="{"".join(moves)}" stroke="{colour}" stroke-width="0.7"/>', *dots]
 
     def bars(self, x: Sequence[Any], low: Sequence[Any], high: Sequence[Any], colour: str) -> str:
@@ -202,8 +201,7 @@ def series(
     marked: Sequence[Any],
     label: str,
     *,
-    spreads: Sequence[Sequence[Any] | None] | None = None,
-    x_label: str = "image",
+    spread: Sequence[Any] | None = None,
     height: Number = 96.0,
 ) -> str:
     """Panels one above the other, with one scale for all; each shows a value of every image.
@@ -212,15 +210,14 @@ def series(
         panels: name with unit, image numbers, values, colour.
         marked: images to mark.
         label: of the figure.
-        spreads: half-lengths of vertical bars in each panel.
-        x_label: of the common axis.
+        spread: half-lengths of vertical bars in every panel.
         height: of one panel.
     """
     values = np.array([v for _, _, column, _ in panels for v in column if math.isfinite(v)])
-    for spread in spreads or ():
-        if spread is not None and len(values):
-            wide = float(np.nanmax(np.abs(np.nan_to_num(np.asarray(spread, float)))))
-            values = np.append(values, [values.max() + wide, values.min() - wide])
+    half = None if spread is None else np.nan_to_num(np.asarray(spread, float))
+    if half is not None and len(values):
+        wide = float(np.abs(half).max())
+        values = np.append(values, [values.max() + wide, values.min() - wide])
     low = min(0.0, float(values.min()) if len(values) else -1.0)
     high = max(0.0, float(values.max()) if len(values) else 1.0)
     margin = 0.08 * (high - low) or 1.0
@@ -231,25 +228,18 @@ def series(
     for k, (name, x, y, colour) in enumerate(panels):
         top = 8.0 + k * (height + 12.0)
         panel = Panel((48.0, top, 374.0, top + height), (first - 1, last + 1), scale)
-        below = x_label if k == len(panels) - 1 else ""
+        below = "image" if k == len(panels) - 1 else ""
         parts += panel.axes(below, name, x_ticks=(first, last))
         zero = panel.place(first, 0.0)[1]
         parts.append(line(48.0, zero, 374.0, zero, "var(--text)", 0.6))
-        titles = None
-        if len(x) <= 300:
-            titles = [f"image {int(a)}: {b:.3f}" for a, b in zip(x, y, strict=True)]
-        if spreads is not None and spreads[k] is not None:
-            half = np.nan_to_num(np.asarray(spreads[k], float))
+        if half is not None:
             column = np.asarray(y, float)
             parts.append(panel.bars(list(x), list(column - half), list(column + half), GREY))
-        parts += panel.stems(list(x), list(y), colour, titles)
-        for a, b in zip(x, y, strict=True):
-            if int(a) in marked:
-                across, down = panel.place(a, b)
-                parts.append(
-                    f'<circle cx="{_at(across)}" cy="{_at(down)}" r="5" fill="none" '
-                    f'stroke="{ORANGE}" stroke-width="1.4"/>'
-                )
+        pairs = list(zip(x, y, strict=True))
+        titles = [f"image {int(a)}: {b:.3f}" if len(x) <= 300 else "" for a, b in pairs]
+        parts += panel.stems(x, y, colour, titles)
+        ring = f'fill="none" stroke="{ORANGE}" stroke-width="1.4"'
+        parts += [circle(*panel.place(a, b), 5, ring) for a, b in pairs if int(a) in marked]
     whole = 8.0 + len(panels) * (height + 12.0) + 26.0
     return figure(whole, parts, label)
 
@@ -296,23 +286,17 @@ def error_map(
     parts = [*panel.axes("lateral (mm)", "depth (mm)"), *cells]
     for a, b in seen[:400]:
         if x[0] <= a <= x[1] and y[0] <= b <= y[1]:
-            place = panel.place(float(a), float(b))
-            parts.append(
-                f'<circle cx="{_at(place[0])}" cy="{_at(place[1])}" r="1.7" fill="#fff" '
-                'stroke="#000" stroke-width="0.6"/>'
-            )
+            dot = 'fill="#fff" stroke="#000" stroke-width="0.6"'
+            parts.append(circle(*panel.place(float(a), float(b)), 1.7, dot))
     parts += _colour_bar(48.0 + across + 22.0, 22.0, min(down - 24.0, 150.0), low, high)
     bar = 10.0 * across / (x[1] - x[0])
     left, under = 48.0 + across + 22.0, 10.0 + down - 4.0
     if down > 210:
         parts.append(line(left, under, left + bar, under, "var(--text)", 2.0))
         parts.append(text(left, under - 6, "10 mm", "start", "tick"))
-        dot = under - 30
-        parts.append(
-            f'<circle cx="{_at(left + 2)}" cy="{_at(dot)}" r="1.7" fill="#fff" '
-            'stroke="var(--text)" stroke-width="0.6"/>'
-        )
-        parts.append(text(left + 8, dot + 3, "target", "start", "tick"))
+        dot = 'fill="#fff" stroke="var(--text)" stroke-width="0.6"'
+        parts.append(circle(left + 2, under - 30, 1.7, dot))
+        parts.append(text(left + 8, under - 27, "target", "start", "tick"))
     return figure(10.0 + down + 34.0, parts, label)
 
 
@@ -321,10 +305,8 @@ def _colour_bar(left: Number, top: Number, height: Number, low: Number, high: Nu
     steps = 40
     for k in range(steps):
         y = top + height * (1 - (k + 1) / steps)
-        high_one, colour = _at(height / steps + 0.4), viridis((k + 0.5) / steps)
-        parts.append(
-            f'<rect x="{_at(left)}" y="{_at(y)}" width="12" height="{high_one}" fill="{colour}"/>'
-        )
+        colour = viridis((k + 0.5) / steps)
+        parts.append(rect(left, y, 12, height / steps + 0.4, f'fill="{colour}"'))
     for value in ticks(low, high, 5):
         y = top + height * (1 - (value - low) / ((high - low) or 1.0))
         parts.append(line(left + 12, y, left + 15, y, "var(--text)", 0.8))
@@ -335,9 +317,7 @@ def _colour_bar(left: Number, top: Number, height: Number, low: Number, high: Nu
 def stacked(rows: Sequence[tuple[str, Sequence[tuple[str, Any, str]]]], label: str) -> str:
     """Horizontal bars of shares that add up to one, with a legend.
 
-    Args:
-        rows: title of each bar, and name, share and colour of its parts.
-        label: of the figure.
+    Each bar has a title, and name, share and colour of its parts.
     """
     parts: list[str] = []
     for k, (title, shares) in enumerate(rows):
@@ -346,10 +326,8 @@ def stacked(rows: Sequence[tuple[str, Sequence[tuple[str, Any, str]]]], label: s
         left = 4.0
         for name, share, colour in shares:
             wide = 372.0 * share
-            parts.append(
-                f'<rect x="{_at(left)}" y="{_at(top + 14)}" width="{_at(wide)}" height="16" '
-                f'fill="{colour}"><title>{escape(name)}: {100 * share:.0f} %</title></rect>'
-            )
+            told = f"{name}: {100 * share:.0f} %"
+            parts.append(rect(left, top + 14, wide, 16, f'fill="{colour}"', told))
             if share > 0.09:
                 parts.append(
                     f'<text x="{_at(left + wide / 2)}" y="{_at(top + 26)}" text-anchor="middle" '
@@ -359,9 +337,7 @@ def stacked(rows: Sequence[tuple[str, Sequence[tuple[str, Any, str]]]], label: s
     under = 6.0 + 46.0 * len(rows)
     left = 4.0
     for name, _, colour in rows[0][1] if rows else ():
-        parts.append(
-            f'<rect x="{_at(left)}" y="{_at(under)}" width="9" height="9" fill="{colour}"/>'
-        )
+        parts.append(rect(left, under, 9, 9, f'fill="{colour}"'))
         parts.append(text(left + 13, under + 8, name, "start", "tick"))
         left += 30.0 + 5.4 * len(name)
     return figure(under + 16.0, parts, label)
@@ -379,11 +355,11 @@ def matrix_map(names: Sequence[str], values: Float[np.ndarray, "k k"], label: st
         )
         for j in range(count):
             value = float(values[i, j])
-            colour = ORANGE if value > 0 else BLUE
-            parts.append(
-                f'<rect x="{_at(left + j * size)}" y="{_at(top + i * size)}" '
-                f'width="{_at(size - 1)}" height="{_at(size - 1)}" fill="{colour}" '
-                f'fill-opacity="{abs(value):.2f}" stroke="var(--grid)" stroke-width="0.5">'
-                f"<title>{escape(name)}, {escape(names[j])}: {value:.2f}</title></rect>"
+            style = (
+                f'fill="{ORANGE if value > 0 else BLUE}" fill-opacity="{abs(value):.2f}" '
+                'stroke="var(--grid)" stroke-width="0.5"'
             )
+            told = f"{name}, {names[j]}: {value:.2f}"
+            place = left + j * size, top + i * size
+            parts.append(rect(*place, size - 1, size - 1, style, told))
     return figure(top + count * size + 18.0, parts, label)

@@ -15,11 +15,7 @@ _UNKNOWN = "-"
 
 
 def calibration_table(record: dict[str, Any]) -> RenderableType:
-    """One calibration: transform, target, errors and quality.
-
-    Args:
-        record: of :func:`jaxcal.report.record.calibration_record`.
-    """
+    """One calibration: transform, target, errors and quality."""
     transform = Table(title="image_plane_to_probe (mm)", box=box.SIMPLE, show_header=False)
     for row in record["image_plane_to_probe"]:
         transform.add_row(*(_number(value, ".6f") for value in row))
@@ -37,12 +33,7 @@ def calibration_table(record: dict[str, Any]) -> RenderableType:
 def comparison_table(
     records: dict[str, dict[str, Any]], milliseconds: dict[str, float] | None = None
 ) -> Table:
-    """Several calibrations of one recording, a row each.
-
-    Args:
-        records: the records, by the names to show.
-        milliseconds: solve times by the same names, if they were measured.
-    """
+    """Several calibrations of one recording by name, a row each, with solve times if measured."""
     table = Table(box=box.SIMPLE)
     table.add_column("method", style="bold")
     for heading in (

@@ -32,14 +32,7 @@ _KINDS = {
 
 
 def verdict(record: dict[str, Any]) -> list[str]:
-    """Sentences for a person, most important first.
-
-    Args:
-        record: of :func:`jaxcal.report.record.calibration_record`.
-
-    Returns:
-        Paragraphs (:mod:`jaxcal.report.paragraphs`).
-    """
+    """Sentences for a person, most important first, as :mod:`jaxcal.report.paragraphs` has them."""
     lines = [headline(record)]
     usable = record["status"] in ("converged", "max_iterations")
     usable = usable and not record.get("wrong_frames")

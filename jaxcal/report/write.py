@@ -48,10 +48,9 @@ NAMES = (
 
 @contextmanager
 def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Make a folder, and check that a report can be written to it, before other work begins.
+    """Make a folder and its missing parents, and check that a report can be written to it.
 
-    Args:
-        path: the folder; missing parents are made.
+    This comes before other work begins.
 
     Yields:
         The folder. If the block raises an error, folders that were made here and are still empty
@@ -106,15 +105,10 @@ def write_report(
     curves: list[Curve],
     comparison: dict[str, Any] | None = None,
 ) -> list[Path]:
-    """Write the report of one calibration.
+    """Write the report of one calibration; an earlier one in the folder is replaced as a whole.
 
-    Args:
-        folder: an existing folder; an earlier report in it is replaced as a whole.
-        record: of :func:`jaxcal.report.record.calibration_record`.
-        result: the calibration.
-        recording: what was calibrated.
-        curves: of the method's objective, for the figure convergence; empty: no such figure.
-        comparison: records of several methods, for comparison.json.
+    Curves of the method's objective make the figure convergence, and records of several methods
+    comparison.json.
 
     Returns:
         The files: calibration.json, verdict.txt, residuals.csv, and each figure as .png and .svg:
@@ -126,7 +120,6 @@ def write_report(
     """
     # Matplotlib takes half a second to import, so it is imported only here, to draw.
     from jaxcal.report import plots
-    from jaxcal.report.figures import convergence_figure
 
     truth = None if recording.truth is None else recording.truth.elevation
     figures = {
@@ -140,7 +133,7 @@ def write_report(
             "limits": plots.plot_limits(result),
         }
     if curves:
-        figures["convergence"] = convergence_figure(curves)
+        figures["convergence"] = plots.convergence_figure(curves)
     texts = {
         "calibration.json": _json(record),
         "verdict.txt": "\n".join(verdict(record)) + "\n",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
@@ -15,7 +14,7 @@ from jaxcal import FormatError, InputError
 from jaxcal.io.atomic import atomic_path, write_text
 from jaxcal.io.frame_names import FramePair
 from jaxcal.io.outputs import check_output
-from jaxcal.io.readable import check_readable, naming, one_line, path_name
+from jaxcal.io.readable import check_readable, naming, one_line, path_name, read_bytes
 from jaxcal.model.unknowns import TABLE, tangent_names
 from jaxcal.result.transform import ImageTransform, SaveFormat, transform_from_plus_matrix
 from jaxcal.runtime.messages import quoted
@@ -225,7 +224,10 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
     lower = name.lower()
     with naming(path):
         if lower.endswith(".xml"):
-            return _load_plus(path)
+            from jaxcal.io.plus import read_transform
+
+            found = read_transform(path)
+            return transform_from_plus_matrix(found.matrix, error_mm=found.error_mm, source=name)
         if lower.endswith((".tfm", ".txt", ".h5")):
             from jaxcal.io.itk import read_itk
 
@@ -245,24 +247,6 @@ def load_calibration(path: str | os.PathLike[str]) -> ImageTransform:
         if lower.endswith(".npz"):
             return _load_npz(path)
         return transform_from_record(_json_object(path), source=name)
-
-
-def _load_plus(path: str | os.PathLike[str]) -> ImageTransform:
-    from jaxcal.io.plus import read_configuration, read_result
-    from jaxcal.io.xml import read_xml
-
-    name = os.fspath(path)
-    root, _ = read_xml(path)
-    found, error = None, None
-    if root.tag == "ProbeCalibrationResult":
-        result = read_result(path)
-        found, error = result.find("Image", "Probe"), result.calibration_error_mm
-    else:
-        found = read_configuration(path).find("Image", "Probe")
-        error = None if found is None else found.error_mm
-    if found is None:
-        raise FormatError("holds no transform from Image to Probe")
-    return transform_from_plus_matrix(found.matrix, error_mm=error, source=name)
 
 
 def _load_npy(path: str | os.PathLike[str]) -> np.ndarray:
@@ -296,15 +280,12 @@ def _load_npz(path: str | os.PathLike[str]) -> ImageTransform:
 
 
 def _json_object(path: str | os.PathLike[str]) -> dict[str, Any]:
-    check_readable(path, maximum_bytes=MAXIMUM_BYTES)
+    content = read_bytes(path, MAXIMUM_BYTES)
+    if not content.lstrip().startswith(b"{"):
+        _format_of(os.fspath(path))
     try:
-        content = Path(path).read_bytes()
-        if not content.lstrip().startswith(b"{"):
-            _format_of(os.fspath(path))
         record = json.loads(content)
-    except (OSError, ValueError, RecursionError) as error:
-        if isinstance(error, FormatError):
-            raise
+    except (ValueError, RecursionError) as error:
         raise FormatError(f"is not JSON: {one_line(error)}") from None
     if not isinstance(record, dict):
         raise FormatError("is not a calibration: a JSON object is needed")

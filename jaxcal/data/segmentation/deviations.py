@@ -12,7 +12,7 @@ no two large numbers are subtracted. The start comes from the straight line that
 over the elements. The steps are Newton's with exact second derivatives, so that each one squares
 the error. (They are Gauss-Newton's where the matrix is indefinite or nearly singular.)
 
-:func:`jaxcal.data.segmentation.time_of_flight.fit_distances` is the plain form; the tests compare
+:func:`jaxcal.data.segmentation.time_of_flight.fit_in_plane` is the plain form; the tests compare
 this fit with it.
 """
 

@@ -250,10 +250,6 @@ def check_region(
 ) -> tuple[int, int, int, int]:
     """The region to look in: (first column, first row, columns, rows), px; the whole frame if None.
 
-    Args:
-        region: what was asked for.
-        shape: (rows, columns) of the frames.
-
     Raises:
         InputError: not four whole numbers, outside the frame, or too small.
     """

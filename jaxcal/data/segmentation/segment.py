@@ -280,10 +280,7 @@ def check_times_of_flight(
 ) -> None:
     """Refuse what cannot be one-way times of flight in seconds; NaN is no answer, and allowed.
 
-    Args:
-        times: (n, elements), s.
-        probe: the transducer.
-        used: (n,) rows to look at; all by default.
+    Only rows that are ``used`` are looked at; by default all.
 
     Raises:
         InputError: another number of elements, a negative or infinite time, times so long that

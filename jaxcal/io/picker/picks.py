@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.atomic import write_text
-from jaxcal.io.readable import check_readable
+from jaxcal.io.readable import read_bytes
 from jaxcal.io.text import read_pose_table
 from jaxcal.runtime.messages import quoted
 
@@ -154,8 +154,7 @@ class Picks:
         """The table as it is on the disk; None where there is none."""
         if not Path(self.path).exists():
             return None
-        check_readable(self.path, maximum_bytes=_MOST_BYTES)
-        return Path(self.path).read_bytes()
+        return read_bytes(self.path, _MOST_BYTES)
 
     def _named(self, frame: int) -> str:
         if not self.files:
