@@ -152,8 +152,8 @@ def segment(
 
     Raises:
         InputError: no times of flight, no probe, times for another number of elements, negative
-            times, microseconds, options of another kind or of the other method; for a recording, fewer than 4 frames that
-            can be segmented.
+            times, microseconds, options of another kind or of the other method; for a recording,
+            fewer than 4 frames that can be segmented.
     """
     images = images_of(data, "jaxcal.segment")
     probe = data.probe if probe is None and isinstance(data, Recording) else probe
