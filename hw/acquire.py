@@ -405,7 +405,7 @@ class _Run:
         )
         estimate = self._estimator.add(shot.pose, shot.measurement, bracket.max_elevation_mm)
         if estimate is not None:
-            self._recorder.add_estimate({"t_host": np.array([clock.now()]), **estimate})
+            self._recorder.add_estimate(t_host=clock.now(), **estimate)
 
 
 def _finish(recorder: Recorder, without_image: int) -> str:

@@ -58,7 +58,7 @@ from typing import Any
 import numpy as np
 
 from hw.extras import require
-from hw.shapes import UInt16
+from jaxcal.runtime.array_types import UInt16
 
 NO_RESPONSE = 0xFFFF
 """Time of flight (ticks) of a line without a response."""

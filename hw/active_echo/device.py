@@ -36,7 +36,7 @@ from hw.active_echo.codec import (
 from hw.active_echo.transport import BAUD, DEVICE, open_transport
 from hw.clock import REAL, Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError
-from hw.shapes import Float, UInt16
+from jaxcal.runtime.array_types import Float, UInt16
 
 COMMAND_TIMEOUT_S = 1.0
 """A command that is not answered within this bench time has failed."""

@@ -23,8 +23,8 @@ from hw.clock import Clock
 from hw.rigid import looking_rotation
 from hw.robot.pose import pose_to_ur, ur_to_pose
 from hw.scene import Scene
-from hw.shapes import Float
 from jaxcal import InputError
+from jaxcal.runtime.array_types import Float
 
 VERSIONS = {125: CB_SERIES, 500: E_SERIES}
 """Controllers that the real client accepts, by their rate: a CB-series and an e-Series."""

@@ -24,9 +24,9 @@ from hw.bench.assembly import Assembly, BenchOptions
 from hw.bench.control import ControlClient
 from hw.clock import Clock
 from hw.scene import Scene
-from hw.shapes import Float
 from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
+from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.isolated import python_command
 
 __all__ = ["Bench", "BenchOptions", "main", "serve", "start_bench"]

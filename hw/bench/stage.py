@@ -12,7 +12,7 @@ import numpy as np
 
 from hw.bench.world import World
 from hw.midplane.search import Echoes
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from hw.scene import Scene
-from hw.shapes import Float
 from jaxcal.data.probe import L14_5, LinearProbe
+from jaxcal.runtime.array_types import Float
 
 ELEMENT_MM = 2.08
 """Outer diameter of the paper's PZT5H tube, mm (section 3.2)."""

@@ -31,8 +31,8 @@ from hw.bench.phantoms import ActiveEcho, Phantom, phantom_named
 from hw.bench.tank import ELEMENT_MM, Beam, Noise, Tank
 from hw.rigid import looking_rotation, rigid, rotation_matrix
 from hw.scene import Scene
-from hw.shapes import Bool, Float
 from jaxcal import InputError
+from jaxcal.runtime.array_types import Bool, Float
 
 FULL_SCALE = 4095
 """Largest amplitude that the electronics' 12-bit converter tells, counts."""

@@ -41,13 +41,13 @@ from hw.recording_layout import RecordingHeader
 from hw.resuming import check_same, described_probe
 from hw.session import DELAY_S, Watch, median_times
 from hw.setup import HandHeldSetup
-from hw.shapes import Float
 from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.poses import inverse_poses
 from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
 from jaxcal.data.timing import interpolate_poses
 from jaxcal.io.readable import naming
+from jaxcal.runtime.array_types import Float
 
 _KIND = "pattern-injection"
 _SILENCE_S = 3.0

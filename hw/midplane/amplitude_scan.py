@@ -16,7 +16,7 @@ import numpy as np
 
 from hw.midplane.bracket import Bracket, Placement, widened
 from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 LEAST_FRACTION = 0.4
 """Samples below this part of the loudest are not used: they show the beam's skirts."""

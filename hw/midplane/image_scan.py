@@ -20,10 +20,10 @@ import numpy as np
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
 from hw.midplane.search import Echoes, Settings
-from hw.shapes import Float, UInt8
 from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.speckle import SMALLEST_REGION, NotFoundError, envelope_of
 from jaxcal.data.segmentation.spot import brightest
+from jaxcal.runtime.array_types import Float, UInt8
 
 Target = Literal["echo", "cross"]
 

@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from hw.shapes import UInt8
+from jaxcal.runtime.array_types import UInt8
 
 COLUMNS, ROWS = 64, 20
 _GREYS = 24

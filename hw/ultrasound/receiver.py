@@ -18,11 +18,11 @@ import numpy as np
 
 from hw.clock import REAL, Clock
 from hw.errors import Device, DeviceError, LostError, StaleError
-from hw.shapes import Float
 from hw.ultrasound.framing import MessageDecoder
 from jaxcal.io.message_content import Picture, Pixels, StatusMessage, Tracked, TrackedFrame
 from jaxcal.io.openigtlink import RF_DEVICE, Message
 from jaxcal.io.readable import one_line
+from jaxcal.runtime.array_types import Float
 
 DEVICE: Device = "ultrasound"
 PORT = 18944

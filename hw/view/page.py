@@ -23,7 +23,7 @@ from hw.robot.kinematics import (
     model_named,
     nearest,
 )
-from hw.shapes import Float, UInt8
+from jaxcal.runtime.array_types import Float, UInt8
 
 UNIT_MM = 100.0
 _CHI_95 = 7.8147

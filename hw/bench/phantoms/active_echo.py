@@ -15,7 +15,7 @@ import numpy as np
 from hw.bench.look import Look
 from hw.bench.phantoms.phantom import Mark, Sensor
 from hw.bench.tank import ELEMENT_MM, Tank
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 
 @dataclass(frozen=True)

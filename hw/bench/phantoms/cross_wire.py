@@ -19,7 +19,7 @@ import numpy as np
 from hw.bench.look import Look
 from hw.bench.phantoms.phantom import Mark, Phantom, two_way
 from hw.bench.tank import Tank
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 WIRE_MM = 0.2
 """Diameter of the fishing lines (section 3.2)."""

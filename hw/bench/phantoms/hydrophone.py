@@ -14,7 +14,7 @@ import numpy as np
 from hw.bench.look import Look
 from hw.bench.phantoms.phantom import Mark, Sensor, two_way
 from hw.bench.tank import Tank
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 APERTURE_MM = 0.01
 """Receiving aperture (section 3.2)."""

@@ -23,7 +23,7 @@ import numpy as np
 
 from hw.bench.look import Look
 from hw.bench.tank import ELEMENT_MM, Tank
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 _RANGE_OF_PEAK_MM = 20.0
 """Range at which the beam's peak amplitude is stated, mm."""
