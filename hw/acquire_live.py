@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from hw.live import LiveCalibration
@@ -81,9 +83,7 @@ class Estimator:
             live.put(pose, row, 1.0)
         live.solve()
 
-    def add(
-        self, pose: np.ndarray, measurement: np.ndarray, bound: float
-    ) -> dict[str, np.ndarray] | None:
+    def add(self, pose: np.ndarray, measurement: np.ndarray, bound: float) -> dict[str, Any] | None:
         """Take an image and solve; a row of /estimate, or None with too few images."""
         if self._put(pose, measurement, bound):
             self._result = self._solve()

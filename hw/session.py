@@ -19,7 +19,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hw.active_echo.device import ActiveEcho, EchoFrame
+from hw.active_echo.device import ActiveEcho, EchoFrame, median_of
 from hw.errors import DeviceError, StaleError
 from hw.recorder import Recorder
 from hw.robot.stream import PoseSample, PoseStream
@@ -429,9 +429,5 @@ def median_times(frames: list[EchoFrame]) -> tuple[np.ndarray, float]:
         (lines,) median time of flight, s, NaN where fewer than half of the frames have one; and
         the median over the frames of the loudest amplitude, counts.
     """
-    times = np.array([frame.tof_s for frame in frames])
-    answered = 2 * np.isfinite(times).sum(axis=0) >= len(frames)
-    middle = np.full(times.shape[1], np.nan)
-    middle[answered] = np.nanmedian(times[:, answered], axis=0)
     loudest = float(np.median([frame.amplitude.max() for frame in frames]))
-    return middle, loudest
+    return median_of(np.array([frame.tof_s for frame in frames])), loudest

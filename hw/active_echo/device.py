@@ -461,3 +461,11 @@ class ActiveEcho:
                     late = now - sent
                 self._anchor = now, packet.ticks, late
         return late
+
+
+def median_of(tof_s: Float[np.ndarray, "frames lines"]) -> Float[np.ndarray, " lines"]:
+    """Median time of flight, s; NaN where fewer than half of the frames have one."""
+    answered = 2 * np.isfinite(tof_s).sum(axis=0) >= len(tof_s)
+    middle = np.full(tof_s.shape[1], np.nan)
+    middle[answered] = np.nanmedian(tof_s[:, answered], axis=0)
+    return middle

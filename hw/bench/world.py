@@ -56,35 +56,47 @@ class World(Tank):
         """Amplitude of every line at the phantom without noise or saturation, counts."""
         return self.phantom.loudness(self, pose)
 
-    def echo(
-        self, pose: Float[np.ndarray, "4 4"], threshold: int, rng: np.random.Generator
-    ) -> tuple[Float[np.ndarray, " elements"], Float[np.ndarray, " elements"]]:
-        """What the element reports of one frame.
+    def echoes(
+        self, pose: Float[np.ndarray, "4 4"], threshold: int, rng: np.random.Generator, frames: int
+    ) -> tuple[Float[np.ndarray, "frames elements"], Float[np.ndarray, "frames elements"]]:
+        """What the element reports of some frames at one place.
 
         Args:
             pose: true, tool -> base, mm.
             threshold: amplitude from which it answers, counts.
-            rng: of this frame's noise.
+            rng: of the frames' noise.
+            frames: how many.
 
         Returns:
             one-way times of flight (s, a whole number of clock periods; NaN: no answer) and
             amplitudes (counts, whole, at most full scale; 0 without an answer).
         """
         count, noise = self.probe.elements, self.noise
-        normal = rng.standard_normal((3, count))
-        amplitude = self.loudness(pose) * (1 + noise.amplitude * normal[0])
-        amplitude = np.rint(amplitude + self.phantom.noise_counts(self) * normal[1])
-        amplitude = np.clip(amplitude, 0, FULL_SCALE)
-        heard = amplitude >= max(threshold, 1)
-
+        loudness, floor = self.loudness(pose), self.phantom.noise_counts(self)
         lateral, elevation, axial = self.target(pose)
-        way = np.sqrt((lateral - self.elements) ** 2 + elevation**2 + axial**2)
-        if noise.reflection > 0:
-            late = rng.random(count) < noise.reflection
-            way = way + late * rng.uniform(*noise.reflection_mm, size=count)
-        time = way / (1e3 * self.sound_speed_m_s) + self.delay_s + noise.time_s * normal[2]
-        time = np.rint(time * self.clock_hz) / self.clock_hz
-        return np.where(heard & (time > 0), time, np.nan), np.where(heard, amplitude, 0.0)
+        straight = np.sqrt((lateral - self.elements) ** 2 + elevation**2 + axial**2)
+        times, amplitudes = np.empty((2, frames, count))
+        for frame in range(frames):
+            normal = rng.standard_normal((3, count))
+            amplitude = np.rint(loudness * (1 + noise.amplitude * normal[0]) + floor * normal[1])
+            amplitude = np.clip(amplitude, 0, FULL_SCALE)
+            heard = amplitude >= max(threshold, 1)
+            way = straight
+            if noise.reflection > 0:
+                late = rng.random(count) < noise.reflection
+                way = way + late * rng.uniform(*noise.reflection_mm, size=count)
+            time = way / (1e3 * self.sound_speed_m_s) + self.delay_s + noise.time_s * normal[2]
+            time = np.rint(time * self.clock_hz) / self.clock_hz
+            times[frame] = np.where(heard & (time > 0), time, np.nan)
+            amplitudes[frame] = np.where(heard, amplitude, 0.0)
+        return times, amplitudes
+
+    def echo(
+        self, pose: Float[np.ndarray, "4 4"], threshold: int, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, " elements"], Float[np.ndarray, " elements"]]:
+        """What the element reports of one frame, as by :meth:`echoes`."""
+        times, amplitudes = self.echoes(pose, threshold, rng, 1)
+        return times[0], amplitudes[0]
 
     def answers(self, pose: Float[np.ndarray, "4 4"], threshold: int) -> Bool[np.ndarray, " e"]:
         """Which lines the element answers, noise apart."""
