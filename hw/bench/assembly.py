@@ -316,9 +316,10 @@ class Assembly:
 
     def _statistics(self) -> dict:
         assert self.robot is not None
+        robot = self.robot.state()
         return {
-            "packets": self.robot.packets,
-            "packets_skipped": self.robot.skipped,
+            "packets": robot["packets"],
+            "packets_skipped": robot["skipped"],
             "echo_frames": self.echo.sent,
             "images": self.images.sent,
             "images_refused": self.images.refused,

@@ -41,6 +41,13 @@ class Peak:
     width_mm: float
     used: int
 
+    def bracket(self, where_mm: float, settings: Settings) -> Bracket:
+        """Where the target's offset lies in an image that was taken at ``where_mm``."""
+        centre, half = self.place_mm - where_mm, settings.factor * self.sd_mm
+        return widened(
+            centre, centre - half, centre + half, self.sd_mm, settings.hidden_sd_mm, settings.factor
+        )
+
 
 def fit_peak(
     offsets_mm: Float[np.ndarray, " n"],
@@ -254,9 +261,4 @@ def free_hand(
     best = int(np.argmax(loud))
     if usable[best] == 0.0:
         best = int(np.argmin(np.abs(np.asarray(offsets_mm) - peak.place_mm)))
-    centre = peak.place_mm - float(offsets_mm[best])
-    half = settings.factor * peak.sd_mm
-    bracket = widened(
-        centre, centre - half, centre + half, peak.sd_mm, settings.hidden_sd_mm, settings.factor
-    )
-    return best, bracket
+    return best, peak.bracket(float(offsets_mm[best]), settings)

@@ -100,6 +100,14 @@ class Screen:
             columns, lines = shutil.get_terminal_size()
         return columns or 80, lines or 24
 
+    def picture(self, frame: np.ndarray, other_rows: int) -> list[str]:
+        """A frame as large as fits beside other rows; nothing where it cannot be shown."""
+        columns, lines = self.size
+        height = min(ROWS, lines - other_rows)
+        if not self.pictures or height <= 0:
+            return []
+        return picture(frame, min(COLUMNS, columns - 1), height)
+
     def say(self, line: str) -> None:
         """One line that stays."""
         with self._lock:

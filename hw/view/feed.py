@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -37,59 +37,28 @@ _END_WALL_S = 2.0
 _LINES = 5
 
 
-@runtime_checkable
-class Audience(Protocol):
-    """Receives the progress of an acquisition; see :class:`LiveView`."""
+class Audience:
+    """Is told of the progress of an acquisition, and ignores it; see :class:`LiveView`."""
 
     def plan(
         self, setup: Setup, plan: MotionPlan, targets: Float[np.ndarray, "n 4 4"], done: list[int]
     ) -> None:
         """What shall be acquired: all poses, and the rows that a resumed recording has."""
-        ...
 
     def watch(self, session: Session | None) -> None:
         """Show the poses and frames of this session; None: show them no longer."""
-        ...
 
     def going(self, row: int) -> None:
         """The robot travels to a pose of the plan."""
-        ...
 
     def stop(self, offset_mm: float, amplitude: float, threshold: int) -> None:
         """The search listened somewhere."""
-        ...
 
     def taken(self, row: int, placement: Placement, answer: Calibration | None) -> None:
         """An image was taken, and this is the estimate now."""
-        ...
 
     def given_up(self, row: int) -> None:
         """No mid-plane was found there, or the operator skipped it."""
-        ...
-
-
-class Nobody:
-    """An audience that ignores everything."""
-
-    def plan(
-        self, setup: Setup, plan: MotionPlan, targets: Float[np.ndarray, "n 4 4"], done: list[int]
-    ) -> None:
-        """Nothing."""
-
-    def watch(self, session: Session | None) -> None:
-        """Nothing."""
-
-    def going(self, row: int) -> None:
-        """Nothing."""
-
-    def stop(self, offset_mm: float, amplitude: float, threshold: int) -> None:
-        """Nothing."""
-
-    def taken(self, row: int, placement: Placement, answer: Calibration | None) -> None:
-        """Nothing."""
-
-    def given_up(self, row: int) -> None:
-        """Nothing."""
 
 
 @contextmanager
@@ -102,7 +71,7 @@ def watched(view: Audience, session: Session) -> Iterator[None]:
         view.watch(None)
 
 
-class LiveView:
+class LiveView(Audience):
     """The live view of one acquisition; a context manager.
 
     Args:

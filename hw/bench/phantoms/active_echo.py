@@ -30,7 +30,6 @@ class ActiveEcho(Sensor):
 
     name = "active-echo"
     answers = True
-    target = "echo"
 
     def marks(
         self,

@@ -50,9 +50,7 @@ class CrossWire(Phantom):
     directions: tuple[tuple[float, float, float], tuple[float, float, float]] = DIRECTIONS
 
     name = "cross-wire"
-    heard = False
     answers = False
-    target = "cross"
 
     def loudness(self, world: Tank, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
         """Silence: there is no sensor."""

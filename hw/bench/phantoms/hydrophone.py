@@ -38,7 +38,6 @@ class Hydrophone(Sensor):
 
     name = "hydrophone"
     answers = False
-    target = "echo"
 
     def noise_counts(self, world: Tank) -> float:
         """The amplitude in the mid-plane times least pressure over the pressure there, counts."""

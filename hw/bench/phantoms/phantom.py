@@ -59,15 +59,11 @@ class Phantom(ABC):
 
     Attributes:
         name: on the command line.
-        heard: whether it is wired to the electronics.
         answers: whether it transmits into the image, so that a pattern can be injected.
-        target: what the segmentation of frames looks for, ``echo`` or ``cross``.
     """
 
     name: ClassVar[str]
-    heard: ClassVar[bool]
     answers: ClassVar[bool]
-    target: ClassVar[str]
 
     @property
     def response_scale(self) -> float:
@@ -111,8 +107,6 @@ class Sensor(Phantom):
     """
 
     size_mm: float = ELEMENT_MM
-
-    heard = True
 
     @property
     def response_scale(self) -> float:
