@@ -92,7 +92,8 @@ class Outcome:
     """Result of a completed run.
 
     Attributes:
-        images: selected.
+        images: selected, in the whole recording.
+        taken: of them in this run.
         given_up: rows of the plan for which no mid-plane was found, or that were skipped.
         sha256: of the finished file.
         seconds: bench seconds that this run took.
@@ -101,6 +102,7 @@ class Outcome:
     """
 
     images: int
+    taken: int
     given_up: tuple[int, ...]
     sha256: str
     seconds: float
@@ -230,7 +232,7 @@ class _Run:
     def outcome(self, confirm: Confirm, watch: Watch | None) -> Outcome:
         """Open the devices, have the plan confirmed, take the images, and finish the file."""
         job, recorder, estimator = self.job, self.recorder, self.estimator
-        started = self.clock.now()
+        started, before = self.clock.now(), estimator.count
         self._note("resumed" if job.progress else "started", f"{job.to_take} images to take")
         for change in job.changes:
             self._note("changed", change)
@@ -248,6 +250,7 @@ class _Run:
         digest = _finish(recorder, len(again))
         return Outcome(
             estimator.count,
+            estimator.count - before,
             without,
             digest,
             self.clock.now() - started,
