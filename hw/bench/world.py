@@ -28,7 +28,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hw.bench.phantoms import ActiveEcho, Phantom, phantom_named
-from hw.bench.tank import ELEMENT_MM, Beam, Noise, Tank
+from hw.bench.tank import ELEMENT_MM, Beam, Noise, Pose, Tank
 from hw.rigid import looking_rotation, rigid, rotation_matrix
 from hw.scene import Scene
 from jaxcal import InputError
@@ -48,16 +48,16 @@ class World(Tank):
 
     phantom: Phantom = field(default_factory=ActiveEcho)
 
-    def shift_mm(self, pose: Float[np.ndarray, "4 4"]) -> float:
+    def shift_mm(self, pose: Pose) -> float:
         """Elevational place where the response is strongest, at this orientation, mm."""
         return self.response_shift_mm(pose, self.phantom.response_scale)
 
-    def loudness(self, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " elements"]:
+    def loudness(self, pose: Pose) -> Float[np.ndarray, " elements"]:
         """Amplitude of every line at the phantom without noise or saturation, counts."""
         return self.phantom.loudness(self, pose)
 
     def echoes(
-        self, pose: Float[np.ndarray, "4 4"], threshold: int, rng: np.random.Generator, frames: int
+        self, pose: Pose, threshold: int, rng: np.random.Generator, frames: int
     ) -> tuple[Float[np.ndarray, "frames elements"], Float[np.ndarray, "frames elements"]]:
         """What the element reports of some frames at one place.
 
@@ -92,13 +92,13 @@ class World(Tank):
         return times, amplitudes
 
     def echo(
-        self, pose: Float[np.ndarray, "4 4"], threshold: int, rng: np.random.Generator
+        self, pose: Pose, threshold: int, rng: np.random.Generator
     ) -> tuple[Float[np.ndarray, " elements"], Float[np.ndarray, " elements"]]:
         """What the element reports of one frame, as by :meth:`echoes`."""
         times, amplitudes = self.echoes(pose, threshold, rng, 1)
         return times[0], amplitudes[0]
 
-    def answers(self, pose: Float[np.ndarray, "4 4"], threshold: int) -> Bool[np.ndarray, " e"]:
+    def answers(self, pose: Pose, threshold: int) -> Bool[np.ndarray, " e"]:
         """Which lines the element answers, noise apart."""
         return self.loudness(pose) >= max(threshold, 1)
 

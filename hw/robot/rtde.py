@@ -20,7 +20,7 @@ import struct
 import time
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from typing import Any
 
 from hw.errors import LostError, refused
 
@@ -292,24 +292,22 @@ class PacketReader:
         values = self._struct.unpack_from(payload, 1)
         if not all(map(math.isfinite, values)):
             raise LostError("a packet holds NaN or Inf", device="robot")
-        told = {name: values[place] for name, place in self._places.items()}
+        told: dict[str, Any] = {name: values[place] for name, place in self._places.items()}
         pendant = PendantSettings(
-            told["payload"][0] if "payload" in told else None,
-            told.get("payload_cog"),
-            *told["target_speed_fraction"],
+            told.get("payload"), told.get("payload_cog"), told["target_speed_fraction"]
         )
         if pendant != self._pendant:
             self._pendant = pendant
         return Packet(
             now,
-            *told["timestamp"],
+            told["timestamp"],
             told["actual_TCP_pose"],
             told["actual_TCP_speed"],
             told["actual_TCP_force"],
-            *told["robot_mode"],
-            *told["runtime_state"],
-            *told["robot_status_bits"],
-            *told["safety_status_bits"],
+            told["robot_mode"],
+            told["runtime_state"],
+            told["robot_status_bits"],
+            told["safety_status_bits"],
             told.get("tcp_offset"),
             self._pendant,
             told.get("actual_q"),
@@ -354,11 +352,12 @@ class PacketReader:
         if wrong or len(types) != len(names):
             raise refused(f"the controller has no {', '.join(wrong) or 'such recipe'}")
         self._struct = struct.Struct(">" + "".join(FIELDS[name][1] for name in names))
-        ends = list(accumulate(int(FIELDS[name][1][:-1] or 1) for name in names))
-        self._places = {
-            name: slice(start, end)
-            for name, start, end in zip(names, [0, *ends], ends, strict=False)
-        }
+        self._places: dict[str, int | slice] = {}
+        start = 0
+        for name in names:
+            end = start + int(FIELDS[name][1][:-1] or 1)
+            self._places[name] = start if end == start + 1 else slice(start, end)
+            start = end
         self.bound, self.latency_s = self._begin(deadline)
         """``bound``: a moment of ``time.monotonic()`` and a time of the controller (s): the packet
         with this time stamp was not made before that moment. ``latency_s``: an upper bound of how

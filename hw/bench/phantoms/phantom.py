@@ -22,7 +22,7 @@ from typing import ClassVar
 import numpy as np
 
 from hw.bench.look import Look
-from hw.bench.tank import ELEMENT_MM, Tank
+from hw.bench.tank import ELEMENT_MM, Pose, Tank
 from jaxcal.runtime.array_types import Float
 
 _RANGE_OF_PEAK_MM = 20.0
@@ -75,17 +75,12 @@ class Phantom(ABC):
         return world.noise.amplitude_counts
 
     @abstractmethod
-    def loudness(self, world: Tank, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
+    def loudness(self, world: Tank, pose: Pose) -> Float[np.ndarray, " e"]:
         """Amplitude of every line at its sensor, without noise or saturation, counts."""
 
     @abstractmethod
     def marks(
-        self,
-        world: Tank,
-        pose: Float[np.ndarray, "4 4"],
-        look: Look,
-        rng: np.random.Generator,
-        threshold: int = 0,
+        self, world: Tank, pose: Pose, look: Look, rng: np.random.Generator, threshold: int = 0
     ) -> list[Mark]:
         """What one frame shows of it.
 
@@ -117,7 +112,7 @@ class Sensor(Phantom):
         """Elevational SD of the amplitude that it reports, mm."""
         return np.hypot(world.beam.field_mm(range_mm), self.size_mm / np.sqrt(12.0))
 
-    def loudness(self, world: Tank, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
+    def loudness(self, world: Tank, pose: Pose) -> Float[np.ndarray, " e"]:
         """Amplitude of every line at it, counts; 0 behind the probe."""
         lateral, elevation, axial = world.target(pose)
         elements = world.elements
