@@ -19,11 +19,11 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from hw.pipes import encode
 from hw.recording_check import check_resumable
 from hw.recording_file import utc_now
 from hw.recording_layout import TEXT_BYTES, RecordingHeader
@@ -113,12 +113,7 @@ class Recorder:
     def __enter__(self) -> Recorder:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             self.close()
         except CalibrationError:
@@ -465,15 +460,6 @@ class Recorder:
             # Keep the first error: the later ones follow from it.
             self.error = self.error or error
             self._changed.notify_all()
-
-
-def encode(message: Mapping[str, Any], columns: Mapping[str, np.ndarray]) -> tuple[bytes, ...]:
-    """A message to the writer: length and text of a JSON header, then the arrays' bytes."""
-    arrays = {key: np.ascontiguousarray(values) for key, values in columns.items()}
-    described = [[key, values.dtype.str, list(values.shape)] for key, values in arrays.items()]
-    header = json.dumps({**message, "columns": described}).encode()
-    body = (values.tobytes() for values in arrays.values())
-    return (len(header).to_bytes(4, "big") + header, *body)
 
 
 def _column(items: Sequence[Any], name: str, kind: type = float) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -145,14 +146,7 @@ def load_hand_held(path: str | os.PathLike[str]) -> HandHeldSetup:
     tables = load_toml(path, maximum_bytes=_LARGEST_BYTES)
     names = ("active_echo", "probe", "scene", "search")
     with naming(path):
-        for name in tables:
-            if name not in names:
-                raise InputError(f"[{quoted(name)}] is not known; there are {', '.join(names)}")
-        found = {name: _table(tables, name) for name in names}
-        if "url" not in found["active_echo"]:
-            raise InputError("[active_echo] needs url")
-        if "image_to_probe" not in found["scene"]:
-            raise InputError("[scene] needs image_to_probe")
+        found = _checked(tables, names, active_echo=("url",), scene=("image_to_probe",))
         found["probe"].pop("housing_mm", None)
         drawn = _drawn(found["scene"]["image_to_probe"])
         probe = LinearProbe(**found["probe"])
@@ -229,17 +223,14 @@ _TABLES = {
 
 
 def _setup(tables: dict[str, Any]) -> Setup:
-    found = {name: _table(tables, name) for name in _TABLES}
-    for name in tables:
-        if name not in _TABLES:
-            raise InputError(f"[{quoted(name)}] is not known; there are {', '.join(_TABLES)}")
-    for name, key in (("robot", "host"), ("active_echo", "url")):
-        if key not in found[name]:
-            raise InputError(f"[{name}] needs {key}")
+    found = _checked(
+        tables,
+        _TABLES,
+        robot=("host",),
+        active_echo=("url",),
+        scene=("image_to_probe", "point_mm", "looking"),
+    )
     scene = found["scene"]
-    for key in ("image_to_probe", "point_mm", "looking"):
-        if key not in scene:
-            raise InputError(f"[scene] needs {key}")
     ultrasound = _ultrasound(found["ultrasound"])
     if not found["limits"]:
         raise InputError("[limits] is missing: without it nothing may move")
@@ -350,6 +341,21 @@ def _arm_name(name: str) -> str:
         return model_named(name).name
     except RefusedError as error:
         raise InputError(f"[robot] model: {error.args[0]}") from None
+
+
+def _checked(
+    tables: dict[str, Any], names: Collection[str], **needed: tuple[str, ...]
+) -> dict[str, dict[str, Any]]:
+    """All tables by their names; an unknown one, or a missing key, is refused."""
+    found = {name: _table(tables, name) for name in names}
+    for name in tables:
+        if name not in names:
+            raise InputError(f"[{quoted(name)}] is not known; there are {', '.join(names)}")
+    for name, keys in needed.items():
+        for key in keys:
+            if key not in found[name]:
+                raise InputError(f"[{name}] needs {key}")
+    return found
 
 
 def _table(tables: dict[str, Any], name: str) -> dict[str, Any]:

@@ -23,6 +23,7 @@ import numpy as np
 from hw.errors import DeviceError
 from hw.extras import missing
 from hw.midplane.bracket import Placement
+from hw.pipes import encode
 from hw.robot.motion_plan import MotionPlan
 from hw.session import Session
 from hw.setup import Setup
@@ -240,7 +241,7 @@ class LiveView(Audience):
             session = self._session
             told = {**self._slow} if self._changed else {}
             self._changed = False
-        frame = b""
+        frame: dict[str, np.ndarray] = {}
         if session is not None:
             try:
                 sample = session.poses.latest()
@@ -258,9 +259,8 @@ class LiveView(Audience):
                     pairs = small.shape[1] // 2 * 2
                     small = np.maximum(small[:, :pairs:2], small[:, 1:pairs:2])
                     spacing[0] *= 2
-                frame = small.tobytes()
-                told["frame"] = [*small.shape, *spacing]
-        return encoded(told, frame)
+                frame, told["spacing"] = {"frame": small}, spacing
+        return b"".join(encode(told, frame))
 
     def _greeting(self) -> str:
         """Wait for the viewer; returns the address that it prints once its page can be opened."""
@@ -301,9 +301,3 @@ def halved(frame: np.ndarray) -> np.ndarray:
     rows, columns = (size // 2 * 2 for size in frame.shape)
     even = np.maximum(frame[:rows:2, :columns], frame[1:rows:2, :columns])
     return np.maximum(even[:, ::2], even[:, 1::2])
-
-
-def encoded(told: dict[str, Any], frame: bytes = b"") -> bytes:
-    """A message: sizes of both parts (4 bytes each), JSON, pixels."""
-    text = json.dumps(told).encode()
-    return len(text).to_bytes(4, "big") + len(frame).to_bytes(4, "big") + text + frame
