@@ -11,12 +11,13 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from hw.acquire_live import Estimator
+from hw.clock import Clock
 from hw.errors import DeviceError, LostError, StaleError
 from hw.job import Job, motion_plan, open_recorder, prepare, record_confirmed, resume_command
 from hw.keys import Pause
@@ -42,7 +43,7 @@ from hw.robot.path_checks import check_plan
 from hw.session import Session, Watch, median_times
 from hw.setup import Setup
 from hw.stage import ProbeStage
-from hw.view.feed import Audience, Nobody, watched
+from hw.view.feed import Audience, watched
 from jaxcal import CalibrationError
 from jaxcal.cli.common import ExitCode
 
@@ -91,7 +92,8 @@ class Outcome:
     """Result of a completed run.
 
     Attributes:
-        images: selected.
+        images: selected, in the whole recording.
+        taken: of them in this run.
         given_up: rows of the plan for which no mid-plane was found, or that were skipped.
         sha256: of the finished file.
         seconds: bench seconds that this run took.
@@ -100,6 +102,7 @@ class Outcome:
     """
 
     images: int
+    taken: int
     given_up: tuple[int, ...]
     sha256: str
     seconds: float
@@ -155,8 +158,9 @@ def acquire(
     try:
         with _closing(recorder):
             try:
-                audience = Nobody() if view is None else view
-                run = _Run(job, recorder, estimator, say, oracle, operator, pause, audience)
+                run = _Run(
+                    job, recorder, estimator, say, oracle, operator, pause, view or Audience()
+                )
                 return run.outcome(confirm, watch)
             except KeyboardInterrupt:
                 interrupted = True
@@ -205,74 +209,75 @@ class _Shot:
     amplitude: float
 
 
+@dataclass
 class _Run:
     """One way through a job; arguments as of :func:`acquire`."""
 
-    def __init__(
-        self,
-        job: Job,
-        recorder: Recorder,
-        estimator: Estimator,
-        say: Callable[[str], None],
-        oracle: Oracle | None,
-        operator: Callable[[], Operator],
-        pause: Pause | None,
-        view: Audience,
-    ) -> None:
-        self._job, self._recorder, self._estimator, self._say = job, recorder, estimator, say
-        self._oracle, self._operator, self._pause, self._view = oracle, operator, pause, view
-        self._clock = job.setup.clock
-        self._without: list[int] = []
-        """Rows of the plan for which there is no image: given up, or skipped by the operator."""
+    job: Job
+    recorder: Recorder
+    estimator: Estimator
+    say: Callable[[str], None]
+    oracle: Oracle | None
+    operator: Callable[[], Operator]
+    pause: Pause | None
+    view: Audience
+    without: list[int] = field(default_factory=list)
+    """Rows of the plan for which there is no image: given up, or skipped by the operator."""
+
+    @property
+    def clock(self) -> Clock:
+        """Bench time."""
+        return self.job.setup.clock
 
     def outcome(self, confirm: Confirm, watch: Watch | None) -> Outcome:
         """Open the devices, have the plan confirmed, take the images, and finish the file."""
-        job, recorder, estimator = self._job, self._recorder, self._estimator
-        started = self._clock.now()
+        job, recorder, estimator = self.job, self.recorder, self.estimator
+        started, before = self.clock.now(), estimator.count
         self._note("resumed" if job.progress else "started", f"{job.to_take} images to take")
         for change in job.changes:
             self._note("changed", change)
         session = Session(job.setup, recorder, watch=watch, every_frame=job.request.every_frame)
-        with session, watched(self._view, session):
+        with session, watched(self.view, session):
             motion = self._confirmed(session, confirm)
             with motion:
                 self._take_images(session, ProbeStage(session, motion, job.targets, self._note))
-        if self._oracle is not None:
-            _write_truth(recorder, self._oracle)
+        if self.oracle is not None:
+            _write_truth(recorder, self.oracle)
         self._note("finished", f"{estimator.count} images")
-        without = tuple(sorted(self._without))
+        without = tuple(sorted(self.without))
         # A pool has other poses for those without an image.
         again = without if job.request.plan == "sobol" else ()
         digest = _finish(recorder, len(again))
         return Outcome(
             estimator.count,
+            estimator.count - before,
             without,
             digest,
-            self._clock.now() - started,
+            self.clock.now() - started,
             resume_command(recorder.kept, job.request) if again else None,
         )
 
     def _note(self, kind: str, text: str) -> None:
-        self._recorder.add_event(kind, text, self._clock.now())
-        self._say(f"{kind}: {text}")
+        self.recorder.add_event(kind, text, self.clock.now())
+        self.say(f"{kind}: {text}")
 
     def _log(self, t: float, command: str, numbers: dict[str, object]) -> None:
         # Runs in the thread that hears the motion process; the recorder keeps its own error.
         with suppress(CalibrationError):
-            self._recorder.add_event("command", f"{command} {json.dumps(numbers)}", t)
+            self.recorder.add_event("command", f"{command} {json.dumps(numbers)}", t)
 
     def _confirmed(self, session: Session, confirm: Confirm) -> Motion:
         """The motion of the plan, once that was checked and confirmed; not started yet."""
-        job, setup = self._job, self._job.setup
+        job, setup = self.job, self.job.setup
         plan = motion_plan(job, session)
-        check_sample(session.poses.latest(), plan.limits, self._clock)
+        check_sample(session.poses.latest(), plan.limits, self.clock)
         course = check_plan(plan)
         reach = NOT_CHECKED if course is None else f"{plan.limits.arm_model}: {course.text}"
         self._note("arm", reach)
         done = [row for row in range(len(job.targets)) if row not in job.missing]
-        self._view.plan(setup, plan, job.targets, done)
+        self.view.plan(setup, plan, job.targets, done)
         confirmation = confirm(plan)
-        record_confirmed(job, plan, session, self._recorder)
+        record_confirmed(job, plan, session, self.recorder)
         by = "unattended: nobody was asked" if confirmation.unattended else "by the operator"
         text = f"{by}; plan {plan.digest[:16]} for robot {plan.serial}, {plan.pendant}"
         self._note("confirmed", text)
@@ -280,7 +285,7 @@ class _Run:
             setup.robot_host,
             plan,
             confirmation,
-            clock=self._clock,
+            clock=self.clock,
             dry_run=False,
             log=self._log,
             guard=session.trouble,
@@ -289,24 +294,24 @@ class _Run:
 
     def _take_images(self, session: Session, stage: ProbeStage) -> None:
         """Visit the poses one after the other; those without a mid-plane are left out."""
-        view, failures = self._view, 0
+        view, failures = self.view, 0
         for row in self._rows(session):
-            if self._pause is not None and self._pause.held:
+            if self.pause is not None and self.pause.held:
                 self._note("paused", "before the next image")
-                self._pause.wait()
+                self.pause.wait()
                 self._note("continued", "by the operator")
-            began = self._clock.now()
+            began = self.clock.now()
             view.going(row)
             try:
                 placement = self._place(row, stage)
                 shot = self._shoot(row, stage, session)
             except SkippedError as error:
-                self._without.append(row)
+                self.without.append(row)
                 view.given_up(row)
                 self._note("skipped", f"pose {row + 1}: {error.args[0]}")
                 continue
             except PlacementError as error:
-                self._without.append(row)
+                self.without.append(row)
                 view.given_up(row)
                 self._note("given up", f"pose {row + 1}: {error}")
                 session.check()
@@ -316,12 +321,12 @@ class _Run:
                 continue
             failures = 0
             self._select(row, placement, shot, began)
-            view.taken(row, placement, self._estimator.answer)
-            self._say(self._estimator.line(self._job.images, placement))
+            view.taken(row, placement, self.estimator.answer)
+            self.say(self.estimator.line(self.job.images, placement))
 
     def _rows(self, session: Session) -> Iterator[int]:
         """The poses to visit in turn; a pose given up does not come again in this run."""
-        job, estimator = self._job, self._estimator
+        job, estimator = self.job, self.estimator
         if job.request.plan == "sobol":
             yield from job.missing
             return
@@ -339,7 +344,7 @@ class _Run:
 
     def _place(self, row: int, stage: ProbeStage) -> Placement:
         """Go to a pose, and bring the target into the mid-plane as the request says."""
-        job, estimator, watch = self._job, self._estimator, self._view.stop
+        job, estimator, watch = self.job, self.estimator, self.view.stop
         pose, settings, placement = job.targets[row], job.setup.search, job.request.placement
         start = 0.0
         if estimator.count >= _IMAGES_FOR_PREDICTION:
@@ -360,7 +365,7 @@ class _Run:
                 return pattern_injection(
                     stage,
                     stage,
-                    self._operator(),
+                    self.operator(),
                     settings,
                     start,
                     frame=stage.frame,
@@ -376,9 +381,9 @@ class _Run:
             PlacementError: no frame shows a credible target.
             DeviceError: a device is in lasting trouble.
         """
-        setup = self._job.setup
+        setup = self.job.setup
         steady = session.poses.steady(setup.settle_s)
-        if self._job.request.by_image:
+        if self.job.request.by_image:
             measurement, amplitude = stage.locate(row)
         else:
             heard = session.listen(setup.frames, stage.arrived_s)
@@ -389,11 +394,11 @@ class _Run:
 
     def _select(self, row: int, placement: Placement, shot: _Shot, began: float) -> None:
         """Put the image among those of the calibration, and solve again."""
-        clock, bracket, oracle = self._clock, placement.bracket, self._oracle
-        self._recorder.add_selected(
+        clock, bracket, oracle = self.clock, placement.bracket, self.oracle
+        self.recorder.add_selected(
             shot.pose,
             shot.measurement,
-            kind=self._job.request.kind,
+            kind=self.job.request.kind,
             max_elevation=bracket.max_elevation_mm,
             amplitude=shot.amplitude,
             t_host=clock.now(),
@@ -403,9 +408,9 @@ class _Run:
             true_elevation=float("nan") if oracle is None else oracle.elevation_mm(),
             seconds=clock.now() - began,
         )
-        estimate = self._estimator.add(shot.pose, shot.measurement, bracket.max_elevation_mm)
+        estimate = self.estimator.add(shot.pose, shot.measurement, bracket.max_elevation_mm)
         if estimate is not None:
-            self._recorder.add_estimate({"t_host": np.array([clock.now()]), **estimate})
+            self.recorder.add_estimate(t_host=clock.now(), **estimate)
 
 
 def _finish(recorder: Recorder, without_image: int) -> str:

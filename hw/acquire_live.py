@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from hw.live import LiveCalibration
@@ -41,7 +43,7 @@ class Estimator:
         if progress is not None:
             rows = zip(progress.poses, progress.measurements, progress.max_elevation, strict=True)
             for pose, measurement, bound in rows:
-                self._add(pose, measurement, bound, last=False)
+                self._put(pose, measurement, bound)
             self._result = self._solve()
 
     def _empty(self) -> LiveCalibration:
@@ -72,37 +74,31 @@ class Estimator:
         rng = np.random.default_rng(0)
         seen = seen[:, :3] + rng.normal(0, 0.2, (len(targets), 3))
         if self._kind == "point":
-            points = np.column_stack([seen[:, 0], np.hypot(seen[:, 1], seen[:, 2])])
-            points += rng.normal(0, 0.1, points.shape)
-            for pose, point in zip(targets, points, strict=True):
-                live.put(pose, point, 1.0)
-            live.solve()
-            return
-        distance = np.linalg.norm(seen[:, None] - probe.element_positions(), axis=-1)
-        distance += rng.normal(0, 0.05, distance.shape)
-        for pose, row in zip(targets, probe.time_of_flight_s(distance), strict=True):
+            measured = np.column_stack([seen[:, 0], np.hypot(seen[:, 1], seen[:, 2])])
+            measured += rng.normal(0, 0.1, measured.shape)
+        else:
+            distance = np.linalg.norm(seen[:, None] - probe.element_positions(), axis=-1)
+            measured = probe.time_of_flight_s(distance + rng.normal(0, 0.05, distance.shape))
+        for pose, row in zip(targets, measured, strict=True):
             live.put(pose, row, 1.0)
         live.solve()
 
-    def add(
-        self, pose: np.ndarray, measurement: np.ndarray, bound: float
-    ) -> dict[str, np.ndarray] | None:
+    def add(self, pose: np.ndarray, measurement: np.ndarray, bound: float) -> dict[str, Any] | None:
         """Take an image and solve; a row of /estimate, or None with too few images."""
-        self._add(pose, measurement, bound, last=True)
-        result = self._result
-        if result is None:
+        if self._put(pose, measurement, bound):
+            self._result = self._solve()
+        if self._result is None:
             return None
-        answer = result.numpy()
-        row = {
-            "images": np.array([int(answer.mask.sum())]),
-            "image_to_probe": answer.image_to_probe[None],
-            "covariance": answer.covariance[None],
-            "point": answer.point[None],
-            "sigma": answer.sigma[None],
-            "rms": np.array([float(answer.rms)]),
-            "status": np.array([int(answer.status_code)]),
+        answer = self._result.numpy()
+        return {
+            "images": answer.mask.sum(),
+            "image_to_probe": answer.image_to_probe,
+            "covariance": answer.covariance,
+            "point": answer.point,
+            "sigma": answer.sigma,
+            "rms": answer.rms,
+            "status": answer.status_code,
         }
-        return {name: np.asarray(value) for name, value in row.items()}
 
     def expected_offset_mm(self, pose: np.ndarray) -> float:
         """How far along its elevational axis the probe must go from a pose to meet the target.
@@ -133,15 +129,15 @@ class Estimator:
             head += f" +- {mm:.2f} mm, {degrees:.2f} deg (SD)"
         return f"{head}; RMS {float(answer.rms):.2f} mm; {self._result.status}"
 
-    def _add(self, pose: np.ndarray, measurement: np.ndarray, bound: float, *, last: bool) -> None:
+    def _put(self, pose: np.ndarray, measurement: np.ndarray, bound: float) -> bool:
+        """Whether the calibration takes the image."""
         try:
             self._live.put(pose, measurement, bound)
         except InputError:
             # The file keeps the image; calibrate will say what is wrong with it.
             self._left_out += 1
-            return
-        if last:
-            self._result = self._solve()
+            return False
+        return True
 
     def _solve(self) -> Calibration | None:
         try:

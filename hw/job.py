@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from hw.errors import RefusedError
+from hw.errors import refused
 from hw.recorder import Recorder
 from hw.recording_check import Progress, is_complete, read_progress
 from hw.recording_file import RecordingWriter
@@ -103,19 +103,18 @@ def motion_plan(job: Job, session: Session) -> MotionPlan:
     """
     identity = session.poses.identity()
     if identity.remote is False:
-        raise RefusedError(LOCAL, device="robot")
+        raise refused(LOCAL)
     offset = session.poses.tcp_offset or job.setup.tcp_offset
     if offset is None:
-        raise RefusedError(
+        raise refused(
             "this controller does not tell its TCP offset: put it into the setup as "
-            "[robot] tcp_offset = [x, y, z, rx, ry, rz] (m, rad); it is compared before moving",
-            device="robot",
+            "[robot] tcp_offset = [x, y, z, rx, ry, rz] (m, rad); it is compared before moving"
         )
     if job.progress is not None:
         check_same_robot(job.progress.settings.get("robot"), identity.name, offset)
     pendant = session.poses.pendant
     if pendant is None:
-        raise RefusedError("the controller does not tell its speed slider", device="robot")
+        raise refused("the controller does not tell its speed slider")
     limits = job.setup.motion_limits(controller_arm(identity.model, identity.version))
     joints = session.poses.latest().joints
     # Where every image was taken, only the end of the file is missing: any plan will do.

@@ -46,7 +46,7 @@ def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:
 def lines_of(path: str, outcome: Outcome, speed: float) -> list[str]:
     """How a robot's acquisition went, for a person."""
     lines = [
-        f"{outcome.images} images in {path}, {outcome.images / outcome.seconds * 60:.1f} a minute "
+        f"{outcome.images} images in {path}, {outcome.taken / outcome.seconds * 60:.1f} a minute "
         f"of the bench's time ({outcome.seconds:.0f} s"
         + (f", {outcome.seconds / speed:.0f} s on the wall)" if speed != 1.0 else ")")
     ]

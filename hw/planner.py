@@ -16,11 +16,11 @@ from hw.pool import BENCH_RULES, BENCH_SDS_MM
 from hw.poses import constraints_of
 from hw.rigid import turn_deg
 from hw.setup import Setup
-from hw.shapes import Float
 from jaxcal import InputError
 from jaxcal.design import Candidates, Model, Noise, images_to, next_poses
 from jaxcal.design.information import Known
 from jaxcal.result.calibration import Calibration
+from jaxcal.runtime.array_types import Float
 
 FEWEST_TO_TRUST = 8
 """With at least so many images a calibration's own covariance is used."""

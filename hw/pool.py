@@ -12,10 +12,10 @@ from hw.poses import Extent, PosePlan, constraints_of, in_order, plan_poses
 from hw.robot.kinematics import dexterity_mm, flange_of, inverse, model_named
 from hw.robot.limits import Limits
 from hw.scene import Scene
-from hw.shapes import Bool, Float
 from jaxcal.data.poses import check_poses
 from jaxcal.design import Model, Noise, Rules, make_candidates, plan
 from jaxcal.design.constraints import Allowed
+from jaxcal.runtime.array_types import Bool, Float
 
 BENCH_SDS_MM = (0.15, 0.12, 0.35)
 """Lateral, range and elevational SDs assumed before there are images: for an arm that is good to

@@ -24,10 +24,10 @@ import numpy as np
 
 from hw.rigid import looking_rotation
 from hw.scene import Scene
-from hw.shapes import Float
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.io.atomic import save_figure
+from jaxcal.runtime.array_types import Float
 
 if TYPE_CHECKING:
     from jaxcal.design.constraints import Allowed, Constraints

@@ -19,14 +19,14 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from hw.pipes import encode
 from hw.recording_check import check_resumable
 from hw.recording_file import utc_now
-from hw.recording_layout import RecordingHeader
+from hw.recording_layout import TEXT_BYTES, RecordingHeader
 from hw.robot.pose import ur_to_pose
 from jaxcal import CalibrationError, FormatError, OutputError
 from jaxcal.runtime.isolated import python_command
@@ -113,12 +113,7 @@ class Recorder:
     def __enter__(self) -> Recorder:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             self.close()
         except CalibrationError:
@@ -173,19 +168,17 @@ class Recorder:
         )
 
     def add_event(self, kind: str, text: str, t_host: float) -> None:
-        """Append a line of the acquisition's diary; text beyond 480 bytes is cut.
+        """Append a line of the acquisition's diary; text beyond :data:`TEXT_BYTES` is cut.
 
         What UTF-8 cannot encode (a path that is not UTF-8) becomes an escape sequence.
         """
         whole = text.encode(errors="backslashreplace")
-        self._rows(
+        self._row(
             "events",
-            {
-                "t_host": np.array([t_host]),
-                "utc": np.array([utc_now().encode()]),
-                "kind": np.array([kind.encode()[:32]]),
-                "text": np.array([whole[:480].decode(errors="ignore").encode()]),
-            },
+            t_host=t_host,
+            utc=utc_now().encode(),
+            kind=kind.encode()[:32],
+            text=whole[:TEXT_BYTES].decode(errors="ignore").encode(),
         )
 
     def add_clock(
@@ -198,15 +191,15 @@ class Recorder:
         t_host: float,
     ) -> None:
         """Append the fit of a device's clock (see the layout for its meaning)."""
-        values = {
-            "t_host": t_host,
-            "offset": offset,
-            "drift": drift,
-            "reference": reference,
-            "residual": residual,
-        }
-        columns = {name: np.array([value]) for name, value in values.items()}
-        self._rows("clock", {**columns, "device": np.array([device.encode()[:32]])})
+        self._row(
+            "clock",
+            t_host=t_host,
+            device=device.encode()[:32],
+            offset=offset,
+            drift=drift,
+            reference=reference,
+            residual=residual,
+        )
 
     def add_selected(
         self,
@@ -241,29 +234,27 @@ class Recorder:
         Raises:
             OutputError: the writer failed, or did not answer in time.
         """
-        self._rows(
+        self._row(
             "calibration",
-            {
-                "pose": pose[None],
-                kind: measurement[None],
-                "max_elevation": np.array([max_elevation]),
-                "amplitude": np.array([amplitude]),
-                "mask": np.array([True]),
-                "time": np.array([t_host]),
-                "target": np.array([target]),
-            },
+            pose=pose,
+            max_elevation=max_elevation,
+            amplitude=amplitude,
+            mask=True,
+            time=t_host,
+            target=target,
+            **{kind: measurement},
         )
         centre, low, high, sd = bracket
-        values = {
-            "centre": centre,
-            "low": low,
-            "high": high,
-            "sd": sd,
-            "offset": offset,
-            "true_elevation": true_elevation,
-            "seconds": seconds,
-        }
-        self._rows("placement", {name: np.array([value]) for name, value in values.items()})
+        self._row(
+            "placement",
+            centre=centre,
+            low=low,
+            high=high,
+            sd=sd,
+            offset=offset,
+            true_elevation=true_elevation,
+            seconds=seconds,
+        )
         self.sync()
 
     def add_pixel(
@@ -280,15 +271,8 @@ class Recorder:
         Raises:
             OutputError: the writer failed, or did not answer in time.
         """
-        self._rows(
-            "calibration",
-            {
-                "pose": pose[None],
-                "pixel": pixel[None],
-                "covariance": covariance[None],
-                "mask": np.array([True]),
-                "time": np.array([time_s]),
-            },
+        self._row(
+            "calibration", pose=pose, pixel=pixel, covariance=covariance, mask=True, time=time_s
         )
         self.sync()
 
@@ -301,9 +285,9 @@ class Recorder:
         self._put({"do": "leave out", "row": row})
         self.sync()
 
-    def add_estimate(self, columns: Mapping[str, np.ndarray]) -> None:
+    def add_estimate(self, **values: object) -> None:
         """Append a row to /estimate (see the layout): the calibration so far."""
-        self._rows("estimate", columns)
+        self._row("estimate", **values)
 
     def put(self, group: str, name: str, values: np.ndarray, unit: str) -> None:
         """Write one array of /plan, /test or /truth."""
@@ -365,7 +349,8 @@ class Recorder:
             count = len(next(iter(columns.values())))
             self.dropped[group] = self.dropped.get(group, 0) + count
 
-    def _rows(self, group: str, columns: Mapping[str, np.ndarray]) -> None:
+    def _row(self, group: str, **values: object) -> None:
+        columns = {name: np.asarray(value)[None] for name, value in values.items()}
         self._put({"do": "rows", "group": group}, columns)
 
     def _put(
@@ -475,15 +460,6 @@ class Recorder:
             # Keep the first error: the later ones follow from it.
             self.error = self.error or error
             self._changed.notify_all()
-
-
-def encode(message: Mapping[str, Any], columns: Mapping[str, np.ndarray]) -> tuple[bytes, ...]:
-    """A message to the writer: length and text of a JSON header, then the arrays' bytes."""
-    arrays = {key: np.ascontiguousarray(values) for key, values in columns.items()}
-    described = [[key, values.dtype.str, list(values.shape)] for key, values in arrays.items()]
-    header = json.dumps({**message, "columns": described}).encode()
-    body = (values.tobytes() for values in arrays.values())
-    return (len(header).to_bytes(4, "big") + header, *body)
 
 
 def _column(items: Sequence[Any], name: str, kind: type = float) -> np.ndarray:

@@ -16,16 +16,13 @@ from contextlib import suppress
 from io import RawIOBase
 from typing import Any
 
-import numpy as np
-
-from hw.pipes import exactly
+from hw.pipes import read_message
 from hw.recording_file import RecordingWriter
 from hw.recording_layout import RecordingHeader
 from jaxcal import CalibrationError
 from jaxcal.io.readable import one_line
 
 FLUSH_S = 1.0
-_LARGEST = 2**28
 
 
 def main(path: str) -> int:
@@ -47,7 +44,7 @@ def main(path: str) -> int:
     writer = None
     try:
         with os.fdopen(os.dup(0), "rb", buffering=0) as source:
-            first = _read(source)
+            first = read_message(source)
             if first is None:
                 return 0
             given = first[0]["header"]
@@ -84,7 +81,7 @@ def _serve(writer: RecordingWriter, source: RawIOBase, answer) -> None:
             due = None
         if not waiting:
             continue
-        received = _read(source)
+        received = read_message(source)
         if received is None:
             return
         message, columns = received
@@ -108,29 +105,6 @@ def _serve(writer: RecordingWriter, source: RawIOBase, answer) -> None:
             case "finish":
                 answer(mark="finish", sha256=writer.finish())
                 return
-
-
-def _read(source: RawIOBase) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
-    """The next message; None at the end of the pipe, also if a message is cut off there."""
-    start = exactly(source, 4)
-    if len(start) < 4:
-        return None
-    text = exactly(source, int.from_bytes(start, "big"))
-    try:
-        message = json.loads(text)
-    except ValueError:
-        return None
-    columns = {}
-    for name, dtype, shape in message.pop("columns"):
-        kind = np.dtype(dtype)
-        size = int(np.prod(shape, dtype=object)) * kind.itemsize
-        if size > _LARGEST:
-            raise CalibrationError(f"{name}: {size} bytes in one message")
-        body = exactly(source, size)
-        if len(body) < size:
-            return None
-        columns[name] = np.frombuffer(body, kind).reshape(shape)
-    return message, columns
 
 
 if __name__ == "__main__":

@@ -53,33 +53,27 @@ def check_resumable(path: str | os.PathLike[str]) -> None:
         FormatError: missing, not a recording, complete with all images, of another layout, with
             links or data outside of it. One line that starts with the path.
     """
-    check_readable(path)
-    try:
-        with open_root(path, length=stored_length(path)) as root:
-            if text(root, "format") != FORMAT or number(root, "version") != VERSION:
-                raise FormatError("is not a recording of this version")
-            if flag(root, "complete") is not False and not _lacks_images(root):
-                raise FormatError("is complete: there is nothing to resume")
-            for name, columns in LAYOUT.items():
-                node = group(root, name)
-                if node is None:
-                    raise FormatError(f"has no /{name}: it was not made by an acquisition")
-                for key, column in columns.items():
-                    dataset = child(node, key)
-                    if dataset is not None:
-                        _check_column(dataset, column)
-                        check_attributes(dataset)
+    with opened(path) as root:
+        if text(root, "format") != FORMAT or number(root, "version") != VERSION:
+            raise FormatError("is not a recording of this version")
+        if flag(root, "complete") is not False and not _lacks_images(root):
+            raise FormatError("is complete: there is nothing to resume")
+        for name, columns in LAYOUT.items():
+            node = _existing(root, name)
+            for key, column in columns.items():
+                dataset = child(node, key)
+                if dataset is not None:
+                    _check_column(dataset, column)
+                    check_attributes(dataset)
+            check_attributes(node)
+        check_attributes(root)
+        for name in ("probe", *STATIC):
+            node = group(root, name)
+            if node is not None:
                 check_attributes(node)
-            check_attributes(root)
-            for name in ("probe", *STATIC):
-                node = group(root, name)
-                if node is not None:
-                    check_attributes(node)
-                    for member in members(node, _MOST_MEMBERS):
-                        _check_place(member)
-                        check_attributes(member)
-    except FormatError as error:
-        raise FormatError(f"{path}: {error}") from None
+                for member in members(node, _MOST_MEMBERS):
+                    _check_place(member)
+                    check_attributes(member)
 
 
 def is_complete(path: str | os.PathLike[str]) -> bool:
@@ -89,7 +83,7 @@ def is_complete(path: str | os.PathLike[str]) -> bool:
         FormatError: it cannot be resumed.
     """
     check_resumable(path)
-    with open_root(path, length=stored_length(path)) as root:
+    with opened(path) as root:
         return flag(root, "complete") is True
 
 
@@ -134,35 +128,33 @@ def read_progress(path: str | os.PathLike[str]) -> Progress:
     Raises:
         FormatError: not such a file; one line that starts with the path.
     """
-    check_readable(path)
-    try:
-        with open_root(path, length=stored_length(path)) as root:
-            images = UpTo(100_000, "images")
-            taken = read_column(root, "calibration", "target", (images,), "i")
-            last = [0.0]
-            for name in ("tracker", "ae", "events"):
-                times = read_column(root, name, "t_host", (UpTo(2**27, "rows"),))
-                last.append(float(np.nanmax(times, initial=0.0)))
-            targets = read_column(root, "plan", "targets", (images, 4, 4))
-            # Checked but not changed in any digit: the plan's digest must be the same again.
+    with opened(path) as root:
+        images = UpTo(100_000, "images")
+        taken = read_column(root, "calibration", "target", (images,), "i")
+        last = [0.0]
+        for name in ("tracker", "ae", "events"):
+            times = read_column(root, name, "t_host", (UpTo(2**27, "rows"),))
+            last.append(float(np.nanmax(times, initial=0.0)))
+        targets = read_column(root, "plan", "targets", (images, 4, 4))
+        # Checked but not changed in any digit: the plan's digest must be the same again.
+        try:
             check_poses(targets)
-            progress = Progress(
-                settings=_settings(root),
-                targets=targets,
-                poses=read_column(root, "calibration", "pose", (images, 4, 4)),
-                measurements=_measurements(root, images),
-                max_elevation=read_column(root, "calibration", "max_elevation", (images,)),
-                taken=taken,
-                true_elevation=read_column(root, "placement", "true_elevation", (images,)),
-                last_s=max(last),
-                probe=_probe(root),
-                ended=_lacks_images(root),
-            )
-    except InputError as error:
-        raise FormatError(f"{path}: {error}") from None
-    if taken.size and not (taken.min() >= 0 and taken.max() < len(progress.targets)):
-        raise FormatError(f"{path}: /calibration/target names a pose that the plan does not have")
-    return progress
+        except InputError as error:
+            raise FormatError(str(error)) from None
+        if taken.size and not (taken.min() >= 0 and taken.max() < len(targets)):
+            raise FormatError("/calibration/target names a pose that the plan does not have")
+        return Progress(
+            settings=_settings(root),
+            targets=targets,
+            poses=read_column(root, "calibration", "pose", (images, 4, 4)),
+            measurements=_measurements(root, images),
+            max_elevation=read_column(root, "calibration", "max_elevation", (images,)),
+            taken=taken,
+            true_elevation=read_column(root, "placement", "true_elevation", (images,)),
+            last_s=max(last),
+            probe=_probe(root),
+            ended=_lacks_images(root),
+        )
 
 
 def settings_of(path: str | os.PathLike[str]) -> dict[str, object]:
@@ -200,10 +192,15 @@ def opened(path: str | os.PathLike[str]) -> Iterator[Node]:
         yield root
 
 
-def _probe(root: Node) -> dict[str, float]:
-    node = group(root, "probe")
+def _existing(root: Node, name: str) -> Node:
+    node = group(root, name)
     if node is None:
-        raise FormatError("has no /probe: it was not made by an acquisition")
+        raise FormatError(f"has no /{name}: it was not made by an acquisition")
+    return node
+
+
+def _probe(root: Node) -> dict[str, float]:
+    node = _existing(root, "probe")
     names = ("elements", "pitch_mm", "sound_speed_m_s", "delay_s")
     found = {name: number(node, name) for name in names}
     return {name: value for name, value in found.items() if value is not None}
@@ -264,10 +261,7 @@ def stored_length(path: str | os.PathLike[str]) -> int | None:
 
 
 def _check_column(node: Node, column: Column) -> None:
-    dataset = node.item
-    if not isinstance(dataset, h5py.Dataset):
-        raise FormatError(f"{node} must be a dataset")
-    _check_place(node)
+    dataset = _check_place(node)
     wanted = (len(column.tail) + 1, FRAME_TYPES if column.dtype == "frame" else (column.dtype,))
     names = (dataset.dtype.name, dataset.dtype.str[1:])
     if dataset.ndim != wanted[0] or not set(names) & {np.dtype(d).str[1:] for d in wanted[1]}:
@@ -278,9 +272,11 @@ def _check_column(node: Node, column: Column) -> None:
         raise FormatError(f"{node} claims rows of shape {dataset.shape[1:]}")
 
 
-def _check_place(node: Node) -> None:
+def _check_place(node: Node) -> h5py.Dataset:
+    """The dataset, which holds its data itself."""
     if not isinstance(node.item, h5py.Dataset):
         raise FormatError(f"{node} must be a dataset")
     layout = node.item.id.get_create_plist()
     if layout.get_layout() == h5d.VIRTUAL or layout.get_external_count():
         raise FormatError(f"{node} is stored in another file: recordings must hold their data")
+    return node.item

@@ -130,17 +130,10 @@ LAYOUT: dict[str, dict[str, Column]] = {
 }
 """Groups that may be appended to; a row is appended to all columns of its group, or to none."""
 
+_PLACED = ("max_elevation", "amplitude", "mask", "time", "target")
 SELECTED = {
-    "time_of_flight": (
-        "pose",
-        "time_of_flight",
-        "max_elevation",
-        "amplitude",
-        "mask",
-        "time",
-        "target",
-    ),
-    "point": ("pose", "point", "max_elevation", "amplitude", "mask", "time", "target"),
+    "time_of_flight": ("pose", "time_of_flight", *_PLACED),
+    "point": ("pose", "point", *_PLACED),
     "pixel": ("pose", "pixel", "covariance", "mask", "time"),
 }
 """Columns of /calibration by what the selected images hold."""

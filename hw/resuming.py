@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hw.errors import RefusedError
+from hw.errors import refused
 from hw.recording_check import Progress
 from hw.robot.stream import offset_changed
 from hw.setup import Setup
@@ -115,9 +115,7 @@ def check_same_robot(before: object, serial: str, tcp_offset: Sequence[float]) -
         known, numbers = before["serial_number"], before["tcp_offset"]  # pyright: ignore[reportIndexIssue]
         offset = np.array(numbers, dtype=np.float64).reshape(6)
     except (TypeError, KeyError, ValueError):
-        raise RefusedError(
-            "the recording does not say with which robot it began", device="robot"
-        ) from None
+        raise refused("the recording does not say with which robot it began") from None
     if known != serial:
         what = f"the recording was begun with robot {known}, this one is {serial}"
     elif offset_changed(offset.tolist(), tcp_offset):
@@ -127,7 +125,7 @@ def check_same_robot(before: object, serial: str, tcp_offset: Sequence[float]) -
         )
     else:
         return
-    raise RefusedError(f"{what}: its images would not fit together", device="robot")
+    raise refused(f"{what}: its images would not fit together")
 
 
 def _same(old: Any, new: Any) -> bool:

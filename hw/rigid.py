@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 _SMALL_ANGLE = 1e-6
 """Below this angle (rad) sines are taken from their series, which are exact to 1e-24 there."""

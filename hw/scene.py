@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 
 @dataclass(frozen=True)

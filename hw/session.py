@@ -13,13 +13,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from hw.active_echo.device import ActiveEcho, EchoFrame
+from hw.active_echo.device import ActiveEcho, EchoFrame, median_of
 from hw.errors import DeviceError, StaleError
 from hw.recorder import Recorder
 from hw.robot.stream import PoseSample, PoseStream
@@ -35,6 +35,12 @@ _KEPT_FRAMES = 256
 DELAY_S = 10.0
 """After so many bench seconds the delay of the echo frames is measured again."""
 _LEAST_STAMPS, _MOST_STAMPS = 20, 20_000
+_BAD_FRAMES = {
+    "crc_errors": "arrived damaged (CRC)",
+    "lost": "were lost (missed triggers, or damaged on the way)",
+    "short": "came with lines missing (missed line triggers)",
+}
+""":class:`hw.active_echo.device.EchoStatistics` that tell of damaged frames, in words."""
 
 
 @dataclass(frozen=True)
@@ -100,32 +106,27 @@ class Session:
         self._stopping = False
         self._began = self.clock.now()
         self._echo_seen = self._image_seen = self._began
-        opened = []
-        try:
-            self.poses = PoseStream(
-                setup.robot_host,
-                clock=self.clock,
-                frequency_hz=setup.frequency_hz,
-                max_age_s=self.clock.patience(self.watch.pose_age_s),
+        with ExitStack() as opened:
+            self.poses = opened.enter_context(
+                PoseStream(
+                    setup.robot_host,
+                    clock=self.clock,
+                    frequency_hz=setup.frequency_hz,
+                    max_age_s=self.clock.patience(self.watch.pose_age_s),
+                )
             )
-            self.poses.start()
-            opened.append(self.poses)
-            self.echo = ActiveEcho(
-                setup.active_echo_url, clock=self.clock, lines=setup.probe.elements
+            self.echo = opened.enter_context(
+                ActiveEcho(setup.active_echo_url, clock=self.clock, lines=setup.probe.elements)
             )
-            opened.append(self.echo)
             self.images: UltrasoundStream | None = None
             if setup.ultrasound is not None:
-                self.images = UltrasoundStream(*setup.ultrasound, clock=self.clock)
-                self.images.start()
-                opened.append(self.images)
+                self.images = opened.enter_context(
+                    UltrasoundStream(*setup.ultrasound, clock=self.clock)
+                )
             self.echo.stream(True)
             self._clock_hz = self.echo.clock_hz()
             self._measure_echo_delay()
-        except BaseException:
-            for device in reversed(opened):
-                device.close()
-            raise
+            self._devices = opened.pop_all()
         self._counts = self.echo.statistics()
         self._echo_seen = self._image_seen = self.clock.now()
         self._thread = threading.Thread(target=self._pump, daemon=True, name="session")
@@ -150,9 +151,7 @@ class Session:
             if repeated:
                 text = f"{repeated} echo frames came twice; the second ones were dropped"
                 self._recorder.add_event("repeated", text, self.clock.now())
-        for device in (self.images, self.echo, self.poses):
-            if device is not None:
-                device.close()
+        self._devices.close()
 
     # Trouble
 
@@ -339,13 +338,8 @@ class Session:
         poses = self.poses.drain()
         now, counts = self.clock.now(), self.echo.statistics()
         with self._changed:
-            for what in ("crc_errors", "lost", "short"):
+            for what, text in _BAD_FRAMES.items():
                 more = getattr(counts, what) - getattr(self._counts, what)
-                text = {
-                    "crc_errors": "arrived damaged (CRC)",
-                    "lost": "were lost (missed triggers, or damaged on the way)",
-                    "short": "came with lines missing (missed line triggers)",
-                }[what]
                 self._bad.extend((now, text) for _ in range(min(more, 16)))
             self._counts = counts
             if frames:
@@ -429,9 +423,5 @@ def median_times(frames: list[EchoFrame]) -> tuple[np.ndarray, float]:
         (lines,) median time of flight, s, NaN where fewer than half of the frames have one; and
         the median over the frames of the loudest amplitude, counts.
     """
-    times = np.array([frame.tof_s for frame in frames])
-    answered = 2 * np.isfinite(times).sum(axis=0) >= len(frames)
-    middle = np.full(times.shape[1], np.nan)
-    middle[answered] = np.nanmedian(times[:, answered], axis=0)
     loudest = float(np.median([frame.amplitude.max() for frame in frames]))
-    return middle, loudest
+    return median_of(np.array([frame.tof_s for frame in frames])), loudest

@@ -8,27 +8,27 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from hw.clock import REAL, Clock
-from hw.errors import RefusedError
+from hw.errors import RefusedError, refused
 from hw.hosts import check_host
 from hw.midplane.search import Settings
 from hw.poses import Extent
 from hw.robot.kinematics import model_named
 from hw.robot.limits import FURTHEST_TIP_MM, Limits, hull_of, numbers
 from hw.scene import Scene
-from hw.shapes import Float
 from hw.ultrasound.receiver import PORT
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.data.probe import LinearProbe
 from jaxcal.io.readable import naming
 from jaxcal.io.toml import load_toml
+from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.messages import quoted
 
 _LARGEST_BYTES = 2**18
@@ -100,16 +100,14 @@ class Setup:
         if given is not None and not np.allclose(
             numbers(given, 3, "tip_mm"), tip, rtol=0.0, atol=_TIP_TOLERANCE_MM
         ):
-            raise RefusedError(
+            raise refused(
                 f"tip_mm {given} contradicts [scene] image_to_probe, whose tip is "
-                f"{np.round(tip, 3).tolist()} mm: leave tip_mm out",
-                device="robot",
+                f"{np.round(tip, 3).tolist()} mm: leave tip_mm out"
             )
         model = self.model or self.limits.get("arm_model") or controller_model or ""
         if model and controller_model and model_named(model).name != controller_model:
-            raise RefusedError(
-                f"the setup is for a {model}, but the controller is that of a {controller_model}",
-                device="robot",
+            raise refused(
+                f"the setup is for a {model}, but the controller is that of a {controller_model}"
             )
         width = self.probe.elements * self.probe.pitch_mm
         hull = hull_of(self.scene.image_to_probe, *(self.housing_mm or (width, *_HOUSING_MM)))
@@ -148,14 +146,7 @@ def load_hand_held(path: str | os.PathLike[str]) -> HandHeldSetup:
     tables = load_toml(path, maximum_bytes=_LARGEST_BYTES)
     names = ("active_echo", "probe", "scene", "search")
     with naming(path):
-        for name in tables:
-            if name not in names:
-                raise InputError(f"[{quoted(name)}] is not known; there are {', '.join(names)}")
-        found = {name: _table(tables, name) for name in names}
-        if "url" not in found["active_echo"]:
-            raise InputError("[active_echo] needs url")
-        if "image_to_probe" not in found["scene"]:
-            raise InputError("[scene] needs image_to_probe")
+        found = _checked(tables, names, active_echo=("url",), scene=("image_to_probe",))
         found["probe"].pop("housing_mm", None)
         drawn = _drawn(found["scene"]["image_to_probe"])
         probe = LinearProbe(**found["probe"])
@@ -232,17 +223,14 @@ _TABLES = {
 
 
 def _setup(tables: dict[str, Any]) -> Setup:
-    found = {name: _table(tables, name) for name in _TABLES}
-    for name in tables:
-        if name not in _TABLES:
-            raise InputError(f"[{quoted(name)}] is not known; there are {', '.join(_TABLES)}")
-    for name, key in (("robot", "host"), ("active_echo", "url")):
-        if key not in found[name]:
-            raise InputError(f"[{name}] needs {key}")
+    found = _checked(
+        tables,
+        _TABLES,
+        robot=("host",),
+        active_echo=("url",),
+        scene=("image_to_probe", "point_mm", "looking"),
+    )
     scene = found["scene"]
-    for key in ("image_to_probe", "point_mm", "looking"):
-        if key not in scene:
-            raise InputError(f"[scene] needs {key}")
     ultrasound = _ultrasound(found["ultrasound"])
     if not found["limits"]:
         raise InputError("[limits] is missing: without it nothing may move")
@@ -355,6 +343,21 @@ def _arm_name(name: str) -> str:
         raise InputError(f"[robot] model: {error.args[0]}") from None
 
 
+def _checked(
+    tables: dict[str, Any], names: Collection[str], **needed: tuple[str, ...]
+) -> dict[str, dict[str, Any]]:
+    """All tables by their names; an unknown one, or a missing key, is refused."""
+    found = {name: _table(tables, name) for name in names}
+    for name in tables:
+        if name not in names:
+            raise InputError(f"[{quoted(name)}] is not known; there are {', '.join(names)}")
+    for name, keys in needed.items():
+        for key in keys:
+            if key not in found[name]:
+                raise InputError(f"[{name}] needs {key}")
+    return found
+
+
 def _table(tables: dict[str, Any], name: str) -> dict[str, Any]:
     table = tables.get(name, {})
     if not isinstance(table, dict):
@@ -384,28 +387,17 @@ def _table(tables: dict[str, Any], name: str) -> dict[str, Any]:
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...], table: str = "scene") -> np.ndarray:
     try:
-        if not all(_is_number(leaf) for leaf in _leaves(value)):
-            raise TypeError
-        array = np.asarray(value, float)
-    except (ValueError, TypeError, OverflowError):
-        array = np.empty(0)
-    if array.shape != shape or not np.isfinite(array).all():
+        array = np.array(value, dtype=object)
+        # Neither text nor true or false, which numpy would take for numbers.
+        if array.shape != shape or not all(type(leaf) in (int, float) for leaf in array.flat):
+            raise ValueError
+        array = array.astype(float)
+        if not np.isfinite(array).all():
+            raise ValueError
+    except (ValueError, OverflowError):
         size = " x ".join(map(str, shape))
-        raise InputError(f"[{table}] {name} must be {size} numbers")
+        raise InputError(f"[{table}] {name} must be {size} numbers") from None
     return array
-
-
-def _leaves(value: Any) -> Iterator[object]:
-    """What nested lists hold."""
-    if isinstance(value, list):
-        for item in value:
-            yield from _leaves(item)
-    else:
-        yield value
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _as_tuple(value: Any) -> Any:

@@ -18,9 +18,9 @@ from hw.rigid import turn_deg
 from hw.robot.motion import Motion
 from hw.robot.stream import PoseSample
 from hw.session import Session
-from hw.shapes import Float
 from hw.ultrasound.receiver import Image
 from jaxcal.data.segmentation.image import localise
+from jaxcal.runtime.array_types import Float
 
 _MOST_HESITATIONS = 10
 IMAGE_AGE_S = 0.2

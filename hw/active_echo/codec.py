@@ -58,7 +58,7 @@ from typing import Any
 import numpy as np
 
 from hw.extras import require
-from hw.shapes import UInt16
+from jaxcal.runtime.array_types import UInt16
 
 NO_RESPONSE = 0xFFFF
 """Time of flight (ticks) of a line without a response."""
@@ -116,7 +116,7 @@ class Mode(Enum):
     """Whether the device streams is not known; the first line or frame with a right CRC tells."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class DecoderCounts:
     """What a decoder has seen.
 
@@ -193,15 +193,8 @@ class Decoder:
         self._scanned = 0
         self._skipping = False
         self._damaged = False
-        self.frames = self.replies = self.crc_errors = self.malformed = self.resynchronised = 0
+        self.counts = DecoderCounts()
         self.mode = mode
-
-    @property
-    def counts(self) -> DecoderCounts:
-        """What was seen so far."""
-        return DecoderCounts(
-            self.frames, self.replies, self.crc_errors, self.malformed, self.resynchronised
-        )
 
     def reset(self, mode: Mode) -> None:
         """Forget what is half read and read what comes in ``mode``; the counts go on."""
@@ -209,10 +202,6 @@ class Decoder:
         self._scanned = 0
         self._skipping = self._damaged = False
         self.mode = mode
-
-    def forget_counts(self) -> None:
-        """Count from zero."""
-        self.frames = self.replies = self.crc_errors = self.malformed = self.resynchronised = 0
 
     def feed(self, data: bytes) -> list[EchoPacket | Reply]:
         """What ``data`` completes, in order."""
@@ -251,7 +240,7 @@ class Decoder:
         if not chunk:
             return None, True
         if len(chunk) > longest:
-            self.malformed += 1
+            self.counts.malformed += 1
             self._damaged = True
             return None, True
         return take(chunk), True
@@ -259,7 +248,7 @@ class Decoder:
     def _skip(self) -> None:
         """Drop a chunk that is too long, up to the next delimiter."""
         if not self._skipping:
-            self.malformed += 1
+            self.counts.malformed += 1
         self._buffer.clear()
         self._scanned = 0
         self._skipping = self._damaged = True
@@ -279,7 +268,7 @@ class Decoder:
             self._scanned = feed + 1
             if not checked:
                 if checked is False:
-                    self.crc_errors += 1
+                    self.counts.crc_errors += 1
                     self._damaged = True
                 return None, True
             del self._buffer[: feed + 1]
@@ -300,9 +289,9 @@ class Decoder:
             return self._accept_reply(text)
         self._damaged = True
         if checked is None:
-            self.malformed += 1
+            self.counts.malformed += 1
         else:
-            self.crc_errors += 1
+            self.counts.crc_errors += 1
         return None
 
     def _frame(self, chunk: bytes) -> EchoPacket | Reply | None:
@@ -311,22 +300,22 @@ class Decoder:
         except self._error:
             payload = b""
         if not 6 <= len(payload) <= _LONGEST:
-            self.malformed += 1
+            self.counts.malformed += 1
             self._damaged = True
             return None
         body = payload[:-4]
         if zlib.crc32(body) != int.from_bytes(payload[-4:], "little"):
-            self.crc_errors += 1
+            self.counts.crc_errors += 1
             self._damaged = True
             return None
         item = self._echo(body) if body[0] == _ECHO else None
         if item is not None:
-            self.frames += 1
+            self.counts.frames += 1
             self._good()
             return item
         if body[0] == _REPLY and body[1] == _VERSION:
             return self._accept_reply(body[2:].decode("ascii", "replace"))
-        self.malformed += 1
+        self.counts.malformed += 1
         self._damaged = True
         return None
 
@@ -341,7 +330,7 @@ class Decoder:
         return EchoPacket(frame, ticks, threshold, tof, amplitude)
 
     def _accept_reply(self, text: str) -> Reply:
-        self.replies += 1
+        self.counts.replies += 1
         self._good()
         word, _, value = text.partition(" ")
         if word == "STRM":
@@ -350,5 +339,5 @@ class Decoder:
 
     def _good(self) -> None:
         if self._damaged:
-            self.resynchronised += 1
+            self.counts.resynchronised += 1
             self._damaged = False

@@ -19,7 +19,7 @@ import threading
 import time
 import zlib
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from hw.active_echo.codec import (
     MAXIMUM_THRESHOLD,
     NO_RESPONSE,
     Decoder,
+    DecoderCounts,
     EchoPacket,
     Mode,
     Reply,
@@ -36,7 +37,7 @@ from hw.active_echo.codec import (
 from hw.active_echo.transport import BAUD, DEVICE, open_transport
 from hw.clock import REAL, Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError
-from hw.shapes import Float, UInt16
+from jaxcal.runtime.array_types import Float, UInt16
 
 COMMAND_TIMEOUT_S = 1.0
 """A command that is not answered within this bench time has failed."""
@@ -77,7 +78,7 @@ class EchoFrame:
     late_s: float = float("nan")
 
 
-@dataclass(frozen=True)
+@dataclass
 class EchoStatistics:
     """Counts since the port was opened.
 
@@ -129,8 +130,7 @@ class ActiveEcho:
         self._asking = threading.Lock()
         self._frames: deque[EchoFrame] = deque(maxlen=queue)
         self._replies: deque[Reply] = deque(maxlen=64)
-        self._received = self._lost = self._dropped = self._short = self._restarts = 0
-        self._repeated = 0
+        self._counts = EchoStatistics()
         self._last_frame: int | None = None
         self._recent: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
         # _asked: time of the question, and the number of the next frame then. _anchor: a frame's
@@ -155,9 +155,7 @@ class ActiveEcho:
         self._tick_s = 1.0 / self.clock_hz()
         with self._changed:
             self._frames.clear()
-            self._decoder.forget_counts()
-            self._received = self._lost = self._dropped = self._short = self._restarts = 0
-            self._repeated = 0
+            self._decoder.counts, self._counts = DecoderCounts(), EchoStatistics()
             self._last_frame = None
             self._recent.clear()
 
@@ -165,7 +163,7 @@ class ActiveEcho:
 
     def identify(self) -> str:
         """Maker, model, serial number and firmware, as the device puts them."""
-        return self._query("*IDN?")
+        return self._ask("*IDN?")
 
     def clock_hz(self) -> float:
         """Frequency of the device's counter, Hz.
@@ -173,7 +171,7 @@ class ActiveEcho:
         Raises:
             DeviceError: an answer that cannot be a frequency.
         """
-        text = self._query("CLK?")
+        text = self._ask("CLK?")
         value = float(text) if text.replace(".", "", 1).isdigit() else 0.0
         if not 1e3 <= value <= 1e12:
             raise DeviceError(f"{self.url} has a clock of {text!r} Hz", device=DEVICE)
@@ -193,7 +191,7 @@ class ActiveEcho:
 
     def threshold(self) -> int:
         """Threshold in force, counts."""
-        return self._integer("THR?", self._query("THR?"))
+        return self._integer("THR?", self._ask("THR?"))
 
     def load_pattern(self, pattern: bytes) -> None:
         """Load the pattern to answer with: a level (0 to 255) for each line.
@@ -227,7 +225,7 @@ class ActiveEcho:
 
     def trigger_count(self) -> tuple[int, int]:
         """Line triggers and frame triggers that the device has counted since power-up."""
-        text = self._query("TRIG:COUN?")
+        text = self._ask("TRIG:COUN?")
         lines, comma, frames = text.partition(",")
         if not comma:
             raise DeviceError(f"{self.url} answered TRIG:COUN? by {text!r}", device=DEVICE)
@@ -295,15 +293,10 @@ class ActiveEcho:
         """Counts since the port was opened."""
         with self._changed:
             counts = self._decoder.counts
-            return EchoStatistics(
-                received=self._received,
-                lost=self._lost,
+            return replace(
+                self._counts,
                 crc_errors=counts.crc_errors + counts.malformed,
                 resynchronised=counts.resynchronised,
-                dropped=self._dropped,
-                short=self._short,
-                restarts=self._restarts,
-                repeated=self._repeated,
             )
 
     def close(self) -> None:
@@ -324,9 +317,6 @@ class ActiveEcho:
         self.close()
 
     # Asking
-
-    def _query(self, word: str) -> str:
-        return self._ask(word)
 
     def _integer(self, word: str, text: str) -> int:
         if not (text.isdigit() and len(text) < 20):
@@ -412,23 +402,23 @@ class ActiveEcho:
 
     def _take(self, packet: EchoPacket, now: float) -> None:
         if (packet.frame, packet.ticks) in self._recent:
-            self._repeated += 1
+            self._counts.repeated += 1
             return
         self._recent.append((packet.frame, packet.ticks))
         if self._last_frame is not None:
             gap = (packet.frame - self._last_frame - 1) % 2**32
             if gap < _LARGEST_GAP:
-                self._lost += gap
+                self._counts.lost += gap
             else:
-                self._restarts += 1
+                self._counts.restarts += 1
                 self._asked = self._anchor = None
         self._last_frame = packet.frame
         if len(packet.tof_ticks) != self.lines:
-            self._short += 1
+            self._counts.short += 1
             return
         if len(self._frames) == self._frames.maxlen:
-            self._dropped += 1
-        self._received += 1
+            self._counts.dropped += 1
+        self._counts.received += 1
         silent = packet.tof_ticks == NO_RESPONSE
         seconds = np.where(silent, np.nan, packet.tof_ticks * self._tick_s)
         self._frames.append(
@@ -461,3 +451,11 @@ class ActiveEcho:
                     late = now - sent
                 self._anchor = now, packet.ticks, late
         return late
+
+
+def median_of(tof_s: Float[np.ndarray, "frames lines"]) -> Float[np.ndarray, " lines"]:
+    """Median time of flight, s; NaN where fewer than half of the frames have one."""
+    answered = 2 * np.isfinite(tof_s).sum(axis=0) >= len(tof_s)
+    middle = np.full(tof_s.shape[1], np.nan)
+    middle[answered] = np.nanmedian(tof_s[:, answered], axis=0)
+    return middle

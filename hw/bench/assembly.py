@@ -23,8 +23,8 @@ from hw.clock import Clock
 from hw.rigid import looking_rotation
 from hw.robot.pose import pose_to_ur, ur_to_pose
 from hw.scene import Scene
-from hw.shapes import Float
 from jaxcal import InputError
+from jaxcal.runtime.array_types import Float
 
 VERSIONS = {125: CB_SERIES, 500: E_SERIES}
 """Controllers that the real client accepts, by their rate: a CB-series and an e-Series."""
@@ -316,9 +316,10 @@ class Assembly:
 
     def _statistics(self) -> dict:
         assert self.robot is not None
+        robot = self.robot.state()
         return {
-            "packets": self.robot.packets,
-            "packets_skipped": self.robot.skipped,
+            "packets": robot["packets"],
+            "packets_skipped": robot["skipped"],
             "echo_frames": self.echo.sent,
             "images": self.images.sent,
             "images_refused": self.images.refused,

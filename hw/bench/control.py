@@ -14,6 +14,7 @@ import json
 import socket
 import threading
 from collections.abc import Callable, Mapping
+from typing import Any
 
 LONGEST_LINE = 1 << 20
 _MOST_CONNECTIONS = 8
@@ -98,7 +99,7 @@ class ControlClient:
         self._stream = self._socket.makefile("rwb")
         self._lock = threading.Lock()
 
-    def ask(self, do: str, **arguments: object) -> object:
+    def ask(self, do: str, **arguments: object) -> Any:
         """One request and its answer.
 
         Raises:

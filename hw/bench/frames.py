@@ -20,8 +20,8 @@ import numpy as np
 from hw.bench.look import Look
 from hw.bench.phantoms import ActiveEcho, CrossWire, Mark
 from hw.bench.world import World
-from hw.shapes import Float, UInt8
 from jaxcal import InputError
+from jaxcal.runtime.array_types import Float, UInt8
 
 ROWS, COLUMNS = 480, 640
 DEPTH_MM = 90.0

@@ -26,7 +26,7 @@ from hw.robot.kinematics import (
     nearest_turn,
 )
 from hw.robot.pose import ur_to_pose
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 LEAST_DEXTERITY_MM = 1.0
 """Smallest singular value (mm per rad, :func:`hw.robot.kinematics.dexterity_mm`) at which the

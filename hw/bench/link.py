@@ -9,44 +9,61 @@ from __future__ import annotations
 import errno
 import os
 import socket
+from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Protocol
 
 _MOST_PENDING = 1 << 16
 
 
-class Link(Protocol):
-    """One end of a line."""
+class Link(ABC):
+    """One end of a line.
+
+    Attributes:
+        url: what the other end opens.
+    """
 
     url: str
 
+    def __init__(self) -> None:
+        self._pending = bytearray()
+
+    @abstractmethod
     def fileno(self) -> int:
         """File descriptor to wait on for reading."""
-        ...
 
+    @abstractmethod
     def read(self) -> bytes:
         """Whatever has come; may be empty."""
-        ...
+
+    @abstractmethod
+    def close(self) -> None:
+        """Vanish from the other end, as an unplugged cable does."""
+
+    @abstractmethod
+    def _send(self, data: bytearray) -> int:
+        """Hand over what the other end has room for; the number of bytes."""
 
     def write(self, data: bytes) -> bool:
         """Send; False when there is no room: then none of the data are sent."""
-        ...
+        if len(self._pending) + len(data) > _MOST_PENDING:
+            self.flush()
+            if len(self._pending) + len(data) > _MOST_PENDING:
+                return False
+        self._pending += data
+        self.flush()
+        return True
 
     @property
     def waits(self) -> bool:
         """Whether data that were sent are still kept here."""
-        ...
+        return bool(self._pending)
 
     def flush(self) -> None:
         """Hand over what the other end has room for."""
-        ...
-
-    def close(self) -> None:
-        """Vanish from the other end, as an unplugged cable does."""
-        ...
+        del self._pending[: self._send(self._pending)]
 
 
-class PtyLink:
+class PtyLink(Link):
     """The master of a pty; a symbolic link with a fixed path leads to its slave.
 
     Args:
@@ -56,6 +73,7 @@ class PtyLink:
     def __init__(self, path: Path) -> None:
         import tty
 
+        super().__init__()
         self._path = path
         # The slave stays open here too: reading the master fails while nobody has the slave open.
         self._master, self._slave = os.openpty()
@@ -63,7 +81,6 @@ class PtyLink:
         os.set_blocking(self._master, False)
         self._path.unlink(missing_ok=True)
         self._path.symlink_to(os.ttyname(self._slave))
-        self._pending = bytearray()
         self.url = str(path)
 
     def fileno(self) -> int:
@@ -81,30 +98,13 @@ class PtyLink:
                 return b""
             raise
 
-    def write(self, data: bytes) -> bool:
-        """See :class:`Link`."""
-        if len(self._pending) + len(data) > _MOST_PENDING:
-            self.flush()
-            if len(self._pending) + len(data) > _MOST_PENDING:
-                return False
-        self._pending += data
-        self.flush()
-        return True
-
-    @property
-    def waits(self) -> bool:
-        """See :class:`Link`."""
-        return bool(self._pending)
-
-    def flush(self) -> None:
-        """See :class:`Link`."""
+    def _send(self, data: bytearray) -> int:
         try:
-            sent = os.write(self._master, self._pending)
+            return os.write(self._master, data)
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.EIO):
-                return
+                return 0
             raise
-        del self._pending[:sent]
 
     def close(self) -> None:
         """See :class:`Link`."""
@@ -113,14 +113,14 @@ class PtyLink:
         os.close(self._slave)
 
 
-class TcpLink:
+class TcpLink(Link):
     """A TCP port that takes one peer at a time, like a serial-to-TCP bridge."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
+        super().__init__()
         self._listener = socket.create_server((host, port))
         self._listener.setblocking(False)
         self._peer: socket.socket | None = None
-        self._pending = bytearray()
         self.url = f"socket://{host}:{self._listener.getsockname()[1]}"
 
     def fileno(self) -> int:
@@ -148,33 +148,19 @@ class TcpLink:
         return data
 
     def write(self, data: bytes) -> bool:
-        """See :class:`Link`."""
-        if self._peer is None:
-            return True
-        self._pending += data
-        self.flush()
-        if len(self._pending) > _MOST_PENDING:
-            del self._pending[len(self._pending) - len(data) :]
-            return False
-        return True
+        """As :meth:`Link.write`; lost where there is no peer."""
+        return self._peer is None or super().write(data)
 
-    @property
-    def waits(self) -> bool:
-        """See :class:`Link`."""
-        return bool(self._pending)
-
-    def flush(self) -> None:
-        """See :class:`Link`."""
+    def _send(self, data: bytearray) -> int:
         if self._peer is None:
-            return
+            return 0
         try:
-            sent = self._peer.send(self._pending)
+            return self._peer.send(data)
         except BlockingIOError:
-            return
+            return 0
         except OSError:
             self._hang_up()
-            return
-        del self._pending[:sent]
+            return 0
 
     def _hang_up(self) -> None:
         if self._peer is not None:

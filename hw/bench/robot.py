@@ -19,6 +19,7 @@ import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import asdict
+from typing import Any
 
 from hw.bench.arm import Arm
 from hw.bench.rtde import RtdeServer
@@ -33,6 +34,11 @@ START = (0.4, -0.1, 0.3, 0.0, 3.0, 0.2)
 E_SERIES, CB_SERIES = (5, 11, 0, 108249), (3, 15, 8, 106339)
 """Controller versions of the two series of robots."""
 
+_FAULTS = (
+    *("mute", "drop", "protective_stop", "unlock", "enter", "play", "set_remote"),
+    *("set_tcp_offset", "set_payload", "set_speed_slider", "spoil_dashboard"),
+)
+"""Methods of the server that may be asked for."""
 _PATIENCE_S = 30.0
 
 
@@ -148,22 +154,10 @@ class RobotProcess:
         self.ask("set_speed_slider", fraction)
 
     def state(self) -> dict:
-        """Where the arm is, what the program does, and every command so far."""
-        state = self.ask("state")
-        assert isinstance(state, dict)
-        return state
+        """Where the arm is, what the program does, every command and the packets so far."""
+        return self.ask("state")
 
-    @property
-    def packets(self) -> int:
-        """Real-time packets made so far."""
-        return self.state()["packets"]
-
-    @property
-    def skipped(self) -> int:
-        """Packets left out for a client that did not read."""
-        return self.state()["skipped"]
-
-    def ask(self, name: str, *values: object) -> object:
+    def ask(self, name: str, *values: object) -> Any:
         """One request: ``state``, ``force`` or a fault (the last two answer with the bench time).
 
         Raises:
@@ -259,19 +253,7 @@ def _do(robot: RtdeServer, name: str, values: list) -> dict:
             robot.arm.force = tuple(values[0])
         case "drop control":
             robot.drop(control_only=True)
-        case (
-            "mute"
-            | "drop"
-            | "protective_stop"
-            | "unlock"
-            | "set_tcp_offset"
-            | "set_payload"
-            | "set_speed_slider"
-            | "enter"
-            | "set_remote"
-            | "play"
-            | "spoil_dashboard"
-        ):
+        case _ if name in _FAULTS:
             getattr(robot, name)(*values)
         case _:
             return {"trouble": f"unknown request {name}"}

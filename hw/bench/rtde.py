@@ -20,6 +20,7 @@ ur_client_library, and what ur_rtde 1.6.5 sends and expects.
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import queue
 import random
@@ -29,6 +30,7 @@ import struct
 import sys
 import threading
 from collections.abc import Callable
+from typing import Any
 
 from hw.bench.arm import Arm
 from hw.bench.controller import NORMAL, Controller
@@ -77,6 +79,16 @@ class _Connection:
         self.complete = True
         """Whether every variable of the output recipe exists."""
         self.started = False
+
+
+def _in_the_loop(act: Callable[..., None]) -> Callable[..., None]:
+    """A method that the serving thread executes; it has acted when the call returns."""
+
+    @functools.wraps(act)
+    def called(self: RtdeServer, *values: Any, **named: Any) -> None:
+        self._call(lambda: act(self, *values, **named))
+
+    return called
 
 
 class RtdeServer:
@@ -176,89 +188,72 @@ class RtdeServer:
 
     # Faults
 
+    @_in_the_loop
     def mute(self, on: bool = True) -> None:
         """Neither read nor write; connections stay, and new ones are accepted but not answered."""
+        self._muted = on
+        for connection in self._connections:
+            known = connection.socket in self._selector.get_map()
+            if on and known:
+                # Unread data would wake the loop again and again.
+                self._selector.unregister(connection.socket)
+            elif not on and not known:
+                self._selector.register(connection.socket, selectors.EVENT_READ, connection)
 
-        def act() -> None:
-            self._muted = on
-            for connection in self._connections:
-                known = connection.socket in self._selector.get_map()
-                if on and known:
-                    # Unread data would wake the loop again and again.
-                    self._selector.unregister(connection.socket)
-                elif not on and not known:
-                    self._selector.register(connection.socket, selectors.EVENT_READ, connection)
-
-        self._call(act)
-
+    @_in_the_loop
     def drop(self, *, reset: bool = True, control_only: bool = False) -> None:
         """Close all clients' connections, or only those that command: reset, or closed in order."""
+        for connection in [c for c in self._connections if c.inputs or not control_only]:
+            if reset:
+                linger = struct.pack("ii", 1, 0)
+                connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+            self._forget(connection)
 
-        def act() -> None:
-            for connection in [c for c in self._connections if c.inputs or not control_only]:
-                if reset:
-                    linger = struct.pack("ii", 1, 0)
-                    connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
-                self._forget(connection)
-
-        self._call(act)
-
+    @_in_the_loop
     def protective_stop(self) -> None:
         """As if the arm had met an obstacle."""
-        self._call(lambda: self.controller.protect(self.clock.now()))
+        self.controller.protect(self.clock.now())
 
+    @_in_the_loop
     def unlock(self) -> None:
         """What a person does at the pendant after a protective stop."""
+        self.controller.safety_mode = NORMAL
 
-        def act() -> None:
-            self.controller.safety_mode = NORMAL
-
-        self._call(act)
-
+    @_in_the_loop
     def enter(self, robot_mode: int, safety_mode: int) -> None:
         """The robot enters these modes; see :meth:`hw.bench.controller.Controller.enter`."""
-        self._call(lambda: self.controller.enter(self.clock.now(), robot_mode, safety_mode))
+        self.controller.enter(self.clock.now(), robot_mode, safety_mode)
 
+    @_in_the_loop
     def set_remote(self, on: bool) -> None:
         """What a person does at the pendant of an e-Series: remote or local control."""
+        self.controller.remote = on
 
-        def act() -> None:
-            self.controller.remote = on
-
-        self._call(act)
-
+    @_in_the_loop
     def play(self) -> None:
         """What a person does at the pendant: the program ends, and soon another one runs."""
-        self._call(lambda: self.controller.play(self.clock.now()))
+        self.controller.play(self.clock.now())
 
+    @_in_the_loop
     def spoil_dashboard(self, answer: str | None) -> None:
         """The dashboard answers with this text, with "" not at all, with None as usual."""
+        self._dashboard_says = answer
 
-        def act() -> None:
-            self._dashboard_says = answer
-
-        self._call(act)
-
+    @_in_the_loop
     def set_tcp_offset(self, offset: tuple[float, ...]) -> None:
         """What a person does at the pendant: another tool."""
-        self._call(lambda: self.arm.set_tcp_offset(offset))
+        self.arm.set_tcp_offset(offset)
 
+    @_in_the_loop
     def set_payload(self, mass_kg: float, cog_m: tuple[float, ...]) -> None:
         """What a person does at the pendant: another payload."""
+        self.controller.payload_kg = float(mass_kg)
+        self.controller.payload_cog_m = tuple(cog_m)
 
-        def act() -> None:
-            self.controller.payload_kg = float(mass_kg)
-            self.controller.payload_cog_m = tuple(cog_m)
-
-        self._call(act)
-
+    @_in_the_loop
     def set_speed_slider(self, fraction: float) -> None:
         """What a person does at the pendant; motions from now on are slower."""
-
-        def act() -> None:
-            self.controller.speed_fraction = float(fraction)
-
-        self._call(act)
+        self.controller.speed_fraction = float(fraction)
 
     def _call(self, act: Callable[[], None]) -> None:
         if self._thread is None or threading.current_thread() is self._thread:

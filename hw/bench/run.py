@@ -24,9 +24,9 @@ from hw.bench.assembly import Assembly, BenchOptions
 from hw.bench.control import ControlClient
 from hw.clock import Clock
 from hw.scene import Scene
-from hw.shapes import Float
 from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
+from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.isolated import python_command
 
 __all__ = ["Bench", "BenchOptions", "main", "serve", "start_bench"]
@@ -44,7 +44,6 @@ class Bench:
     Attributes:
         clock: shared with the emulators.
         robot_host: loopback address of the controller.
-        robot_serial: what its dashboard says.
         tcp_offset: (6,) m and rad, of the controller at the start.
         active_echo_url: what to open.
         ultrasound: (host, port).
@@ -58,7 +57,7 @@ class Bench:
         self._process = process
         self.addresses = told
         self.clock = Clock(told["speed"], told["origin_s"])
-        self.robot_host, self.robot_serial = told["robot_host"], told["robot_serial"]
+        self.robot_host = told["robot_host"]
         self.pose_hz: float = told["pose_hz"]
         self.tcp_offset: tuple[float, ...] = tuple(told["tcp_offset"])
         self.active_echo_url = told["active_echo_url"]
@@ -93,7 +92,7 @@ class Bench:
         Raises:
             RuntimeError: no such fault, or the bench is gone.
         """
-        return float(str(self._control.ask("fault", name=name, **arguments)))
+        return self._control.ask("fault", name=name, **arguments)
 
     def recover(self) -> None:
         """End the devices' faults; changes at the pendant stay.
@@ -108,8 +107,7 @@ class Bench:
 
     def rest_since(self) -> float | None:
         """Bench time since which the arm rests; None while it moves."""
-        since = self._control.ask("rest_since")
-        return None if since is None else float(str(since))
+        return self._control.ask("rest_since")
 
     def truth(self, pose: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 3"]:
         """(lateral, range, elevation) mm of the target for true poses."""
@@ -120,28 +118,22 @@ class Bench:
     def world_truth(self) -> dict[str, np.ndarray]:
         """``image_to_probe`` (4, 4), ``point_mm`` (3,), ``sound_speed_m_s``, ``latency_s``."""
         told = self._control.ask("world")
-        assert isinstance(told, dict)
         return {name: np.array(value) for name, value in told.items()}
 
     def test_set(
         self, count: int = 50, seed: int = 1
     ) -> tuple[Float[np.ndarray, "count 4 4"], Float[np.ndarray, "count 2"]]:
         """Noise-free in-plane test images: true poses and [lateral, range], mm."""
-        told = self._control.ask("test_set", count=count, seed=seed)
-        assert isinstance(told, list)
-        return np.array(told[0]), np.array(told[1])
+        poses, points = self._control.ask("test_set", count=count, seed=seed)
+        return np.array(poses), np.array(points)
 
     def statistics(self) -> dict[str, int]:
         """What was sent: packets, packets_skipped, echo_frames, images, images_refused."""
-        told = self._control.ask("statistics")
-        assert isinstance(told, dict)
-        return told
+        return self._control.ask("statistics")
 
     def robot(self) -> dict[str, object]:
         """``running`` and ``reason``: the controller's program, and why it last stopped."""
-        told = self._control.ask("robot")
-        assert isinstance(told, dict)
-        return told
+        return self._control.ask("robot")
 
     def close(self) -> None:
         """End the bench's process; safe to repeat."""

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hw.active_echo.device import median_of
 from hw.bench.world import World
 from hw.midplane.search import Echoes
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 
 @dataclass(frozen=True)
@@ -86,9 +87,7 @@ class WorldStage:
 
     def read(self, frames: int) -> Echoes:
         """Whole frames at the place where the probe stands."""
-        told = [self.world.echo(self.true_pose, self.threshold, self._rng) for _ in range(frames)]
-        self.seconds += frames * self.pace.frame_s
-        times, amplitude = (np.array(part) for part in zip(*told, strict=True))
+        times, amplitude = self._hear(frames)
         return Echoes(amplitude, np.isfinite(times))
 
     def set_threshold(self, threshold: int) -> None:
@@ -113,10 +112,10 @@ class WorldStage:
 
     def times_of_flight(self, frames: int) -> Float[np.ndarray, " elements"]:
         """Median over some frames, s; NaN where fewer than half of them were answered."""
-        told = [self.world.echo(self.true_pose, self.threshold, self._rng) for _ in range(frames)]
+        return median_of(self._hear(frames)[0])
+
+    def _hear(
+        self, frames: int
+    ) -> tuple[Float[np.ndarray, "frames elements"], Float[np.ndarray, "frames elements"]]:
         self.seconds += frames * self.pace.frame_s
-        times = np.array([time for time, _ in told])
-        answered = np.isfinite(times).sum(axis=0) >= frames / 2
-        middle = np.full(times.shape[1], np.nan)
-        middle[answered] = np.nanmedian(times[:, answered], axis=0)
-        return middle
+        return self.world.echoes(self.true_pose, self.threshold, self._rng, frames)

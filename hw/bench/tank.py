@@ -11,13 +11,16 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from hw.scene import Scene
-from hw.shapes import Float
 from jaxcal.data.probe import L14_5, LinearProbe
+from jaxcal.runtime.array_types import Float
 
 ELEMENT_MM = 2.08
 """Outer diameter of the paper's PZT5H tube, mm (section 3.2)."""
 
 _WAVES = 96
+
+Pose = Float[np.ndarray, "4 4"]
+"""True pose of the tool centre point, tool -> base, mm."""
 
 
 @dataclass(frozen=True)
@@ -110,24 +113,22 @@ class Tank:
     noise: Noise = field(default_factory=Noise)
     seed: int = 0
 
-    def target(self, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, 3]:
+    def target(self, pose: Pose) -> Float[np.ndarray, 3]:
         """The target in the image frame: q = X^-1 B^-1 c, mm."""
         return self.target_of(pose, self.point_mm)
 
-    def target_of(
-        self, pose: Float[np.ndarray, "4 4"], point_mm: Float[np.ndarray, 3]
-    ) -> Float[np.ndarray, 3]:
+    def target_of(self, pose: Pose, point_mm: Float[np.ndarray, 3]) -> Float[np.ndarray, 3]:
         """Any point of the base frame in the image frame, mm."""
         x = self.image_to_probe
         in_tool = (point_mm - pose[:3, 3]) @ pose[:3, :3]
         return (in_tool - x[:3, 3]) @ x[:3, :3]
 
-    def truth(self, pose: Float[np.ndarray, "4 4"]) -> Place:
+    def truth(self, pose: Pose) -> Place:
         """Where the target truly is when the tool centre point is at ``pose``."""
         lateral, elevation, axial = self.target(np.asarray(pose, float))
         return Place(float(lateral), float(np.hypot(elevation, axial)), float(elevation))
 
-    def field(self, pose: Float[np.ndarray, "4 4"], stream: int = 0) -> float:
+    def field(self, pose: Pose, stream: int = 0) -> float:
         """A smooth random field over the orientation: mean 0, SD 1, three degrees long.
 
         Args:
@@ -138,7 +139,7 @@ class Tank:
         wave = np.cos(frequency @ pose[:3, :3].reshape(9) + phase)
         return float(np.sqrt(2 / _WAVES) * wave.sum())
 
-    def response_shift_mm(self, pose: Float[np.ndarray, "4 4"], scale: float) -> float:
+    def response_shift_mm(self, pose: Pose, scale: float) -> float:
         """Elevational place where a sensor hears the most, at this orientation, mm.
 
         Args:

@@ -28,11 +28,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hw.bench.phantoms import ActiveEcho, Phantom, phantom_named
-from hw.bench.tank import ELEMENT_MM, Beam, Noise, Tank
+from hw.bench.tank import ELEMENT_MM, Beam, Noise, Pose, Tank
 from hw.rigid import looking_rotation, rigid, rotation_matrix
 from hw.scene import Scene
-from hw.shapes import Bool, Float
 from jaxcal import InputError
+from jaxcal.runtime.array_types import Bool, Float
 
 FULL_SCALE = 4095
 """Largest amplitude that the electronics' 12-bit converter tells, counts."""
@@ -48,45 +48,57 @@ class World(Tank):
 
     phantom: Phantom = field(default_factory=ActiveEcho)
 
-    def shift_mm(self, pose: Float[np.ndarray, "4 4"]) -> float:
+    def shift_mm(self, pose: Pose) -> float:
         """Elevational place where the response is strongest, at this orientation, mm."""
         return self.response_shift_mm(pose, self.phantom.response_scale)
 
-    def loudness(self, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " elements"]:
+    def loudness(self, pose: Pose) -> Float[np.ndarray, " elements"]:
         """Amplitude of every line at the phantom without noise or saturation, counts."""
         return self.phantom.loudness(self, pose)
 
-    def echo(
-        self, pose: Float[np.ndarray, "4 4"], threshold: int, rng: np.random.Generator
-    ) -> tuple[Float[np.ndarray, " elements"], Float[np.ndarray, " elements"]]:
-        """What the element reports of one frame.
+    def echoes(
+        self, pose: Pose, threshold: int, rng: np.random.Generator, frames: int
+    ) -> tuple[Float[np.ndarray, "frames elements"], Float[np.ndarray, "frames elements"]]:
+        """What the element reports of some frames at one place.
 
         Args:
             pose: true, tool -> base, mm.
             threshold: amplitude from which it answers, counts.
-            rng: of this frame's noise.
+            rng: of the frames' noise.
+            frames: how many.
 
         Returns:
             one-way times of flight (s, a whole number of clock periods; NaN: no answer) and
             amplitudes (counts, whole, at most full scale; 0 without an answer).
         """
         count, noise = self.probe.elements, self.noise
-        normal = rng.standard_normal((3, count))
-        amplitude = self.loudness(pose) * (1 + noise.amplitude * normal[0])
-        amplitude = np.rint(amplitude + self.phantom.noise_counts(self) * normal[1])
-        amplitude = np.clip(amplitude, 0, FULL_SCALE)
-        heard = amplitude >= max(threshold, 1)
-
+        loudness, floor = self.loudness(pose), self.phantom.noise_counts(self)
         lateral, elevation, axial = self.target(pose)
-        way = np.sqrt((lateral - self.elements) ** 2 + elevation**2 + axial**2)
-        if noise.reflection > 0:
-            late = rng.random(count) < noise.reflection
-            way = way + late * rng.uniform(*noise.reflection_mm, size=count)
-        time = way / (1e3 * self.sound_speed_m_s) + self.delay_s + noise.time_s * normal[2]
-        time = np.rint(time * self.clock_hz) / self.clock_hz
-        return np.where(heard & (time > 0), time, np.nan), np.where(heard, amplitude, 0.0)
+        straight = np.sqrt((lateral - self.elements) ** 2 + elevation**2 + axial**2)
+        times, amplitudes = np.empty((2, frames, count))
+        for frame in range(frames):
+            normal = rng.standard_normal((3, count))
+            amplitude = np.rint(loudness * (1 + noise.amplitude * normal[0]) + floor * normal[1])
+            amplitude = np.clip(amplitude, 0, FULL_SCALE)
+            heard = amplitude >= max(threshold, 1)
+            way = straight
+            if noise.reflection > 0:
+                late = rng.random(count) < noise.reflection
+                way = way + late * rng.uniform(*noise.reflection_mm, size=count)
+            time = way / (1e3 * self.sound_speed_m_s) + self.delay_s + noise.time_s * normal[2]
+            time = np.rint(time * self.clock_hz) / self.clock_hz
+            times[frame] = np.where(heard & (time > 0), time, np.nan)
+            amplitudes[frame] = np.where(heard, amplitude, 0.0)
+        return times, amplitudes
 
-    def answers(self, pose: Float[np.ndarray, "4 4"], threshold: int) -> Bool[np.ndarray, " e"]:
+    def echo(
+        self, pose: Pose, threshold: int, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, " elements"], Float[np.ndarray, " elements"]]:
+        """What the element reports of one frame, as by :meth:`echoes`."""
+        times, amplitudes = self.echoes(pose, threshold, rng, 1)
+        return times[0], amplitudes[0]
+
+    def answers(self, pose: Pose, threshold: int) -> Bool[np.ndarray, " e"]:
         """Which lines the element answers, noise apart."""
         return self.loudness(pose) >= max(threshold, 1)
 

@@ -38,6 +38,9 @@ if TYPE_CHECKING:
     from hw.setup import Setup
     from hw.view.feed import LiveView
 
+_ALSO_RESUMED = ("bench", "setup_path", "move", "unattended", "preview", "view", "speed",
+                 "controller")  # fmt: skip
+"""Options that go with --resume."""
 _RESUMED_BY_ITSELF = 30
 """How often an acquisition on the emulated bench is resumed without a person."""
 
@@ -125,23 +128,8 @@ def acquire(
         raise InputError(f"give either --bench or --setup TOML{also}")
     if not bench and (speed, controller, bench_seed) != (None, None, None):
         raise InputError("--speed, --controller and --bench-seed need --bench")
-    given = [
-        name
-        for name, value in (
-            ("--images", images),
-            ("--plan", plan),
-            ("--until-tre", until_tre),
-            ("--placement", placement),
-            ("--phantom", phantom),
-            ("--operator", operator),
-            ("--seed", seed),
-            ("--every-frame", every_frame or None),
-            ("--bench-seed", bench_seed),
-        )
-        if value is not None
-    ]
     if resume:
-        check_resumed(recording, given)
+        check_resumed(recording, *_ALSO_RESUMED)
     if operator is not None and not resume and placement != "pattern-injection":
         raise InputError("--operator needs --placement pattern-injection")
     if until_tre is not None and plan != "optimal" and not resume:
@@ -195,9 +183,17 @@ def acquire(
         emulated = started(stack, bench, bench_seed, speed, controller, phantom)
         setup = setup_of(setup_path, emulated)
         if not bench and not move:
-            return _dry_run(setup, path, request, preview)
+            from hw.dry_run import dry_run
+
+            for line in dry_run(setup, path, request, preview):
+                click.echo(line)
+            return ExitCode.CONVERGED
         if preview is not None:
-            _preview(setup, request, preview)
+            from hw.dry_run import draw
+
+            if request is None:
+                raise InputError("--preview draws a new plan; it does not go with --resume")
+            draw(setup, request, preview)
         return _acquire(setup, path, request, emulated, unattended, operator, view)
 
 
@@ -290,22 +286,3 @@ def _finished(path: str, outcome: Outcome, setup: Setup) -> int:
 
     lines = lines_of(path, outcome, setup.clock.speed)
     return exit_code([calibrate_and_print(path, *lines)])
-
-
-def _dry_run(
-    setup: Setup, path: str, request: AcquisitionRequest | None, preview: str | None
-) -> int:
-    """Everything but the motion: the plan, and the way from pose to pose, against the limits."""
-    from hw.dry_run import dry_run
-
-    for line in dry_run(setup, path, request, preview):
-        click.echo(line)
-    return ExitCode.CONVERGED
-
-
-def _preview(setup: Setup, request: AcquisitionRequest | None, preview: str) -> None:
-    from hw.dry_run import draw
-
-    if request is None:
-        raise InputError("--preview draws a new plan; it does not go with --resume")
-    draw(setup, request, preview)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 
 from hw.choices import PHANTOMS
 from jaxcal import InputError
@@ -36,12 +36,19 @@ bench_seed_option = click.option(
 )
 
 
-def check_resumed(recording: str | None, given: Sequence[str]) -> None:
-    """Refuse --resume without a recording, or with options that the recording knows."""
+def check_resumed(recording: str | None, *allowed: str) -> None:
+    """Refuse --resume without a recording, or with options but the allowed: the recording knows."""
     if recording is None:
         raise InputError("--resume needs the RECORDING to go on with")
-    if given:
-        raise InputError(f"{given[0]} does not go with --resume: the recording knows")
+    context = click.get_current_context()
+    for option in context.command.params:
+        source = context.get_parameter_source(str(option.name))
+        if (
+            isinstance(option, click.Option)
+            and source is ParameterSource.COMMANDLINE
+            and option.name not in ("resume", *allowed)
+        ):
+            raise InputError(f"{option.opts[0]} does not go with --resume: the recording knows")
 
 
 def started(

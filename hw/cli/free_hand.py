@@ -7,7 +7,6 @@ from datetime import datetime
 from typing import Any
 
 import click
-from click.core import ParameterSource
 
 from hw.choices import HAND_PLACEMENTS
 from hw.cli.common import check_resumed
@@ -89,15 +88,7 @@ def free_hand(
     from hw.freehand.terminal import INJECTION_KEYS, KEYS, TerminalPerson
 
     if resume:
-        context = click.get_current_context()
-        given = [
-            option.opts[0]
-            for option in context.command.params
-            if isinstance(option, click.Option)
-            and option.name not in ("resume", "placement", "setup_path")
-            and context.get_parameter_source(str(option.name)) is ParameterSource.COMMANDLINE
-        ]
-        check_resumed(recording, given)
+        check_resumed(recording, "placement", "setup_path")
     injected = placement == "pattern-injection"
     if injected != (setup_path is not None):
         raise InputError("--placement pattern-injection and --setup TOML go together")

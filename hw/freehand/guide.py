@@ -15,10 +15,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hw.freehand.posed import PosedImage
-from hw.shapes import Float
 from jaxcal import InputError
 from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.spot import Target
+from jaxcal.runtime.array_types import Float
 
 _COLUMN_NAMES, _ROW_NAMES = ("left", "middle", "right"), ("upper", "central", "lower")
 _LEAST_IN_CELL = 1

@@ -31,23 +31,23 @@ from hw.freehand.kept import KeptImages, read_images
 from hw.freehand.posed import PosedImage, PosedImages
 from hw.freehand.request import FreeHand, FreeHandStopped, Person, recorded_request
 from hw.midplane.amplitude_scan import fit_peak
-from hw.midplane.bracket import Bracket, widened
+from hw.midplane.bracket import Bracket
 from hw.midplane.live_view import describe, profile
 from hw.midplane.pattern_injection import View, bar, bar_length, sides_seen
-from hw.midplane.search import Echoes, PlacementError, Settings
+from hw.midplane.search import Echoes, PlacementError
 from hw.recorder import Recorder
 from hw.recording_check import probe_of
 from hw.recording_layout import RecordingHeader
 from hw.resuming import check_same, described_probe
 from hw.session import DELAY_S, Watch, median_times
 from hw.setup import HandHeldSetup
-from hw.shapes import Float
 from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.poses import inverse_poses
 from jaxcal.data.recording import MINIMUM_IMAGES, MetresError, check_pose_units
 from jaxcal.data.timing import interpolate_poses
 from jaxcal.io.readable import naming
+from jaxcal.runtime.array_types import Float
 
 _KIND = "pattern-injection"
 _SILENCE_S = 3.0
@@ -431,15 +431,12 @@ class _Run:
 
     def _bracket(self, times: list[float]) -> tuple[Bracket, float]:
         """The bracket of the target's offset while the probe was held, and the probe's place."""
-        settings: Settings = self._setup.search
+        settings = self._setup.search
         offsets, peaks = self._sweep()
         peak = fit_peak(offsets, peaks, settings.full_scale)
         now = np.isin([sample.t for sample in self._samples], times)
         where = float(offsets[now].mean())
-        centre, half = peak.place_mm - where, settings.factor * peak.sd_mm
-        return widened(
-            centre, centre - half, centre + half, peak.sd_mm, settings.hidden_sd_mm, settings.factor
-        ), where
+        return peak.bracket(where, settings), where
 
     def _keep(
         self, poses: np.ndarray, frames: list[EchoFrame], bracket: Bracket, where: float

@@ -10,9 +10,9 @@ import numpy as np
 from hw.recorder import Recorder
 from hw.recording_check import opened, read_column
 from hw.recording_file import RecordingWriter
-from hw.shapes import Float
 from jaxcal.data.recording import MetresError, check_pose_units
 from jaxcal.io.untrusted import UpTo
+from jaxcal.runtime.array_types import Float
 
 _IMAGES = UpTo(100_000, "images")
 

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.errors import DeviceError, StaleError
-from hw.shapes import Float
 from hw.ultrasound.receiver import Image, Transform, UltrasoundStream
 from jaxcal.data.poses import inverse_poses
 from jaxcal.data.timing import interpolate_poses
 from jaxcal.io.frame_names import FramePair, capitalised, path_between, split_name
+from jaxcal.runtime.array_types import Float
 
 LISTEN_S = 5.0
 """How long to wait for the first image and the first transform."""

@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from hw.keys import Keyboard
-from hw.midplane.terminal_image import COLUMNS, ROWS, Screen, picture
+from hw.midplane.terminal_image import Screen
 
 KEYS = "u: take the last image back, q or Enter: finish, Ctrl-C: stop (it can be resumed)"
 INJECTION_KEYS = (
@@ -36,12 +36,7 @@ class TerminalPerson:
         if now - self._shown < _PERIOD_S:
             return
         self._shown = now
-        rows = []
-        if self._screen.pictures and frame.dtype == np.uint8:
-            columns, lines = self._screen.size
-            height = min(ROWS, lines - _OTHER_ROWS)
-            if height > 0:
-                rows += picture(frame, min(COLUMNS, columns - 1), height)
+        rows = self._screen.picture(frame, _OTHER_ROWS) if frame.dtype == np.uint8 else []
         self._screen.show([*rows, *words.split("\n"), f"next: {advice}", self._keys])
 
     def say(self, line: str) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from hw.midplane.bracket import Bracket, Placement, widened
 from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 LEAST_FRACTION = 0.4
 """Samples below this part of the loudest are not used: they show the beam's skirts."""
@@ -40,6 +40,13 @@ class Peak:
     amplitude: float
     width_mm: float
     used: int
+
+    def bracket(self, where_mm: float, settings: Settings) -> Bracket:
+        """Where the target's offset lies in an image that was taken at ``where_mm``."""
+        centre, half = self.place_mm - where_mm, settings.factor * self.sd_mm
+        return widened(
+            centre, centre - half, centre + half, self.sd_mm, settings.hidden_sd_mm, settings.factor
+        )
 
 
 def fit_peak(
@@ -254,9 +261,4 @@ def free_hand(
     best = int(np.argmax(loud))
     if usable[best] == 0.0:
         best = int(np.argmin(np.abs(np.asarray(offsets_mm) - peak.place_mm)))
-    centre = peak.place_mm - float(offsets_mm[best])
-    half = settings.factor * peak.sd_mm
-    bracket = widened(
-        centre, centre - half, centre + half, peak.sd_mm, settings.hidden_sd_mm, settings.factor
-    )
-    return best, bracket
+    return best, peak.bracket(float(offsets_mm[best]), settings)

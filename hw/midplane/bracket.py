@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.shapes import Float
 from jaxcal import InputError
+from jaxcal.runtime.array_types import Float
 
 
 @dataclass(frozen=True)

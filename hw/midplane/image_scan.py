@@ -20,10 +20,10 @@ import numpy as np
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
 from hw.midplane.search import Echoes, Settings
-from hw.shapes import Float, UInt8
 from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.speckle import SMALLEST_REGION, NotFoundError, envelope_of
 from jaxcal.data.segmentation.spot import brightest
+from jaxcal.runtime.array_types import Float, UInt8
 
 Target = Literal["echo", "cross"]
 
@@ -131,15 +131,8 @@ def image_scan(
 ) -> Placement:
     """Scan with the robot, fit the maximum of the intensity, go there.
 
-    Args:
-        bench: looks at frames.
-        settings: steps and caps; the response's stated accuracy, which is of the active echo
-            element, is not used.
-        start_mm: where the mid-plane is expected, as an offset from the plan's pose.
-        watch: told of every stop.
-
-    Raises:
-        PlacementError: given up; the probe is at the last good place.
+    As :func:`hw.midplane.amplitude_scan.amplitude_scan`; the response's stated accuracy, which is
+    of the active echo element, is not used.
     """
     settings = Settings() if settings is None else settings
     # The wires part within half a millimetre: coarse steps of 2 mm would step over the crossing.

@@ -21,7 +21,7 @@ import numpy as np
 
 from hw.interrupts import heed_interrupt
 from hw.midplane.pattern_injection import LONGEST, Decision, View, middle_of, sides_seen
-from hw.midplane.terminal_image import COLUMNS, ROWS, Screen, picture
+from hw.midplane.terminal_image import Screen
 from jaxcal import InputError
 
 _LEAST_STEP_MM, _LARGEST_STEP_MM = 0.02, 1.0
@@ -155,11 +155,8 @@ class TerminalOperator:
     def _show(self, view: View) -> None:
         frame = view.frame()
         rows = [view.title] if view.title else []
-        if frame is not None and self._screen.pictures:
-            columns, lines = self._screen.size
-            height = min(ROWS, lines - _OTHER_ROWS)
-            if height > 0:
-                rows += picture(frame, min(COLUMNS, columns - 1), height)
+        if frame is not None:
+            rows += self._screen.picture(frame, _OTHER_ROWS)
         rows.append(describe(view, self._keys.step(view)))
         rows += profile(view)
         if view.message:

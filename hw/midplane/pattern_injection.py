@@ -22,8 +22,8 @@ import numpy as np
 from hw.errors import DeviceError
 from hw.midplane.bracket import Placement
 from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
-from hw.shapes import UInt8
 from jaxcal import InputError
+from jaxcal.runtime.array_types import UInt8
 
 LONGEST = 31
 """Lines that the longest bar covers; also the number of lengths an operator can tell apart."""

@@ -20,8 +20,8 @@ import numpy as np
 
 from hw.errors import Device, DeviceError
 from hw.midplane.bracket import Placement, widened
-from hw.shapes import Bool, Float
 from jaxcal import InputError
+from jaxcal.runtime.array_types import Bool, Float
 
 _TOP_LINES = 8
 _ANSWERING_LINES = 4

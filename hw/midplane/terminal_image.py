@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from hw.shapes import UInt8
+from jaxcal.runtime.array_types import UInt8
 
 COLUMNS, ROWS = 64, 20
 _GREYS = 24
@@ -99,6 +99,14 @@ class Screen:
         except (AttributeError, OSError, ValueError):
             columns, lines = shutil.get_terminal_size()
         return columns or 80, lines or 24
+
+    def picture(self, frame: np.ndarray, other_rows: int) -> list[str]:
+        """A frame as large as fits beside other rows; nothing where it cannot be shown."""
+        columns, lines = self.size
+        height = min(ROWS, lines - other_rows)
+        if not self.pictures or height <= 0:
+            return []
+        return picture(frame, min(COLUMNS, columns - 1), height)
 
     def say(self, line: str) -> None:
         """One line that stays."""

@@ -132,11 +132,7 @@ def threshold_climb(
 ) -> Placement:
     """Coarse raster, fine scan, threshold climb; the probe ends half way between the loss edges.
 
-    Args:
-        bench: what to move and listen to.
-        settings: how to search.
-        start_mm: where the mid-plane is expected, as an offset from the plan's pose.
-        watch: told of every stop.
+    Arguments are those of :func:`hw.midplane.amplitude_scan.amplitude_scan`.
 
     Returns:
         A placement whose bracket holds the last stretch, widened by the errors that no search sees.

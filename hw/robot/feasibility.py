@@ -39,7 +39,7 @@ from hw.robot.kinematics import (
     scaled_jacobian,
     tool_of,
 )
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 _COARSE_MM = 20.0
 """First distance between samples, of the flange and ANGLE_MM per rad."""

@@ -33,10 +33,10 @@ from functools import cached_property
 
 import numpy as np
 
-from hw.errors import RefusedError
+from hw.errors import refused
 from hw.rigid import inverse as inverse_transform
 from hw.rigid import rigid
-from hw.shapes import Bool, Float, Int
+from jaxcal.runtime.array_types import Bool, Float, Int
 
 ANGLE_MM = 100.0
 """A turn of one rad counts as this many mm in the Jacobian's singular values: about the distance
@@ -117,34 +117,20 @@ class ArmModel:
         return math.sqrt(linear + 15 * ANGLE_MM**2)
 
 
-def _model(
-    name: str,
-    d1: float,
-    a2: float,
-    a3: float,
-    d4: float,
-    d5: float,
-    d6: float,
-    elbow: float,
-    radius: float,
-    speed: float = 180.0,
-) -> tuple[str, ArmModel]:
-    return name, ArmModel(name, d1, a2, a3, d4, d5, d6, elbow, radius, speed)
-
-
-MODELS: dict[str, ArmModel] = dict(
-    [
-        _model("UR3", 151.9, -243.65, -213.25, 112.35, 85.35, 81.9, 119.8, 55.0),
-        _model("UR5", 89.159, -425.0, -392.25, 109.15, 94.65, 82.3, 135.85, 65.0),
-        _model("UR10", 127.3, -612.0, -572.3, 163.941, 115.7, 92.2, 220.941, 85.0, 120.0),
-        _model("UR3e", 151.85, -243.55, -213.2, 131.05, 85.35, 92.1, 120.0, 55.0),
-        _model("UR5e", 162.5, -425.0, -392.2, 133.3, 99.7, 99.6, 138.0, 65.0),
-        _model("UR10e", 180.7, -612.7, -571.55, 174.15, 119.85, 116.55, 176.2, 85.0, 120.0),
-        _model("UR16e", 180.7, -478.4, -360.0, 174.15, 119.85, 116.55, 176.2, 85.0, 120.0),
-        _model("UR20", 236.3, -862.0, -728.7, 201.0, 159.3, 154.3, 260.0, 110.0, 120.0),
-        _model("UR30", 236.3, -637.0, -503.7, 201.0, 159.3, 154.3, 260.0, 110.0, 120.0),
-    ]
-)
+MODELS = {
+    model.name: model
+    for model in (
+        ArmModel("UR3", 151.9, -243.65, -213.25, 112.35, 85.35, 81.9, 119.8, 55.0),
+        ArmModel("UR5", 89.159, -425.0, -392.25, 109.15, 94.65, 82.3, 135.85, 65.0),
+        ArmModel("UR10", 127.3, -612.0, -572.3, 163.941, 115.7, 92.2, 220.941, 85.0, 120.0),
+        ArmModel("UR3e", 151.85, -243.55, -213.2, 131.05, 85.35, 92.1, 120.0, 55.0),
+        ArmModel("UR5e", 162.5, -425.0, -392.2, 133.3, 99.7, 99.6, 138.0, 65.0),
+        ArmModel("UR10e", 180.7, -612.7, -571.55, 174.15, 119.85, 116.55, 176.2, 85.0, 120.0),
+        ArmModel("UR16e", 180.7, -478.4, -360.0, 174.15, 119.85, 116.55, 176.2, 85.0, 120.0),
+        ArmModel("UR20", 236.3, -862.0, -728.7, 201.0, 159.3, 154.3, 260.0, 110.0, 120.0),
+        ArmModel("UR30", 236.3, -637.0, -503.7, 201.0, 159.3, 154.3, 260.0, 110.0, 120.0),
+    )
+}
 """The arms that are known. DH numbers are the maker's; the elbow's offset is ur_description's, and
 the radii are ours, on the large side."""
 
@@ -161,9 +147,7 @@ def model_named(name: str) -> ArmModel:
     for known, model in MODELS.items():
         if known.lower() == wanted:
             return model
-    raise RefusedError(
-        f"no arm {name[:40]!r} is known; there are {', '.join(MODELS)}", device="robot"
-    )
+    raise refused(f"no arm {name[:40]!r} is known; there are {', '.join(MODELS)}")
 
 
 # Forward

@@ -20,7 +20,7 @@ import numpy as np
 
 from hw.errors import refused
 from hw.robot.kinematics import model_named
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 _VECTORS = {
     "box_min_mm": 3,

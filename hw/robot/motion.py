@@ -34,7 +34,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hw.clock import REAL, Clock
-from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
+from hw.errors import DeviceError, LostError, StaleError, StoppedError, refused
 from hw.interrupts import heed_interrupt
 from hw.robot._process import spawn
 from hw.robot.confirmation import Confirmation
@@ -112,21 +112,20 @@ class Motion:
             LostError: the controller does not answer.
         """
         if sys.platform == "win32":
-            raise RefusedError("the robot can be moved from Linux only", device="robot")
+            raise refused("the robot can be moved from Linux only")
         check_plan(self.plan)
         given = self._confirmation
         if not self.dry_run:
             if given is None:
-                raise RefusedError("motion needs the operator's confirmation", device="robot")
+                raise refused("motion needs the operator's confirmation")
             if given.used.is_set():
-                raise RefusedError(
-                    "this confirmation was used for an earlier connection; confirm the plan again",
-                    device="robot",
+                raise refused(
+                    "this confirmation was used for an earlier connection; confirm the plan again"
                 )
             given.used.set()
         if self._stop is not None:
             self._ended = self._stop
-            raise RefusedError(f"motion was stopped ({self._stop.args[0]})", device="robot")
+            raise refused(f"motion was stopped ({self._stop.args[0]})")
         setup = Setup(
             self.host, self.plan, given, self.clock, self.dry_run, self._caller_s
         ).message()
@@ -143,7 +142,7 @@ class Motion:
                 answer = {}
         except BaseException:
             if self._process is not None:
-                self._kill(RefusedError("motion was interrupted at its start", device="robot"))
+                self._kill(refused("motion was interrupted at its start"))
             raise
         if answer.get("what") != "ready":
             error = error_of(answer) or LostError(
@@ -310,7 +309,7 @@ class Motion:
             self._send({"request": "close"})
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(timeout=8.0)
-        self._kill(RefusedError("motion was closed", device="robot"))
+        self._kill(refused("motion was closed"))
 
     def check(self) -> None:
         """Raise the error if motion has ended, also where nothing was asked to move meanwhile.
@@ -319,12 +318,11 @@ class Motion:
             DeviceError: why it has ended.
         """
         if self._process is None:
-            raise RefusedError("motion was not started", device="robot")
+            raise refused("motion was not started")
         over = self._ended or self._stop
         if over is not None:
-            raise RefusedError(
-                f"motion has ended ({over.args[0]}); confirm the plan again and start anew",
-                device="robot",
+            raise refused(
+                f"motion has ended ({over.args[0]}); confirm the plan again and start anew"
             )
         while not self._answers.empty():
             answer = self._answers.get()

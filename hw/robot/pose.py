@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from hw.rigid import rigid, rotation_vector
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 MM_PER_M = 1000.0
 

@@ -20,8 +20,9 @@ import struct
 import time
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from hw.errors import LostError, RefusedError
+from hw.errors import LostError, refused
 
 PORT = 30004
 
@@ -288,25 +289,25 @@ class PacketReader:
                 f"a packet of {len(payload)} bytes came instead of {1 + self._struct.size}",
                 device="robot",
             )
-        v = self._struct.unpack_from(payload, 1)
-        if not all(map(math.isfinite, v)):
+        values = self._struct.unpack_from(payload, 1)
+        if not all(map(math.isfinite, values)):
             raise LostError("a packet holds NaN or Inf", device="robot")
-        told = dict(zip(self._optional, (v[a:b] for a, b in self._optional_slots), strict=True))
+        told: dict[str, Any] = {name: values[place] for name, place in self._places.items()}
         pendant = PendantSettings(
-            told["payload"][0] if "payload" in told else None, told.get("payload_cog"), v[23]
+            told.get("payload"), told.get("payload_cog"), told["target_speed_fraction"]
         )
         if pendant != self._pendant:
             self._pendant = pendant
         return Packet(
             now,
-            v[0],
-            v[1:7],
-            v[7:13],
-            v[13:19],
-            v[19],
-            v[20],
-            v[21],
-            v[22],
+            told["timestamp"],
+            told["actual_TCP_pose"],
+            told["actual_TCP_speed"],
+            told["actual_TCP_force"],
+            told["robot_mode"],
+            told["runtime_state"],
+            told["robot_status_bits"],
+            told["safety_status_bits"],
             told.get("tcp_offset"),
             self._pendant,
             told.get("actual_q"),
@@ -331,7 +332,7 @@ class PacketReader:
 
     def _negotiate(self, frequency_hz: float | None, deadline: float) -> None:
         if self._ask(b"V", struct.pack(">H", 2), deadline)[:1] != b"\x01":
-            raise RefusedError("the controller does not speak RTDE version 2", device="robot")
+            raise refused("the controller does not speak RTDE version 2")
         answer = self._ask(b"v", b"", deadline)
         if len(answer) != 16:
             raise LostError("the controller did not tell its version", device="robot")
@@ -349,16 +350,13 @@ class PacketReader:
             types = self._recipe(names, deadline)
         wrong = [n for n, kind in zip(names, types, strict=False) if FIELDS[n][0] != kind]
         if wrong or len(types) != len(names):
-            raise RefusedError(
-                f"the controller has no {', '.join(wrong) or 'such recipe'}", device="robot"
-            )
+            raise refused(f"the controller has no {', '.join(wrong) or 'such recipe'}")
         self._struct = struct.Struct(">" + "".join(FIELDS[name][1] for name in names))
-        self._optional = [name for name in names if name in _OPTIONAL]
-        self._optional_slots = []
-        start = 24
-        for name in self._optional:
+        self._places: dict[str, int | slice] = {}
+        start = 0
+        for name in names:
             end = start + int(FIELDS[name][1][:-1] or 1)
-            self._optional_slots.append((start, end))
+            self._places[name] = start if end == start + 1 else slice(start, end)
             start = end
         self.bound, self.latency_s = self._begin(deadline)
         """``bound``: a moment of ``time.monotonic()`` and a time of the controller (s): the packet
@@ -390,7 +388,7 @@ class PacketReader:
                 self._ask(b"P", b"", deadline)
             asked = time.monotonic()
             if self._ask(b"S", b"", deadline)[:1] != b"\x01":
-                raise RefusedError("the controller would not start sending", device="robot")
+                raise refused("the controller would not start sending")
             packet = self._first(deadline)
             if packet is None:
                 # The controller accepts but sends nothing: whoever reads will notice.

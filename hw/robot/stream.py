@@ -18,21 +18,21 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from hw.clock import REAL, Clock
-from hw.errors import LostError, RefusedError, StaleError
+from hw.errors import LostError, StaleError, refused
 from hw.rigid import rotation_vector
 from hw.robot._process import spawn
 from hw.robot._reader import BOUND, ERROR, POSE, RECORD
 from hw.robot.identity import Identity, read_identity
 from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import PendantSettings, too_late
-from hw.shapes import Float
+from jaxcal.runtime.array_types import Float
 
 _OFFSET_TOLERANCE = 1e-6
 _MOST_DRIFT = 200e-6
@@ -265,7 +265,7 @@ class PoseStream:
         if error:
             raise LostError(error, device="robot")
         if self._changed:
-            raise RefusedError(self._changed, device="robot")
+            raise refused(self._changed)
 
     def _receive(self) -> None:
         assert self._process is not None
@@ -365,23 +365,10 @@ def average(samples: Sequence[PoseSample]) -> SteadyPose:
     position = poses[:, :3, 3].mean(axis=0)
     u, _, vt = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    last = samples[-1]
-    raw = (*(position / 1000.0), *rotation_vector(rotation))
-    mean = PoseSample(
-        last.t_host,
-        last.t_device,
-        tuple(float(v) for v in raw),
-        last.safety_bits,
-        last.robot_mode,
-        last.runtime_state,
-        last.lag_s,
-    )
+    raw = tuple(float(v) for v in (*(position / 1000.0), *rotation_vector(rotation)))
+    mean = replace(samples[-1], raw=raw, joints=None)
     distances = np.sum((poses[:, :3, 3] - position) ** 2, axis=1)
-    return SteadyPose(
-        sample=mean,
-        count=len(samples),
-        scatter_mm=float(np.sqrt(distances.mean())),
-    )
+    return SteadyPose(mean, len(samples), float(np.sqrt(distances.mean())))
 
 
 def _numbers(values: Sequence[float]) -> str:

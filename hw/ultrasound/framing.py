@@ -14,9 +14,7 @@ from dataclasses import dataclass
 
 from fastcrc import crc64
 
-from jaxcal.io.message_content import (
-    ContentError,
-)
+from jaxcal.io.message_content import ContentError
 from jaxcal.io.openigtlink import (
     BEGINNING,
     HEADER_SIZE,
@@ -33,7 +31,7 @@ _BEGIN = re.compile(rb"\x00[\x01\x02][A-Z0-9_]")
 _CHECKS_PER_BYTE = 4
 
 
-@dataclass(frozen=True)
+@dataclass
 class FramingCounts:
     """What a decoder has seen.
 
@@ -68,20 +66,8 @@ class MessageDecoder:
         self._hunting = False
         self._damaged = False
         self._budget = 0
-        self.messages = self.crc_errors = self.broken_headers = self.unsupported = 0
-        self.resynchronised = 0
+        self.counts = FramingCounts()
         self.reason = ""
-
-    @property
-    def counts(self) -> FramingCounts:
-        """What was seen so far."""
-        return FramingCounts(
-            self.messages,
-            self.crc_errors,
-            self.broken_headers,
-            self.unsupported,
-            self.resynchronised,
-        )
 
     @property
     def held(self) -> int:
@@ -126,7 +112,7 @@ class MessageDecoder:
                 self._accept(self._header, body, found)
                 self._drop(end)
                 return True
-            self.crc_errors += 1
+            self.counts.crc_errors += 1
             self._wrong_crc = self._damaged = True
         # The bytes that follow show whether the size can be trusted.
         if len(self._buffer) < end + HEADER_SIZE:
@@ -155,21 +141,21 @@ class MessageDecoder:
 
     def _accept(self, header: Header, body: bytes, found: list[Message]) -> None:
         if self._damaged:
-            self.resynchronised += 1
+            self.counts.resynchronised += 1
             self._damaged = False
         try:
             found.append(decode_body(header, body, self._began))
         except ContentError as error:
-            self.unsupported += 1
+            self.counts.unsupported += 1
             self.reason = f"{header.device}: {error}"
             return
-        self.messages += 1
+        self.counts.messages += 1
 
     def _hunt(self) -> bool:
         """Drop bytes up to the next place where a header may begin."""
         if not self._hunting:
             self._hunting = self._damaged = True
-            self.broken_headers += 1
+            self.counts.broken_headers += 1
         # If fewer bytes than a header are left, they may be the beginning of one.
         last = len(self._buffer) - HEADER_SIZE
         place = 1

@@ -8,21 +8,20 @@ new image (the machine is frozen): it is counted and not handed on.
 from __future__ import annotations
 
 import math
-import re
 import socket
 import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hw.clock import REAL, Clock
 from hw.errors import Device, DeviceError, LostError, StaleError
-from hw.shapes import Float
 from hw.ultrasound.framing import MessageDecoder
 from jaxcal.io.message_content import Picture, Pixels, StatusMessage, Tracked, TrackedFrame
 from jaxcal.io.openigtlink import RF_DEVICE, Message
 from jaxcal.io.readable import one_line
+from jaxcal.runtime.array_types import Float
 
 DEVICE: Device = "ultrasound"
 PORT = 18944
@@ -34,7 +33,6 @@ _CHUNK = 1 << 18
 # As jaxcal.data.geometry takes it; that module would bring JAX into a process that only receives.
 _ROTATION_TOLERANCE = 1e-2
 _QUEUE_BYTES = 256 << 20
-_FRAMES = re.compile(r"(?P<source>.+)To(?P<target>[A-Z].*)")
 
 
 @dataclass(frozen=True)
@@ -82,14 +80,8 @@ class Transform:
     matrix: Float[np.ndarray, "4 4"]
     valid: bool
 
-    @property
-    def frames(self) -> tuple[str, str]:
-        """(From, To) by the naming convention of PLUS; (name, "") where it is not followed."""
-        match = _FRAMES.fullmatch(self.name)
-        return (match["source"], match["target"]) if match else (self.name, "")
 
-
-@dataclass(frozen=True)
+@dataclass
 class UltrasoundStatistics:
     """Counts since the connection was made.
 
@@ -150,9 +142,7 @@ class UltrasoundStream:
         self._bytes = 0
         self._transforms: deque[Transform] = deque(maxlen=4096)
         self._status: StatusMessage | None = None
-        self._counts = dict.fromkeys(
-            ("received", "lost", "dropped", "repeated", "other", "transforms"), 0
-        )
+        self._counts = UltrasoundStatistics()
         self._last: dict[str, tuple[int, float]] = {}
         self._other_devices: set[str] = set()
         self._failure: LostError | None = None
@@ -253,13 +243,13 @@ class UltrasoundStream:
         """Counts since the connection was made."""
         with self._changed:
             counts = self._decoder.counts
-            return UltrasoundStatistics(
+            return replace(
+                self._counts,
                 crc_errors=counts.crc_errors,
                 resynchronised=counts.resynchronised,
                 unsupported=counts.unsupported,
                 reason=self._decoder.reason,
                 other_devices=tuple(sorted(self._other_devices)),
-                **self._counts,
             )
 
     def _receive(self) -> None:
@@ -305,7 +295,7 @@ class UltrasoundStream:
             case StatusMessage():
                 self._status = message.content
             case content:
-                self._counts["other"] += 1
+                self._counts.other += 1
                 # A peer may invent devices without end.
                 if isinstance(content, Picture | TrackedFrame) and len(self._other_devices) < 64:
                     self._other_devices.add(message.device)
@@ -314,16 +304,16 @@ class UltrasoundStream:
         counts = self._counts
         number, stamp = self._last.get(message.device, (0, math.nan))
         if message.t_device == stamp:
-            counts["repeated"] += 1
+            counts.repeated += 1
             return
         if message.message_id and 0 < number < message.message_id:
-            counts["lost"] += message.message_id - number - 1
+            counts.lost += message.message_id - number - 1
         self._remember(message)
-        counts["received"] += 1
+        counts.received += 1
         image = Image(
             t_host=message.t_host,
             t_device=message.t_device,
-            frame_id=message.message_id or counts["received"],
+            frame_id=message.message_id or counts.received,
             array=picture.array,
             spacing_mm=picture.spacing_mm,
             device=message.device,
@@ -334,7 +324,7 @@ class UltrasoundStream:
             self._bytes > _QUEUE_BYTES and len(self._images) > 1
         ):
             self._bytes -= self._images.popleft().array.nbytes
-            counts["dropped"] += 1
+            counts.dropped += 1
 
     def _remember(self, message: Message) -> None:
         """Keep number and time stamp of a device's last image, for at most 64 devices.
@@ -348,8 +338,8 @@ class UltrasoundStream:
 
     def _take_transform(self, message: Message, tracked: Tracked) -> None:
         if len(self._transforms) == self._transforms.maxlen:
-            self._counts["dropped"] += 1
-        self._counts["transforms"] += 1
+            self._counts.dropped += 1
+        self._counts.transforms += 1
         self._transforms.append(
             Transform(
                 message.t_host,

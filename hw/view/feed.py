@@ -16,13 +16,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
 from hw.errors import DeviceError
 from hw.extras import missing
 from hw.midplane.bracket import Placement
+from hw.pipes import encode
 from hw.robot.motion_plan import MotionPlan
 from hw.session import Session
 from hw.setup import Setup
@@ -37,59 +38,28 @@ _END_WALL_S = 2.0
 _LINES = 5
 
 
-@runtime_checkable
-class Audience(Protocol):
-    """Receives the progress of an acquisition; see :class:`LiveView`."""
+class Audience:
+    """Is told of the progress of an acquisition, and ignores it; see :class:`LiveView`."""
 
     def plan(
         self, setup: Setup, plan: MotionPlan, targets: Float[np.ndarray, "n 4 4"], done: list[int]
     ) -> None:
         """What shall be acquired: all poses, and the rows that a resumed recording has."""
-        ...
 
     def watch(self, session: Session | None) -> None:
         """Show the poses and frames of this session; None: show them no longer."""
-        ...
 
     def going(self, row: int) -> None:
         """The robot travels to a pose of the plan."""
-        ...
 
     def stop(self, offset_mm: float, amplitude: float, threshold: int) -> None:
         """The search listened somewhere."""
-        ...
 
     def taken(self, row: int, placement: Placement, answer: Calibration | None) -> None:
         """An image was taken, and this is the estimate now."""
-        ...
 
     def given_up(self, row: int) -> None:
         """No mid-plane was found there, or the operator skipped it."""
-        ...
-
-
-class Nobody:
-    """An audience that ignores everything."""
-
-    def plan(
-        self, setup: Setup, plan: MotionPlan, targets: Float[np.ndarray, "n 4 4"], done: list[int]
-    ) -> None:
-        """Nothing."""
-
-    def watch(self, session: Session | None) -> None:
-        """Nothing."""
-
-    def going(self, row: int) -> None:
-        """Nothing."""
-
-    def stop(self, offset_mm: float, amplitude: float, threshold: int) -> None:
-        """Nothing."""
-
-    def taken(self, row: int, placement: Placement, answer: Calibration | None) -> None:
-        """Nothing."""
-
-    def given_up(self, row: int) -> None:
-        """Nothing."""
 
 
 @contextmanager
@@ -102,7 +72,7 @@ def watched(view: Audience, session: Session) -> Iterator[None]:
         view.watch(None)
 
 
-class LiveView:
+class LiveView(Audience):
     """The live view of one acquisition; a context manager.
 
     Args:
@@ -271,7 +241,7 @@ class LiveView:
             session = self._session
             told = {**self._slow} if self._changed else {}
             self._changed = False
-        frame = b""
+        frame: dict[str, np.ndarray] = {}
         if session is not None:
             try:
                 sample = session.poses.latest()
@@ -289,9 +259,8 @@ class LiveView:
                     pairs = small.shape[1] // 2 * 2
                     small = np.maximum(small[:, :pairs:2], small[:, 1:pairs:2])
                     spacing[0] *= 2
-                frame = small.tobytes()
-                told["frame"] = [*small.shape, *spacing]
-        return encoded(told, frame)
+                frame, told["spacing"] = {"frame": small}, spacing
+        return b"".join(encode(told, frame))
 
     def _greeting(self) -> str:
         """Wait for the viewer; returns the address that it prints once its page can be opened."""
@@ -332,9 +301,3 @@ def halved(frame: np.ndarray) -> np.ndarray:
     rows, columns = (size // 2 * 2 for size in frame.shape)
     even = np.maximum(frame[:rows:2, :columns], frame[1:rows:2, :columns])
     return np.maximum(even[:, ::2], even[:, 1::2])
-
-
-def encoded(told: dict[str, Any], frame: bytes = b"") -> bytes:
-    """A message: sizes of both parts (4 bytes each), JSON, pixels."""
-    text = json.dumps(told).encode()
-    return len(text).to_bytes(4, "big") + len(frame).to_bytes(4, "big") + text + frame

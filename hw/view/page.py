@@ -23,7 +23,7 @@ from hw.robot.kinematics import (
     model_named,
     nearest,
 )
-from hw.shapes import Float, UInt8
+from jaxcal.runtime.array_types import Float, UInt8
 
 UNIT_MM = 100.0
 _CHI_95 = 7.8147
@@ -126,7 +126,7 @@ class Page:
 
     def show(self, told: dict[str, Any], frame: UInt8[np.ndarray, "r c"] | None) -> None:
         """Take a message of the feed, and redraw what it changes."""
-        pose, spacing = told.pop("pose", None), told.pop("frame", None)
+        pose, spacing = told.pop("pose", None), told.pop("spacing", None)
         joints = told.pop("joints", None)
         trouble = told.pop("trouble", None)
         changed = bool(told) or trouble != self._told.get("trouble")
@@ -141,7 +141,7 @@ class Page:
             if told.keys() & {"plan", "estimate"}:
                 self._draw_target()
             if frame is not None and spacing is not None:
-                self._frame, self._spacing = frame, (spacing[2], spacing[3])
+                self._frame, self._spacing = frame, tuple(spacing)
             moved = "estimate" in told
             if pose is not None:
                 self._pose = np.vstack([np.reshape(pose, (3, 4)), [0, 0, 0, 1]])

@@ -14,20 +14,16 @@ import http.client
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing, redirect_stdout
-from io import RawIOBase
 from typing import Any
 from urllib.parse import urlsplit
 
-import numpy as np
-
-from hw.pipes import exactly
+from hw.pipes import read_message
 
 HOST = "127.0.0.1"
 _OWN_NAMES = (HOST, "localhost")
 """As a browser names this machine, also at the end of an ssh tunnel."""
-_LARGEST = 1 << 26
 
 
 def main(port: int) -> int:
@@ -63,8 +59,9 @@ def main(port: int) -> int:
         answer(url=f"http://{HOST}:{server.get_port()}")
         answers.close()
         with os.fdopen(os.dup(0), "rb", buffering=0) as source:
-            for told, frame in messages(source):
-                page.show(told, frame)
+            while (message := read_message(source)) is not None:
+                told, arrays = message
+                page.show(told, arrays.get("frame"))
         server.stop()
     return 0
 
@@ -134,24 +131,6 @@ def ignore_browsers(server: Any) -> None:
         return None
 
     listener._handle_incoming_message = dropped  # pyright: ignore[reportOptionalMemberAccess]
-
-
-def messages(source: RawIOBase) -> Iterator[tuple[dict[str, Any], np.ndarray | None]]:
-    """The feed's messages until the pipe ends; a message that is cut off there is dropped."""
-    while True:
-        start = exactly(source, 8)
-        sizes = int.from_bytes(start[:4], "big"), int.from_bytes(start[4:], "big")
-        if len(start) < 8 or max(sizes) > _LARGEST:
-            return
-        text, pixels = exactly(source, sizes[0]), exactly(source, sizes[1])
-        if len(text) < sizes[0] or len(pixels) < sizes[1]:
-            return
-        told = json.loads(text)
-        frame = None
-        if pixels:
-            rows, columns = told["frame"][:2]
-            frame = np.frombuffer(pixels, np.uint8).reshape(rows, columns)
-        yield told, frame
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from hw.emulated import BenchOracle, setup_of, start
 from hw.errors import RefusedError
 from hw.keys import Pause
 from hw.midplane.search import Settings
-from hw.outcome import share_inside
+from hw.outcome import lines_of, share_inside
 from hw.poses import Extent
 from hw.request import AcquisitionRequest, request_in
 from hw.resuming import check_same_robot
@@ -534,6 +534,18 @@ def test_a_resumed_run_needs_the_same_robot():
 def test_a_request_in_a_file_is_not_trusted(asked):
     with pytest.raises(InputError):
         request_in({"request": asked})
+
+
+def test_the_rate_is_that_of_this_run(tmp_path):
+    """Not that of all images of a resumed recording in the seconds of its last run."""
+    path = tmp_path / "rec.h5"
+    with h5py.File(path, "w") as file:
+        for name in ("low", "high", "true_elevation"):
+            file[f"placement/{name}"] = np.full(60, np.nan)
+    outcome = Outcome(60, taken=10, given_up=(), sha256="", seconds=100.0)
+    assert lines_of(str(path), outcome, 1.0) == [
+        f"60 images in {path}, 6.0 a minute of the bench's time (100 s)"
+    ]
 
 
 def viewers(parent: int) -> list[int]:

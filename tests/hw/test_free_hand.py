@@ -6,8 +6,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import h5py
@@ -31,33 +30,37 @@ from jaxcal import FormatError, InputError
 SERVER = Path(__file__).with_name("plus_server.py")
 
 
-@contextmanager
-def plus_server(**asked) -> Iterator[int]:
-    """Its port."""
-    process = subprocess.Popen(
-        [sys.executable, str(SERVER), json.dumps(asked)],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-    )  # fmt: skip
-    try:
-        assert process.stdout is not None
-        yield json.loads(process.stdout.readline())["port"]
-    finally:
+PlusServer = Callable[..., int]
+"""Starts a server of what is asked for; its port."""
+
+
+@pytest.fixture(scope="module")
+def plus_server() -> Iterator[PlusServer]:
+    with subprocess.Popen(
+        [sys.executable, str(SERVER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+
+        def start(**asked) -> int:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            process.stdin.write(json.dumps(asked) + "\n")
+            process.stdin.flush()
+            return int(process.stdout.readline())
+
+        yield start
         process.kill()
-        process.communicate()
 
 
 @pytest.fixture(scope="module")
-def separate() -> Iterator[int]:
+def separate(plus_server: PlusServer) -> int:
     """Port of a server of separate messages, which begins anew for every client."""
-    with plus_server(mode="separate") as port:
-        yield port
+    return plus_server(mode="separate")
 
 
 @pytest.fixture(scope="module")
-def tracked() -> Iterator[int]:
+def tracked(plus_server: PlusServer) -> int:
     """The same of tracked frames."""
-    with plus_server(mode="tracked") as port:
-        yield port
+    return plus_server(mode="tracked")
 
 
 class Scripted:
@@ -104,11 +107,11 @@ def check(path: Path, order: list[int], seed: int = 1, count: int = 9) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_from_the_command_line_to_a_calibration(tmp_path, capsys):
+def test_a_run_from_the_command_line_to_a_calibration(tmp_path, capsys, plus_server):
     path = tmp_path / "rec.h5"
-    with plus_server(mode="tracked", poses=14) as port:
-        arguments = [f"127.0.0.1:{port}", str(path), "--images", "12"]
-        assert main(["free-hand", *arguments]) == 0
+    port = plus_server(mode="tracked", poses=14)
+    arguments = [f"127.0.0.1:{port}", str(path), "--images", "12"]
+    assert main(["free-hand", *arguments]) == 0
     told = capsys.readouterr()
     assert "poses from Probe to Reference" in told.err
     assert "image 12/12" in told.err
@@ -137,13 +140,13 @@ def test_images_and_transforms_apart(tmp_path, separate):
     np.testing.assert_array_equal(images.spacing_mm, SPACING_MM)
 
 
-def test_what_is_not_taken_is_said(tmp_path):
+def test_what_is_not_taken_is_said(tmp_path, plus_server):
     """Out of view, nothing credible, and a pose that was there before; u takes an image back."""
     person = Scripted(image_3="u")
     order = [0, 1, 2, 1, 3, 4, 5, 6]
-    with plus_server(mode="separate", order=order, lost=[3], hidden=[4]) as port:
-        asked = FreeHand("127.0.0.1", port, images=5)
-        assert acquire_free_hand(tmp_path / "r.h5", asked, person) == 5
+    port = plus_server(mode="separate", order=order, lost=[3], hidden=[4])
+    asked = FreeHand("127.0.0.1", port, images=5)
+    assert acquire_free_hand(tmp_path / "r.h5", asked, person) == 5
     assert "not tracked: ProbeToTracker is not tracked" in person.words
     assert any(words.startswith("no credible target: nothing stands out") for words in person.words)
     assert any(words.startswith("as in image #") for words in person.words)
@@ -156,13 +159,13 @@ def test_what_is_not_taken_is_said(tmp_path):
     assert not images.mask[2]
 
 
-def test_a_lost_stream_is_gone_on_with(tmp_path):
+def test_a_lost_stream_is_gone_on_with(tmp_path, plus_server):
     path, person = tmp_path / "r.h5", Scripted()
     asked = {"mode": "tracked", "poses": 9}
-    with plus_server(**asked, dies_after=110) as port:
-        wanted = FreeHand("127.0.0.1", port, images=7)
-        with pytest.raises(FreeHandStopped, match="has closed the connection") as stopped:
-            acquire_free_hand(path, wanted, person)
+    port = plus_server(**asked, dies_after=110)
+    wanted = FreeHand("127.0.0.1", port, images=7)
+    with pytest.raises(FreeHandStopped, match="has closed the connection") as stopped:
+        acquire_free_hand(path, wanted, person)
     assert stopped.value.exit_code == 4
     assert re.search(r"[1-6] of 7 images are in .*r\.h5; go on with: jaxcal-hw free-hand",
                      str(stopped.value))  # fmt: skip
@@ -170,13 +173,13 @@ def test_a_lost_stream_is_gone_on_with(tmp_path):
         jaxcal.load(path)
     with h5py.File(path) as file:
         before = len(file["calibration/pose"])
-    with plus_server(**asked, first=before) as port:
-        again = FreeHand("127.0.0.1", port)
-        interrupting = Scripted(image_6="ctrl-c")
-        with pytest.raises(FreeHandStopped, match="interrupted; 6 of 7") as stopped:
-            acquire_free_hand(path, again, interrupting, resume=True)
-        assert stopped.value.exit_code == 130
-        assert acquire_free_hand(path, again, Scripted(), resume=True) == 7
+    port = plus_server(**asked, first=before)
+    again = FreeHand("127.0.0.1", port)
+    interrupting = Scripted(image_6="ctrl-c")
+    with pytest.raises(FreeHandStopped, match="interrupted; 6 of 7") as stopped:
+        acquire_free_hand(path, again, interrupting, resume=True)
+    assert stopped.value.exit_code == 130
+    assert acquire_free_hand(path, again, Scripted(), resume=True) == 7
     poses, _ = holds(9, 1)
     images = jaxcal.load(path).calibration
     away = np.linalg.norm(images.poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
@@ -191,12 +194,12 @@ def test_too_few_images_stay_resumable(tmp_path, tracked):
         acquire_free_hand(tmp_path / "r.h5", asked, Scripted(image_1="q"))
 
 
-def test_poses_in_metres_are_noticed_at_the_second_image(tmp_path, tracked):
+def test_poses_in_metres_are_noticed_at_the_second_image(tmp_path, tracked, plus_server):
     path = tmp_path / "r.h5"
-    with plus_server(mode="tracked", metres=True) as port:
-        asked = FreeHand("127.0.0.1", port, images=4)
-        with pytest.raises(FreeHandStopped, match="look like metres; give them in mm; 0 of 4 im"):
-            acquire_free_hand(path, asked, Scripted())
+    port = plus_server(mode="tracked", metres=True)
+    asked = FreeHand("127.0.0.1", port, images=4)
+    with pytest.raises(FreeHandStopped, match="look like metres; give them in mm; 0 of 4 im"):
+        acquire_free_hand(path, asked, Scripted())
     with h5py.File(path) as file:
         assert not file.attrs["complete"]
         assert file["calibration/mask"][()].tolist() == [False]
@@ -207,12 +210,12 @@ def test_poses_in_metres_are_noticed_at_the_second_image(tmp_path, tracked):
         FreeHand("127.0.0.1", spacing_mm=(0.0002, 0.0002))
 
 
-def test_an_image_that_was_not_written_is_not_counted(tmp_path):
+def test_an_image_that_was_not_written_is_not_counted(tmp_path, plus_server):
     path = tmp_path / "my rec.h5"
-    with plus_server(mode="tracked", cut_after=70) as port:
-        asked = FreeHand("127.0.0.1", port, images=7)
-        with pytest.raises(FreeHandStopped) as stopped:
-            acquire_free_hand(path, asked, Scripted())
+    port = plus_server(mode="tracked", cut_after=70)
+    asked = FreeHand("127.0.0.1", port, images=7)
+    with pytest.raises(FreeHandStopped) as stopped:
+        acquire_free_hand(path, asked, Scripted())
     with h5py.File(path) as file:
         count = len(file["calibration/mask"])
         assert file["us/frames"].shape == (count, ROWS, COLUMNS)
@@ -224,39 +227,39 @@ def test_an_image_that_was_not_written_is_not_counted(tmp_path):
     )
 
 
-def test_an_image_with_pixels_of_another_size_ends_the_run(tmp_path):
+def test_an_image_with_pixels_of_another_size_ends_the_run(tmp_path, plus_server):
     """The machine's depth was changed: the frames have as many pixels as before."""
     path = tmp_path / "r.h5"
-    with plus_server(mode="separate", deeper_after=70) as port:
-        asked = FreeHand("127.0.0.1", port, images=7)
-        with pytest.raises(FreeHandStopped, match="of 2 x 2 mm does not") as told:
-            acquire_free_hand(path, asked, Scripted())
+    port = plus_server(mode="separate", deeper_after=70)
+    asked = FreeHand("127.0.0.1", port, images=7)
+    with pytest.raises(FreeHandStopped, match="of 2 x 2 mm does not") as told:
+        acquire_free_hand(path, asked, Scripted())
     with h5py.File(path) as file:
         count = len(file["calibration/mask"])
     assert count in (2, 3)
     assert f"; {count} of 7 images are in " in str(told.value)
-    with plus_server(mode="separate", deeper_after=0) as port:
-        asked = FreeHand("127.0.0.1", port)
-        with pytest.raises(FreeHandStopped, match=f"1 x 1 mm: set .*; {count} of 7 images"):
-            acquire_free_hand(path, asked, Scripted(), resume=True)
-    with plus_server(mode="separate", first=count) as port:
-        asked = FreeHand("127.0.0.1", port)
-        assert acquire_free_hand(path, asked, Scripted(), resume=True) == 7
+    port = plus_server(mode="separate", deeper_after=0)
+    asked = FreeHand("127.0.0.1", port)
+    with pytest.raises(FreeHandStopped, match=f"1 x 1 mm: set .*; {count} of 7 images"):
+        acquire_free_hand(path, asked, Scripted(), resume=True)
+    port = plus_server(mode="separate", first=count)
+    asked = FreeHand("127.0.0.1", port)
+    assert acquire_free_hand(path, asked, Scripted(), resume=True) == 7
 
 
-def test_images_are_of_one_device(tmp_path):
-    with plus_server(mode="separate", second="Overview") as port:
-        asked = FreeHand("127.0.0.1", port, images=4)
-        message = r"name the device of the images \(--device\); .*'Image_Reference', 'Overview'"
-        with pytest.raises(DeviceError, match=message):
-            acquire_free_hand(tmp_path / "r.h5", asked, Scripted())
-        assert not list(tmp_path.iterdir())
-        named = FreeHand("127.0.0.1", port, images=4, device="Image_Reference")
-        assert acquire_free_hand(tmp_path / "r.h5", named, Scripted()) == 4
+def test_images_are_of_one_device(tmp_path, plus_server):
+    port = plus_server(mode="separate", second="Overview")
+    asked = FreeHand("127.0.0.1", port, images=4)
+    message = r"name the device of the images \(--device\); .*'Image_Reference', 'Overview'"
+    with pytest.raises(DeviceError, match=message):
+        acquire_free_hand(tmp_path / "r.h5", asked, Scripted())
+    assert not list(tmp_path.iterdir())
+    named = FreeHand("127.0.0.1", port, images=4, device="Image_Reference")
+    assert acquire_free_hand(tmp_path / "r.h5", named, Scripted()) == 4
     check(tmp_path / "r.h5", [0, 1, 2, 3])
 
 
-def test_a_servers_clock_that_is_set_back_is_no_end(tmp_path):
+def test_a_servers_clock_that_is_set_back_is_no_end(tmp_path, plus_server):
     """For an hour no image was taken after one that was judged and not taken."""
 
     class Impatient(Scripted):
@@ -265,9 +268,9 @@ def test_a_servers_clock_that_is_set_back_is_no_end(tmp_path):
             assert len(seen) < 400, words
 
     seen: list[str] = []
-    with plus_server(mode="tracked", hidden=[3], back_after=86, rate_hz=40.0) as port:
-        asked = FreeHand("127.0.0.1", port, images=4)
-        assert acquire_free_hand(tmp_path / "r.h5", asked, Impatient()) == 4
+    port = plus_server(mode="tracked", hidden=[3], back_after=86, rate_hz=40.0)
+    asked = FreeHand("127.0.0.1", port, images=4)
+    assert acquire_free_hand(tmp_path / "r.h5", asked, Impatient()) == 4
     check(tmp_path / "r.h5", [0, 1, 2, 4])
 
 

@@ -262,8 +262,9 @@ def test_a_mirror_of_the_arm_follows_the_one_in_the_robot_s_process():
         robot.protective_stop()
         until(lambda: arm.rest_since(clock.now()) is not None)
         assert arm.raw(clock.now()) == pytest.approx(robot.state()["raw"])
-        assert robot.packets > 0
-        assert robot.skipped == 0
+        state = robot.state()
+        assert state["packets"] > 0
+        assert state["skipped"] == 0
         with pytest.raises(RuntimeError, match="unknown request"):
             robot.ask("explode")
         control.disconnect()

@@ -25,7 +25,7 @@ _SPEC.loader.exec_module(study)
 
 
 def trials(series: str) -> list:
-    """Around the request in each way, and, in those that test_motion.py lacks, in motion."""
+    """Around the request in each way, and, in those that test_motion_stops.py lacks, in motion."""
     rng = np.random.default_rng(3)
     edges = np.linspace(study.EARLIEST_S, study.LATEST_S, 3)
     tried = []

@@ -14,8 +14,7 @@ import numpy as np
 
 from hw.bench.look import Look
 from hw.bench.phantoms.phantom import Mark, Sensor
-from hw.bench.tank import ELEMENT_MM, Tank
-from hw.shapes import Float
+from hw.bench.tank import ELEMENT_MM, Pose, Tank
 
 
 @dataclass(frozen=True)
@@ -30,15 +29,9 @@ class ActiveEcho(Sensor):
 
     name = "active-echo"
     answers = True
-    target = "echo"
 
     def marks(
-        self,
-        world: Tank,
-        pose: Float[np.ndarray, "4 4"],
-        look: Look,
-        rng: np.random.Generator,
-        threshold: int = 0,
+        self, world: Tank, pose: Pose, look: Look, rng: np.random.Generator, threshold: int = 0
     ) -> list[Mark]:
         """The answer and, in a share of the frames, its reflection; nothing below the threshold."""
         loud = self.loudness(world, pose)

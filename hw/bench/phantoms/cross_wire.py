@@ -18,8 +18,8 @@ import numpy as np
 
 from hw.bench.look import Look
 from hw.bench.phantoms.phantom import Mark, Phantom, two_way
-from hw.bench.tank import Tank
-from hw.shapes import Float
+from hw.bench.tank import Pose, Tank
+from jaxcal.runtime.array_types import Float
 
 WIRE_MM = 0.2
 """Diameter of the fishing lines (section 3.2)."""
@@ -50,21 +50,14 @@ class CrossWire(Phantom):
     directions: tuple[tuple[float, float, float], tuple[float, float, float]] = DIRECTIONS
 
     name = "cross-wire"
-    heard = False
     answers = False
-    target = "cross"
 
-    def loudness(self, world: Tank, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
+    def loudness(self, world: Tank, pose: Pose) -> Float[np.ndarray, " e"]:
         """Silence: there is no sensor."""
         return np.zeros(world.probe.elements)
 
     def marks(
-        self,
-        world: Tank,
-        pose: Float[np.ndarray, "4 4"],
-        look: Look,
-        rng: np.random.Generator,
-        threshold: int = 0,
+        self, world: Tank, pose: Pose, look: Look, rng: np.random.Generator, threshold: int = 0
     ) -> list[Mark]:
         """The pieces of both wires within the thickness of the beam."""
         x = world.image_to_probe

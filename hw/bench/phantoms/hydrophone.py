@@ -13,8 +13,7 @@ import numpy as np
 
 from hw.bench.look import Look
 from hw.bench.phantoms.phantom import Mark, Sensor, two_way
-from hw.bench.tank import Tank
-from hw.shapes import Float
+from hw.bench.tank import Pose, Tank
 
 APERTURE_MM = 0.01
 """Receiving aperture (section 3.2)."""
@@ -38,19 +37,13 @@ class Hydrophone(Sensor):
 
     name = "hydrophone"
     answers = False
-    target = "echo"
 
     def noise_counts(self, world: Tank) -> float:
         """The amplitude in the mid-plane times least pressure over the pressure there, counts."""
         return world.beam.peak * LEAST_PRESSURE_MPA / PRESSURE_MPA
 
     def marks(
-        self,
-        world: Tank,
-        pose: Float[np.ndarray, "4 4"],
-        look: Look,
-        rng: np.random.Generator,
-        threshold: int = 0,
+        self, world: Tank, pose: Pose, look: Look, rng: np.random.Generator, threshold: int = 0
     ) -> list[Mark]:
         """A faint spot where the beam crosses the tip."""
         lateral, elevation, axial = world.target(pose)

@@ -22,8 +22,8 @@ from typing import ClassVar
 import numpy as np
 
 from hw.bench.look import Look
-from hw.bench.tank import ELEMENT_MM, Tank
-from hw.shapes import Float
+from hw.bench.tank import ELEMENT_MM, Pose, Tank
+from jaxcal.runtime.array_types import Float
 
 _RANGE_OF_PEAK_MM = 20.0
 """Range at which the beam's peak amplitude is stated, mm."""
@@ -59,15 +59,11 @@ class Phantom(ABC):
 
     Attributes:
         name: on the command line.
-        heard: whether it is wired to the electronics.
         answers: whether it transmits into the image, so that a pattern can be injected.
-        target: what the segmentation of frames looks for, ``echo`` or ``cross``.
     """
 
     name: ClassVar[str]
-    heard: ClassVar[bool]
     answers: ClassVar[bool]
-    target: ClassVar[str]
 
     @property
     def response_scale(self) -> float:
@@ -79,17 +75,12 @@ class Phantom(ABC):
         return world.noise.amplitude_counts
 
     @abstractmethod
-    def loudness(self, world: Tank, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
+    def loudness(self, world: Tank, pose: Pose) -> Float[np.ndarray, " e"]:
         """Amplitude of every line at its sensor, without noise or saturation, counts."""
 
     @abstractmethod
     def marks(
-        self,
-        world: Tank,
-        pose: Float[np.ndarray, "4 4"],
-        look: Look,
-        rng: np.random.Generator,
-        threshold: int = 0,
+        self, world: Tank, pose: Pose, look: Look, rng: np.random.Generator, threshold: int = 0
     ) -> list[Mark]:
         """What one frame shows of it.
 
@@ -112,8 +103,6 @@ class Sensor(Phantom):
 
     size_mm: float = ELEMENT_MM
 
-    heard = True
-
     @property
     def response_scale(self) -> float:
         """In proportion to its size (assumption): a point hears the most in the mid-plane."""
@@ -123,7 +112,7 @@ class Sensor(Phantom):
         """Elevational SD of the amplitude that it reports, mm."""
         return np.hypot(world.beam.field_mm(range_mm), self.size_mm / np.sqrt(12.0))
 
-    def loudness(self, world: Tank, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " e"]:
+    def loudness(self, world: Tank, pose: Pose) -> Float[np.ndarray, " e"]:
         """Amplitude of every line at it, counts; 0 behind the probe."""
         lateral, elevation, axial = world.target(pose)
         elements = world.elements

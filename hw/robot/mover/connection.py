@@ -6,7 +6,7 @@ import math
 import signal
 import threading
 
-from hw.errors import LostError, RefusedError
+from hw.errors import LostError, refused
 from hw.extras import require
 from hw.robot._process import ASKS, RECEIVES, be_prompt
 from hw.robot.gate import Gate
@@ -117,7 +117,7 @@ class Connection:
                 problem = "a program runs on the robot, or is paused: stop it at the pendant"
             self._inputs.read(self._clock.wall(0.01))
         if problem:
-            raise RefusedError(problem, device="robot")
+            raise refused(problem)
 
     def _watch_control(self) -> None:
         """In a thread of its own: no packet tells whether the robot is in remote control."""

@@ -25,7 +25,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hw.errors import DeviceError, RefusedError, StaleError, StoppedError
+from hw.errors import DeviceError, RefusedError, StaleError, StoppedError, refused
 from hw.rigid import turn_deg
 from hw.robot.gate import Command, Gate
 from hw.robot.limits import numbers
@@ -154,7 +154,7 @@ class ControlLoop:
         raw = list(self._allow(pose, speed_mm_s).raw)
         if not controller.command("isPoseWithinSafetyLimits", raw):
             text = "the controller says that the pose is outside its safety limits"
-            raise RefusedError(text, device="robot")
+            raise refused(text)
         self._heed()
         controller.watch_motion()
         # The questions took time: check again for a stop, and check the move from the newest pose.

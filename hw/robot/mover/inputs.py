@@ -13,7 +13,7 @@ import select
 from collections import deque
 
 from hw.clock import Clock
-from hw.errors import LostError, RefusedError, StaleError, StoppedError
+from hw.errors import LostError, StaleError, StoppedError, refused
 from hw.robot.mover.messages import Caller
 from hw.robot.mover.stop_latch import Ended, Stop, StopLatch
 from hw.robot.rtde import Packet, PacketReader, PendantSettings
@@ -139,7 +139,7 @@ class Inputs:
             self.tcp_offset = packet.tcp_offset
 
     def _refuse(self, text: str) -> None:
-        self.latch.set(Stop(RefusedError(text, device="robot"), True))
+        self.latch.set(Stop(refused(text), True))
 
     def _take_request(self, request: dict) -> None:
         match request["request"]:

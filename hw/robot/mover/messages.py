@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 from hw.clock import Clock
 from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
@@ -81,8 +81,7 @@ class Setup:
             RefusedError: it holds no plan.
         """
         plan, given = message["plan"], message["confirmation"]
-        pendant = plan["pendant"]
-        cog = pendant["payload_cog_m"]
+        cog = plan["pendant"]["payload_cog_m"]
         return cls(
             message["host"],
             MotionPlan.from_poses(
@@ -91,9 +90,7 @@ class Setup:
                 plan["tcp_offset"],
                 plan["serial"],
                 PendantSettings(
-                    pendant["payload_kg"],
-                    None if cog is None else tuple(cog),
-                    pendant["speed_fraction"],
+                    **{**plan["pendant"], "payload_cog_m": None if cog is None else tuple(cog)}
                 ),
             ),
             None if given is None else Confirmation(**given),
@@ -103,23 +100,14 @@ class Setup:
         )
 
 
-def plain(sample: PoseSample) -> list:
+def plain(sample: PoseSample) -> dict:
     """A pose as it is sent; the joints are not."""
-    return [
-        sample.t_host,
-        sample.t_device,
-        sample.raw,
-        sample.safety_bits,
-        sample.robot_mode,
-        sample.runtime_state,
-        sample.lag_s,
-    ]
+    return asdict(replace(sample, joints=None))
 
 
-def sample_of(values: list) -> PoseSample:
+def sample_of(values: dict) -> PoseSample:
     """The pose that was sent as :func:`plain`."""
-    t_host, t_device, raw, *rest = values
-    return PoseSample(t_host, t_device, tuple(raw), *rest)
+    return PoseSample(**{**values, "raw": tuple(values["raw"])})
 
 
 def told(error: DeviceError) -> dict[str, str]:

@@ -1,0 +1,241 @@
+"""Stops that the caller asks for, or that follow from its end, by the real ur_rtde."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from motions import (
+    HOME,
+    LIMITS,
+    OFFSET,
+    PLAN,
+    SERIAL,
+    STOP_WITHIN_S,
+    beside,
+    moving,
+    sent,
+)
+from robots import CB_SERIES, START, EmulatedRobot
+
+from hw.errors import RefusedError, StaleError, StoppedError
+from hw.interrupts import as_interrupts
+from hw.robot.confirmation import confirm_unattended
+from hw.robot.identity import read_identity
+from hw.robot.motion import Motion
+from hw.robot.motion_plan import MotionPlan
+from jaxcal.runtime.isolated import import_path
+
+pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
+
+pytestmark = pytest.mark.real_time
+
+
+def test_a_hesitation_at_full_speed_leaves_the_watchdog_at_rest():
+    """From 250 mm/s the arm brakes for longer than the controller's watchdog waits."""
+    limits = replace(LIMITS, max_speed_mm_s=250.0, max_acceleration_mm_s2=2000.0)
+    plan = MotionPlan(np.array([HOME, beside(50.0, 0.0, 0.0)]), limits, OFFSET, SERIAL)
+    with EmulatedRobot(version=CB_SERIES) as robot, moving(robot, plan=plan) as motion:
+
+        def guard() -> StaleError | None:
+            fast = robot.state()["velocity"][0] > 0.24
+            return StaleError("no frame", device="active echo") if fast else None
+
+        motion.guard = guard
+        with pytest.raises(StaleError, match="no frame"):
+            motion.move_to(plan.targets[1])
+        assert not motion.ended
+        assert robot.state()["velocity"] == [0.0] * 6
+        motion.guard = None
+        np.testing.assert_allclose(motion.move_to(HOME).pose, HOME, atol=1e-6)
+
+
+def test_a_guard_that_fails_stops_the_robot():
+    def guard() -> str | None:
+        if robot.state()["velocity"][0] > 0.04:
+            raise ZeroDivisionError
+        return None
+
+    with (
+        EmulatedRobot(version=CB_SERIES) as robot,
+        moving(robot, guard=guard, caller_s=2.0) as motion,
+    ):
+        with pytest.raises(ZeroDivisionError):
+            motion.move_to(PLAN.targets[2])
+        state = robot.state()
+        assert state["rest_since"] is not None
+        assert state["raw"][0] < START[0] + 0.049
+        motion.guard = None
+        with pytest.raises(RefusedError, match="confirm the plan again"):
+            motion.move_to(HOME)
+
+
+_CALLER = """
+import json, os, sys, time
+import numpy as np
+from hw.clock import Clock
+from hw.robot.identity import read_identity
+from hw.robot.limits import Limits
+from hw.robot.motion import Motion
+from hw.robot.confirmation import confirm_unattended
+from hw.robot.motion_plan import MotionPlan
+host, origin, targets, limits, offset, serial = json.loads(sys.argv[1])
+clock = Clock(1.0, origin)
+plan = MotionPlan.from_poses(targets, Limits.from_mapping(limits), offset, serial)
+given = confirm_unattended(plan, plan.digest, clock=clock)
+with Motion(host, plan, given, clock=clock, dry_run=False) as motion:
+    caller = os.getpid()
+    if sys.argv[2] == "with a child" and os.fork() == 0:
+        while os.getppid() == caller:
+            time.sleep(0.02)
+        time.sleep(5.0)
+        os._exit(0)
+    print("ready", flush=True)
+    motion.move_to(plan.targets[2])
+"""
+
+
+@pytest.mark.parametrize("caller_is", ["alone", "with a child"])
+def test_killing_the_caller_stops_the_robot(caller_is):
+    """Also where a child of the caller holds its end of the pipe, which then stays open."""
+    with EmulatedRobot() as robot:
+        values = [
+            robot.host, robot.clock.origin_s, PLAN.targets.tolist(), asdict(LIMITS), OFFSET,
+            read_identity(robot.host).name,
+        ]  # fmt: skip
+        caller = subprocess.Popen(
+            [sys.executable, "-c", _CALLER, json.dumps(values), caller_is],
+            stdout=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(import_path())},
+        )  # fmt: skip
+        with caller:
+            assert caller.stdout is not None
+            assert caller.stdout.readline() == b"ready\n"
+            while math.hypot(*robot.state()["velocity"]) < 0.04:
+                assert caller.poll() is None
+                time.sleep(0.002)
+            before = robot.state()["t"]
+            children = Path(f"/proc/{caller.pid}/task/{caller.pid}/children").read_text().split()
+            caller.kill()
+        deadline = time.monotonic() + 5.0
+        while (state := robot.state())["rest_since"] is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert state["rest_since"] - before <= STOP_WITHIN_S
+        assert state["raw"][0] < START[0] + 0.049
+        # Nobody is left to end the process that moves the robot: it ends by itself.
+        assert len(children) >= 1
+        while any(map(is_mover, children)) and time.monotonic() < deadline - 1.0:
+            time.sleep(0.05)
+        assert not any(map(is_mover, children))
+
+
+def is_mover(process: str) -> bool:
+    try:
+        return b"hw.robot.mover" in Path(f"/proc/{process}/cmdline").read_bytes()
+    except OSError:
+        return False
+
+
+def test_a_stop_before_the_start_or_at_rest_is_kept():
+    with EmulatedRobot(version=CB_SERIES) as robot:
+        given = confirm_unattended(PLAN, PLAN.digest, clock=robot.clock)
+        motion = Motion(robot.host, PLAN, given, clock=robot.clock, dry_run=False)
+        motion.stop("not today")
+        with pytest.raises(RefusedError, match="was stopped"):
+            motion.start()
+        with moving(robot) as motion:
+            motion.stop("the operator pressed stop")
+            assert motion.ended
+            with pytest.raises(RefusedError, match=r"the operator pressed stop.*confirm the plan"):
+                motion.move_to(HOME)
+        assert sent(robot, 3) == []
+
+
+def test_a_stop_while_it_connects_is_heard():
+    """At once after the setup, so that both may be read together."""
+    with EmulatedRobot(version=CB_SERIES) as robot, ThreadPoolExecutor(1) as pool:
+        plan = replace(PLAN, serial=read_identity(robot.host).name)
+        given = confirm_unattended(plan, plan.digest, clock=robot.clock)
+        motion = Motion(robot.host, plan, given, clock=robot.clock, dry_run=False)
+        with closing(motion):
+            started = pool.submit(motion.start)
+            while motion._process is None:
+                time.sleep(0.001)
+            motion.stop("the operator")
+            started.result()
+            assert motion._process.wait(timeout=5.0) == 1
+            with pytest.raises(RefusedError, match="the operator"):
+                motion.check()
+        assert sent(robot, 3) == []
+
+
+def test_a_danger_told_after_a_hesitation_ends_motion():
+    """The robot still brakes for the hesitation when the guard tells of the danger."""
+    told: list[str | StaleError] = []
+
+    def guard() -> str | StaleError | None:
+        if robot.state()["velocity"][0] < 0.04 and not told:
+            return None
+        told.append("danger" if told else StaleError("no frame", device="active echo"))
+        return told[-1]
+
+    with (
+        EmulatedRobot(version=CB_SERIES) as robot,
+        moving(robot, guard=guard, caller_s=2.0) as motion,
+    ):
+        with pytest.raises(StoppedError, match="danger"):
+            motion.move_to(PLAN.targets[2])
+        assert motion.ended
+
+
+def test_an_interrupt_that_was_dropped_stops_the_robot():
+    """As it would be in a callback of the garbage collector that runs meanwhile."""
+    times: list[float] = []
+
+    def guard() -> None:
+        if not times and robot.state()["velocity"][0] > 0.04:
+            times.append(robot.state()["t"])
+            with suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGTERM)
+
+    with (
+        EmulatedRobot(version=CB_SERIES) as robot,
+        as_interrupts(),
+        moving(robot, guard=guard, caller_s=2.0) as motion,
+    ):
+        with pytest.raises(KeyboardInterrupt):
+            motion.move_to(PLAN.targets[2])
+        assert motion.ended
+        assert robot.state()["rest_since"] - times[0] <= STOP_WITHIN_S
+
+
+def test_a_log_that_fails_stops_the_robot():
+    times: list[float] = []
+
+    def log(t: float, command: str, numbers: dict[str, object]) -> None:
+        if command == "moveL":
+            times.append(t)
+            raise OSError("no space left on device")
+
+    with EmulatedRobot(version=CB_SERIES) as robot:
+        plan = replace(PLAN, serial=read_identity(robot.host).name)
+        given = confirm_unattended(plan, plan.digest, clock=robot.clock)
+        named = {"clock": robot.clock, "dry_run": False, "caller_s": 2.0}
+        with Motion(robot.host, plan, given, log=log, **named) as motion:
+            with pytest.raises(StoppedError, match="the log failed: OSError: no space left"):
+                motion.move_to(PLAN.targets[2])
+            assert motion.ended
+        state = robot.state()
+    assert state["rest_since"] - times[0] <= STOP_WITHIN_S
+    assert state["reason"] == "the client stopped the script"
