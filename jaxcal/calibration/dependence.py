@@ -36,6 +36,8 @@ from jaxcal import InputError
 from jaxcal.data.poses import nearest_rotations, targets_in_images
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.runtime.array_types import Bool, Float, Int
+from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
+from jaxcal.solvers.closed_form.reduced_objective import knows_spacing
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
@@ -404,12 +406,7 @@ def conventional_errors(
     Returns:
         The errors of the conventional fit in closed form; None where there is no such fit.
     """
-    from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
-
-    known = getattr(data, "spacing_known", True)
-    if getattr(data, "kind", "point") == "pixel":
-        known = getattr(data, "spacing_mm", None) is not None
-    free = ("scale",) if "scale" in estimate or not known else ()
+    free = ("scale",) if "scale" in estimate or not knows_spacing(data) else ()
     try:
         found = calibrate_closed_form(data, estimate=free)
     except InputError:
