@@ -36,13 +36,12 @@ from jaxcal import InputError
 from jaxcal.data.poses import nearest_rotations, targets_in_images
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.runtime.array_types import Bool, Float, Int
-from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 from jaxcal.solvers.closed_form.reduced_objective import knows_spacing
+from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
     from jaxcal.data.recording import Images
-    from jaxcal.solvers.closed_form.single import ClosedForm
 
 SAME_POSE_MM = 1.0
 """Two poses are the same if no point within the lever moves farther than this between them."""
@@ -408,7 +407,7 @@ def conventional_errors(
     """
     free = ("scale",) if "scale" in estimate or not knows_spacing(data) else ()
     try:
-        found = calibrate_closed_form(data, estimate=free)
+        found = solve_problem(data, free)
     except InputError:
         return None
     return _errors(found, data)

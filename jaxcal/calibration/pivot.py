@@ -31,7 +31,7 @@ from jaxcal.result.calibration import Status
 from jaxcal.runtime import buckets, compiler, executables
 from jaxcal.runtime.arrays import is_traced, real_array
 from jaxcal.runtime.given_values import check_flag
-from jaxcal.runtime.precision import in_own_modes, require_float64
+from jaxcal.runtime.precision import in_own_modes, inside_transformation, require_float64
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import (
     FEWEST_IMAGES,
@@ -203,8 +203,7 @@ def calibrate_pivot(
         array = jnp.concatenate([array, last], axis=-2)
     weight = jnp.ones(array.shape[:-2]) if mask is None else jnp.asarray(mask)
     weight = jnp.broadcast_to(weight.astype(array.dtype), array.shape[:-2])
-    alone = compiler.is_whole_program(array, weight)
-    platform = jax.default_backend() if alone else None
+    platform = None if inside_transformation(array, weight) else jax.default_backend()
     if platform == "cpu" and array.ndim == 3:
         found = _solve_kept(np.asarray(array), np.asarray(weight), robust)
         return jax.device_put(found, next(iter(array.devices())) if array.committed else None)

@@ -4,9 +4,9 @@ Two aims contradict each other. Plain batches hold millions of problems, and the
 should run as fast as the hardware allows: :func:`fast_to_run`. For one problem, a person waits for
 the compiler and not for the answer: :func:`quick_to_compile`.
 
-Flags belong to a whole program, so none are given inside somebody else's jit, vmap or grad:
-:func:`is_whole_program`. Flags come and go with versions of XLA, so each is only a wish: it is
-tried once, and left out if the compiler does not know it (:func:`known`).
+Flags belong to a whole program, so none are given inside somebody else's jit, vmap or grad. Flags
+come and go with versions of XLA, so each is only a wish: it is tried once, and left out if the
+compiler does not know it (:func:`known`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-
-from jaxcal.runtime.precision import inside_transformation
 
 if TYPE_CHECKING:
     from jax.typing import ArrayLike
@@ -167,8 +165,3 @@ def traced_once(function: Callable[..., T], *arguments: Any) -> tuple[Callable[.
         return jax.tree.unflatten(jax.tree.structure(shapes), found)
 
     return again, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-
-
-def is_whole_program(*arguments: object) -> bool:
-    """Whether all arrays have values, so that a call with them compiles a whole program."""
-    return not inside_transformation(*arguments)
