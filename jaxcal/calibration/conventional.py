@@ -21,11 +21,12 @@ from jaxcal.data.sound import WATER_M_S
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, threshold
 from jaxcal.model.unknowns import EXTRA, block_slice, size
-from jaxcal.result.calibration import Calibration, Convergence, Linearisation, Medium, Status
+from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.trees import map_arrays
 from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
+from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.plan import SolvePlan
 
 STATIONARY = 1e-6

@@ -38,22 +38,20 @@ class Alternation(eqx.Module):
 
     Attributes:
         place: X and c.
-        offset: y_i, mm.
         cost: sum of squared distances, mm^2.
         cosine: gradient cosine of the bounded joint problem there.
         iterations: rounds.
-        tolerance_met: it stopped because X had stopped moving, not at the round limit.
+        settled: it stopped because X had stopped moving, not at the round limit.
         rotation_change: X's rotation in the last round, rad.
         translation_change: X's translation in the last round, mm.
         trace: cost after each of the first rounds, NaN beyond the last; None: not kept.
     """
 
     place: Iterate
-    offset: Float[Array, "lanes n"]
     cost: Float[Array, " lanes"]
     cosine: Float[Array, " lanes"]
     iterations: Int[Array, " lanes"]
-    tolerance_met: Bool[Array, " lanes"]
+    settled: Bool[Array, " lanes"]
     rotation_change: Float[Array, " lanes"]
     translation_change: Float[Array, " lanes"]
     trace: Float[Array, "trace lanes"] | None
@@ -134,12 +132,10 @@ def alternate(
     rounding = Rounding.of(start, observation, images)
     return Alternation(
         place=state.place,
-        offset=local_unknowns(state.place, observation, images),
         cost=normal.cost,
         cosine=gradient_cosine(normal, rounding.vanished),
         iterations=state.rounds,
-        tolerance_met=(state.rotation_change < tolerance_rad)
-        & (state.translation_change < tolerance_mm),
+        settled=(state.rotation_change < tolerance_rad) & (state.translation_change < tolerance_mm),
         rotation_change=state.rotation_change,
         translation_change=state.translation_change,
         trace=state.trace,

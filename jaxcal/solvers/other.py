@@ -44,6 +44,31 @@ class Fit(eqx.Module):
     updated: Float[Array, "k lanes"]
     trace: Float[Array, "trace lanes"] | None
 
+    @classmethod
+    def of(
+        cls,
+        found: optx.Solution,
+        place: Iterate,
+        start: Iterate,
+        observation: Observation,
+        images: ImagePlanes,
+        medium: MediumPrior | None,
+        trace: int,
+    ) -> Fit:
+        """From a solver's result for one problem, the place that it stands for, and the start."""
+        normal = accumulate(place, observation, images, None, medium)
+        rounding = Rounding.of(start, observation, images)
+        nothing = jnp.full((trace, images.lanes), jnp.nan, images.mask.dtype)
+        return cls(
+            place,
+            normal.cost,
+            gradient_cosine(normal, rounding.vanished),
+            (found.result == optx.RESULTS.successful)[None],
+            jnp.asarray(found.stats["num_steps"], jnp.int32)[None],
+            observation.sigma,
+            nothing if trace else None,
+        )
+
 
 def whitened_residuals(
     place: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
@@ -94,20 +119,7 @@ def minimise_with(
         residual, solver, still, max_steps=options.max_iterations, throw=False
     )
     place = start.moved(found.value[:, None])
-    normal = accumulate(place, observation, images, None, medium)
-    rounding = Rounding.of(start, observation, images)
-    trace = None
-    if options.trace:
-        trace = jnp.full((options.trace, images.lanes), jnp.nan, images.mask.dtype)
-    return Fit(
-        place,
-        normal.cost,
-        gradient_cosine(normal, rounding.vanished),
-        (found.result == optx.RESULTS.successful)[None],
-        jnp.asarray(found.stats["num_steps"], jnp.int32)[None],
-        observation.sigma,
-        trace,
-    )
+    return Fit.of(found, place, start, observation, images, medium, options.trace)
 
 
 def self_tuned_with(

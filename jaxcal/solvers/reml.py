@@ -85,7 +85,7 @@ def with_floor(sigma: Float[Array, " components ..."]) -> Float[Array, " compone
     return jnp.maximum(sigma, least_sigma(sigma))
 
 
-def floored(sigma: Float[Array, " components ..."]) -> Bool[Array, " components ..."]:
+def on_floor(sigma: Float[Array, " components ..."]) -> Bool[Array, " components ..."]:
     """Which SDs rest on their floor."""
     return sigma <= 1.001 * least_sigma(sigma)
 
