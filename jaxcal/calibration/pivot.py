@@ -23,7 +23,7 @@ from jaxcal.calibration.answer import covariance_and_observability
 from jaxcal.data.poses import check_poses
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LEAST_REACH_MM, MINIMUM_IMAGES, MetresError
-from jaxcal.diagnostics.outliers import images_that_stand_out, listed_departures
+from jaxcal.diagnostics.outliers import listed_departures, outliers
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
@@ -144,7 +144,7 @@ class Pivot(eqx.Module):
                     f"the tip is known to {variances[-1] ** 0.5:.1f} mm (SD) along ({direction}) "
                     "of the tool's frame: turn the tool farther, about further axes"
                 )
-        named = images_that_stand_out(self)
+        named = outliers(self)
         if named:
             told = listed_departures(self, AXES)
             verb = "left out" if self.robust else "kept"

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.uncertainty import TUNED, Whitened
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.trees import map_arrays
@@ -89,17 +89,14 @@ def _like(before: Any, values: np.ndarray) -> Any:
 def _in_sds(result: Calibration) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3 p"]]:
     """Errors of the used images and their derivatives by the unknowns, in SDs."""
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
-    problem = answer.problem
-    assert problem is not None
-    unknowns = Unknowns.of(answer)
-    seen = ImageErrors.of(unknowns, problem, answer.blocks)
+    seen = ImageErrors.of_answer(answer)
     if answer.prior in TUNED:
-        whitened = Whitened.of(answer, seen.shifted(answer, unknowns, problem), problem)
+        whitened = Whitened.of(answer, seen.shifted(answer))
         errors, rows = whitened.errors, whitened.rows
     else:
         in_plane = np.zeros_like(seen.mask)
         errors, axial = seen.from_circle(in_plane)
-        rows = seen.circle_rows(in_plane, axial, answer.blocks)
+        rows = seen.circle_rows(in_plane, axial)
         sd = np.sqrt(answer.linearisation.variance)[:, None, None]
         order = [0, 2, 1]
         errors, rows = (errors / sd)[..., order], (rows / sd[..., None])[:, :, order]

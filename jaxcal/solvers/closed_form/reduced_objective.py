@@ -171,8 +171,8 @@ def image_data(
     return data, CONSTRAINTS[estimate]
 
 
-def knows_spacing(source: Problem | Images) -> bool:
-    """Whether the size of the pixels is known; of points in mm it is."""
+def knows_spacing(source: Any) -> bool:
+    """Whether the size of the pixels of a problem or of images is known; of points in mm it is."""
     if hasattr(source, "kind"):
         return source.kind != "pixel" or source.spacing_mm is not None
     return source.spacing_known
