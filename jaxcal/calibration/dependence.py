@@ -36,6 +36,7 @@ from jaxcal import InputError
 from jaxcal.data.poses import nearest_rotations, targets_in_images
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.runtime.array_types import Bool, Float, Int
+from jaxcal.runtime.arrays import like
 from jaxcal.solvers.closed_form.reduced_objective import knows_spacing
 from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 
@@ -305,17 +306,13 @@ def _joined(data: Any, found: Independent) -> Any:
 
 def _changed(data: Any, values: dict[str, Any]) -> Any:
     """The data with other arrays; each is a numpy or JAX array like the one that it replaces."""
-    after = {}
-    for name, value in values.items():
-        before = getattr(data, name)
-        if isinstance(value, np.ndarray) and not isinstance(before, np.ndarray):
-            import jax.numpy as jnp
-
-            value = jnp.asarray(value, before.dtype)
-        elif isinstance(value, np.ndarray):
-            value = value.astype(before.dtype)
-        after[name] = value
-    return replace(data, **after)
+    return replace(
+        data,
+        **{
+            name: like(getattr(data, name), value) if isinstance(value, np.ndarray) else value
+            for name, value in values.items()
+        },
+    )
 
 
 def _middle(values: np.ndarray, name: str) -> Any:

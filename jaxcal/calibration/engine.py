@@ -59,15 +59,17 @@ def solve_problem(problem: Problem, given: Given, plan: SolvePlan) -> Calibratio
 
 def _solve_compiled(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """One problem by a program of JAX's own, which serves every method and prior."""
-    from jaxcal.calibration import programs
+    from jaxcal.calibration.pipeline import agreed_images
+    from jaxcal.calibration.programs import solve_one
 
     platform = None
     if not inside_transformation(problem, given):
         platform = _devices(problem)[0].platform
     agreed = None
     if plan.robust:
-        agreed = programs.agreement(platform)(problem.points_only(), plan.blocks)
-    return programs.one_problem(platform)(problem, given, agreed, None, plan)
+        search = compiler.compiled(agreed_images, 1, platform)
+        agreed = search(problem.points_only(), plan.blocks)
+    return compiler.compiled(solve_one, 4, platform)(problem, given, agreed, None, plan)
 
 
 def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:

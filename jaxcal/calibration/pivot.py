@@ -10,7 +10,7 @@ The errors of the three axes share one SD, so this is plain least squares on the
 
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -207,13 +207,7 @@ def calibrate_pivot(
     if platform == "cpu" and array.ndim == 3:
         found = _solve_kept(np.asarray(array), np.asarray(weight), robust)
         return jax.device_put(found, next(iter(array.devices())) if array.committed else None)
-    return _program(platform)(array, weight, robust)
-
-
-@cache
-def _program(platform: str | None):
-    flags = None if platform is None else compiler.quick_to_compile(platform)
-    return jax.jit(_solve_all, static_argnums=2, compiler_options=flags)
+    return compiler.compiled(_solve_all, 2, platform)(array, weight, robust)
 
 
 def _solve_kept(

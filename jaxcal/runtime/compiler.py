@@ -101,6 +101,21 @@ def quick_to_compile(platform: str) -> Flags | None:
     return known(platform, {"xla_cpu_use_fusion_emitters": False}) if platform == "cpu" else None
 
 
+@cache
+def compiled(function: Callable[..., T], static: int, platform: str | None) -> Callable[..., T]:
+    """A function compiled by JAX when it is first called.
+
+    Args:
+        function: a pure function of a module.
+        static: the number of its argument that is static.
+        platform: where it is a program of its own, which a person waits for; None inside another.
+    """
+    import jax
+
+    flags = None if platform is None else quick_to_compile(platform)
+    return jax.jit(function, static_argnums=static, compiler_options=flags)
+
+
 ONE_PROBLEM: Flags = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_backend_optimization_level": 0,

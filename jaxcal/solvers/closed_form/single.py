@@ -29,7 +29,6 @@ Software 2, 1993 (the equality); Briales and Gonzalez-Jimenez, CVPR 2017.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +36,7 @@ import numpy as np
 
 from jaxcal.data.poses import rotations_from_quaternions
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.trees import array_tree
 from jaxcal.solvers.closed_form.certificate import Certificate, certify_point, tolerance
 from jaxcal.solvers.closed_form.reduced_objective import (
     ImageData,
@@ -69,7 +69,7 @@ RESTING = 1e-12
 """A descent is finished when its step is below this, in radians and in shares of the scale."""
 
 
-@dataclass(frozen=True)
+@array_tree
 class ClosedForm:
     """The conventional calibration of one problem, or of a batch (arrays with its leading axes).
 
