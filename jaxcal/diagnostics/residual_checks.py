@@ -248,7 +248,7 @@ def gains(answer: Calibration, seen: ImageErrors, uncertainty: Uncertainty) -> F
     )
     q = np.stack([places[..., 0], np.zeros_like(places[..., 0]), places[..., 1]], axis=-1)
 
-    step = uncertainty.weakest / uncertainty.scale
+    step = uncertainty.spectra.weakest / uncertainty.scale
     errors = np.einsum("kmip,kp->kmi", motion(q, turned, blocks), step)
     errors = errors[..., [0, 2, 1]]
     # The positions in mm are linear functions of the measurements, so the measurements at these

@@ -65,15 +65,16 @@ def _piece(answer: Calibration, eps: float) -> dict[str, Array]:
     seen = ImageErrors.of_answer(answer)
     shifted = seen.shifted(answer)
     uncertainty = assess(answer, shifted, eps)
+    spectra = uncertainty.spectra
     inspection = inspect(answer, seen, shifted, uncertainty, eps)
     residual, _ = seen.from_circle(np.zeros_like(seen.mask))
     return {
         "elevation_sd": uncertainty.elevation_sd,
         "at_bound": uncertainty.at_bound,
         "residual": np.where(answer.mask[..., None] > 0, residual, 0.0),
-        "condition": uncertainty.condition,
-        "weakest": uncertainty.weakest,
-        "weakest_sd": uncertainty.weakest_sd,
+        "condition": spectra.condition,
+        "weakest": spectra.weakest,
+        "weakest_sd": spectra.weakest_sd,
         "prior_direction": uncertainty.prior_direction,
         **{field.name: getattr(inspection, field.name) for field in fields(Inspection)},
     }

@@ -54,9 +54,7 @@ class Uncertainty:
     Attributes:
         elevation_sd: mm; NaN where an offset rests on its bound or an image is left out.
         at_bound: 1 where an offset rests on its bound.
-        condition: largest over smallest eigenvalue of the scaled information.
-        weakest: unit eigenvector of the smallest eigenvalue, in scaled units.
-        weakest_sd: SD along ``weakest``, mm; NaN where there is no finite SD.
+        spectra: of the information and the design in scaled units.
         prior_direction: unit vector that the measurements alone leave open; zeros if there is none.
         inverse: of the information.
         scale: factors that turn every unknown's tangent into mm at the target.
@@ -64,9 +62,7 @@ class Uncertainty:
 
     elevation_sd: Float[Array, "k n"]
     at_bound: Float[Array, "k n"]
-    condition: Float[Array, " k"]
-    weakest: Float[Array, "k p"]
-    weakest_sd: Float[Array, " k"]
+    spectra: Spectra
     prior_direction: Float[Array, "k p"]
     inverse: Float[Array, "k p p"]
     scale: Float[Array, "k p"]
@@ -100,9 +96,7 @@ def assess(answer: Calibration, seen: ImageErrors, eps: float) -> Uncertainty:
     return Uncertainty(
         elevation_sd=elevation_sd,
         at_bound=at_bound,
-        condition=found.condition,
-        weakest=found.weakest,
-        weakest_sd=found.weakest_sd,
+        spectra=found,
         prior_direction=_known_from_prior(answer, seen, scale, eps),
         inverse=inverse,
         scale=scale,

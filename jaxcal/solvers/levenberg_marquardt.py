@@ -343,32 +343,6 @@ def iterate_once(
     )
 
 
-def descend(
-    begun: Descent,
-    equations: Equations,
-    rounding: Rounding,
-    tolerance: float,
-    max_steps: int,
-    *,
-    undamped: bool = False,
-    less_exact: float = LESS_EXACT,
-) -> Descent:
-    """Steps until no lane is active."""
-
-    def one(state: Descent) -> Descent:
-        return iterate_once(
-            state,
-            equations,
-            rounding,
-            tolerance,
-            max_steps,
-            undamped=undamped,
-            less_exact=less_exact,
-        )
-
-    return jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun)
-
-
 def minimise(
     start: Iterate,
     observation: Observation,
@@ -408,15 +382,19 @@ def minimise(
     # The curvature jumps where offsets reach or leave their bounds, so a good exact step says
     # little about the next one.
     less_exact = LESS if isinstance(observation, LocalUnknown) else LESS_EXACT
-    return descend(
-        begun,
-        equations,
-        rounding,
-        tolerance,
-        max_steps,
-        undamped=undamped,
-        less_exact=less_exact,
-    )
+
+    def one(state: Descent) -> Descent:
+        return iterate_once(
+            state,
+            equations,
+            rounding,
+            tolerance,
+            max_steps,
+            undamped=undamped,
+            less_exact=less_exact,
+        )
+
+    return jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun)
 
 
 def default_tolerance(dtype: jnp.dtype) -> float:

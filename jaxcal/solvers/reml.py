@@ -442,14 +442,10 @@ def self_tuned(
     )
     begun = SelfTuned.before(barrier(start), held, trace)
 
-    def going_on(state: SelfTuned) -> Array:
-        return jnp.any(state.active)
-
-    def iterate_once(state: SelfTuned) -> SelfTuned:
-        # Not the bound method itself: JAX hashes what it loops over, and arrays have no hash.
-        return tuning.iterate_once(state)
-
-    return jax.lax.while_loop(going_on, iterate_once, begun)
+    # Not the bound method itself: JAX hashes what it loops over, and arrays have no hash.
+    return jax.lax.while_loop(
+        lambda state: jnp.any(state.active), lambda state: tuning.iterate_once(state), begun
+    )
 
 
 def update_at(
