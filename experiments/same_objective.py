@@ -198,7 +198,7 @@ def main() -> None:
 
     def segment(problems: Problem, starts: Parameters, bound: Array, rounds: Array) -> Segment:
         done = advance(problems, starts, bound, TOLERANCE, TOLERANCE, rounds)
-        return Segment(done.place.parameters(), done.cost, done.tolerance_met)
+        return Segment(done.place.parameters(), done.cost, done.settled)
 
     lanes = jnp.zeros(count, jnp.int32)
     go_on = chunked(segment, problems, starts, per_image, lanes)

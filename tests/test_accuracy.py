@@ -200,7 +200,7 @@ def test_whitened_errors_are_those_of_the_solve(tracker_sd):
     recording = experiment(3, images=24) if tracker_sd is not None else recording
     result = jaxcal.calibrate(recording, "joint", "gaussian", **given)
     alone = jax.tree.map(influences._first, result.numpy())
-    whitened = influences._whitened(alone, alone.problem)
+    whitened = influences._whitened(alone)
     information = np.einsum("mkp,mkq->pq", whitened.rows, whitened.rows)
     size = np.sqrt(np.diagonal(information))
     stated = np.asarray(result.information)

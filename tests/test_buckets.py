@@ -143,7 +143,7 @@ def test_masked_images_beyond_the_bucket_change_nothing(name, problems):
 
 def test_the_answer_is_that_of_the_unpadded_problem(problems):
     nine = select(problems[0], slice(0, 9))
-    plan, given = prepare(nine, Request(method="conventional"))
+    nine, plan, given = prepare(nine, Request(method="conventional"))
     solved = jax.jit(programs.solve_one, static_argnums=4)(nine, given, None, None, plan)
     exact = solved.with_problem(nine)
     found = jaxcal.calibrate(nine, "conventional")

@@ -103,7 +103,7 @@ def test_sound_speed_is_the_engines():
 
 
 def closed_form(one: jaxcal.Problem, **asked):
-    plan, _ = prepare(one, Request(method=METHOD, **asked))
+    one, plan, _ = prepare(one, Request(method=METHOD, **asked))
     return closed_form_answer(one, plan)
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal.data.problem import Channels, Problem
-from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns, channel_rows
+from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.residual_checks import medians
 from jaxcal.diagnostics.uncertainty import inverses, nearest_unknown
 
@@ -89,14 +89,14 @@ def test_rows_of_offsets_that_are_held(scene):
     residual, axial = seen.from_circle(y[None])
     np.testing.assert_allclose(residual[0], model.circle(data, unknowns, y), atol=1e-12)
     expected = by_complex_steps(lambda u: model.circle(data, u, y), unknowns, (7, 3))
-    np.testing.assert_allclose(seen.circle_rows(y[None], axial, ALL)[0], expected, atol=1e-11)
+    np.testing.assert_allclose(seen.circle_rows(y[None], axial)[0], expected, atol=1e-11)
 
 
 def test_rows_of_every_element(scene):
     data, unknowns, there, mine = scene
     seen = ImageErrors.of(mine, there, ALL)
     expected = by_complex_steps(lambda u: model.channels(data, u), unknowns, data.heard.shape)
-    found = channel_rows(seen, mine, there, ALL).reshape(expected.shape)
+    found = seen.channel_rows().reshape(expected.shape)
     np.testing.assert_allclose(found, expected * data.heard[..., None], atol=1e-11)
 
 

@@ -31,7 +31,8 @@ from jaxcal.model.distributions import OffsetLaw
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.thresholds import LARGEST_ELEVATION, MINIMUM_SELF_TUNING
 from jaxcal.model.unknowns import EXTRA, TABLE, Blocks, block_slice, measured, size
-from jaxcal.result.calibration import Calibration, Convergence, Linearisation, Medium, Status
+from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
+from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.dense import inverse_lanes_last
 from jaxcal.solvers.methods import nominal_sound_speed
 from jaxcal.solvers.plan import Given, SolvePlan

@@ -19,16 +19,15 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.calibration.conventional import closed_form_answer
 from jaxcal.calibration.dependence import independent
-from jaxcal.calibration.inputs import as_batch, converting, unknown_names
 from jaxcal.calibration.options import (
     DELAY_SD_S,
     SOUND_SPEED_SD_M_S,
     Request,
-    check_shapes,
+    as_batch,
     check_values,
-    options_of,
+    converting,
     prepare,
-    with_bound,
+    unknown_names,
 )
 from jaxcal.calibration.serial_correlation import widened
 from jaxcal.data.problem import Problem
@@ -36,23 +35,9 @@ from jaxcal.data.recording import MINIMUM_IMAGES, Recording
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import whole_number
-from jaxcal.runtime.precision import (
-    importing_jax,
-    in_own_modes,
-    inside_transformation,
-    require_float64,
-    with_dtype,
-)
-from jaxcal.solvers.names import (
-    Data,
-    Method,
-    PriorName,
-)
-from jaxcal.solvers.plan import (
-    Given,
-    Options,
-    SolvePlan,
-)
+from jaxcal.runtime.precision import importing_jax, in_own_modes, inside_transformation
+from jaxcal.solvers.names import Data, Method, PriorName
+from jaxcal.solvers.plan import Given, Options, SolvePlan
 
 if TYPE_CHECKING:
     from jax import Array
@@ -126,47 +111,42 @@ def calibrate(
             differentiated that stops before the minimum.
     """
     assert isinstance(problem, Problem)  # converted
-    estimate = unknown_names(estimate)
-    check_shapes(problem)
-    problem = _in_asked_precision(problem, options, "jaxcal.calibrate")
     request = Request(
         method,
         prior,
         max_elevation,
         sigma,
         tracker_sd,
-        estimate,
+        unknown_names(estimate),
         data,
         sound_speed_sd,
         delay_sd,
         options,
         robust,
     )
-    plan, given = prepare(problem, request)
+    problem, plan, given = prepare(problem, request)
     if problem.batch_shape:
         from jaxcal.calibration.engine import solve_batch
 
         return solve_batch(problem, given, plan, None)
     check_values(problem)
-    problem = with_bound(problem, given)
     if is_traced(problem, given):
-        return _solve_alone(problem, given, plan).with_problem(problem)
-    joined, found = independent(problem, estimate)
+        return replace(_solve_alone(problem, given, plan), problem=problem)
+    joined, found = independent(problem, request.estimate)
     left = int(np.count_nonzero(np.asarray(joined.mask) > 0))
     if left < MINIMUM_IMAGES:
         raise InputError(
             f"{found.words or 'too few images'}; at least {MINIMUM_IMAGES} that are independent "
             "are needed: hold the probe still at different poses"
         )
-    result = _solve_alone(joined, given, plan).with_problem(joined)
-    result = replace(result, notes=() if found.words is None else (found.words,))
-    return widened(result)
+    notes = () if found.words is None else (found.words,)
+    return widened(replace(_solve_alone(joined, given, plan), problem=joined, notes=notes))
 
 
 def _solve_alone(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """Solve one problem in closed form or by the engine (traceable); the result is without it."""
     found = None
-    if not inside_transformation(problem, given):
+    if plan.method == "conventional" and not inside_transformation(problem, given):
         found = closed_form_answer(problem, plan)
     if found is None:
         from jaxcal.calibration.engine import solve_problem
@@ -230,34 +210,24 @@ def calibrate_batch(
         InputError: contradicting options, or problems without a leading axis.
     """
     problems = as_batch(problems, "jaxcal.calibrate_batch")
-    estimate = unknown_names(estimate)
     if not problems.batch_shape:
         raise InputError("calibrate_batch needs problems with a leading axis; use calibrate")
     if chunk is not None:
         chunk = whole_number("chunk", chunk, 1, LARGEST_CHUNK)
-    check_shapes(problems)
-    problems = _in_asked_precision(problems, options, "jaxcal.calibrate_batch")
     request = Request(
         method,
         prior,
         max_elevation,
         sigma,
         tracker_sd,
-        estimate,
+        unknown_names(estimate),
         data,
         sound_speed_sd,
         delay_sd,
         options,
         robust,
     )
-    plan, given = prepare(problems, request)
+    problems, plan, given = prepare(problems, request, "jaxcal.calibrate_batch")
     from jaxcal.calibration.engine import solve_batch
 
     return solve_batch(problems, given, plan, chunk)
-
-
-def _in_asked_precision(problem: Problem, options: Options | None, name: str) -> Problem:
-    precision = options_of(options).precision
-    if precision == "float64":
-        require_float64(name)
-    return with_dtype(problem, np.dtype(precision))

@@ -21,12 +21,12 @@ from jaxcal.data.sound import WATER_M_S
 from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, inverses, mm_at_target, threshold
 from jaxcal.model.unknowns import EXTRA, block_slice, size
-from jaxcal.result.calibration import Calibration, Convergence, Linearisation, Medium, Status
+from jaxcal.result.calibration import Calibration, Linearisation, Medium, Status
 from jaxcal.runtime.array_types import Float
 from jaxcal.runtime.trees import map_arrays
-from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
 from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS
-from jaxcal.solvers.closed_form.single import ClosedForm
+from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
+from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.plan import SolvePlan
 
 STATIONARY = 1e-6
@@ -36,20 +36,20 @@ STATIONARY = 1e-6
 def closed_form_answer(problem: Problem, plan: SolvePlan) -> Calibration | None:
     """The conventional calibration where the closed form is proved to be the answer, else None.
 
-    It is None for other methods and solvers, a robust search, float32, further unknowns that have
-    no closed form (a delay), images that do not determine all unknowns, and minima without a proof.
+    It is None for other solvers, a robust search, float32, further unknowns that have no closed
+    form (a delay), images that do not determine all unknowns, and minima without a proof.
 
     Args:
         problem: one problem with concrete, finite values and at least 4 used images.
-        plan: the request.
+        plan: the request, for the conventional method.
     """
     options = plan.options
-    asked = plan.method == "conventional" and options.solver == "lm" and not plan.robust
+    asked = options.solver == "lm" and not plan.robust
     estimate = tuple(name for name in EXTRA if name in plan.blocks)
     if not asked or options.precision != "float64" or estimate not in CONSTRAINTS:
         return None
     problem = map_arrays(np.asarray, replace(problem, channels=None))
-    found = calibrate_closed_form(problem, estimate=estimate)
+    found = solve_problem(problem, estimate)
     if not (found.certified and found.unique):
         return None
     return _with_uncertainty(found, problem, plan)
@@ -62,7 +62,7 @@ def _with_uncertainty(found: ClosedForm, problem: Problem, plan: SolvePlan) -> C
     seen = ImageErrors.of(unknowns, map_arrays(lambda a: a[None], problem), blocks)
     plane = np.zeros_like(seen.mask)
     residual, axial = seen.from_circle(plane)
-    rows = seen.circle_rows(plane, axial, blocks).reshape(-1, size(blocks))
+    rows = seen.circle_rows(plane, axial).reshape(-1, size(blocks))
     errors = residual.ravel()
     information = rows.T @ rows
     used = float(seen.mask.sum())

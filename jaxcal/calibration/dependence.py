@@ -36,11 +36,13 @@ from jaxcal import InputError
 from jaxcal.data.poses import nearest_rotations, targets_in_images
 from jaxcal.data.recording import MINIMUM_IMAGES
 from jaxcal.runtime.array_types import Bool, Float, Int
+from jaxcal.runtime.arrays import like
+from jaxcal.solvers.closed_form.reduced_objective import knows_spacing
+from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
     from jaxcal.data.recording import Images
-    from jaxcal.solvers.closed_form.single import ClosedForm
 
 SAME_POSE_MM = 1.0
 """Two poses are the same if no point within the lever moves farther than this between them."""
@@ -304,17 +306,13 @@ def _joined(data: Any, found: Independent) -> Any:
 
 def _changed(data: Any, values: dict[str, Any]) -> Any:
     """The data with other arrays; each is a numpy or JAX array like the one that it replaces."""
-    after = {}
-    for name, value in values.items():
-        before = getattr(data, name)
-        if isinstance(value, np.ndarray) and not isinstance(before, np.ndarray):
-            import jax.numpy as jnp
-
-            value = jnp.asarray(value, before.dtype)
-        elif isinstance(value, np.ndarray):
-            value = value.astype(before.dtype)
-        after[name] = value
-    return replace(data, **after)
+    return replace(
+        data,
+        **{
+            name: like(getattr(data, name), value) if isinstance(value, np.ndarray) else value
+            for name, value in values.items()
+        },
+    )
 
 
 def _middle(values: np.ndarray, name: str) -> Any:
@@ -404,14 +402,9 @@ def conventional_errors(
     Returns:
         The errors of the conventional fit in closed form; None where there is no such fit.
     """
-    from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
-
-    known = getattr(data, "spacing_known", True)
-    if getattr(data, "kind", "point") == "pixel":
-        known = getattr(data, "spacing_mm", None) is not None
-    free = ("scale",) if "scale" in estimate or not known else ()
+    free = ("scale",) if "scale" in estimate or not knows_spacing(data) else ()
     try:
-        found = calibrate_closed_form(data, estimate=free)
+        found = solve_problem(data, free)
     except InputError:
         return None
     return _errors(found, data)

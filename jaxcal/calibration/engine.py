@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.calibration.options import with_bound
 from jaxcal.data.problem import Problem, fill_up
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import buckets, compiler, executables
@@ -44,11 +43,12 @@ FEW_PROBLEMS = 1024
 """Up to so many problems of a batch are padded to a bucket of images."""
 
 
+@in_own_modes
 def solve_problem(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """One problem, but for the problem itself in the result (traceable).
 
     Args:
-        problem: checked, with the caller's bound.
+        problem: checked.
         given: numbers that came with the request.
         plan: what is static about it.
     """
@@ -57,25 +57,24 @@ def solve_problem(problem: Problem, given: Given, plan: SolvePlan) -> Calibratio
     return _solve_compiled(problem, given, plan)
 
 
-@in_own_modes
 def _solve_compiled(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """One problem by a program of JAX's own, which serves every method and prior."""
-    from jaxcal.calibration import programs
+    from jaxcal.calibration.pipeline import agreed_images
+    from jaxcal.calibration.programs import solve_one
 
     platform = None
     if not inside_transformation(problem, given):
         platform = _devices(problem)[0].platform
     agreed = None
     if plan.robust:
-        agreed = programs.agreement(platform)(problem.points_only(), plan.blocks)
-    return programs.one_problem(platform)(problem, given, agreed, None, plan)
+        search = compiler.compiled(agreed_images, 1, platform)
+        agreed = search(problem.points_only(), plan.blocks)
+    return compiler.compiled(solve_one, 4, platform)(problem, given, agreed, None, plan)
 
 
-@in_own_modes
 def _solve_kept(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:
     """One problem by programs that are kept, which serve every number of images of a bucket."""
     padded = fill_up(problem)
-    given = replace(given, max_elevation=None)  # the problem has it
     run = partial(executables.run, flags=compiler.ONE_PROBLEM)
     label = _label(plan, padded.images)
     agreed, used = None, problem
@@ -103,7 +102,6 @@ def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | N
         chunk: problems solved side by side; None: by their kind.
     """
     shape = problems.batch_shape
-    problems = with_bound(problems, given)
     flat = problems
     if len(shape) > 1:
         flat = map_arrays(lambda leaf: leaf.reshape((-1, *leaf.shape[len(shape) :])), problems)
@@ -114,12 +112,12 @@ def solve_batch(problems: Problem, given: Given, plan: SolvePlan, chunk: int | N
     if kept:
         result, done = _solve_chunks_kept(flat, given, plan, largest, flat is problems)
         if done:
-            return result.with_problem(problems)
+            return replace(result, problem=problems)
     else:
         result = _solve_chunks_compiled(flat, given, plan, largest)
     result = map_arrays(lambda leaf: leaf[:count].reshape((*shape, *leaf.shape[1:])), result)
     # Only now: a slice of a numpy array is a view, one of a JAX array is a program that copies.
-    return (as_jax_holds(result, problems) if kept else result).with_problem(problems)
+    return replace(as_jax_holds(result, problems) if kept else result, problem=problems)
 
 
 def _side_by_side(problems: Problem, plan: SolvePlan, *, inside: bool) -> int:
@@ -154,7 +152,6 @@ def _solve_chunks_kept(
         arrays, which may go on behind the last problem, and False.
     """
     count, images = problems.mask.shape
-    given = replace(given, max_elevation=None)  # the problems have it
     chunk = min(buckets.size(count), largest)
     pieces = -(-count // chunk)
     padded = problems

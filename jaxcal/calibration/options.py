@@ -1,22 +1,25 @@
-"""A caller's request, the checks that it must pass, and the plan that it becomes."""
+"""What a caller gives: a problem in any form, a request, its checks, and the plan it becomes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, get_args
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar, get_args
 
 import numpy as np
 
 from jaxcal import InputError
-from jaxcal.data.problem import Problem
-from jaxcal.data.recording import MINIMUM_IMAGES
+from jaxcal.data.problem import Problem, stack
+from jaxcal.data.recording import MINIMUM_IMAGES, Images, Recording
 from jaxcal.model.distributions import Shape
 from jaxcal.model.unknowns import EXTRA, MEDIUM, RIGID
 from jaxcal.runtime.array_types import AnyArray, Array
 from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.given_values import check_flag
 from jaxcal.runtime.messages import shown
+from jaxcal.runtime.precision import require_float64, with_dtype
 from jaxcal.solvers.names import Data, Method, PriorName
 from jaxcal.solvers.plan import (
     LAWS,
@@ -27,6 +30,14 @@ from jaxcal.solvers.plan import (
     check_size,
     is_one_of,
     is_optimistix,
+)
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_HOW = (
+    "jaxcal.Problem.from_arrays(poses, measurements) makes one of arrays, jaxcal.load(path) reads "
+    "a recording"
 )
 
 PRIORS: dict[str, tuple[PriorName, ...]] = {
@@ -44,6 +55,80 @@ DELAY_SD_S = 1e-6
 
 ALTERNATION = ("tolerance_rad", "tolerance_mm", "max_rounds", "inner_steps")
 """The options that the alternation alone has."""
+
+
+def as_problem(value: Any, name: str) -> Problem:
+    """The problem that a caller gave; recordings and images are converted.
+
+    Args:
+        value: a problem, a recording or one set of images.
+        name: of the function that was called, for messages.
+
+    Raises:
+        InputError: anything else, with what to do.
+    """
+    if isinstance(value, Problem):
+        return value
+    if isinstance(value, Recording | Images):
+        return Problem.from_recording(value)
+    if isinstance(value, str | os.PathLike):
+        raise InputError(
+            f"{name} takes a problem, not a path: {name}(jaxcal.load({os.fspath(value)!r})), or "
+            "import the file first (jaxcal import)"
+        )
+    if isinstance(value, list | tuple) and value and _are_problems(value):
+        raise InputError(
+            f"{name} takes one problem, not {len(value)}: jaxcal.calibrate_batch takes a list"
+        )
+    kind = "a dictionary" if isinstance(value, dict) else f"{type(value).__name__}"
+    raise InputError(f"{name} takes a problem or a recording, not {kind}: {_HOW}")
+
+
+def converting(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a public function whose first argument is a problem: it takes recordings as well.
+
+    Placed outside :func:`jaxcal.runtime.precision.in_own_modes`: to segment times of flight imports
+    JAX, and what imports JAX within would run in the caller's modes.
+    """
+
+    @wraps(function)
+    def converted(*args: P.args, **kwargs: P.kwargs) -> T:
+        name = f"jaxcal.{function.__name__}"
+        if args:
+            return function(*(as_problem(args[0], name), *args[1:]), **kwargs)  # pyright: ignore[reportCallIssue]
+        if "problem" in kwargs:
+            kwargs["problem"] = as_problem(kwargs["problem"], name)
+        return function(*args, **kwargs)
+
+    return converted
+
+
+def as_batch(value: Any, name: str) -> Problem:
+    """The batch of problems that a caller gave; a list of problems or recordings is stacked.
+
+    Raises:
+        InputError: anything else, or problems that differ in their number of images or in parts.
+    """
+    if isinstance(value, list | tuple):
+        if not value:
+            raise InputError(f"{name} takes at least one problem; the list is empty")
+        return stack([as_problem(each, name) for each in value])
+    return as_problem(value, name)
+
+
+def unknown_names(estimate: Any) -> tuple[str, ...]:
+    """Names of further unknowns as a tuple; a text may hold one name or several with commas."""
+    if isinstance(estimate, str):
+        return tuple(name.strip() for name in estimate.split(","))
+    if estimate is None:
+        return ()
+    if not isinstance(estimate, Iterable):
+        raise InputError(f"estimate must be names of unknowns, not {shown(estimate)}")
+    return tuple(estimate)
+
+
+def _are_problems(values: Any) -> bool:
+    return all(isinstance(each, Problem | Recording | Images) for each in values)
 
 
 def options_of(options: Options | None) -> Options:
@@ -90,12 +175,28 @@ class Request:
     robust: bool = False
 
 
-def prepare(problem: Problem, request: Request) -> tuple[SolvePlan, Given]:
-    """Check a request against its problem, and divide it into a static and a traced part.
+def prepare(
+    problem: Problem, request: Request, name: str = "jaxcal.calibrate"
+) -> tuple[Problem, SolvePlan, Given]:
+    """Check a request against its problem.
+
+    Args:
+        problem: one or a batch.
+        request: of the caller.
+        name: of the function that was called, for messages.
+
+    Returns:
+        The problem in the precision and with the bound that the request asks for, and the static
+        and the traced part of the request.
 
     Raises:
         InputError: parts that contradict each other or the problem.
     """
+    check_shapes(problem)
+    options = options_of(request.options)
+    if options.precision == "float64":
+        require_float64(name)
+    problem = with_dtype(problem, np.dtype(options.precision))
     kind = check_request(request)
     _check_unknowns(problem, request)
     channels = _uses_channels(problem, request, kind)
@@ -110,9 +211,7 @@ def prepare(problem: Problem, request: Request) -> tuple[SolvePlan, Given]:
     if kind == "gaussian" and any(name in blocks for name in MEDIUM):
         believed = (request.sound_speed_sd, request.delay_sd)
         medium = array_module(believed).stack([array(sd) for sd in believed])
-    given = Given(
-        array(request.sigma), array(request.tracker_sd), array(request.max_elevation), medium
-    )
+    given = Given(array(request.sigma), array(request.tracker_sd), medium)
     components = 2 if channels else 3
     if given.sigma is not None and given.sigma.shape != (components,):
         names = "element distance, offset" if channels else "lateral, range, elevational"
@@ -128,10 +227,10 @@ def prepare(problem: Problem, request: Request) -> tuple[SolvePlan, Given]:
         laws,
         channels,
         blocks,
-        options_of(request.options),
+        options,
         bool(request.robust),
     )
-    return plan, given
+    return _with_bound(problem, array(request.max_elevation)), plan, given
 
 
 def check_request(request: Request) -> Prior:
@@ -304,11 +403,11 @@ def check_values(problem: Problem) -> None:
         raise InputError("face_offset of the problem must be finite")
 
 
-def with_bound(problem: Problem, given: Given) -> Problem:
+def _with_bound(problem: Problem, bound: AnyArray | None) -> Problem:
     """The problem with the caller's bound on the offsets, where there is one."""
-    if given.max_elevation is None:
+    if bound is None:
         return problem
-    bound, wanted = given.max_elevation, problem.mask.shape
+    wanted = problem.mask.shape
     try:
         bound = array_module(bound).broadcast_to(bound, wanted)
     except ValueError:

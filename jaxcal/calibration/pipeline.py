@@ -18,7 +18,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.model.batch import ImagePlanes, barrier
 from jaxcal.model.observations import BoundedOffsets, LocalUnknown, local_unknowns
 from jaxcal.model.unknowns import Blocks
-from jaxcal.result.calibration import Calibration, Convergence
+from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.precision import in_standard_promotion
 from jaxcal.solvers import methods
 from jaxcal.solvers.consensus import find_consensus, rigid_model
@@ -97,7 +97,6 @@ def _solved(
     offset = jnp.zeros((images.lanes, 0), images.mask.dtype)
     if isinstance(observation, LocalUnknown):
         offset = local_unknowns(found.place, observation, images)
-        offset = found.offset if found.offset is not None else offset
     solved = Solved(
         parameters=found.place.parameters(),
         offset=offset,
@@ -105,7 +104,7 @@ def _solved(
         bound=observation.bound if isinstance(observation, BoundedOffsets) else None,
         information=jnp.moveaxis(information, -1, 0),
         design=jnp.moveaxis(design, -1, 0),
-        convergence=_convergence(found, plan),
+        convergence=found.convergence,
     )
     if found.covariance is None or found.elevation_sd is None or found.law is None:
         return solved, None
@@ -125,24 +124,3 @@ def _normal_matrices(
     if geometry is observation:
         return weighted, weighted
     return weighted, accumulate(place, geometry, images, None).stacked()
-
-
-def _convergence(found: Solution, plan: SolvePlan) -> Convergence:
-    floored = found.sigma_floored
-    if floored.shape[0] == 1:
-        floored = jnp.tile(floored, (3, 1))
-    if plan.channels:
-        # Lateral position and range both come from the elements' distances.
-        floored = jnp.stack([floored[0], floored[0], floored[1]])
-    return Convergence(
-        cost=found.cost,
-        stationarity=found.cosine,
-        tolerance_met=found.arrived,
-        iterations=found.iterations,
-        variance_rounds=found.variance_rounds,
-        searched_start=found.searched,
-        sigma_floored=floored.T,
-        rotation_change=found.rotation_change,
-        translation_change=found.translation_change,
-        trace=None if found.trace is None else found.trace.T,
-    )

@@ -10,7 +10,7 @@ The errors of the three axes share one SD, so this is plain least squares on the
 
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ from jaxcal.calibration.answer import covariance_and_observability
 from jaxcal.data.poses import check_poses
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import LEAST_REACH_MM, MINIMUM_IMAGES, MetresError
-from jaxcal.diagnostics.outliers import images_that_stand_out, listed_departures
+from jaxcal.diagnostics.outliers import listed_departures, outliers
 from jaxcal.diagnostics.uncertainty import LARGEST_SD, Spectra
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import target_in_image
@@ -31,7 +31,7 @@ from jaxcal.result.calibration import Status
 from jaxcal.runtime import buckets, compiler, executables
 from jaxcal.runtime.arrays import is_traced, real_array
 from jaxcal.runtime.given_values import check_flag
-from jaxcal.runtime.precision import in_own_modes, require_float64
+from jaxcal.runtime.precision import in_own_modes, inside_transformation, require_float64
 from jaxcal.solvers import dense
 from jaxcal.solvers.consensus import (
     FEWEST_IMAGES,
@@ -144,7 +144,7 @@ class Pivot(eqx.Module):
                     f"the tip is known to {variances[-1] ** 0.5:.1f} mm (SD) along ({direction}) "
                     "of the tool's frame: turn the tool farther, about further axes"
                 )
-        named = images_that_stand_out(self)
+        named = outliers(self)
         if named:
             told = listed_departures(self, AXES)
             verb = "left out" if self.robust else "kept"
@@ -203,18 +203,11 @@ def calibrate_pivot(
         array = jnp.concatenate([array, last], axis=-2)
     weight = jnp.ones(array.shape[:-2]) if mask is None else jnp.asarray(mask)
     weight = jnp.broadcast_to(weight.astype(array.dtype), array.shape[:-2])
-    alone = compiler.is_whole_program(array, weight)
-    platform = jax.default_backend() if alone else None
+    platform = None if inside_transformation(array, weight) else jax.default_backend()
     if platform == "cpu" and array.ndim == 3:
         found = _solve_kept(np.asarray(array), np.asarray(weight), robust)
         return jax.device_put(found, next(iter(array.devices())) if array.committed else None)
-    return _program(platform)(array, weight, robust)
-
-
-@cache
-def _program(platform: str | None):
-    flags = None if platform is None else compiler.quick_to_compile(platform)
-    return jax.jit(_solve_all, static_argnums=2, compiler_options=flags)
+    return compiler.compiled(_solve_all, 2, platform)(array, weight, robust)
 
 
 def _solve_kept(

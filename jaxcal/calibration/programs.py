@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-from jaxcal.calibration.pipeline import agreed_images, solve_problems
+from jaxcal.calibration.pipeline import solve_problems
 from jaxcal.data.problem import Problem
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime import compiler
@@ -44,20 +44,6 @@ def solve_one(
     begun = None if start is None else GivenStart.of(alone[2], plan.blocks)
     result = solve_problems(alone[0], given, plan, alone[1], begun)
     return jax.tree.map(lambda leaf: leaf[0], result)
-
-
-@cache
-def one_problem(platform: str | None):
-    """The compiled solve of one problem; with a platform, as a program of its own."""
-    flags = None if platform is None else compiler.quick_to_compile(platform)
-    return jax.jit(solve_one, static_argnums=4, compiler_options=flags)
-
-
-@cache
-def agreement(platform: str | None):
-    """The compiled consensus of one problem's images; with a platform, as a program of its own."""
-    flags = None if platform is None else compiler.quick_to_compile(platform)
-    return jax.jit(agreed_images, static_argnums=1, compiler_options=flags)
 
 
 def solve_chunks(problems: Problem, given: Given, plan: SolvePlan, chunk: int) -> Calibration:

@@ -24,13 +24,14 @@ from jaxtyping import Array, Float, Int, Key
 from jaxcal import InputError
 from jaxcal.calibration.calibrate import calibrate, calibrate_batch
 from jaxcal.calibration.dependence import independent
-from jaxcal.calibration.inputs import as_problem
+from jaxcal.calibration.options import as_problem
 from jaxcal.data.problem import Problem
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording
 from jaxcal.diagnostics.metrics import calibration_reproducibility
 from jaxcal.model.parameters import Parameters
 from jaxcal.model.residuals import measured_points, measurement_residual
 from jaxcal.result.calibration import Calibration
+from jaxcal.runtime import buckets
 from jaxcal.runtime.arrays import is_traced
 from jaxcal.runtime.given_values import LARGEST_SEED, check_key, check_made, whole_number
 from jaxcal.runtime.precision import in_own_modes
@@ -337,26 +338,12 @@ def _many(problem: Problem, masks: Float[Array, "k n"]) -> Problem:
 
 def _drawn(problem: Problem, rows: Array, mask: Float[Array, " n"]) -> Problem:
     """The problem with other rows of images in each of k copies."""
-    count = problem.images
 
-    def pick(leaf: Array) -> Array:
-        return leaf[rows]
+    def drawn(rows: Int[Array, " n"]) -> Problem:
+        found = buckets.each_image(problem, lambda values, axis: jnp.take(values, rows, axis))
+        return replace(found, mask=mask)
 
-    many = _many(problem, jnp.broadcast_to(mask, rows.shape))
-    changed: dict[str, Any] = {
-        name: pick(getattr(problem, name))
-        for name in ("poses", "measurements", "covariance", "max_elevation")
-        if getattr(problem, name) is not None
-    }
-    if problem.channels is not None:
-        assert many.channels is not None
-        changed["channels"] = replace(
-            many.channels,
-            distances=pick(problem.channels.distances),
-            heard=pick(problem.channels.heard),
-        )
-    assert rows.shape[1] == count
-    return replace(many, **changed)
+    return jax.vmap(drawn)(rows)
 
 
 def _parameters(result: Calibration, problem: Problem) -> Parameters:

@@ -22,13 +22,14 @@ parameter for each kind of error describes the correlation at all lags.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.uncertainty import TUNED, Whitened
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.arrays import like
 from jaxcal.runtime.trees import map_arrays
 
 if TYPE_CHECKING:
@@ -68,38 +69,26 @@ def widened(result: Calibration) -> Calibration:
     lines = result.linearisation
     # The information about all unknowns changes in the same proportion.
     whole = _stretched(np.linalg.inv(np.asarray(lines.information, float)), before, after)
-    information = np.linalg.inv(whole).astype(covariance.dtype)
-    wider = _stretched(covariance, before, after).astype(covariance.dtype)
+    information = np.linalg.inv(whole)
+    wider = _stretched(covariance, before, after)
     return replace(
         result,
-        unknowns_covariance=_like(result.unknowns_covariance, wider),
-        linearisation=replace(lines, information=_like(lines.information, information)),
+        unknowns_covariance=like(result.unknowns_covariance, wider),
+        linearisation=replace(lines, information=like(lines.information, information)),
     )
-
-
-def _like(before: Any, values: np.ndarray) -> Any:
-    """The values as a numpy or JAX array, like the array that they replace."""
-    if isinstance(before, np.ndarray):
-        return values
-    import jax.numpy as jnp
-
-    return jnp.asarray(values)
 
 
 def _in_sds(result: Calibration) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3 p"]]:
     """Errors of the used images and their derivatives by the unknowns, in SDs."""
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], result)
-    problem = answer.problem
-    assert problem is not None
-    unknowns = Unknowns.of(answer)
-    seen = ImageErrors.of(unknowns, problem, answer.blocks)
+    seen = ImageErrors.of_answer(answer)
     if answer.prior in TUNED:
-        whitened = Whitened.of(answer, seen.shifted(answer, unknowns, problem), problem)
+        whitened = Whitened.of(answer, seen.shifted(answer))
         errors, rows = whitened.errors, whitened.rows
     else:
         in_plane = np.zeros_like(seen.mask)
         errors, axial = seen.from_circle(in_plane)
-        rows = seen.circle_rows(in_plane, axial, answer.blocks)
+        rows = seen.circle_rows(in_plane, axial)
         sd = np.sqrt(answer.linearisation.variance)[:, None, None]
         order = [0, 2, 1]
         errors, rows = (errors / sd)[..., order], (rows / sd[..., None])[:, :, order]

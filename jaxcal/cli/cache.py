@@ -106,7 +106,7 @@ def warm(
     except (OSError, RuntimeError) as error:
         raise OutputError(f"the cache cannot be used: {error}") from error
     from jaxcal.calibration.calibrate import calibrate
-    from jaxcal.calibration.inputs import unknown_names
+    from jaxcal.calibration.options import unknown_names
     from jaxcal.runtime.buckets import size
 
     names = unknown_names(estimate)

@@ -187,8 +187,7 @@ def calibrate(
     inputs = [recording] if test is None else [recording, test]
     targets = [_export_target(export, inputs, out) for export in exports]
     import_engine()
-    from jaxcal.calibration.inputs import unknown_names
-    from jaxcal.calibration.options import Request, check_alternation, check_request
+    from jaxcal.calibration.options import Request, check_alternation, check_request, unknown_names
     from jaxcal.solvers.plan import Options
 
     alternation = {

@@ -49,7 +49,7 @@ def _record(result: Pivot) -> dict[str, Any]:
     import numpy as np
 
     from jaxcal.calibration.pivot import AXES
-    from jaxcal.diagnostics.outliers import images_that_stand_out, outlier_reasons
+    from jaxcal.diagnostics.outliers import outlier_reasons, outliers
     from jaxcal.report.record import plain
 
     mask, covariance = np.asarray(result.mask), np.asarray(result.covariance)
@@ -65,7 +65,7 @@ def _record(result: Pivot) -> dict[str, Any]:
             "sigma_mm": float(result.sigma),
             "rms_mm": float(result.rms),
             "robust": result.robust,
-            "outliers": images_that_stand_out(result),
+            "outliers": outliers(result),
             "outlier_reasons": outlier_reasons(result, AXES),
             "warnings": result.warnings,
         }

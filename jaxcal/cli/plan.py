@@ -232,7 +232,7 @@ def _from_recording(
 ) -> tuple[Any, Candidates]:
     from jaxcal import design
     from jaxcal.calibration.calibrate import calibrate
-    from jaxcal.calibration.inputs import unknown_names
+    from jaxcal.calibration.options import unknown_names
     from jaxcal.io.hdf5 import load
     from jaxcal.report.next_poses import NOT_PLANNED
 

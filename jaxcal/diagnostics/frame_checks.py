@@ -23,6 +23,7 @@ images with another orientation than those that it was made with.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,11 +31,19 @@ import numpy as np
 from jaxcal import InputError
 from jaxcal.data.poses import quaternions_from_rotations, rotations_from_quaternions
 from jaxcal.runtime.array_types import Float
+from jaxcal.solvers.closed_form.reduced_objective import (
+    CONSTRAINTS,
+    ImageData,
+    ReducedObjective,
+    image_data,
+    knows_spacing,
+    reduce,
+)
+from jaxcal.solvers.closed_form.single import descend, feasible, scalar_root
 
 if TYPE_CHECKING:
     from jaxcal.data.problem import Problem
     from jaxcal.data.recording import Images
-    from jaxcal.solvers.closed_form.reduced_objective import ImageData
 
 ODDS = 1e6
 """How many times more probable the data must be with a slip corrected."""
@@ -75,11 +84,7 @@ def wrong_frames(data: Problem | Images, estimate: tuple[str, ...] = ()) -> str 
         data: one problem with concrete values, or images with points.
         estimate: what the calibration estimates.
     """
-    from jaxcal.solvers.closed_form.reduced_objective import image_data
-
-    known = getattr(data, "spacing_known", True)
-    if getattr(data, "kind", "point") == "pixel":
-        known = getattr(data, "spacing_mm", None) is not None
+    known = knows_spacing(data)
     try:
         images, _ = image_data(data, () if known else ("scale",))
     except InputError:
@@ -88,27 +93,32 @@ def wrong_frames(data: Problem | Images, estimate: tuple[str, ...] = ()) -> str 
     count = len(rows)
     if 3 * count <= UNKNOWNS:
         return None
-    rotations, shifts, points = (
-        images.rotations[rows],
-        images.translations[rows],
-        images.points[rows],
+    given = replace(
+        images,
+        rotations=images.rotations[rows],
+        translations=images.translations[rows],
+        points=images.points[rows],
+        face_offset=0.0,
     )
-    before, scales = _free_fit(rotations, shifts, points)
-    if not np.isfinite(before) or before <= 0:
+    fit = _free_fit(given)
+    if fit is None or fit.squares <= 0:
         return None
+    before = fit.squares
     best, told = before, None
-    for words, *other in _slips(rotations, shifts, points):
-        found, each = _free_fit(*other)
-        found *= count / len(other[2])
-        if found < best and _credible(each, images, known):
-            best, told = found, words
+    for words, changed in _slips(given):
+        other = _free_fit(replace(given, **changed))
+        if other is None:
+            continue
+        squares = other.squares * count / other.reduced.images
+        if squares < best and _credible(other.scales, images, known):
+            best, told = squares, words
     if told is not None and _far_better(before, best, count):
         return _sentence(told, before, best, count)
     if known and not {"scale", "sound-speed"} & set(estimate):
-        told = _wrong_scale(images, rows, before, scales)
+        told = _wrong_scale(given, fit)
         if told is not None:
             return told
-    apart, extent = _typical_error(rotations, shifts, points)
+    apart, extent = _typical_error(given, fit)
     if 3 * count > 2 * UNKNOWNS and apart > max(UNFIT_MM, UNFIT * extent):
         return (
             f"the images do not fit together (typical error {apart:.2g} mm, of a target that moves "
@@ -118,46 +128,42 @@ def wrong_frames(data: Problem | Images, estimate: tuple[str, ...] = ()) -> str 
     return None
 
 
-def _typical_error(
-    rotations: Float[np.ndarray, "n 3 3"],
-    shifts: Float[np.ndarray, "n 3"],
-    points: Float[np.ndarray, "n 2"],
-) -> tuple[float, float]:
-    """Median error of the images under the best fit, and the target's motion in them, mm."""
-    from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS, ImageData, reduce
-    from jaxcal.solvers.closed_form.single import scalar_root
+@dataclass(frozen=True)
+class _Fit:
+    """The least-squares fit of Eq. 7 with both scales free.
 
-    data = ImageData(rotations, shifts, points, 0.0, np.ones(2), True)
+    Attributes:
+        reduced: its objective.
+        x: its minimiser (a1, a3).
+    """
+
+    reduced: ReducedObjective
+    x: Float[np.ndarray, 6]
+
+    @property
+    def squares(self) -> float:
+        """Sum of squares, mm^2; less would only be rounding."""
+        return max(float(self.reduced(self.x)), self.reduced.resolution)
+
+    @property
+    def scales(self) -> Float[np.ndarray, 2]:
+        """Factors on the points' two axes."""
+        return np.linalg.norm(self.x.reshape(2, 3), axis=1)
+
+
+def _free_fit(data: ImageData) -> _Fit | None:
     reduced = reduce(data, CONSTRAINTS[("scale",)])
     found = scalar_root(reduced)
-    if found is None:
-        return 0.0, 0.0
-    x = found[1]
-    origin, target = reduced.origin_and_target(x)
-    seen = points @ x.reshape(2, 3)
-    error = np.einsum("nij,nj->ni", rotations, seen + origin) + shifts - target
+    return None if found is None or not np.isfinite(reduced(found[1])) else _Fit(reduced, found[1])
+
+
+def _typical_error(data: ImageData, fit: _Fit) -> tuple[float, float]:
+    """Median error of the images under a fit, and the target's motion in them, mm."""
+    origin, target = fit.reduced.origin_and_target(fit.x)
+    seen = data.points @ fit.x.reshape(2, 3)
+    cloud = np.einsum("nij,nj->ni", data.rotations, seen + origin) + data.translations
     extent = float(np.sqrt(np.mean(np.sum((seen - seen.mean(axis=0)) ** 2, axis=1))))
-    return float(np.median(np.linalg.norm(error, axis=1))), extent
-
-
-def _free_fit(
-    rotations: Float[np.ndarray, "n 3 3"],
-    shifts: Float[np.ndarray, "n 3"],
-    points: Float[np.ndarray, "n 2"],
-) -> tuple[float, Float[np.ndarray, 2]]:
-    """Least sum of squares of Eq. 7 (mm^2), and the factors on the points' two axes."""
-    from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS, ImageData, reduce
-    from jaxcal.solvers.closed_form.single import scalar_root
-
-    data = ImageData(rotations, shifts, points, 0.0, np.ones(2), True)
-    reduced = reduce(data, CONSTRAINTS[("scale",)])
-    found = scalar_root(reduced)
-    if found is None:
-        return np.inf, np.ones(2)
-    x = found[1]
-    scales = np.linalg.norm(x.reshape(2, 3), axis=1)
-    # A smaller sum of squares is only rounding.
-    return max(float(reduced(x)), reduced.resolution), scales
+    return float(np.median(np.linalg.norm(cloud - target, axis=1))), extent
 
 
 def _far_better(before: float, after: float, count: int) -> bool:
@@ -173,42 +179,36 @@ def _credible(scales: Float[np.ndarray, 2], images: ImageData, known: bool) -> b
     return bool((size > PIXELS_MM[0]).all() and (size < PIXELS_MM[1]).all())
 
 
-def _slips(
-    rotations: Float[np.ndarray, "n 3 3"],
-    shifts: Float[np.ndarray, "n 3"],
-    points: Float[np.ndarray, "n 2"],
-) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    """The common slips: words, and the corrected rotations, translations and points."""
+def _slips(data: ImageData) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
+    """The common slips: words, and the fields of the data that are corrected."""
+    rotations, shifts = data.rotations, data.translations
     turned = np.swapaxes(rotations, 1, 2)
     back = -np.einsum("nij,nj->ni", turned, shifts)
-    yield ("the poses are from the tracker to the probe: invert them", turned, back, points)
+    yield (
+        "the poses are from the tracker to the probe: invert them",
+        {"rotations": turned, "translations": back},
+    )
     yield (
         "the poses' rotations are transposed (columns for rows, or conjugate quaternions): "
         "transpose the 3x3 blocks",
-        turned,
-        shifts,
-        points,
+        {"rotations": turned},
     )
+    quaternions = quaternions_from_rotations(rotations)
     for words, right, order in (
         ("first but is read as last", "wxyz", [1, 2, 3, 0]),
         ("last but is read as first", "xyzw", [3, 0, 1, 2]),
     ):
-        reordered = _with_quaternions_reordered(rotations, order)
         yield (
             f"the quaternions' scalar stands {words}: correct the header where it names the "
             f"columns, else import with --quaternion {right}",
-            reordered,
-            shifts,
-            points,
+            {"rotations": rotations_from_quaternions(quaternions[:, order], "xyzw")},
         )
     for axis, name in enumerate("xyz"):
         signs = np.where(np.arange(3) == axis, -1.0, 1.0)
         yield (
             f"the poses' translations have the wrong sign along {name} (a left-handed frame, "
             "converted by half?): reverse it",
-            rotations,
-            shifts * signs,
-            points,
+            {"translations": shifts * signs},
         )
     for order, name in (
         ([1, 0, 2], "x and y"),
@@ -219,80 +219,55 @@ def _slips(
     ):
         yield (
             f"the columns {name} of the poses' translations are exchanged: put them in order",
-            rotations,
-            shifts[:, order],
-            points,
+            {"translations": shifts[:, order]},
         )
-    if len(points) > 5:
-        yield (
-            "each point belongs to the pose of the row before: the two lists are one row out of "
-            "step",
-            rotations[:-1],
-            shifts[:-1],
-            points[1:],
-        )
-        yield (
-            "each point belongs to the pose of the row after: the two lists are one row out of "
-            "step",
-            rotations[1:],
-            shifts[1:],
-            points[:-1],
-        )
+    if len(data.points) > 5:
+        all_but_last, all_but_first = slice(None, -1), slice(1, None)
+        for words, poses, points in (
+            ("before", all_but_last, all_but_first),
+            ("after", all_but_first, all_but_last),
+        ):
+            yield (
+                f"each point belongs to the pose of the row {words}: the two lists are one row out "
+                "of step",
+                {
+                    "rotations": rotations[poses],
+                    "translations": shifts[poses],
+                    "points": data.points[points],
+                },
+            )
 
 
-def _with_quaternions_reordered(
-    rotations: Float[np.ndarray, "n 3 3"], order: list[int]
-) -> Float[np.ndarray, "n 3 3"]:
-    """Rotations whose quaternions' components, x y z w, were read in another order."""
-    found = quaternions_from_rotations(rotations)
-    return rotations_from_quaternions(found[:, order], "xyzw")
-
-
-def _wrong_scale(
-    images: ImageData, rows: np.ndarray, free: float, scales: Float[np.ndarray, 2]
-) -> str | None:
+def _wrong_scale(data: ImageData, fit: _Fit) -> str | None:
     """Words if the images fit far worse with the known scales than with free ones; else None."""
-    from jaxcal.solvers.closed_form.reduced_objective import CONSTRAINTS, ImageData, reduce
-    from jaxcal.solvers.closed_form.single import descend, feasible, scalar_root
-
+    scales, free, count = fit.scales, fit.squares, len(data.points)
     if (np.abs(np.log(scales)) < np.log(1.01)).all():
         return None
-    chosen = ImageData(
-        images.rotations[rows],
-        images.translations[rows],
-        images.points[rows],
-        0.0,
-        np.ones(2),
-        True,
-    )
-    reduced = reduce(chosen, CONSTRAINTS[()])
-    start = scalar_root(reduce(chosen, CONSTRAINTS[("scale",)]))
-    assert start is not None
-    before = float(reduced(descend(reduced, feasible(start[1], reduced.constraints)[None])))
-    count = len(rows)
+    reduced = reduce(data, CONSTRAINTS[()])
+    before = float(reduced(descend(reduced, feasible(fit.x, reduced.constraints)[None])))
     if not _far_better(before, free, count):
         return None
-    swapped = images.spacing[::-1] / images.spacing
+    swapped = data.spacing[::-1] / data.spacing
     if np.abs(np.log(swapped)).max() > np.log(ANISOTROPY) and np.allclose(
         scales, swapped, rtol=0.3 * (np.abs(np.log(swapped)).max())
     ):
         return _sentence(
             "u and v, or their two spacings, are exchanged: swap them", before, free, count
         )
-    points = "the pixels' sizes" if images.pixels else "the points"
+    points = "the pixels' sizes" if data.pixels else "the points"
     for unit, name in UNITS.items():
         for factor, wrong, other in ((1 / unit, "the poses", points), (unit, points, "the poses")):
             if (np.abs(np.log(scales / factor)) < UNIT_WITHIN).all():
                 told = f"{wrong} are in {name}, or {other} are {unit:g} times too large: give mm"
                 in_mm = unit if factor < 1 else 1.0
                 return _sentence(told, before, in_mm**2 * free, count)
-    if not images.pixels:
+    if not data.pixels:
         told = f"the points are {scales[0]:.3g} and {scales[1]:.3g} times as long as given"
     else:
-        size = scales * images.spacing
+        size = scales * data.spacing
         told = (
-            f"the pixels are {size[0]:.4g} x {size[1]:.4g} mm, not {images.spacing[0]:.4g} x "
-            f"{images.spacing[1]:.4g}"
+            f"the pixels are {size[0]:.4g} x {size[1]:.4g} mm, not {data.spacing[0]:.4g} x "
+            f"{data.spacing[1]:.4g}"
         )
     return _sentence(f"{told}: correct the spacing, or estimate the scale", before, free, count)
 

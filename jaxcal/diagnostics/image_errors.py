@@ -73,6 +73,9 @@ class ImageErrors:
         errors: lateral, range and elevational, mm; 0 where left out.
         rows: derivatives of ``errors`` by the unknowns (order of ``blocks``); 0 where left out.
         mask: 1 for images that count.
+        unknowns: at which the errors are.
+        problem: whose images they are.
+        blocks: the free unknowns.
     """
 
     q: Float[Array, "k n 3"]
@@ -82,6 +85,15 @@ class ImageErrors:
     errors: Float[Array, "k n 3"]
     rows: Float[Array, "k n 3 p"]
     mask: Float[Array, "k n"]
+    unknowns: Unknowns
+    problem: Problem
+    blocks: Blocks
+
+    @classmethod
+    def of_answer(cls, answer: Calibration) -> ImageErrors:
+        """The errors of calibrations with one leading axis, which hold their problem."""
+        assert answer.problem is not None
+        return cls.of(Unknowns.of(answer), answer.problem, answer.blocks)
 
     @classmethod
     def of(
@@ -127,14 +139,15 @@ class ImageErrors:
         ):
             rows[..., 0, column], rows[..., 1, column] = -moved[0], -moved[1]
         rows *= mask[..., None, None]
-        return cls(q, turned, lateral, distance, mask[..., None] * errors, rows, mask)
+        errors = mask[..., None] * errors
+        return cls(q, turned, lateral, distance, errors, rows, mask, unknowns, problem, blocks)
 
-    def shifted(self, answer: Calibration, unknowns: Unknowns, problem: Problem) -> ImageErrors:
+    def shifted(self, answer: Calibration) -> ImageErrors:
         """These errors with the target moved by the estimated error of the tracker, if any."""
         if answer.linearisation.tracker_sd is None:
             return self
         shift = np.where(answer.mask > 0, answer.elevation - self.q[..., 1], 0.0)
-        return ImageErrors.of(unknowns, problem, answer.blocks, shift)
+        return ImageErrors.of(self.unknowns, self.problem, self.blocks, shift)
 
     def centred(self, answer: Calibration) -> ImageErrors:
         """These errors of one calibration, the offsets about the mean that it found for them."""
@@ -157,16 +170,37 @@ class ImageErrors:
         return self.mask[..., None] * residual, axial
 
     def circle_rows(
-        self, elevation: Float[Array, "k n"], axial: Float[Array, "k n"], blocks: Blocks
+        self, elevation: Float[Array, "k n"], axial: Float[Array, "k n"]
     ) -> Float[Array, "k n 3 p"]:
         """Derivatives of :meth:`from_circle` by the unknowns, the elevation held."""
-        rows = motion(self.q, self.turned, blocks) * self.mask[..., None, None]
+        rows = motion(self.q, self.turned, self.blocks) * self.mask[..., None, None]
         further = size(RIGID)
         # Further unknowns move the measured point instead of q.
         rows[..., 0, further:] = self.rows[..., 0, further:]
         stretch = self.distance / axial
         rows[..., 2, further:] = stretch[..., None] * self.rows[..., 1, further:]
         return rows
+
+    def channel_rows(self) -> Float[Array, "k m p"]:
+        """Derivatives of every element's distance error, mm; m is n times the number of elements.
+
+        The model of a measured distance is |q - e| / s + delay.
+        """
+        channels = self.problem.channels
+        assert channels is not None
+        apart = self.q[:, :, None] - np.asarray(channels.elements)[:, None]
+        far = np.linalg.norm(apart, axis=-1)
+        further = self.unknowns.along(2)
+        # The derivative by the distance is a complex step, too.
+        gain = np.imag(model.heard(far + 1j * TINY, further)) / TINY
+        rows = (gain / far)[..., None] * (apart @ motion(self.q, self.turned, self.blocks))
+        for column, (change,) in further_derivatives(
+            lambda values: [model.heard(far, values)], further, self.blocks
+        ):
+            rows[..., column] = change
+        weight = self.mask[..., None] * np.nan_to_num(np.asarray(channels.heard))
+        rows = np.where(weight[..., None] > 0, rows, 0.0) * weight[..., None]
+        return rows.reshape(len(rows), -1, rows.shape[-1])
 
 
 def motion(
@@ -181,28 +215,3 @@ def motion(
     along[..., 2, 3], along[..., 2, 4] = -y, x
     along[..., 6:9] = turned
     return along
-
-
-def channel_rows(
-    seen: ImageErrors, unknowns: Unknowns, problem: Problem, blocks: Blocks
-) -> Float[Array, "k m p"]:
-    """Derivatives of every element's distance error, mm; m is n times the number of elements.
-
-    The model of a measured distance is |q - e| / s + delay.
-    """
-    channels = problem.channels
-    assert channels is not None
-    elements = np.asarray(channels.elements)
-    apart = seen.q[:, :, None] - elements[:, None]
-    far = np.linalg.norm(apart, axis=-1)
-    further = unknowns.along(2)
-    # The derivative by the distance is a complex step, too.
-    gain = np.imag(model.heard(far + 1j * TINY, further)) / TINY
-    rows = (gain / far)[..., None] * (apart @ motion(seen.q, seen.turned, blocks))
-    for column, (change,) in further_derivatives(
-        lambda values: [model.heard(far, values)], further, blocks
-    ):
-        rows[..., column] = change
-    weight = seen.mask[..., None] * np.nan_to_num(np.asarray(channels.heard))
-    rows = np.where(weight[..., None] > 0, rows, 0.0) * weight[..., None]
-    return rows.reshape(len(rows), -1, rows.shape[-1])

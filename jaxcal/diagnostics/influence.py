@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import CalibrationError
-from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns, channel_rows
+from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
 from jaxcal.diagnostics.uncertainty import (
     TUNED,
     Whitened,
@@ -115,7 +115,7 @@ def influence_of(calibration: Calibration) -> Influence:
         raise CalibrationError("a batch holds many calibrations: take one of them")
     alone = map_arrays(_first, calibration.numpy())
     with np.errstate(all="ignore"):
-        found = _whitened(alone, alone.problem)
+        found = _whitened(alone)
         information = np.asarray(alone.linearisation.information)
         information = information / np.asarray(alone.linearisation.variance)[:, None, None]
         averaged = calibration.offset_law is not None and bool(calibration.offset_law.weighed)
@@ -180,29 +180,26 @@ def _influence(
     )
 
 
-def _whitened(answer: Calibration, problem: Problem | None) -> _Errors:
+def _whitened(answer: Calibration) -> _Errors:
     """Whitened errors of a calibration with one leading axis of length 1."""
-    assert problem is not None
-    blocks, unknowns = answer.blocks, Unknowns.of(answer)
-    seen = ImageErrors.of(unknowns, problem, blocks)
+    seen = ImageErrors.of_answer(answer)
     used = np.asarray(answer.mask)[0] > 0
     if answer.data == "channels":
-        return _on_channels(answer, seen, unknowns, problem, used)
+        return _on_channels(answer, seen, used)
     if answer.prior in TUNED:
-        return _on_points(answer, seen, unknowns, problem, used)
+        return _on_points(answer, seen, used)
     sd = float(np.sqrt(answer.linearisation.variance[0]))
     y = np.asarray(answer.elevation) if answer.prior == "bounded" else np.zeros_like(seen.mask)
-    return _equal_weights(seen, y, sd, blocks, used, answer.prior == "bounded", answer.at_bound[0])
+    free = used & (answer.at_bound[0] == 0) if answer.prior == "bounded" else None
+    return _equal_weights(seen, y, sd, used, free)
 
 
-def _on_points(
-    answer: Calibration, seen: ImageErrors, unknowns: Unknowns, problem: Problem, used: Array
-) -> _Errors:
+def _on_points(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors:
     tau = answer.linearisation.tracker_sd
-    seen = seen.shifted(answer, unknowns, problem).centred(answer)
-    whitened = Whitened.of(answer, seen, problem)
+    seen = seen.shifted(answer).centred(answer)
+    whitened = Whitened.of(answer, seen)
     errors, rows = whitened.errors[0][used], whitened.rows[0][used]
-    log_sd, shape = np.zeros(len(rows)), own_covariance(answer, problem)
+    log_sd, shape = np.zeros(len(rows)), own_covariance(answer, seen)
     if shape is not None:
         log_sd = 0.5 * np.log(np.linalg.det(shape[0][used]))
     if whitened.offset is not None:
@@ -222,18 +219,16 @@ def _on_points(
     return _Errors(errors, rows, np.arange(3), log_sd, used, len(used))
 
 
-def _on_channels(
-    answer: Calibration, seen: ImageErrors, unknowns: Unknowns, problem: Problem, used: Array
-) -> _Errors:
-    channels, sigma = problem.channels, np.asarray(answer.sigma)[0]
+def _on_channels(answer: Calibration, seen: ImageErrors, used: Array) -> _Errors:
+    channels, sigma = seen.problem.channels, np.asarray(answer.sigma)[0]
     assert channels is not None
     assert answer.channel_sigma is not None
     element_sd = float(np.asarray(answer.channel_sigma)[0])
-    rows = channel_rows(seen, unknowns, problem, answer.blocks)[0]
+    rows = seen.channel_rows()[0]
     elements = np.asarray(channels.elements)[0]
     rows = rows.reshape(len(used), len(elements), -1)[used] / element_sd
     far = np.linalg.norm(seen.q[0][used, None] - elements, axis=-1)
-    model = heard(far[None], unknowns.along(2))[0]
+    model = heard(far[None], seen.unknowns.along(2))[0]
     listened = np.nan_to_num(np.asarray(channels.heard))[0][used]
     measured = np.nan_to_num(np.asarray(channels.distances))[0][used]
     errors = np.where(listened > 0, model - measured, 0.0) / element_sd
@@ -250,19 +245,18 @@ def _equal_weights(
     seen: ImageErrors,
     y: Float[Array, "1 n"],
     sd: float,
-    blocks: Blocks,
-    used: Array,
-    bounded: bool = False,
-    at_bound: Any = None,
+    used: Bool[Array, " n"],
+    free: Bool[Array, " n"] | None = None,
 ) -> _Errors:
+    """Errors with one SD; the part along a ``free`` offset's circle is projected out."""
     residual, axial = seen.from_circle(y)
-    rows = seen.circle_rows(y, axial, blocks)[0][used]
+    rows = seen.circle_rows(y, axial)[0][used]
     errors = residual[0][used]
-    if bounded:
+    if free is not None:
         slope = (y / axial)[0][used]
         along = np.stack([0 * slope, -np.ones_like(slope), slope], axis=1)
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
-        along = np.where(at_bound[used, None] > 0, 0.0, along)
+        along = np.where(free[used, None], along, 0.0)
         rows = rows - along[..., None] * np.einsum("mk,mkp->mp", along, rows)[:, None]
         errors = errors - along * np.sum(along * errors, axis=1, keepdims=True)
     log_sd = np.full(int(used.sum()), 3 * np.log(sd))
@@ -302,10 +296,10 @@ def conventional_fit(
     """
     seen = ImageErrors.of(unknowns, problem, blocks)
     zero = np.zeros_like(seen.mask)
-    plain = _equal_weights(seen, zero, 1.0, blocks, used)
+    plain = _equal_weights(seen, zero, 1.0, used)
     left = max(plain.errors.size - plain.rows.shape[2], 1)
     sd = float(np.sqrt(np.sum(plain.errors**2) / left))
-    scaled = _equal_weights(seen, zero, sd, blocks, used)
+    scaled = _equal_weights(seen, zero, sd, used)
     rows = scaled.rows.reshape(-1, scaled.rows.shape[2])
     found = _influence(scaled, rows.T @ rows)
     weight = (sigma / sd) ** 2

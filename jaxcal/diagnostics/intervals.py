@@ -48,6 +48,10 @@ image, medians and upper ends of intervals are right to 0.2 %, lower ends to 1 %
 axis 6 %). Over the image, in up to 11 dimensions, they are right to 1.3 and 9 %, which only errors
 along one or two axes reach."""
 
+LEVEL = 0.95
+"""Probability that an interval of the target registration error holds the actual error; its tails
+are equal."""
+
 _RADII = 4000
 """Number of values of rho^2 between which its distribution is interpolated."""
 _AT_ONCE = 32
@@ -116,7 +120,8 @@ def transform_intervals(
     Raises:
         InputError: a level that is not between 0 and 1.
     """
-    _check_level(level)
+    if not (is_number(level) and 0 < level < 1):
+        raise InputError(f"level must be between 0 and 1, not {level!r}")
     left = np.asarray(degrees_of_freedom(calibration), float)
     factor = np.where(
         np.isfinite(left),
@@ -240,34 +245,29 @@ class TargetError:
         return TargetError(factor * self.rms, factor * self.lower, factor * self.upper)
 
 
-def tre_at(
-    calibration: Calibration, points: Float[np.ndarray, "*points 2"], level: float = 0.95
-) -> TargetError:
-    """Target registration error to expect at image points, with equal-tailed intervals.
+def tre_at(calibration: Calibration, points: Float[np.ndarray, "*points 2"]) -> TargetError:
+    """Target registration error to expect at image points, with intervals of :data:`LEVEL`.
 
     Args:
         calibration: one or a batch, with concrete values.
         points: [lateral, axial] in the image plane, mm.
-        level: probability that an interval holds the actual error.
 
     Returns:
         Arrays of shape (*batch, *points); NaN where X is not observable.
 
     Raises:
-        InputError: a level that is not between 0 and 1, or points of another shape, NaN or Inf.
+        InputError: points of another shape, NaN or Inf.
     """
     points = _image_points(points)
     covariance = np.asarray(error_covariance(calibration.numpy(), points.reshape(-1, 2)))
     left = np.asarray(degrees_of_freedom(calibration), float)[..., None]
     factor = np.asarray(variance_factor(calibration))[..., None]
-    found = _errors(covariance, np.broadcast_to(left, covariance.shape[:-2]), factor, level)
+    found = _errors(covariance, np.broadcast_to(left, covariance.shape[:-2]), factor)
     shape = (*covariance.shape[:-3], *points.shape[:-1])
     return TargetError(*(value.reshape(shape) for value in found))
 
 
-def tre_over(
-    calibration: Calibration, points: Float[np.ndarray, "m 2"], level: float = 0.95
-) -> TargetError:
+def tre_over(calibration: Calibration, points: Float[np.ndarray, "m 2"]) -> TargetError:
     """Root mean square over image points of the error of one calibration, with its interval.
 
     It is sqrt(mean of |J_p d|^2 over the points p), the single number with which two calibrations
@@ -276,7 +276,6 @@ def tre_over(
     Args:
         calibration: one or a batch, with concrete values.
         points: [lateral, axial] of points that fill the region, mm.
-        level: probability that the interval holds the actual value.
     """
     answer = calibration.numpy()
     rows = in_image(answer.blocks)
@@ -288,17 +287,15 @@ def tre_over(
     spread = np.swapaxes(root, -1, -2) @ covariance @ root
     left = np.asarray(degrees_of_freedom(calibration), float)
     factor = np.asarray(variance_factor(calibration))
-    return TargetError(*_errors(spread, np.broadcast_to(left, spread.shape[:-2]), factor, level))
+    return TargetError(*_errors(spread, np.broadcast_to(left, spread.shape[:-2]), factor))
 
 
 def _errors(
     covariance: Float[np.ndarray, "*shape k k"],
     left: Float[np.ndarray, "*shape"],
     factor: np.ndarray,
-    level: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Root mean square and interval of the length of a vector with Student's distribution."""
-    _check_level(level)
     finite = np.asarray(np.isfinite(covariance).all(axis=(-1, -2)))
     spread = np.where(finite[..., None, None], covariance, np.eye(covariance.shape[-1]))
     values = np.maximum(np.linalg.eigvalsh(spread), 0.0)
@@ -306,7 +303,7 @@ def _errors(
     lower, upper = np.empty(len(flat)), np.empty(len(flat))
     for each in np.unique(freedom):
         rows = np.asarray(freedom == each)
-        for chance, out in ((0.5 - 0.5 * level, lower), (0.5 + 0.5 * level, upper)):
+        for chance, out in ((0.5 - 0.5 * LEVEL, lower), (0.5 + 0.5 * LEVEL, upper)):
             out[rows] = _length_quantile(flat[rows], float(each), chance)
     rms = np.sqrt(factor * values.sum(axis=-1))
     found = rms, lower.reshape(left.shape), upper.reshape(left.shape)
@@ -431,8 +428,3 @@ def _radial(dimensions: int, freedom: float) -> _Radial:
     else:
         below = special.chdtr(dimensions, square)
     return _Radial(float(first), float(last), below, np.diff(below, append=below[-1]))
-
-
-def _check_level(level: float) -> None:
-    if not (is_number(level) and 0 < level < 1):
-        raise InputError(f"level must be between 0 and 1, not {level!r}")

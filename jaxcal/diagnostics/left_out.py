@@ -17,8 +17,7 @@ from jaxcal.data.poses import targets_in_images
 from jaxcal.data.problem import Problem
 from jaxcal.model.image_points import distance
 from jaxcal.runtime.array_types import Float
-from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
-from jaxcal.solvers.closed_form.single import ClosedForm
+from jaxcal.solvers.closed_form.single import ClosedForm, solve_problem
 
 if TYPE_CHECKING:
     from jaxcal.result.calibration import Calibration
@@ -52,7 +51,7 @@ def left_out(
     estimate = ("scale",) if "scale" in answer.blocks else ()
     try:
         own, other = (
-            calibrate_closed_form(replace(problem, mask=mask.astype(float)), estimate=estimate)
+            solve_problem(replace(problem, mask=mask.astype(float)), estimate)
             for mask in (kept, left)
         )
     except InputError:

@@ -49,13 +49,8 @@ class HasOutliers(Protocol):
         ...
 
 
-def outliers(result: Calibration) -> list[int]:
-    """Images that do not fit the rest (see :mod:`jaxcal.solvers.consensus`)."""
-    return images_that_stand_out(result)
-
-
-def images_that_stand_out(result: HasOutliers) -> list[int]:
-    """Indices of the images marked as outliers."""
+def outliers(result: HasOutliers) -> list[int]:
+    """Indices of the images that do not fit the rest (see :mod:`jaxcal.solvers.consensus`)."""
     return [int(image) for image in np.flatnonzero(np.asarray(result.outlier) > 0)]
 
 
@@ -69,7 +64,7 @@ def outlier_reasons(
     """
     departure = np.asarray(result.departure, dtype=float)
     found: list[OutlierReason] = []
-    for image in images_that_stand_out(result):
+    for image in outliers(result):
         worst = int(np.argmax(np.abs(departure[image])))
         reason: OutlierReason = {
             "image": image,
@@ -104,7 +99,7 @@ def suspects(result: Calibration) -> list[OutlierReason]:
     # The second factor corrects medians of few images; it is from simulated Gaussian errors.
     limit = NormalDist().inv_cdf(1 - SUSPECTED / (4 * count)) * (1 + 8 / count)
     error = np.array(result.inspection.range_at_place, dtype=float)
-    error[images_that_stand_out(result)] = 0.0
+    error[outliers(result)] = 0.0
     return [
         {
             "image": int(image),

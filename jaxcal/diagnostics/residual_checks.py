@@ -24,17 +24,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.diagnostics.image_errors import ImageErrors, motion
 from jaxcal.diagnostics.sd_by_place import relative_sd
 from jaxcal.diagnostics.uncertainty import TUNED, Uncertainty, Whitened, inverses, quadratic
-from jaxcal.model.outliers import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
+from jaxcal.model.thresholds import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.unknowns import block_slice, further_derivatives, measured
 from jaxcal.result.findings import Inspection
 from jaxcal.runtime.array_types import Bool, Float
 
 if TYPE_CHECKING:
-    from jaxcal.data.problem import Problem
-    from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
-    from jaxcal.model.unknowns import Blocks
     from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
@@ -50,8 +48,6 @@ def inspect(
     answer: Calibration,
     seen: ImageErrors,
     shifted: ImageErrors,
-    unknowns: Unknowns,
-    problem: Problem,
     uncertainty: Uncertainty,
     eps: float,
 ) -> Inspection:
@@ -61,13 +57,11 @@ def inspect(
         answer: the calibrations.
         seen: all images that the caller wanted to use, those left out as outliers included.
         shifted: the same images, shifted by the estimated error of the tracker.
-        unknowns: the unknowns.
-        problem: the data.
         uncertainty: of the calibrations.
         eps: relative rounding of the arithmetic that solved them.
     """
     kept = np.asarray(answer.mask, float)
-    departure = departures(seen, problem, kept, answer.blocks, eps)
+    departure = departures(seen, kept, eps)
     if answer.robust:
         outlier = seen.mask * (1 - kept)
     else:
@@ -75,19 +69,18 @@ def inspect(
         outlier = seen.mask * judged[:, None] * stands_out(departure, kept)
     residual = seen.errors
     if answer.prior in TUNED and answer.data == "points":
-        whitened = Whitened.of(answer, shifted, problem)
+        whitened = Whitened.of(answer, shifted)
         left = np.maximum(1 - whitened.leverage(uncertainty.inverse), 0.05)
         residual = whitened.errors / np.sqrt(left)
     kurtosis, misfit = check_noise_model(residual, seen.distance, kept)
-    gain = gains(answer, seen, unknowns, problem, uncertainty)
+    gain = gains(answer, seen, uncertainty)
     at_place = range_at_place(departure[..., 1], seen, kept)
     return Inspection(outlier, departure, at_place, kurtosis, misfit, gain)
 
 
-def departures(
-    seen: ImageErrors, problem: Problem, kept: Float[Array, "k n"], blocks: Blocks, eps: float
-) -> Float[Array, "k n 3"]:
+def departures(seen: ImageErrors, kept: Float[Array, "k n"], eps: float) -> Float[Array, "k n 3"]:
     """Every image's departure from the fit to the kept ones, in robust SDs, leverage included."""
+    blocks, problem = seen.blocks, seen.problem
     rigid = [name for name in blocks if name in ("translation", "rotation", "point", "scale")]
     columns = np.concatenate([np.r_[block_slice(blocks, name)] for name in rigid])
     # This range only scales errors, so nominal values of the further unknowns are good enough.
@@ -225,13 +218,7 @@ def skewness_score(skewness: Float[Array, "*#b"], count: Float[Array, "*#b"]) ->
     return delta * np.arcsinh(y / alpha)
 
 
-def gains(
-    answer: Calibration,
-    seen: ImageErrors,
-    unknowns: Unknowns,
-    problem: Problem,
-    uncertainty: Uncertainty,
-) -> Float[Array, "k 5"]:
+def gains(answer: Calibration, seen: ImageErrors, uncertainty: Uncertainty) -> Float[Array, "k 5"]:
     """By how many SDs the weakest direction would change one more image: :attr:`Inspection.gain`.
 
     The first three kinds are tilts of 25 degrees either way about the image's axes, from the pose
@@ -261,14 +248,12 @@ def gains(
     )
     q = np.stack([places[..., 0], np.zeros_like(places[..., 0]), places[..., 1]], axis=-1)
 
-    step = uncertainty.weakest / uncertainty.scale
-    from jaxcal.diagnostics.image_errors import motion
-
+    step = uncertainty.spectra.weakest / uncertainty.scale
     errors = np.einsum("kmip,kp->kmi", motion(q, turned, blocks), step)
     errors = errors[..., [0, 2, 1]]
     # The positions in mm are linear functions of the measurements, so the measurements at these
     # places follow from the positions of two others.
-    face, further = np.asarray(problem.face_offset)[:, None], unknowns.along(1)
+    face, further = np.asarray(seen.problem.face_offset)[:, None], seen.unknowns.along(1)
     one = np.ones_like(places[..., 0])
     offset, end = (np.stack(measured(k * one, k * one, face, further), -1) for k in (0, 1))
     across, deep = np.moveaxis((places - offset) / (end - offset), -1, 0)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal import CalibrationError
-from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.residual_checks import inspect
 from jaxcal.diagnostics.uncertainty import assess
 from jaxcal.result.findings import Inspection, Summary
@@ -62,21 +62,19 @@ def summarise(calibration: Calibration) -> Summary:
 
 def _piece(answer: Calibration, eps: float) -> dict[str, Array]:
     """Diagnostics by name, for calibrations with one leading axis."""
-    problem = answer.problem
-    assert problem is not None
-    unknowns = Unknowns.of(answer)
-    seen = ImageErrors.of(unknowns, problem, answer.blocks)
-    shifted = seen.shifted(answer, unknowns, problem)
-    uncertainty = assess(answer, shifted, unknowns, problem, eps)
-    inspection = inspect(answer, seen, shifted, unknowns, problem, uncertainty, eps)
+    seen = ImageErrors.of_answer(answer)
+    shifted = seen.shifted(answer)
+    uncertainty = assess(answer, shifted, eps)
+    spectra = uncertainty.spectra
+    inspection = inspect(answer, seen, shifted, uncertainty, eps)
     residual, _ = seen.from_circle(np.zeros_like(seen.mask))
     return {
         "elevation_sd": uncertainty.elevation_sd,
         "at_bound": uncertainty.at_bound,
         "residual": np.where(answer.mask[..., None] > 0, residual, 0.0),
-        "condition": uncertainty.condition,
-        "weakest": uncertainty.weakest,
-        "weakest_sd": uncertainty.weakest_sd,
+        "condition": spectra.condition,
+        "weakest": spectra.weakest,
+        "weakest_sd": spectra.weakest_sd,
         "prior_direction": uncertainty.prior_direction,
         **{field.name: getattr(inspection, field.name) for field in fields(Inspection)},
     }

@@ -28,8 +28,7 @@ from jaxcal.runtime.arrays import array_module
 from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM
 
 if TYPE_CHECKING:
-    from jaxcal.data.problem import Problem
-    from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+    from jaxcal.diagnostics.image_errors import ImageErrors
     from jaxcal.model.unknowns import Blocks
     from jaxcal.result.calibration import Calibration
 
@@ -55,9 +54,7 @@ class Uncertainty:
     Attributes:
         elevation_sd: mm; NaN where an offset rests on its bound or an image is left out.
         at_bound: 1 where an offset rests on its bound.
-        condition: largest over smallest eigenvalue of the scaled information.
-        weakest: unit eigenvector of the smallest eigenvalue, in scaled units.
-        weakest_sd: SD along ``weakest``, mm; NaN where there is no finite SD.
+        spectra: of the information and the design in scaled units.
         prior_direction: unit vector that the measurements alone leave open; zeros if there is none.
         inverse: of the information.
         scale: factors that turn every unknown's tangent into mm at the target.
@@ -65,28 +62,18 @@ class Uncertainty:
 
     elevation_sd: Float[Array, "k n"]
     at_bound: Float[Array, "k n"]
-    condition: Float[Array, " k"]
-    weakest: Float[Array, "k p"]
-    weakest_sd: Float[Array, " k"]
+    spectra: Spectra
     prior_direction: Float[Array, "k p"]
     inverse: Float[Array, "k p p"]
     scale: Float[Array, "k p"]
 
 
-def assess(
-    answer: Calibration,
-    seen: ImageErrors,
-    unknowns: Unknowns,
-    problem: Problem,
-    eps: float,
-) -> Uncertainty:
+def assess(answer: Calibration, seen: ImageErrors, eps: float) -> Uncertainty:
     """Uncertainty of calibrations with one leading axis.
 
     Args:
         answer: the calibrations, arrays in float64.
         seen: their images.
-        unknowns: their unknowns.
-        problem: their data.
         eps: relative rounding of the arithmetic that solved them.
     """
     blocks, kept = answer.blocks, np.asarray(answer.mask)
@@ -101,7 +88,7 @@ def assess(
     )
     inverse = inverses(information, eps)
     size = np.where(np.isnan(found.weakest_sd), np.nan, variance)
-    at_bound, elevation_sd = _offsets(answer, seen, problem, inverse, size)
+    at_bound, elevation_sd = _offsets(answer, seen, inverse, size)
     if lines.average_elevation_sd is not None:
         assert answer.offset_law is not None
         better = np.asarray(answer.offset_law.weighed)[:, None] & np.isfinite(elevation_sd)
@@ -109,10 +96,8 @@ def assess(
     return Uncertainty(
         elevation_sd=elevation_sd,
         at_bound=at_bound,
-        condition=found.condition,
-        weakest=found.weakest,
-        weakest_sd=found.weakest_sd,
-        prior_direction=_known_from_prior(answer, seen, unknowns, problem, scale, eps),
+        spectra=found,
+        prior_direction=_known_from_prior(answer, seen, scale, eps),
         inverse=inverse,
         scale=scale,
     )
@@ -233,15 +218,6 @@ def nearest_unknown(
     return picked / np.where(length > 0, length, 1.0)
 
 
-def bound_of(answer: Calibration, problem: Problem) -> Float[Array, "k n"] | None:
-    """The bounds on the offsets, mm; None for calibrations without bounds."""
-    if answer.prior != "bounded":
-        return None
-    if problem.max_elevation is None:
-        return np.full_like(answer.mask, DEFAULT_MAX_ELEVATION_MM)
-    return np.asarray(problem.max_elevation)
-
-
 def quadratic(rows: Float[Array, "k m p"], matrix: Float[Array, "k p p"]) -> Float[Array, "k m"]:
     """The quadratic form r' C r of every row r, with C the matrix."""
     return np.einsum("kmp,kmp->km", rows @ matrix, rows)
@@ -250,15 +226,15 @@ def quadratic(rows: Float[Array, "k m p"], matrix: Float[Array, "k p p"]) -> Flo
 def _offsets(
     answer: Calibration,
     seen: ImageErrors,
-    problem: Problem,
     inverse: Float[Array, "k p p"],
     variance: Float[Array, " k"],
 ) -> tuple[Float[Array, "k n"], Float[Array, "k n"]]:
     """Which offsets rest on their bound, and the SDs of the others, mm."""
     kept = np.asarray(answer.mask) > 0
-    bound, size = bound_of(answer, problem), variance[:, None]
-    at_bound = np.zeros(kept.shape)
-    if bound is not None:
+    size, at_bound = variance[:, None], np.zeros(kept.shape)
+    if answer.prior == "bounded":
+        given = seen.problem.max_elevation
+        bound = DEFAULT_MAX_ELEVATION_MM if given is None else np.asarray(given)
         y = np.asarray(answer.elevation)
         residual, axial = seen.from_circle(y)
         slope = y / axial
@@ -267,13 +243,13 @@ def _offsets(
         force = slope * residual[..., 2] - residual[..., 1]
         near = np.abs(y) >= (1 - AT_BOUND) * limit
         at_bound = (kept & near & (np.sign(y) * force <= 0)).astype(float)
-        rows = seen.circle_rows(y, axial, answer.blocks)
+        rows = seen.circle_rows(y, axial)
         through = slope[..., None] * rows[..., 2, :] - rows[..., 1, :]
         weight = 1 + slope**2
         total = size * (quadratic(through, inverse) / weight + 1) / weight
         kept = kept & (at_bound == 0)
     elif answer.linearisation.tracker_sd is not None:
-        whitened = Whitened.of(answer, seen, problem)
+        whitened = Whitened.of(answer, seen)
         assert whitened.offset is not None
         tau = answer.linearisation.tracker_sd[:, None]
         along = seen.rows[..., 2, :] - tau[..., None] * whitened.pull
@@ -303,10 +279,10 @@ class Whitened:
     pull: Float[Array, "k n p"]
 
     @classmethod
-    def of(cls, answer: Calibration, seen: ImageErrors, problem: Problem) -> Whitened:
+    def of(cls, answer: Calibration, seen: ImageErrors) -> Whitened:
         """The errors of calibrations on points with Gaussian errors."""
         sigma, tau = np.asarray(answer.sigma), answer.linearisation.tracker_sd
-        offset, shape = None, own_covariance(answer, problem)
+        offset, shape = None, own_covariance(answer, seen)
         if tau is not None:
             sigma = np.hypot(sigma, tau[:, None] * [1.0, 1.0, 0.0])
             far = np.hypot(seen.errors[..., 2], seen.q[..., 2])
@@ -334,12 +310,13 @@ class Whitened:
         return quadratic(flat, inverse).reshape(rows.shape[:-1]) + own
 
 
-def own_covariance(answer: Calibration, problem: Problem) -> Float[Array, "k n 2 2"] | None:
+def own_covariance(answer: Calibration, seen: ImageErrors) -> Float[Array, "k n 2 2"] | None:
     """The shape of the images' own covariances, if these whiten the errors; else None."""
-    if problem.covariance is None:
+    given = seen.problem.covariance
+    if given is None:
         return None
     kept = np.asarray(answer.mask)[..., None] > 0
-    covariance = np.where(kept[..., None], problem.covariance, np.eye(2))
+    covariance = np.where(kept[..., None], given, np.eye(2))
     variances = np.where(kept, np.diagonal(covariance, axis1=-2, axis2=-1), 0.0)
     mean = variances.sum(axis=1) / kept.sum(axis=1)
     shaped = (mean > 0).all(axis=1)
@@ -365,16 +342,9 @@ def _decorrelated(
 
 
 def _known_from_prior(
-    answer: Calibration,
-    seen: ImageErrors,
-    unknowns: Unknowns,
-    problem: Problem,
-    scale: Float[Array, "k p"],
-    eps: float,
+    answer: Calibration, seen: ImageErrors, scale: Float[Array, "k p"], eps: float
 ) -> Float[Array, "k p"]:
     """The direction that the measurements do not determine without a prior on the offsets."""
-    from jaxcal.diagnostics.image_errors import channel_rows
-
     found = np.zeros_like(scale)
     if answer.prior == "none":
         return found
@@ -382,7 +352,7 @@ def _known_from_prior(
         # A turn about the element line, the lateral axis, moves no lateral position and no range.
         found[:, block_slice(answer.blocks, "rotation").start] = np.isfinite(scale).all(axis=1)
         return found
-    rows = channel_rows(seen, unknowns, problem, answer.blocks) / scale[:, None]
+    rows = seen.channel_rows() / scale[:, None]
     values, vectors = spectrum(np.swapaxes(rows, 1, 2) @ rows)
     null = values < threshold(eps) * values.sum(axis=1, keepdims=True)
     return np.where(null[:, :1], nearest_unknown(vectors, null), found)

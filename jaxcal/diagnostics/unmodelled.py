@@ -28,13 +28,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.diagnostics.image_errors import ImageErrors, Unknowns
+from jaxcal.diagnostics.image_errors import ImageErrors
 from jaxcal.diagnostics.uncertainty import TUNED, Whitened
 from jaxcal.runtime.array_types import Bool, Float
 from jaxcal.runtime.trees import map_arrays
 
 if TYPE_CHECKING:
-    from jaxcal.model.unknowns import Blocks
     from jaxcal.result.calibration import Calibration
 
 Array = np.ndarray
@@ -118,27 +117,22 @@ def unmodelled(calibration: Calibration) -> list[Unmodelled]:
     if used.sum() < FEWEST or calibration.linearisation.tracker_sd is not None:
         return []
     answer = map_arrays(lambda leaf: np.asarray(leaf)[None], calibration.numpy())
-    problem = answer.problem
-    assert problem is not None
-    unknowns = Unknowns.of(answer)
-    seen = ImageErrors.of(unknowns, problem, answer.blocks).centred(answer)
-    face = float(np.asarray(problem.face_offset)[0])
+    seen = ImageErrors.of_answer(answer).centred(answer)
     found = []
     with np.errstate(all="ignore"):
-        for kind, columns in _columns(seen, used, face, answer.blocks).items():
+        for kind, columns in _columns(seen, used).items():
             rows = np.concatenate([seen.rows, columns[None]], axis=-1)
-            whitened = Whitened.of(answer, replace(seen, rows=rows), problem)
+            whitened = Whitened.of(answer, replace(seen, rows=rows))
             each = _fit(kind, whitened.errors[0][used], whitened.rows[0][used])
             if each is not None:
                 found.append(each)
     return sorted(found, key=lambda each: -each.statistic / _BY_CHANCE[each.kind])
 
 
-def _columns(
-    seen: ImageErrors, used: Bool[Array, " n"], face: float, blocks: Blocks
-) -> dict[str, Float[Array, "n 3 k"]]:
+def _columns(seen: ImageErrors, used: Bool[Array, " n"]) -> dict[str, Float[Array, "n 3 k"]]:
     """Derivatives of every image's three errors (prediction less measurement) by theta."""
     lateral, distance = seen.lateral[0], seen.distance[0]
+    face = float(np.asarray(seen.problem.face_offset)[0])
     zero = np.zeros_like(lateral)
     order = (np.cumsum(used) - 1) / (used.sum() - 1) - 0.5
     found = {
@@ -147,7 +141,7 @@ def _columns(
         "curve": np.stack([zero, -((lateral / SIDE_MM) ** 2), zero], axis=-1)[..., None],
         "beside": np.stack([zero, 0.5 / distance, zero], axis=-1)[..., None],
     }
-    if not {"scale", "sound-speed"} & set(blocks):
+    if not {"scale", "sound-speed"} & set(seen.blocks):
         along = (
             np.stack([-lateral, zero, zero], axis=-1),
             np.stack([zero, face - distance, zero], -1),

@@ -7,3 +7,18 @@ LARGEST_ELEVATION = 0.95
 
 MINIMUM_SELF_TUNING = 8
 """With fewer used images the residuals cannot determine three SDs besides nine unknowns."""
+
+CUT = 6.0
+"""SDs beyond which an image stands out. Heavy tails (Student's t4) put 0.3 % of images there."""
+
+FEW_IMAGES = 30
+"""With fewer images in use, n, the limit is wider by sqrt(30 / n): 9.5 SDs for a dozen."""
+
+FEWEST_IMAGES = 8
+"""With fewer used images nothing is left out: they cannot outvote one another."""
+
+MAD = 1.4826
+"""SD of a normal law over the median of its magnitude."""
+
+RELATIVE_FLOOR = 0.02
+"""No component's SD is taken to be less than this share of the largest."""

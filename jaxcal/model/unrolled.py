@@ -131,11 +131,6 @@ def solve(matrix: Matrix, vector: Vector) -> Vector:
     return backward(factor, inverse, forward(factor, inverse, vector))
 
 
-def upper(matrix: Matrix) -> Vector:
-    """The upper triangle, row by row."""
-    return [matrix[i][j] for i in range(len(matrix)) for j in range(i, len(matrix))]
-
-
 def rotation(vector: Vector) -> Matrix:
     """Cayley's rotation of a vector w (rad): Exp(w) to second order, and a rotation for any w.
 

@@ -19,6 +19,7 @@ from jaxcal.result.transform import AppliedPoints, ImageTransform, SaveFormat
 from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
 from jaxcal.runtime.arrays import array_module, is_traced
 from jaxcal.runtime.trees import array_tree, map_arrays, static
+from jaxcal.solvers.convergence import Convergence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,36 +34,6 @@ class Status(enum.IntEnum):
     MAX_ITERATIONS = 1
     UNOBSERVABLE = 2
     FAILED = 3
-
-
-@array_tree
-class Convergence:
-    """How the method ended.
-
-    Attributes:
-        cost: the minimised sum of squares, mm^2 (equal weights) or whitened.
-        stationarity: scaled KKT residual of that objective.
-        tolerance_met: the method's own stopping rule was met.
-        iterations: linearisations (joint, conventional) or rounds (alternating).
-        variance_rounds: variance updates of the self-tuning; 0 without.
-        searched_start: the closed-form start was unsound, so a search found another start.
-        sigma_floored: which SDs are at their floor.
-        rotation_change: X's last move in rad (alternating), else 0.
-        translation_change: X's last move in mm (alternating), else 0.
-        trace: objective after each of the first iterations, NaN beyond the last; None if no trace
-            was requested.
-    """
-
-    cost: Float[AnyArray, "*batch"]
-    stationarity: Float[AnyArray, "*batch"]
-    tolerance_met: Bool[AnyArray, "*batch"]
-    iterations: Int[AnyArray, "*batch"]
-    variance_rounds: Int[AnyArray, "*batch"]
-    searched_start: Bool[AnyArray, "*batch"]
-    sigma_floored: Bool[AnyArray, "*batch 3"]
-    rotation_change: Float[AnyArray, "*batch"]
-    translation_change: Float[AnyArray, "*batch"]
-    trace: Float[AnyArray, "*batch trace"] | None
 
 
 @array_tree

@@ -64,6 +64,15 @@ def array_module(*values: object) -> Any:
     return sys.modules["jax"].numpy if is_traced(*values) else np
 
 
+def like(before: Any, values: np.ndarray) -> Any:
+    """Values as a numpy or JAX array of the dtype of another array, like that one."""
+    if isinstance(before, np.ndarray):
+        return values.astype(before.dtype)
+    import jax.numpy as jnp
+
+    return jnp.asarray(values, before.dtype)
+
+
 def traceable(function: Callable[P, T]) -> Callable[P, T]:
     """Decorate a user of :func:`array_module`, which then runs traced in JAX's standard modes."""
 

@@ -4,9 +4,9 @@ Two aims contradict each other. Plain batches hold millions of problems, and the
 should run as fast as the hardware allows: :func:`fast_to_run`. For one problem, a person waits for
 the compiler and not for the answer: :func:`quick_to_compile`.
 
-Flags belong to a whole program, so none are given inside somebody else's jit, vmap or grad:
-:func:`is_whole_program`. Flags come and go with versions of XLA, so each is only a wish: it is
-tried once, and left out if the compiler does not know it (:func:`known`).
+Flags belong to a whole program, so none are given inside somebody else's jit, vmap or grad. Flags
+come and go with versions of XLA, so each is only a wish: it is tried once, and left out if the
+compiler does not know it (:func:`known`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-
-from jaxcal.runtime.precision import inside_transformation
 
 if TYPE_CHECKING:
     from jax.typing import ArrayLike
@@ -103,6 +101,21 @@ def quick_to_compile(platform: str) -> Flags | None:
     return known(platform, {"xla_cpu_use_fusion_emitters": False}) if platform == "cpu" else None
 
 
+@cache
+def compiled(function: Callable[..., T], static: int, platform: str | None) -> Callable[..., T]:
+    """A function compiled by JAX when it is first called.
+
+    Args:
+        function: a pure function of a module.
+        static: the number of its argument that is static.
+        platform: where it is a program of its own, which a person waits for; None inside another.
+    """
+    import jax
+
+    flags = None if platform is None else quick_to_compile(platform)
+    return jax.jit(function, static_argnums=static, compiler_options=flags)
+
+
 ONE_PROBLEM: Flags = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_backend_optimization_level": 0,
@@ -167,8 +180,3 @@ def traced_once(function: Callable[..., T], *arguments: Any) -> tuple[Callable[.
         return jax.tree.unflatten(jax.tree.structure(shapes), found)
 
     return again, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-
-
-def is_whole_program(*arguments: object) -> bool:
-    """Whether all arrays have values, so that a call with them compiles a whole program."""
-    return not inside_transformation(*arguments)

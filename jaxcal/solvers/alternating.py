@@ -25,7 +25,14 @@ from jaxcal.data.geometry import chord_angle
 from jaxcal.model.batch import ImagePlanes, Iterate, barrier, choose
 from jaxcal.model.observations import BoundedOffsets, Further, HeldOffsets, local_unknowns
 from jaxcal.solvers import dense
-from jaxcal.solvers.levenberg_marquardt import Descent, Rounding, gradient_cosine, minimise
+from jaxcal.solvers.levenberg_marquardt import (
+    Descent,
+    Rounding,
+    empty_trace,
+    gradient_cosine,
+    minimise,
+    recorded,
+)
 from jaxcal.solvers.normal_equations import accumulate
 
 WARM_UP_ROUNDS = 10
@@ -38,22 +45,20 @@ class Alternation(eqx.Module):
 
     Attributes:
         place: X and c.
-        offset: y_i, mm.
         cost: sum of squared distances, mm^2.
         cosine: gradient cosine of the bounded joint problem there.
         iterations: rounds.
-        tolerance_met: it stopped because X had stopped moving, not at the round limit.
+        settled: it stopped because X had stopped moving, not at the round limit.
         rotation_change: X's rotation in the last round, rad.
         translation_change: X's translation in the last round, mm.
         trace: cost after each of the first rounds, NaN beyond the last; None: not kept.
     """
 
     place: Iterate
-    offset: Float[Array, "lanes n"]
     cost: Float[Array, " lanes"]
     cosine: Float[Array, " lanes"]
     iterations: Int[Array, " lanes"]
-    tolerance_met: Bool[Array, " lanes"]
+    settled: Bool[Array, " lanes"]
     rotation_change: Float[Array, " lanes"]
     translation_change: Float[Array, " lanes"]
     trace: Float[Array, "trace lanes"] | None
@@ -103,17 +108,15 @@ def alternate(
     def one_round(state: _State) -> _State:
         held = HeldOffsets.of(barrier(local_unknowns(state.place, observation, images)), images)
         after, _ = jax.lax.fori_loop(0, inner_steps, gauss_newton, (state.place, held))
-        recorded = state.trace
-        if recorded is not None:
-            rows = jnp.arange(recorded.shape[0])[:, None]
-            cost = accumulate(after, held, images, None).cost
-            recorded = jnp.where(rows == state.rounds, cost, recorded)
+        kept = state.trace
+        if kept is not None:
+            kept = recorded(kept, state.rounds, accumulate(after, held, images, None).cost)
         moved = _State(
             after,
             state.rounds + 1,
             chord_angle(state.place.rotation - after.rotation),
             jnp.sqrt(jnp.sum((state.place.translation - after.translation) ** 2, axis=0)),
-            recorded,
+            kept,
         )
         return choose(active(state), moved, state)
 
@@ -127,19 +130,17 @@ def alternate(
         jnp.zeros(none.shape, jnp.int32),
         none + jnp.inf,
         none + jnp.inf,
-        jnp.full((trace, *none.shape), jnp.nan, none.dtype) if trace else None,
+        empty_trace(trace, none),
     )
     state = jax.lax.while_loop(lambda state: jnp.any(active(state)), one_round, state)
     normal = barrier(accumulate(state.place, observation, images, None))
     rounding = Rounding.of(start, observation, images)
     return Alternation(
         place=state.place,
-        offset=local_unknowns(state.place, observation, images),
         cost=normal.cost,
         cosine=gradient_cosine(normal, rounding.vanished),
         iterations=state.rounds,
-        tolerance_met=(state.rotation_change < tolerance_rad)
-        & (state.translation_change < tolerance_mm),
+        settled=(state.rotation_change < tolerance_rad) & (state.translation_change < tolerance_mm),
         rotation_change=state.rotation_change,
         translation_change=state.translation_change,
         trace=state.trace,

@@ -40,9 +40,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxcal.data.problem import Problem
-from jaxcal.model.outliers import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.parameters import Parameters, retract
 from jaxcal.model.residuals import measured_points, measurement_residual
+from jaxcal.model.thresholds import CUT, FEW_IMAGES, FEWEST_IMAGES, MAD, RELATIVE_FLOOR
 from jaxcal.model.unknowns import Blocks, size
 from jaxcal.solvers import dense
 from jaxcal.solvers.proposals import SUBSET, linear_proposals, nominal, subset_weights

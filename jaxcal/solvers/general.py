@@ -26,12 +26,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxcal import InputError
-from jaxcal.model import unrolled
 from jaxcal.runtime.array_types import AnyArray
 from jaxcal.runtime.arrays import is_traced, real_array
 from jaxcal.runtime.given_values import whole_number
@@ -165,9 +165,9 @@ def _normal(residual: Callable[[Array], Array], here: Float[Array, " p"]) -> Nor
 
 
 def _packed(matrix: Array, gradient: Array, cost: Array, squares: Array | None) -> Normal:
-    rows = [[matrix[i, j][None] for j in range(len(matrix))] for i in range(len(matrix))]
+    upper = matrix[np.triu_indices(len(matrix))]
     wide = None if squares is None else squares[:, None]
-    return Normal(jnp.stack(unrolled.upper(rows)), gradient[:, None], cost[None], wide)
+    return Normal(upper[:, None], gradient[:, None], cost[None], wide)
 
 
 def arrow_least_squares(

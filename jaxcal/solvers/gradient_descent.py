@@ -20,8 +20,6 @@ from jaxtyping import Array, Float
 
 from jaxcal.model.batch import ImagePlanes, Iterate
 from jaxcal.model.observations import Further, InPlane
-from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
-from jaxcal.solvers.normal_equations import accumulate
 from jaxcal.solvers.other import Fit
 from jaxcal.solvers.plan import Options
 
@@ -87,18 +85,4 @@ def pairwise_gradient(start: Iterate, images: ImagePlanes, options: Options) -> 
     found = optx.minimise(cost, solver, jnp.zeros(6, lever.dtype), max_steps=steps, throw=False)
     place = moved(found.value)
     place = eqx.tree_at(lambda it: it.point, place, target(place))
-    observation = InPlane.of(images)
-    normal = accumulate(place, observation, images, None)
-    rounding = Rounding.of(start, observation, images)
-    trace = None
-    if options.trace:
-        trace = jnp.full((options.trace, images.lanes), jnp.nan, lever.dtype)
-    return Fit(
-        place,
-        normal.cost,
-        gradient_cosine(normal, rounding.vanished),
-        (found.result == optx.RESULTS.successful)[None],
-        jnp.asarray(found.stats["num_steps"], jnp.int32)[None],
-        observation.sigma,
-        trace,
-    )
+    return Fit.of(found, place, start, InPlane.of(images), images, None, options.trace)

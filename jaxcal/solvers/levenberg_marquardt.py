@@ -188,8 +188,24 @@ class Descent(eqx.Module):
             iterations=count,
             settled=no,
             active=~no,
-            trace=jnp.full((trace, *number.shape), jnp.nan, number.dtype) if trace else None,
+            trace=empty_trace(trace, number),
         )
+
+
+def empty_trace(length: int, number: Float[Array, " lanes"]) -> Float[Array, "trace lanes"] | None:
+    """A trace without values, for lanes like those of ``number``; None for a length of 0."""
+    return jnp.full((length, *number.shape), jnp.nan, number.dtype) if length else None
+
+
+def recorded(
+    trace: Float[Array, "trace lanes"] | None,
+    at: Int[Array, " lanes"],
+    cost: Float[Array, " lanes"],
+) -> Float[Array, "trace lanes"] | None:
+    """The trace with one more value in each lane; those beyond its end are not kept."""
+    if trace is None:
+        return None
+    return jnp.where(jnp.arange(trace.shape[0])[:, None] == at, cost, trace)
 
 
 class Rounding(eqx.Module):
@@ -305,10 +321,6 @@ def iterate_once(
         & (cosine > tolerance)
     )
     exact_next = (cosine < exact_below) & jnp.logical_not(lost | undamped)
-    trace = state.trace
-    if trace is not None:
-        rows = jnp.arange(trace.shape[0])[:, None]
-        trace = jnp.where(rows == state.iterations, cost, trace)
     after = Descent(
         place=place,
         cost=cost,
@@ -323,38 +335,12 @@ def iterate_once(
         iterations=iterations,
         settled=(cosine <= 10 * tolerance) | last | (idle >= IDLE),
         active=(cosine > tolerance) & jnp.logical_not(stuck | last),
-        trace=trace,
+        trace=recorded(state.trace, state.iterations, cost),
     )
     after = choose(state.active, after, eqx.tree_at(lambda old: old.place, state, place))
     return eqx.tree_at(
         lambda new: new.place, after, choose(last & state.active, candidate, after.place)
     )
-
-
-def descend(
-    begun: Descent,
-    equations: Equations,
-    rounding: Rounding,
-    tolerance: float,
-    max_steps: int,
-    *,
-    undamped: bool = False,
-    less_exact: float = LESS_EXACT,
-) -> Descent:
-    """Steps until no lane is active."""
-
-    def one(state: Descent) -> Descent:
-        return iterate_once(
-            state,
-            equations,
-            rounding,
-            tolerance,
-            max_steps,
-            undamped=undamped,
-            less_exact=less_exact,
-        )
-
-    return jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun)
 
 
 def minimise(
@@ -396,15 +382,19 @@ def minimise(
     # The curvature jumps where offsets reach or leave their bounds, so a good exact step says
     # little about the next one.
     less_exact = LESS if isinstance(observation, LocalUnknown) else LESS_EXACT
-    return descend(
-        begun,
-        equations,
-        rounding,
-        tolerance,
-        max_steps,
-        undamped=undamped,
-        less_exact=less_exact,
-    )
+
+    def one(state: Descent) -> Descent:
+        return iterate_once(
+            state,
+            equations,
+            rounding,
+            tolerance,
+            max_steps,
+            undamped=undamped,
+            less_exact=less_exact,
+        )
+
+    return jax.lax.while_loop(lambda state: jnp.any(state.active), one, begun)
 
 
 def default_tolerance(dtype: jnp.dtype) -> float:

@@ -8,12 +8,11 @@ the offsets' laws where they are weighed. One problem is a batch of one.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from jaxcal.data.problem import Problem
 from jaxcal.data.sound import WATER_M_S
@@ -28,19 +27,19 @@ from jaxcal.model.observations import (
     OwnCovariances,
     Points,
     TrackedPoints,
-    local_unknowns,
     unit_shape,
     variance_planes,
 )
 from jaxcal.model.unknowns import MEDIUM
 from jaxcal.solvers import implicit
-from jaxcal.solvers.alternating import alternate, bounded
+from jaxcal.solvers.alternating import Alternation, alternate, bounded
 from jaxcal.solvers.auto import average_over_laws
+from jaxcal.solvers.convergence import Convergence
 from jaxcal.solvers.gradient_descent import pairwise_gradient
-from jaxcal.solvers.levenberg_marquardt import minimise
-from jaxcal.solvers.other import minimise_with, self_tuned_with
+from jaxcal.solvers.levenberg_marquardt import Descent, minimise
+from jaxcal.solvers.other import Fit, minimise_with, self_tuned_with
 from jaxcal.solvers.plan import DEFAULT_MAX_ELEVATION_MM, Given, Options, SolvePlan
-from jaxcal.solvers.reml import floored, self_tuned
+from jaxcal.solvers.reml import SelfTuned, on_floor, self_tuned
 from jaxcal.solvers.start import ConventionalStart, GivenStart, conventional
 
 HELD_SIGMA = (0.5, 0.5, 1.0)
@@ -51,23 +50,13 @@ HELD_CHANNEL_SIGMA = (0.5, 1.0)
 
 
 class Solution(eqx.Module):
-    """Where a method stopped; lanes last, except in the law.
+    """Where a method stopped; lanes last, except in the law and the convergence.
 
     Attributes:
         place: X, c and the further unknowns.
         observation: the objective there, with its SDs.
         medium: what was known of sound speed and delay beforehand, or None.
-        offset: y_i, mm, where offsets are bounded unknowns of their own; else None.
-        cost: sum of squared (whitened) residuals.
-        cosine: gradient cosine.
-        arrived: it stopped because it had converged.
-        iterations: passes over the images, or rounds of the alternation.
-        variance_rounds: of these, passes that updated SDs.
-        sigma_floored: which SDs rest on their floor.
-        rotation_change: of the alternation's last round, rad.
-        translation_change: of the alternation's last round, mm.
-        trace: the objective's values; None: not kept.
-        searched: whether the start had to be searched for.
+        convergence: how the method ended.
         covariance: of the unknowns over all laws of the offsets, where they were weighed.
         elevation_sd: SDs of the offsets over all laws, mm, where they were weighed.
         law: what was found out about the offsets' law, where laws were weighed.
@@ -76,17 +65,7 @@ class Solution(eqx.Module):
     place: Iterate
     observation: Observation
     medium: MediumPrior | None
-    offset: Float[Array, "lanes n"] | None
-    cost: Float[Array, " lanes"]
-    cosine: Float[Array, " lanes"]
-    arrived: Bool[Array, " lanes"]
-    iterations: Int[Array, " lanes"]
-    variance_rounds: Int[Array, " lanes"]
-    sigma_floored: Bool[Array, "components lanes"]
-    rotation_change: Float[Array, " lanes"]
-    translation_change: Float[Array, " lanes"]
-    trace: Float[Array, "trace lanes"] | None
-    searched: Bool[Array, " lanes"]
+    convergence: Convergence
     covariance: Float[Array, "p p lanes"] | None = None
     elevation_sd: Float[Array, "lanes n"] | None = None
     law: OffsetLaw | None = None
@@ -185,116 +164,69 @@ def run(
 ) -> Solution:
     """The plan's method from conventional fits."""
     observation, medium = observe(problems, images, given, plan)
-    start = begun.place
+    found = _descended(begun, observation, medium, images, plan)
+    zero = jnp.zeros_like(found.cost)
+    floored, rounds = jnp.zeros((images.lanes, 3), bool), jnp.zeros_like(found.iterations)
+    if plan.self_tuning:
+        assert isinstance(found, SelfTuned | Fit)
+        observation = observation.with_sigma(found.updated)
+        floored, rounds = on_floor(found.updated).T, found.iterations
+        if plan.channels:
+            # Lateral position and range both come from the elements' distances.
+            floored = floored[:, [0, 0, 1]]
+    moves = (zero, zero)
+    if isinstance(found, Alternation):
+        moves = (found.rotation_change, found.translation_change)
+    convergence = Convergence(
+        cost=found.cost,
+        stationarity=found.cosine,
+        tolerance_met=found.settled,
+        iterations=found.iterations,
+        variance_rounds=rounds,
+        searched_start=begun.searched,
+        sigma_floored=floored,
+        rotation_change=moves[0],
+        translation_change=moves[1],
+        trace=None if found.trace is None else found.trace.T,
+    )
+    return Solution(found.place, observation, medium, convergence)
+
+
+def _descended(
+    begun: ConventionalStart | GivenStart,
+    observation: Observation,
+    medium: MediumPrior | None,
+    images: ImagePlanes,
+    plan: SolvePlan,
+) -> Alternation | Descent | Fit | SelfTuned:
+    """Where the plan's method stops."""
+    options, other, start = plan.options, plan.other_solver, begun.place
+    limits = {"max_steps": options.max_iterations, "trace": options.trace}
     if plan.method == "conventional":
         assert isinstance(begun, ConventionalStart)
-        found, own = _conventional(begun, observation, images, plan)
-    elif isinstance(observation, BoundedOffsets):
-        solved = _alternating if plan.method == "alternating" else _bounded
-        found, own = solved(start, observation, images, plan)
-    elif plan.self_tuning:
-        found, own = _self_tuned(start, observation, images, medium, plan)
-    else:
-        found, own = _with_given_sds(start, observation, images, medium, plan)
-    zero = jnp.zeros_like(images.mask[:, 0])
-    common = {
-        "place": found.place,
-        "observation": observation,
-        "medium": medium,
-        "offset": None,
-        "cost": found.cost,
-        "cosine": found.cosine,
-        "iterations": found.iterations,
-        "variance_rounds": jnp.zeros(zero.shape, jnp.int32),
-        "sigma_floored": jnp.zeros((observation.sigma.shape[0], *zero.shape), bool),
-        "rotation_change": zero,
-        "translation_change": zero,
-        "trace": getattr(found, "trace", None),
-        "searched": begun.searched,
-    }
-    return Solution(**(common | own))
-
-
-# Each of the following returns where a method stopped, and the fields of the solution that only it
-# can fill.
-
-
-def _conventional(
-    begun: ConventionalStart, observation: Observation, images: ImagePlanes, plan: SolvePlan
-) -> tuple[Any, dict[str, Any]]:
-    fit = begun.fit
-    if plan.options.solver == "gradient":
-        fit = pairwise_gradient(begun.start, images, plan.options)
-    if plan.other_solver is not None:
-        fit = minimise_with(plan.other_solver, begun.start, observation, images, None, plan.options)
-    return fit, {"arrived": fit.settled}
-
-
-def _alternating(
-    start: Iterate, observation: BoundedOffsets, images: ImagePlanes, plan: SolvePlan
-) -> tuple[Any, dict[str, Any]]:
-    done = alternate(
-        start,
-        observation,
-        images,
-        tolerance_rad=plan.options.tolerance_rad,
-        tolerance_mm=plan.options.tolerance_mm,
-        max_rounds=plan.options.max_rounds,
-        inner_steps=plan.options.inner_steps,
-        trace=plan.options.trace,
-    )
-    return done, {
-        "arrived": done.tolerance_met,
-        "offset": done.offset,
-        "rotation_change": done.rotation_change,
-        "translation_change": done.translation_change,
-    }
-
-
-def _bounded(
-    start: Iterate, observation: BoundedOffsets, images: ImagePlanes, plan: SolvePlan
-) -> tuple[Any, dict[str, Any]]:
-    limits = {"max_steps": plan.options.max_iterations, "trace": plan.options.trace}
-    fit = bounded(start, observation, images, **limits)
-    offset = local_unknowns(fit.place, observation, images)
-    return fit, {"arrived": fit.settled, "offset": offset}
-
-
-def _with_given_sds(
-    start: Iterate,
-    observation: Observation,
-    images: ImagePlanes,
-    medium: MediumPrior | None,
-    plan: SolvePlan,
-) -> tuple[Any, dict[str, Any]]:
-    other, options = plan.other_solver, plan.options
-    if other is not None:
-        fit = minimise_with(other, start, observation, images, medium, options)
-    else:
-        fit = minimise(
+        if options.solver == "gradient":
+            return pairwise_gradient(begun.start, images, options)
+        if other is not None:
+            return minimise_with(other, begun.start, observation, images, None, options)
+        return begun.fit
+    if isinstance(observation, BoundedOffsets):
+        if plan.method != "alternating":
+            return bounded(start, observation, images, **limits)
+        return alternate(
             start,
             observation,
             images,
-            medium=medium,
-            damping=1e-6,
-            max_steps=options.max_iterations,
+            tolerance_rad=options.tolerance_rad,
+            tolerance_mm=options.tolerance_mm,
+            max_rounds=options.max_rounds,
+            inner_steps=options.inner_steps,
             trace=options.trace,
         )
-    return fit, {"arrived": fit.settled}
-
-
-def _self_tuned(
-    start: Iterate,
-    observation: Observation,
-    images: ImagePlanes,
-    medium: MediumPrior | None,
-    plan: SolvePlan,
-) -> tuple[Any, dict[str, Any]]:
-    other, options = plan.other_solver, plan.options
     if other is not None:
-        tuned = self_tuned_with(other, start, observation, images, medium, options)
-    else:
-        tuned = self_tuned(
+        solve_with = self_tuned_with if plan.self_tuning else minimise_with
+        return solve_with(other, start, observation, images, medium, options)
+    if plan.self_tuning:
+        return self_tuned(
             start,
             observation,
             images,
@@ -302,12 +234,7 @@ def _self_tuned(
             max_rounds=options.max_iterations,
             trace=options.trace,
         )
-    return tuned, {
-        "arrived": tuned.settled,
-        "observation": observation.with_sigma(tuned.updated),
-        "sigma_floored": floored(tuned.updated),
-        "variance_rounds": tuned.iterations,
-    }
+    return minimise(start, observation, images, medium=medium, damping=1e-6, **limits)
 
 
 def _attached(
@@ -324,11 +251,7 @@ def _attached(
         step = implicit.stopped_short(found.place, observation, images)
     else:
         step = implicit.optimum(found.place, observation, images, medium)
-    place = found.place.moved(step)
-    offset = found.offset
-    if isinstance(observation, BoundedOffsets):
-        offset = local_unknowns(place, observation, images)
-    return replace(found, place=place, observation=observation, medium=medium, offset=offset)
+    return replace(found, place=found.place.moved(step), observation=observation, medium=medium)
 
 
 def _ends_still(options: Options) -> bool:

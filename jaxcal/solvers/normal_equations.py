@@ -146,12 +146,12 @@ def _derive(
     return _Derived(unknowns, components, slopes, bends, free)
 
 
-def _over_elements(plane: Entry) -> Entry:
+def over_elements(plane: Entry) -> Entry:
     """A plane with an axis of elements summed over them."""
     return plane if unrolled.is_zero(plane) or plane.ndim < 3 else jnp.sum(plane, axis=2)
 
 
-def _weight(component: Component, images: ImagePlanes) -> Array:
+def weight_of(component: Component, images: ImagePlanes) -> Array:
     """1 for every residual that is there."""
     if component.errors[0].ndim < 3:
         return images.mask if component.present is None else images.mask * component.present
@@ -162,19 +162,19 @@ def _weight(component: Component, images: ImagePlanes) -> Array:
 def _plain(derived: _Derived, k: int, images: ImagePlanes) -> Term:
     """Component k alone, unweighted, with Gauss-Newton's curvature."""
     component, slopes = derived.components[k], derived.slopes[k]
-    width, weight = len(slopes[0]), _weight(component, images)
+    width, weight = len(slopes[0]), weight_of(component, images)
     cost: Entry = 0
     gradient: Vector = [0] * width
     curvature: Matrix = [[0] * width for _ in range(width)]
     for error, slope in zip(component.errors, slopes, strict=True):
         pull = weight * error
         heavy = [unrolled.times(weight, entry) for entry in slope]
-        cost = unrolled.add(cost, _over_elements(pull * error))
+        cost = unrolled.add(cost, over_elements(pull * error))
         for i in range(width):
-            along = _over_elements(unrolled.times(pull, slope[i]))
+            along = over_elements(unrolled.times(pull, slope[i]))
             gradient[i] = unrolled.add(gradient[i], along)
             for j in range(i, width):
-                entry = _over_elements(unrolled.times(heavy[i], slope[j]))
+                entry = over_elements(unrolled.times(heavy[i], slope[j]))
                 curvature[i][j] = unrolled.add(curvature[i][j], entry)
                 curvature[j][i] = curvature[i][j]
     return Term(cost, gradient, curvature)
@@ -183,10 +183,10 @@ def _plain(derived: _Derived, k: int, images: ImagePlanes) -> Term:
 def _bent(derived: _Derived, k: int, images: ImagePlanes) -> Matrix:
     """What second derivatives of component k's residuals add to its curvature."""
     component, width = derived.components[k], len(derived.slopes[k][0])
-    weight = _weight(component, images)
+    weight = weight_of(component, images)
     found: Matrix = [[0] * width for _ in range(width)]
     for (row, i, j), bend in derived.bends[k].items():
-        entry = _over_elements(weight * component.errors[row] * bend)
+        entry = over_elements(weight * component.errors[row] * bend)
         found[i][j] = unrolled.add(found[i][j], entry)
         found[j][i] = found[i][j]
     return found

@@ -42,8 +42,9 @@ from jaxtyping import Array, Float
 
 from jaxcal.model import unrolled
 from jaxcal.model.batch import RIGID_UNKNOWNS, ImagePlanes, Iterate, targets
-from jaxcal.model.observations import Component, Further, Observation
+from jaxcal.model.observations import Further, Observation
 from jaxcal.model.unrolled import Vector
+from jaxcal.solvers.normal_equations import over_elements, weight_of
 
 MEAN_SD = 2.0
 """Prior SD of the offsets' mean if there is one, in SDs of the offsets."""
@@ -150,16 +151,12 @@ def influences(
     parts = observation.components(q, Further.of(place, here[len(q) :]), images)
     total = share = jnp.zeros_like(images.mask)
 
-    def over_elements(plane: Array, part: Component) -> Array:
-        plane = plane if part.present is None else plane * part.present
-        return plane if plane.ndim < 3 else jnp.sum(plane, axis=2)
-
     for k, part in enumerate(parts):
-        heavy = weight[k][:, None]
+        heavy, present = weight[k][:, None], weight_of(part, images)
         for value, change, slope in zip(values[k], to_minimum[k], slopes[k], strict=True):
-            total = total + heavy * over_elements((value + change) * slope, part)
-            share = share + heavy * over_elements(slope * slope, part)
-    return images.mask * total, images.mask * share / along[-1][:, None]
+            total = total + heavy * over_elements(present * (value + change) * slope)
+            share = share + heavy * over_elements(present * slope * slope)
+    return total, share / along[-1][:, None]
 
 
 def trust_in(

@@ -17,10 +17,16 @@ from jaxcal.model.batch import ImagePlanes, Iterate, choose, targets
 from jaxcal.model.observations import Further, MediumPrior, Observation
 from jaxcal.model.thresholds import MINIMUM_SELF_TUNING
 from jaxcal.runtime.compiler import traced_once
-from jaxcal.solvers.levenberg_marquardt import Rounding, gradient_cosine
-from jaxcal.solvers.normal_equations import accumulate, component_sums
+from jaxcal.solvers.levenberg_marquardt import Rounding, empty_trace, gradient_cosine
+from jaxcal.solvers.normal_equations import accumulate, component_sums, weight_of
 from jaxcal.solvers.plan import Options
 from jaxcal.solvers.reml import update_at, with_floor
+
+TOLERANCE = 1e-9
+"""Relative change of the SDs at which they are tuned."""
+
+MOST_UPDATES = 60
+"""Most updates of the SDs."""
 
 
 class Fit(eqx.Module):
@@ -44,6 +50,30 @@ class Fit(eqx.Module):
     updated: Float[Array, "k lanes"]
     trace: Float[Array, "trace lanes"] | None
 
+    @classmethod
+    def of(
+        cls,
+        found: optx.Solution,
+        place: Iterate,
+        start: Iterate,
+        observation: Observation,
+        images: ImagePlanes,
+        medium: MediumPrior | None,
+        trace: int,
+    ) -> Fit:
+        """From a solver's result for one problem, the place that it stands for, and the start."""
+        normal = accumulate(place, observation, images, None, medium)
+        rounding = Rounding.of(start, observation, images)
+        return cls(
+            place,
+            normal.cost,
+            gradient_cosine(normal, rounding.vanished),
+            (found.result == optx.RESULTS.successful)[None],
+            jnp.asarray(found.stats["num_steps"], jnp.int32)[None],
+            observation.sigma,
+            empty_trace(trace, normal.cost),
+        )
+
 
 def whitened_residuals(
     place: Iterate, observation: Observation, images: ImagePlanes, medium: MediumPrior | None
@@ -54,10 +84,7 @@ def whitened_residuals(
     found = observation.components(q, Further.at(place, axes), images)
     for component, sd in zip(found, observation.sigma, strict=True):
         for error in component.errors:
-            present = images.mask if error.ndim == 2 else images.mask[..., None]
-            if component.present is not None:
-                present = present * component.present
-            white = present * error / sd.reshape(-1, *(1,) * (error.ndim - 1))
+            white = weight_of(component, images) * error / sd.reshape(-1, *(1,) * (error.ndim - 1))
             parts.append(white.reshape(images.lanes, -1).T)
     if medium is not None:
         parts += [
@@ -94,20 +121,7 @@ def minimise_with(
         residual, solver, still, max_steps=options.max_iterations, throw=False
     )
     place = start.moved(found.value[:, None])
-    normal = accumulate(place, observation, images, None, medium)
-    rounding = Rounding.of(start, observation, images)
-    trace = None
-    if options.trace:
-        trace = jnp.full((options.trace, images.lanes), jnp.nan, images.mask.dtype)
-    return Fit(
-        place,
-        normal.cost,
-        gradient_cosine(normal, rounding.vanished),
-        (found.result == optx.RESULTS.successful)[None],
-        jnp.asarray(found.stats["num_steps"], jnp.int32)[None],
-        observation.sigma,
-        trace,
-    )
+    return Fit.of(found, place, start, observation, images, medium, options.trace)
 
 
 def self_tuned_with(
@@ -117,9 +131,6 @@ def self_tuned_with(
     images: ImagePlanes,
     medium: MediumPrior | None,
     options: Options,
-    *,
-    tolerance: float = 1e-9,
-    max_rounds: int = 60,
 ) -> Fit:
     """Weighted solves with Helmert's updates between them, until the SDs no longer change.
 
@@ -130,8 +141,6 @@ def self_tuned_with(
         images: the data, of one lane.
         medium: what is known of sound speed and delay beforehand.
         options: with the largest number of steps of each solve.
-        tolerance: relative change of the SDs to stop at.
-        max_rounds: most updates.
     """
     enough = images.used >= MINIMUM_SELF_TUNING
     squares = component_sums(start, observation, images, None, medium).squares
@@ -148,12 +157,12 @@ def self_tuned_with(
 
     def unfinished(state: tuple) -> Array:
         _, _, rounds, change, _ = state
-        return jnp.any(change > tolerance) & (rounds < max_rounds)
+        return jnp.any(change > TOLERANCE) & (rounds < MOST_UPDATES)
 
     def one_round(state: tuple) -> tuple:
         fit, sigma, rounds, change, taken = state
         after = solve(fit.place, sigma)
-        moving = change > tolerance
+        moving = change > TOLERANCE
         moved = jnp.max(jnp.abs(jnp.log(after.updated / sigma)), axis=0)
         # A lane that is lost (NaN) must stop, not hold up its neighbours.
         moved = jnp.where(jnp.isfinite(moved), moved, 0.0)
@@ -168,5 +177,5 @@ def self_tuned_with(
     one = jnp.ones_like(first[0])
     state = (empty, first, jnp.zeros((), jnp.int32), one, jnp.zeros(one.shape, jnp.int32))
     fit, _, _, change, taken = jax.lax.while_loop(unfinished, one_round, state)
-    done = fit.settled & (change <= tolerance)
+    done = fit.settled & (change <= TOLERANCE)
     return eqx.tree_at(lambda f: (f.settled, f.iterations), fit, (done, taken))

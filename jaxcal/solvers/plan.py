@@ -143,13 +143,11 @@ class Given:
     Attributes:
         sigma: SDs of (lateral, range, offset), or of (element distance, offset) on channels, mm.
         tracker_sd: SD of the tracked position, mm.
-        max_elevation: bound on the offsets, mm.
         medium_sd: prior SDs of the sound speed (m/s) and the delay (s).
     """
 
     sigma: Float[AnyArray, " components"] | None
     tracker_sd: Float[AnyArray, ""] | None
-    max_elevation: Float[AnyArray, "*images"] | None
     medium_sd: Float[AnyArray, 2] | None
 
 

@@ -92,28 +92,15 @@ def linear_proposals(problem: Problem, subsets: Float[Array, "k n"], *, scaled: 
         first, third = columns[:3], columns[3:]
         sizes = jnp.stack([jnp.sqrt(jnp.sum(first**2)), jnp.sqrt(jnp.sum(third**2))])
         lateral, axial = orthonormal_pair(first / sizes[0], third / sizes[1])
-        if scaled:
-            lateral, axial = sizes[0] * lateral, sizes[1] * axial
-        known = jnp.concatenate([lateral, axial])
+        scale = sizes if scaled else jnp.ones_like(sizes)
+        known = jnp.concatenate([scale[0] * lateral, scale[1] * axial])
         rest = dense.solve_positive(
             matrix[6:, 6:], (system[6:12, 12] - system[6:12, :6] @ known)[:, None]
         )[:, 0]
-        rotation = jnp.stack(
-            [
-                lateral / jnp.sqrt(jnp.sum(lateral**2)),
-                jnp.cross(axial, lateral) / jnp.sqrt(jnp.sum(axial**2) * jnp.sum(lateral**2)),
-                axial / jnp.sqrt(jnp.sum(axial**2)),
-            ],
-            axis=1,
-        )
-        translation = length * rest[:3] - mean[0] * lateral - mean[1] * axial
-        scale = sizes if scaled else jnp.ones_like(sizes)
         # Pixel row 0 need not be at the transducer's face: the range of row 0 is not scaled.
-        translation = (
-            translation
-            + jnp.where(jnp.asarray(scaled), (scale[1] - 1) * problem.face_offset, 0.0)
-            * rotation[:, 2]
-        )
+        depth = scale[1] * (mean[1] - problem.face_offset) + problem.face_offset
+        translation = length * rest[:3] - scale[0] * mean[0] * lateral - depth * axial
+        rotation = jnp.stack([lateral, jnp.cross(axial, lateral), axial], axis=1)
         return Parameters.of(rotation, translation, length * rest[3:] + centre, scale)
 
     return jax.vmap(solve)(systems)

@@ -49,10 +49,13 @@ from jaxcal.solvers.levenberg_marquardt import (
     MORE,
     Judged,
     Rounding,
+    damped_step,
     default_tolerance,
+    empty_trace,
     gradient_cosine,
     judge_step,
     reach,
+    recorded,
 )
 from jaxcal.solvers.normal_equations import (
     ComponentSums,
@@ -85,7 +88,7 @@ def with_floor(sigma: Float[Array, " components ..."]) -> Float[Array, " compone
     return jnp.maximum(sigma, least_sigma(sigma))
 
 
-def floored(sigma: Float[Array, " components ..."]) -> Bool[Array, " components ..."]:
+def on_floor(sigma: Float[Array, " components ..."]) -> Bool[Array, " components ..."]:
     """Which SDs rest on their floor."""
     return sigma <= 1.001 * least_sigma(sigma)
 
@@ -178,7 +181,7 @@ class SelfTuned(eqx.Module):
             iterations=count,
             settled=no,
             active=~no,
-            trace=jnp.full((trace, *number.shape), jnp.nan, number.dtype) if trace else None,
+            trace=empty_trace(trace, number),
         )
 
 
@@ -204,25 +207,6 @@ class Proposal(eqx.Module):
     indefinite: Bool[Array, " lanes"]
     half: Float[Array, " lanes"]
     predicted: Float[Array, " lanes"]
-
-
-def damped_step(
-    normal: Normal, rest: Float[Array, "triangle lanes"], damping: Array, exact: Array
-) -> Float[Array, "p lanes"]:
-    """The step with given weights; NaN where the matrix is indefinite.
-
-    Args:
-        normal: Gauss-Newton's equations.
-        rest: what exact second derivatives add to the curvature.
-        damping: Marquardt's lambda.
-        exact: 1 where ``rest`` is added.
-    """
-    diagonal = normal.diagonal()
-    held = damping * jnp.where(diagonal > 0, diagonal, 1.0)
-    matrix = stacked(normal.curvature + exact * rest)
-    places = jnp.eye(len(diagonal), dtype=diagonal.dtype)[..., None]
-    matrix, gradient = barrier((matrix + places * held, normal.gradient))
-    return dense.solve_lanes_last(matrix, -gradient)
 
 
 def updated(
@@ -287,31 +271,35 @@ class Tuning(eqx.Module):
 
     def update(
         self, sums: ComponentSums, sigma: Array, damping: Array, exact: Array
-    ) -> tuple[Array, Array, Array]:
-        """The step for given SDs, the SDs after it, and where the matrix was indefinite."""
+    ) -> tuple[Array, Array, Array, Array]:
+        """The step for given SDs, its predicted decrease, the SDs after it, and where it is lost.
+
+        It is lost, and zero, where the matrix is indefinite.
+        """
         normal = sums.weighed(1 / sigma**2)
-        move = damped_step(normal, sums.rest, damping, exact)
-        lost = jnp.logical_not(jnp.all(jnp.isfinite(move), axis=0))
-        move = jnp.where(lost, 0.0, move)
+        curved = Normal(
+            normal.curvature + exact * sums.rest, normal.gradient, normal.cost, normal.diagonal()
+        )
+        move, predicted, lost = damped_step(curved, damping)
         after = barrier(updated(sums, normal, sigma, move, self.count))
         tuned = jnp.where(jnp.isfinite(after), after, sigma)
-        return move, jnp.where(self.enough, tuned, self.held), lost
+        return move, predicted, jnp.where(self.enough, tuned, self.held), lost
 
     def propose(self, sums: ComponentSums, sigma: Array, damping: Array, exact: Array) -> Proposal:
         """From the sums at a place, a few updates of the SDs and the step for the new SDs."""
 
         def again(carry: tuple) -> tuple:
-            count, sigma, _, _, first, exact, _ = carry
-            move, after, lost = self.update(sums, sigma, damping, exact)
+            count, sigma, _, _, _, first, exact, _ = carry
+            move, predicted, after, lost = self.update(sums, sigma, damping, exact)
             first = jnp.where(count == 0, after, first)
-            return count + 1, after, sigma, move, first, jnp.where(lost, 0.0, exact), lost
+            exact = jnp.where(lost, 0.0, exact)
+            return count + 1, after, sigma, move, predicted, first, exact, lost
 
         none = jnp.zeros_like(sums.gradient[0])
-        carry = (jnp.zeros((), jnp.int32), sigma, sigma, none, sigma, exact, exact > 1)
+        zero = jnp.zeros((), jnp.int32)
+        carry = (zero, sigma, sigma, none, none[0], sigma, exact, exact > 1)
         carry = jax.lax.while_loop(lambda carry: carry[0] < UPDATES, again, carry)
-        _, after, weighed, move, first, exact, lost = carry
-        normal = sums.weighed(1 / weighed**2)
-        held_back = damping * normal.diagonal() * move
+        _, after, weighed, move, predicted, first, exact, lost = carry
         return Proposal(
             move=move,
             sigma=after,
@@ -319,8 +307,8 @@ class Tuning(eqx.Module):
             first=first,
             exact=exact,
             indefinite=lost,
-            half=0.5 * normal.cost,
-            predicted=0.5 * jnp.sum(move * (held_back - normal.gradient), axis=0),
+            half=0.5 * sums.weighed(1 / weighed**2).cost,
+            predicted=predicted,
         )
 
     def judge(self, state: SelfTuned, sums: ComponentSums, rounding: Rounding) -> Judged:
@@ -362,8 +350,7 @@ class Tuning(eqx.Module):
         )
         # Where the candidate is refused, the proposal from its sums is not used.
         exact = jnp.where(cosine <= EXACT_BELOW, 1.0, 0.0).astype(self.coordinates.dtype)
-        damping = judged.damping + 16 * jnp.finfo(self.held.dtype).eps
-        found = self.propose(sums, sigma, damping, exact)
+        found = self.propose(sums, sigma, judged.damping, exact)
         new = self.next_state(state, judged, found, place, sigma, cost, cosine)
         return choose(state.active, new, state)
 
@@ -389,10 +376,6 @@ class Tuning(eqx.Module):
         over = (damping > LARGEST_DAMPING) | (iterations >= self.max_rounds)
         over = over | jnp.logical_not(jnp.isfinite(cost))
         retry = found.indefinite | jnp.logical_not(accept)
-        recorded = state.trace
-        if recorded is not None:
-            rows = jnp.arange(recorded.shape[0])[:, None]
-            recorded = jnp.where(rows == state.iterations, cost, recorded)
         return SelfTuned(
             place=place,
             sigma=sigma,
@@ -413,7 +396,7 @@ class Tuning(eqx.Module):
             iterations=iterations,
             settled=done,
             active=jnp.logical_not(done | over),
-            trace=recorded,
+            trace=recorded(state.trace, state.iterations, cost),
         )
 
 
@@ -423,27 +406,25 @@ def self_tuned(
     images: ImagePlanes,
     *,
     medium: MediumPrior | None = None,
-    tolerance: float | None = None,
     max_rounds: int = 100,
     trace: int = 0,
 ) -> SelfTuned:
     """Solve every lane, its SDs estimated by REML.
+
+    It stops at a gradient cosine of 1e-10 and a relative change of the SDs of 1e-9 in float64, and
+    at 1e-4 for both in float32.
 
     Args:
         start: a conventional fit.
         observation: the objective; lanes with fewer than 8 used images keep its SDs.
         images: the data.
         medium: what is known of sound speed and delay beforehand.
-        tolerance: relative change of the SDs to stop at; by default 1e-9 in float64, 1e-4 in
-            float32. The gradient cosine always stops at 1e-10 in float64, 1e-4 in float32.
         max_rounds: most passes.
         trace: how many values of the objective to keep.
     """
     held, count = observation.sigma, observation.count(images)
     enough = images.used >= MINIMUM_SELF_TUNING
     standing = default_tolerance(images.mask.dtype)
-    if tolerance is None:
-        tolerance = 10 * standing if standing < 1e-9 else standing
     images, observation = barrier((images.padded(), observation.padded()))
     # Values of a lane are computed once, and not again for every image.
     coordinates, held, count, enough = barrier((reach(start, images), held, count, enough))
@@ -456,19 +437,15 @@ def self_tuned(
         enough=enough,
         coordinates=coordinates,
         standing=standing,
-        tolerance=tolerance,
+        tolerance=10 * standing if standing < 1e-9 else standing,
         max_rounds=max_rounds,
     )
     begun = SelfTuned.before(barrier(start), held, trace)
 
-    def going_on(state: SelfTuned) -> Array:
-        return jnp.any(state.active)
-
-    def iterate_once(state: SelfTuned) -> SelfTuned:
-        # Not the bound method itself: JAX hashes what it loops over, and arrays have no hash.
-        return tuning.iterate_once(state)
-
-    return jax.lax.while_loop(going_on, iterate_once, begun)
+    # Not the bound method itself: JAX hashes what it loops over, and arrays have no hash.
+    return jax.lax.while_loop(
+        lambda state: jnp.any(state.active), lambda state: tuning.iterate_once(state), begun
+    )
 
 
 def update_at(

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from jaxcal.calibration.options import Request, prepare, with_bound
+from jaxcal.calibration.options import Request, prepare
 from jaxcal.calibration.pipeline import solve_problems
 from jaxcal.data.geometry import chord_angle
 from jaxcal.data.problem import Problem
@@ -160,9 +160,10 @@ def solve(
     images = batch.images
     problems = problems_of(images)
     options = replace(options, differentiate=False)
-    plan, given = prepare(problems, Request(*kind, max_elevation=bound, options=options))
+    request = Request(*kind, max_elevation=bound, options=options)
+    problems, plan, given = prepare(problems, request)
     # Parts of the calibration that are not used are not computed.
-    found = solve_problems(with_bound(problems, given), given, plan, begun=begun)
+    found = solve_problems(problems, given, plan, begun=begun)
     matrix = jnp.asarray(found.image_to_probe)
     place = Iterate(
         jnp.moveaxis(matrix[:, :3, :3], 0, -1),

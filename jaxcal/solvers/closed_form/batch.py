@@ -20,7 +20,7 @@ They cost two solves with a known factor, in forward and reverse mode, and may b
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -54,23 +54,6 @@ MET = 500
 """Constraints are met when they are off by less than this many roundings of |x|^2."""
 SHORTER = 0.25
 """Factor on a step that was no better."""
-
-_FIELDS = tuple(ClosedForm.__dataclass_fields__)
-
-
-def _flatten(answer: ClosedForm) -> tuple[tuple[Any, ...], None]:
-    return tuple(getattr(answer, name) for name in _FIELDS), None
-
-
-def _unflatten(_: None, leaves: tuple[Any, ...]) -> ClosedForm:
-    # Not by the constructor: JAX also builds trees of things that are no arrays.
-    answer = object.__new__(ClosedForm)
-    for name, leaf in zip(_FIELDS, leaves, strict=True):
-        object.__setattr__(answer, name, leaf)
-    return answer
-
-
-jax.tree_util.register_pytree_node(ClosedForm, _flatten, _unflatten)
 
 
 def solve_batch(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
@@ -132,9 +115,9 @@ def _concrete(problems: Problem, estimate: tuple[str, ...]) -> ClosedForm:
             alone = solve_problem(one, estimate)
         except InputError:
             continue
-        for name in _FIELDS:
-            if getattr(answer, name) is not None:
-                getattr(answer, name)[lane] = getattr(alone, name)
+        for field in fields(ClosedForm):
+            if getattr(answer, field.name) is not None:
+                getattr(answer, field.name)[lane] = getattr(alone, field.name)
     return answer
 
 

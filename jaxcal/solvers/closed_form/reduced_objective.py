@@ -155,13 +155,12 @@ def image_data(
     if not hasattr(source, "mask"):
         raise InputError(f"a problem or a recording is needed, not {type(problem).__name__}")
     if hasattr(source, "kind"):
-        pixels, known = source.kind == "pixel", source.spacing_mm is not None
-        spacing = np.asarray(source.spacing_mm, dtype=float) if known else np.ones(2)
-        known, face = known or not pixels, float(source.face_offset_mm)
+        pixels, face = source.kind == "pixel", source.face_offset_mm
+        spacing = np.ones(2) if source.spacing_mm is None else np.asarray(source.spacing_mm, float)
     else:
-        pixels, known = source.pixels, source.spacing_known
-        spacing, face = np.asarray(source.spacing, dtype=float), source.face_offset
-    check_estimate(estimate, pixels, known)
+        pixels, face = source.pixels, source.face_offset
+        spacing = np.asarray(source.spacing, dtype=float)
+    check_estimate(estimate, pixels, knows_spacing(source))
     mask = np.asarray(source.mask)
     if mask.ndim != 1:
         raise InputError(f"one problem is wanted, not a batch with axes {mask.shape[:-1]}")
@@ -170,6 +169,13 @@ def image_data(
     )
     data = used_images(poses, measurements, mask > 0, spacing, float(face), pixels)
     return data, CONSTRAINTS[estimate]
+
+
+def knows_spacing(source: Any) -> bool:
+    """Whether the size of the pixels of a problem or of images is known; of points in mm it is."""
+    if hasattr(source, "kind"):
+        return source.kind != "pixel" or source.spacing_mm is not None
+    return source.spacing_known
 
 
 def check_estimate(estimate: tuple[str, ...], pixels: bool, spacing_known: bool) -> None:

@@ -29,13 +29,14 @@ Software 2, 1993 (the equality); Briales and Gonzalez-Jimenez, CVPR 2017.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxcal.data.poses import rotations_from_quaternions
 from jaxcal.runtime.array_types import Float
+from jaxcal.runtime.trees import array_tree
 from jaxcal.solvers.closed_form.certificate import Certificate, certify_point, tolerance
 from jaxcal.solvers.closed_form.reduced_objective import (
     ImageData,
@@ -68,7 +69,7 @@ RESTING = 1e-12
 """A descent is finished when its step is below this, in radians and in shares of the scale."""
 
 
-@dataclass(frozen=True)
+@array_tree
 class ClosedForm:
     """The conventional calibration of one problem, or of a batch (arrays with its leading axes).
 
@@ -262,13 +263,7 @@ def _rotations() -> Float[np.ndarray, "60 3 3"]:
     for q in unit:
         if not any(abs(abs(q @ other) - 1) < 1e-9 for other in found):
             found.append(q)
-    w, x, y, z = np.array(found).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
+    return rotations_from_quaternions(np.array(found), "wxyz")
 
 
 def _parity(permutation: tuple[int, ...]) -> int:

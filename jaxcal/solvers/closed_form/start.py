@@ -10,7 +10,7 @@ from jaxcal.data.problem import Problem
 from jaxcal.model.unknowns import Blocks
 from jaxcal.runtime.array_types import Bool, Float, HeldArray
 from jaxcal.runtime.trees import array_tree, assembled
-from jaxcal.solvers.closed_form.calibrate import calibrate_closed_form
+from jaxcal.solvers.closed_form.single import solve_problem
 
 
 @array_tree
@@ -46,7 +46,7 @@ def closed_form_start(problem: Problem, blocks: Blocks) -> Start:
         The start in the problem's own precision.
     """
     known = replace(problem, spacing_known=True, channels=None)
-    found = calibrate_closed_form(known, estimate=("scale",) if "scale" in blocks else ())
+    found = solve_problem(known, ("scale",) if "scale" in blocks else ())
     scale = np.ones(2)
     if found.scale_mm_per_px is not None:
         scale = np.asarray(found.scale_mm_per_px) / np.asarray(problem.spacing)

@@ -1,0 +1,36 @@
+"""How a method ended, for every method alike. Needs no JAX."""
+
+from __future__ import annotations
+
+from jaxcal.runtime.array_types import AnyArray, Bool, Float, Int
+from jaxcal.runtime.trees import array_tree
+
+
+@array_tree
+class Convergence:
+    """How the method ended.
+
+    Attributes:
+        cost: the minimised sum of squares, mm^2 (equal weights) or whitened.
+        stationarity: scaled KKT residual of that objective.
+        tolerance_met: the method's own stopping rule was met.
+        iterations: linearisations (joint, conventional) or rounds (alternating).
+        variance_rounds: variance updates of the self-tuning; 0 without.
+        searched_start: the closed-form start was unsound, so a search found another start.
+        sigma_floored: which SDs are at their floor.
+        rotation_change: X's last move in rad (alternating), else 0.
+        translation_change: X's last move in mm (alternating), else 0.
+        trace: objective after each of the first iterations, NaN beyond the last; None if no trace
+            was requested.
+    """
+
+    cost: Float[AnyArray, "*batch"]
+    stationarity: Float[AnyArray, "*batch"]
+    tolerance_met: Bool[AnyArray, "*batch"]
+    iterations: Int[AnyArray, "*batch"]
+    variance_rounds: Int[AnyArray, "*batch"]
+    searched_start: Bool[AnyArray, "*batch"]
+    sigma_floored: Bool[AnyArray, "*batch 3"]
+    rotation_change: Float[AnyArray, "*batch"]
+    translation_change: Float[AnyArray, "*batch"]
+    trace: Float[AnyArray, "*batch trace"] | None
