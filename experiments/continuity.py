@@ -21,7 +21,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, results_folder, write_rows
 from scipy.spatial.transform import Rotation
 
 from jaxcal import Problem, Protocol, calibrate_batch, simulate
@@ -115,11 +115,7 @@ def main() -> None:
         keys = jax.vmap(lambda k, root=root: jax.random.fold_in(root, k))(indices)
         rows.append(run(kind, images, keys))
         print(rows[-1], flush=True)
-        write_table(
-            results_folder(quick) / "continuity.csv",
-            list(rows[0]),
-            [list(row.values()) for row in rows],
-        )
+        write_rows(results_folder(quick) / "continuity.csv", rows)
     print(machine())
 
 

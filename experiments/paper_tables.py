@@ -17,9 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from common import arguments, machine, open_study, results_folder, write_table
-
-from jaxcal.io.atomic import atomic_path
+from common import arguments, machine, open_study, results_folder, save_figure, write_table
 
 PAPER = Path(__file__).parent / "paper"
 FITTED = 0.55
@@ -271,8 +269,7 @@ def plot(path: Path, data) -> None:
         panel.legend(title="elevation (points: paper)", fontsize="small")
     for panel in panels:
         panel.grid(alpha=0.3)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=130)
+    save_figure(figure, path, dpi=130)
 
 
 if __name__ == "__main__":

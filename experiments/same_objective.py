@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, results_folder, save_figure, write_table
 from jaxtyping import Array
 
 from jaxcal import Calibration, Problem, calibrate_batch
@@ -31,7 +31,6 @@ from jaxcal.backend import (
 )
 from jaxcal.data.poses import rotation_angle
 from jaxcal.diagnostics.uncertainty import mm_at_target, spectrum, threshold
-from jaxcal.io.atomic import atomic_path
 from jaxcal.model.observations import local_unknowns
 from jaxcal.runtime.compiler import fast_to_run
 from jaxcal.solvers.alternating import Alternation, alternate
@@ -306,8 +305,7 @@ def plot(path, costs: np.ndarray, joint_cost: np.ndarray, iterations: np.ndarray
              title="Same objective, same start, n = 50")  # fmt: skip
     axes.legend()
     axes.grid(alpha=0.3)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(figure, path, dpi=150)
 
 
 if __name__ == "__main__":

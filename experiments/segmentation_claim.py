@@ -61,13 +61,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, results_folder, save_figure, write_table
 from jaxtyping import Float
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision, simulate
 from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.time_of_flight import fit_distances
-from jaxcal.io.atomic import atomic_path
 
 SEED = 20261122
 IMAGES = 60
@@ -306,8 +305,7 @@ def plot(path, everything: list[dict]) -> None:
         panel.grid(alpha=0.3)
     panels[0].invert_yaxis()
     panels[0].legend(fontsize="x-small")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(figure, path, dpi=150)
 
 
 if __name__ == "__main__":

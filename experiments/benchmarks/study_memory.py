@@ -19,9 +19,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from common import arguments, machine, results_folder, write_table
-
-from jaxcal.io.atomic import atomic_path
+from common import arguments, machine, results_folder, save_figure, write_table
 
 PERIOD_S, CHUNK = 0.1, 2048
 
@@ -130,8 +128,7 @@ def plot(path: Path, runs: dict[int, np.ndarray], rows: list[list[object]]) -> N
     right.legend(fontsize="small")
     for panel in (left, right):
         panel.grid(alpha=0.3)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 if __name__ == "__main__":

@@ -27,9 +27,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import study_peer
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, results_folder, save_figure, write_table
 
-from jaxcal.io.atomic import atomic_path
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.study.cluster import compute_from_text
 from jaxcal.study.spec import Spec, parse_spec
@@ -354,8 +353,7 @@ def plot(
         right.bar(list(labels.values()), height, bottom=base, label=part)
     right.set(ylabel="share of a trial's time", title="where the time goes")
     right.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 if __name__ == "__main__":
