@@ -10,7 +10,7 @@ import itertools
 from pathlib import Path
 
 import numpy as np
-from common import arguments, machine, open_study, results_folder, save_figure, write_table
+from common import arguments, machine, open_study, save_figure, write_table
 
 from jaxcal.study.show import mean_interval
 
@@ -60,9 +60,9 @@ def summary(rows: list[list[object]]) -> list[list[object]]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     data = open_study("alternating_vs_joint", trials=64 if quick else None, quick=quick)
-    rows, folder = table(data), results_folder(quick)
+    rows = table(data)
     write_table(folder / "alternating_vs_joint.csv", HEADER, rows)
     told = summary(rows)
     header = ["elevation_distribution", "method", "cells", "cells_better", "cells_worse",

@@ -34,7 +34,6 @@ from common import (
     machine,
     paired_ratio,
     precision,
-    results_folder,
     save_figure,
     write_rows,
 )
@@ -214,10 +213,10 @@ def run_cell(cell: Cell, indices: Array, *, with_hindsight: bool = True) -> dict
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials, again = (50, 200) if quick else (TRIALS, AGAIN)
     enable_compilation_cache()
-    folder, todo = results_folder(quick), cells(quick)
+    todo = cells(quick)
     rows: list[dict[str, Any]] = []
     for index, cell in enumerate(todo):
         if index and cell.images != todo[index - 1].images:

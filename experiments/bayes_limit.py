@@ -41,7 +41,6 @@ from common import (
     machine,
     paired_ratio,
     precision,
-    results_folder,
     save_figure,
     show,
     write_table,
@@ -132,7 +131,7 @@ def run_cell(
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 50 if quick else 200
     grid = QUICK if quick else tuple(itertools.product(ELEVATIONS_MM[1:], NOISES_MM))
     cells: list[tuple[OffsetLaw, int, float, float]] = []
@@ -140,7 +139,7 @@ def main() -> None:
         cells.append((law, 50, elevation, noise))
     for images, law in itertools.product(FEW_IMAGES, LAWS):
         cells.append((law, images, *FEW_IMAGES_CELL))
-    folder, rows, begun = results_folder(quick), [], time.perf_counter()
+    rows, begun = [], time.perf_counter()
     for cell, (law, images, elevation, noise) in enumerate(cells):
         rows.append(run_cell(law, images, elevation, noise, cell * 1_000_000 + jnp.arange(trials)))
         show(rows[-1])

@@ -19,7 +19,7 @@ import bayes_limit
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, precision, results_folder, show, write_table
+from common import arguments, machine, precision, show, write_table
 from jaxtyping import Array
 
 from jaxcal.backend import RIGID, Parameters, measurement_residual, retract
@@ -159,8 +159,8 @@ def rms(values: np.ndarray) -> float:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
-    folder, rows = results_folder(quick), []
+    quick, folder = arguments(__doc__)
+    rows = []
     for condition in range(1 if quick else len(CONDITIONS)):
         rows.append(run(condition, 20, 20_000 if quick else 200_000))
         show(rows[-1])

@@ -21,7 +21,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, write_table
 from jaxtyping import Array, Float
 
 import jaxcal
@@ -380,12 +380,11 @@ def _timed(call) -> float:
 
 
 def main() -> None:
-    options = arguments(__doc__ or "")
+    quick, folder = arguments(__doc__)
     jax.config.update("jax_enable_x64", True)
-    folder = results_folder(options.quick)
     outcomes: list[Outcome] = []
-    total = QUICK if options.quick else PROBLEMS
-    name = "closed_form_quick" if options.quick else "closed_form"
+    total = QUICK if quick else PROBLEMS
+    name = "closed_form_quick" if quick else "closed_form"
     kept = Path(__file__).parent / "studies" / name
     kept.mkdir(parents=True, exist_ok=True)
     for index in range(total // BLOCK):
@@ -403,7 +402,7 @@ def main() -> None:
             print("look at:", d.family, d.estimate, d.images, d.noise, d.offset, o.objective,
                   o.best, o.gap, o.certified, o.unique)  # fmt: skip
     draw_figure(outcomes, str(folder / "closed_form_study.png"))
-    speed(folder, options.quick)
+    speed(folder, quick)
 
 
 if __name__ == "__main__":

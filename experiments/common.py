@@ -41,11 +41,12 @@ LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "one-sided", "heavy-tailed",
 """Of the offsets, in most experiments."""
 
 
-def arguments(description: str) -> argparse.Namespace:
-    """Parse ``--quick``."""
+def arguments(description: str | None) -> tuple[bool, Path]:
+    """Whether ``--quick`` was asked for, and the folder for its results."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--quick", action="store_true", help="few trials; minutes on two cores")
-    return parser.parse_args()
+    quick = parser.parse_args().quick
+    return quick, results_folder(quick)
 
 
 def results_folder(quick: bool) -> Path:

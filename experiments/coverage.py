@@ -22,7 +22,6 @@ from common import (
     arguments,
     experiments,
     machine,
-    results_folder,
     right_errors,
     save_figure,
     write_table,
@@ -57,11 +56,10 @@ def distances(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 200 if quick else 1000
     rows: list[list[object]] = []
     conditions = list(itertools.product(SIZES_MM[:1] if quick else SIZES_MM, ASKED, LAWS))
-    folder = results_folder(quick)
     for condition, ((elevation, noise), images, law) in enumerate(conditions):
         indices = condition * 1_000_000 + jnp.arange(trials)
         protocol = Protocol(

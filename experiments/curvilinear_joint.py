@@ -26,7 +26,6 @@ from common import (
     experiments,
     machine,
     precision,
-    results_folder,
     save_figure,
     write_table,
 )
@@ -112,7 +111,7 @@ def run_cell(cell: int, bound: float, noise: float, trials: int) -> dict[str, np
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 50 if quick else 500
     rows = []
     ratios = np.zeros((len(BOUNDS_MM), len(NOISES_MM)))
@@ -135,7 +134,6 @@ def main() -> None:
             f"not converged {failures}",
             flush=True,
         )
-    folder = results_folder(quick)
     write_table(
         folder / "curvilinear_joint.csv",
         ["offset_bound_mm", "channel_noise_mm", "trials", "rp_conventional_mm", "rp_paper_way_mm",

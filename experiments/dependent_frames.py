@@ -19,10 +19,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from common import arguments, batch_of, machine, results_folder, right_errors, write_table
+from common import arguments, batch_of, machine, right_errors, write_table
 from scipy.spatial.transform import Rotation
 
 import jaxcal
@@ -182,7 +181,7 @@ def row_of(result: Calibration, truth: np.ndarray) -> list[object]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 40 if quick else 400
     enable_compilation_cache()
     rows: list[list[object]] = []
@@ -212,8 +211,7 @@ def main() -> None:
                 rest = row_of(jaxcal.calibrate_batch(batch_of(some, most), chunk=40), those)
             rows.append(head + rest)
             print(*rows[-1], flush=True)
-    path: Path = results_folder(quick) / "dependent_frames.csv"
-    write_table(path, HEADER, rows)
+    write_table(folder / "dependent_frames.csv", HEADER, rows)
     print(machine())
 
 

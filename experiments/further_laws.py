@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from auto_grid import COMPARED, SUBSET, Cell, run_cell
-from common import LAWS, arguments, machine, results_folder, write_rows
+from common import LAWS, arguments, machine, write_rows
 
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.study.laws import OFFSET_LAWS
@@ -43,10 +43,10 @@ def cells(quick: bool) -> list[Cell]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials, again = (50, 200) if quick else (TRIALS, AGAIN)
     enable_compilation_cache()
-    folder, todo = results_folder(quick), cells(quick)
+    todo = cells(quick)
     rows: list[dict[str, Any]] = []
     repeated: list[dict[str, Any]] = []
     for index, cell in enumerate(todo):

@@ -26,7 +26,6 @@ from common import (
     machine,
     paired_ratio,
     precision,
-    results_folder,
     save_figure,
     write_table,
 )
@@ -134,10 +133,9 @@ HEADER = ["law", "elevation_mm", "noise_mm", "fraction", "kind", "images", "tria
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 24 if quick else 200
     enable_compilation_cache()
-    folder = results_folder(quick)
     rows: list[list] = []
     for index, cell in enumerate(cells(quick)):
         rows.append(run_cell(index, cell, trials))

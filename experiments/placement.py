@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from common import arguments, machine, results_folder, save_figure, write_table
+from common import arguments, machine, save_figure, write_table
 
 from hw.bench.stage import Pace, WorldStage
 from hw.bench.world import World, make_world
@@ -207,7 +207,7 @@ def precision(transforms: np.ndarray, runs: list[Run]) -> np.ndarray:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     benches = 4 if quick else 64
     rows, spread = [], {}
     for name in ARMS:
@@ -247,7 +247,6 @@ def main() -> None:
             f"{rows[-1][16]}",
             flush=True,
         )
-    folder = results_folder(quick)
     write_table(
         folder / "placement.csv",
         ["placement", "benches", "images", "rp_joint_mm", "rp_bounded_mm", "rp_conventional_mm",

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from common import arguments, machine, results_folder, show, write_table
+from common import arguments, machine, show, write_table
 from pose_design import MOST
 
 import jaxcal
@@ -78,10 +78,10 @@ def benches(count: int) -> list[list[object]]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     enable_compilation_cache()
     rows = benches(4 if quick else 64)
-    write_table(results_folder(quick) / "pose_design_benches.csv", HEADER, rows)
+    write_table(folder / "pose_design_benches.csv", HEADER, rows)
     print(machine())
 
 

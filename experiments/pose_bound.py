@@ -7,7 +7,7 @@ that no set of the candidates goes below (``jaxcal.design.least_error``). Seed 2
 from __future__ import annotations
 
 import numpy as np
-from common import arguments, machine, results_folder, show, write_table
+from common import arguments, machine, show, write_table
 from pose_design import CONES, COUNTS, POOL, SEED, planned, pool
 
 from jaxcal import design
@@ -42,9 +42,9 @@ def bounds() -> list[list[object]]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    _, folder = arguments(__doc__)
     enable_compilation_cache()
-    write_table(results_folder(quick) / "pose_design_bound.csv", HEADER, bounds())
+    write_table(folder / "pose_design_bound.csv", HEADER, bounds())
     print(machine())
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, show, write_table
+from common import arguments, machine, show, write_table
 from crosswire_real import DATA
 
 import jaxcal
@@ -72,13 +72,13 @@ def crosswire(folder: Path, halves: int) -> list[list[object]]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     enable_compilation_cache()
     if not DATA.is_dir():
         print(f"{DATA}: the recording is not here; nothing was done")
         return
     rows = crosswire(DATA, 40 if quick else 200)
-    write_table(results_folder(quick) / "pose_design_crosswire.csv", HEADER, rows)
+    write_table(folder / "pose_design_crosswire.csv", HEADER, rows)
     print(machine())
 
 

@@ -32,7 +32,6 @@ from common import (
     arguments,
     batch_of,
     machine,
-    results_folder,
     save_figure,
     show,
     write_table,
@@ -282,9 +281,8 @@ def plot(path: Path, rows: list[list[object]]) -> None:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     enable_compilation_cache()
-    folder = results_folder(quick)
     rows = simulated(24 if quick else TRIALS, LAWS[:2] if quick else LAWS, folder)
     print("\n".join(verdict(rows)))
     plot(folder / "pose_design.png", rows)

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from common import arguments, machine, results_folder, save_figure, write_table
+from common import arguments, machine, save_figure, write_table
 from matplotlib.figure import Figure
 from pose_design import CONES, POOL, SEED, pool
 
@@ -72,10 +72,10 @@ def timings() -> list[str]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    _, folder = arguments(__doc__)
     enable_compilation_cache()
     print("\n".join(timings()))
-    planning_curves(results_folder(quick))
+    planning_curves(folder)
     print(machine())
 
 

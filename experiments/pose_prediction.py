@@ -12,7 +12,7 @@ import itertools
 from pathlib import Path
 
 import numpy as np
-from common import LAWS, arguments, batch_of, machine, results_folder, show, write_table
+from common import LAWS, arguments, batch_of, machine, show, write_table
 from pose_design import (
     ARMS,
     CONES,
@@ -78,9 +78,9 @@ def predictions(trials: int, folder: Path) -> None:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     enable_compilation_cache()
-    predictions(24 if quick else SIMULATED, results_folder(quick))
+    predictions(24 if quick else SIMULATED, folder)
     print(machine())
 
 

@@ -31,7 +31,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, write_table
 
 from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
 from hw.errors import DeviceError
@@ -210,8 +210,7 @@ def speeds(moves: int) -> list[list[object]]:
 
 def main() -> None:
     """Make the tables and the figure."""
-    quick = arguments("faults, rates and speeds of the emulated robot").quick
-    folder = results_folder(quick)
+    quick, folder = arguments(__doc__)
     privileged = real_time()
     end = "" if privileged else "_unprivileged"
     print(f"{machine()}; real-time scheduling: {privileged}; seed {SEED}")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, save_figure, write_table
+from common import arguments, machine, save_figure, write_table
 from jaxtyping import Array
 
 from jaxcal import Calibration, Problem, calibrate_batch
@@ -179,7 +179,7 @@ def scipy_solution(problem: Problem, start: Parameters, offset: np.ndarray, boun
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     count, compared = (100, 10) if quick else (1000, 50)
     problems, settings, bounds = draw(count)
     per_image = jnp.asarray(bounds)[:, None] * jnp.ones(IMAGES)
@@ -237,7 +237,6 @@ def main() -> None:
     # Where scipy ends in another, higher minimum there is no X to compare.
     angles = [peer[-1] for peer in peers if peer[6] and not peer[4]]
 
-    folder = results_folder(quick)
     write_table(
         folder / "same_objective.csv",
         ["problem", "elevation_mm", "noise_mm", "bound_mm", "joint_cost_mm2", "joint_iterations",

@@ -14,7 +14,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from common import arguments, machine, results_folder, save_figure, write_table
+from common import arguments, machine, save_figure, write_table
 
 from jaxcal.data.probe import C5_2, L14_5, Probe
 from jaxcal.data.recording import make_images
@@ -143,9 +143,8 @@ def curvilinear_rows(frames: int) -> list[list[object]]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     frames = 1000 if quick else 10_000
-    folder = results_folder(quick)
     linear, curved = linear_rows(frames), curvilinear_rows(frames)
     foot = [f"{frames} frames a row, seed {SEED}", machine()]
     write_table(

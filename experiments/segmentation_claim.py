@@ -61,7 +61,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, save_figure, write_table
+from common import arguments, machine, save_figure, write_table
 from jaxtyping import Float
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision, simulate
@@ -237,7 +237,7 @@ def verdict(mean: float, half: float) -> str:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 20 if quick else 400
     seen = {}
     for contrast in CONTRASTS_DB:
@@ -261,7 +261,6 @@ def main() -> None:
                         difference = interval(rp - manual[reference][method, kind])
                         line += [*difference, verdict(*difference)]
                     rows.append([*line, row["not_converged"]])
-    folder = results_folder(quick)
     header = ["elevation_mm", "segmentation", "family", "channel_noise_mm", "clock_mhz",
               "rms_lateral_mm", "rms_range_mm", "bias_lateral_mm", "bias_range_mm", "method",
               "test_points", "trials", "rp_mm", "ci95_half_mm"]  # fmt: skip

@@ -21,7 +21,6 @@ from common import (
     grid_panel,
     machine,
     precision,
-    results_folder,
     save_figure,
     write_table,
 )
@@ -66,7 +65,7 @@ def realised(drawn: Experiment) -> Array:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 40 if quick else 200
     rows, ratios, worst = [], np.zeros((7, 7)), 0.0
     for cell, (elevation, noise) in enumerate(itertools.product(ELEVATIONS_MM, NOISES_MM)):
@@ -93,7 +92,6 @@ def main() -> None:
             f"sigma/realised {np.round(sigma, 3).tolist()}; not converged {failures}",
             flush=True,
         )
-    folder = results_folder(quick)
     write_table(
         folder / "self_tuned_grid.csv",
         ["elevation_mm", "noise_mm", "trials", "rp_conventional_mm", "rp_alternating_mm",

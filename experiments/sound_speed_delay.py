@@ -22,7 +22,6 @@ from common import (
     experiments,
     machine,
     precision,
-    results_folder,
     save_figure,
     write_table,
 )
@@ -79,7 +78,7 @@ def run_cell(cell: int, kind: str, noise: float, trials: int) -> dict[str, np.nd
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 40 if quick else 500
     rows, draws = [], {}
     for cell, (kind, noise) in enumerate(itertools.product(PROBES, NOISES_MM)):
@@ -103,7 +102,6 @@ def main() -> None:
             + f" mm, estimated/known {rows[-1][14]:.3f}; not converged {rows[-1][15]}",
             flush=True,
         )
-    folder = results_folder(quick)
     write_table(
         folder / "sound_speed_delay.csv",
         ["probe", "channel_noise_mm", "trials", "speed_mean_m_s", "speed_scatter_m_s",

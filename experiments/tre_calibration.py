@@ -30,7 +30,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import LAWS, arguments, experiments, machine, results_folder, save_figure, write_table
+from common import LAWS, arguments, experiments, machine, save_figure, write_table
 
 from jaxcal import Calibration, Problem, Protocol, calibrate_batch, predicted_tre
 from jaxcal.data.probe import L14_5
@@ -206,8 +206,7 @@ def stated_before(result: Calibration, points: np.ndarray) -> float:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
-    folder = results_folder(quick)
+    quick, folder = arguments(__doc__)
     by_law = laws(100 if quick else 1000, folder)
     by_scale = scales(60 if quick else 400, folder)
     for line in misses(by_law, by_scale):

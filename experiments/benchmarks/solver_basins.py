@@ -22,7 +22,6 @@ from solver_peers import (
     calibrated,
     draw,
     load_of_the_machine,
-    results_folder,
     show,
     write_table,
 )
@@ -36,7 +35,7 @@ HEADER = [
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     load, count = os.getloadavg()[0], 1024 if quick else 4096
     near = draw(count, 0.0, 0.0)
     solve = Minimiser.of(near)
@@ -56,7 +55,7 @@ def main() -> None:
         ])  # fmt: skip
         show(rows[-1])
     foot = [load_of_the_machine(load)]
-    write_table(results_folder(quick) / "solver_basins.csv", HEADER, [*rows, foot])
+    write_table(folder / "solver_basins.csv", HEADER, [*rows, foot])
 
 
 if __name__ == "__main__":

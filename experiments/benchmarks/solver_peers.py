@@ -40,7 +40,6 @@ from common import (  # noqa: E402
     batch_of,
     experiments,
     machine,
-    results_folder,
     save_figure,
     show,
     write_table,
@@ -306,8 +305,8 @@ def load_of_the_machine(before: float) -> str:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
-    folder, load = results_folder(quick), os.getloadavg()[0]
+    quick, folder = arguments(__doc__)
+    load = os.getloadavg()[0]
     rows = race(contestants(quick), 3 if quick else 15)
     write_table(folder / "solver_peers.csv", HEADER, [*rows, [load_of_the_machine(load)]])
     for row in rows:
