@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, write_table
+from common import arguments, batch_of, machine, save_figure, write_table
 from jaxtyping import Array, Float
 
 import jaxcal
@@ -299,14 +299,12 @@ def rows_of(outcomes: list[Outcome]) -> list[list[object]]:
     return rows
 
 
-def draw_figure(outcomes: list[Outcome], path: str) -> None:
+def draw_figure(outcomes: list[Outcome], path: Path) -> None:
     """Shares certified and shares of single descents that miss the minimum, over the images."""
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4))
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    axes = figure.subplots(1, 2)
     ordinary = [o for o in outcomes if o.drawn.family in ORDINARY]
     for estimate in ESTIMATES:
         label = "+".join(estimate) or "scales known"
@@ -334,8 +332,7 @@ def draw_figure(outcomes: list[Outcome], path: str) -> None:
             axes[1].plot(n, g, ".", markersize=2, label=name)
     axes[1].set(xlabel="images", ylabel="gap / objective", yscale="log", title="proved gap")
     axes[1].legend(markerscale=4)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def speed(folder, quick: bool) -> None:
@@ -348,16 +345,15 @@ def speed(folder, quick: bool) -> None:
         one = draw(rng)
         if one.family == "general" and one.images == 50 and one.noise > 0:
             general.append(one.data)
-    poses = np.tile(np.eye(4), (count, 50, 1, 1))
-    poses[:, :, :3, :3] = [data.rotations for data in general]
-    poses[:, :, :3, 3] = [data.translations for data in general]
-    points = np.array([data.points for data in general])
+    sets = []
+    for data in general:
+        poses = np.tile(np.eye(4), (50, 1, 1))
+        poses[:, :3, :3], poses[:, :3, 3] = data.rotations, data.translations
+        sets.append((poses, data.points))
+    batch_in_mm = batch_of(sets, 50)
     for estimate in ESTIMATES:
-        problems = jaxcal.Problem(
-            poses=jnp.asarray(poses), measurements=jnp.asarray(points), mask=jnp.ones((count, 50)),
-            spacing=jnp.ones((count, 2)), face_offset=jnp.zeros(count),
-            pixels=bool({"scale", "common-scale"} & set(estimate)),
-        )  # fmt: skip
+        pixels = bool({"scale", "common-scale"} & set(estimate))
+        problems = replace(batch_in_mm, pixels=pixels)
         answers = jaxcal.calibrate_closed_form(problems, estimate=estimate)
         batch = min(_timed(lambda p=problems, e=estimate: jaxcal.calibrate_closed_form(
             p, estimate=e)) for _ in range(20))  # fmt: skip
@@ -381,7 +377,6 @@ def _timed(call) -> float:
 
 def main() -> None:
     quick, folder = arguments(__doc__)
-    jax.config.update("jax_enable_x64", True)
     outcomes: list[Outcome] = []
     total = QUICK if quick else PROBLEMS
     name = "closed_form_quick" if quick else "closed_form"
@@ -401,7 +396,7 @@ def main() -> None:
             d = o.drawn
             print("look at:", d.family, d.estimate, d.images, d.noise, d.offset, o.objective,
                   o.best, o.gap, o.certified, o.unique)  # fmt: skip
-    draw_figure(outcomes, str(folder / "closed_form_study.png"))
+    draw_figure(outcomes, folder / "closed_form_study.png")
     speed(folder, quick)
 
 

@@ -26,12 +26,9 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
-from common import arguments, machine, write_table
+from common import arguments, machine, save_figure, write_table
+from matplotlib.figure import Figure
 
 from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
 from hw.errors import DeviceError
@@ -234,7 +231,8 @@ def main() -> None:
          "bench_s_per_wall_s"],
         speed_rows,
     )  # fmt: skip
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
     names = [str(row[0]) for row in fault_rows]
     left.barh(names, [float(str(row[3])) for row in fault_rows])
     left.axvline(200.0, color="k", linestyle="--", label="bar")
@@ -247,7 +245,7 @@ def main() -> None:
     )  # fmt: skip
     right.set(xlabel="bench seconds per wall second", ylabel="motions that arrived (%)",
               title="speed of the bench", ylim=(0, 105))  # fmt: skip
-    figure.savefig(folder / f"robot_bench{end}.png", dpi=150)
+    save_figure(figure, folder / f"robot_bench{end}.png", dpi=150)
 
 
 if __name__ == "__main__":
