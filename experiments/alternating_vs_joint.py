@@ -10,9 +10,8 @@ import itertools
 from pathlib import Path
 
 import numpy as np
-from common import arguments, machine, open_study, results_folder, write_table
+from common import arguments, machine, open_study, save_figure, write_table
 
-from jaxcal.io.atomic import atomic_path
 from jaxcal.study.show import mean_interval
 
 CELL = ("elevation_distribution", "elevation_mm", "noise_mm")
@@ -61,9 +60,9 @@ def summary(rows: list[list[object]]) -> list[list[object]]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     data = open_study("alternating_vs_joint", trials=64 if quick else None, quick=quick)
-    rows, folder = table(data), results_folder(quick)
+    rows = table(data)
     write_table(folder / "alternating_vs_joint.csv", HEADER, rows)
     told = summary(rows)
     header = ["elevation_distribution", "method", "cells", "cells_better", "cells_worse",
@@ -105,8 +104,7 @@ def plot(path: Path, data, rows: list[list[object]]) -> None:
     panels[0].legend(ncols=3, fontsize="small")
     panels[-1].set_xticks(range(len(cells)), [f"{e:g} mm\n{s:g} mm" for e, s in cells])
     panels[-1].set_xlabel("size of the offsets (above) and noise on each distance (below)")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 if __name__ == "__main__":

@@ -18,25 +18,35 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import ELEVATIONS_MM, LAWS, NOISES_MM, arguments, machine, results_folder, write_table
+from common import (
+    ELEVATIONS_MM,
+    LAWS,
+    NOISES_MM,
+    arguments,
+    experiments,
+    grid_panel,
+    machine,
+    paired_ratio,
+    precision,
+    save_figure,
+    write_rows,
+)
 from jaxtyping import Array
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision
 from jaxcal.backend import RIGID, BoundedOffsets, ImagePlanes, Iterate, Parameters
-from jaxcal.io.atomic import atomic_path
 from jaxcal.runtime.compiler import fast_to_run
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.solvers.alternating import alternate
 from jaxcal.solvers.plan import Options
 from jaxcal.study.offsets import OffsetLaw, nominal_bound
-from jaxcal.study.simulation import Experiment, simulate
+from jaxcal.study.simulation import Experiment
 
 SEED = 20261124
 TRIALS, AGAIN = 200, 4000
@@ -86,23 +96,7 @@ def cells(quick: bool) -> list[Cell]:
     return grid + sizes
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def draw(law: OffsetLaw, images: int, indices: Array, elevation: Array, noise: Array):
-    """Experiments of one cell."""
-    protocol = Protocol(images=images, elevation_distribution=law)
-    protocol = replace(protocol, elevation_mm=elevation, noise_mm=noise)
-    root = jax.random.key(SEED)
-    return jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol))(indices)
-
-
-@jax.jit
-def precision(x: Array, experiments: Experiment) -> Array:
-    """Eq. 8 of every trial."""
-    found = jax.vmap(reconstruction_precision)(x, experiments.test_poses, experiments.test_points)
-    return jnp.asarray(found)
-
-
-def hindsight(begun, problems: Problem, experiments: Experiment, bounds: Array) -> Array:
+def hindsight(begun, problems: Problem, drawn: Experiment, bounds: Array) -> Array:
     """RP of the alternation at each of ROUNDS and by its rule: (trials, bounds, rounds + 1)."""
     rule = Options()
 
@@ -150,8 +144,7 @@ def hindsight(begun, problems: Problem, experiments: Experiment, bounds: Array) 
         found = jnp.concatenate([by_rounds, judged(by_rule.place)[None]])
         return found.T.reshape(-1, count, len(ROUNDS) + 1)
 
-    batch = (begun.image_to_probe, begun.point, problems, experiments.test_poses,
-             experiments.test_points)  # fmt: skip
+    batch = (begun.image_to_probe, begun.point, problems, drawn.test_poses, drawn.test_points)
     parts = jax.tree.map(lambda leaf: leaf.reshape(-1, SIDE_BY_SIDE, *leaf.shape[1:]), batch)
     return jax.lax.map(some, parts).reshape(-1, bounds.shape[0], len(ROUNDS) + 1)
 
@@ -159,26 +152,23 @@ def hindsight(begun, problems: Problem, experiments: Experiment, bounds: Array) 
 _hindsight = jax.jit(hindsight, compiler_options=fast_to_run(jax.default_backend()))
 
 
-def ratio(values: np.ndarray, to: np.ndarray) -> tuple[float, float]:
-    """Ratio of the means of paired trials and half its 95 % interval (linearised)."""
-    quotient = float(values.mean() / to.mean())
-    apart = values - quotient * to
-    return quotient, float(1.96 * apart.std(ddof=1) / np.sqrt(len(to)) / to.mean())
-
-
 def run_cell(cell: Cell, indices: Array, *, with_hindsight: bool = True) -> dict[str, object]:
     """One row of the table."""
     size, noise = cell.elevation_mm, cell.noise_mm
-    experiments = draw(cell.law, cell.images, indices, size, noise)
-    plain = jax.vmap(lambda experiment: experiment.problem())(experiments)
-    weighted = replace(plain, covariance=experiments.covariance)
+    protocol = Protocol(
+        images=cell.images, elevation_distribution=cell.law, elevation_mm=size, noise_mm=noise
+    )
+    drawn = experiments(SEED, indices, protocol)
+    plain = jax.vmap(lambda experiment: experiment.problem())(drawn)
+    weighted = replace(plain, covariance=drawn.covariance)
     results = {
         "conventional": calibrate_batch(plain, "conventional"),
         "alternating": calibrate_batch(plain, "alternating"),
         "auto": calibrate_batch(weighted, "joint"),
         "auto_points": calibrate_batch(plain, "joint"),
     }
-    rp = {k: np.asarray(precision(r.image_to_probe, experiments)) for k, r in results.items()}
+    tests = drawn.test_poses, drawn.test_points
+    rp = {name: precision(found.image_to_probe, *tests) for name, found in results.items()}
     law = results["auto"].offset_law
     assert law is not None
     row: dict[str, object] = {
@@ -190,7 +180,7 @@ def run_cell(cell: Cell, indices: Array, *, with_hindsight: bool = True) -> dict
     for name in COMPARED:
         one, other = name.split("_over_")
         row[name], row[f"{name}_ci95_half"] = (
-            (np.nan, np.nan) if exact else ratio(rp[one], rp[other])
+            (np.nan, np.nan) if exact else paired_ratio(rp[one], rp[other])
         )
     row |= {
         "auto_loses": float(np.mean(rp["auto"] > rp["conventional"])),
@@ -207,9 +197,7 @@ def run_cell(cell: Cell, indices: Array, *, with_hindsight: bool = True) -> dict
     if not size:
         return row
     bounds = FACTORS * nominal_bound(cell.law, size)
-    found = np.asarray(
-        _hindsight(results["conventional"], plain, experiments, jnp.asarray(bounds))
-    )  # fmt: skip
+    found = np.asarray(_hindsight(results["conventional"], plain, drawn, jnp.asarray(bounds)))
     table = found.mean(axis=0)
     bound, stop = np.unravel_index(np.argmin(table), table.shape)
     best = found[:, bound, stop]
@@ -220,15 +208,15 @@ def run_cell(cell: Cell, indices: Array, *, with_hindsight: bool = True) -> dict
             "rp_hindsight_rule_mm": float(table[:, -1].min())}  # fmt: skip
     for one in ("auto", "auto_points"):
         name = f"hindsight_over_{one}"
-        row[name], row[f"{name}_ci95_half"] = ratio(best, rp[one])
+        row[name], row[f"{name}_ci95_half"] = paired_ratio(best, rp[one])
     return row
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials, again = (50, 200) if quick else (TRIALS, AGAIN)
     enable_compilation_cache()
-    folder, todo = results_folder(quick), cells(quick)
+    todo = cells(quick)
     rows: list[dict[str, Any]] = []
     for index, cell in enumerate(todo):
         if index and cell.images != todo[index - 1].images:
@@ -237,7 +225,7 @@ def main() -> None:
         told = (*COMPARED[:3], "not_converged", "hindsight_over_auto", "hindsight_bound_over_true",
                 "hindsight_rounds")  # fmt: skip
         print(f"{cell}: " + ", ".join(f"{name} {rows[-1][name]:.4g}" for name in told), flush=True)
-        write(folder / "auto_grid.csv", rows)
+        write_rows(folder / "auto_grid.csv", rows)
     jax.clear_caches()
     repeated = []
     for index, (cell, row) in enumerate(zip(todo, rows, strict=True)):
@@ -249,16 +237,11 @@ def main() -> None:
                 f"{repeated[-1][f'{name}_ci95_half']:.4f}" for name in COMPARED
             ), flush=True)  # fmt: skip
     if repeated:
-        write(folder / "auto_grid_again.csv", repeated)
+        write_rows(folder / "auto_grid_again.csv", repeated)
     else:
         (folder / "auto_grid_again.csv").unlink(missing_ok=True)
     summary(todo, rows)
     plot(folder / "auto_grid.png", rows)
-
-
-def write(path: Path, rows: list[dict[str, Any]]) -> None:
-    """The rows as a table."""
-    write_table(path, list(rows[0]), [list(row.values()) for row in rows])
 
 
 def summary(todo: list[Cell], rows: list[dict[str, Any]]) -> None:
@@ -302,13 +285,8 @@ def plot(path: Path, rows: list[dict[str, Any]]) -> None:
             if row["images"] == 50 and row["elevation_distribution"] in (law, "none"):
                 at = ELEVATIONS_MM.index(row["elevation_mm"]), NOISES_MM.index(row["noise_mm"])
                 grid[at] = row["auto_over_conventional"]
-        panel.imshow(grid, cmap="RdBu_r", vmin=0, vmax=2, origin="lower")
-        for i, j in np.argwhere(np.isfinite(grid)):
-            panel.text(j, i, f"{grid[i, j]:.2f}", ha="center", va="center", fontsize="small")
-        panel.set_xticks(range(len(NOISES_MM)), [f"{noise:g}" for noise in NOISES_MM])
-        panel.set_yticks(range(len(ELEVATIONS_MM)), [f"{e:g}" for e in ELEVATIONS_MM])
-        panel.set(xlabel="noise on each distance, SD (mm)", ylabel="size of the offsets (mm)",
-                  title=f"{law}: over conventional, n = 50")  # fmt: skip
+        grid_panel(panel, grid, half=1.0)
+        panel.set(title=f"{law}: over conventional, n = 50")
     panel = panels[-1]
     others = (
         ("over conventional", lambda row: row["auto_over_conventional"], -0.12, "C0"),
@@ -325,8 +303,7 @@ def plot(path: Path, rows: list[dict[str, Any]]) -> None:
               ylim=(0, None))  # fmt: skip
     panel.legend(fontsize="x-small")
     figure.suptitle("Mean RP of prior auto")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+    save_figure(figure, path, dpi=120)
 
 
 if __name__ == "__main__":

@@ -26,19 +26,30 @@ from __future__ import annotations
 import itertools
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from bayes_sampler import Mean, posterior_mean
-from common import ELEVATIONS_MM, NOISES_MM, arguments, machine, results_folder, write_table
+from common import (
+    ELEVATIONS_MM,
+    NOISES_MM,
+    arguments,
+    experiments,
+    grid_panel,
+    machine,
+    paired_ratio,
+    precision,
+    save_figure,
+    show,
+    write_table,
+)
 from jaxtyping import Array
 
-from jaxcal import Protocol, calibrate_batch, reconstruction_precision, simulate
-from jaxcal.io.atomic import atomic_path
+from jaxcal import Protocol, calibrate_batch
 from jaxcal.study.offsets import OffsetLaw
+from jaxcal.study.simulation import Experiment
 
 SEED = 20261126
 LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "heavy-tailed", "triangular")
@@ -60,30 +71,22 @@ HEADER = [
 ]  # fmt: skip
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def draw(law: OffsetLaw, images: int, indices: Array, elevation: Array, noise: Array):
+def draw(law: OffsetLaw, images: int, indices: Array, elevation: float, noise: float) -> Experiment:
     """Experiments of one cell."""
-    protocol = Protocol(images=images, elevation_distribution=law)
-    protocol = replace(protocol, elevation_mm=elevation, noise_mm=noise)
-    root = jax.random.key(SEED)
-    return jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol))(indices)
-
-
-@jax.jit
-def precision(x: Array, experiments) -> Array:
-    """Eq. 8 of every trial."""
-    found = jax.vmap(reconstruction_precision)(x, experiments.test_poses, experiments.test_points)
-    return jnp.asarray(found)
+    protocol = Protocol(
+        images=images, elevation_distribution=law, elevation_mm=elevation, noise_mm=noise
+    )
+    return experiments(SEED, indices, protocol)
 
 
 def limits(
-    law: OffsetLaw, size: float, experiments, start, indices: Array, told: bool = True
+    law: OffsetLaw, size: float, drawn: Experiment, start, indices: Array, told: bool = True
 ) -> list[Mean]:
     """The limit's answer to every trial, from a calibration nearby."""
-    covariances = np.asarray(experiments.covariance)
+    covariances = np.asarray(drawn.covariance)
     if not np.any(covariances):
         covariances = covariances + EXACT_MM**2 * np.eye(2)
-    poses, points = np.asarray(experiments.poses), np.asarray(experiments.points)
+    poses, points = np.asarray(drawn.poses), np.asarray(drawn.points)
     x, c = np.asarray(start.image_to_probe), np.asarray(start.point)
     return [
         posterior_mean(
@@ -98,29 +101,27 @@ def run_cell(
     law: OffsetLaw, images: int, elevation: float, noise: float, indices: Array
 ) -> list[object]:
     """One row of the table."""
-    experiments = draw(law, images, indices, elevation, noise)
-    plain = jax.vmap(lambda experiment: experiment.problem())(experiments)
+    drawn = draw(law, images, indices, elevation, noise)
+    plain = jax.vmap(lambda experiment: experiment.problem())(drawn)
     results = {
         "conventional": calibrate_batch(plain, "conventional", chunk=50),
         "gaussian": calibrate_batch(plain, "joint", "gaussian", chunk=50),
-        "auto": calibrate_batch(
-            replace(plain, covariance=experiments.covariance), "joint", chunk=50
-        ),
+        "auto": calibrate_batch(replace(plain, covariance=drawn.covariance), "joint", chunk=50),
     }
-    found = limits(law, elevation, experiments, results["auto"], indices)
+    found = limits(law, elevation, drawn, results["auto"], indices)
     answers = {name: result.image_to_probe for name, result in results.items()}
     answers["bayes"] = jnp.asarray(np.stack([mean.image_to_probe for mean in found]))
     if law == "uniform":
-        untold = limits(law, elevation, experiments, results["auto"], indices, told=False)
+        untold = limits(law, elevation, drawn, results["auto"], indices, told=False)
         answers["untold"] = jnp.asarray(np.stack([mean.image_to_probe for mean in untold]))
-    rp = {name: np.asarray(precision(x, experiments)) for name, x in answers.items()}
+    tests = drawn.test_poses, drawn.test_points
+    rp = {name: precision(x, *tests) for name, x in answers.items()}
     mean = {name: float(values.mean()) for name, values in rp.items()}
-    ratio, unknown = mean["auto"] / mean["bayes"], mean.pop("untold", None)
-    half = 1.96 * (rp["auto"] - ratio * rp["bayes"]).std(ddof=1) / np.sqrt(len(indices))
+    unknown = mean.pop("untold", None)
     worth = [one.effective for one in found]
     return [
-        law, images, elevation, noise, len(indices), *mean.values(), ratio,
-        float(half / mean["bayes"]), mean["gaussian"] / mean["bayes"],
+        law, images, elevation, noise, len(indices), *mean.values(),
+        *paired_ratio(rp["auto"], rp["bayes"]), mean["gaussian"] / mean["bayes"],
         mean["conventional"] / mean["bayes"],
         float(np.sqrt(np.mean([one.error for one in found]))),
         float(np.median(worth)), float(np.min(worth)), *(
@@ -130,7 +131,7 @@ def run_cell(
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 50 if quick else 200
     grid = QUICK if quick else tuple(itertools.product(ELEVATIONS_MM[1:], NOISES_MM))
     cells: list[tuple[OffsetLaw, int, float, float]] = []
@@ -138,14 +139,10 @@ def main() -> None:
         cells.append((law, 50, elevation, noise))
     for images, law in itertools.product(FEW_IMAGES, LAWS):
         cells.append((law, images, *FEW_IMAGES_CELL))
-    folder, rows, begun = results_folder(quick), [], time.perf_counter()
+    rows, begun = [], time.perf_counter()
     for cell, (law, images, elevation, noise) in enumerate(cells):
         rows.append(run_cell(law, images, elevation, noise, cell * 1_000_000 + jnp.arange(trials)))
-        shown = dict(zip(HEADER, rows[-1], strict=True))
-        print(", ".join(
-            f"{name} {value:.4g}" if isinstance(value, float) else str(value)
-            for name, value in shown.items()
-        ), flush=True)  # fmt: skip
+        show(rows[-1])
         write_table(folder / "bayes_limit.csv", HEADER, rows)
     summary(rows)
     write_table(folder / "bayes_limit_again.csv", HEADER, again(cells, rows, trials * AGAIN // 200))
@@ -197,18 +194,12 @@ def plot(path: Path, rows: list[list[object]]) -> None:
         grid = np.full((len(ELEVATIONS_MM), len(NOISES_MM)), np.nan)
         for elevation, noise, ratio, _ in ratios(rows, law, 50):
             grid[ELEVATIONS_MM.index(elevation), NOISES_MM.index(noise)] = ratio
-        panel.imshow(grid[1:], cmap="RdBu_r", vmin=0.6, vmax=1.4, origin="lower")
-        for i, j in np.argwhere(np.isfinite(grid[1:])):
-            panel.text(j, i, f"{grid[i + 1, j]:.2f}", ha="center", va="center", fontsize="small")
-        panel.set_xticks(range(len(NOISES_MM)), [f"{noise:g}" for noise in NOISES_MM])
-        panel.set_yticks(range(len(ELEVATIONS_MM) - 1), [f"{e:g}" for e in ELEVATIONS_MM[1:]])
+        grid_panel(panel, grid[1:], half=0.4)
         few = ", ".join(f"n = {n}: {ratios(rows, law, n)[0, 2]:.2f}" for n in FEW_IMAGES)
         title = f"{law} ({few} at {FEW_IMAGES_CELL[0]:g} mm, noise {FEW_IMAGES_CELL[1]:g} mm)"
-        panel.set(xlabel="noise on each distance, SD (mm)", ylabel="size of the offsets (mm)")
         panel.set_title(title, fontsize="medium")
     figure.suptitle("Mean RP of prior auto over the Bayes limit's, 50 images")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+    save_figure(figure, path, dpi=120)
 
 
 if __name__ == "__main__":

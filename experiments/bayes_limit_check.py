@@ -19,7 +19,7 @@ import bayes_limit
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, precision, show, write_table
 from jaxtyping import Array
 
 from jaxcal.backend import RIGID, Parameters, measurement_residual, retract
@@ -134,8 +134,8 @@ def run(condition: int, trials: int, steps: int) -> list[object]:
              zip(experiments.image_to_probe, sampled, strict=True)]  # fmt: skip
     apart = (np.stack(there) - np.asarray(mean)[:, :6]) / sd[:, :6]
     own = np.asarray(halves[0] - halves[1])[:, :6] / 2 / sd[:, :6]
-    rp = [float(bayes_limit.precision(x, experiments).mean()) for x in
-          (walked, jnp.asarray(sampled))]  # fmt: skip
+    tests = experiments.test_poses, experiments.test_points
+    rp = [float(precision(x, *tests).mean()) for x in (walked, sampled)]
     return [
         law, images, trials, steps, float(accepted.mean()), rms(own),
         float(np.sqrt(np.mean([one.error for one in found]))), rms(apart),
@@ -159,14 +159,11 @@ def rms(values: np.ndarray) -> float:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
-    folder, rows = results_folder(quick), []
+    quick, folder = arguments(__doc__)
+    rows = []
     for condition in range(1 if quick else len(CONDITIONS)):
         rows.append(run(condition, 20, 20_000 if quick else 200_000))
-        print(", ".join(
-            f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}"
-            for name, value in zip(HEADER, rows[-1], strict=True)
-        ), flush=True)  # fmt: skip
+        show(rows[-1])
         write_table(folder / "bayes_limit_check.csv", HEADER, rows)
     print(machine())
 

@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, batch_of, machine, save_figure, write_table
 from jaxtyping import Array, Float
 
 import jaxcal
@@ -123,97 +123,58 @@ def eliminated(data: ImageData) -> tuple[np.ndarray, float]:
     return np.asarray(np.linalg.qr(columns, mode="r")), float(np.sum(away**2) + np.sum(moved**2))
 
 
-def _solve(matrix: list[list[Any]], vector: list[Any]) -> list[Any]:
-    """Gauss's elimination, entry by entry, for arrays of systems."""
-    size = len(vector)
-    rows = [[*row, value] for row, value in zip(matrix, vector, strict=True)]
-    for k in range(size):
-        for i in range(k + 1, size):
-            factor = rows[i][k] / rows[k][k]
-            rows[i] = [a - factor * b for a, b in zip(rows[i], rows[k], strict=True)]
-    found: list[Array] = [jnp.zeros(())] * size
-    for k in reversed(range(size)):
-        later = sum((rows[k][j] * found[j] for j in range(k + 1, size)), jnp.zeros(()))
-        found[k] = (rows[k][size] - later) / rows[k][k]
-    return found
-
-
+@partial(jax.jit, static_argnums=2)
 def descents(
     triangles: Float[Array, "p 7 7"], quaternions: Float[Array, "p s 4"], free: tuple[str, ...]
 ) -> tuple[Float[Array, "p s"], Float[Array, "p s 6"]]:
     """Levenberg-Marquardt from many rotations; the objectives and x where they end."""
-    c = [[triangles[:, i, j, None] for j in range(7)] for i in range(7)]
     groups = {(): [], ("common",): [(0, 1)], ("axial",): [(1,)]}.get(free, [(0,), (1,)])
+    shared = np.array([[float(axis in group) for axis in range(2)] for group in groups])
+    zero = jnp.zeros(3 + len(groups))
 
-    def axes(q: list[Array]) -> list[list[Array]]:
-        w, x, y, z = q
-        first = [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)]
-        third = [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)]
-        return [first, third]
+    def moved(place: tuple, move: Array) -> tuple[Array, Array]:
+        """Quaternion and scales after a turn (rad) and a change of the free log scales."""
+        (a, b, d, e), scales = place
+        x, y, z = 0.5 * move[:3]
+        after = jnp.stack([a - x * b - y * d - z * e, b + x * a + y * e - z * d,
+                           d - x * e + y * a + z * b, e + x * d - y * b + z * a])  # fmt: skip
+        return after / jnp.linalg.norm(after), scales * jnp.exp(move[3:] @ shared.reshape(-1, 2))
 
-    def point(q: list[Array], scales: list[Array]) -> list[list[Array]]:
-        return [[s * value for value in axis] for s, axis in zip(scales, axes(q), strict=True)]
+    def point(place: tuple) -> Array:
+        (w, x, y, z), scales = place
+        first = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
+        third = jnp.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
+        return jnp.concatenate([scales[0] * first, scales[1] * third])
 
-    def times(x: list[Array], last: float) -> list[Array]:
-        terms = [[c[i][j] * x[j] for j in range(i, 6)] + [last * c[i][6]] for i in range(6)]
-        return [sum(row[1:], row[0]) for row in terms]
+    def residual(move: Array, place: tuple, triangle: Array) -> Array:
+        return triangle @ jnp.append(point(moved(place, move)), 1.0)
 
-    def value(pair: list[list[Array]]) -> Array:
-        return sum(r * r for r in times(pair[0] + pair[1], 1.0)) + c[6][6] ** 2
+    def cost(place: tuple, triangle: Array) -> Array:
+        return jnp.sum(residual(zero, place, triangle) ** 2)
 
-    def step(_: int, state: tuple) -> tuple:
-        q, scales, damping, now = state
-        pair = point(q, scales)
-        residual = times(pair[0] + pair[1], 1.0)
-        zero = jnp.zeros_like(now)
-        tangents = []
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            moved = []
-            for a in pair:
-                entry = [zero, zero, zero]
-                entry[i], entry[j] = -a[j], a[i]
-                moved += entry
-            tangents.append(moved)
-        for group in groups:
-            tangents.append([v if b in group else zero for b in range(2) for v in pair[b]])
-        jacobian = [times(tangent, 0.0) for tangent in tangents]
-        normal = [[sum(a * b for a, b in zip(p, r, strict=True)) for r in jacobian]
-                  for p in jacobian]  # fmt: skip
-        slope = [-sum(a * b for a, b in zip(p, residual, strict=True)) for p in jacobian]
-        trace = sum(normal[k][k] for k in range(len(slope)))
-        for k in range(len(slope)):
-            normal[k][k] = normal[k][k] * (1 + damping) + 1e-14 * (damping * trace + 1e-30)
-        move = _solve(normal, slope)
-        half = [0.5 * m for m in move[:3]]
-        turn = [jnp.ones_like(now), *half]
-        w, x, y, z = turn
-        a, b, d, e = q
-        after = [w * a - x * b - y * d - z * e, w * b + x * a + y * e - z * d,
-                 w * d - x * e + y * a + z * b, w * e + x * d - y * b + z * a]  # fmt: skip
-        length = jnp.sqrt(sum(entry * entry for entry in after))
-        after = [entry / length for entry in after]
-        grown = list(scales)
-        for k, group in enumerate(groups):
-            factor = jnp.exp(jnp.clip(move[3 + k], -1.0, 1.0))
-            for b_ in group:
-                grown[b_] = grown[b_] * factor
-        trial = value(point(after, grown))
-        better = trial < now
-        q = [jnp.where(better, n, o) for n, o in zip(after, q, strict=True)]
-        scales = [jnp.where(better, n, o) for n, o in zip(grown, scales, strict=True)]
-        damping = jnp.where(better, damping * 0.3, damping * 4)
-        return q, scales, jnp.clip(damping, 1e-12, 1e12), jnp.where(better, trial, now)
+    def step(triangle: Array, state: tuple) -> tuple:
+        place, damping, now = state
+        jacobian = jax.jacfwd(residual)(zero, place, triangle)
+        normal, slope = jacobian.T @ jacobian, jacobian.T @ residual(zero, place, triangle)
+        size = jnp.diagonal(normal)
+        damped = jnp.diag(damping * size + 1e-14 * (damping * size.sum() + 1e-30))
+        move = jnp.linalg.solve(normal + damped, -slope)
+        trial = moved(place, move.at[3:].set(jnp.clip(move[3:], -1.0, 1.0)))
+        after = cost(trial, triangle)
+        better = after < now
+        place = jax.tree.map(lambda new, old: jnp.where(better, new, old), trial, place)
+        damping = jnp.clip(damping * jnp.where(better, 0.3, 4.0), 1e-12, 1e12)
+        return place, damping, jnp.where(better, after, now)
 
-    q = [quaternions[:, :, k] for k in range(4)]
-    ones = jnp.ones_like(q[0])
-    start = (q, [ones, ones], 1e-3 * ones, value(point(q, [ones, ones])))
-    state = jax.lax.fori_loop(0, FIRST_STEPS, step, start)
-    lowest = jnp.argsort(state[3], axis=1)[:, :FINISHERS]
-    state = jax.tree.map(lambda leaf: jnp.take_along_axis(leaf, lowest, axis=1), state)
-    q, scales, _, now = jax.lax.fori_loop(0, LAST_STEPS, step, state)
-    pair = point(q, scales)
-    return now, jnp.stack(pair[0] + pair[1], axis=-1)
+    each = jax.vmap(jax.vmap(step, (None, 0)))
+    ones = jnp.ones(quaternions.shape[:2])
+    place = (quaternions, jnp.ones((*ones.shape, 2)))
+    state = (place, 1e-3 * ones, jax.vmap(jax.vmap(cost, (0, None)))(place, triangles))
+    state = jax.lax.fori_loop(0, FIRST_STEPS, lambda _, state: each(triangles, state), state)
+    lowest = jnp.argsort(state[2], axis=1)[:, :FINISHERS]
+    state = jax.tree.map(lambda leaf: jax.vmap(lambda a, k: a[k])(leaf, lowest), state)
+    place, _, now = jax.lax.fori_loop(0, LAST_STEPS, lambda _, state: each(triangles, state), state)
+    return now, jax.vmap(jax.vmap(point))(place)
 
 
 def best_of_descents(
@@ -224,7 +185,6 @@ def best_of_descents(
     triangles = np.stack([part[0] for part in parts])
     sizes = np.array([part[1] for part in parts])
     values, points = np.zeros((len(drawn), FINISHERS)), np.zeros((len(drawn), FINISHERS, 6))
-    program = jax.jit(descents, static_argnums=2)
     for estimate in ESTIMATES:
         where = np.flatnonzero([each.estimate == estimate for each in drawn])
         free = CONSTRAINTS[estimate].free
@@ -233,7 +193,7 @@ def best_of_descents(
             quaternions = rng.normal(size=(CHUNK, STARTS, 4))
             quaternions /= np.linalg.norm(quaternions, axis=2, keepdims=True)
             filled = triangles[np.resize(rows, CHUNK)]
-            found = program(jnp.asarray(filled), jnp.asarray(quaternions), free)
+            found = descents(jnp.asarray(filled), jnp.asarray(quaternions), free)
             values[rows], points[rows] = (np.asarray(part)[: len(rows)] for part in found)
     return values, points, sizes, triangles
 
@@ -339,14 +299,12 @@ def rows_of(outcomes: list[Outcome]) -> list[list[object]]:
     return rows
 
 
-def draw_figure(outcomes: list[Outcome], path: str) -> None:
+def draw_figure(outcomes: list[Outcome], path: Path) -> None:
     """Shares certified and shares of single descents that miss the minimum, over the images."""
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4))
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    axes = figure.subplots(1, 2)
     ordinary = [o for o in outcomes if o.drawn.family in ORDINARY]
     for estimate in ESTIMATES:
         label = "+".join(estimate) or "scales known"
@@ -374,8 +332,7 @@ def draw_figure(outcomes: list[Outcome], path: str) -> None:
             axes[1].plot(n, g, ".", markersize=2, label=name)
     axes[1].set(xlabel="images", ylabel="gap / objective", yscale="log", title="proved gap")
     axes[1].legend(markerscale=4)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def speed(folder, quick: bool) -> None:
@@ -388,16 +345,15 @@ def speed(folder, quick: bool) -> None:
         one = draw(rng)
         if one.family == "general" and one.images == 50 and one.noise > 0:
             general.append(one.data)
-    poses = np.tile(np.eye(4), (count, 50, 1, 1))
-    poses[:, :, :3, :3] = [data.rotations for data in general]
-    poses[:, :, :3, 3] = [data.translations for data in general]
-    points = np.array([data.points for data in general])
+    sets = []
+    for data in general:
+        poses = np.tile(np.eye(4), (50, 1, 1))
+        poses[:, :3, :3], poses[:, :3, 3] = data.rotations, data.translations
+        sets.append((poses, data.points))
+    batch_in_mm = batch_of(sets, 50)
     for estimate in ESTIMATES:
-        problems = jaxcal.Problem(
-            poses=jnp.asarray(poses), measurements=jnp.asarray(points), mask=jnp.ones((count, 50)),
-            spacing=jnp.ones((count, 2)), face_offset=jnp.zeros(count),
-            pixels=bool({"scale", "common-scale"} & set(estimate)),
-        )  # fmt: skip
+        pixels = bool({"scale", "common-scale"} & set(estimate))
+        problems = replace(batch_in_mm, pixels=pixels)
         answers = jaxcal.calibrate_closed_form(problems, estimate=estimate)
         batch = min(_timed(lambda p=problems, e=estimate: jaxcal.calibrate_closed_form(
             p, estimate=e)) for _ in range(20))  # fmt: skip
@@ -420,12 +376,10 @@ def _timed(call) -> float:
 
 
 def main() -> None:
-    options = arguments(__doc__ or "")
-    jax.config.update("jax_enable_x64", True)
-    folder = results_folder(options.quick)
+    quick, folder = arguments(__doc__)
     outcomes: list[Outcome] = []
-    total = QUICK if options.quick else PROBLEMS
-    name = "closed_form_quick" if options.quick else "closed_form"
+    total = QUICK if quick else PROBLEMS
+    name = "closed_form_quick" if quick else "closed_form"
     kept = Path(__file__).parent / "studies" / name
     kept.mkdir(parents=True, exist_ok=True)
     for index in range(total // BLOCK):
@@ -442,8 +396,8 @@ def main() -> None:
             d = o.drawn
             print("look at:", d.family, d.estimate, d.images, d.noise, d.offset, o.objective,
                   o.best, o.gap, o.certified, o.unique)  # fmt: skip
-    draw_figure(outcomes, str(folder / "closed_form_study.png"))
-    speed(folder, options.quick)
+    draw_figure(outcomes, folder / "closed_form_study.png")
+    speed(folder, quick)
 
 
 if __name__ == "__main__":

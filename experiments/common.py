@@ -7,14 +7,26 @@ import csv
 import os
 import platform
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
 
+from jaxcal import Problem, Protocol, reconstruction_precision, simulate
 from jaxcal.io.atomic import atomic_path
 from jaxcal.study.laws import OffsetLaw
+from jaxcal.study.simulation import NUMBERS, Experiment
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # The scripts' own arrays; jaxcal computes in 64 bits anyway.
 jax.config.update("jax_enable_x64", True)
@@ -29,11 +41,12 @@ LAWS: tuple[OffsetLaw, ...] = ("uniform", "normal", "one-sided", "heavy-tailed",
 """Of the offsets, in most experiments."""
 
 
-def arguments(description: str) -> argparse.Namespace:
-    """Parse ``--quick``."""
+def arguments(description: str | None) -> tuple[bool, Path]:
+    """Whether ``--quick`` was asked for, and the folder for its results."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--quick", action="store_true", help="few trials; minutes on two cores")
-    return parser.parse_args()
+    quick = parser.parse_args().quick
+    return quick, results_folder(quick)
 
 
 def results_folder(quick: bool) -> Path:
@@ -52,10 +65,117 @@ def write_table(path: Path, header: Iterable[str], rows: Iterable[Iterable[objec
             writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in row])
 
 
+def write_rows(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    """As :func:`write_table`, from rows whose keys are the columns."""
+    write_table(path, rows[0], [row.values() for row in rows])
+
+
+def show(row: Iterable[object]) -> None:
+    """Print a row with short numbers."""
+    print(*(f"{v:.4g}" if isinstance(v, float) else v for v in row), sep=", ", flush=True)
+
+
+def save_figure(figure: Figure, path: Path, dpi: int) -> None:
+    """Write a figure whole or not at all."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=dpi)
+
+
+def grid_panel(panel: Axes, grid: Float[np.ndarray, "elevations noises"], half: float) -> None:
+    """Draw ratios on the paper's grid with their numbers; colours go from 1 - half to 1 + half.
+
+    Args:
+        panel: where.
+        grid: a row for each of the last elevations, a column for each noise; NaN for none.
+        half: of the range of colours.
+    """
+    panel.imshow(grid, cmap="RdBu_r", vmin=1 - half, vmax=1 + half, origin="lower")
+    for i, j in np.argwhere(np.isfinite(grid)):
+        panel.text(j, i, f"{grid[i, j]:.2f}", ha="center", va="center", fontsize="small")
+    panel.set_xticks(range(len(NOISES_MM)), [f"{noise:g}" for noise in NOISES_MM])
+    panel.set_yticks(range(len(grid)), [f"{size:g}" for size in ELEVATIONS_MM[-len(grid) :]])
+    panel.set(xlabel="noise on each distance, SD (mm)", ylabel="size of the offsets (mm)")
+
+
+def experiments(seed: int, indices: Array, protocol: Protocol) -> Experiment:
+    """Simulated experiments: trial k is drawn from fold_in(key(seed), k).
+
+    The tracker is perfect. Protocols that differ in numbers only share one compiled program.
+    """
+    names = [name for name in NUMBERS if not name.startswith("tracker")]
+    numbers = {name: getattr(protocol, name) for name in names}
+    usual = replace(protocol, **{name: getattr(Protocol, name) for name in names})
+    return _experiments(seed, usual, indices, numbers)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _experiments(
+    seed: int, protocol: Protocol, indices: Array, numbers: dict[str, Any]
+) -> Experiment:
+    protocol = replace(protocol, **numbers)
+    root = jax.random.key(seed)
+    return jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol))(indices)
+
+
+def precision(
+    x: Float[Array | np.ndarray, "t 4 4"],
+    poses: Float[Array | np.ndarray, "t n 4 4"],
+    points: Float[Array | np.ndarray, "t n 2"],
+) -> Float[np.ndarray, " t"]:
+    """Eq. 8 of every trial's X on its own test images, mm."""
+    return np.asarray(_precision(x, poses, points))
+
+
+_precision = jax.jit(jax.vmap(reconstruction_precision))
+
+
+def right_errors(
+    estimate: Float[np.ndarray, "t 4 4"], truth: Float[np.ndarray, "t 4 4"]
+) -> Float[np.ndarray, "t 6"]:
+    """Right perturbations [shift, turn] from estimates to truths, mm and rad."""
+    inverse = estimate[:, :3, :3].swapaxes(1, 2)
+    turn = Rotation.from_matrix(inverse @ truth[:, :3, :3]).as_rotvec()
+    shift = np.einsum("kij,kj->ki", inverse, truth[:, :3, 3] - estimate[:, :3, 3])
+    return np.concatenate([shift, turn], axis=1)
+
+
+def paired_ratio(values: np.ndarray, to: np.ndarray) -> tuple[float, float]:
+    """Ratio of the means of paired trials, and half its 95 % interval (linearised)."""
+    quotient = float(values.mean() / to.mean())
+    apart = values - quotient * to
+    return quotient, float(1.96 * apart.std(ddof=1) / np.sqrt(len(to)) / to.mean())
+
+
+def batch_of(
+    sets: Sequence[tuple[np.ndarray, np.ndarray]], most: int, bounds: np.ndarray | None = None
+) -> Problem:
+    """Problems side by side; those with fewer images have masked ones in their place.
+
+    Args:
+        sets: of each problem, poses (n, 4, 4) and points [lateral, range] (n, 2), mm.
+        most: images of every problem of the batch.
+        bounds: on the offsets of the images, (problems, n), mm.
+    """
+    count = len(sets)
+    poses = np.tile(np.eye(4), (count, most, 1, 1))
+    points, mask = np.ones((count, most, 2)), np.zeros((count, most))
+    for k, (some, where) in enumerate(sets):
+        poses[k, : len(some)], points[k, : len(some)], mask[k, : len(some)] = some, where, 1.0
+    limits = None
+    if bounds is not None:
+        limits = jnp.pad(bounds, [(0, 0), (0, most - bounds.shape[1])], constant_values=1.0)
+    return Problem(
+        poses=jnp.asarray(poses),
+        measurements=jnp.asarray(points),
+        mask=jnp.asarray(mask),
+        spacing=jnp.ones((count, 2)),
+        face_offset=jnp.zeros(count),
+        max_elevation=limits,
+    )
+
+
 def machine() -> str:
     """Processor, cores and versions, for a table's foot."""
-    import jax
-
     model = platform.processor() or platform.machine()
     for line in Path("/proc/cpuinfo").read_text().splitlines() if os.name == "posix" else ():
         if line.startswith("model name"):

@@ -21,7 +21,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, write_rows
 from scipy.spatial.transform import Rotation
 
 from jaxcal import Problem, Protocol, calibrate_batch, simulate
@@ -121,17 +121,13 @@ def run(kind: str, images: int, keys: jax.Array) -> dict[str, object]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     count = 40 if quick else PATHS
     rows: list[dict[str, object]] = []
     for number, (kind, images) in enumerate(CONDITIONS):
         rows.append(run(kind, images, keys_of(number, count)))
         print(rows[-1], flush=True)
-        write_table(
-            results_folder(quick) / "continuity.csv",
-            list(rows[0]),
-            [list(row.values()) for row in rows],
-        )
+        write_rows(folder / "continuity.csv", rows)
     print(machine())
 
 

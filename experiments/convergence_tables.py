@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from common import save_figure
 from convergence_arms import CHUNK, COLORS, THREE_STARTS, Stops
 from scipy.spatial.transform import Rotation
-
-from jaxcal.io.atomic import atomic_path
 
 FLOOR = 1e-14
 """Relative excess of the objective below which there is only rounding."""
@@ -216,5 +215,4 @@ def plot(path: Path, by_iteration: list, by_tolerance: list, by_start: list) -> 
     for panel in panels[:5]:
         panel.grid(alpha=0.3)
     panels[0].legend(fontsize="small")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    save_figure(figure, path, dpi=110)

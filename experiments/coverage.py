@@ -13,18 +13,21 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
-from jaxtyping import Array
-from scipy.spatial.transform import Rotation
+from common import (
+    arguments,
+    experiments,
+    machine,
+    right_errors,
+    save_figure,
+    write_table,
+)
 
-from jaxcal import Protocol, calibrate_batch, predicted_tre, simulate, transform_intervals
-from jaxcal.io.atomic import atomic_path
+from jaxcal import Protocol, calibrate_batch, predicted_tre, transform_intervals
 from jaxcal.study.laws import OffsetLaw
 
 SEED = 20261125
@@ -45,44 +48,32 @@ HEADER = [
 ]  # fmt: skip
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def draw(law: OffsetLaw, images: int, indices: Array, elevation: Array, noise: Array):
-    """Experiments of one condition."""
-    protocol = Protocol(images=images, test_images=2, elevation_distribution=law)
-    protocol = replace(protocol, elevation_mm=elevation, noise_mm=noise)
-    root = jax.random.key(SEED)
-    return jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol))(indices)
-
-
-def errors(estimate: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The right perturbation from estimate to truth (6), and how far the points are off, mm."""
-    inverse = estimate[:, :3, :3].swapaxes(1, 2)
-    turn = Rotation.from_matrix(inverse @ truth[:, :3, :3]).as_rotvec()
-    shift = np.einsum("kij,kj->ki", inverse, truth[:, :3, 3] - estimate[:, :3, 3])
+def distances(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """How far the image points are off, mm (trials, points)."""
     points = POINTS_MM.reshape(-1, 2)
     there = np.stack([points[:, 0], 0 * points[:, 0], points[:, 1], np.ones(len(points))])
-    apart = ((estimate - truth) @ there)[:, :3]
-    return np.concatenate([shift, turn], axis=1), np.linalg.norm(apart, axis=1)
+    return np.linalg.norm(((estimate - truth) @ there)[:, :3], axis=1)
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 200 if quick else 1000
     rows: list[list[object]] = []
     conditions = list(itertools.product(SIZES_MM[:1] if quick else SIZES_MM, ASKED, LAWS))
-    folder = results_folder(quick)
     for condition, ((elevation, noise), images, law) in enumerate(conditions):
         indices = condition * 1_000_000 + jnp.arange(trials)
-        experiments = draw(law, images, indices, elevation, noise)
-        plain = jax.vmap(lambda experiment: experiment.problem())(experiments)
-        problems = replace(plain, covariance=experiments.covariance)
+        protocol = Protocol(
+            images=images, test_images=2, elevation_distribution=law, elevation_mm=elevation,
+            noise_mm=noise,
+        )  # fmt: skip
+        drawn = experiments(SEED, indices, protocol)
+        plain = jax.vmap(lambda experiment: experiment.problem())(drawn)
+        problems = replace(plain, covariance=drawn.covariance)
         result = calibrate_batch(problems, "joint", chunk=50)
-        error, distance = errors(
-            np.asarray(result.image_to_probe), np.asarray(experiments.image_to_probe)
-        )
-        cover = np.abs(error) <= transform_intervals(result)
+        found, truth = np.asarray(result.image_to_probe), np.asarray(drawn.image_to_probe)
+        cover = np.abs(right_errors(found, truth)) <= transform_intervals(result)
         predicted = np.asarray(predicted_tre(result, POINTS_MM))
-        actual = float(np.sqrt(np.mean(distance**2)))
+        actual = float(np.sqrt(np.mean(distances(found, truth) ** 2)))
         told = float(np.sqrt(np.mean(predicted**2)))
         row = [law, images, elevation, noise, trials, *map(float, cover.mean(axis=0)), actual, told,
                told / actual, int(np.sum(~np.asarray(result.converged)))]  # fmt: skip
@@ -136,8 +127,7 @@ def plot(path: Path, rows: list[list[object]]) -> None:
     lower.set(ylabel="predicted over actual TRE", ylim=(0.7, 1.3))
     for panel in (upper, lower):
         panel.set_xticks(range(len(rows)), names, fontsize=6)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=130)
+    save_figure(figure, path, dpi=130)
 
 
 if __name__ == "__main__":

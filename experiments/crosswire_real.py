@@ -18,12 +18,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from common import machine, results_folder, write_table
+from common import machine, results_folder, save_figure, write_table
 
 import jaxcal
 from jaxcal.calibration.resampling import CrossValidation
 from jaxcal.diagnostics.misfits import misfits
-from jaxcal.io.atomic import atomic_path
 from jaxcal.io.text import read_crosswire, read_poses
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.solvers.names import Method
@@ -258,8 +257,7 @@ def plot(path: Path, standard: np.ndarray) -> None:
         panel.axline((0, 0), slope=1, color="grey", linewidth=0.8)
         panel.set(title=name, xlabel="normal quantile")
     figure.axes[0].set_ylabel("held-out error (SDs)")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(figure, path, dpi=150)
 
 
 if __name__ == "__main__":

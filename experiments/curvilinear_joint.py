@@ -21,15 +21,21 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import (
+    arguments,
+    experiments,
+    machine,
+    precision,
+    save_figure,
+    write_table,
+)
 from jaxtyping import Array, Float
 
-from jaxcal import Protocol, calibrate_batch, reconstruction_precision, simulate
+from jaxcal import Protocol, calibrate_batch
 from jaxcal.backend import RIGID, ImagePlanes, Iterate, Parameters, minimise, target_in_image
 from jaxcal.data.probe import C5_2
 from jaxcal.data.problem import Problem
 from jaxcal.data.segmentation.time_of_flight import fit_out_of_plane
-from jaxcal.io.atomic import atomic_path
 from jaxcal.model.observations import HeldOffsets
 
 SEED = 20261121
@@ -80,29 +86,20 @@ def _with_signs(
 
 
 def run_cell(cell: int, bound: float, noise: float, trials: int) -> dict[str, np.ndarray]:
-    protocol = Protocol(elevation_mm=bound, noise_mm=noise, probe=C5_2)
     indices = cell * 1_000_000 + jnp.arange(trials)
-
-    @jax.jit
-    def draw(indices: Array):
-        root = jax.random.key(SEED)
-        made = jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol))(indices)
-        return made, jax.vmap(lambda e: e.problem(probe=C5_2))(made)
-
-    experiments, problems = draw(indices)
+    protocol = Protocol(elevation_mm=bound, noise_mm=noise, probe=C5_2)
+    drawn = experiments(SEED, indices, protocol)
+    problems = jax.jit(jax.vmap(lambda e: e.problem(probe=C5_2)))(drawn)
     conventional = calibrate_batch(problems, method="conventional")
     joint = calibrate_batch(problems, method="joint", prior="gaussian")
-    paper = paper_way(problems)
-    precision = jax.jit(jax.vmap(reconstruction_precision))
-    out = {
-        name: np.asarray(precision(x, experiments.test_poses, experiments.test_points))
-        for name, x in (
-            ("conventional", conventional.image_to_probe),
-            ("paper", paper),
-            ("joint", joint.image_to_probe),
-        )
+    answers = {
+        "conventional": conventional.image_to_probe,
+        "paper": paper_way(problems),
+        "joint": joint.image_to_probe,
     }
-    truth = np.asarray(experiments.elevation)
+    tests = drawn.test_poses, drawn.test_points
+    out = {name: precision(x, *tests) for name, x in answers.items()}
+    truth = np.asarray(drawn.elevation)
     visible = np.abs(truth) > 0.1 * bound
     right = np.sign(np.asarray(joint.elevation)) == np.sign(truth)
     out["sign"] = np.array([right[visible].mean()])
@@ -114,7 +111,7 @@ def run_cell(cell: int, bound: float, noise: float, trials: int) -> dict[str, np
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 50 if quick else 500
     rows = []
     ratios = np.zeros((len(BOUNDS_MM), len(NOISES_MM)))
@@ -137,7 +134,6 @@ def main() -> None:
             f"not converged {failures}",
             flush=True,
         )
-    folder = results_folder(quick)
     write_table(
         folder / "curvilinear_joint.csv",
         ["offset_bound_mm", "channel_noise_mm", "trials", "rp_conventional_mm", "rp_paper_way_mm",
@@ -167,8 +163,7 @@ def plot(path, rows: list) -> None:
     panels[0].set_ylabel("mean reconstruction precision (mm)")
     panels[0].legend()
     figure.suptitle("Curvilinear probe, n = 50")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(figure, path, dpi=150)
 
 
 if __name__ == "__main__":

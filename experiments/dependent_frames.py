@@ -19,11 +19,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
-import jax
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, batch_of, machine, right_errors, write_table
 from scipy.spatial.transform import Rotation
 
 import jaxcal
@@ -148,27 +146,6 @@ CONDITIONS: dict[str, Callable[[np.random.Generator], Frames]] = {
 }
 
 
-def stacked(sets: list[tuple[np.ndarray, np.ndarray]]) -> jaxcal.Problem:
-    """Poses and points of several trials as one batch, padded with masked images."""
-    most = -(-max(len(poses) for poses, _ in sets) // 16) * 16
-    poses = np.tile(np.eye(4), (len(sets), most, 1, 1))
-    points, mask = np.ones((len(sets), most, 2)), np.zeros((len(sets), most))
-    for row, (some, those) in enumerate(sets):
-        poses[row, : len(some)], points[row, : len(some)] = some, those
-        mask[row, : len(some)] = 1.0
-    ones = np.ones((len(sets), 2))
-    arrays = jax.tree.map(jax.numpy.asarray, (poses, points, mask, ones, 0 * ones[:, 0]))
-    return jaxcal.Problem(*arrays)
-
-
-def error_of(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """The right perturbations from estimates to truths, (k, 6)."""
-    inverse = estimate[:, :3, :3].swapaxes(1, 2)
-    turn = Rotation.from_matrix(inverse @ truth[:, :3, :3]).as_rotvec()
-    shift = np.einsum("kij,kj->ki", inverse, truth[:, :3, 3] - estimate[:, :3, 3])
-    return np.concatenate([shift, turn], axis=1)
-
-
 def stated_tre(results: Calibration) -> np.ndarray:
     """Root mean square target registration error over the image, by which answers are judged."""
     lateral, axial = np.meshgrid(np.linspace(-25, 25, 5), np.linspace(15, 85, 5))
@@ -181,7 +158,7 @@ def row_of(result: Calibration, truth: np.ndarray) -> list[object]:
     """What the table says of some answers."""
     answer = result.numpy()
     converged = np.asarray(result.converged)
-    error = error_of(np.asarray(answer.image_to_probe), truth)[converged]
+    error = right_errors(np.asarray(answer.image_to_probe), truth)[converged]
     kept = answer[converged]
     inside, outside = (
         np.abs(error) <= jaxcal.transform_intervals(kept, 0.95),
@@ -204,7 +181,7 @@ def row_of(result: Calibration, truth: np.ndarray) -> list[object]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 40 if quick else 400
     enable_compilation_cache()
     rows: list[list[object]] = []
@@ -229,11 +206,12 @@ def main() -> None:
             head: list[object] = [name, how, tried, tried - len(some)]
             rest: list[object] = [""] * (len(HEADER) - 4)
             if some:
-                rest = row_of(jaxcal.calibrate_batch(stacked(some), chunk=40), those)
+                # Padded to few sizes, each of which is a program.
+                most = -(-max(len(poses) for poses, _ in some) // 16) * 16
+                rest = row_of(jaxcal.calibrate_batch(batch_of(some, most), chunk=40), those)
             rows.append(head + rest)
             print(*rows[-1], flush=True)
-    path: Path = results_folder(quick) / "dependent_frames.csv"
-    write_table(path, HEADER, rows)
+    write_table(folder / "dependent_frames.csv", HEADER, rows)
     print(machine())
 
 

@@ -19,8 +19,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from auto_grid import COMPARED, SUBSET, Cell, run_cell, write
-from common import LAWS, arguments, machine, results_folder
+from auto_grid import COMPARED, SUBSET, Cell, run_cell
+from common import LAWS, arguments, machine, write_rows
 
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.study.laws import OFFSET_LAWS
@@ -43,10 +43,10 @@ def cells(quick: bool) -> list[Cell]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials, again = (50, 200) if quick else (TRIALS, AGAIN)
     enable_compilation_cache()
-    folder, todo = results_folder(quick), cells(quick)
+    todo = cells(quick)
     rows: list[dict[str, Any]] = []
     repeated: list[dict[str, Any]] = []
     for index, cell in enumerate(todo):
@@ -54,13 +54,13 @@ def main() -> None:
             jax.clear_caches()  # a process may map only so many compiled programs
         first = (FIRST + index) * 1_000_000
         rows.append(run_cell(cell, first + jnp.arange(trials), with_hindsight=False))
-        write(folder / "further_laws.csv", rows)
+        write_rows(folder / "further_laws.csv", rows)
         told = ", ".join(f"{name} {rows[-1][name]:.4g}" for name in (*COMPARED, "auto_loses"))
         print(f"{cell}: {told}", flush=True)
         if any(rows[-1][name] > 1 for name in COMPARED):
             first += 500_000
             repeated.append(run_cell(cell, first + jnp.arange(again), with_hindsight=False))
-            write(folder / "further_laws_again.csv", repeated)
+            write_rows(folder / "further_laws_again.csv", repeated)
             print("again: " + ", ".join(
                 f"{name} {repeated[-1][name]:.4f} +- {repeated[-1][f'{name}_ci95_half']:.4f}"
                 for name in COMPARED

@@ -21,11 +21,17 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import (
+    arguments,
+    machine,
+    paired_ratio,
+    precision,
+    save_figure,
+    write_table,
+)
 from jaxtyping import Array
 
-from jaxcal import Protocol, calibrate_batch, reconstruction_precision, simulate
-from jaxcal.io.atomic import atomic_path
+from jaxcal import Protocol, calibrate_batch, simulate
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.study.contamination import OutlierKind, contaminate
 from jaxcal.study.offsets import OffsetLaw
@@ -104,20 +110,14 @@ def run_cell(index: int, cell: Cell, trials: int) -> list[object]:
     robust = calibrate_batch(replace(problems, mask=agreed))
     oracle = calibrate_batch(replace(problems, mask=problems.mask - outlier))
     plain = calibrate_batch(problems)
-    precision = jax.vmap(reconstruction_precision)
-
-    def rp(result) -> np.ndarray:
-        return np.asarray(
-            precision(result.image_to_probe, experiments.test_poses, experiments.test_points)
-        )
-
-    robust_rp, oracle_rp, plain_rp = rp(robust), rp(oracle), rp(plain)
+    tests = experiments.test_poses, experiments.test_points
+    robust_rp, oracle_rp, plain_rp = (
+        precision(found.image_to_probe, *tests) for found in (robust, oracle, plain)
+    )
     spoilt, left = np.asarray(outlier), 1 - np.asarray(agreed)
     named = float((left * spoilt).sum() / spoilt.sum()) if spoilt.any() else float("nan")
     false = float((left * (1 - spoilt)).sum() / (1 - spoilt).sum())
-    ratio = float(robust_rp.mean() / oracle_rp.mean())
-    apart = robust_rp - ratio * oracle_rp
-    half = float(1.96 * apart.std(ddof=1) / np.sqrt(trials) / oracle_rp.mean())
+    ratio, half = paired_ratio(robust_rp, oracle_rp)
     median = float(np.median(robust_rp / oracle_rp))
     stayed = int(((1 - left) * spoilt).any(axis=1).sum())
     failed = int((~np.asarray(robust.converged)).sum())
@@ -133,10 +133,9 @@ HEADER = ["law", "elevation_mm", "noise_mm", "fraction", "kind", "images", "tria
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 24 if quick else 200
     enable_compilation_cache()
-    folder = results_folder(quick)
     rows: list[list] = []
     for index, cell in enumerate(cells(quick)):
         rows.append(run_cell(index, cell, trials))
@@ -191,8 +190,7 @@ def plot(path, rows: list[list]) -> None:
     panels[-1].set_xlabel(
         "elevational size, noise (mm), n = 50; and 2, 2 at other numbers of images"
     )
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(figure, path, dpi=150)
 
 
 if __name__ == "__main__":

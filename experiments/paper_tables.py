@@ -17,9 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from common import arguments, machine, open_study, results_folder, write_table
-
-from jaxcal.io.atomic import atomic_path
+from common import arguments, machine, open_study, save_figure, write_table
 
 PAPER = Path(__file__).parent / "paper"
 FITTED = 0.55
@@ -217,10 +215,9 @@ def cells(chosen: np.ndarray, elevations: np.ndarray, noises: np.ndarray) -> str
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     data = open_study("paper_tables", trials=64 if quick else None, quick=quick)
     rows = compare(data)
-    folder = results_folder(quick)
     write_table(folder / "paper_tables.csv", HEADER, rows)
     header = ["protocol", "table", "cells", "within_1_sd", "within_half_sd"]
     write_table(folder / "paper_tables_verdict.csv", header, counts(rows))
@@ -271,8 +268,7 @@ def plot(path: Path, data) -> None:
         panel.legend(title="elevation (points: paper)", fontsize="small")
     for panel in panels:
         panel.grid(alpha=0.3)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=130)
+    save_figure(figure, path, dpi=130)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from common import save_figure
 
 from hw.bench.frames import DEPTH_MM, Camera
 from hw.bench.look import Look
@@ -19,7 +20,6 @@ from hw.bench.world import World, make_world
 from hw.choices import PHANTOMS
 from hw.rigid import rotation_matrix
 from jaxcal.data.segmentation.image import Target, localise
-from jaxcal.io.atomic import atomic_path
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "phantoms.png"
 LATERAL_MM, RANGE_MM = 6.0, 55.0
@@ -78,8 +78,7 @@ def main() -> None:
                 across, down = camera.spacing_mm
                 place = (u - camera.pixel(0.0, 0.0)[0]) * across, v * down
                 panel.plot(*place, "o", ms=30, mfc="none", mec="C1")
-    with atomic_path(PICTURE) as temporary:
-        figure.savefig(temporary, dpi=80, format="png")
+    save_figure(figure, PICTURE, dpi=80)
     print(PICTURE)
 
 

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, save_figure, write_table
 
 from hw.bench.stage import Pace, WorldStage
 from hw.bench.world import World, make_world
@@ -41,7 +41,6 @@ from hw.poses import plan_poses
 from hw.rigid import rigid
 from jaxcal import Problem, Recording, calibrate_batch, make_images, reconstruction_precision, stack
 from jaxcal.data.poses import rotation_angle
-from jaxcal.io.atomic import atomic_path
 
 IMAGES = 60
 TRACKER_SD_MM = 0.1
@@ -208,7 +207,7 @@ def precision(transforms: np.ndarray, runs: list[Run]) -> np.ndarray:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     benches = 4 if quick else 64
     rows, spread = [], {}
     for name in ARMS:
@@ -248,7 +247,6 @@ def main() -> None:
             f"{rows[-1][16]}",
             flush=True,
         )
-    folder = results_folder(quick)
     write_table(
         folder / "placement.csv",
         ["placement", "benches", "images", "rp_joint_mm", "rp_bounded_mm", "rp_conventional_mm",
@@ -278,8 +276,7 @@ def plot(path: Path, rows: list, spread: dict[str, np.ndarray]) -> None:
     pace.margins(x=0.25, y=0.15)
     for axes in (boxes, pace):
         axes.grid(alpha=0.3, which="both")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(figure, path, dpi=150)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ Seed 20261123.
 from __future__ import annotations
 
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, write_table
 from pose_design import MOUNT, POOL, errors, pool, taken
 from unmodelled import CURVE_MM, judged
 
@@ -33,7 +33,7 @@ HEADER = [
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     enable_compilation_cache()
     trials = 20 if quick else TRIALS
     candidates = pool("wide")
@@ -70,7 +70,7 @@ def main() -> None:
                     float(np.sqrt(squared.mean())), float(told[0]), float(told[3]),
                 ])  # fmt: skip
                 print(*rows[-1], sep=", ", flush=True)
-    write_table(results_folder(quick) / "plan_faults.csv", HEADER, rows)
+    write_table(folder / "plan_faults.csv", HEADER, rows)
     print(machine())
 
 

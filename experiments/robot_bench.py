@@ -26,12 +26,9 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, save_figure, write_table
+from matplotlib.figure import Figure
 
 from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
 from hw.errors import DeviceError
@@ -210,8 +207,7 @@ def speeds(moves: int) -> list[list[object]]:
 
 def main() -> None:
     """Make the tables and the figure."""
-    quick = arguments("faults, rates and speeds of the emulated robot").quick
-    folder = results_folder(quick)
+    quick, folder = arguments(__doc__)
     privileged = real_time()
     end = "" if privileged else "_unprivileged"
     print(f"{machine()}; real-time scheduling: {privileged}; seed {SEED}")
@@ -235,7 +231,8 @@ def main() -> None:
          "bench_s_per_wall_s"],
         speed_rows,
     )  # fmt: skip
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
     names = [str(row[0]) for row in fault_rows]
     left.barh(names, [float(str(row[3])) for row in fault_rows])
     left.axvline(200.0, color="k", linestyle="--", label="bar")
@@ -248,7 +245,7 @@ def main() -> None:
     )  # fmt: skip
     right.set(xlabel="bench seconds per wall second", ylabel="motions that arrived (%)",
               title="speed of the bench", ylim=(0, 105))  # fmt: skip
-    figure.savefig(folder / f"robot_bench{end}.png", dpi=150)
+    save_figure(figure, folder / f"robot_bench{end}.png", dpi=150)
 
 
 if __name__ == "__main__":

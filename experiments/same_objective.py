@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, save_figure, write_table
 from jaxtyping import Array
 
 from jaxcal import Calibration, Problem, calibrate_batch
@@ -31,7 +31,6 @@ from jaxcal.backend import (
 )
 from jaxcal.data.poses import rotation_angle
 from jaxcal.diagnostics.uncertainty import mm_at_target, spectrum, threshold
-from jaxcal.io.atomic import atomic_path
 from jaxcal.model.observations import local_unknowns
 from jaxcal.runtime.compiler import fast_to_run
 from jaxcal.solvers.alternating import Alternation, alternate
@@ -180,7 +179,7 @@ def scipy_solution(problem: Problem, start: Parameters, offset: np.ndarray, boun
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     count, compared = (100, 10) if quick else (1000, 50)
     problems, settings, bounds = draw(count)
     per_image = jnp.asarray(bounds)[:, None] * jnp.ones(IMAGES)
@@ -238,7 +237,6 @@ def main() -> None:
     # Where scipy ends in another, higher minimum there is no X to compare.
     angles = [peer[-1] for peer in peers if peer[6] and not peer[4]]
 
-    folder = results_folder(quick)
     write_table(
         folder / "same_objective.csv",
         ["problem", "elevation_mm", "noise_mm", "bound_mm", "joint_cost_mm2", "joint_iterations",
@@ -306,8 +304,7 @@ def plot(path, costs: np.ndarray, joint_cost: np.ndarray, iterations: np.ndarray
              title="Same objective, same start, n = 50")  # fmt: skip
     axes.legend()
     axes.grid(alpha=0.3)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(figure, path, dpi=150)
 
 
 if __name__ == "__main__":

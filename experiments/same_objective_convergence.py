@@ -23,7 +23,7 @@ import os
 from typing import Any
 
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, write_table
 from convergence_arms import (
     ALTERNATION,
     ARMS,
@@ -120,7 +120,7 @@ def from_starts(bench: Bench, count: int) -> dict[tuple[str, str], list[Stops]]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     count, starts, repeats = (50, 3, 1) if quick else (200, 10, 3)
     bench = Bench(count)
     print("compiled", flush=True)
@@ -169,7 +169,6 @@ def main() -> None:
         "iterations_to_best_median", "iterations_to_best_p90", "rate_median", "rate_p90",
         "rate_above_0.9",
     ]  # fmt: skip
-    folder = results_folder(quick)
     foot: list[list[object]] = [
         [
             f"{count} problems, {interval.sum()} with an interval of minimisers; {machine()}; "

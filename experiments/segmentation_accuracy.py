@@ -14,12 +14,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, save_figure, write_table
 
 from jaxcal.data.probe import C5_2, L14_5, Probe
 from jaxcal.data.recording import make_images
 from jaxcal.data.segmentation.segment import Segmentation, segment
-from jaxcal.io.atomic import atomic_path
 
 SEED = 20261121
 NOISES = (0.05, 0.5, 2.0)
@@ -144,9 +143,8 @@ def curvilinear_rows(frames: int) -> list[list[object]]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     frames = 1000 if quick else 10_000
-    folder = results_folder(quick)
     linear, curved = linear_rows(frames), curvilinear_rows(frames)
     foot = [f"{frames} frames a row, seed {SEED}", machine()]
     write_table(
@@ -200,8 +198,7 @@ def plot(path: Path, linear: list[list[object]], curved: list[list[object]]) -> 
     for axes in (left, middle, right):
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(figure, path, dpi=150)
 
 
 if __name__ == "__main__":

@@ -61,13 +61,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, save_figure, write_table
 from jaxtyping import Float
 
 from jaxcal import Problem, Protocol, calibrate_batch, reconstruction_precision, simulate
 from jaxcal.data.segmentation.image import localise
 from jaxcal.data.segmentation.time_of_flight import fit_in_plane
-from jaxcal.io.atomic import atomic_path
 
 SEED = 20261122
 IMAGES = 60
@@ -239,7 +238,7 @@ def verdict(mean: float, half: float) -> str:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 20 if quick else 400
     seen = {}
     for contrast in CONTRASTS_DB:
@@ -263,7 +262,6 @@ def main() -> None:
                         difference = interval(rp - manual[reference][method, kind])
                         line += [*difference, verdict(*difference)]
                     rows.append([*line, row["not_converged"]])
-    folder = results_folder(quick)
     header = ["elevation_mm", "segmentation", "family", "channel_noise_mm", "clock_mhz",
               "rms_lateral_mm", "rms_range_mm", "bias_lateral_mm", "bias_range_mm", "method",
               "test_points", "trials", "rp_mm", "ci95_half_mm"]  # fmt: skip
@@ -307,8 +305,7 @@ def plot(path, everything: list[dict]) -> None:
         panel.grid(alpha=0.3)
     panels[0].invert_yaxis()
     panels[0].legend(fontsize="x-small")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(figure, path, dpi=150)
 
 
 if __name__ == "__main__":

@@ -13,45 +13,46 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import ELEVATIONS_MM, NOISES_MM, arguments, machine, results_folder, write_table
+from common import (
+    ELEVATIONS_MM,
+    NOISES_MM,
+    arguments,
+    experiments,
+    grid_panel,
+    machine,
+    precision,
+    save_figure,
+    write_table,
+)
 from jaxtyping import Array
 
-from jaxcal import Protocol, calibrate_batch, reconstruction_precision, simulate
-from jaxcal.io.atomic import atomic_path
+from jaxcal import Protocol, calibrate_batch
+from jaxcal.study.simulation import Experiment
 
 SEED = 20261121
 
 
 def run_cell(cell: int, elevation: float, noise: float, trials: int) -> dict[str, np.ndarray]:
     """All trials of one cell: RP of every method, estimated and realised SDs (mm)."""
-    protocol = Protocol(elevation_mm=elevation, noise_mm=noise)
     indices = cell * 1_000_000 + jnp.arange(trials)
-
-    @jax.jit
-    def draw(indices: Array):
-        root = jax.random.key(SEED)
-        return jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol))(indices)
-
-    experiments = draw(indices)
-    problems = jax.vmap(lambda experiment: experiment.problem())(experiments)
+    drawn = experiments(SEED, indices, Protocol(elevation_mm=elevation, noise_mm=noise))
+    problems = jax.vmap(lambda experiment: experiment.problem())(drawn)
     results = {
         "conventional": calibrate_batch(problems, method="conventional"),
         "alternating": calibrate_batch(problems, method="alternating"),
         "joint": calibrate_batch(problems, method="joint", prior="gaussian"),
     }
-    precision = jax.vmap(reconstruction_precision)
     out: dict[str, np.ndarray] = {}
     for name, result in results.items():
-        rp = precision(result.image_to_probe, experiments.test_poses, experiments.test_points)
-        out[name] = np.asarray(rp)
+        out[name] = precision(result.image_to_probe, drawn.test_poses, drawn.test_points)
         out[f"{name}_converged"] = np.asarray(result.converged)
     out["sigma"] = np.asarray(results["joint"].sigma)
-    out["realised"] = np.asarray(realised(experiments))
+    out["realised"] = np.asarray(realised(drawn))
     return out
 
 
 @jax.jit
-def realised(experiments) -> Array:
+def realised(drawn: Experiment) -> Array:
     """Root mean square of the true lateral, range and elevational errors of each trial, mm."""
 
     def one(e):
@@ -60,11 +61,11 @@ def realised(experiments) -> Array:
         errors = [e.points[:, 0] - q[:, 0], e.points[:, 1] - jnp.hypot(q[:, 1], q[:, 2]), q[:, 1]]
         return jnp.sqrt(jnp.mean(jnp.stack(errors) ** 2, axis=1))
 
-    return jax.vmap(one)(experiments)
+    return jax.vmap(one)(drawn)
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 40 if quick else 200
     rows, ratios, worst = [], np.zeros((7, 7)), 0.0
     for cell, (elevation, noise) in enumerate(itertools.product(ELEVATIONS_MM, NOISES_MM)):
@@ -91,7 +92,6 @@ def main() -> None:
             f"sigma/realised {np.round(sigma, 3).tolist()}; not converged {failures}",
             flush=True,
         )
-    folder = results_folder(quick)
     write_table(
         folder / "self_tuned_grid.csv",
         ["elevation_mm", "noise_mm", "trials", "rp_conventional_mm", "rp_alternating_mm",
@@ -112,17 +112,10 @@ def plot(path, ratios: np.ndarray) -> None:
 
     figure = Figure(figsize=(6.5, 5), layout="constrained")
     axes = figure.subplots()
-    image = axes.imshow(ratios, cmap="RdBu_r", vmin=0, vmax=2, origin="lower")
-    for i, j in itertools.product(range(7), range(7)):
-        if np.isfinite(ratios[i, j]):
-            axes.text(j, i, f"{ratios[i, j]:.2f}", ha="center", va="center")
-    axes.set_xticks(range(7), [f"{noise:g}" for noise in NOISES_MM])
-    axes.set_yticks(range(7), [f"{elevation:g}" for elevation in ELEVATIONS_MM])
-    axes.set(xlabel="noise on each distance, SD (mm)", ylabel="elevational offset, bound (mm)",
-             title="Mean RP, self-tuned joint over conventional")  # fmt: skip
-    figure.colorbar(image, ax=axes, label="ratio (below 1: joint better)")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    grid_panel(axes, ratios, half=1.0)
+    axes.set(title="Mean RP, self-tuned joint over conventional")
+    figure.colorbar(axes.images[0], ax=axes, label="ratio (below 1: joint better)")
+    save_figure(figure, path, dpi=150)
 
 
 if __name__ == "__main__":

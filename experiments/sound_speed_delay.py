@@ -17,14 +17,19 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
-from jaxtyping import Array
+from common import (
+    arguments,
+    experiments,
+    machine,
+    precision,
+    save_figure,
+    write_table,
+)
 
-from jaxcal import Protocol, calibrate, calibrate_batch, reconstruction_precision, simulate
+from jaxcal import Protocol, calibrate, calibrate_batch, simulate
 from jaxcal.data.probe import C5_2, L14_5
 from jaxcal.data.problem import Problem
 from jaxcal.data.segmentation.time_of_flight import fit_in_plane
-from jaxcal.io.atomic import atomic_path
 
 SEED = 20261122
 PROBES = {"linear": L14_5, "curvilinear": C5_2}
@@ -49,26 +54,16 @@ def run_cell(cell: int, kind: str, noise: float, trials: int) -> dict[str, np.nd
     protocol = Protocol(elevation_mm=ELEVATION_MM, noise_mm=noise, probe=probe, raw=True)
     indices = cell * 1_000_000 + jnp.arange(trials)
 
-    @jax.jit
-    def draw(indices: Array):
-        root = jax.random.key(SEED)
-        made = jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol))(indices)
-        known = jax.vmap(lambda e: e.problem(probe=probe))(made)
-        return made, known, jax.vmap(lambda p: as_measured(p))(known)
-
-    experiments, known, measured = draw(indices)
+    drawn = experiments(SEED, indices, protocol)
+    known = jax.jit(jax.vmap(lambda e: e.problem(probe=probe)))(drawn)
+    measured = jax.jit(jax.vmap(as_measured))(known)
     results = {
         "estimated": calibrate_batch(measured, prior="gaussian", estimate=MEDIUM, data="channels"),
         "known": calibrate_batch(known, prior="gaussian", data="channels"),
         "wrong": calibrate_batch(measured, prior="gaussian", data="channels"),
     }
-    precision = jax.jit(jax.vmap(reconstruction_precision))
-    out = {
-        f"rp_{name}": np.asarray(
-            precision(r.image_to_probe, experiments.test_poses, experiments.test_points)
-        )
-        for name, r in results.items()
-    }
+    tests = drawn.test_poses, drawn.test_points
+    out = {f"rp_{name}": precision(r.image_to_probe, *tests) for name, r in results.items()}
     found = results["estimated"]
     out["converged"] = np.asarray(found.converged)
     for name, value, sd, truth in (
@@ -83,7 +78,7 @@ def run_cell(cell: int, kind: str, noise: float, trials: int) -> dict[str, np.nd
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 40 if quick else 500
     rows, draws = [], {}
     for cell, (kind, noise) in enumerate(itertools.product(PROBES, NOISES_MM)):
@@ -107,7 +102,6 @@ def main() -> None:
             + f" mm, estimated/known {rows[-1][14]:.3f}; not converged {rows[-1][15]}",
             flush=True,
         )
-    folder = results_folder(quick)
     write_table(
         folder / "sound_speed_delay.csv",
         ["probe", "channel_noise_mm", "trials", "speed_mean_m_s", "speed_scatter_m_s",
@@ -143,8 +137,7 @@ def plot(path, draws: dict) -> None:
                  ylabel="delay (us)")  # fmt: skip
         axes.grid(alpha=0.3)
         axes.legend()
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(figure, path, dpi=150)
 
 
 if __name__ == "__main__":

@@ -329,14 +329,12 @@ def summary(trials: list[Trial]) -> list[list[object]]:
     return rows
 
 
-def figure(trials: list[Trial], path: os.PathLike[str]) -> None:
+def figure(trials: list[Trial]):
     """Time to rest and travel after a stop, against the moment of the stop."""
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    drawing, axes = plt.subplots(2, 2, figsize=(10, 7), sharex=True, layout="constrained")
+    drawing = Figure(figsize=(10, 7), layout="constrained")
+    axes = drawing.subplots(2, 2, sharex=True)
     for column, series in enumerate(SERIES):
         for way in WAYS:
             mine = [t for t in trials if (t.series, t.way) == (series, way)]
@@ -351,14 +349,14 @@ def figure(trials: list[Trial], path: os.PathLike[str]) -> None:
     axes[0, 0].set(ylabel="time to rest (ms)")
     axes[1, 0].set(ylabel="travel after the stop (mm)")
     axes[1, 1].legend()
-    drawing.savefig(path, dpi=150)
+    return drawing
 
 
 def main() -> int:
     """Make the tables and the figure; 1 if any stop was lost."""
     import csv
 
-    from common import machine, results_folder, write_table
+    from common import machine, results_folder, save_figure, show, write_table
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="5 trials for each way")
@@ -386,7 +384,7 @@ def main() -> int:
         trials += run(series, ways, 5 if given.quick else given.trials, given.robots, SEED)
     rows = summary(trials)
     for row in rows:
-        print(*(f"{value:.3g}" if isinstance(value, float) else value for value in row))
+        show(row)
     write_table(
         folder / "stops.csv",
         ["series", "way", "trials", "lost", "arrived", "moving", "rest_median_ms", "rest_max_ms",
@@ -398,7 +396,7 @@ def main() -> int:
         [*asdict(trials[0]), "lost"],
         [[*asdict(trial).values(), trial.lost] for trial in trials],
     )
-    figure(trials, folder / "stops.png")
+    save_figure(figure(trials), folder / "stops.png", dpi=150)
     lost = [trial for trial in trials if trial.lost]
     for trial in lost:
         print("lost:", trial)

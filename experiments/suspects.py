@@ -18,7 +18,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, write_table
 from jaxtyping import Array
 
 import jaxcal
@@ -66,7 +66,7 @@ def draw(law: OffsetLaw, images: int, fault: str, indices: Array):
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials = 60 if quick else 250
     enable_compilation_cache()
     rows: list[list[object]] = []
@@ -97,7 +97,7 @@ def main() -> None:
                 shares = [float(np.mean(count / trials)) for count in counts]
                 rows.append([law, images, fault, trials, *shares])
                 print(*rows[-1], sep=", ", flush=True)
-    write_table(results_folder(quick) / "suspects.csv", HEADER, rows)
+    write_table(folder / "suspects.csv", HEADER, rows)
     print(machine())
 
 

@@ -13,14 +13,14 @@ observation of one's own (:mod:`tank_sds`, through jaxcal.backend).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import write_table
-from tank_grid import Grid, interval, padded_problems, precision
+from common import precision, save_figure, write_rows
+from tank_grid import Grid, interval, padded_problems
 from tank_placements import beside, digest, library, part, rows_of
 from tank_planning import Session, Shots, one
 from tank_run import Run
@@ -28,7 +28,6 @@ from tank_sds import FACTOR, GAIN_SD, from_amplitude, own_sds
 from tank_table4 import paired, percent
 
 from jaxcal import calibrate_batch
-from jaxcal.io.atomic import atomic_path
 from jaxcal.study import ArraySpec, Chunk
 
 SCENARIOS: dict[str, tuple[tuple[str, float], ...]] = {
@@ -107,18 +106,8 @@ def drawn(scenario: Scenario, seed: int, trial: int) -> tuple[Shots, np.ndarray,
     def mixed(name: str) -> np.ndarray:
         return np.array([getattr(shot, name) for shot in shots])[which, place]
 
-    first = shots[0]
-    together = Shots(
-        mixed("poses"),
-        mixed("points"),
-        mixed("bounds"),
-        mixed("offset_sd"),
-        mixed("placements"),
-        mixed("elevation"),
-        first.seconds,
-        first.test_poses,
-        first.test_points,
-    )
+    names = ("poses", "points", "bounds", "offset_sd", "placements", "elevation")
+    together = replace(shots[0], **{name: mixed(name) for name in names})
     assert together.placements is not None
     gain = float(1 + GAIN_SD * rng.normal())
     return together, *from_amplitude(together.placements, gain)
@@ -199,7 +188,7 @@ def bounds(run: Run) -> None:
         Scenario(name, n, beside(path), digest(path)) for n in IMAGES for name in SCENARIOS
     )
     data = run.study("paper_experiment_bounds", run.grid(Bounds, conditions))
-    rows: list[list[object]] = []
+    rows: list[dict[str, Any]] = []
     for c, scenario in enumerate(conditions):
         rp: dict[str, np.ndarray] = dict(zip(ARMS, data["rp"][c], strict=True))
         static = min(
@@ -213,18 +202,21 @@ def bounds(run: Run) -> None:
             same = f"{family}, best static"
             over_same = paired(rp[arm], rp[same]) if same in rp else ("", "")
             rows.append(
-                [
-                    scenario.name,
-                    scenario.images,
-                    arm,
-                    len(rp[arm]),
-                    mean,
-                    half,
-                    *over_auto,
-                    static,
-                    *over_static,
-                    *over_same,
-                ]
+                {
+                    "scenario": scenario.name,
+                    "images": scenario.images,
+                    "arm": arm,
+                    "experiments": len(rp[arm]),
+                    "rp_mm": mean,
+                    "ci95_half_mm": half,
+                    "over_auto_percent": over_auto[0],
+                    "over_auto_half": over_auto[1],
+                    "best_static_arm": static,
+                    "over_best_static_percent": over_static[0],
+                    "over_best_static_half": over_static[1],
+                    "over_same_method_static_percent": over_same[0],
+                    "over_same_method_static_half": over_same[1],
+                }
             )
         print(
             f"{scenario.name}, {scenario.images} images: auto {rp['auto'].mean():.4f} mm; "
@@ -235,31 +227,18 @@ def bounds(run: Run) -> None:
             + f"; best of the static ones {static} {rp[static].mean():.4f} mm",
             flush=True,
         )
-    header = [
-        "scenario",
-        "images",
-        "arm",
-        "experiments",
-        "rp_mm",
-        "ci95_half_mm",
-        "over_auto_percent",
-        "over_auto_half",
-        "best_static_arm",
-        "over_best_static_percent",
-        "over_best_static_half",
-        "over_same_method_static_percent",
-        "over_same_method_static_half",
-    ]
-    write_table(run.folder / "paper_experiment_bounds.csv", header, rows)
+    write_rows(run.folder / "paper_experiment_bounds.csv", rows)
     run.statements("bounds", statements(rows))
     plot(run.folder / "paper_experiment_bounds.png", rows)
 
 
-def statements(rows: list[list[Any]]) -> list[list[str]]:
+def statements(rows: list[dict[str, Any]]) -> list[list[str]]:
     """What section 4.3 says of the bound, with our evidence."""
     cells = [(name, n) for n in IMAGES for name in SCENARIOS]
-    mean = {(row[0], row[1], row[2]): row[4] for row in rows}
-    over_auto = {(row[0], row[1], row[2]): row[6] for row in rows}
+    mean, over_auto = (
+        {(row["scenario"], row["images"], row["arm"]): row[name] for row in rows}
+        for name in ("rp_mm", "over_auto_percent")
+    )
 
     def below(first: str, second: str) -> int:
         return sum(mean[*cell, first] < mean[*cell, second] for cell in cells)
@@ -316,7 +295,7 @@ def statements(rows: list[list[Any]]) -> list[list[str]]:
     ]
 
 
-def plot(path: Path, rows: list[list[Any]]) -> None:
+def plot(path: Path, rows: list[dict[str, Any]]) -> None:
     """Mean precision of every arm by scenario, 60 images."""
     from matplotlib.figure import Figure
 
@@ -324,16 +303,13 @@ def plot(path: Path, rows: list[list[Any]]) -> None:
     panels = figure.subplots(1, len(SCENARIOS))
     colors = {"without": "C7", "alternating": "C3", "bounded": "C1", "auto": "C0", "own SDs": "C2"}
     for panel, name in zip(panels, SCENARIOS, strict=True):
-        chosen = [r for r in rows if r[0] == name and r[1] == IMAGES[-1]]
-        place = np.arange(len(chosen))[::-1]
+        chosen = [row for row in rows if (row["scenario"], row["images"]) == (name, IMAGES[-1])]
+        place, arms = np.arange(len(chosen))[::-1], [row["arm"] for row in chosen]
         panel.barh(
-            place,
-            [r[4] for r in chosen],
-            xerr=[r[5] for r in chosen],
-            color=[colors[r[2].split(",")[0]] for r in chosen],
-        )
-        panel.set_yticks(place, [r[2] for r in chosen] if name == "amplitude scan" else [])
+            place, [row["rp_mm"] for row in chosen], xerr=[row["ci95_half_mm"] for row in chosen],
+            color=[colors[arm.split(",")[0]] for arm in arms],
+        )  # fmt: skip
+        panel.set_yticks(place, arms if name == "amplitude scan" else [])
         panel.set(title=name, xlabel="mean RP (mm)")
         panel.grid(alpha=0.3, axis="x")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
+    save_figure(figure, path, dpi=110)

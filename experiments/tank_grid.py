@@ -10,11 +10,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-import jax
 import numpy as np
+from common import batch_of
 from jaxtyping import Float
 
-from jaxcal import InputError, Problem, reconstruction_precision
+from jaxcal import InputError, Problem
 from jaxcal.study import ArraySpec, Chunk
 from jaxcal.study.store import Store
 
@@ -109,18 +109,6 @@ def read_all(folder: Path, study: Grid) -> dict[str, np.ndarray]:
     }
 
 
-_each_precision = jax.jit(jax.vmap(reconstruction_precision))
-
-
-def precision(
-    x: Float[np.ndarray, "t 4 4"],
-    poses: Float[np.ndarray, "t n 4 4"],
-    points: Float[np.ndarray, "t n 2"],
-) -> Float[np.ndarray, " t"]:
-    """Eq. 8 of every X on its own test set, mm."""
-    return np.asarray(_each_precision(x, poses, points))
-
-
 def padded_problems(
     poses: Float[np.ndarray, "lanes n 4 4"],
     points: Float[np.ndarray, "lanes n 2"],
@@ -133,21 +121,9 @@ def padded_problems(
         points: [lateral, range], mm.
         bounds: on the offsets, mm.
     """
-    lanes, n = points.shape[:2]
-    room = next((size for size in _ROOM if size >= n), n)
-    more = [(0, 0), (0, room - n)]
-    filled = np.pad(poses, [*more, (0, 0), (0, 0)])
-    filled[:, n:] = np.eye(4)
-    arrays: dict[str, Any] = {
-        "poses": filled,
-        "measurements": np.pad(points, [*more, (0, 0)], constant_values=1.0),
-        "mask": np.pad(np.ones((lanes, n)), more),
-        "spacing": np.ones((lanes, 2)),
-        "face_offset": np.zeros(lanes),
-    }
-    if bounds is not None:
-        arrays["max_elevation"] = np.pad(bounds, more, constant_values=1.0)
-    return Problem(**arrays)
+    count = points.shape[1]
+    room = next((size for size in _ROOM if size >= count), count)
+    return batch_of(list(zip(poses, points, strict=True)), room, bounds)
 
 
 def interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import write_table
+from common import precision, save_figure, show, write_rows
 from tank import (
     CROSSING,
     FWHM,
@@ -21,7 +22,7 @@ from tank import (
     pose_errors,
     wire_widths_mm,
 )
-from tank_grid import Grid, interval, padded_problems, precision
+from tank_grid import Grid, interval, padded_problems
 from tank_placements import (
     BY_EYE_S,
     PROCEDURES,
@@ -39,7 +40,6 @@ from tank_sds import FACTOR, GAIN_SD, from_amplitude, own_sds
 from hw.bench.world import DRAWN, TANK_MM
 from hw.rigid import rotation_matrix
 from jaxcal import calibrate_batch
-from jaxcal.io.atomic import atomic_path
 from jaxcal.study import ArraySpec, Chunk
 
 BY_EYE = "by eye, cross-wire"
@@ -241,47 +241,31 @@ def planning(run: Run) -> None:
         for n in IMAGES
     )
     data = run.study("paper_experiment_planning", run.grid(Planning, conditions))
-    rows: list[list[object]] = []
+    rows: list[dict[str, Any]] = []
     for c, session in enumerate(conditions):
-        minutes = data["seconds"][c] / 60
         for m, name in enumerate(METHODS):
-            mean, half = interval(data["rp"][c, m])
+            rp = data["rp"][c, m]
+            mean, half = interval(rp)
             rows.append(
-                [
-                    session.way,
-                    name,
-                    session.images,
-                    session.accuracy_mm,
-                    run.trials,
-                    float(minutes.mean()),
-                    mean,
-                    half,
-                    float(np.quantile(data["rp"][c, m], 0.95)),
-                    int((data["status"][c, m] != 0).sum()),
-                ]
+                {
+                    "placement": session.way,
+                    "method": name,
+                    "images": session.images,
+                    "accuracy_mm": session.accuracy_mm,
+                    "experiments": run.trials,
+                    "minutes": float((data["seconds"][c] / 60).mean()),
+                    "rp_mm": mean,
+                    "ci95_half_mm": half,
+                    "rp_95_mm": float(np.quantile(rp, 0.95)),
+                    "not_converged": int((data["status"][c, m] != 0).sum()),
+                }
             )
-    header = [
-        "placement",
-        "method",
-        "images",
-        "accuracy_mm",
-        "experiments",
-        "minutes",
-        "rp_mm",
-        "ci95_half_mm",
-        "rp_95_mm",
-        "not_converged",
-    ]
-    write_table(run.folder / "paper_experiment_planning.csv", header, rows)
+    write_rows(run.folder / "paper_experiment_planning.csv", rows)
     advice = times_to(rows)
-    header = ["accuracy_mm", "wanted_rp_mm", "placement", "method", "images", "minutes"]
-    write_table(run.folder / "paper_experiment_planning_times.csv", header, advice)
+    write_rows(run.folder / "paper_experiment_planning_times.csv", advice)
     for row in advice:
-        if row[5] != "":
-            print(
-                f"robot {row[0]} mm, wanted {row[1]} mm: {row[2]}, {row[3]}: {row[4]:.0f} images, "
-                f"{row[5]:.1f} min"
-            )
+        if row["minutes"] != "":
+            show(row.values())
     placements = rows_of(beside(path), sha)
     first = np.abs(part(placements["first seen, robot"], "true_offset_mm"))
     told = statements(rows, advice, placements)
@@ -299,17 +283,21 @@ def planning(run: Run) -> None:
 
 
 def statements(
-    rows: list[list[Any]], advice: list[list[Any]], placements: dict[str, np.ndarray]
+    rows: list[dict[str, Any]], advice: list[dict[str, Any]], placements: dict[str, np.ndarray]
 ) -> list[list[str]]:
     """What section 4.3 says of placement and estimation, with our evidence."""
     wanted = 0.15
 
     def minutes(accuracy: float, way: str, method: str) -> str:
-        (value,) = [row[5] for row in advice if tuple(row[:4]) == (accuracy, wanted, way, method)]
+        (value,) = [
+            row["minutes"] for row in advice
+            if (row["accuracy_mm"], row["wanted_rp_mm"], row["placement"], row["method"])
+            == (accuracy, wanted, way, method)
+        ]  # fmt: skip
         return "not with 120 images" if value == "" else f"{value:.1f} min"
 
-    def rp(way: str, method: str, images: int = 60, accuracy: float = 0.0) -> float:
-        (value,) = [row[6] for row in rows if tuple(row[:4]) == (way, method, images, accuracy)]
+    def rp(way: str, method: str) -> float:
+        (value,) = [row["rp_mm"] for row in chosen(rows, way, method, 0.0) if row["images"] == 60]
         return value
 
     fine, rough = "amplitude scan", "seen, by hand"
@@ -361,33 +349,40 @@ def statements(
     return found
 
 
-def times_to(rows: list[list[Any]]) -> list[list[object]]:
+def chosen(
+    rows: list[dict[str, Any]], way: str, method: str, accuracy: float
+) -> list[dict[str, Any]]:
+    """The rows of a placement, a method and a robot: one for each number of images."""
+    wanted = {"placement": way, "method": method, "accuracy_mm": accuracy}
+    return [row for row in rows if row.items() >= wanted.items()]
+
+
+def times_to(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Images and minutes to a wanted mean RP, interpolated in log-log; empty: not reached."""
-    found: list[list[object]] = []
-    for accuracy in ACCURACIES_MM:
-        for wanted in WANTED_MM:
-            for way in WAYS:
-                for method in METHODS:
-                    chosen = [r for r in rows if (r[0], r[1], r[3]) == (way, method, accuracy)]
-                    n, minutes, rp = (np.array([r[k] for r in chosen], float) for k in (2, 5, 6))
-                    reached = np.flatnonzero(rp <= wanted)
-                    if not reached.size:
-                        found.append([accuracy, wanted, way, method, "", ""])
-                        continue
-                    k = int(reached[0])
-                    if k == 0:
-                        found.append([accuracy, wanted, way, method, n[0], minutes[0]])
-                        continue
-                    part = np.log(rp[k - 1] / wanted) / np.log(rp[k - 1] / rp[k])
-                    needed = [
-                        float(np.exp((1 - part) * np.log(v[k - 1]) + part * np.log(v[k])))
-                        for v in (n, minutes)
-                    ]
-                    found.append([accuracy, wanted, way, method, *needed])
+    found: list[dict[str, Any]] = []
+    for accuracy, wanted, way, method in itertools.product(ACCURACIES_MM, WANTED_MM, WAYS, METHODS):
+        some = chosen(rows, way, method, accuracy)
+        rp = np.array([row["rp_mm"] for row in some])
+        reached = np.flatnonzero(rp <= wanted)
+        row: dict[str, Any] = {
+            "accuracy_mm": accuracy, "wanted_rp_mm": wanted, "placement": way, "method": method,
+        }  # fmt: skip
+        for name in ("images", "minutes"):
+            values = np.array([row[name] for row in some], float)
+            if not reached.size:
+                row[name] = ""
+            elif reached[0] == 0:
+                row[name] = float(values[0])
+            else:
+                k = int(reached[0])
+                share = np.log(rp[k - 1] / wanted) / np.log(rp[k - 1] / rp[k])
+                ends = np.log(values[k - 1 : k + 1])
+                row[name] = float(np.exp((1 - share) * ends[0] + share * ends[1]))
+        found.append(row)
     return found
 
 
-def plot(path: Path, rows: list[list[Any]]) -> None:
+def plot(path: Path, rows: list[dict[str, Any]]) -> None:
     """Minutes of the bench against mean RP; without estimation and joint."""
     from matplotlib.figure import Figure
 
@@ -396,18 +391,14 @@ def plot(path: Path, rows: list[list[Any]]) -> None:
     for panel, accuracy in zip(panels, ACCURACIES_MM, strict=True):
         for way in WAYS:
             for method, style in (("without", "o:"), ("joint, own SDs", "s-")):
-                chosen = [r for r in rows if (r[0], r[1], r[3]) == (way, method, accuracy)]
+                points = [
+                    (row["minutes"], row["rp_mm"], row["ci95_half_mm"])
+                    for row in chosen(rows, way, method, accuracy)
+                ]
                 panel.errorbar(
-                    [r[5] for r in chosen],
-                    [r[6] for r in chosen],
-                    [r[7] for r in chosen],
-                    fmt=style,
-                    ms=4,
-                    color=COLORS[way],
-                    capsize=2,
-                    lw=1.2,
-                    label=way if style == "s-" else None,
-                )
+                    *zip(*points, strict=True), fmt=style, ms=4, color=COLORS[way], capsize=2,
+                    lw=1.2, label=way if style == "s-" else None,
+                )  # fmt: skip
         panel.set(
             xscale="log",
             yscale="log",
@@ -419,5 +410,4 @@ def plot(path: Path, rows: list[list[Any]]) -> None:
     panels[0].plot([], [], "k:", marker="o", ms=4, label="without out-of-plane estimation")
     panels[0].plot([], [], "k-", marker="s", ms=4, label="joint, an SD for each image's offset")
     panels[0].legend(fontsize="small")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
+    save_figure(figure, path, dpi=110)

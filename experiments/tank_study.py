@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from common import precision
 from jaxtyping import Float
 from tank import PERSONS, Points, Tank, draw
-from tank_grid import Grid, padded_problems, precision
+from tank_grid import Grid, padded_problems
 
 from jaxcal import calibrate_batch
 from jaxcal.data.poses import rotation_angle

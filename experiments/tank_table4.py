@@ -4,37 +4,17 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from common import write_table
+from common import save_figure, write_rows
 from tank import QUALITIES, Tank
 from tank_grid import interval
 from tank_run import Run
 from tank_study import METHODS, SETS, TESTS, TankStudy
 
-from jaxcal.io.atomic import atomic_path
-
 PAPER = Path(__file__).parent / "paper" / "table4.csv"
-HEADER = [
-    "experiment",
-    "calibrate_test",
-    "method",
-    "experiments",
-    "paper_rp_mm",
-    "rp_mm",
-    "ci95_half_mm",
-    "sd_mm",
-    "low_95_mm",
-    "high_95_mm",
-    "best_of_3_mm",
-    "best_ci95_half_mm",
-    "exact_mm",
-    "exact_ci95_half_mm",
-    "test_scatter_mm",
-    "paper_in_95_range",
-    "not_converged",
-]
-NAMES = {"without": "", "alternating": "OOP", "joint": "joint"}
+ENDINGS = {"without": "", "alternating": "OOP", "joint": " joint"}
 
 
 def paper_cells() -> dict[tuple[str, str], float]:
@@ -48,8 +28,7 @@ def paper_cells() -> dict[tuple[str, str], float]:
 
 def label(name: str, method: str, test: str) -> str:
     """The paper's heading of a column: AEOOP/Opt."""
-    ending = {"": "", "OOP": "OOP", "joint": " joint"}[NAMES[method]]
-    return f"{name}{ending}/{'Opt' if test == 'OH' else test}"
+    return f"{name}{ENDINGS[method]}/{'Opt' if test == 'OH' else test}"
 
 
 def table4(run: Run) -> None:
@@ -57,8 +36,7 @@ def table4(run: Run) -> None:
     conditions = tuple(Tank(quality=name) for name in QUALITIES)
     data = run.study("paper_experiment_table4", run.grid(TankStudy, conditions))
     paper = paper_cells()
-    rows: list[list[object]] = []
-    used = set()
+    rows: list[dict[str, Any]] = []
     for e, experiment in enumerate(QUALITIES):
         for s, name in enumerate(SETS):
             for m, method in enumerate(METHODS):
@@ -66,24 +44,19 @@ def table4(run: Run) -> None:
                     if test == "exact" or name.split("-")[-1].split(",")[0] == test:
                         continue
                     heading = label(name, method, test)
-                    used.add((experiment, heading))
-                    rows.append(
-                        [
-                            experiment,
-                            heading,
-                            method,
-                            *cell(data, e, s, m, t, paper.get((experiment, heading))),
-                        ]
-                    )
-    missing = set(paper) - used
+                    head = {"experiment": experiment, "calibrate_test": heading, "method": method}
+                    rows.append(head | cell(data, e, s, m, t, paper.get((experiment, heading))))
+    missing = set(paper) - {(row["experiment"], row["calibrate_test"]) for row in rows}
     if missing:
         raise SystemExit(f"cells of the paper without ours: {sorted(missing)}")
-    write_table(run.folder / "paper_experiment.csv", HEADER, rows)
+    write_rows(run.folder / "paper_experiment.csv", rows)
     for row in rows:
-        if row[4] != "":
+        if row["paper_rp_mm"] != "":
             print(
-                f"{row[0]} {row[1]}: {row[5]:.2f} +- {row[6]:.2f} mm (best of 3 {row[10]:.2f}), "
-                f"paper {row[4]}; X alone {row[12]:.3f}, test set's own scatter {row[14]:.2f}"
+                f"{row['experiment']} {row['calibrate_test']}: {row['rp_mm']:.2f} +- "
+                f"{row['ci95_half_mm']:.2f} mm (best of 3 {row['best_of_3_mm']:.2f}), paper "
+                f"{row['paper_rp_mm']}; X alone {row['exact_mm']:.3f}, test set's own scatter "
+                f"{row['test_scatter_mm']:.2f}"
             )
     run.statements("table4", statements(data))
     plot(run.folder / "paper_experiment.png", data, paper)
@@ -91,31 +64,28 @@ def table4(run: Run) -> None:
 
 def cell(
     data: dict[str, np.ndarray], e: int, s: int, m: int, t: int, printed: float | None
-) -> list[object]:
-    """Numbers of one cell from the count of experiments on."""
+) -> dict[str, object]:
+    """Numbers of one cell."""
     rp = data["rp"][e, s, m]
-    one = rp[0, t]
-    best = rp[:, t].min(axis=0)
-    exact = rp[0, TESTS.index("exact")]
-    own = data["own_rp"][e, 0, t]
-    low, high = np.quantile(one, [0.025, 0.975])
-    bad = int((data["status"][e, s, m, 0] != 0).sum())
-    inside = "" if printed is None else bool(low <= printed <= high)
-    mean, half = interval(one)
-    return [
-        len(one),
-        "" if printed is None else printed,
-        mean,
-        half,
-        float(one.std(ddof=1)),
-        float(low),
-        float(high),
-        *interval(best),
-        *interval(exact),
-        float(own.mean()),
-        inside,
-        bad,
-    ]
+    one, best, exact = rp[0, t], rp[:, t].min(axis=0), rp[0, TESTS.index("exact")]
+    low, high = map(float, np.quantile(one, [0.025, 0.975]))
+    means = [interval(values) for values in (one, best, exact)]
+    return {
+        "experiments": len(one),
+        "paper_rp_mm": "" if printed is None else printed,
+        "rp_mm": means[0][0],
+        "ci95_half_mm": means[0][1],
+        "sd_mm": float(one.std(ddof=1)),
+        "low_95_mm": low,
+        "high_95_mm": high,
+        "best_of_3_mm": means[1][0],
+        "best_ci95_half_mm": means[1][1],
+        "exact_mm": means[2][0],
+        "exact_ci95_half_mm": means[2][1],
+        "test_scatter_mm": float(data["own_rp"][e, 0, t].mean()),
+        "paper_in_95_range": "" if printed is None else bool(low <= printed <= high),
+        "not_converged": int((data["status"][e, s, m, 0] != 0).sum()),
+    }
 
 
 def paired(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
@@ -134,24 +104,17 @@ def statements(data: dict[str, np.ndarray]) -> list[list[str]]:
     names = list(QUALITIES)
 
     def rp(experiment: str, name: str, method: str, test: str) -> np.ndarray:
-        return data["rp"][
-            names.index(experiment),
-            SETS.index(name),
-            list(METHODS).index(method),
-            0,
-            TESTS.index(test),
-        ]
+        cell = names.index(experiment), SETS.index(name), list(METHODS).index(method)
+        return data["rp"][*cell, 0, TESTS.index(test)]
 
     def own(experiment: str, test: str) -> float:
         return float(data["own_rp"][names.index(experiment), 0, TESTS.index(test)].mean())
 
-    def say(holds: bool | str) -> str:
-        return holds if isinstance(holds, str) else ("holds" if holds else "does not hold")
-
     found: list[list[str]] = []
 
     def add(section: str, statement: str, holds: bool | str, evidence: str) -> None:
-        found.append([section, statement, say(holds), evidence])
+        said = holds if isinstance(holds, str) else "holds" if holds else "does not hold"
+        found.append([section, statement, said, evidence])
 
     def m(values: np.ndarray) -> float:
         return float(values.mean())
@@ -352,5 +315,4 @@ def plot(path: Path, data: dict[str, np.ndarray], paper: dict[tuple[str, str], f
     panels[1, 0].set_ylabel("RP on images without errors (mm)")
     for panel in panels.flat:
         panel.grid(alpha=0.3, axis="y")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
+    save_figure(figure, path, dpi=110)

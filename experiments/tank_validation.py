@@ -13,10 +13,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import tank
-from common import write_table
+from common import show, write_rows
 from tank import FWHM, PICK, QUALITIES, Tank
 from tank_run import SEED, Run
 
@@ -33,15 +34,6 @@ from hw.stage import IMAGE_AGE_S
 from jaxcal import Images, segment
 from jaxcal.data.segmentation.image import Target, localise
 
-HEADER = [
-    "quantity",
-    "experiment",
-    "images",
-    "fast_model",
-    "bench",
-    "unit",
-    "bench_over_fast",
-]
 WIRED = CrossWire(directions=tuple(tuple(float(v) for v in row) for row in tank.WIRES))  # pyright: ignore[reportArgumentType]
 VISIBLE = 1.0 - 10 ** (-2.0 / 20)
 """A dip that a person sees: 2 dB (assumption)."""
@@ -93,23 +85,40 @@ def one_spot(frame: np.ndarray, u: float, v: float) -> bool:
 def validation(run: Run) -> None:
     """Compare, and write the table."""
     count = 24 if run.quick else 120
-    rows: list[list[object]] = []
+    rows: list[dict[str, Any]] = []
     for name in QUALITIES:
         rows += [*picks(name, count), *person_reach(name, count // 2)]
     rows += [*placements(count), *times(count), *frames(count)]
-    write_table(run.folder / "paper_experiment_validation.csv", HEADER, rows)
-    for row in rows:
-        fast = f"{row[3]:.3f}" if row[3] != "" else "-"
-        print(f"{row[0]}, {row[1]}: fast model {fast}, bench {row[4]:.3f} {row[5]}")
+    write_rows(run.folder / "paper_experiment_validation.csv", rows)
+    for one in rows:
+        show(one.values())
 
 
-def row(quantity: str, experiment: str, n: int, fast: float | None, bench: float) -> list[object]:
+def row(quantity: str, experiment: str, n: int, fast: float | None, bench: float) -> dict[str, Any]:
     """One line of the table."""
-    ratio = "" if fast is None else bench / fast
-    return [quantity, experiment, n, "" if fast is None else fast, bench, "mm", ratio]
+    return {
+        "quantity": quantity,
+        "experiment": experiment,
+        "images": n,
+        "fast_model": "" if fast is None else fast,
+        "bench": bench,
+        "unit": "mm",
+        "bench_over_fast": "" if fast is None else bench / fast,
+    }
 
 
-def picks(name: str, count: int) -> list[list[object]]:
+def by_axis(
+    quantity: str, experiment: str, n: int, fast: np.ndarray | None, bench: np.ndarray
+) -> list[dict[str, Any]]:
+    """Two lines, lateral position and range, in the place of ``{}``."""
+    return [
+        row(quantity.format(axis), experiment, n, None if fast is None else float(fast[k]),
+            float(bench[k]))
+        for k, axis in enumerate(("lateral", "range"))
+    ]  # fmt: skip
+
+
+def picks(name: str, count: int) -> list[dict[str, Any]]:
     """SDs of a person's picks in the plane."""
     condition, found = Tank(quality=name), []
     # A reflection is no matter of a pick's spread; background and focus are.
@@ -141,16 +150,8 @@ def picks(name: str, count: int) -> list[list[object]]:
             )
         sd = np.std(errors, axis=0)
         expected = np.sqrt(np.mean(np.square(fast), axis=0))
-        found += [
-            row(
-                f"{label}: SD of a person's pick in the plane, {axis}",
-                name,
-                count,
-                float(expected[k]),
-                float(sd[k]),
-            )
-            for k, axis in enumerate(("lateral", "range"))
-        ]
+        quantity = f"{label}: SD of a person's pick in the plane, {{}}"
+        found += by_axis(quantity, name, count, expected, sd)
     return found
 
 
@@ -160,7 +161,7 @@ def wires_in_image(world: World, pose: np.ndarray) -> np.ndarray:
     return (-along[:, 0] / along[:, 1])[None]
 
 
-def person_reach(name: str, count: int) -> list[list[object]]:
+def person_reach(name: str, count: int) -> list[dict[str, Any]]:
     """Offset up to which two wires look like one."""
     condition = Tank(quality=name)
     look = condition.look
@@ -180,18 +181,11 @@ def person_reach(name: str, count: int) -> list[list[object]]:
         wires = wires_in_image(world, pose)
         depth = np.array([world.truth(pose).range_mm])
         fast.append(float(tank.parted_mm(condition, depth, wires)[0]))
-    return [
-        row(
-            "CW: offset up to which two wires look like one",
-            name,
-            count,
-            float(np.mean(fast)),
-            float(np.mean(seen)),
-        )
-    ]
+    quantity = "CW: offset up to which two wires look like one"
+    return [row(quantity, name, count, float(np.mean(fast)), float(np.mean(seen)))]
 
 
-def placements(count: int) -> list[list[object]]:
+def placements(count: int) -> list[dict[str, Any]]:
     """SDs of the offsets that placements leave."""
     condition = Tank()
     stop = condition.repeatability_mm
@@ -242,7 +236,7 @@ def image_bench(stage: WorldStage, camera: Camera, rng: np.random.Generator) -> 
     return ImageBench(stage, see, place, 120.0)
 
 
-def times(count: int) -> list[list[object]]:
+def times(count: int) -> list[dict[str, Any]]:
     """SDs of points from times of flight, the bench's against the fast model's."""
     found = []
     for name, phantom in (("Auto-AE", ActiveEcho()), ("OH", Hydrophone())):
@@ -268,20 +262,11 @@ def times(count: int) -> list[list[object]]:
                 points = segment(images, world.probe, method=method).images
                 errors = (points.measurements - exact)[points.mask]
                 sds.append(np.std(errors, axis=0))
-            found += [
-                row(
-                    f"{name}: SD of the point by {method}, {axis}",
-                    "all",
-                    count,
-                    float(sds[0][k]),
-                    float(sds[1][k]),
-                )
-                for k, axis in enumerate(("lateral", "range"))
-            ]
+            found += by_axis(f"{name}: SD of the point by {method}, {{}}", "all", count, *sds)
     return found
 
 
-def frames(count: int) -> list[list[object]]:
+def frames(count: int) -> list[dict[str, Any]]:
     """SDs of automatic points from frames; the fast model has none."""
     found = []
     cases: tuple[tuple[str, ActiveEcho | CrossWire, Target], ...] = (
@@ -301,14 +286,7 @@ def frames(count: int) -> list[list[object]]:
                 exact.append(camera.pixel(truth.lateral_mm, truth.range_mm))
             located = localise(np.array(drawn), target, near=np.array(exact), within_px=80.0)
             errors = (located.position - exact) * camera.spacing_mm
-            found += [
-                row(
-                    f"{name}: SD of the point localised in frames, {axis}, offset {offset:g} mm",
-                    "Exp. 3",
-                    int(located.found.sum()),
-                    None,
-                    float(np.nanstd(errors[:, k])),
-                )
-                for k, axis in enumerate(("lateral", "range"))
-            ]
+            quantity = f"{name}: SD of the point localised in frames, {{}}, offset {offset:g} mm"
+            sds = np.nanstd(errors, axis=0)
+            found += by_axis(quantity, "Exp. 3", int(located.found.sum()), None, sds)
     return found

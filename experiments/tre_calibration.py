@@ -25,19 +25,16 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import LAWS, arguments, machine, results_folder, write_table
-from jaxtyping import Array
+from common import LAWS, arguments, experiments, machine, save_figure, write_table
 
-from jaxcal import Calibration, Problem, Protocol, calibrate_batch, predicted_tre, simulate
+from jaxcal import Calibration, Problem, Protocol, calibrate_batch, predicted_tre
 from jaxcal.data.probe import L14_5
 from jaxcal.diagnostics.intervals import tre_at, tre_over
-from jaxcal.io.atomic import atomic_path
 from jaxcal.model import unknowns
 from jaxcal.solvers.names import Method, PriorName
 from jaxcal.study.offsets import OffsetLaw
@@ -74,25 +71,6 @@ SCALE_HEADER = [
     "held_at_points",
     "not_converged",
 ]  # fmt: skip
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def draw(
-    law: OffsetLaw,
-    images: int,
-    raw: bool,
-    indices: Array,
-    elevation: Array,
-    noise: Array,
-    lateral: float | Array = 29.25,
-    depth: tuple[float | Array, float | Array] = (10.0, 90.0),
-):
-    """Experiments of one condition."""
-    protocol = Protocol(images=images, test_images=2, elevation_distribution=law, raw=raw)
-    protocol = replace(protocol, elevation_mm=elevation, noise_mm=noise)
-    protocol = replace(protocol, lateral_mm=lateral, depth_mm=depth)
-    root = jax.random.key(SEED)
-    return jax.vmap(lambda k: simulate(jax.random.fold_in(root, k), protocol))(indices)
 
 
 def in_pixels(problems: Problem) -> Problem:
@@ -148,10 +126,13 @@ def laws(trials: int, folder: Path) -> list[list[object]]:
     conditions = [*itertools.product(SIZES_MM, LAWS), *((size, MIXTURE) for size in SIZES_MM)]
     for condition, (size, law) in enumerate(conditions):
         indices = condition * 1_000_000 + jnp.arange(trials)
-        experiments = draw(law, 40, False, indices, size, 0.5)
-        plain = jax.vmap(lambda experiment: experiment.problem())(experiments)
-        result = calibrate_batch(replace(plain, covariance=experiments.covariance))
-        actual = actual_errors(result, np.asarray(experiments.image_to_probe), POINTS_MM)
+        protocol = Protocol(
+            images=40, test_images=2, elevation_distribution=law, elevation_mm=size, noise_mm=0.5
+        )
+        drawn = experiments(SEED, indices, protocol)
+        plain = jax.vmap(lambda experiment: experiment.problem())(drawn)
+        result = calibrate_batch(replace(plain, covariance=drawn.covariance))
+        actual = actual_errors(result, np.asarray(drawn.image_to_probe), POINTS_MM)
         stated = tre_at(result, POINTS_MM)
         whole, over = tre_over(result, POINTS_MM), np.sqrt(np.mean(actual**2, axis=1))
         below, above = np.mean(actual < stated.lower), np.mean(actual > stated.upper)
@@ -188,13 +169,17 @@ def scales(trials: int, folder: Path) -> list[list[object]]:
         # The same recordings whatever the method.
         first = (100 + 2 * images + (field == "all")) * 1_000_000
         indices = first + jnp.arange(count)
-        experiments = draw("normal", images, channels, indices, elevation, 0.5, lateral, depth)
+        protocol = Protocol(
+            images=images, test_images=2, elevation_distribution="normal", elevation_mm=elevation,
+            noise_mm=0.5, lateral_mm=lateral, depth_mm=depth, raw=channels,
+        )  # fmt: skip
+        drawn = experiments(SEED, indices, protocol)
         probe = L14_5 if channels else None
-        problems = jax.vmap(lambda experiment, p=probe: experiment.problem(probe=p))(experiments)
+        problems = jax.vmap(lambda experiment, p=probe: experiment.problem(probe=p))(drawn)
         if not channels:
             problems = in_pixels(problems)
         result = calibrate_batch(problems, method, prior, estimate=unknown)
-        actual = actual_errors(result, np.asarray(experiments.image_to_probe), points)
+        actual = actual_errors(result, np.asarray(drawn.image_to_probe), points)
         stated = tre_at(result, places(result, points))
         held = np.mean((actual >= stated.lower) & (actual <= stated.upper))
         told, happened, before = rms(stated.rms), rms(actual), stated_before(result, points)
@@ -221,8 +206,7 @@ def stated_before(result: Calibration, points: np.ndarray) -> float:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
-    folder = results_folder(quick)
+    quick, folder = arguments(__doc__)
     by_law = laws(100 if quick else 1000, folder)
     by_scale = scales(60 if quick else 400, folder)
     for line in misses(by_law, by_scale):
@@ -279,8 +263,7 @@ def plot(path: Path, by_law: list[list[object]], by_scale: list[list[object]]) -
     right.set(ylabel="predicted over actual TRE", yscale="log")
     right.set_yticks([0.8, 1.0, 1.2, 1.5, 2.0, 3.0], ["0.8", "1", "1.2", "1.5", "2", "3"])
     right.legend(fontsize="small")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=130)
+    save_figure(figure, path, dpi=130)
 
 
 if __name__ == "__main__":

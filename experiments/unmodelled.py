@@ -28,7 +28,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, write_table
 from jaxtyping import Array
 
 import jaxcal
@@ -109,7 +109,7 @@ def judged(result, recording: Recording, x: np.ndarray, size: np.ndarray, fault:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     enable_compilation_cache()
     rows: list[list[object]] = []
     condition = 0
@@ -126,7 +126,7 @@ def main() -> None:
             shares = np.mean(told, axis=0)
             rows.append([fault, images, trials, *map(float, shares)])
             print(*rows[-1], sep=", ", flush=True)
-    write_table(results_folder(quick) / "unmodelled.csv", HEADER, rows)
+    write_table(folder / "unmodelled.csv", HEADER, rows)
     print(machine())
 
 

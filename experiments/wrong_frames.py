@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, write_table
 from dependent_frames import placed, seen
 from scipy.spatial.transform import Rotation
 
@@ -174,7 +174,7 @@ def outcome(arrays: Arrays, method: str) -> tuple[str, str, np.ndarray | None]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     count = 8 if quick else 40
     enable_compilation_cache()
     rows: list[list[object]] = []
@@ -197,7 +197,7 @@ def main() -> None:
             print(*rows[-1], sep=", ", flush=True)
             for end, said, _ in ends[:1]:
                 print(f"    {end}: {said}")
-    write_table(results_folder(quick) / "wrong_frames.csv", HEADER, rows)
+    write_table(folder / "wrong_frames.csv", HEADER, rows)
     print(machine())
 
 

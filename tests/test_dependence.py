@@ -157,7 +157,7 @@ def test_held_probes_are_covered_and_never_good(frames):
             assert result.notes[0] in result.warnings
             if result.status != "converged":
                 continue
-            error = frames.error_of(
+            error = frames.right_errors(
                 np.asarray(result.image_to_probe)[None], made.image_to_probe[None]
             )[0]
             inside.append(np.abs(error) <= jaxcal.transform_intervals(result, 0.95))
@@ -194,7 +194,7 @@ def test_correlated_errors_widen_the_covariance(frames, monkeypatch):
 
     found = np.array([np.asarray(wide[k].image_to_probe) for k in used])
     np.testing.assert_array_equal(found, [np.asarray(plain[k].image_to_probe) for k in used])
-    error = frames.error_of(found, np.array([made[k].image_to_probe for k in used]))
+    error = frames.right_errors(found, np.array([made[k].image_to_probe for k in used]))
     before, after = spreads(plain), spreads(wide)
     assert (after >= before * (1 - 1e-9)).all()
     assert np.mean(after / before) > 1.08

@@ -37,7 +37,7 @@ from jaxcal.study.pipeline import (
     shape_of,
 )
 from jaxcal.study.show import as_csv, as_record, mean_interval, summarise
-from jaxcal.study.spec import AXES, parse_spec, spec_from_canonical
+from jaxcal.study.spec import AXES, Spec, parse_spec
 from jaxcal.study.store import Store
 
 SPEC = """
@@ -189,7 +189,7 @@ def test_what_says_the_same_has_the_same_hash():
     again = small().replace("seed = 11\ntrials = 10", "trials = 10 # few\nseed = 11")
     again = again.replace("noise_mm = 0.5", "test_fraction = 0.75\nnoise_mm = 0.50")
     assert parse_spec(again).sha256 == spec.sha256
-    assert spec_from_canonical(spec.canonical()) == spec
+    assert Spec.from_canonical(spec.canonical()) == spec
     edits = {"seed = 11": "seed = 12", "[0.5, 2]": "[0.5, 3]", "1.5": "1.6",
              "elements = 8": "elements = 9", "noise_mm = 0.5": "noise_mm = [0.5]"}  # fmt: skip
     for old, new in edits.items():
@@ -197,7 +197,7 @@ def test_what_says_the_same_has_the_same_hash():
         assert changed != small()
         assert parse_spec(changed).sha256 != spec.sha256
     with pytest.raises(InputError):
-        spec_from_canonical(spec.canonical().replace('"seed": 11', '"seed": 11.0'))
+        Spec.from_canonical(spec.canonical().replace('"seed": 11', '"seed": 11.0'))
 
 
 def test_the_grid_is_counted_in_order():

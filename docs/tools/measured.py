@@ -24,6 +24,9 @@ SETTINGS: dict[str, tuple[str, ...]] = {
     README: (
         "PLUS and 3D Slicer",
         "Boctor (2017)",
+        "about 30 images with",
+        "tilted by 20 to 30 degrees",
+        "expect up to 0.5 mm, up to 1.5 mm of error",
         "Python 3.11 or newer",
         "BSD 3-clause",
     ),

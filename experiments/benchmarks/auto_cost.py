@@ -25,7 +25,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from common import arguments, machine, results_folder, write_table  # noqa: E402
+from common import arguments, machine, write_table  # noqa: E402
 
 from jaxcal import Problem, calibrate_batch  # noqa: E402
 from jaxcal.study.simulation import Protocol, simulate  # noqa: E402
@@ -96,13 +96,13 @@ def measure(images: int, batch: int, rounds: int) -> list[list[object]]:
 
 def main() -> None:
     """Measure and write the table."""
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     print(machine())
     rows: list[list[object]] = []
     for images, batch in QUICK if quick else SIZES:
         rows += measure(images, batch, QUICK_ROUNDS if quick else ROUNDS)
     rows.append([f"# {machine()}, one core"])
-    write_table(results_folder(quick) / "auto_cost.csv", HEADER, rows)
+    write_table(folder / "auto_cost.csv", HEADER, rows)
 
 
 if __name__ == "__main__":

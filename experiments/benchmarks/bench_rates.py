@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, write_table
 
 from hw.active_echo import ActiveEcho
 from hw.clock import Clock
@@ -118,12 +118,12 @@ def main() -> None:
     if sys.argv[1:2] == ["--serve"]:
         serve(int(sys.argv[2]))
         return
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     rows = []
     for controller in CONTROLLERS:
         rows += measure(controller, 5.0 if quick else 60.0)
     write_table(
-        results_folder(quick) / "bench_rates.csv",
+        folder / "bench_rates.csv",
         (
             "controller_hz", "stream", "seconds", "received", "per_second", "missing", "dropped",
             "crc_errors", "late_median_ms", "late_999_ms", "late_max_ms",

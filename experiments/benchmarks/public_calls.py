@@ -167,9 +167,9 @@ def in_a_fresh_process(*words: str) -> dict[str, Any]:
 def main() -> None:
     """Measure every method in a process of its own and write the table."""
     sys.path.insert(0, str(Path(__file__).parents[1]))
-    from common import arguments, machine, results_folder, write_table
+    from common import arguments, machine, write_table
 
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     flag = ["--quick"] if quick else []
     rows: list[list[Any]] = []
     for name in METHODS:
@@ -203,7 +203,7 @@ def main() -> None:
         )
         print(f"auto, {which}: {sizes[which]} StableHLO lines", flush=True)
     rows.append(["", machine(), "", "", "", "", "", "", ""])
-    write_table(results_folder(quick) / "public_calls.csv", HEADER, rows)
+    write_table(folder / "public_calls.csv", HEADER, rows)
 
 
 if __name__ == "__main__":

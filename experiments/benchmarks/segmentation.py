@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, write_table
 
 from jaxcal.data.probe import C5_2, L14_5
 from jaxcal.data.segmentation.segment import compiled_fit
@@ -69,7 +69,7 @@ def scipy_frame(distances: np.ndarray, elements: np.ndarray, how: str) -> np.nda
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     trials, looped, rounds = (64, 1, 3) if quick else (256, 2, 15)
     linear, curved = draw(trials)
     elements = L14_5.element_positions()
@@ -116,7 +116,6 @@ def main() -> None:
         ["load average before and after", load, os.getloadavg()[0], "", ""],
         [machine(), "", "", "", ""],
     ]
-    folder = results_folder(quick)
     header = ["case", "jaxcal_us_per_trial", "against", "us_per_trial", "median_ratio"]
     write_table(folder / "benchmark_segmentation.csv", header, rows)
     for row in rows:

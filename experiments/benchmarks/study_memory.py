@@ -19,9 +19,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from common import arguments, machine, results_folder, write_table
-
-from jaxcal.io.atomic import atomic_path
+from common import arguments, machine, save_figure, write_table
 
 PERIOD_S, CHUNK = 0.1, 2048
 
@@ -84,7 +82,7 @@ def watch(trials: int, place: Path) -> tuple[np.ndarray, float, float]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, out = arguments(__doc__)
     sizes = (1000, 10_000, 100_000) if quick else (10_000, 100_000, 1_000_000)
     rows: list[list[object]] = []
     runs: dict[int, np.ndarray] = {}
@@ -108,7 +106,6 @@ def main() -> None:
             print(*rows[-1], flush=True)
     header = ["trials", "peak_mib", "first_quarter_mib", "last_quarter_mib",
               "growth_mib_per_million_trials", "seconds", "trials_a_second"]  # fmt: skip
-    out = results_folder(quick)
     plot(out / "study_memory.png", runs, rows)
     write_table(out / "study_memory.csv", header, [*rows, [machine(), *[""] * 6]])
 
@@ -130,8 +127,7 @@ def plot(path: Path, runs: dict[int, np.ndarray], rows: list[list[object]]) -> N
     right.legend(fontsize="small")
     for panel in (left, right):
         panel.grid(alpha=0.3)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 if __name__ == "__main__":

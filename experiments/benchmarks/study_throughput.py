@@ -27,9 +27,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import study_peer
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, save_figure, write_table
 
-from jaxcal.io.atomic import atomic_path
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 from jaxcal.study.cluster import compute_from_text
 from jaxcal.study.spec import Spec, parse_spec
@@ -138,9 +137,8 @@ def stage_times(canonical: str, repeats: int) -> dict[str, float]:
     import jaxcal
     from jaxcal.study import lean, pipeline
     from jaxcal.study.simulation import draw, draw_noise
-    from jaxcal.study.spec import spec_from_canonical
 
-    spec = spec_from_canonical(canonical)
+    spec = Spec.from_canonical(canonical)
     devices = tuple(jax.local_devices())
     condition = spec.condition(spec.condition_count - 1)
     shape, lanes = pipeline.shape_of(condition, spec.probe), pipeline.LANES["cpu"]
@@ -204,7 +202,7 @@ def whole_study(spec: Spec, trials: int) -> float:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     enable_compilation_cache()
     looped = {"best": 80, "usual": 32, "plain": 16}
     rounds, looped = (3, {name: n // 8 for name, n in looped.items()}) if quick else (15, looped)
@@ -314,7 +312,6 @@ def main() -> None:
         ["load average before and after", loads[0], loads[1], ""],
         [machine(), "", "", ""],
     ]
-    folder = results_folder(quick)
     write_table(folder / "study_throughput.csv", ["what", "median", "quartile_1", "quartile_3"],
                 rows)  # fmt: skip
     plot(folder / "study_throughput.png", rates, stages, clocks)
@@ -354,8 +351,7 @@ def plot(
         right.bar(list(labels.values()), height, bottom=base, label=part)
     right.set(ylabel="share of a trial's time", title="where the time goes")
     right.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 if __name__ == "__main__":

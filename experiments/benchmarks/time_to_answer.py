@@ -223,9 +223,9 @@ def one_round(every: list[Case], folder: Path) -> list[tuple[str, str, float, fl
 def main() -> None:
     """Measure and write the table."""
     sys.path.insert(0, str(Path(__file__).parents[1]))
-    from common import arguments, results_folder, write_table
+    from common import arguments, write_table
 
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     with tempfile.TemporaryDirectory() as name:
         every = cases(Path(name), quick)
         load = os.getloadavg()[0]
@@ -233,7 +233,7 @@ def main() -> None:
         found: list[tuple] = []
         for _ in range(rounds):
             found += one_round(every, Path(name))
-            write_table(results_folder(quick) / "time_to_answer.csv", HEADER, medians(found, load))
+            write_table(folder / "time_to_answer.csv", HEADER, medians(found, load))
 
 
 def medians(found: list[tuple], load: float) -> list[list[object]]:

@@ -23,7 +23,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from common import arguments, machine, results_folder, write_table
+from common import arguments, machine, write_table
 
 from hw.emulated import setup_of, start
 from hw.errors import RefusedError, StaleError, StoppedError
@@ -117,10 +117,10 @@ def measure(pages: int, seconds: float) -> list[object]:
 
 
 def main() -> None:
-    options = arguments(__doc__ or "")
-    seconds = QUICK_SECONDS if options.quick else SECONDS
+    quick, folder = arguments(__doc__)
+    seconds = QUICK_SECONDS if quick else SECONDS
     rows = [measure(pages, seconds) for pages in (0, 1, 2)]
-    write_table(results_folder(options.quick) / "view_cost.csv", HEADER, rows)
+    write_table(folder / "view_cost.csv", HEADER, rows)
     print(machine())
     for row in rows:
         print(dict(zip(HEADER, row, strict=True)))

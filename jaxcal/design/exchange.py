@@ -12,18 +12,18 @@ import numpy as np
 
 from jaxcal.design.greedy import Chosen, Search
 
-PASSES = 2
+_PASSES = 2
+"""Largest number of passes over all poses."""
 _SHORTLIST = 600
 _LEAST_GAIN = 1e-6
 
 
-def exchange(search: Search, chosen: Chosen, passes: int = PASSES) -> Chosen:
+def exchange(search: Search, chosen: Chosen) -> Chosen:
     """Improve what greedy chose; poses that fill space stay.
 
     Args:
         search: candidates and what is known.
         chosen: by :func:`jaxcal.design.greedy.choose`.
-        passes: largest number of passes over all poses.
     """
     rows, information = list(chosen.rows), chosen.information.copy()
     scores = search.scores(information)
@@ -32,7 +32,7 @@ def exchange(search: Search, chosen: Chosen, passes: int = PASSES) -> Chosen:
     shortlist = np.unique(np.concatenate([order[: _SHORTLIST // 2], spread, rows]))
     place = {row: k for k, row in enumerate(shortlist.tolist())}
     counts = search.counts(rows)
-    for _ in range(passes):
+    for _ in range(_PASSES):
         moved = False
         for k, row in enumerate(rows):
             if chosen.filling[k]:

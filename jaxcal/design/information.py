@@ -216,10 +216,10 @@ def effective_elevational(
         return float(np.log(told / said))
 
     low, high = np.log(_EFFICIENCY)
-    if not (said > 0 and excess(low) < 0 < excess(high)):
-        return (
-            1.0 if not said > 0 else float(_EFFICIENCY[0] if excess(low) >= 0 else _EFFICIENCY[1])
-        )
+    if not said > 0:
+        return 1.0
+    if not excess(low) < 0 < excess(high):
+        return _EFFICIENCY[0] if excess(low) >= 0 else _EFFICIENCY[1]
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if excess(middle) < 0 else (low, middle)

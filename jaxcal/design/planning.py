@@ -18,7 +18,7 @@ from jaxcal.design.criteria import (
     weight_of,
 )
 from jaxcal.design.exchange import exchange
-from jaxcal.design.greedy import MOST_POSES, Chosen, Rules, Search, choose, space_features
+from jaxcal.design.greedy import MOST_POSES, Rules, Search, choose, space_features
 from jaxcal.design.information import (
     Known,
     Model,
@@ -152,8 +152,20 @@ def plan(
     if polish:
         from jaxcal.design.polish import polish as polished
 
-        poses, _ = polished(search, candidates, chosen)
-    return _finished(candidates, known, criterion, rules, chosen, poses)
+        poses = polished(search, candidates, chosen)
+    tre, rp = curve(candidates, known, poses)
+    return Plan(
+        poses=poses,
+        targets=candidates.model.targets(poses),
+        filling=np.array(chosen.filling, bool),
+        rows=np.array(chosen.rows),
+        criterion=criterion,
+        candidates=candidates,
+        known=known,
+        tre_mm=tre,
+        rp_mm=rp,
+        rules=rules,
+    )
 
 
 def next_poses(
@@ -257,10 +269,9 @@ def make_search(candidates: Candidates, known: Known, criterion: Criterion, rule
     factors = hypotheses(model.noise.doubt)
     rows = model.jacobian(candidates.poses)
     before = np.repeat(known.information[None], len(factors), axis=0)
-    if known.images == 0:
-        taken = np.zeros((0, 4, 4))
-    else:
-        taken = candidates.taken if candidates.taken is not None else np.zeros((0, 4, 4))
+    taken = np.zeros((0, 4, 4))
+    if known.images > 0 and candidates.taken is not None:
+        taken = candidates.taken
     x = model.image_to_probe[:3, :3]
     return Search(
         rows=rows[None] / factors[:, None, :, None],
@@ -280,29 +291,6 @@ def _taken_features(candidates: Candidates) -> Float[np.ndarray, "t 5"]:
     if candidates.taken is None or not len(candidates.taken):
         return np.zeros((0, 5))
     return space_features(replace(candidates, poses=candidates.taken))
-
-
-def _finished(
-    candidates: Candidates,
-    known: Known,
-    criterion: Criterion,
-    rules: Rules,
-    chosen: Chosen,
-    poses: Float[np.ndarray, "n 4 4"],
-) -> Plan:
-    tre, rp = curve(candidates, known, poses)
-    return Plan(
-        poses,
-        candidates.model.targets(poses),
-        np.array(chosen.filling, bool),
-        np.array(chosen.rows),
-        criterion,
-        candidates,
-        known,
-        tre,
-        rp,
-        rules,
-    )
 
 
 def check_candidates(candidates: Candidates) -> None:

@@ -100,10 +100,8 @@ def _cut_off(numbers: Float[np.ndarray, 5], candidates: Candidates) -> Float[np.
 
 
 @in_own_modes
-def polish(
-    search: Search, candidates: Candidates, chosen: Chosen
-) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "k p p"]]:
-    """Move the chosen poses, one after the other.
+def polish(search: Search, candidates: Candidates, chosen: Chosen) -> Float[np.ndarray, "n 4 4"]:
+    """The chosen poses, moved one after the other.
 
     Those that fill space stay, and so do a caller's own that are outside the constraints.
 
@@ -111,9 +109,6 @@ def polish(
         search: the search that chose the poses.
         candidates: the candidates of the search.
         chosen: the chosen poses.
-
-    Returns:
-        The poses, and the information with all of them under every set of SDs.
     """
     model, bounds = candidates.model, candidates.constraints
     x, point = np.asarray(model.image_to_probe), np.asarray(model.point)
@@ -180,7 +175,7 @@ def polish(
         rotations[k] = (poses[k, :3, :3] @ x[:3, :3]).reshape(9)
         places[k] = model.targets(poses[k])
         information = information + _outer(model, poses[k], search.factors) - own
-    return poses, information
+    return poses
 
 
 def _outer(

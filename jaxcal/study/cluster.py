@@ -27,12 +27,18 @@ from functools import lru_cache, partial
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
-
 from jaxcal import CalibrationError, InputError, MissingExtraError, __version__
 from jaxcal.io.readable import one_line
 from jaxcal.runtime.messages import quoted
-from jaxcal.study.own import Chunk, Study, computed, study_from, where_defined
+from jaxcal.study.own import (
+    Chunk,
+    Results,
+    Study,
+    computed,
+    made_by,
+    study_from,
+    where_defined,
+)
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -99,19 +105,15 @@ def connected(scheduler: Any) -> Iterator[Client]:
             log.setLevel(level)
 
 
-def compute_from_text(
-    canonical: str, where: tuple[tuple[str, str], ...], index: int
-) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+def compute_from_text(canonical: str, where: tuple[tuple[str, str], ...], index: int) -> Results:
     """What a worker does: chunk ``index`` of the study with this canonical text and class."""
-    from jaxcal.study.pipeline import made_by
-
     spec = _spec(canonical, where)
-    return computed(spec, spec.chunk(index)), made_by()
+    return computed(spec, spec.chunk(index))
 
 
 def prepare(canonical: str, where: tuple[tuple[str, str], ...]) -> None:
     """What a worker does first: import all that a chunk needs, or raise an error that says why."""
-    from jaxcal.study.pipeline import made_by
+    import jaxcal.study.pipeline  # noqa: F401
 
     _spec(canonical, where)
     made_by()
@@ -205,7 +207,7 @@ def _in_words(wrong: dict[str, str | None]) -> str:
 
 def compute_on_cluster(
     client: Client, spec: Study, chunks: list[Chunk], note: Callable[[str], None]
-) -> Iterator[tuple[Chunk, dict[str, np.ndarray], dict[str, str]]]:
+) -> Iterator[tuple[Chunk, *Results]]:
     """Compute chunks on worker processes; yields them as they are done.
 
     Args:

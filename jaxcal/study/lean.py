@@ -25,7 +25,7 @@ from jaxcal.model.batch import ImagePlanes, Iterate, targets, total
 from jaxcal.model.unknowns import RIGID
 from jaxcal.solvers.names import Method, PriorName
 from jaxcal.solvers.plan import Options
-from jaxcal.solvers.start import ConventionalStart, conventional
+from jaxcal.solvers.start import ConventionalStart
 from jaxcal.study.simulation import Protocol, arrange, draw, draw_noise
 
 Kind = tuple[Method, PriorName]
@@ -132,11 +132,6 @@ def problems_of(images: ImagePlanes) -> Problem:
         spacing=jnp.ones((lanes, 2)),
         face_offset=jnp.zeros(lanes),
     )
-
-
-def begin(batch: Experiments, max_steps: int) -> ConventionalStart:
-    """The conventional fits from which every method starts."""
-    return conventional(batch.images, RIGID, max_steps=max_steps)
 
 
 def solve(

@@ -19,7 +19,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from jaxcal import InputError
+from jaxcal import InputError, __version__
 
 
 @dataclass(frozen=True)
@@ -133,14 +133,31 @@ def study_from(where: dict[str, str], canonical: str) -> Study:
     return kind.from_canonical(canonical)
 
 
-def computed(study: Study, chunk: Chunk) -> dict[str, np.ndarray]:
+Results = tuple[dict[str, np.ndarray], dict[str, str]]
+"""The arrays of a chunk, and what computed them."""
+
+
+def computed(study: Study, chunk: Chunk) -> Results:
     """What a study computes of a chunk, checked: a file of anything else could not be read.
 
     Raises:
         InputError: it is not what the study says that a chunk holds.
     """
     results, wanted = study.compute(chunk), study.arrays(chunk)
-    return {name: _as_wanted(name, results.get(name), wanted[name]) for name in wanted}
+    arrays = {name: _as_wanted(name, results.get(name), wanted[name]) for name in wanted}
+    return arrays, made_by()
+
+
+def made_by() -> dict[str, str]:
+    """What computes in this process: versions, and the device in words."""
+    import jax
+
+    devices = jax.local_devices()
+    return {
+        "jaxcal": __version__,
+        "jax": jax.__version__,
+        "device": f"{len(devices)} x {devices[0].platform} {devices[0].device_kind}",
+    }
 
 
 def _as_wanted(name: str, values: object, wanted: ArraySpec) -> np.ndarray:

@@ -27,15 +27,15 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
-import jaxcal
 from jaxcal.data.probe import LinearProbe
 from jaxcal.model.batch import Iterate
+from jaxcal.model.unknowns import RIGID
 from jaxcal.runtime.compiler import fast_to_run, single_threaded
 from jaxcal.runtime.precision import in_own_modes
 from jaxcal.solvers.plan import Options
-from jaxcal.solvers.start import ConventionalStart
+from jaxcal.solvers.start import ConventionalStart, conventional
 from jaxcal.study.laws import OffsetLaw
-from jaxcal.study.lean import Experiments, Kind, Measured, begin, experiments, solve
+from jaxcal.study.lean import Experiments, Kind, experiments, solve
 from jaxcal.study.offsets import nominal_bound
 from jaxcal.study.own import Chunk
 from jaxcal.study.simulation import Protocol
@@ -152,17 +152,8 @@ class Block:
         kind: Kind = (method.method, method.prior)
         program = lean_program(kind, method.options, self._devices)
         begun = self.begun(method.max_iterations)
-        return _as_numpy(program(self.batch, self.truth, begun, bound))
-
-
-def made_by() -> dict[str, str]:
-    """What computes in this process: versions, and the device in words."""
-    devices = jax.local_devices()
-    return {
-        "jaxcal": jaxcal.__version__,
-        "jax": jax.__version__,
-        "device": f"{len(devices)} x {devices[0].platform} {devices[0].device_kind}",
-    }
+        measured = program(self.batch, self.truth, begun, bound)
+        return {name: _trials(value) for name, value in vars(measured).items()}
 
 
 def bound_mm(method: MethodSpec, condition: Condition) -> float:
@@ -199,10 +190,6 @@ def numbers_of(condition: Condition) -> dict[str, Any]:
         "tracker_mm": condition.tracker_mm,
         "tracker_rad": float(np.radians(condition.tracker_deg)),
     }
-
-
-def _as_numpy(measured: Measured) -> dict[str, np.ndarray]:
-    return {name: _trials(value) for name, value in vars(measured).items()}
 
 
 def _trials(value: Array) -> np.ndarray:
@@ -260,7 +247,11 @@ def trial_keys(indices: Array, seed: Array) -> Array:
 @cache
 def begin_program(max_steps: int, devices: Devices) -> Any:
     """From experiments to their conventional fits, compiled."""
-    return compile_pieces(lambda batch: begin(batch, max_steps), devices, pieces=1)
+
+    def program(batch: Experiments) -> ConventionalStart:
+        return conventional(batch.images, RIGID, max_steps=max_steps)
+
+    return compile_pieces(program, devices, pieces=1)
 
 
 @cache

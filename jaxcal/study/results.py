@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxcal import FormatError, MissingExtraError
 from jaxcal.result.calibration import Status
+from jaxcal.study.own import Chunk
 from jaxcal.study.pipeline import COMPONENTS, bound_mm
 from jaxcal.study.spec import UNITS, Spec
 from jaxcal.study.store import Store
@@ -84,9 +85,8 @@ def read_all(store: Store[Spec], *, incomplete: bool = False) -> dict[str, np.nd
             f"{store.folder}: {spec.chunk_count - len(present)} of {spec.chunk_count} chunks are "
             "missing: finish it with 'jaxcal study run ... --resume'"
         )
-    conditions, methods, trials = spec.condition_count, len(spec.methods), spec.trials
-    shapes = dict.fromkeys(UNITS, (conditions, methods, trials))
-    shapes |= {"sigma": (conditions, methods, trials, 3), "realised": (conditions, trials, 3)}
+    whole = spec.arrays(Chunk(0, 0, 0, spec.trials))
+    shapes = {name: (spec.condition_count, *array.shape) for name, array in whole.items()}
     integers = {"status": np.int8, "iterations": np.int32}
     values = {
         name: np.full(shape, MISSING if name in integers else np.nan, integers.get(name, float))

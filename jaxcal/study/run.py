@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
-
-import numpy as np
 
 from jaxcal import FormatError, InputError, OutputError
 from jaxcal.io.readable import one_line
@@ -18,7 +16,7 @@ from jaxcal.runtime.given_values import check_flag, whole_number
 from jaxcal.runtime.interrupts import no_interrupt_lost
 from jaxcal.runtime.messages import shown
 from jaxcal.study.cluster import compute_on_cluster, connected
-from jaxcal.study.own import Chunk, Study, computed
+from jaxcal.study.own import Chunk, Results, Study, computed
 from jaxcal.study.store import Store
 
 if TYPE_CHECKING:
@@ -30,9 +28,6 @@ except ImportError:  # not on Windows
     fcntl = None
 
 _MOST_WORKERS = 10_000
-
-Computed = tuple[Chunk, dict[str, np.ndarray], dict[str, str]]
-"""A chunk, its results, and what computed it."""
 
 
 @runtime_checkable
@@ -49,17 +44,8 @@ class Watcher(Protocol):
         """Something that a person should know."""
 
 
-class Silence:
+class Silence(Watcher):
     """A watcher that says nothing."""
-
-    def begin(self, trials: int, done: int) -> None:
-        """Say nothing."""
-
-    def advance(self, trials: int) -> None:
-        """Say nothing."""
-
-    def note(self, message: str) -> None:
-        """Say nothing."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +150,8 @@ def _missing(store: Store, watcher: Watcher) -> tuple[list[Chunk], int]:
 
 def _computed(
     spec: Study, missing: list[Chunk], workers: int, client: Client | None, watcher: Watcher
-) -> Generator[Computed]:
+) -> Generator[tuple[Chunk, *Results]]:
+    """The chunks one after the other, each with its results and what computed them."""
     if not missing:
         return
     if client is not None:
@@ -175,14 +162,8 @@ def _computed(
         groups = core_groups(min(workers, len(missing)))
         yield from compute_on_workers(spec, missing, groups)
     else:
-        yield from _compute_here(spec, missing)
-
-
-def _compute_here(spec: Study, missing: Iterable[Chunk]) -> Iterator[Computed]:
-    from jaxcal.study.pipeline import made_by
-
-    for chunk in missing:
-        yield chunk, computed(spec, chunk), made_by()
+        for chunk in missing:
+            yield (chunk, *computed(spec, chunk))
 
 
 @contextmanager

@@ -150,11 +150,6 @@ def _root_mean_square(values: np.ndarray) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
-def shown_axes(spec: Spec) -> list[str]:
-    """The fields of ``[conditions]`` that tell the conditions apart."""
-    return [name for name, values in spec.axes if len(values) > 1]
-
-
 def as_record(store: Store[Spec], cells: list[Cell]) -> dict[str, Any]:
     """The table as one JSON-able object."""
     spec = store.spec
@@ -188,7 +183,8 @@ def as_table(spec: Spec, cells: list[Cell]) -> Table:
     from rich.table import Table
 
     table = Table(title=f"{spec.name}: reconstruction precision (mm), mean ± 95 % interval")
-    axes = shown_axes(spec)
+    # Only the fields that tell the conditions apart.
+    axes = [name for name, values in spec.axes if len(values) > 1]
     for name in axes:
         table.add_column(name.replace("_", " "))
     for name in ("method", "trials", "mean", "SD", "minus conventional", "not ok"):

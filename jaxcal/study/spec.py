@@ -241,14 +241,9 @@ class Spec:
         return dict(self.axes)[name]
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        """Lengths of all axes, in the order of :data:`AXES`."""
-        return tuple(len(values) for _, values in self.axes)
-
-    @property
     def condition_count(self) -> int:
         """Cells of the grid."""
-        return math.prod(self.shape)
+        return math.prod(len(values) for _, values in self.axes)
 
     def condition(self, index: int) -> Condition:
         """Cell ``index`` of the grid, in counting order."""
@@ -295,8 +290,27 @@ class Spec:
 
     @classmethod
     def from_canonical(cls, text: str) -> Spec:
-        """:func:`spec_from_canonical`."""
-        return spec_from_canonical(text)
+        """The spec that :meth:`canonical` was made from (it travels to workers as this text).
+
+        Raises:
+            InputError: the text was not made by :meth:`canonical`.
+        """
+        try:
+            content = json.loads(text)
+            given = content["axes"]
+            spec = cls(
+                *_head(content),
+                tuple((name, tuple(given[name])) for name in AXES),
+                tuple(content["listed"]),
+                LinearProbe(**content["probe"]),
+                tuple(MethodSpec(**method) for method in content["methods"]),
+            )
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"is not a study's canonical spec: {error}") from None
+        if spec.canonical() != text:
+            raise InputError("is not a study's canonical spec")
+        _check_size(spec)
+        return spec
 
     def arrays(self, chunk: Chunk) -> dict[str, ArraySpec]:
         """What a chunk's file holds."""
@@ -362,32 +376,6 @@ def _head(content: dict[str, Any]) -> tuple[str, int, int, int]:
     trials = whole_number("trials", _required(content, "trials"), 1, MAXIMUM_EXPERIMENTS)
     chunk = whole_number("chunk_trials", content.get("chunk_trials", 512), 1, 2**20)
     return name, seed, trials, min(chunk, trials)
-
-
-def spec_from_canonical(text: str) -> Spec:
-    """The spec that :meth:`Spec.canonical` was made from (it travels to workers as this text).
-
-    Raises:
-        InputError: the text was not made by :meth:`Spec.canonical`.
-    """
-    try:
-        content = json.loads(text)
-        given = content["axes"]
-        axes = tuple((name, tuple(given[name])) for name in AXES)
-        methods = tuple(MethodSpec(**method) for method in content["methods"])
-        spec = Spec(
-            *_head(content),
-            axes,
-            tuple(content["listed"]),
-            LinearProbe(**content["probe"]),
-            methods,
-        )
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"is not a study's canonical spec: {error}") from None
-    if spec.canonical() != text:
-        raise InputError("is not a study's canonical spec")
-    _check_size(spec)
-    return spec
 
 
 def _known(table: dict[str, Any], names: set[str], where: str = "") -> None:

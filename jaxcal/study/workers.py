@@ -25,7 +25,7 @@ from jaxcal import CalibrationError
 from jaxcal.io.readable import one_line
 from jaxcal.runtime import jax_cache
 from jaxcal.runtime.isolated import python_command
-from jaxcal.study.own import Chunk, Study, computed, study_from, where_defined
+from jaxcal.study.own import Chunk, Results, Study, computed, study_from, where_defined
 
 MOST_DEATHS = 3
 """Workers that may die over one chunk before the study gives up."""
@@ -71,7 +71,7 @@ class Worker:
                 }
             )
 
-    def compute(self, chunk: Chunk) -> tuple[dict[str, np.ndarray], dict[str, str]] | None:
+    def compute(self, chunk: Chunk) -> Results | None:
         """A chunk's arrays and what computed them; None where the worker died.
 
         Raises:
@@ -111,7 +111,7 @@ class Worker:
 
 def compute_on_workers(
     spec: Study, chunks: list[Chunk], groups: list[set[int]]
-) -> Iterator[tuple[Chunk, dict[str, np.ndarray], dict[str, str]]]:
+) -> Iterator[tuple[Chunk, *Results]]:
     """Compute chunks on worker processes; yields them as they are done.
 
     Args:
@@ -146,7 +146,7 @@ def compute_on_workers(
         except Exception as error:
             hand_over(error)
 
-    def _computed(place: int, chunk: Chunk) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    def _computed(place: int, chunk: Chunk) -> Results:
         for _ in range(MOST_DEATHS):
             if place not in workers:
                 workers[place] = Worker(spec, groups[place])
@@ -221,14 +221,11 @@ def main() -> None:
 
 def _answer(answers: BinaryIO, spec: Callable[[], Study], index: int) -> None:
     try:
-        # What cannot be imported is told as what cannot be computed is.
-        from jaxcal.study.pipeline import made_by
-
         study = spec()
-        arrays = computed(study, study.chunk(index))
+        arrays, maker = computed(study, study.chunk(index))
         found = {name: np.asarray(values, order="C") for name, values in arrays.items()}
         described = [[name, values.dtype.str, list(values.shape)] for name, values in found.items()]
-        header: dict[str, Any] = {"arrays": described, "maker": made_by()}
+        header: dict[str, Any] = {"arrays": described, "maker": maker}
     except Exception as error:
         found = {}
         header = {"error": f"{type(error).__name__}: {one_line(error)[:300]}"}
