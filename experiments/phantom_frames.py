@@ -17,8 +17,8 @@ from common import save_figure
 from hw.bench.frames import DEPTH_MM, Camera
 from hw.bench.look import Look
 from hw.bench.world import World, make_world
-from hw.choices import PHANTOMS
-from hw.rigid import rotation_matrix
+from hw.runtime.choices import PHANTOMS
+from hw.runtime.rigid import rotation_matrix
 from jaxcal.data.segmentation.image import Target, localise
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "phantoms.png"

@@ -37,8 +37,8 @@ from hw.midplane.bracket import Bracket
 from hw.midplane.pattern_injection import SteadyOperator, pattern_injection
 from hw.midplane.search import PlacementError, Settings, first_seen
 from hw.midplane.threshold_climb import threshold_climb
-from hw.poses import plan_poses
-from hw.rigid import rigid
+from hw.planning.poses import plan_poses
+from hw.runtime.rigid import rigid
 from jaxcal import Problem, Recording, calibrate_batch, make_images, reconstruction_precision, stack
 from jaxcal.data.poses import rotation_angle
 

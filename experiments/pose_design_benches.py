@@ -17,8 +17,8 @@ from hw.bench.stage import WorldStage
 from hw.bench.world import make_world
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.search import PlacementError
-from hw.pool import BENCH_RULES, BENCH_SDS_MM
-from hw.poses import Extent, constraints_of, plan_poses
+from hw.planning.pool import BENCH_RULES, BENCH_SDS_MM
+from hw.planning.poses import Extent, constraints_of, plan_poses
 from jaxcal import design
 from jaxcal.runtime.jax_cache import enable_compilation_cache
 

@@ -31,7 +31,6 @@ from common import arguments, machine, save_figure, write_table
 from matplotlib.figure import Figure
 
 from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
-from hw.errors import DeviceError
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
@@ -39,6 +38,7 @@ from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.pose import ur_to_pose
 from hw.robot.stream import PoseStream
+from hw.runtime.errors import DeviceError
 
 SEED = 7
 HOME = ur_to_pose(np.array(START))

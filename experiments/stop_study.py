@@ -42,14 +42,14 @@ import numpy as np
 
 from hw.bench.robot import CB_SERIES, E_SERIES, START, EmulatedRobot
 from hw.bench.travel import Motion as ArmMotion
-from hw.clock import Clock
-from hw.errors import DeviceError
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.pose import ur_to_pose
+from hw.runtime.clock import Clock
+from hw.runtime.errors import DeviceError
 from jaxcal.runtime.isolated import import_path
 
 SEED = 16

@@ -22,9 +22,9 @@ from hw.bench.look import Look
 from hw.bench.phantoms.cross_wire import SCATTER_MM, WIRE_MM
 from hw.bench.tank import ELEMENT_MM, Beam, Noise
 from hw.bench.world import DRAWN, TANK_MM
-from hw.poses import Extent, plan_poses
-from hw.rigid import looking_rotation, rotation_matrix
-from hw.scene import Scene
+from hw.planning.poses import Extent, plan_poses
+from hw.planning.scene import Scene
+from hw.runtime.rigid import looking_rotation, rotation_matrix
 from jaxcal import Images, segment
 from jaxcal.data.probe import L14_5
 from jaxcal.data.segmentation.segment import Method

@@ -32,7 +32,7 @@ from hw.midplane.bracket import Bracket
 from hw.midplane.pattern_injection import SteadyOperator, pattern_injection
 from hw.midplane.search import PlacementError, first_seen
 from hw.midplane.threshold_climb import threshold_climb
-from hw.poses import Extent, plan_poses
+from hw.planning.poses import Extent, plan_poses
 from jaxcal import InputError
 from jaxcal.study import ArraySpec, Chunk
 

@@ -38,7 +38,7 @@ from tank_run import Run
 from tank_sds import FACTOR, GAIN_SD, from_amplitude, own_sds
 
 from hw.bench.world import DRAWN, TANK_MM
-from hw.rigid import rotation_matrix
+from hw.runtime.rigid import rotation_matrix
 from jaxcal import calibrate_batch
 from jaxcal.study import ArraySpec, Chunk
 

@@ -21,6 +21,7 @@ from common import show, write_rows
 from tank import FWHM, PICK, QUALITIES, Tank
 from tank_run import SEED, Run
 
+from hw.acquisition.stage import IMAGE_AGE_S
 from hw.bench.frames import COLUMNS, DECIBELS, Camera
 from hw.bench.look import Look
 from hw.bench.phantoms import ActiveEcho, CrossWire, Hydrophone
@@ -29,8 +30,7 @@ from hw.bench.world import World, make_world
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.image_scan import ImageBench, image_scan, pixel_of
 from hw.midplane.search import PlacementError
-from hw.poses import Extent, plan_poses
-from hw.stage import IMAGE_AGE_S
+from hw.planning.poses import Extent, plan_poses
 from jaxcal import Images, segment
 from jaxcal.data.segmentation.image import Target, localise
 

@@ -34,10 +34,10 @@ import continuity
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import arguments, machine, results_folder, write_table
+from common import arguments, experiments, machine, write_rows
 from jaxtyping import Array, Float
 
-from jaxcal import Problem, Protocol, calibrate_batch, simulate
+from jaxcal import Problem, Protocol, calibrate_batch
 
 SEED = 20261125
 NODES, REACH = 17, 6.0
@@ -56,7 +56,7 @@ AT_ONCE = 2048
 
 
 class Integral(NamedTuple):
-    """The answer along the weak direction.
+    """The answer integrated along the weak direction.
 
     Attributes:
         image_to_probe: X of the mean.
@@ -64,9 +64,9 @@ class Integral(NamedTuple):
         weight: of every node.
     """
 
-    image_to_probe: Float[Array, "4 4"]
-    covariance: Float[Array, "9 9"]
-    weight: Float[Array, " nodes"]
+    image_to_probe: Float[Array | np.ndarray, "*batch 4 4"]
+    covariance: Float[Array | np.ndarray, "*batch 9 9"]
+    weight: Float[Array | np.ndarray, "*batch nodes"]
 
 
 def turned(vector: Float[Array, " 3"]) -> Float[Array, "3 3"]:
@@ -182,10 +182,10 @@ def integrals(problems: Problem) -> Integral:
     """The integrals of a batch."""
     start = calibrate_batch(problems, "conventional")
     data = start.image_to_probe, start.point, problems.poses, problems.measurements
-    parts = [
-        jax.tree.map(np.asarray, integrate(*(jnp.asarray(part[k : k + AT_ONCE]) for part in data)))
-        for k in range(0, len(problems.mask), AT_ONCE)
-    ]
+    parts = []
+    for k in range(0, len(problems.mask), AT_ONCE):
+        x, point, poses, measured = (jnp.asarray(part[k : k + AT_ONCE]) for part in data)
+        parts.append(jax.tree.map(np.asarray, integrate(x, point, poses, measured)))
     return Integral(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
@@ -199,11 +199,12 @@ def paths_row(kind: str, count: int, others: int) -> dict[str, object]:
     largest = np.where(sound, default.max(axis=1), 0.0)
     stepping = np.flatnonzero(largest > continuity.LARGEST_STEP)
     chosen = np.concatenate([stepping, np.flatnonzero(sound & (largest > 0))[:others]])
-    ends = jax.tree.map(lambda leaf: leaf[chosen], (first, second))
-    found = integrals(continuity.on_the_way(*ends, fine[chosen]))
+    first, second = (jax.tree.map(lambda leaf: leaf[chosen], end) for end in (first, second))
+    found = integrals(continuity.on_the_way(first, second, fine[chosen]))
     sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))[:, :6]
     sd[:, 3:] /= LEVER_MM
-    integral = continuity.largest_steps(found.image_to_probe, sd, len(chosen)).max(axis=1)
+    x = np.asarray(found.image_to_probe)
+    integral = continuity.largest_steps(x, sd, len(chosen)).max(axis=1)
     row: dict[str, object] = {"path": kind, "images": 12, "paths_converged": int(sound.sum())}
     for name, steps in (
         ("default", largest[stepping]),
@@ -222,11 +223,8 @@ def paths_row(kind: str, count: int, others: int) -> dict[str, object]:
 def error_row(condition: int, images: int, trials: int) -> dict[str, object]:
     """Errors in the middle of the image of both answers."""
     protocol = Protocol(images=images, elevation_mm=4.0, noise_mm=0.5)
-    root = jax.random.key(SEED)
-    numbers = condition * 10**6 + jnp.arange(trials)
-    keys = jax.vmap(lambda k: jax.random.fold_in(root, k))(numbers)
-    drawn = jax.jit(jax.vmap(lambda key: simulate(key, protocol)))(keys)
-    problems = jax.jit(jax.vmap(lambda key: simulate(key, protocol).problem()))(keys)
+    drawn = experiments(SEED, condition * 10**6 + jnp.arange(trials), protocol)
+    problems = jax.jit(jax.vmap(lambda experiment: experiment.problem()))(drawn)
     row: dict[str, object] = {"images": images, "trials": trials}
     truth = np.asarray(drawn.image_to_probe)
     answers = {
@@ -244,18 +242,17 @@ def error_row(condition: int, images: int, trials: int) -> dict[str, object]:
 
 
 def main() -> None:
-    quick = arguments(__doc__ or "").quick
+    quick, folder = arguments(__doc__)
     count, others, trials = (100, 3, 50) if quick else (continuity.PATHS, 100, 2000)
-    folder = results_folder(quick)
-    for name, rows in (
+    for name, found in (
         ("weak_direction", (paths_row(kind, count, others) for kind in ("mean", "outlier"))),
         ("weak_direction_error", (error_row(k, n, trials) for k, n in enumerate((8, 12, 20)))),
     ):
-        table: list[dict[str, object]] = []
-        for row in rows:
-            table.append(row)
+        rows: list[dict[str, object]] = []
+        for row in found:
+            rows.append(row)
             print(row, flush=True)
-        write_table(folder / f"{name}.csv", list(table[0]), [list(row.values()) for row in table])
+            write_rows(folder / f"{name}.csv", rows)
     print(machine())
 
 

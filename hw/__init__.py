@@ -9,14 +9,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hw.live import LiveCalibration
+    from hw.acquisition.live_calibration import LiveCalibration
 
 __all__ = ["LiveCalibration"]
 
 
 def __getattr__(name: str) -> object:
     if name == "LiveCalibration":
-        from hw.live import LiveCalibration
+        from hw.acquisition.live_calibration import LiveCalibration
 
         return LiveCalibration
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -23,7 +23,7 @@ import pytest
 import jaxcal
 from hw.cli.main import commands as bench_commands
 from hw.cli.main import main as bench_main
-from hw.errors import DeviceError
+from hw.runtime.errors import DeviceError
 from jaxcal.cli import common, demo, plan
 from jaxcal.cli.main import commands, main
 from jaxcal.cli.run import run

@@ -1,4 +1,4 @@
-"""Modules import one way: no circles, and nothing in jaxcal imports a folder above its own.
+"""Modules import one way: no circles, and none imports a folder of its package above its own.
 
 The sources are read, not imported. Imports within functions may close a circle or point upwards
 only where they are listed here.
@@ -15,21 +15,38 @@ import pytest
 
 HOME = Path(__file__).parents[1]
 
-LAYERS = (
-    "runtime",
-    "data",
-    "io",
-    "model",
-    "solvers",
-    "result",
-    "diagnostics",
-    "calibration",
-    "study",
-    "design",
-    "report",
-    "cli",
-)
-"""Folders of jaxcal, the lowest first."""
+LAYERS = {
+    "jaxcal": (
+        "runtime",
+        "data",
+        "io",
+        "model",
+        "solvers",
+        "result",
+        "diagnostics",
+        "calibration",
+        "study",
+        "design",
+        "report",
+        "cli",
+    ),
+    "hw": (
+        "runtime",
+        "active_echo",
+        "ultrasound",
+        "robot",
+        "midplane",
+        "planning",
+        "bench",
+        "setup",
+        "recording",
+        "view",
+        "acquisition",
+        "freehand",
+        "cli",
+    ),
+}
+"""Folders of each package, the lowest first."""
 
 ANSWERS = {
     # What a user asks of an answer is found out, told, drawn and written above it.
@@ -110,15 +127,16 @@ def graph() -> tuple[Imports, Imports]:
 
 
 def upwards(imports: Imports) -> list[str]:
-    """Imports within jaxcal of a folder above."""
+    """Imports within a package of a folder above."""
     found = []
     for name, others in imports.items():
-        here = name.split(".")
+        package, *here = name.split(".")
+        layers = LAYERS[package]
         for other in others:
             there = other.split(".")
-            if here[0] == "jaxcal" == there[0] and len(here) > 1 and len(there) > 1:
-                both = here[1] in LAYERS and there[1] in LAYERS
-                if both and LAYERS.index(here[1]) < LAYERS.index(there[1]):
+            if here and here[0] in layers and there[0] == package and there[1:2]:
+                above = there[1] in layers and layers.index(here[0]) < layers.index(there[1])
+                if above:
                     found.append(f"{name} imports {other}")
     return sorted(found)
 
@@ -132,9 +150,10 @@ def circle(imports: Imports) -> str:
     return ""
 
 
-def test_every_folder_has_a_layer():
-    folders = {path.name for path in (HOME / "jaxcal").iterdir() if (path / "__init__.py").exists()}
-    assert folders == set(LAYERS)
+@pytest.mark.parametrize("package", LAYERS)
+def test_every_folder_has_a_layer(package):
+    folders = {path.name for path in (HOME / package).iterdir() if (path / "__init__.py").exists()}
+    assert folders == set(LAYERS[package])
 
 
 def test_no_module_imports_upwards(graph):
@@ -166,4 +185,7 @@ def test_a_circle_and_a_way_up_are_found():
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}}).count(" imports ") == 3
     assert upwards({"jaxcal.data.probe": {"jaxcal.io.text", "jaxcal.runtime.arrays"}}) == [
         "jaxcal.data.probe imports jaxcal.io.text"
+    ]
+    assert upwards({"hw.robot.gate": {"hw.cli.main", "hw.runtime.clock", "jaxcal.cli.main"}}) == [
+        "hw.robot.gate imports hw.cli.main"
     ]

@@ -147,7 +147,7 @@ import warnings
 import jax
 import numpy as np
 import jaxcal
-from hw.live import LiveCalibration
+from hw.acquisition.live_calibration import LiveCalibration
 from jaxcal import backend
 from jaxcal.study import run_study
 from jaxcal.study.spec import parse_spec

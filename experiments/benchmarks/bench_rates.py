@@ -22,8 +22,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from common import arguments, machine, write_table
 
 from hw.active_echo import ActiveEcho
-from hw.clock import Clock
 from hw.robot.stream import PoseStream
+from hw.runtime.clock import Clock
 from hw.ultrasound import UltrasoundStream
 from jaxcal.data.timing import fit_clock
 

@@ -25,16 +25,16 @@ from websockets.sync.client import connect
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from common import arguments, machine, write_table
 
-from hw.emulated import setup_of, start
-from hw.errors import RefusedError, StaleError, StoppedError
 from hw.midplane.bracket import Bracket, Placement
-from hw.poses import plan_poses
-from hw.recorder import Recorder
-from hw.recording_layout import RecordingHeader
+from hw.planning.poses import plan_poses
+from hw.recording.layout import RecordingHeader
+from hw.recording.recorder import Recorder
+from hw.recording.session import Session
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
-from hw.session import Session
+from hw.runtime.errors import RefusedError, StaleError, StoppedError
+from hw.setup.emulated import setup_of, start
 from hw.view.feed import LiveView, watched
 
 SEED = 3

@@ -57,7 +57,7 @@ from typing import Any
 
 import numpy as np
 
-from hw.extras import require
+from hw.runtime.extras import require
 from jaxcal.runtime.array_types import UInt16
 
 NO_RESPONSE = 0xFFFF

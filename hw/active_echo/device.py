@@ -35,8 +35,8 @@ from hw.active_echo.codec import (
     encode_line,
 )
 from hw.active_echo.transport import BAUD, DEVICE, open_transport
-from hw.clock import REAL, Clock
-from hw.errors import DeviceError, LostError, RefusedError, StaleError
+from hw.runtime.clock import REAL, Clock
+from hw.runtime.errors import DeviceError, LostError, RefusedError, StaleError
 from jaxcal.runtime.array_types import Float, UInt16
 
 COMMAND_TIMEOUT_S = 1.0

@@ -1,7 +1,7 @@
 """Bytes to and from the active-echo electronics: a serial port, a pty or a TCP bridge.
 
-Every error of pyserial becomes a :class:`~hw.errors.DeviceError` or a subclass of it, with one line
-for a person. A pty (the bench's emulator) takes any baud rate, also a wrong one.
+Every error of pyserial becomes a :class:`~hw.runtime.errors.DeviceError` or a subclass of it, with
+one line for a person. A pty (the bench's emulator) takes any baud rate, also a wrong one.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import errno
 import threading
 from typing import Any
 
-from hw.errors import Device, DeviceError, LostError, StaleError
-from hw.extras import require
+from hw.runtime.errors import Device, DeviceError, LostError, StaleError
+from hw.runtime.extras import require
 
 BAUD = 921_600
 """Frames of 128 lines at 30/s are 162 kbaud: the usual 115200 is too slow."""

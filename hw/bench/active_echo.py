@@ -30,7 +30,7 @@ from hw.active_echo.codec import (
     encode_reply,
 )
 from hw.bench.link import Link, PtyLink, TcpLink
-from hw.clock import REAL, Clock
+from hw.runtime.clock import REAL, Clock
 
 Echo = Callable[[float, int], tuple[np.ndarray, np.ndarray]]
 """(time s, threshold) -> time of flight (lines,) s with NaN for no response, amplitude (lines,)."""

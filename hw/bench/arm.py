@@ -299,8 +299,8 @@ def _six(values: Sequence[float]) -> Vector:
     return result
 
 
-# As in hw.rigid, but in plain Python: the controller calls these a thousand times a second, and
-# what takes 6 us here takes 76 us with numpy on arrays of four numbers.
+# As in hw.runtime.rigid, but in plain Python: the controller calls these a thousand times a second,
+# and what takes 6 us here takes 76 us with numpy on arrays of four numbers.
 
 
 def _quaternion(vector: Sequence[float]) -> Vector:

@@ -19,10 +19,10 @@ from hw.bench.phantoms import phantom_named
 from hw.bench.robot import CB_SERIES, E_SERIES, RobotProcess, model_of
 from hw.bench.ultrasound import ImageServer
 from hw.bench.world import World, make_world
-from hw.clock import Clock
-from hw.rigid import looking_rotation
+from hw.planning.scene import Scene
 from hw.robot.pose import pose_to_ur, ur_to_pose
-from hw.scene import Scene
+from hw.runtime.clock import Clock
+from hw.runtime.rigid import looking_rotation
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Float
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.bench.travel import Motion
-from hw.rigid import quaternion_to_matrix, rigid
 from hw.robot.kinematics import (
     ANGLE_MM,
     ArmModel,
@@ -26,6 +25,7 @@ from hw.robot.kinematics import (
     nearest_turn,
 )
 from hw.robot.pose import ur_to_pose
+from hw.runtime.rigid import quaternion_to_matrix, rigid
 from jaxcal.runtime.array_types import Float
 
 LEAST_DEXTERITY_MM = 1.0

@@ -24,8 +24,8 @@ from typing import Any
 from hw.bench.arm import Arm
 from hw.bench.rtde import RtdeServer
 from hw.bench.travel import Motion
-from hw.clock import REAL, Clock
 from hw.robot._process import ANSWERS, be_prompt
+from hw.runtime.clock import REAL, Clock
 from jaxcal.runtime.isolated import python_command
 
 START = (0.4, -0.1, 0.3, 0.0, 3.0, 0.2)

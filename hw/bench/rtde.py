@@ -35,7 +35,6 @@ from typing import Any
 from hw.bench.arm import Arm
 from hw.bench.controller import NORMAL, Controller
 from hw.bench.rtde_fields import INPUTS, OUTPUTS, STRUCT, output_type
-from hw.clock import REAL, Clock
 from hw.robot._process import ANSWERS, be_prompt
 from hw.robot.identity import (
     DASHBOARD_PORT,
@@ -45,6 +44,7 @@ from hw.robot.identity import (
     ROBOT_STATE,
 )
 from hw.robot.kinematics import MODELS
+from hw.runtime.clock import REAL, Clock
 
 __all__ = ["Arm", "RtdeServer"]
 

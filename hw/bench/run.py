@@ -22,8 +22,8 @@ import numpy as np
 
 from hw.bench.assembly import Assembly, BenchOptions
 from hw.bench.control import ControlClient
-from hw.clock import Clock
-from hw.scene import Scene
+from hw.planning.scene import Scene
+from hw.runtime.clock import Clock
 from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
 from jaxcal.runtime.array_types import Float

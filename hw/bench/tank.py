@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from hw.scene import Scene
+from hw.planning.scene import Scene
 from jaxcal.data.probe import L14_5, LinearProbe
 from jaxcal.runtime.array_types import Float
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hw.clock import REAL, Clock
+from hw.runtime.clock import REAL, Clock
 from jaxcal.io.message_content import Content, Picture, StatusMessage, Tracked
 from jaxcal.io.openigtlink import HEADER_SIZE, RF_DEVICE, Message, encode
 

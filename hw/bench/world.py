@@ -29,8 +29,8 @@ import numpy as np
 
 from hw.bench.phantoms import ActiveEcho, Phantom, phantom_named
 from hw.bench.tank import ELEMENT_MM, Beam, Noise, Pose, Tank
-from hw.rigid import looking_rotation, rigid, rotation_matrix
-from hw.scene import Scene
+from hw.planning.scene import Scene
+from hw.runtime.rigid import looking_rotation, rigid, rotation_matrix
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Bool, Float
 

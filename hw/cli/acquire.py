@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hw.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
 from hw.cli.common import (
     bench_option,
     bench_seed_option,
@@ -22,20 +21,21 @@ from hw.cli.common import (
     started,
 )
 from hw.cli.confirming import confirming_by
+from hw.runtime.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
 from jaxcal import InputError
 from jaxcal.cli.common import POSITIVE, ExitCode, exit_code
 
 if TYPE_CHECKING:
-    from hw.acquire import Outcome
+    from hw.acquisition.acquire import Outcome
+    from hw.acquisition.request import AcquisitionRequest
     from hw.bench.run import Bench
-    from hw.extras import Extra
-    from hw.keys import Keyboard
     from hw.midplane.pattern_injection import Operator
     from hw.midplane.terminal_image import Screen
-    from hw.request import AcquisitionRequest
     from hw.robot.confirmation import Confirmation
     from hw.robot.motion_plan import MotionPlan
-    from hw.setup import Setup
+    from hw.runtime.extras import Extra
+    from hw.runtime.keys import Keyboard
+    from hw.setup.description import Setup
     from hw.view.feed import LiveView
 
 _ALSO_RESUMED = ("bench", "setup_path", "move", "unattended", "preview", "view", "speed",
@@ -138,9 +138,9 @@ def acquire(
         raise InputError("--unattended needs --move")
     if view and not (bench or move):
         raise InputError("--view needs --move: a dry run has nothing to show")
-    from hw.extras import missing
-    from hw.recording_check import check_resumable
-    from hw.request import AcquisitionRequest, recorded_request
+    from hw.acquisition.request import AcquisitionRequest, recorded_request
+    from hw.recording.check import check_resumable
+    from hw.runtime.extras import missing
 
     if resume:
         assert recording is not None
@@ -183,13 +183,13 @@ def acquire(
         emulated = started(stack, bench, bench_seed, speed, controller, phantom)
         setup = setup_of(setup_path, emulated)
         if not bench and not move:
-            from hw.dry_run import dry_run
+            from hw.acquisition.dry_run import dry_run
 
             for line in dry_run(setup, path, request, preview):
                 click.echo(line)
             return ExitCode.CONVERGED
         if preview is not None:
-            from hw.dry_run import draw
+            from hw.acquisition.dry_run import draw
 
             if request is None:
                 raise InputError("--preview draws a new plan; it does not go with --resume")
@@ -206,11 +206,11 @@ def _acquire(
     operator: str,
     show: bool,
 ) -> int:
-    from hw.acquire import AcquisitionStopped
-    from hw.acquire import acquire as run_acquisition
-    from hw.emulated import BenchOracle
-    from hw.keys import Pause, watch_keys
+    from hw.acquisition.acquire import AcquisitionStopped
+    from hw.acquisition.acquire import acquire as run_acquisition
     from hw.midplane.terminal_image import Screen
+    from hw.runtime.keys import Pause, watch_keys
+    from hw.setup.emulated import BenchOracle
 
     pause, screen = Pause(), Screen(sys.stderr)
     confirming = confirming_by(setup, emulated is not None, unattended)
@@ -282,7 +282,7 @@ def _operators(operator: str, keyboard: Keyboard, screen: Screen) -> Callable[[]
 
 
 def _finished(path: str, outcome: Outcome, setup: Setup) -> int:
-    from hw.outcome import calibrate_and_print, lines_of
+    from hw.acquisition.outcome import calibrate_and_print, lines_of
 
     lines = lines_of(path, outcome, setup.clock.speed)
     return exit_code([calibrate_and_print(path, *lines)])

@@ -29,7 +29,7 @@ def check(bench: bool, setup_path: str | None, speed: float | None, controller: 
         raise InputError("give either --bench or --setup TOML")
     if (speed, controller) != (None, None) and not bench:
         raise InputError("--speed and --controller need --bench")
-    from hw.check import check as look
+    from hw.setup.check import check as look
 
     with ExitStack() as stack:
         found = look(setup_of(setup_path, started(stack, bench, None, speed or 1.0, controller)))

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import click
 from click.core import ParameterSource
 
-from hw.choices import PHANTOMS
+from hw.runtime.choices import PHANTOMS
 from jaxcal import InputError
 from jaxcal.cli.common import POSITIVE
 
 if TYPE_CHECKING:
     from hw.bench.run import Bench
-    from hw.setup import Setup
+    from hw.setup.description import Setup
 
 POSE_HZ = {"cb": 125, "e": 500}
 """Poses a second of a controller's series."""
@@ -62,7 +62,7 @@ def started(
     """Start the emulated bench if it was asked for."""
     if not bench:
         return None
-    from hw.emulated import SPEED, start
+    from hw.setup.emulated import SPEED, start
 
     speed = SPEED if speed is None else speed
     return stack.enter_context(
@@ -72,10 +72,11 @@ def started(
 
 def setup_of(path: str | None, emulated: Bench | None) -> Setup:
     """The description of the emulated bench, or of the one in a file."""
-    from hw import emulated as emulation
-    from hw.setup import load_setup
-
     if emulated is not None:
+        from hw.setup import emulated as emulation
+
         return emulation.setup_of(emulated)
+    from hw.setup.description import load_setup
+
     assert path is not None
     return load_setup(path)

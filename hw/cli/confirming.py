@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from hw.acquire import Confirm
+    from hw.acquisition.acquire import Confirm
     from hw.robot.confirmation import Confirmation
     from hw.robot.motion_plan import MotionPlan
-    from hw.setup import Setup
+    from hw.setup.description import Setup
 
 
 def confirming_by(setup: Setup, emulated: bool, unattended: str | None) -> Confirm:

@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
-from hw.choices import HAND_PLACEMENTS
 from hw.cli.common import check_resumed
+from hw.runtime.choices import HAND_PLACEMENTS
 from jaxcal import InputError
 from jaxcal.cli.common import exit_code
 from jaxcal.cli.sequence_options import spacing_option
@@ -107,15 +107,15 @@ def free_hand(
     path = recording or f"free-hand-{datetime.now():%Y%m%d-%H%M%S}.h5"
     rules = Rules(target="cross" if target == "cross" else "echo", region=region)
     asked = FreeHand(host, int(port or 18944), rules=rules, **options)
-    from hw.keys import Keyboard, Pause
     from hw.midplane.terminal_image import Screen
+    from hw.runtime.keys import Keyboard, Pause
 
     screen = Screen(sys.stderr)
     with Keyboard(Pause(), (), screen.say) as keyboard, keyboard.asking():
         person = TerminalPerson(screen, keyboard, INJECTION_KEYS if injected else KEYS)
         if setup_path is not None:
             from hw.freehand.injection import acquire_by_injection
-            from hw.setup import load_hand_held
+            from hw.setup.description import load_hand_held
 
             if not keyboard.there:
                 raise InputError("pattern injection needs a terminal to read keys from")
@@ -124,7 +124,7 @@ def free_hand(
         else:
             acquire_free_hand(path, asked, person, resume=resume)
         screen.clear()
-    from hw.outcome import calibrate_and_print
+    from hw.acquisition.outcome import calibrate_and_print
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     enable_compilation_cache()

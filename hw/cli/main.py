@@ -13,7 +13,7 @@ from hw.cli.bench import bench
 from hw.cli.check import check
 from hw.cli.free_hand import free_hand
 from hw.cli.setup import setup
-from hw.interrupts import as_interrupts
+from hw.runtime.interrupts import as_interrupts
 from jaxcal import __version__
 from jaxcal.cli.common import Commands
 from jaxcal.cli.run import run

@@ -19,7 +19,7 @@ def setup(out: str | None) -> int:
 
     from jaxcal.io.atomic import write_text
 
-    text = files("hw").joinpath("example_setup.toml").read_text("utf-8")
+    text = files("hw.setup").joinpath("example_setup.toml").read_text("utf-8")
     if out is None:
         click.echo(text, nl=False)
         return ExitCode.CONVERGED

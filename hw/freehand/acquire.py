@@ -13,13 +13,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from hw.errors import DeviceError
 from hw.freehand.guide import Guide, Taken
 from hw.freehand.kept import KeptImages, read_images
 from hw.freehand.posed import PosedImages
 from hw.freehand.request import FreeHand, FreeHandStopped, Person, recorded_request
-from hw.recorder import Recorder
-from hw.recording_layout import RecordingHeader
+from hw.recording.layout import RecordingHeader
+from hw.recording.recorder import Recorder
+from hw.runtime.errors import DeviceError
 from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.recording import MINIMUM_IMAGES, Recording, make_images

@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 
 from hw.active_echo.device import ActiveEcho, EchoFrame
-from hw.errors import DeviceError, StaleError
 from hw.freehand.guide import mean_pose, spread_of
 from hw.freehand.kept import KeptImages, read_images
 from hw.freehand.posed import PosedImage, PosedImages
@@ -35,12 +34,13 @@ from hw.midplane.bracket import Bracket
 from hw.midplane.live_view import describe, profile
 from hw.midplane.pattern_injection import View, bar, bar_length, sides_seen
 from hw.midplane.search import Echoes, PlacementError
-from hw.recorder import Recorder
-from hw.recording_check import probe_of
-from hw.recording_layout import RecordingHeader
-from hw.resuming import check_same, described_probe
-from hw.session import DELAY_S, Watch, median_times
-from hw.setup import HandHeldSetup
+from hw.recording.check import probe_of
+from hw.recording.layout import RecordingHeader
+from hw.recording.recorder import Recorder
+from hw.recording.resuming import check_same, described_probe
+from hw.recording.session import DELAY_S, Watch, median_times
+from hw.runtime.errors import DeviceError, StaleError
+from hw.setup.description import HandHeldSetup
 from hw.ultrasound.receiver import UltrasoundStream
 from jaxcal import CalibrationError, InputError
 from jaxcal.data.poses import inverse_poses

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hw.recorder import Recorder
-from hw.recording_check import opened, read_column
-from hw.recording_file import RecordingWriter
+from hw.recording.check import opened, read_column
+from hw.recording.file import RecordingWriter
+from hw.recording.recorder import Recorder
 from jaxcal.data.recording import MetresError, check_pose_units
 from jaxcal.io.untrusted import UpTo
 from jaxcal.runtime.array_types import Float

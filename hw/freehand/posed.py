@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.errors import DeviceError, StaleError
+from hw.runtime.errors import DeviceError, StaleError
 from hw.ultrasound.receiver import Image, Transform, UltrasoundStream
 from jaxcal.data.poses import inverse_poses
 from jaxcal.data.timing import interpolate_poses

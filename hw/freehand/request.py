@@ -11,8 +11,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from hw.freehand.guide import Rules
-from hw.hosts import check_host
-from hw.recording_check import settings_of
+from hw.recording.check import settings_of
+from hw.runtime.hosts import check_host
 from jaxcal import CalibrationError, InputError
 from jaxcal.cli.common import ExitCode
 from jaxcal.data.recording import MINIMUM_IMAGES, check_spacing_unit

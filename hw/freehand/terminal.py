@@ -6,8 +6,8 @@ import time
 
 import numpy as np
 
-from hw.keys import Keyboard
 from hw.midplane.terminal_image import Screen
+from hw.runtime.keys import Keyboard
 
 KEYS = "u: take the last image back, q or Enter: finish, Ctrl-C: stop (it can be resumed)"
 INJECTION_KEYS = (

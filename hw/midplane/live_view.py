@@ -19,9 +19,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from hw.interrupts import heed_interrupt
 from hw.midplane.pattern_injection import LONGEST, Decision, View, middle_of, sides_seen
 from hw.midplane.terminal_image import Screen
+from hw.runtime.interrupts import heed_interrupt
 from jaxcal import InputError
 
 _LEAST_STEP_MM, _LARGEST_STEP_MM = 0.02, 1.0
@@ -116,7 +116,7 @@ def profile(view: View, columns: int = _PROFILE_COLUMNS) -> tuple[str, str]:
 
 @runtime_checkable
 class KeySource(Protocol):
-    """Where keys come from (see :class:`hw.keys.Keyboard`)."""
+    """Where keys come from (see :class:`hw.runtime.keys.Keyboard`)."""
 
     def asking(self) -> AbstractContextManager[None]:
         """Within it keys go to :meth:`read`; those pressed before are forgotten."""

@@ -19,9 +19,9 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from hw.errors import DeviceError
 from hw.midplane.bracket import Placement
 from hw.midplane.search import Bench, PlacementError, Settings, Walker, coarse, guarded
+from hw.runtime.errors import DeviceError
 from jaxcal import InputError
 from jaxcal.runtime.array_types import UInt8
 

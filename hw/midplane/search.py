@@ -18,8 +18,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from hw.errors import Device, DeviceError
 from hw.midplane.bracket import Placement, widened
+from hw.runtime.errors import Device, DeviceError
 from jaxcal import InputError
 from jaxcal.runtime.array_types import Bool, Float
 
@@ -74,7 +74,7 @@ class Echoes:
 
 @runtime_checkable
 class Bench(Protocol):
-    """What a procedure needs; :class:`hw.stage.ProbeStage` provides it by the real devices."""
+    """What a procedure needs; :class:`hw.acquisition.stage.ProbeStage` has it of real devices."""
 
     def move(self, offset_mm: float) -> float:
         """Go there, arrive, settle; returns the offset as tracked, mm."""

@@ -13,10 +13,10 @@ import struct
 import sys
 import time
 
-from hw.errors import DeviceError, LostError
-from hw.extras import require
 from hw.robot._process import RECEIVES, be_prompt
 from hw.robot.rtde import Packet, PacketReader
+from hw.runtime.errors import DeviceError, LostError
+from hw.runtime.extras import require
 
 RECORD = struct.Struct("<8dIiI6d5d6d")
 """Host and device time (s), pose (6), safety bits, mode, runtime state, TCP offset (6), payload and

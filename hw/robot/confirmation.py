@@ -8,11 +8,11 @@ import threading
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from hw.clock import Clock
-from hw.errors import refused
 from hw.robot.limits import between
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.path_checks import check_plan
+from hw.runtime.clock import Clock
+from hw.runtime.errors import refused
 
 _VALID_S = 600.0
 LEAST_DIGEST_DIGITS = 16

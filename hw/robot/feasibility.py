@@ -20,8 +20,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.errors import RefusedError, refused
-from hw.rigid import cross_matrix, rotation_vector, straight_way
 from hw.robot.kinematics import (
     ANGLE_MM,
     BRANCHES,
@@ -39,6 +37,8 @@ from hw.robot.kinematics import (
     scaled_jacobian,
     tool_of,
 )
+from hw.runtime.errors import RefusedError, refused
+from hw.runtime.rigid import cross_matrix, rotation_vector, straight_way
 from jaxcal.runtime.array_types import Float
 
 _COARSE_MM = 20.0

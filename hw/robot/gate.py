@@ -15,8 +15,6 @@ from functools import cached_property
 
 import numpy as np
 
-from hw.clock import Clock
-from hw.errors import StaleError, refused
 from hw.robot.confirmation import Confirmation
 from hw.robot.feasibility import check_model, follow, follow_all
 from hw.robot.limits import Limits, numbers
@@ -25,6 +23,8 @@ from hw.robot.path_checks import check_path, checked_pose, pace, within_search
 from hw.robot.pose import pose_to_ur
 from hw.robot.rtde import PendantSettings, state_text
 from hw.robot.stream import PoseSample, offset_changed
+from hw.runtime.clock import Clock
+from hw.runtime.errors import StaleError, refused
 
 _LEAST_SPEED_MM_S = 0.01
 """A slower move is a mistake of units; at 0.01 mm/s a search step of 0.05 mm takes 5 s."""

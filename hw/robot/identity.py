@@ -23,7 +23,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from hw.errors import LostError
+from hw.runtime.errors import LostError
 from jaxcal.runtime.messages import quoted
 
 DASHBOARD_PORT, PRIMARY_PORT = 29999, 30001

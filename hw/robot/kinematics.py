@@ -33,9 +33,9 @@ from functools import cached_property
 
 import numpy as np
 
-from hw.errors import refused
-from hw.rigid import inverse as inverse_transform
-from hw.rigid import rigid
+from hw.runtime.errors import refused
+from hw.runtime.rigid import inverse as inverse_transform
+from hw.runtime.rigid import rigid
 from jaxcal.runtime.array_types import Bool, Float, Int
 
 ANGLE_MM = 100.0

@@ -18,8 +18,8 @@ from dataclasses import MISSING, dataclass, fields
 
 import numpy as np
 
-from hw.errors import refused
 from hw.robot.kinematics import model_named
+from hw.runtime.errors import refused
 from jaxcal.runtime.array_types import Float
 
 _VECTORS = {

@@ -33,15 +33,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hw.clock import REAL, Clock
-from hw.errors import DeviceError, LostError, StaleError, StoppedError, refused
-from hw.interrupts import heed_interrupt
 from hw.robot._process import spawn
 from hw.robot.confirmation import Confirmation
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.mover.messages import Setup, error_of, line_of, sample_of, told
 from hw.robot.path_checks import check_plan
 from hw.robot.stream import PoseSample
+from hw.runtime.clock import REAL, Clock
+from hw.runtime.errors import DeviceError, LostError, StaleError, StoppedError, refused
+from hw.runtime.interrupts import heed_interrupt
 
 Log = Callable[[float, str, dict[str, object]], None]
 """Takes bench time (s), the command, and its numbers."""

@@ -10,11 +10,11 @@ from functools import cached_property
 
 import numpy as np
 
-from hw.errors import refused
 from hw.robot.feasibility import Arm
 from hw.robot.kinematics import model_named
 from hw.robot.limits import Limits, numbers
 from hw.robot.rtde import PendantSettings
+from hw.runtime.errors import refused
 
 _MOST_TARGETS = 10_000
 

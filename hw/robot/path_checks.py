@@ -13,12 +13,12 @@ import math
 
 import numpy as np
 
-from hw.errors import refused
-from hw.rigid import inverse, straight_way, turn_deg
 from hw.robot.feasibility import Course, follow_all
 from hw.robot.kinematics import tool_of
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan, array_of
+from hw.runtime.errors import refused
+from hw.runtime.rigid import inverse, straight_way, turn_deg
 
 _ROTATION_TOLERANCE = 1e-6
 _POSITION_TOLERANCE_MM = 1e-6

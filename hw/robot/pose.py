@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.rigid import rigid, rotation_vector
+from hw.runtime.rigid import rigid, rotation_vector
 from jaxcal.runtime.array_types import Float
 
 MM_PER_M = 1000.0

@@ -22,7 +22,7 @@ from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hw.errors import LostError, refused
+from hw.runtime.errors import LostError, refused
 
 PORT = 30004
 

@@ -24,14 +24,14 @@ from typing import Literal
 
 import numpy as np
 
-from hw.clock import REAL, Clock
-from hw.errors import LostError, StaleError, refused
-from hw.rigid import rotation_vector
 from hw.robot._process import spawn
 from hw.robot._reader import BOUND, ERROR, POSE, RECORD
 from hw.robot.identity import Identity, read_identity
 from hw.robot.pose import ur_to_pose
 from hw.robot.rtde import PendantSettings, too_late
+from hw.runtime.clock import REAL, Clock
+from hw.runtime.errors import LostError, StaleError, refused
+from hw.runtime.rigid import rotation_vector
 from jaxcal.runtime.array_types import Float
 
 _OFFSET_TOLERANCE = 1e-6

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hw.clock import REAL, Clock
-from hw.errors import Device, DeviceError, LostError, StaleError
+from hw.runtime.clock import REAL, Clock
+from hw.runtime.errors import Device, DeviceError, LostError, StaleError
 from hw.ultrasound.framing import MessageDecoder
 from jaxcal.io.message_content import Picture, Pixels, StatusMessage, Tracked, TrackedFrame
 from jaxcal.io.openigtlink import RF_DEVICE, Message

@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from hw.errors import DeviceError
-from hw.extras import missing
 from hw.midplane.bracket import Placement
-from hw.pipes import encode
+from hw.recording.session import Session
 from hw.robot.motion_plan import MotionPlan
-from hw.session import Session
-from hw.setup import Setup
+from hw.runtime.errors import DeviceError
+from hw.runtime.extras import missing
+from hw.runtime.pipes import encode
+from hw.setup.description import Setup
 from jaxcal import InputError
 from jaxcal.result.calibration import Calibration
 from jaxcal.runtime.array_types import Float

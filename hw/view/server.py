@@ -19,7 +19,7 @@ from contextlib import closing, redirect_stdout
 from typing import Any
 from urllib.parse import urlsplit
 
-from hw.pipes import read_message
+from hw.runtime.pipes import read_message
 
 HOST = "127.0.0.1"
 _OWN_NAMES = (HOST, "localhost")

@@ -33,7 +33,7 @@ def python_command(module: str, *arguments: str) -> list[str]:
     """The command that runs a module of an installed package in a new, isolated interpreter.
 
     Args:
-        module: its full name, e.g. ``hw.recorder_process``.
+        module: its full name, e.g. ``hw.recording.writer_process``.
         arguments: for it, as ``sys.argv[1:]``.
     """
     return [sys.executable, "-I", "-c", _START, json.dumps(import_path()), module, *arguments]

@@ -25,21 +25,21 @@ pytest.importorskip("serial", reason="pyserial is not installed (jaxcal[serial])
 from test_recorder import wait_until_closed
 
 import jaxcal
-from hw.acquire import AcquisitionStopped, Outcome, acquire
+from hw.acquisition.acquire import AcquisitionStopped, Outcome, acquire
+from hw.acquisition.outcome import lines_of, share_inside
+from hw.acquisition.request import AcquisitionRequest, request_in
 from hw.bench.run import Bench
-from hw.check import check
-from hw.emulated import BenchOracle, setup_of, start
-from hw.errors import RefusedError
-from hw.keys import Pause
 from hw.midplane.search import Settings
-from hw.outcome import lines_of, share_inside
-from hw.poses import Extent
-from hw.request import AcquisitionRequest, request_in
-from hw.resuming import check_same_robot
+from hw.planning.poses import Extent
+from hw.recording.resuming import check_same_robot
+from hw.recording.session import Watch
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.motion_plan import MotionPlan
-from hw.session import Watch
-from hw.setup import Setup
+from hw.runtime.errors import RefusedError
+from hw.runtime.keys import Pause
+from hw.setup.check import check
+from hw.setup.description import Setup
+from hw.setup.emulated import BenchOracle, setup_of, start
 from jaxcal import InputError
 from jaxcal.cli.main import main
 

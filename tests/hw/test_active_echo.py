@@ -19,8 +19,8 @@ from hw.active_echo import ActiveEcho, EchoFrame, EchoStatistics
 from hw.active_echo.codec import EchoPacket, decode_line, encode_echo, encode_line, encode_reply
 from hw.active_echo.transport import open_transport
 from hw.bench.active_echo import AuspisEmulator
-from hw.clock import Clock
-from hw.errors import DeviceError, LostError, RefusedError, StaleError
+from hw.runtime.clock import Clock
+from hw.runtime.errors import DeviceError, LostError, RefusedError, StaleError
 
 pytest.importorskip("serial", reason="pyserial, for ports and ptys")
 

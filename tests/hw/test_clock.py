@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from hw import extras
-from hw.clock import REAL, Clock
-from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
-from hw.extras import missing, require
+from hw.runtime import extras
+from hw.runtime.clock import REAL, Clock
+from hw.runtime.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
+from hw.runtime.extras import missing, require
 
 
 def test_bench_time_runs_at_its_speed():
@@ -91,7 +91,7 @@ def test_where_the_robot_extra_installs_something(version, system, machine, monk
 def test_device_processes_do_not_load_the_engine():
     program = (
         "import sys, hw.robot.mover.__main__, hw.robot._reader, hw.bench.robot; "
-        "import hw.recorder_process; "
+        "import hw.recording.writer_process; "
         "print({'jax', 'jaxtyping', 'scipy', 'asyncio'} & set(sys.modules))"
     )
     run = subprocess.run(

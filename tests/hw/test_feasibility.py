@@ -10,9 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hw.bench.joints import first_joints
-from hw.clock import Clock
-from hw.errors import RefusedError
-from hw.rigid import straight_way
 from hw.robot.feasibility import Arm, check_model, follow, follow_all
 from hw.robot.gate import Gate
 from hw.robot.kinematics import (
@@ -32,6 +29,9 @@ from hw.robot.motion_plan import MotionPlan, plan_lines
 from hw.robot.path_checks import check_plan
 from hw.robot.pose import pose_to_ur
 from hw.robot.stream import PoseSample
+from hw.runtime.clock import Clock
+from hw.runtime.errors import RefusedError
+from hw.runtime.rigid import straight_way
 
 UR5 = MODELS["UR5"]
 OFFSET = (0.0, 0.0, 0.12, 0.0, 0.0, 0.0)

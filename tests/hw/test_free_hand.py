@@ -17,13 +17,13 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from hw.cli.main import main
-from hw.errors import DeviceError
 from hw.freehand.acquire import acquire_free_hand
 from hw.freehand.guide import Guide, Rules, Taken, orientation_sds
 from hw.freehand.posed import PosedImage, PosedImages
 from hw.freehand.request import FreeHand, FreeHandStopped
 from hw.robot.identity import read_identity
 from hw.robot.rtde import PacketReader
+from hw.runtime.errors import DeviceError
 from hw.ultrasound.receiver import Image, UltrasoundStream
 from jaxcal import FormatError, InputError
 

@@ -23,15 +23,15 @@ from hw.bench.frames import Camera
 from hw.bench.ultrasound import ImageServer
 from hw.bench.world import make_world
 from hw.cli.main import main
-from hw.clock import REAL
 from hw.freehand.guide import Rules
 from hw.freehand.injection import acquire_by_injection, hand_advice
 from hw.freehand.request import FreeHand, FreeHandStopped
 from hw.midplane.pattern_injection import View
-from hw.poses import Extent, plan_poses
-from hw.recorder import Recorder
-from hw.recording_layout import RecordingHeader
-from hw.setup import HandHeldSetup, load_hand_held
+from hw.planning.poses import Extent, plan_poses
+from hw.recording.layout import RecordingHeader
+from hw.recording.recorder import Recorder
+from hw.runtime.clock import REAL
+from hw.setup.description import HandHeldSetup, load_hand_held
 from jaxcal import InputError
 
 WORLD = make_world(3)

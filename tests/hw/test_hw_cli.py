@@ -16,9 +16,9 @@ from test_setup import GOOD
 import jaxcal
 from hw.cli.confirming import plan_page
 from hw.cli.main import main
-from hw.recording_check import read_progress
-from hw.recording_file import RecordingWriter
-from hw.recording_layout import RecordingHeader
+from hw.recording.check import read_progress
+from hw.recording.file import RecordingWriter
+from hw.recording.layout import RecordingHeader
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan
 

@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from hw.interrupts import as_interrupts, heed_interrupt
+from hw.runtime.interrupts import as_interrupts, heed_interrupt
 
 pytestmark = pytest.mark.skipif(
     threading.current_thread() is not threading.main_thread() or sys.platform == "win32",

@@ -8,12 +8,12 @@ pytest.importorskip("pty", reason="there are no pseudo-terminals here")
 
 from terminal import Terminal
 
-from hw.keys import names_of
+from hw.runtime.keys import names_of
 
 PROGRAM = """
 import sys, time
 from types import SimpleNamespace
-from hw.keys import watch_keys
+from hw.runtime.keys import watch_keys
 from hw.midplane.terminal_image import Screen
 state = SimpleNamespace(held=False)
 pause = SimpleNamespace(held=False)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from hw.errors import RefusedError
 from hw.robot.kinematics import (
     ANGLE_MM,
     BRANCHES,
@@ -28,6 +27,7 @@ from hw.robot.kinematics import (
     tool_of,
     wrapped,
 )
+from hw.runtime.errors import RefusedError
 
 ALL = pytest.mark.parametrize("model", MODELS.values(), ids=list(MODELS))
 

@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from hw.bench.frames import Camera
 from hw.bench.stage import WorldStage
 from hw.bench.world import make_world
-from hw.interrupts import as_interrupts
 from hw.midplane.live_view import Keys, TerminalOperator, WindowOperator, advice
 from hw.midplane.pattern_injection import (
     LONGEST,
@@ -29,7 +28,8 @@ from hw.midplane.pattern_injection import (
     sides_seen,
 )
 from hw.midplane.terminal_image import Screen, picture
-from hw.poses import plan_poses
+from hw.planning.poses import plan_poses
+from hw.runtime.interrupts import as_interrupts
 from jaxcal import InputError
 
 

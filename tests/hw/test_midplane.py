@@ -10,7 +10,6 @@ import pytest
 
 from hw.bench.stage import WorldStage
 from hw.bench.world import make_world
-from hw.errors import LostError
 from hw.midplane.amplitude_scan import amplitude_scan, fit_peak, free_hand
 from hw.midplane.bracket import Bracket, widened
 from hw.midplane.pattern_injection import (
@@ -24,7 +23,8 @@ from hw.midplane.pattern_injection import (
 from hw.midplane.search import Echoes, PlacementError, Settings, coarse, first_seen
 from hw.midplane.search import Walker as SearchWalker
 from hw.midplane.threshold_climb import threshold_climb
-from hw.poses import plan_poses
+from hw.planning.poses import plan_poses
+from hw.runtime.errors import LostError
 from jaxcal import InputError
 
 

@@ -27,9 +27,9 @@ from motions import (
 )
 from robots import CB_SERIES, E_SERIES, EmulatedRobot
 
-from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 from hw.robot.identity import stop_program
 from hw.robot.motion import Motion
+from hw.runtime.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 from jaxcal.runtime.isolated import import_path
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")

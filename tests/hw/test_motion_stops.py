@@ -29,12 +29,12 @@ from motions import (
 )
 from robots import CB_SERIES, START, EmulatedRobot
 
-from hw.errors import RefusedError, StaleError, StoppedError
-from hw.interrupts import as_interrupts
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
+from hw.runtime.errors import RefusedError, StaleError, StoppedError
+from hw.runtime.interrupts import as_interrupts
 from jaxcal.runtime.isolated import import_path
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
@@ -84,7 +84,7 @@ def test_a_guard_that_fails_stops_the_robot():
 _CALLER = """
 import json, os, sys, time
 import numpy as np
-from hw.clock import Clock
+from hw.runtime.clock import Clock
 from hw.robot.identity import read_identity
 from hw.robot.limits import Limits
 from hw.robot.motion import Motion

@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 from robots import address
 
-from hw.clock import Clock
-from hw.errors import LostError, RefusedError, StaleError, StoppedError
 from hw.robot.confirmation import Confirmation
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan
@@ -32,6 +30,8 @@ from hw.robot.mover.no_reconnect import NoReconnect
 from hw.robot.mover.stop_latch import Stop, StopLatch
 from hw.robot.rtde import PendantSettings
 from hw.robot.stream import PoseSample
+from hw.runtime.clock import Clock
+from hw.runtime.errors import LostError, RefusedError, StaleError, StoppedError
 
 CLOCK = Clock()
 PLAN = MotionPlan(

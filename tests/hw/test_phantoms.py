@@ -16,23 +16,23 @@ import pytest
 from test_world import placed
 
 import jaxcal
+from hw.acquisition.request import AcquisitionRequest
+from hw.acquisition.stage import ProbeStage
 from hw.bench.frames import COLUMNS, DECIBELS, Camera
 from hw.bench.look import Look
 from hw.bench.phantoms import ActiveEcho, Hydrophone, phantom_named
 from hw.bench.stage import WorldStage
 from hw.bench.world import make_world
-from hw.choices import PHANTOMS
-from hw.clock import Clock
 from hw.midplane.amplitude_scan import amplitude_scan, fit_peak
 from hw.midplane.image_scan import ImageBench, image_scan, pixel_of, place_of
-from hw.poses import plan_poses
-from hw.recorder import Recorder
-from hw.recording_check import check_resumable, read_progress, settings_of
-from hw.recording_layout import RecordingHeader
-from hw.request import AcquisitionRequest
+from hw.planning.poses import plan_poses
+from hw.recording.check import check_resumable, read_progress, settings_of
+from hw.recording.layout import RecordingHeader
+from hw.recording.recorder import Recorder
+from hw.recording.session import Session
 from hw.robot.motion import Motion
-from hw.session import Session
-from hw.stage import ProbeStage
+from hw.runtime.choices import PHANTOMS
+from hw.runtime.clock import Clock
 from hw.ultrasound.receiver import Image
 from jaxcal import InputError
 from jaxcal.data.segmentation.image import localise

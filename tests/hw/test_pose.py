@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hw.rigid import rotation_vector, turn_deg
 from hw.robot.pose import pose_to_ur, ur_to_pose
+from hw.runtime.rigid import rotation_vector, turn_deg
 
 number = st.floats(-4.0, 4.0)
 

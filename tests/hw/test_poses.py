@@ -7,15 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hw.acquisition.planner import Planner
 from hw.bench.world import make_world
-from hw.planner import Planner
-from hw.pool import allowed_by, plan_pool
-from hw.poses import Extent, plan_poses, preview
-from hw.rigid import turn_deg
+from hw.planning.pool import allowed_by, plan_pool
+from hw.planning.poses import Extent, plan_poses, preview
+from hw.planning.scene import Scene
 from hw.robot.kinematics import flange_of, inverse, model_named
 from hw.robot.path_checks import out_of_box_mm
-from hw.scene import Scene
-from hw.setup import Setup
+from hw.runtime.rigid import turn_deg
+from hw.setup.description import Setup
 from jaxcal import InputError
 
 SCENE = make_world(0).scene

@@ -17,10 +17,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from hw.recorder import Recorder
-from hw.recording_check import check_resumable, settings_of
-from hw.recording_file import RecordingWriter
-from hw.recording_layout import RecordingHeader
+from hw.recording.check import check_resumable, settings_of
+from hw.recording.file import RecordingWriter
+from hw.recording.layout import RecordingHeader
+from hw.recording.recorder import Recorder
 from jaxcal.cli.main import main
 
 PROBE = {"kind": "linear", "elements": 128, "pitch_mm": 58.5 / 128, "sound_speed_m_s": 1490.0}

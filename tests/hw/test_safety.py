@@ -12,8 +12,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from hw.clock import Clock
-from hw.errors import RefusedError, StaleError
 from hw.robot.confirmation import Challenge, Confirmation, confirm, confirm_unattended
 from hw.robot.gate import Command, Gate
 from hw.robot.limits import Limits
@@ -22,6 +20,8 @@ from hw.robot.path_checks import check_plan
 from hw.robot.pose import pose_to_ur, ur_to_pose
 from hw.robot.rtde import PendantSettings
 from hw.robot.stream import PoseSample
+from hw.runtime.clock import Clock
+from hw.runtime.errors import RefusedError, StaleError
 
 SERIAL = "20195500042"
 OFFSET = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)

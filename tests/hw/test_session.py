@@ -12,12 +12,12 @@ from robots import EmulatedRobot
 from hw.active_echo.device import ActiveEcho
 from hw.bench.active_echo import AuspisEmulator
 from hw.bench.ultrasound import ImageServer
-from hw.clock import Clock
-from hw.recorder import Recorder
-from hw.recording_layout import RecordingHeader
-from hw.scene import Scene
-from hw.session import Session, frame_period
-from hw.setup import Setup
+from hw.planning.scene import Scene
+from hw.recording.layout import RecordingHeader
+from hw.recording.recorder import Recorder
+from hw.recording.session import Session, frame_period
+from hw.runtime.clock import Clock
+from hw.setup.description import Setup
 from jaxcal.data.probe import LinearProbe
 
 pytest.importorskip("serial", reason="needs jaxcal[serial]")

@@ -10,7 +10,7 @@ import pytest
 
 import jaxcal
 from hw.cli.main import main
-from hw.setup import _TABLES, load_setup
+from hw.setup.description import _TABLES, load_setup
 
 GOOD = """
 [robot]

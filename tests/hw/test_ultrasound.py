@@ -16,8 +16,8 @@ import pytest
 from hw.active_echo import ActiveEcho
 from hw.bench.active_echo import AuspisEmulator
 from hw.bench.ultrasound import ImageServer
-from hw.clock import Clock
-from hw.errors import DeviceError, LostError, StaleError
+from hw.runtime.clock import Clock
+from hw.runtime.errors import DeviceError, LostError, StaleError
 from hw.ultrasound import Image, UltrasoundStream
 from jaxcal.io.message_content import Picture, StatusMessage
 from jaxcal.io.openigtlink import HEADER_SIZE, Message, encode

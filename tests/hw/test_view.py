@@ -23,19 +23,19 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from hw.bench.run import Bench
-from hw.emulated import setup_of, start
-from hw.errors import LostError, StaleError
-from hw.extras import missing
 from hw.midplane.bracket import Bracket, Placement
-from hw.poses import Extent, plan_poses
-from hw.recorder import Recorder
-from hw.recording_layout import RecordingHeader
+from hw.planning.poses import Extent, plan_poses
+from hw.recording.layout import RecordingHeader
+from hw.recording.recorder import Recorder
+from hw.recording.session import Session
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.stream import PoseSample
-from hw.session import Session
-from hw.setup import Setup
+from hw.runtime.errors import LostError, StaleError
+from hw.runtime.extras import missing
+from hw.setup.description import Setup
+from hw.setup.emulated import setup_of, start
 from hw.view.feed import LiveView, halved, watched
 from hw.view.page import ellipsoid, to_scale, towards
 

@@ -10,8 +10,8 @@ from hw.bench.frames import COLUMNS, ROWS, Camera
 from hw.bench.look import Look
 from hw.bench.world import FULL_SCALE, make_world
 from hw.midplane.pattern_injection import bar
-from hw.poses import plan_poses
-from hw.rigid import rigid, rotation_matrix
+from hw.planning.poses import plan_poses
+from hw.runtime.rigid import rigid, rotation_matrix
 from jaxcal import InputError
 from jaxcal.data.poses import rotation_angle
 from jaxcal.data.segmentation.image import localise

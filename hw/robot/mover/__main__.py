@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from typing import NoReturn
 
-from hw.errors import DeviceError, LostError, StoppedError
 from hw.robot._process import ASKS, be_prompt
 from hw.robot.gate import Gate
 from hw.robot.mover.connection import Connection
@@ -14,6 +13,7 @@ from hw.robot.mover.controller import Controller
 from hw.robot.mover.inputs import Inputs
 from hw.robot.mover.messages import Caller, Setup, told
 from hw.robot.mover.stop_latch import Ended, Stop
+from hw.runtime.errors import DeviceError, LostError, StoppedError
 
 
 def main() -> NoReturn:

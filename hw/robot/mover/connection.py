@@ -6,8 +6,6 @@ import math
 import signal
 import threading
 
-from hw.errors import LostError, refused
-from hw.extras import require
 from hw.robot._process import ASKS, RECEIVES, be_prompt
 from hw.robot.gate import Gate
 from hw.robot.identity import LOCAL, read_identity, stop_program, until_local
@@ -19,6 +17,8 @@ from hw.robot.mover.no_reconnect import NoReconnect
 from hw.robot.path_checks import check_plan
 from hw.robot.rtde import PROGRAM_RUNS, PacketReader, safety_text, state_text, too_late
 from hw.robot.stream import Lag
+from hw.runtime.errors import LostError, refused
+from hw.runtime.extras import require
 
 _END_S = 5.0
 """Longest time for the end of the script and of the connection."""

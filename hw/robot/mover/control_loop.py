@@ -25,8 +25,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from hw.errors import DeviceError, RefusedError, StaleError, StoppedError, refused
-from hw.rigid import turn_deg
 from hw.robot.gate import Command, Gate
 from hw.robot.limits import numbers
 from hw.robot.mover.connection import Connection
@@ -36,6 +34,8 @@ from hw.robot.mover.messages import Caller, Setup, plain, told
 from hw.robot.mover.monitor import Monitor
 from hw.robot.mover.stop_latch import Ended, Stop
 from hw.robot.stream import PoseSample
+from hw.runtime.errors import DeviceError, RefusedError, StaleError, StoppedError, refused
+from hw.runtime.rigid import turn_deg
 
 _REPORT_S = 0.05
 _STEADY_S, _STEADY_POLL_S = 0.5, 0.05

@@ -12,12 +12,12 @@ import os
 import select
 from collections import deque
 
-from hw.clock import Clock
-from hw.errors import LostError, StaleError, StoppedError, refused
 from hw.robot.mover.messages import Caller
 from hw.robot.mover.stop_latch import Ended, Stop, StopLatch
 from hw.robot.rtde import Packet, PacketReader, PendantSettings
 from hw.robot.stream import Lag, PoseSample, offset_changed
+from hw.runtime.clock import Clock
+from hw.runtime.errors import LostError, StaleError, StoppedError, refused
 
 _RECONNECTS = ("econnect", "Lost connection", "Could not receive", "closed the connection")
 

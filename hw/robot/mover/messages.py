@@ -17,13 +17,13 @@ import json
 import os
 from dataclasses import asdict, dataclass, replace
 
-from hw.clock import Clock
-from hw.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 from hw.robot.confirmation import Confirmation
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.rtde import PendantSettings
 from hw.robot.stream import PoseSample
+from hw.runtime.clock import Clock
+from hw.runtime.errors import DeviceError, LostError, RefusedError, StaleError, StoppedError
 
 _KINDS = {kind.__name__: kind for kind in (LostError, RefusedError, StaleError, StoppedError)}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from hw.errors import StaleError, StoppedError
 from hw.robot.identity import LOCAL
 from hw.robot.mover.controller import Controller, unfit
 from hw.robot.mover.inputs import Inputs, lost
@@ -10,6 +9,7 @@ from hw.robot.mover.messages import Setup
 from hw.robot.mover.stop_latch import Stop
 from hw.robot.path_checks import out_of_box_mm
 from hw.robot.rtde import PROGRAM_RUNS
+from hw.runtime.errors import StaleError, StoppedError
 
 _BOX_MARGIN_MM = 1.0
 

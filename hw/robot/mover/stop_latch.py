@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hw.errors import DeviceError
+from hw.runtime.errors import DeviceError
 
 
 @dataclass(frozen=True)

@@ -17,16 +17,16 @@ import numpy as np
 import pytest
 
 import jaxcal
-from hw.acquire import acquire as run_acquisition
+from hw.acquisition.acquire import acquire as run_acquisition
 from hw.cli.main import main as acquire
-from hw.errors import RefusedError
-from hw.recorder import Recorder
-from hw.recording_check import check_resumable, read_progress
-from hw.recording_file import RecordingWriter
-from hw.recording_layout import LAYOUT, RecordingHeader
-from hw.resuming import compare, described
+from hw.recording.check import check_resumable, read_progress
+from hw.recording.file import RecordingWriter
+from hw.recording.layout import LAYOUT, RecordingHeader
+from hw.recording.recorder import Recorder
+from hw.recording.resuming import compare, described
 from hw.robot.limits import Limits
-from hw.setup import Setup, load_setup
+from hw.runtime.errors import RefusedError
+from hw.setup.description import Setup, load_setup
 from jaxcal.cli.main import main as study
 from jaxcal.io.toml import parse_toml
 
@@ -36,7 +36,8 @@ HEADER = RecordingHeader(kind="time_of_flight", probe=PROBE)
 EVIL = "open({mark!r}, 'a').write(__name__ + chr(10))\nraise SystemExit('a stranger ran')\n"
 SHADOWED = (
     "h5py", "queue", "select", "json", "runpy", "numpy", "subprocess", "hw/__init__",
-    "hw/robot/__init__", "hw/robot/mover/__init__", "hw/recorder_process", "jaxcal/__init__",
+    "hw/robot/__init__", "hw/robot/mover/__init__", "hw/recording/__init__",
+    "hw/recording/writer_process", "jaxcal/__init__",
 )  # fmt: skip
 
 
@@ -56,8 +57,8 @@ import sys
 from hw.bench.arm import Arm
 from hw.bench.robot import START, RobotProcess
 from hw.bench.run import start_bench
-from hw.recorder import Recorder
-from hw.recording_layout import RecordingHeader
+from hw.recording.recorder import Recorder
+from hw.recording.layout import RecordingHeader
 from hw.robot._process import spawn
 
 probe = {"kind": "linear", "elements": 8, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
@@ -271,8 +272,8 @@ WRITE = """
 import sys
 from types import SimpleNamespace
 import numpy as np
-from hw.recorder import Recorder
-from hw.recording_layout import RecordingHeader
+from hw.recording.recorder import Recorder
+from hw.recording.layout import RecordingHeader
 from jaxcal import CalibrationError
 probe = {"kind": "linear", "elements": 8, "pitch_mm": 0.5, "sound_speed_m_s": 1490.0}
 recorder = Recorder(sys.argv[1], RecordingHeader(kind="time_of_flight", probe=probe))

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from hw.cli.main import main
-from hw.errors import RefusedError
 from hw.robot.limits import numbers
+from hw.runtime.errors import RefusedError
 
 GOOD = """
 [robot]

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from hw.errors import refused
-from hw.recording_check import Progress
+from hw.recording.check import Progress
 from hw.robot.stream import offset_changed
-from hw.setup import Setup
+from hw.runtime.errors import refused
+from hw.setup.description import Setup
 from jaxcal import InputError
 from jaxcal.data.probe import LinearProbe
 from jaxcal.runtime.messages import quoted

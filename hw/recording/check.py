@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 from h5py import h5d  # pyright: ignore[reportAttributeAccessIssue]
 
-from hw.recording_layout import (
+from hw.recording.layout import (
     FORMAT,
     FRAME_TYPES,
     LARGEST_ROW,

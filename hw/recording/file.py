@@ -27,8 +27,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hw.recording_check import check_resumable, stored_length
-from hw.recording_layout import (
+from hw.recording.check import check_resumable, stored_length
+from hw.recording.layout import (
     FORMAT,
     FRAME_TYPES,
     LARGEST_SETTINGS,

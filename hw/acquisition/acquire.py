@@ -16,11 +16,18 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from hw.acquire_live import Estimator
-from hw.clock import Clock
-from hw.errors import DeviceError, LostError, StaleError
-from hw.job import Job, motion_plan, open_recorder, prepare, record_confirmed, resume_command
-from hw.keys import Pause
+from hw.acquisition.job import (
+    Job,
+    motion_plan,
+    open_recorder,
+    prepare,
+    record_confirmed,
+    resume_command,
+)
+from hw.acquisition.live_estimate import Estimator
+from hw.acquisition.planner import Planner
+from hw.acquisition.request import AcquisitionRequest
+from hw.acquisition.stage import ProbeStage
 from hw.midplane.amplitude_scan import amplitude_scan
 from hw.midplane.bracket import Placement
 from hw.midplane.image_scan import image_scan
@@ -32,17 +39,17 @@ from hw.midplane.pattern_injection import (
 )
 from hw.midplane.search import PlacementError, first_seen
 from hw.midplane.threshold_climb import threshold_climb
-from hw.planner import Planner
-from hw.recorder import Recorder
-from hw.request import AcquisitionRequest
+from hw.recording.recorder import Recorder
+from hw.recording.session import Session, Watch, median_times
 from hw.robot.confirmation import Confirmation
 from hw.robot.gate import check_sample
 from hw.robot.motion import Motion
 from hw.robot.motion_plan import MotionPlan
 from hw.robot.path_checks import check_plan
-from hw.session import Session, Watch, median_times
-from hw.setup import Setup
-from hw.stage import ProbeStage
+from hw.runtime.clock import Clock
+from hw.runtime.errors import DeviceError, LostError, StaleError
+from hw.runtime.keys import Pause
+from hw.setup.description import Setup
 from hw.view.feed import Audience, watched
 from jaxcal import CalibrationError
 from jaxcal.cli.common import ExitCode

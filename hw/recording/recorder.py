@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from hw.pipes import encode
-from hw.recording_check import check_resumable
-from hw.recording_file import utc_now
-from hw.recording_layout import TEXT_BYTES, RecordingHeader
+from hw.recording.check import check_resumable
+from hw.recording.file import utc_now
+from hw.recording.layout import TEXT_BYTES, RecordingHeader
 from hw.robot.pose import ur_to_pose
+from hw.runtime.pipes import encode
 from jaxcal import CalibrationError, FormatError, OutputError
 from jaxcal.runtime.isolated import python_command
 
@@ -48,7 +48,7 @@ class Recorder:
 
     Args:
         path: the file to make, or with ``header`` None the incomplete one to go on with.
-        header: of a new file (see :class:`hw.recording_layout.RecordingHeader`).
+        header: of a new file (see :class:`hw.recording.layout.RecordingHeader`).
         time_offset_s: added to host times, so that they go on where a resumed recording ended.
         queue_bytes: most bytes that may wait; continuous data beyond are dropped and counted.
         patience_s: how long a selected image or the end may take, in wall-clock seconds, before
@@ -87,7 +87,7 @@ class Recorder:
         self._marks = 0
         # In a session of its own: Ctrl-C, or a signal to the whole group, must not stop the writer.
         self._process = subprocess.Popen(
-            python_command("hw.recorder_process", self.path),
+            python_command("hw.recording.writer_process", self.path),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,

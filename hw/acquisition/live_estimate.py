@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from hw.live import LiveCalibration
+from hw.acquisition.live_calibration import LiveCalibration
 from hw.midplane.bracket import Placement
-from hw.recording_check import Progress
-from hw.setup import Setup
+from hw.recording.check import Progress
+from hw.setup.description import Setup
 from jaxcal import InputError
 from jaxcal.data.recording import Kind
 from jaxcal.result.calibration import Calibration

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from hw.clock import REAL, Clock
-from hw.errors import RefusedError, refused
-from hw.hosts import check_host
 from hw.midplane.search import Settings
-from hw.poses import Extent
+from hw.planning.poses import Extent
+from hw.planning.scene import Scene
 from hw.robot.kinematics import model_named
 from hw.robot.limits import FURTHEST_TIP_MM, Limits, hull_of, numbers
-from hw.scene import Scene
+from hw.runtime.clock import REAL, Clock
+from hw.runtime.errors import RefusedError, refused
+from hw.runtime.hosts import check_host
 from hw.ultrasound.receiver import PORT
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses

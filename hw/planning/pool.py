@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from hw.poses import Extent, PosePlan, constraints_of, in_order, plan_poses
+from hw.planning.poses import Extent, PosePlan, constraints_of, in_order, plan_poses
+from hw.planning.scene import Scene
 from hw.robot.kinematics import dexterity_mm, flange_of, inverse, model_named
 from hw.robot.limits import Limits
-from hw.scene import Scene
 from jaxcal.data.poses import check_poses
 from jaxcal.design import Model, Noise, Rules, make_candidates, plan
 from jaxcal.design.constraints import Allowed

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hw.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
-from hw.pool import allowed_by, plan_pool
-from hw.poses import PosePlan, plan_poses
-from hw.recording_check import settings_of
-from hw.setup import Setup
+from hw.planning.pool import allowed_by, plan_pool
+from hw.planning.poses import PosePlan, plan_poses
+from hw.recording.check import settings_of
+from hw.runtime.choices import OPERATORS, PHANTOMS, PLACEMENTS, PLACEMENTS_OF, PLANS
+from hw.setup.description import Setup
 from jaxcal import InputError
 from jaxcal.io.readable import naming
 from jaxcal.runtime.given_values import LARGEST_SEED, whole_number

@@ -11,13 +11,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hw.errors import RefusedError, StaleError
 from hw.midplane.image_scan import ImageBench, pixel_of, place_of
 from hw.midplane.search import Echoes, PlacementError
-from hw.rigid import turn_deg
+from hw.recording.session import Session
 from hw.robot.motion import Motion
 from hw.robot.stream import PoseSample
-from hw.session import Session
+from hw.runtime.errors import RefusedError, StaleError
+from hw.runtime.rigid import turn_deg
 from hw.ultrasound.receiver import Image
 from jaxcal.data.segmentation.image import localise
 from jaxcal.runtime.array_types import Float

@@ -9,17 +9,17 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from hw.errors import refused
-from hw.recorder import Recorder
-from hw.recording_check import Progress, is_complete, read_progress
-from hw.recording_file import RecordingWriter
-from hw.recording_layout import RecordingHeader
-from hw.request import AcquisitionRequest, planned, request_in
-from hw.resuming import check_same_robot, compare, described, described_probe
+from hw.acquisition.request import AcquisitionRequest, planned, request_in
+from hw.recording.check import Progress, is_complete, read_progress
+from hw.recording.file import RecordingWriter
+from hw.recording.layout import RecordingHeader
+from hw.recording.recorder import Recorder
+from hw.recording.resuming import check_same_robot, compare, described, described_probe
+from hw.recording.session import Session
 from hw.robot.identity import LOCAL
 from hw.robot.motion_plan import MotionPlan
-from hw.session import Session
-from hw.setup import Setup, controller_arm
+from hw.runtime.errors import refused
+from hw.setup.description import Setup, controller_arm
 from jaxcal.io.readable import naming
 
 
@@ -32,7 +32,8 @@ class Job:
         request: as it was asked for, now or when the recording was begun.
         targets: (n, 4, 4) poses, mm: the plan in the order of travel, or the pool to choose from.
         progress: of the recording that is resumed; None for a new one.
-        changes: lines that a person has to confirm with the plan (:func:`hw.resuming.compare`).
+        changes: lines that a person has to confirm with the plan
+            (:func:`hw.recording.resuming.compare`).
     """
 
     setup: Setup

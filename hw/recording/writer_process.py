@@ -1,7 +1,8 @@
 """The process that writes a recording: messages on standard input, answers on standard output.
 
-Started by :class:`hw.recorder.Recorder` only. It flushes new data to the file within about a
-second. When its standard input ends, the acquisition is gone, and it closes the file in order.
+Started by :class:`hw.recording.recorder.Recorder` only. It flushes new data to the file within
+about a second. When its standard input ends, the acquisition is gone, and it closes the file in
+order.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from contextlib import suppress
 from io import RawIOBase
 from typing import Any
 
-from hw.pipes import read_message
-from hw.recording_file import RecordingWriter
-from hw.recording_layout import RecordingHeader
+from hw.recording.file import RecordingWriter
+from hw.recording.layout import RecordingHeader
+from hw.runtime.pipes import read_message
 from jaxcal import CalibrationError
 from jaxcal.io.readable import one_line
 

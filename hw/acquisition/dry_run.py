@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from hw.poses import preview
-from hw.recording_file import check_new
-from hw.request import AcquisitionRequest, planned
+from hw.acquisition.request import AcquisitionRequest, planned
+from hw.planning.poses import preview
+from hw.recording.file import check_new
 from hw.robot.limits import Limits
 from hw.robot.motion_plan import MotionPlan, plan_lines
 from hw.robot.path_checks import check_plan
-from hw.setup import Setup
+from hw.setup.description import Setup
 from jaxcal import InputError
 
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hw.pool import BENCH_RULES, BENCH_SDS_MM
-from hw.poses import constraints_of
-from hw.rigid import turn_deg
-from hw.setup import Setup
+from hw.planning.pool import BENCH_RULES, BENCH_SDS_MM
+from hw.planning.poses import constraints_of
+from hw.runtime.rigid import turn_deg
+from hw.setup.description import Setup
 from jaxcal import InputError
 from jaxcal.design import Candidates, Model, Noise, images_to, next_poses
 from jaxcal.design.information import Known

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.active_echo.device import ActiveEcho
-from hw.errors import DeviceError
-from hw.extras import missing
 from hw.robot.identity import LOCAL
 from hw.robot.rtde import state_text
 from hw.robot.stream import PoseStream
-from hw.setup import Setup
+from hw.runtime.errors import DeviceError
+from hw.runtime.extras import missing
+from hw.setup.description import Setup
 from hw.ultrasound.receiver import UltrasoundStream
 
 

@@ -20,10 +20,10 @@ from itertools import pairwise
 import numpy as np
 
 from hw.active_echo.device import ActiveEcho, EchoFrame, median_of
-from hw.errors import DeviceError, StaleError
-from hw.recorder import Recorder
+from hw.recording.recorder import Recorder
 from hw.robot.stream import PoseSample, PoseStream
-from hw.setup import Setup
+from hw.runtime.errors import DeviceError, StaleError
+from hw.setup.description import Setup
 from hw.ultrasound.receiver import Image, UltrasoundStream
 from jaxcal import CalibrationError
 from jaxcal.data.timing import fit_clock

@@ -5,9 +5,9 @@ target is spread over the image. All five numbers of a pose come from one Sobol 
 modulo 1 by the seed (:mod:`jaxcal.design.candidates`). A pose whose tip leaves the box, or whose
 tool centre point is out of the arm's reach, is passed over for the next one of the sequence.
 
-A plan may also be a pool to choose from while the experiment runs (:mod:`hw.pool`). The whole pool
-is checked and confirmed before anything moves; which of its poses are visited, and in which order,
-follows from the images (:mod:`hw.planner`).
+A plan may also be a pool to choose from while the experiment runs (:mod:`hw.planning.pool`). The
+whole pool is checked and confirmed before anything moves; which of its poses are visited, and in
+which order, follows from the images (:mod:`hw.acquisition.planner`).
 
 The planner knows a drawing of the probe's mount and roughly where the target is, not the truth. So
 the target will be off the mid-plane by some millimetres; the search of :mod:`hw.midplane` corrects
@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hw.rigid import looking_rotation
-from hw.scene import Scene
+from hw.planning.scene import Scene
+from hw.runtime.rigid import looking_rotation
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.io.atomic import save_figure

@@ -9,7 +9,7 @@ import sys
 from types import ModuleType
 from typing import Literal
 
-from hw.errors import Device, DeviceError
+from hw.runtime.errors import Device, DeviceError
 
 Extra = Literal["robot", "serial", "view"]
 _DEVICE: dict[str, Device] = {"robot": "robot", "serial": "active echo"}

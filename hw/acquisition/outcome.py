@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 if TYPE_CHECKING:
-    from hw.acquire import Outcome
+    from hw.acquisition.acquire import Outcome
 
 
 def calibrate_and_print(path: str, *lines: str) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hw.bench.run import Bench, BenchOptions, start_bench
-from hw.setup import Setup
+from hw.setup.description import Setup
 
 SPEED = 5.0
 """Bench seconds per second on the wall, unless asked otherwise."""
@@ -67,7 +67,7 @@ def setup_of(bench: Bench) -> Setup:
 
 
 class BenchOracle:
-    """The truth of an emulated bench (see :class:`hw.acquire.Oracle`)."""
+    """The truth of an emulated bench (see :class:`hw.acquisition.acquire.Oracle`)."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench = bench

@@ -1,0 +1,1 @@
+"""The experiment: what to acquire, pose by pose, and what is known so far."""

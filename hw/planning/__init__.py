@@ -1,0 +1,1 @@
+"""Poses to take images from, before and while an experiment runs."""
