@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from jaxcal import InputError
 from jaxcal.cli.main import main
 from jaxcal.io.text import read_poses
 
@@ -50,8 +51,8 @@ def test_rotation_about_one_axis_leaves_the_tip_open_along_it():
         assert np.isnan(result.covariance).all()
         assert abs(float(np.asarray(result.weakest) @ axis)) > 0.999
         assert "do not determine the tip along" in result.warnings[0]
-    still = jaxcal.calibrate_pivot(swung(Rotation.identity(300)))
-    assert still.status == "unobservable"
+    with pytest.raises(InputError, match="300 used poses, 1 of them different, are too few"):
+        jaxcal.calibrate_pivot(swung(Rotation.identity(300)))
 
 
 def test_a_third_of_the_poses_may_be_anything():
@@ -66,13 +67,30 @@ def test_a_third_of_the_poses_may_be_anything():
     assert np.linalg.norm(plain.tip - TIP) > 20 * np.linalg.norm(robust.tip - TIP)
 
 
-def test_errors_that_no_tip_in_a_dimple_has_are_told():
+def test_errors_that_no_tip_in_a_dimple_has_are_told(tmp_path, capsys):
     poses = swung(random_rotations(60))
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
     poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()  # the scalar read as x
-    told = jaxcal.calibrate_pivot(poses).warnings
-    assert "too large for a tip that stays in place" in told[0]
-    assert jaxcal.calibrate_pivot(swung(random_rotations(60), noise=0.5)).warnings == []
+    found = jaxcal.calibrate_pivot(poses)
+    assert found.wrong_frames is not None
+    assert "too large for a tip that stays in place" in found.wrong_frames
+    assert found.warnings[0] == found.wrong_frames
+    path = tmp_path / "poses.txt"
+    np.savetxt(path, poses.reshape(60, 16))
+    assert main(["pivot", str(path), "--json"]) == 3
+    assert json.loads(capsys.readouterr().out)["wrong_frames"] == found.wrong_frames
+    right = jaxcal.calibrate_pivot(swung(random_rotations(60), noise=0.5))
+    assert right.warnings == []
+    assert right.wrong_frames is None
+
+
+def test_poses_that_a_tracker_repeats_count_once():
+    poses = swung(random_rotations(60), noise=0.5)
+    once, twice = jaxcal.calibrate_pivot(poses), jaxcal.calibrate_pivot(np.repeat(poses, 2, axis=0))
+    assert int(twice.mask.sum()) == 60
+    np.testing.assert_allclose(twice.covariance, once.covariance, rtol=1e-9)
+    with pytest.raises(InputError, match="20 used poses, 2 of them different, are too few"):
+        jaxcal.calibrate_pivot(np.repeat(poses[:2], 10, axis=0))
 
 
 def test_a_tool_that_is_hardly_turned_is_told():

@@ -213,7 +213,7 @@ def _acquire(
     from hw.setup.emulated import BenchOracle
 
     pause, screen = Pause(), Screen(sys.stderr)
-    confirming = confirming_by(setup, emulated is not None, unattended)
+    confirming = confirming_by(setup.clock, emulated is not None, unattended)
 
     def say(line: str) -> None:
         screen.say(line)

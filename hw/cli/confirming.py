@@ -10,21 +10,22 @@ if TYPE_CHECKING:
     from hw.acquisition.acquire import Confirm
     from hw.robot.confirmation import Confirmation
     from hw.robot.motion_plan import MotionPlan
-    from hw.setup.description import Setup
+    from hw.runtime.clock import Clock
 
 
-def confirming_by(setup: Setup, emulated: bool, unattended: str | None) -> Confirm:
+def confirming_by(clock: Clock, emulated: bool, unattended: str | None) -> Confirm:
     """Who confirms a plan: a person, or ``--unattended``; nobody on the emulated bench."""
 
     def ask(plan: MotionPlan) -> Confirmation:
         from hw.robot.confirmation import Challenge, confirm, confirm_unattended
 
         if emulated:
-            return confirm_unattended(plan, plan.digest, clock=setup.clock)
+            # The digest counts here, too: who tries it out should see that a wrong one is refused.
+            return confirm_unattended(plan, unattended or plan.digest, clock=clock)
         for line in plan_page(plan):
             click.echo(line, err=True)
         if unattended is not None:
-            return confirm_unattended(plan, unattended, clock=setup.clock)
+            return confirm_unattended(plan, unattended, clock=clock)
         challenge = Challenge(plan)
         click.echo(
             "Clear the tank, keep the emergency stop in reach, then type "
@@ -35,7 +36,7 @@ def confirming_by(setup: Setup, emulated: bool, unattended: str | None) -> Confi
             code = click.prompt("code", err=True)
         except click.Abort:
             raise KeyboardInterrupt from None
-        return confirm(challenge, code, clock=setup.clock)
+        return confirm(challenge, code, clock=clock)
 
     return ask
 

@@ -112,6 +112,17 @@ class Pivot(eqx.Module):
         return found.weakest.reshape(*sigma.shape, 6), found.weakest_sd.reshape(sigma.shape)
 
     @property
+    def wrong_frames(self) -> str | None:
+        """That no tip stays in place under these poses, in words, or None (concrete)."""
+        if self.status == "failed" or not float(self.rms) > _LARGEST_RMS_MM:
+            return None
+        return (
+            f"errors of {float(self.rms):.1f} mm are too large for a tip that stays in place: "
+            "either it slipped in most poses, or the poses are wrong (order or signs of their "
+            "numbers, units, direction)"
+        )
+
+    @property
     def warnings(self) -> list[str]:
         """What a person should know before using this answer (one calibration, concrete).
 
@@ -129,12 +140,8 @@ class Pivot(eqx.Module):
                 f"not observable: these poses do not determine the tip along ({direction}) of the "
                 "tool's frame; tilt the tool about a further axis"
             )
-        if float(self.rms) > _LARGEST_RMS_MM:
-            found.append(
-                f"errors of {float(self.rms):.1f} mm are too large for a tip that stays in place: "
-                "either it slipped in most poses, or the poses are wrong (order or signs of their "
-                "numbers, units, direction)"
-            )
+        if self.wrong_frames is not None:
+            found.append(self.wrong_frames)
         covariance = np.asarray(self.covariance)[:3, :3]
         if np.isfinite(covariance).all():
             variances, directions = np.linalg.eigh(covariance)
@@ -164,7 +171,8 @@ def calibrate_pivot(
     Args:
         poses: tool -> tracker, mm, (n, 4, 4) or (n, 3, 4); concrete ones are checked and their
             rotations projected to SO(3). Leading axes make a batch, which is solved as it is.
-        mask: 1 (or True) for poses to use; all by default.
+        mask: 1 (or True) for poses to use; all by default. Of concrete poses, not of a batch, those
+            that repeat an earlier one exactly are not used.
         robust: find the poses that agree with each other, even if nearly half of all poses are
             wrong, and leave the others out.
 
@@ -186,9 +194,12 @@ def calibrate_pivot(
     if not is_traced(poses) and np.ndim(poses) == 3:
         used = np.ones(len(poses), bool) if mask is None else np.asarray(mask) > 0
         poses = check_poses(real_array(poses, "poses"), used)
-        if used.sum() < MINIMUM_IMAGES:
+        mask = used & _first_of_each(poses, used)
+        if mask.sum() < MINIMUM_IMAGES:
+            count, different = int(used.sum()), int(mask.sum())
+            among = "" if different == count else f", {different} of them different,"
             raise InputError(
-                f"{int(used.sum())} used poses are too few: at least {MINIMUM_IMAGES} are needed"
+                f"{count} used poses{among} are too few: at least {MINIMUM_IMAGES} are needed"
             )
         reach = float(np.linalg.norm(poses[used, :3, 3], axis=1).max())
         if 0 < reach < LEAST_REACH_MM:
@@ -208,6 +219,15 @@ def calibrate_pivot(
         found = _solve_kept(np.asarray(array), np.asarray(weight), robust)
         return jax.device_put(found, next(iter(array.devices())) if array.committed else None)
     return compiler.compiled(_solve_all, 2, platform)(array, weight, robust)
+
+
+def _first_of_each(
+    poses: Float[np.ndarray, "n rows 4"], used: Bool[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Used poses that are no exact copy of an earlier one, as of a tracker read too often."""
+    rows = np.flatnonzero(used)
+    _, first = np.unique(poses[rows].reshape(len(rows), -1), axis=0, return_index=True)
+    return np.isin(np.arange(len(poses)), rows[first])
 
 
 def _solve_kept(

@@ -67,6 +67,8 @@ def _record(result: Pivot) -> dict[str, Any]:
             "robust": result.robust,
             "outliers": outliers(result),
             "outlier_reasons": outlier_reasons(result, AXES),
+            "repeated": int(((mask <= 0) & (np.asarray(result.outlier) <= 0)).sum()),
+            "wrong_frames": result.wrong_frames,
             "warnings": result.warnings,
         }
     )

@@ -302,7 +302,7 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     if record.get("format", FORMAT) != FORMAT:
         raise FormatError(f"is not a calibration: its format is {quoted(str(record['format']))}")
     version = record.get("version", 0)
-    if not isinstance(version, int) or version > VERSION:
+    if type(version) is not int or not 0 <= version <= VERSION:
         raise FormatError(
             f"is version {quoted(str(version))} of the calibration format; this jaxcal understands "
             f"version {VERSION}: update jaxcal"
@@ -312,12 +312,14 @@ def transform_from_record(record: dict[str, Any], *, source: str = "memory") -> 
     matrix = _array(record, key, (4, 4))
     if matrix is None:
         raise FormatError(f"is not a calibration: {key} is missing, or the solve had failed")
+    usable = record.get("converged")
+    if not (usable is None or isinstance(usable, bool)):
+        raise FormatError("converged must be true, false or null")
     scale = _array(record, "scale_mm_per_px", (2,))
     offset = _array(record, "face_offset_mm", ())
     factor = _array(record, "range_factor", ())
     error = _array(record, "rms_mm", ())
-    usable = record.get("converged")
-    usable = usable and not record.get("wrong_frames") if isinstance(usable, bool) else None
+    usable = usable and not record.get("wrong_frames")
     unknowns = _unknowns(record)
     size = len(tangent_names(unknowns))
     return ImageTransform(
@@ -354,7 +356,11 @@ def _array(record: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarr
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise FormatError(f"{key} must be numbers of shape {shape}") from None
-    # If the solve had failed, there may be NaN instead of null.
     if array.shape != shape:
         raise FormatError(f"{key} must have shape {shape}, it has {array.shape}")
-    return array if np.isfinite(array).all() else None
+    if np.isfinite(array).all():
+        return array
+    # If the solve had failed, there may be NaN instead of null.
+    if record.get("converged") is not False:
+        raise FormatError(f"{key} holds NaN or Inf")
+    return None

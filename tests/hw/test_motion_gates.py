@@ -28,6 +28,7 @@ from motions import (
 from robots import CB_SERIES, START, EmulatedRobot
 
 import hw
+from hw.cli.confirming import confirming_by
 from hw.robot.confirmation import confirm_unattended
 from hw.robot.identity import read_identity
 from hw.robot.motion import Motion
@@ -142,6 +143,13 @@ def test_a_dry_run_sends_nothing():
     assert not state["running"]
     assert state["raw"] == pytest.approx(START)
     assert [entry[1] for entry in log] == ["dry run: moveL"] * 3 + ["refused"]
+
+
+@pytest.mark.parametrize("emulated", [True, False])
+def test_a_plan_that_was_not_named_is_not_confirmed_on_the_emulated_bench_either(emulated):
+    with pytest.raises(RefusedError, match="another plan was named"):
+        confirming_by(REAL, emulated, "0" * 16)(PLAN)
+    assert confirming_by(REAL, emulated, PLAN.digest[:16])(PLAN).digest == PLAN.digest
 
 
 def test_motion_needs_its_own_unused_confirmation():
