@@ -42,7 +42,9 @@ from jaxcal import Problem, Protocol, calibrate_batch
 SEED = 20261125
 NODES, REACH = 17, 6.0
 """Number of nodes, and where the outermost are, in SDs along the weak direction."""
-ROUNDS = 60
+LONGEST_MM = 3.0
+"""Longest step of a round."""
+ROUNDS = 100
 """Rounds of Gauss-Newton and Helmert's update at a node."""
 STARTING_SDS_MM = (0.5, 0.5, 2.0)
 LEVER_MM = 50.0
@@ -145,6 +147,7 @@ def integrate(
             information = others.T @ jnp.tensordot(weight, matrix, 1) @ others
             inverse = jnp.linalg.inv(information)
             change = -others @ (inverse @ (others.T @ (weight @ gradient)))
+            change = change * jnp.minimum(1.0, LONGEST_MM / jnp.linalg.norm(change))
             within = others @ inverse @ others.T
             freedom = measured.shape[0] - weight * jnp.einsum("kij,ij->k", matrix, within)
             left = (
@@ -197,8 +200,10 @@ def paths_row(kind: str, count: int, others: int) -> dict[str, object]:
     fine = continuity.fine_places(first, second)
     default, sound = continuity.steps(continuity.on_the_way(first, second, fine), count)
     largest = np.where(sound, default.max(axis=1), 0.0)
-    stepping = np.flatnonzero(largest > continuity.LARGEST_STEP)
-    chosen = np.concatenate([stepping, np.flatnonzero(sound & (largest > 0))[:others]])
+    stepping = largest > continuity.LARGEST_STEP
+    quiet = np.flatnonzero(sound & ~stepping)[:others]
+    stepping = np.flatnonzero(stepping)
+    chosen = np.concatenate([stepping, quiet])
     first, second = (jax.tree.map(lambda leaf: leaf[chosen], end) for end in (first, second))
     found = integrals(continuity.on_the_way(first, second, fine[chosen]))
     sd = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))[:, :6]
@@ -209,7 +214,7 @@ def paths_row(kind: str, count: int, others: int) -> dict[str, object]:
     for name, steps in (
         ("default", largest[stepping]),
         ("integral", integral[: len(stepping)]),
-        ("other_default", largest[chosen[len(stepping) :]]),
+        ("other_default", largest[quiet]),
         ("other_integral", integral[len(stepping) :]),
     ):
         row |= {

@@ -64,7 +64,7 @@ class Alternation(eqx.Module):
     trace: Float[Array, "trace lanes"] | None
 
 
-class _State(eqx.Module):
+class _Rounds(eqx.Module):
     place: Iterate
     rounds: Int[Array, " lanes"]
     rotation_change: Float[Array, " lanes"]
@@ -105,13 +105,13 @@ def alternate(
         matrix, gradient = barrier((normal.stacked() * (1 + 16 * eps * eye), normal.gradient))
         return barrier(place.moved(barrier(dense.solve_lanes_last(matrix, -gradient)))), held
 
-    def one_round(state: _State) -> _State:
+    def one_round(state: _Rounds) -> _Rounds:
         held = HeldOffsets.of(barrier(local_unknowns(state.place, observation, images)), images)
         after, _ = jax.lax.fori_loop(0, inner_steps, gauss_newton, (state.place, held))
         kept = state.trace
         if kept is not None:
             kept = recorded(kept, state.rounds, accumulate(after, held, images, None).cost)
-        moved = _State(
+        moved = _Rounds(
             after,
             state.rounds + 1,
             chord_angle(state.place.rotation - after.rotation),
@@ -120,12 +120,12 @@ def alternate(
         )
         return choose(active(state), moved, state)
 
-    def active(state: _State) -> Bool[Array, " lanes"]:
+    def active(state: _Rounds) -> Bool[Array, " lanes"]:
         moving = state.rotation_change >= tolerance_rad
         moving = moving | (state.translation_change >= tolerance_mm)
         return moving & (state.rounds < max_rounds)
 
-    state = _State(
+    state = _Rounds(
         start,
         jnp.zeros(none.shape, jnp.int32),
         none + jnp.inf,

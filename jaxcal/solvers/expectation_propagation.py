@@ -278,7 +278,7 @@ def propagate(
         # The first turn starts afresh, so it does not use this state.
         gaussian, start = traced_once(under.gaussian, sd[0])
 
-        def one(state: _State, turn: tuple) -> tuple[_State, _Found]:
+        def one(state: _Propagation, turn: tuple) -> tuple[_Propagation, _Found]:
             family, sd, fresh = turn
             state = jax.lax.cond(fresh, lambda: gaussian(sd), lambda: state)
             return under.swept(family, sd, state, sweeps)
@@ -307,7 +307,7 @@ class _Belief(eqx.Module):
         return site + 0.5 * gained - 0.5 * self.log_determinant
 
 
-class _State(eqx.Module):
+class _Propagation(eqx.Module):
     """The sites (tau, nu) of every image, and the belief that they make."""
 
     tau: Float[Array, "lanes n"]
@@ -347,13 +347,13 @@ class _Laws(eqx.Module):
     squares: Float[Array, "6 6 lanes"]
     pull: Float[Array, "6 lanes"]
 
-    def gaussian(self, sd: Float[Array, " lanes"]) -> _State:
+    def gaussian(self, sd: Float[Array, " lanes"]) -> _Propagation:
         """The sites of the Gaussian law."""
         tau = self.sites.used / (sd * sd)[:, None]
         belief = _solved(
             self.known.information + self.squares / sd**2, self.known.gradient - self.pull / sd**2
         )
-        return _State(tau, jnp.zeros_like(tau), belief)
+        return _Propagation(tau, jnp.zeros_like(tau), belief)
 
     def under_gaussian(self, sd: Float[Array, " lanes"]) -> _Found:
         """The result under the Gaussian law itself."""
@@ -363,8 +363,8 @@ class _Laws(eqx.Module):
         return _Found(belief.mean, belief.covariance, belief.evidence(site), jnp.zeros_like(sd))
 
     def swept(
-        self, family: Array, sd: Float[Array, " lanes"], state: _State, sweeps: int
-    ) -> tuple[_State, _Found]:
+        self, family: Array, sd: Float[Array, " lanes"], state: _Propagation, sweeps: int
+    ) -> tuple[_Propagation, _Found]:
         """Take ``sweeps`` sweeps under a law; the evidence is that before the last one."""
 
         def sweep(_: Array, carry: tuple) -> tuple:
@@ -382,8 +382,8 @@ class _Laws(eqx.Module):
         return state, _Found(state.belief.mean, state.belief.covariance, evidence, change)
 
     def sweep(
-        self, family: Array, sd: Float[Array, " lanes"], state: _State
-    ) -> tuple[_State, Array, Array]:
+        self, family: Array, sd: Float[Array, " lanes"], state: _Propagation
+    ) -> tuple[_Propagation, Array, Array]:
         """Update all sites once; the log evidence before, and where a site dominates the others."""
         h, offset, used = self.sites.direction, self.sites.offset, self.sites.used
         tau, nu, belief = state.tau, state.nu, state.belief
@@ -420,7 +420,7 @@ class _Laws(eqx.Module):
             self.known.information + stacked(unrolled.as_array(sums[:size])),
             self.known.gradient + unrolled.as_array(sums[size:]),
         )
-        return _State(tau, nu, after), evidence, crowded > 0
+        return _Propagation(tau, nu, after), evidence, crowded > 0
 
 
 def refreshed(found: Moments, centre: Array, without: Array) -> tuple[Array, Array]:

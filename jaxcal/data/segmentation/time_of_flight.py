@@ -125,7 +125,7 @@ def fit_in_plane(
     """
     d, m, ex, ez = _cleaned(distances, element_positions)
     lines, x, z = _closed_form(d, m, ex, ez)
-    start = _State(x, z, jnp.zeros_like(x), jnp.zeros_like(x))
+    start = _Values(x, z, jnp.zeros_like(x), jnp.zeros_like(x))
     return _iterate(start, d, m, ex, ez, lines, robust=robust, steps=steps, out_of_plane=False)
 
 
@@ -151,15 +151,15 @@ def fit_out_of_plane(
     """
     d, m, ex, ez = _cleaned(distances, element_positions)
     lines, x, z = _closed_form(d, m, ex, ez)
-    start = _State(x, z, jnp.zeros_like(x), jnp.zeros_like(x))
+    start = _Values(x, z, jnp.zeros_like(x), jnp.zeros_like(x))
     plane = _iterate(start, d, m, ex, ez, lines, robust=robust, steps=steps, out_of_plane=False)
     x, z = plane.position[..., 0], plane.position[..., 1]
-    start = _State(x, z, jnp.zeros_like(x), plane.noise)
+    start = _Values(x, z, jnp.zeros_like(x), plane.noise)
     full = _iterate(start, d, m, ex, ez, lines, robust=robust, steps=steps, out_of_plane=True)
     return plane, full
 
 
-class _State(eqx.Module):
+class _Values(eqx.Module):
     """The current values of a fit: x, z, y^2, and the scale of the residuals (mm)."""
 
     x: Float[Array, "*batch"]
@@ -207,7 +207,7 @@ def _closed_form(d: Array, m: Array, ex: Array, ez: Array) -> tuple[Array, Array
 
 
 def _iterate(
-    state: _State,
+    state: _Values,
     d: Array,
     m: Array,
     ex: Array,
@@ -221,7 +221,7 @@ def _iterate(
     """Gauss-Newton from a start; the last pass also gives the covariance."""
     unknowns = 3 if out_of_plane else 2
 
-    def derivatives(at: _State) -> tuple[tuple[Array, ...], Array]:
+    def derivatives(at: _Values) -> tuple[tuple[Array, ...], Array]:
         across, deep = at.x[..., None] - ex, at.z[..., None] - ez
         square = across * across + deep * deep
         if out_of_plane:
@@ -230,14 +230,14 @@ def _iterate(
         columns = (across * inverse, deep * inverse)
         return (*columns, 0.5 * inverse) if out_of_plane else columns, d - square * inverse
 
-    def moved(at: _State, step: tuple[Array, ...], scale: Array) -> _State:
+    def moved(at: _Values, step: tuple[Array, ...], scale: Array) -> _Values:
         # A step of more than the depth itself can only come from a start far off.
         reach = jnp.maximum(jnp.abs(at.z), 1.0)
         x = at.x + jnp.clip(step[0], -reach, reach)
         z = at.z + jnp.clip(step[1], -0.5 * reach, reach)
-        return _State(x, z, at.square + step[2] if out_of_plane else at.square, scale)
+        return _Values(x, z, at.square + step[2] if out_of_plane else at.square, scale)
 
-    def equal(at: _State) -> tuple[_State, list[Array], Array]:
+    def equal(at: _Values) -> tuple[_Values, list[Array], Array]:
         columns, residual = derivatives(at)
         weighted = [m * column for column in columns]
         *products, rss = _sums(*_products(weighted, columns, residual), m * residual * residual)
@@ -248,7 +248,7 @@ def _iterate(
         noise = jnp.sqrt(rss / (lines - unknowns))
         return moved(at, step, noise), inverse, noise
 
-    def weighed(at: _State, stage: _Stage) -> tuple[_State, list[Array], Array]:
+    def weighed(at: _Values, stage: _Stage) -> tuple[_Values, list[Array], Array]:
         columns, residual = derivatives(at)
         scale = jnp.maximum(at.scale, _FINEST_MM)
         square = (residual / scale[..., None]) ** 2
@@ -271,7 +271,7 @@ def _iterate(
         scale = jnp.maximum(scale * jnp.sqrt(ratio), _FINEST_MM)
         return moved(at, step, scale), inverse, lost
 
-    def repeat(count: int, step: Callable, at: _State) -> _State:
+    def repeat(count: int, step: Callable, at: _Values) -> _Values:
         return jax.lax.fori_loop(0, count, lambda _, state: step(state)[0], at)
 
     if robust:
