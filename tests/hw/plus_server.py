@@ -1,8 +1,9 @@
-"""Emulated PlusServers in a process of their own: a hand that holds a probe over a point.
+"""An emulated PlusServer in a process of its own: a hand that holds a probe over a point.
 
-Every line of standard input, like {"mode": "tracked", "poses": 8}, starts a server, whose port is
-printed; it streams to whoever connects. All of them end with standard input. The stamps of the
-stream run faster than the clock on the wall, so that a test does not take minutes.
+    python plus_server.py '{"mode": "tracked", "poses": 8}'
+
+prints its port as one JSON line, streams to whoever connects, and ends with its standard input. The
+stamps of the stream run faster than the clock on the wall, so that a test does not take minutes.
 """
 
 from __future__ import annotations
@@ -146,17 +147,16 @@ def messages(asked: dict):
         yield b"".join(parts)
 
 
-def main() -> None:
-    """Start servers until standard input ends."""
-    for line in sys.stdin:
-        listener = socket.create_server(("127.0.0.1", 0))
-        print(listener.getsockname()[1], flush=True)
-        serving = threading.Thread(target=serve, args=(listener, json.loads(line)), daemon=True)
-        serving.start()
+def main(asked: dict) -> None:
+    """Serve one client after the other until standard input ends."""
+    listener = socket.create_server(("127.0.0.1", asked.get("port", 0)))
+    print(json.dumps({"port": listener.getsockname()[1]}), flush=True)
+    threading.Thread(target=serve, args=(listener, asked), daemon=True).start()
+    while sys.stdin.buffer.read(64):
+        pass
 
 
 def serve(listener: socket.socket, asked: dict) -> None:
-    """Serve one client after the other."""
     while True:
         client, _ = listener.accept()
         try:
@@ -171,4 +171,4 @@ def serve(listener: socket.socket, asked: dict) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(json.loads(sys.argv[1]))

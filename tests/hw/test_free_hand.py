@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import h5py
@@ -34,33 +35,42 @@ PlusServer = Callable[..., int]
 """Starts a server of what is asked for; its port."""
 
 
-@pytest.fixture(scope="module")
-def plus_server() -> Iterator[PlusServer]:
-    with subprocess.Popen(
-        [sys.executable, str(SERVER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
+@contextmanager
+def starting() -> Iterator[PlusServer]:
+    """Each server has a process of its own: its hand holds still for a fraction of a second."""
+    with ExitStack() as processes:
 
         def start(**asked) -> int:
-            assert process.stdin is not None
+            process = subprocess.Popen(
+                [sys.executable, str(SERVER), json.dumps(asked)],
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            )  # fmt: skip
+            processes.enter_context(process)
+            processes.callback(process.kill)
             assert process.stdout is not None
-            process.stdin.write(json.dumps(asked) + "\n")
-            process.stdin.flush()
-            return int(process.stdout.readline())
+            return json.loads(process.stdout.readline())["port"]
 
         yield start
-        process.kill()
+
+
+@pytest.fixture
+def plus_server() -> Iterator[PlusServer]:
+    with starting() as start:
+        yield start
 
 
 @pytest.fixture(scope="module")
-def separate(plus_server: PlusServer) -> int:
+def separate() -> Iterator[int]:
     """Port of a server of separate messages, which begins anew for every client."""
-    return plus_server(mode="separate")
+    with starting() as start:
+        yield start(mode="separate")
 
 
 @pytest.fixture(scope="module")
-def tracked(plus_server: PlusServer) -> int:
+def tracked() -> Iterator[int]:
     """The same of tracked frames."""
-    return plus_server(mode="tracked")
+    with starting() as start:
+        yield start(mode="tracked")
 
 
 class Scripted:
