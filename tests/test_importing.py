@@ -376,7 +376,11 @@ def test_points_of_a_sequence(tmp_path, sequence, name, text, points):
         ("p.csv", "frame,u,v\n9,1,1\n", "frame 9 is not in the sequence"),
         ("p.csv", "frame,u,v\n1,1,1\n1,2,2\n", "frame 1 has more than one point"),
         ("p.csv", "frame,u,v\n1.5,1,1\n", "p.csv:2: column 1 is not the number of an image"),
-        ("p.csv", "time,u,v\n11.5,1,1\n", "line 2: no frame was taken at 11.5 s"),
+        (
+            "p.csv",
+            "time,u,v\n11.5,1,1\n",
+            "taken at 11.500 s (the sequence lasts from 10.000 s to 10.500 s)",
+        ),
         ("p.csv", "u,v\n1,1\n", "has neither a column frame nor a column time"),
         ("p.csv", "frame,x,y,z,qx,qy,qz,qw\n1,1,1,1,0,0,0,1\n", "holds no points"),
         ("p.csv", "frame,u,v\n0,1,1\n1,1,1\n2,3,4\n", "2 used images are too few"),

@@ -16,7 +16,7 @@ from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.slicer import pixels_from_markups, read_markups
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Float, Int
-from jaxcal.runtime.messages import quoted
+from jaxcal.runtime.messages import quoted, seconds
 
 Assignment = Literal["order", "labels"]
 """How points without a time or a frame's number are assigned to frames: one for each frame in
@@ -157,8 +157,8 @@ def _nearest_in_time(table: PoseTable, sequence: TrackedSequence) -> Int[np.ndar
     far = np.flatnonzero(np.abs(time[nearer] - asked) > slack)
     if len(far):
         raise InputError(
-            f"line {table.lines[int(far[0])]}: no frame was taken at {asked[far[0]]:.6g} s "
-            f"(the sequence lasts from {time[0]:.6g} to {time[-1]:.6g} s"
+            f"line {table.lines[int(far[0])]}: no frame was taken at {seconds(asked[int(far[0])])} "
+            f"(the sequence lasts from {seconds(time[0])} to {seconds(time[-1])}"
             + (f"; {untimed}: name frames in a column frame)" if unknown else ")")
         )
     return order[nearer]

@@ -19,6 +19,7 @@ from jaxcal.io.frame_names import FramePair
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Bool, Float, Int
+from jaxcal.runtime.messages import seconds
 
 LONGEST_GAP = 5.0
 """Longest time between two poses that is bridged, in median intervals."""
@@ -95,8 +96,8 @@ def with_poses_by_time(
     if not between.any():
         raise InputError(
             f"{images.source}: no image lies between poses of {source}: images are from "
-            f"{asked.min():.6g} to {asked.max():.6g} s, poses from {time[0]:.6g} to "
-            f"{time[-1]:.6g} s: are they of one clock?"
+            f"{seconds(asked.min())} to {seconds(asked.max())}, poses from {seconds(time[0])} to "
+            f"{seconds(time[-1])}: are they of one clock?"
         )
     found = np.full((len(images), 4, 4), np.nan)
     found[between] = interpolate_poses(time, poses, asked[between], max_gap_s=gap, valid=valid)
