@@ -61,7 +61,13 @@ def opened(
             raise InputError(f"{table.name}: needs columns of times and of poses")
         time, valid = times_of_table(table, sequence), np.ones(len(table), bool)
         found = Tracking(
-            time, table.poses, valid, PROBE_TO_TRACKER, table.name, table.length_stated
+            time,
+            table.poses,
+            valid,
+            PROBE_TO_TRACKER,
+            table.name,
+            table.length_stated,
+            table.time_stated,
         )
         return sequence, found, table.notes
     tracking = read_tracked(options.poses, options.pose_units)

@@ -63,6 +63,7 @@ class PoseTable:
         file: n names of images' files.
         skipped: rows that were left out as invalid.
         length_stated: whether the header states the unit of translations.
+        time_stated: whether times are dates, or the header states their unit.
     """
 
     name: str
@@ -76,6 +77,7 @@ class PoseTable:
     file: tuple[str, ...] | None = None
     skipped: int = 0
     length_stated: bool = False
+    time_stated: bool = False
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -137,6 +139,7 @@ def read_pose_table(
             file=file,
             skipped=skipped,
             length_stated=columns.length_mm is not None,
+            time_stated=clock is not None or columns.time_s is not None,
         )
 
 
@@ -371,7 +374,7 @@ def _times(
         return None, None
     dates = [_date(table.rows[row][column]) for row in rows]
     if dates[0] is None:
-        time = table.numbers((column,), rows)[:, 0] * columns.time_s
+        time = table.numbers((column,), rows)[:, 0] * (columns.time_s or 1.0)
         late = np.flatnonzero(np.abs(time) > _LATEST_S)
         if len(late):
             raise FormatError(
