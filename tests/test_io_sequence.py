@@ -117,13 +117,29 @@ def edit(path, pattern, replacement, count=1):
     path.write_bytes(new)
 
 
-def test_unknown_orientation_is_asked_for(tmp_path):
+@pytest.mark.parametrize("stated", [b"XX", b"??", b""])
+def test_unknown_orientation_is_asked_for(tmp_path, stated):
     written(tmp_path / "a.mha")
-    edit(tmp_path / "a.mha", rb"Orientation = MFA", b"Orientation = XX")
+    edit(tmp_path / "a.mha", rb"Orientation = MFA", b"Orientation = " + stated)
     found = read_sequence(tmp_path / "a.mha")
     with pytest.raises(FormatError, match="does not say how its pixels are oriented"):
         next(found.images())
     assert next(found.images(orientation="UN")).shape == (6, 4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("stated", ["FMA", "NU", "UNKNOWN", "MFAX"])
+def test_an_orientation_that_is_not_known_is_no_unknown_one(tmp_path, name, stated):
+    """A file that states something was said to state nothing; UNKNOWN was taken for UN."""
+    written(tmp_path / name)
+    path = tmp_path / name
+    edit(path, rb"(?i)(orientation( = |:=))MFA", rb"\1" + stated.encode())
+    with pytest.raises(FormatError, match=f"orientation '{stated}' is not read: only MF, UF, MN"):
+        read_sequence(path)
+    # As PLUS writes RF data; its transforms can be used.
+    edit(path, rb"(?i)(image type( = |:=))BRIGHTNESS|(imagetype = )BRIGHTNESS", rb"\1\3RF_REAL")
+    with pytest.raises(FormatError, match="holds 'RF_REAL' data"):
+        next(read_sequence(path).images())
 
 
 @pytest.mark.parametrize(

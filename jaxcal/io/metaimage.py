@@ -86,6 +86,7 @@ def _metaimage_pixels(
         raise FormatError("holds pixels as text; only binary ones are read")
     big = _flag(fields, "BinaryDataByteOrderMSB", "ElementByteOrderMSB")
     dtype = _META_TYPES[fields["ElementType"]].newbyteorder(">" if big else "<")
+    image_type = image_type_of(fields.get("UltrasoundImageType", ""))
     data = fields["ElementDataFile"]
     pixels = Pixels(
         path if data == "LOCAL" else _beside(path, data),
@@ -95,8 +96,8 @@ def _metaimage_pixels(
         rows,
         whole_numbers(fields.get("ElementNumberOfChannels", "1"), "ElementNumberOfChannels")[0],
         dtype,
-        orientation_of(fields.get("UltrasoundImageOrientation", "")),
-        image_type_of(fields.get("UltrasoundImageType", "")),
+        orientation_of(fields.get("UltrasoundImageOrientation", ""), image_type),
+        image_type,
     )
     skipped = fields.get("HeaderSize", "0")
     if skipped != "0":

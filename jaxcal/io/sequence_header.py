@@ -114,10 +114,21 @@ def check_count(count: int, header: SequenceHeader) -> None:
         raise FormatError(f"has fields of frame {min(beyond)}, but only {count} frames")
 
 
-def orientation_of(text: str) -> Orientation | None:
-    """The first two letters of an orientation; None for XX, ?? and nothing."""
-    start = text.strip().upper()[:2]
-    return cast(Orientation, start) if start in ("MF", "UF", "MN", "UN") else None
+def orientation_of(text: str, image_type: str) -> Orientation | None:
+    """The first two letters of an orientation; None for XX, ?? and nothing.
+
+    PLUS writes others (``FM``) for RF data alone, which are refused as such when asked for.
+    """
+    stated = text.strip().upper()
+    # The third letter, the direction of a volume's planes, follows from the others.
+    if re.fullmatch("(MF|UF|MN|UN)[AD]?", stated):
+        return cast(Orientation, stated[:2])
+    if stated not in ("", "XX", "??") and image_type == "BRIGHTNESS":
+        raise FormatError(
+            f"orientation {quoted(text)} is not read: only MF, UF, MN and UN (write XX where it is "
+            "not known)"
+        )
+    return None
 
 
 def image_type_of(text: str) -> str:
