@@ -423,6 +423,21 @@ def test_times_of_points_count_though_a_frame_has_none(tmp_path, sequence):
     np.testing.assert_allclose(ordered[0].calibration.measurements, PIXELS[KEPT])
 
 
+@pytest.mark.parametrize("apart", [False, True])
+def test_transforms_without_a_status_are_told_once(tmp_path, sequence, apart):
+    """PLUS refuses them; old files have none."""
+    content = sequence.read_bytes()
+    (tmp_path / "p.csv").write_text("\n".join(table(["u", "v"], [PIXELS])))
+    options = ImportOptions(poses=sequence if apart else None)
+    told = "s.igs.mha: ProbeToTracker without a status is taken as OK"
+    for pattern, times in ((rb"Stylus", 0), (rb"(Seq_Frame000[13]_ProbeTo\w+Status) = OK\n", 1)):
+        sequence.write_bytes(re.sub(pattern, b"", content))
+        recording, notes, _ = import_files([sequence, tmp_path / "p.csv"], options)
+        assert "\n".join(notes).count("without a status") == times
+        assert "\n".join(notes).count(told) == times
+        assert len(recording.calibration) == len(KEPT)
+
+
 @pytest.mark.parametrize("kind", ["sequence", "poses", "ndi"])
 def test_poses_of_a_sequence_in_metres(tmp_path, kind):
     """What the refusal advises works."""

@@ -117,7 +117,11 @@ def with_poses_by_time(
             f"{gap:.3g} s are bridged)"
         )
     return replace(
-        images, transforms={pair: found}, valid={pair: between}, length_stated=length_stated
+        images,
+        transforms={pair: found},
+        valid={pair: between},
+        length_stated=length_stated,
+        without_status=(),
     ), notes
 
 

@@ -144,6 +144,7 @@ def sequence_of(
     """The sequence of a header; ``image_status`` is how the format names that field."""
     transforms: dict[FramePair, np.ndarray] = {}
     valid: dict[FramePair, np.ndarray] = {}
+    without_status: dict[FramePair, None] = {}
     time = np.full(count, np.nan)
     image_valid = np.full(count, pixels is not None)
     for number, fields in header.frames.items():
@@ -158,11 +159,21 @@ def sequence_of(
             if pair not in transforms:
                 transforms[pair] = np.full((count, 4, 4), np.nan)
                 valid[pair] = np.zeros(count, bool)
-            status, _ = fields.get(f"{field_name}Status", ("OK", 0))
-            if status.upper() == "OK":
+            status = fields.get(f"{field_name}Status")
+            if status is None:
+                without_status[pair] = None
+            if status is None or status[0].upper() == "OK":
                 transforms[pair][number] = _sixteen(value, line)
                 valid[pair][number] = True
-    return TrackedSequence(transforms, valid, time, image_valid, pixels, name)
+    return TrackedSequence(
+        transforms,
+        valid,
+        time,
+        image_valid,
+        pixels,
+        name,
+        without_status=tuple(without_status),
+    )
 
 
 def _transform_frames(field_name: str) -> FramePair | None:
