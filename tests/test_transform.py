@@ -607,6 +607,15 @@ def test_apply_refuses_options_of_a_table_where_none_is_read(saved, tmp_path, ca
         assert told in capsys.readouterr().err
 
 
+def test_apply_refuses_options_of_poses_where_a_table_has_none(saved, tmp_path, capsys):
+    uv = tmp_path / "uv.csv"
+    uv.write_text("u,v\n1,2\n")
+    for given in (["--quaternion", "wxyz"], ["--pose-units", "m"]):
+        assert main(["apply", str(saved), str(uv), *given]) == 2
+        assert f"{given[0]}: for poses, and {uv} holds none" in capsys.readouterr().err
+    assert main(["apply", str(saved), str(uv), "--skip-invalid"]) == 0
+
+
 def test_served_to_another_client():
     """pyigtl, which is not ours, gets the matrix at once, and again."""
     pyigtl = pytest.importorskip("pyigtl")
