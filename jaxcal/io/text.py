@@ -18,7 +18,7 @@ from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quate
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
 from jaxcal.io.readable import naming
-from jaxcal.io.table import Table, read_table
+from jaxcal.io.table import Table, has_commented_header, read_table
 from jaxcal.runtime.array_types import Float, Int
 from jaxcal.runtime.messages import quoted
 
@@ -272,10 +272,12 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
         matrix = tuple(range(1, width - 2))
         return Columns(width, matrix=matrix, time=0, point=(width - 2, width - 1))
     if width != 10:
-        alone = " (name two columns of points by a first line u,v)" if width == 2 else ""
+        hint = " (name two columns of points by a first line u,v)" if width == 2 else ""
+        if has_commented_header(table):
+            hint = " (remove the # before the header)"
         raise FormatError(
             f"{table.row(0)}: {width} columns without a header; 15 or 19 (time, 12 or 16 "
-            f"pose numbers, u and v) or 10 (time, x, y, z, a quaternion, u and v) are needed{alone}"
+            f"pose numbers, u and v) or 10 (time, x, y, z, a quaternion, u and v) are needed{hint}"
         )
     if quaternion is None:
         raise FormatError(
