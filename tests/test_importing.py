@@ -376,8 +376,12 @@ def test_points_of_a_sequence(tmp_path, sequence, name, text, points):
         ("p.csv", "frame,u,v\n9,1,1\n", "frame 9 is not in the sequence"),
         ("p.csv", "frame,u,v\n1,1,1\n1,2,2\n", "frame 1 has more than one point"),
         ("p.csv", "frame,u,v\n1.5,1,1\n", "p.csv:2: column 1 is not the number of an image"),
-        ("p.csv", "time,u,v\n11.5,1,1\n", "line 2: no frame was taken at 11.5 s"),
-        ("p.csv", "u,v\n1,1\n", "has neither a column frame nor time stamps"),
+        (
+            "p.csv",
+            "time,u,v\n11.5,1,1\n",
+            "taken at 11.500 s (the sequence lasts from 10.000 s to 10.500 s)",
+        ),
+        ("p.csv", "u,v\n1,1\n", "has neither a column frame nor a column time"),
         ("p.csv", "frame,x,y,z,qx,qy,qz,qw\n1,1,1,1,0,0,0,1\n", "holds no points"),
         ("p.csv", "frame,u,v\n0,1,1\n1,1,1\n2,3,4\n", "2 used images are too few"),
     ],
@@ -390,6 +394,48 @@ def test_points_that_do_not_belong(tmp_path, sequence, name, text, message, caps
     assert message in error
     assert error.count("\n") == 1
     assert not out.exists()
+
+
+def test_times_of_points_count_though_a_frame_has_none(tmp_path, sequence):
+    """They were paired in order, without a word, if there were as many points as frames."""
+    content, stamp = sequence.read_text("latin-1"), r"Seq_Frame000{}_Timestamp = .*\n"
+    assert re.search(stamp.format(4), content)
+    moments = 10 + np.arange(6) / 10
+    swapped = [0, 1, 3, 2, 5]
+    sequence.write_bytes(re.sub(stamp.format(4), "", content).encode("latin-1"))
+    rows = table(["time", "u", "v"], [moments[swapped], PIXELS[swapped]])
+    (tmp_path / "p.csv").write_text("\n".join(rows))
+    images = import_files([sequence, tmp_path / "p.csv"])[0].calibration
+    np.testing.assert_allclose(images.measurements, PIXELS[[0, 1, 3, 5]])
+    np.testing.assert_allclose(images.poses, POSES[[0, 1, 3, 5]], atol=1e-11)
+    (tmp_path / "p.csv").write_text("\n".join(table(["time", "u", "v"], [moments, PIXELS])))
+    with pytest.raises(InputError, match=r"line 6: .*1 of 6 frames of .* have no time stamp"):
+        import_files([sequence, tmp_path / "p.csv"])
+    sequence.write_bytes(re.sub(stamp.format("[135]"), "", content).encode("latin-1"))
+    with pytest.raises(InputError, match=r"line 3: .*3 of 6 frames of .* have no time stamp"):
+        import_files([sequence, tmp_path / "p.csv"])
+    sequence.write_bytes(re.sub(stamp.format("[0-4]"), "", content).encode("latin-1"))
+    with pytest.raises(
+        InputError, match=r"by time: 5 of 6 frames .* have no time stamp .*--points"
+    ):
+        import_files([sequence, tmp_path / "p.csv"])
+    ordered = import_files([sequence, tmp_path / "p.csv"], ImportOptions(points="order"))
+    np.testing.assert_allclose(ordered[0].calibration.measurements, PIXELS[KEPT])
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_transforms_without_a_status_are_told_once(tmp_path, sequence, apart):
+    """PLUS refuses them; old files have none."""
+    content = sequence.read_bytes()
+    (tmp_path / "p.csv").write_text("\n".join(table(["u", "v"], [PIXELS])))
+    options = ImportOptions(poses=sequence if apart else None)
+    told = "s.igs.mha: ProbeToTracker without a status is taken as OK"
+    for pattern, times in ((rb"Stylus", 0), (rb"(Seq_Frame000[13]_ProbeTo\w+Status) = OK\n", 1)):
+        sequence.write_bytes(re.sub(pattern, b"", content))
+        recording, notes, _ = import_files([sequence, tmp_path / "p.csv"], options)
+        assert "\n".join(notes).count("without a status") == times
+        assert "\n".join(notes).count(told) == times
+        assert len(recording.calibration) == len(KEPT)
 
 
 @pytest.mark.parametrize("kind", ["sequence", "poses", "ndi"])

@@ -25,6 +25,7 @@ from jaxcal.cli.main import main
 from jaxcal.cli.segment import _default_out
 from jaxcal.io.dicom import read_pixel_size
 from jaxcal.io.folder import read_folder
+from jaxcal.io.frame_poses import open_sequence
 from jaxcal.io.import_options import ImportOptions
 from jaxcal.io.importing import import_files
 from jaxcal.io.picker.picks import Picks
@@ -485,7 +486,7 @@ def test_dates_are_not_matched_with_seconds(tmp_path, what, capsys):
 @pytest.mark.parametrize(
     ("times", "message"),
     [
-        (MOMENTS + 1e6, "are they of one clock?"),
+        (MOMENTS + 1778070000, r"poses from 1778070100.000 s to 1778070103.980 s: .* one clock\?"),
         (MOMENTS[::-1], "is before the one before it"),
         (np.full(200, np.nan), "states no times"),
         (np.full(200, 101.0), "one time stamp"),
@@ -499,6 +500,38 @@ def test_poses_of_other_times(tmp_path, times, message):
     tracking = Tracking(times, moving(MOMENTS), np.ones(200, bool), PAIR, "t.mha")
     with pytest.raises(InputError, match=message):
         with_poses_by_time(images, tracking)
+
+
+@pytest.mark.parametrize(
+    ("named", "unit", "every", "length", "refused"),
+    [
+        ("time", 1e3, 0.02, 7.5, True),
+        ("time", 1e3, 0.005, 7.5, True),
+        ("time [ms]", 1e3, 0.02, 7.5, False),
+        ("time", 1.0, 0.02, 7.5, False),
+        # One recording of the tracker, of which the images are a short part.
+        ("time", 1.0, 0.04, 800.0, False),
+        # As slow as this it might be in ms: the header says that it is not.
+        ("time", 1.0, 0.1, 800.0, True),
+        ("time [s]", 1.0, 0.1, 800.0, False),
+    ],
+)
+def test_times_of_poses_that_may_be_in_ms(tmp_path, named, unit, every, length, refused):
+    """Every image got a pose of the first milliseconds, without a word."""
+    images = [np.zeros((4, 4), np.uint8)] * 151
+    write_sequence(tmp_path / "i.mha", {}, np.arange(151) / 20, images=images)
+    times = np.arange(-0.02, length + 0.02, every)
+    rows = [f"{t * unit!r},{t!r},0,0,0,0,0,1" for t in times.tolist()]
+    (tmp_path / "t.csv").write_text("\n".join([f"{named},x,y,z,qx,qy,qz,qw", *rows]))
+    options = ImportOptions(poses=tmp_path / "t.csv")
+    if refused:
+        with pytest.raises(InputError, match=r"t\.csv: its poses last .* is its time in ms\?"):
+            open_sequence(tmp_path / "i.mha", options)
+        return
+    found, _ = open_sequence(tmp_path / "i.mha", options)
+    there = found.valid[PAIR]
+    assert there.sum() >= 150
+    np.testing.assert_allclose(found.transforms[PAIR][there, 0, 3], found.time[there], atol=1e-9)
 
 
 def test_times_that_only_rounding_puts_beyond_the_poses_have_one(tmp_path):

@@ -117,13 +117,29 @@ def edit(path, pattern, replacement, count=1):
     path.write_bytes(new)
 
 
-def test_unknown_orientation_is_asked_for(tmp_path):
+@pytest.mark.parametrize("stated", [b"XX", b"??", b""])
+def test_unknown_orientation_is_asked_for(tmp_path, stated):
     written(tmp_path / "a.mha")
-    edit(tmp_path / "a.mha", rb"Orientation = MFA", b"Orientation = XX")
+    edit(tmp_path / "a.mha", rb"Orientation = MFA", b"Orientation = " + stated)
     found = read_sequence(tmp_path / "a.mha")
     with pytest.raises(FormatError, match="does not say how its pixels are oriented"):
         next(found.images())
     assert next(found.images(orientation="UN")).shape == (6, 4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("stated", ["FMA", "NU", "UNKNOWN", "MFAX"])
+def test_an_orientation_that_is_not_known_is_no_unknown_one(tmp_path, name, stated):
+    """A file that states something was said to state nothing; UNKNOWN was taken for UN."""
+    written(tmp_path / name)
+    path = tmp_path / name
+    edit(path, rb"(?i)(orientation( = |:=))MFA", rb"\1" + stated.encode())
+    with pytest.raises(FormatError, match=f"orientation '{stated}' is not read: only MF, UF, MN"):
+        read_sequence(path)
+    # As PLUS writes RF data; its transforms can be used.
+    edit(path, rb"(?i)(image type( = |:=))BRIGHTNESS|(imagetype = )BRIGHTNESS", rb"\1\3RF_REAL")
+    with pytest.raises(FormatError, match="holds 'RF_REAL' data"):
+        next(read_sequence(path).images())
 
 
 @pytest.mark.parametrize(
@@ -149,6 +165,82 @@ def test_forms_that_occur(tmp_path, old, new):
     found = read_sequence(tmp_path / "a.mha")
     np.testing.assert_array_equal(np.array(list(found.images())), images)
     np.testing.assert_array_equal(found.transforms[PROBE][0], transforms[PROBE][0])
+
+
+def beside(path, line, *, before=b"", after=b"", big=False, compressed=False):
+    """A sequence whose pixels are in a file beside it, with a line more in the header."""
+    rng = np.random.default_rng(3)
+    images = rng.integers(-9000, 9000, (5, 6, 4), dtype=np.int16)
+    written(path, images=images, compressed=compressed)
+    edit(path, rb"BinaryDataByteOrderMSB = False\n", b"")
+    edit(path, rb"(ElementDataFile)", line + rb"\n\1")
+    data = path.with_suffix(".zraw" if compressed else ".raw")
+    pixels = images.astype(">i2").tobytes() if big else data.read_bytes()
+    data.write_bytes(before + pixels + after)
+    return images
+
+
+@pytest.mark.parametrize(
+    ("line", "how"),
+    [
+        (b"HeaderSize = 0", {}),
+        (b"HeaderSize = 37", {"before": b"x" * 37}),
+        (b"HeaderSize = -1", {"before": b"x" * 37}),
+        (b"HeaderSize = 37", {"before": b"x" * 37, "compressed": True}),
+        (b"ElementByteOrderMSB = True", {"big": True}),
+        (b"BinaryDataByteOrderMSB = True\nElementByteOrderMSB = True", {"big": True}),
+        (b"ElementByteOrderMSB = False", {}),
+    ],
+)
+def test_pixels_beside_as_metaio_reads_them(tmp_path, line, how):
+    """HeaderSize and MetaIO's other name of the order of bytes were passed over."""
+    path = tmp_path / "a.mhd"
+    images = beside(path, line, **how)
+    np.testing.assert_array_equal(np.array(list(read_sequence(path).images())), images)
+    sitk = pytest.importorskip("SimpleITK")
+    np.testing.assert_array_equal(sitk.GetArrayFromImage(sitk.ReadImage(str(path))), images)
+
+
+@pytest.mark.parametrize(
+    ("line", "how", "message"),
+    [
+        (b"HeaderSize = 3", {}, "claims 240 bytes of pixels, the file holds 237"),
+        (
+            b"HeaderSize = -1",
+            {"before": b"x", "compressed": True},
+            "state where the packed ones begin",
+        ),
+        (b"HeaderSize = -2", {}, "HeaderSize must be whole numbers, not '-2'"),
+        (b"HeaderSize = 1 2", {}, "HeaderSize must be one number, not '1 2'"),
+        (b"Comment = x", {"before": b"x" * 37}, "the file holds 277: correct the header's size"),
+        (b"Comment = x", {"after": b"x"}, "claims 240 bytes of pixels, the file holds 241"),
+        (b"ElementByteOrderMSB = yes", {}, "must be True or False, not 'yes'"),
+        (
+            b"BinaryDataByteOrderMSB = False\nElementByteOrderMSB = True",
+            {},
+            "BinaryDataByteOrderMSB and ElementByteOrderMSB contradict each other",
+        ),
+    ],
+)
+def test_pixels_beside_that_lie(tmp_path, line, how, message):
+    beside(tmp_path / "a.mhd", line, **how)
+    with pytest.raises(FormatError, match=re.escape(message)) as caught:
+        read_sequence(tmp_path / "a.mhd")
+    assert str(caught.value).startswith(str(tmp_path / "a.mhd"))
+
+
+@pytest.mark.parametrize("name", ["a.mha", "a.nrrd"])
+def test_more_pixels_than_claimed(tmp_path, name):
+    written(tmp_path / name, compressed=False)
+    content = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(content + b"x")
+    with pytest.raises(FormatError, match="claims 120 bytes of pixels, the file holds 121"):
+        read_sequence(tmp_path / name)
+    if name.endswith(".mha"):
+        (tmp_path / name).write_bytes(content)
+        edit(tmp_path / name, b"(ElementDataFile)", rb"HeaderSize = 9\n\1")
+        with pytest.raises(FormatError, match="HeaderSize = '9': is read only for pixels in"):
+            read_sequence(tmp_path / name)
 
 
 @pytest.mark.parametrize("size", ["0 0 3", "1 1 3"])

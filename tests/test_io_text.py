@@ -169,6 +169,22 @@ def test_csv_only_one_header(tmp_path):
         read_csv(path)
 
 
+@pytest.mark.parametrize("delimiter", [",", " ", ";"])
+def test_a_header_that_numpy_made_a_comment(tmp_path, delimiter):
+    path = tmp_path / "table.csv"
+    names = ["x", "y", "z", "qx", "qy", "qz", "qw", "u", "v"]
+    rows = np.array([[9 * k, 20 * k, 0, 0, 0, 0, 1, k, k] for k in range(1, 9)], float)
+    np.savetxt(path, rows, delimiter=delimiter, header="of the probe\n" + delimiter.join(names))
+    told = r"table\.csv:3: 9 columns without a header; .* \(remove the # before the header\)$"
+    with pytest.raises(FormatError, match=told):
+        read_csv(path)
+    path.write_text(path.read_text().replace("# x", "x"))
+    read_csv(path)
+    np.savetxt(path, rows, delimiter=delimiter, header="of the probe")
+    with pytest.raises(FormatError, match=r"9 columns without a header; .* are needed$"):
+        read_csv(path)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

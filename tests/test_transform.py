@@ -571,6 +571,31 @@ def test_what_did_not_converge_is_not_handed_on(saved, capsys):
         assert "must not be used" in capsys.readouterr().err
 
 
+NOT_TWO_NAMES = """
+import numpy as np
+from jaxcal import ImageTransform, InputError
+known = ImageTransform(np.eye(4), scale_mm_per_px=np.ones(2))
+for form in ("plus", "ros"):
+    for frames in ("Image", ("Image",), None, ("Image", 3), ("A", "B", "C")):
+        try:
+            print(form, frames, known.text(form, frames=frames))
+        except InputError as error:
+            assert str(error).startswith("frames must be two names"), error
+    assert known.text(form, frames=["Image", "Probe"]) == known.text(form)
+"""
+
+
+def test_frames_are_two_names():
+    """One name alone gave frames of its letters, I and m; others a raw error.
+
+    In a process of its own: here annotations are checked, which they are not for a user.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", NOT_TWO_NAMES], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 def test_apply_to_a_table(saved, tmp_path, capsys):
     (tmp_path / "p.csv").write_text("v;u\n12,5;300\n40;7,25\n")
     assert main(["apply", str(saved), str(tmp_path / "p.csv"), "--pixel-sd", "0.5"]) == 0
@@ -590,6 +615,15 @@ def test_apply_refuses_options_of_a_table_where_none_is_read(saved, tmp_path, ca
         assert main(["apply", str(saved), *source, *rest]) == 2
         told = "--quaternion, --pose-units, --skip-invalid: for tables, and none is read"
         assert told in capsys.readouterr().err
+
+
+def test_apply_refuses_options_of_poses_where_a_table_has_none(saved, tmp_path, capsys):
+    uv = tmp_path / "uv.csv"
+    uv.write_text("u,v\n1,2\n")
+    for given in (["--quaternion", "wxyz"], ["--pose-units", "m"]):
+        assert main(["apply", str(saved), str(uv), *given]) == 2
+        assert f"{given[0]}: for poses, and {uv} holds none" in capsys.readouterr().err
+    assert main(["apply", str(saved), str(uv), "--skip-invalid"]) == 0
 
 
 def test_served_to_another_client():

@@ -134,6 +134,10 @@ def _read(source: str, quaternion, pose_units, skip_invalid: bool):
     )
     if table.points is None:
         raise InputError(f"{source}: holds no points (columns u and v)")
+    of_poses = {"--quaternion": quaternion, "--pose-units": pose_units}
+    unused = [option for option, value in of_poses.items() if value is not None]
+    if unused and table.poses is None:
+        raise click.UsageError(f"{', '.join(unused)}: for poses, and {source} holds none")
     return table.points, table.poses, table.kind, ("line", table.lines) if skip_invalid else None
 
 

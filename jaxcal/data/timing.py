@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from jaxcal import InputError
 from jaxcal.data.poses import check_poses
 from jaxcal.runtime.arrays import is_number, real_array
+from jaxcal.runtime.messages import seconds
 
 MINIMUM_MOTION_MM = 8.0
 """Least motion from which a latency is estimated."""
@@ -113,9 +114,9 @@ def interpolate_poses(
     if len(refused):
         row = int(refused[0])
         raise InputError(
-            f"no pose for time {row} ({asked[row]:.6g} s): it is outside "
-            f"{times[0]:.6g} to {times[-1]:.6g} s, in a gap longer than {max_gap_s:g} s, or next "
-            "to a pose that cannot be used"
+            f"no pose for time {row} ({seconds(asked[row])}): it is outside "
+            f"{seconds(times[0])} to {seconds(times[-1])}, in a gap longer than {max_gap_s:g} s, "
+            "or next to a pose that cannot be used"
         )
     sound = check_poses(np.asarray(poses), None if valid is None else np.asarray(valid, bool))
     before = _interval(times, asked)

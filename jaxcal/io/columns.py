@@ -71,7 +71,7 @@ class Columns:
         valid: whether a row counts.
         length_mm: one unit of translations in mm.
         point_unit: ``px`` or a unit of length; None where the header does not say.
-        time_s: one unit of time in s.
+        time_s: one unit of time in s; None where the header does not say.
     """
 
     width: int
@@ -85,7 +85,7 @@ class Columns:
     valid: int | None = None
     length_mm: float | None = None
     point_unit: str | None = None
-    time_s: float = 1.0
+    time_s: float | None = None
 
 
 def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> Columns:
@@ -148,7 +148,7 @@ def columns_of_header(names: list[str], quaternion: QuaternionOrder | None) -> C
         valid=roles.get("valid"),
         length_mm=_length(lengths, names, list(units)),
         point_unit=point_unit,
-        time_s=TIMES_S[time_unit or "s"],
+        time_s=None if time_unit is None else TIMES_S[time_unit],
     )
 
 

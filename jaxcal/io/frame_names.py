@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from jaxcal import FormatError
-from jaxcal.runtime.messages import quoted
+from jaxcal import FormatError, InputError
+from jaxcal.runtime.messages import quoted, shown
 
 FramePair = tuple[str, str]
 """(from, to): the transform takes coordinates of the first frame to the second."""
@@ -26,15 +26,31 @@ def capitalised(name: str) -> str:
     return name[:1].upper() + name[1:]
 
 
+def two_names(frames: object) -> FramePair:
+    """The frames, if they are two texts; one text alone would give its letters.
+
+    Raises:
+        InputError: anything else.
+    """
+    if isinstance(frames, (tuple, list)) and len(frames) == 2:
+        source, target = frames
+        if isinstance(source, str) and isinstance(target, str):
+            return source, target
+    raise InputError(
+        f'frames must be two names, ("Image", "Probe") for instance, not {shown(frames)}'
+    )
+
+
 def check_frames(frames: FramePair) -> FramePair:
     """Two different frames' names that PLUS and Slicer accept, capitalised.
 
     Raises:
+        InputError: not two texts.
         FormatError: a name that is not letters and digits after a first letter, or in which "To"
             stands before a capital letter: ``ProbeToTracker`` could not be split again; or one
             frame twice.
     """
-    source, target = capitalised(frames[0]), capitalised(frames[1])
+    source, target = map(capitalised, two_names(frames))
     for name, capital in zip(frames, (source, target), strict=True):
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*", name) or _SEPARATOR.search(capital):
             raise FormatError(

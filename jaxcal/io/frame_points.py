@@ -16,7 +16,7 @@ from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.slicer import pixels_from_markups, read_markups
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Float, Int
-from jaxcal.runtime.messages import quoted
+from jaxcal.runtime.messages import quoted, seconds
 
 Assignment = Literal["order", "labels"]
 """How points without a time or a frame's number are assigned to frames: one for each frame in
@@ -129,27 +129,36 @@ def _rows_of_table(
         return sequence.rows_of(table.frame, [f"{table.name}:{line}" for line in table.lines])
     if assignment == "order":
         return _in_order(len(table), sequence)
-    if table.time is not None and np.isfinite(sequence.time).all() and len(sequence) > 1:
+    if table.time is not None:
         return _nearest_in_time(table, sequence)
     if len(table) == len(sequence):
         return _in_order(len(table), sequence)
     raise InputError(
-        "has neither a column frame nor time stamps that the sequence has: which frames are the "
-        "points in?"
+        "has neither a column frame nor a column time: which frames are the points in?"
     )
 
 
 def _nearest_in_time(table: PoseTable, sequence: TrackedSequence) -> Int[np.ndarray, " m"]:
+    timed = np.flatnonzero(np.isfinite(sequence.time))
+    unknown = len(sequence) - len(timed)
+    untimed = f"{unknown} of {len(sequence)} frames of {sequence.source} have no time stamp"
+    if len(timed) < 2:
+        raise InputError(
+            f"its points cannot be matched by time: {untimed} (name frames in a column frame, or "
+            "say --points order if there is one point for each frame)"
+        )
     asked = times_of_table(table, sequence)
-    order = np.argsort(sequence.time, kind="stable")
+    order = timed[np.argsort(sequence.time[timed], kind="stable")]
     time = sequence.time[order]
-    slack = _SLACK * float(np.median(np.diff(time)))
+    # From one frame to the next, also across frames without a time stamp.
+    slack = _SLACK * float(np.median(np.diff(time) / np.abs(np.diff(order))))
     after = np.clip(np.searchsorted(time, asked), 1, len(time) - 1)
     nearer = after - (asked - time[after - 1] < time[after] - asked)
     far = np.flatnonzero(np.abs(time[nearer] - asked) > slack)
     if len(far):
         raise InputError(
-            f"line {table.lines[int(far[0])]}: no frame was taken at {asked[far[0]]:.6g} s "
-            f"(the sequence lasts from {time[0]:.6g} to {time[-1]:.6g} s)"
+            f"line {table.lines[int(far[0])]}: no frame was taken at {seconds(asked[int(far[0])])} "
+            f"(the sequence lasts from {seconds(time[0])} to {seconds(time[-1])}"
+            + (f"; {untimed}: name frames in a column frame)" if unknown else ")")
         )
     return order[nearer]

@@ -61,7 +61,13 @@ def opened(
             raise InputError(f"{table.name}: needs columns of times and of poses")
         time, valid = times_of_table(table, sequence), np.ones(len(table), bool)
         found = Tracking(
-            time, table.poses, valid, PROBE_TO_TRACKER, table.name, table.length_stated
+            time,
+            table.poses,
+            valid,
+            PROBE_TO_TRACKER,
+            table.name,
+            table.length_stated,
+            table.time_stated,
         )
         return sequence, found, table.notes
     tracking = read_tracked(options.poses, options.pose_units)
@@ -120,6 +126,17 @@ def frames_to_show(
 
 
 def _frames(sequence: TrackedSequence, options: ImportOptions) -> tuple[str, str, list[str]]:
+    """The frames of the poses, and what was assumed about them and about statuses."""
+    start, end, notes = _chosen_frames(sequence, options)
+    if sequence.without_status:
+        names = ", ".join("To".join(pair) for pair in sequence.without_status)
+        notes.append(
+            f"{sequence.source}: {names} without a status is taken as OK (PLUS refuses such frames)"
+        )
+    return start, end, notes
+
+
+def _chosen_frames(sequence: TrackedSequence, options: ImportOptions) -> tuple[str, str, list[str]]:
     """The frames of the poses, and what was assumed about them."""
     pairs: list[FramePair] = list(sequence.transforms)
     if not pairs:

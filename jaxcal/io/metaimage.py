@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,27 +82,58 @@ def _metaimage_pixels(
     fields = header.fields
     if fields.get("ElementType") not in _META_TYPES:
         raise FormatError(f"ElementType {quoted(fields.get('ElementType', ''))} is not read")
-    if fields.get("BinaryData", "True").lower() != "true":
+    if not _flag(fields, "BinaryData", default=True):
         raise FormatError("holds pixels as text; only binary ones are read")
-    big = fields.get("BinaryDataByteOrderMSB", "False").lower() == "true"
+    big = _flag(fields, "BinaryDataByteOrderMSB", "ElementByteOrderMSB")
     dtype = _META_TYPES[fields["ElementType"]].newbyteorder(">" if big else "<")
-    packed = fields.get("CompressedData", "False").lower() == "true"
+    image_type = image_type_of(fields.get("UltrasoundImageType", ""))
     data = fields["ElementDataFile"]
-    start, where = (header.end, path) if data == "LOCAL" else (0, _beside(path, data))
-    return checked_pixels(
-        Pixels(
-            where,
-            start,
-            "zlib" if packed else "raw",
-            columns,
-            rows,
-            whole_numbers(fields.get("ElementNumberOfChannels", "1"), "ElementNumberOfChannels")[0],
-            dtype,
-            orientation_of(fields.get("UltrasoundImageOrientation", "")),
-            image_type_of(fields.get("UltrasoundImageType", "")),
-        ),
-        count,
+    pixels = Pixels(
+        path if data == "LOCAL" else _beside(path, data),
+        header.end if data == "LOCAL" else 0,
+        "zlib" if _flag(fields, "CompressedData") else "raw",
+        columns,
+        rows,
+        whole_numbers(fields.get("ElementNumberOfChannels", "1"), "ElementNumberOfChannels")[0],
+        dtype,
+        orientation_of(fields.get("UltrasoundImageOrientation", ""), image_type),
+        image_type,
     )
+    skipped = fields.get("HeaderSize", "0")
+    if skipped != "0":
+        pixels = replace(pixels, start=_after_header(skipped, data, pixels, count))
+    return checked_pixels(pixels, count)
+
+
+def _flag(fields: dict[str, str], *names: str, default: bool = False) -> bool:
+    """Whether a field, which may have several names, is True."""
+    stated = {name: fields[name] for name in names if name in fields}
+    known = {"true": True, "1": True, "false": False, "0": False}
+    for name, value in stated.items():
+        if value.lower() not in known:
+            raise FormatError(f"{name} must be True or False, not {quoted(value)}")
+    found = {known[value.lower()] for value in stated.values()}
+    if len(found) > 1:
+        raise FormatError(f"{' and '.join(stated)} contradict each other: remove the wrong one")
+    return found.pop() if found else default
+
+
+def _after_header(stated: str, data: str, pixels: Pixels, count: int) -> int:
+    """Where pixels begin in their file, by HeaderSize: -1 says that they are its end."""
+    if data == "LOCAL":
+        raise FormatError(
+            f"HeaderSize = {quoted(stated)}: is read only for pixels in another file, and they "
+            "follow the header: remove the line"
+        )
+    if stated != "-1":
+        numbers = whole_numbers(stated, "HeaderSize")
+        if len(numbers) > 1:
+            raise FormatError(f"HeaderSize must be one number, not {quoted(stated)}")
+        return numbers[0]
+    if pixels.packing != "raw":
+        raise FormatError("HeaderSize = -1: is for raw pixels: state where the packed ones begin")
+    # A file that is too short is told from its size.
+    return max(pixels.path.stat().st_size - pixels.frame_bytes * count, 0)
 
 
 def check_data_name(data: str) -> None:

@@ -149,6 +149,7 @@ def _nrrd_pixels(
         raise FormatError(f"encoding {quoted(encoding)} is not read: write raw or gzip")
     order = ">" if fields.get("endian", "little").lower() == "big" else "<"
     columns, rows, channels = size
+    image_type = image_type_of(fields.get("ultrasound image type", ""))
     return checked_pixels(
         Pixels(
             path,
@@ -158,8 +159,8 @@ def _nrrd_pixels(
             rows,
             channels,
             _DTYPES[kind].newbyteorder(order),
-            orientation_of(fields.get("ultrasound image orientation", "")),
-            image_type_of(fields.get("ultrasound image type", "")),
+            orientation_of(fields.get("ultrasound image orientation", ""), image_type),
+            image_type,
         ),
         count,
     )

@@ -28,7 +28,7 @@ class PixelStream:
         size: bytes of the unpacked pixels according to the file's header.
 
     Raises:
-        FormatError: fewer bytes than the header says, or packed bytes that cannot hold as many.
+        FormatError: not as many bytes as the header says, or packed bytes that cannot hold as many.
     """
 
     def __init__(self, path: Path, start: int, packing: Packing, size: int) -> None:
@@ -47,6 +47,12 @@ class PixelStream:
             self._file.close()
             raise FormatError(
                 f"claims {size} bytes of pixels, the file holds {max(stored, 0)}{packed}"
+            )
+        if packing == "raw" and size < stored:
+            self._file.close()
+            raise FormatError(
+                f"claims {size} bytes of pixels, the file holds {stored}: correct the header's "
+                "size or type, or say there where the pixels begin"
             )
         self._inflate = None
         if packing != "raw":

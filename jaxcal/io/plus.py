@@ -205,7 +205,7 @@ def patched_configuration(
             between the frames, or another path from one to the other.
         InputError: a matrix or names that cannot be written.
     """
-    wanted = capitalised(frames[0]), capitalised(frames[1])
+    wanted = check_frames(frames)
     new = _replaced(content, wanted, matrix, error_mm, date)
     # The notes name lines of the new content, which is what their reader opens.
     root = parse_xml(new)

@@ -19,9 +19,12 @@ from jaxcal.io.frame_names import FramePair
 from jaxcal.io.sequence import TrackedSequence
 from jaxcal.io.text import PoseTable
 from jaxcal.runtime.array_types import Bool, Float, Int
+from jaxcal.runtime.messages import seconds
 
 LONGEST_GAP = 5.0
 """Longest time between two poses that is bridged, in median intervals."""
+_SHORT = 0.02
+"""Images of less than this part of the tracking make one ask for the unit of its times."""
 _ROUNDED_S = 1e-6
 """Times that were written as text and read again may be off by so much."""
 
@@ -36,6 +39,7 @@ class Tracking(NamedTuple):
         pair: frames (from, to) of the poses.
         source: the file, for messages.
         length_stated: whether the file states the unit of translations.
+        time_stated: whether the unit of its times is known, and not only taken for seconds.
     """
 
     time: Float[np.ndarray, " m"]
@@ -44,6 +48,7 @@ class Tracking(NamedTuple):
     pair: FramePair
     source: str
     length_stated: bool = False
+    time_stated: bool = True
 
 
 def times_of_table(table: PoseTable, sequence: TrackedSequence) -> Float[np.ndarray, " m"]:
@@ -80,23 +85,27 @@ def with_poses_by_time(
         The sequence, valid where a pose could be interpolated; and notes for the user.
 
     Raises:
-        InputError: images or poses without times, times that go back, or no image between poses.
+        InputError: images or poses without times, times that go back, no image between poses, or
+            times of poses that are taken for seconds, though hardly any could be of the images.
     """
-    time, poses, valid, pair, source, length_stated = tracking
+    time, poses, valid, pair, source, length_stated, time_stated = tracking
     if not np.isfinite(images.time).all():
         raise InputError(
             f"{images.source}: states no times, by which poses of {source} would be found"
         )
     kept = _increasing(time, source)
     time, poses, valid = time[kept], poses[kept], valid[kept]
-    gap = LONGEST_GAP * float(np.median(np.diff(time)))
+    interval = float(np.median(np.diff(time)))
+    if not time_stated:
+        _check_unit(images, time, interval, source)
+    gap = LONGEST_GAP * interval
     asked = _within(images.time - lag_s, time[valid])
     between = can_interpolate(time, asked, max_gap_s=gap, valid=valid)
     if not between.any():
         raise InputError(
             f"{images.source}: no image lies between poses of {source}: images are from "
-            f"{asked.min():.6g} to {asked.max():.6g} s, poses from {time[0]:.6g} to "
-            f"{time[-1]:.6g} s: are they of one clock?"
+            f"{seconds(asked.min())} to {seconds(asked.max())}, poses from {seconds(time[0])} to "
+            f"{seconds(time[-1])}: are they of one clock?"
         )
     found = np.full((len(images), 4, 4), np.nan)
     found[between] = interpolate_poses(time, poses, asked[between], max_gap_s=gap, valid=valid)
@@ -108,8 +117,28 @@ def with_poses_by_time(
             f"{gap:.3g} s are bridged)"
         )
     return replace(
-        images, transforms={pair: found}, valid={pair: between}, length_stated=length_stated
+        images,
+        transforms={pair: found},
+        valid={pair: between},
+        length_stated=length_stated,
+        without_status=(),
     ), notes
+
+
+def _check_unit(
+    images: TrackedSequence, time: Float[np.ndarray, " m"], interval: float, source: str
+) -> None:
+    """Refuse a tracking that is far longer than the images and slower: its times may be in ms."""
+    covered, whole = float(np.ptp(images.time)), float(time[-1] - time[0])
+    if len(images) < 2 or covered >= _SHORT * whole:
+        return
+    of_images = float(np.median(np.diff(np.sort(images.time))))
+    if interval > of_images:
+        raise InputError(
+            f"{source}: its poses last {whole:.4g} s, one every {interval:.3g} s, the images "
+            f"{covered:.3g} s, one every {of_images:.3g} s: is its time in ms? State the unit in "
+            "the header: time [ms], or time [s]"
+        )
 
 
 def _within(asked: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]) -> np.ndarray:

@@ -114,10 +114,21 @@ def check_count(count: int, header: SequenceHeader) -> None:
         raise FormatError(f"has fields of frame {min(beyond)}, but only {count} frames")
 
 
-def orientation_of(text: str) -> Orientation | None:
-    """The first two letters of an orientation; None for XX, ?? and nothing."""
-    start = text.strip().upper()[:2]
-    return cast(Orientation, start) if start in ("MF", "UF", "MN", "UN") else None
+def orientation_of(text: str, image_type: str) -> Orientation | None:
+    """The first two letters of an orientation; None for XX, ?? and nothing.
+
+    PLUS writes others (``FM``) for RF data alone, which are refused as such when asked for.
+    """
+    stated = text.strip().upper()
+    # The third letter, the direction of a volume's planes, follows from the others.
+    if re.fullmatch("(MF|UF|MN|UN)[AD]?", stated):
+        return cast(Orientation, stated[:2])
+    if stated not in ("", "XX", "??") and image_type == "BRIGHTNESS":
+        raise FormatError(
+            f"orientation {quoted(text)} is not read: only MF, UF, MN and UN (write XX where it is "
+            "not known)"
+        )
+    return None
 
 
 def image_type_of(text: str) -> str:
@@ -133,6 +144,7 @@ def sequence_of(
     """The sequence of a header; ``image_status`` is how the format names that field."""
     transforms: dict[FramePair, np.ndarray] = {}
     valid: dict[FramePair, np.ndarray] = {}
+    without_status: dict[FramePair, None] = {}
     time = np.full(count, np.nan)
     image_valid = np.full(count, pixels is not None)
     for number, fields in header.frames.items():
@@ -147,11 +159,21 @@ def sequence_of(
             if pair not in transforms:
                 transforms[pair] = np.full((count, 4, 4), np.nan)
                 valid[pair] = np.zeros(count, bool)
-            status, _ = fields.get(f"{field_name}Status", ("OK", 0))
-            if status.upper() == "OK":
+            status = fields.get(f"{field_name}Status")
+            if status is None:
+                without_status[pair] = None
+            if status is None or status[0].upper() == "OK":
                 transforms[pair][number] = _sixteen(value, line)
                 valid[pair][number] = True
-    return TrackedSequence(transforms, valid, time, image_valid, pixels, name)
+    return TrackedSequence(
+        transforms,
+        valid,
+        time,
+        image_valid,
+        pixels,
+        name,
+        without_status=tuple(without_status),
+    )
 
 
 def _transform_frames(field_name: str) -> FramePair | None:

@@ -139,6 +139,17 @@ def read_table(
     return Table(name, names, rows, lines, separator or "")
 
 
+def has_commented_header(table: Table) -> bool:
+    """Whether the comment just before the first row has as many cells, as numpy writes a header."""
+    before = ""
+    for line, content in text_lines(table.name, comments=True):
+        if line == table.lines[0]:
+            break
+        before = content.strip()
+    cells = _cells(before.removeprefix("#").strip(), table.separator)
+    return before.startswith("#") and len(cells) == len(table.rows[0])
+
+
 def _cells(content: str, separator: str) -> list[str]:
     if not separator:
         return content.split()

@@ -18,7 +18,7 @@ from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quate
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
 from jaxcal.io.readable import naming
-from jaxcal.io.table import Table, read_table
+from jaxcal.io.table import Table, has_commented_header, read_table
 from jaxcal.runtime.array_types import Float, Int
 from jaxcal.runtime.messages import quoted
 
@@ -63,6 +63,7 @@ class PoseTable:
         file: n names of images' files.
         skipped: rows that were left out as invalid.
         length_stated: whether the header states the unit of translations.
+        time_stated: whether times are dates, or the header states their unit.
     """
 
     name: str
@@ -76,6 +77,7 @@ class PoseTable:
     file: tuple[str, ...] | None = None
     skipped: int = 0
     length_stated: bool = False
+    time_stated: bool = False
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -137,6 +139,7 @@ def read_pose_table(
             file=file,
             skipped=skipped,
             length_stated=columns.length_mm is not None,
+            time_stated=clock is not None or columns.time_s is not None,
         )
 
 
@@ -269,10 +272,12 @@ def _columns(table: Table, quaternion: QuaternionOrder | None) -> Columns:
         matrix = tuple(range(1, width - 2))
         return Columns(width, matrix=matrix, time=0, point=(width - 2, width - 1))
     if width != 10:
-        alone = " (name two columns of points by a first line u,v)" if width == 2 else ""
+        hint = " (name two columns of points by a first line u,v)" if width == 2 else ""
+        if has_commented_header(table):
+            hint = " (remove the # before the header)"
         raise FormatError(
             f"{table.row(0)}: {width} columns without a header; 15 or 19 (time, 12 or 16 "
-            f"pose numbers, u and v) or 10 (time, x, y, z, a quaternion, u and v) are needed{alone}"
+            f"pose numbers, u and v) or 10 (time, x, y, z, a quaternion, u and v) are needed{hint}"
         )
     if quaternion is None:
         raise FormatError(
@@ -371,7 +376,7 @@ def _times(
         return None, None
     dates = [_date(table.rows[row][column]) for row in rows]
     if dates[0] is None:
-        time = table.numbers((column,), rows)[:, 0] * columns.time_s
+        time = table.numbers((column,), rows)[:, 0] * (columns.time_s or 1.0)
         late = np.flatnonzero(np.abs(time) > _LATEST_S)
         if len(late):
             raise FormatError(

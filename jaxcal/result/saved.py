@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxcal import FormatError, InputError
 from jaxcal.io.atomic import atomic_path, write_text
-from jaxcal.io.frame_names import FramePair
+from jaxcal.io.frame_names import FramePair, two_names
 from jaxcal.io.outputs import check_output
 from jaxcal.io.readable import check_readable, naming, one_line, path_name, read_bytes
 from jaxcal.model.unknowns import TABLE, tangent_names
@@ -160,7 +160,7 @@ def text_of(transform: ImageTransform, format: SaveFormat, *, frames: FramePair)
         from jaxcal.io.ros import ros_yaml
 
         # ROS's own frames are in lower case; the user's are written as they are.
-        child, parent = (n.lower() if n in ("Image", "Probe") else n for n in frames)
+        child, parent = (n.lower() if n in ("Image", "Probe") else n for n in two_names(frames))
         return ros_yaml(transform.image_plane_to_probe, parent, child, left_out(transform, format))
     if format == "tusrec":
         from jaxcal.io.tus_rec import calib_matrix

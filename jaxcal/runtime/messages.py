@@ -11,3 +11,8 @@ def quoted(text: str, limit: int = 40) -> str:
 def shown(value: object) -> str:
     """What a caller gave, short, for a message."""
     return quoted(value) if isinstance(value, str) else quoted(repr(value))[1:-1]
+
+
+def seconds(moment: float) -> str:
+    """A time stamp, to the millisecond also where it counts from 1970, for a message."""
+    return f"{moment:.3f} s"
