@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 from test_transform import random_transform
@@ -169,6 +170,46 @@ def test_a_simulation_replaces_a_simulation(folder, monkeypatch, capsys):
     jaxcal.save(replace(known, truth=truth), "simulated.h5")
     assert main(["simulate", "simulated.h5", "--images", "8"]) == 0
     assert len(jaxcal.load("simulated.h5").calibration) == 8
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "import points.txt bench.h5",
+        "segment bench.h5 --out bench.h5",
+        "segment rec.h5 --out bench.h5",
+        "segment sweep.igs.mha --out bench.h5",
+        "simulate bench.h5",
+    ],
+)
+def test_an_acquisition_is_not_replaced(folder, arguments, capsys):
+    """A recording, with truth as of an emulated bench, that is not complete or holds raw data."""
+    known = replace(jaxcal.load("rec.h5"), truth=Truth(np.eye(4), np.zeros(3), np.zeros(6)))
+    for found in ("/tracker, /us", "not complete"):
+        jaxcal.save(known, "bench.h5")
+        with h5py.File("bench.h5", "r+") as file:
+            if found == "not complete":
+                file.attrs["complete"] = False
+            else:
+                file["us/frames"] = file["tracker/pose"] = np.zeros(3)
+        before = (folder / "bench.h5").read_bytes()
+        assert main(arguments.split()) == 2
+        assert (
+            f"bench.h5: is an acquisition with its raw data ({found}): choose another name"
+            in capsys.readouterr().err
+        )
+        assert (folder / "bench.h5").read_bytes() == before
+
+
+def test_a_recording_that_is_open_elsewhere(folder, capsys):
+    fcntl = pytest.importorskip("fcntl")
+    with open("rec.h5", "rb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert main(["import", "points.txt", "rec.h5"]) == 2
+    assert (
+        "rec.h5: is being written: close it in the program that writes it (not replaced: "
+        "name another file)" in capsys.readouterr().err
+    )
 
 
 def test_saved_from_python(folder):

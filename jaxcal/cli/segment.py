@@ -73,7 +73,8 @@ if TYPE_CHECKING:
     "--out",
     type=click.Path(),
     metavar="OUT.h5",
-    help="By default REC-segmented.h5, beside REC. The name of REC itself replaces it.",
+    help="By default REC-segmented.h5, beside REC. The name of REC itself replaces it, unless REC "
+    "is an acquisition with its raw data.",
 )
 @tracking_options
 @search_options
@@ -123,7 +124,7 @@ def segment(
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     target = _default_out(recording) if out is None else out
-    # REC itself may be replaced: all of it is in the output.
+    # REC itself may be replaced: all of it is in the output, where it is no acquisition.
     check_output(target, "a recording", is_recording)
     data = load(recording)
     check_writable(target)

@@ -10,10 +10,16 @@ import os
 import stat
 from collections.abc import Callable, Iterable
 
-from jaxcal import CalibrationError, InputError
+from jaxcal import CalibrationError, FormatError, InputError
 from jaxcal.io.readable import path_name
 
 Path = str | os.PathLike[str]
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+
+
+class NotReplacedError(InputError):
+    """Why a file is not replaced although it may be of the kind that is written."""
 
 
 def check_output(
@@ -25,7 +31,8 @@ def check_output(
         path: the file to write. Where there is none yet, an empty one or no ordinary file, nothing
             is checked: whoever writes it says what is wrong.
         what: the kind in words, for messages.
-        is_one: whether a file is of this kind; an error of jaxcal's means no.
+        is_one: whether a file is of this kind; an error of jaxcal's means no, with a reason of its
+            own where it is a :class:`NotReplacedError`.
         inputs: files that are read, which must not be replaced whatever they are.
 
     Raises:
@@ -42,6 +49,8 @@ def check_output(
         return
     try:
         replaceable = is_one(path)
+    except NotReplacedError as error:
+        raise InputError(f"{name}: {error}") from None
     except (CalibrationError, OSError):
         replaceable = False
     if not replaceable:
@@ -59,19 +68,36 @@ def begins_with(*starts: bytes) -> Callable[[Path], bool]:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is one of our recordings, be it complete or not."""
-    from jaxcal.io.hdf5 import FORMAT
+    """Whether a file is one of our recordings, with nothing that would be lost by writing another.
+
+    Raises:
+        NotReplacedError: it is an acquisition, with more than :func:`jaxcal.save` writes or to be
+            resumed; or it is HDF5 that cannot be read: damaged, or open in another program.
+    """
+    from jaxcal.io.hdf5 import FORMAT, raw_data
     from jaxcal.io.untrusted import open_root, text
 
-    with open_root(path) as root:
-        return text(root, "format") == FORMAT
+    try:
+        with open_root(path) as root:
+            if text(root, "format") != FORMAT:
+                return False
+            found = raw_data(root)
+    except FormatError as error:
+        if begins_with(_HDF5)(path):
+            raise NotReplacedError(f"{error} (not replaced: name another file)") from None
+        raise
+    if found is not None:
+        raise NotReplacedError(
+            f"is an acquisition with its raw data ({found}): choose another name"
+        )
+    return True
 
 
 def is_simulated(path: Path) -> bool:
     """Whether a file is a recording that holds the truth, as simulations do."""
     from jaxcal.io.hdf5 import load
 
-    return load(path).truth is not None
+    return is_recording(path) and load(path).truth is not None
 
 
 def _same(status: os.stat_result, other: Path) -> bool:
