@@ -242,6 +242,24 @@ def test_a_name_says_the_format(folder, format, name, capsys):
     assert not (folder / name).exists()
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "simulate a.csv",
+        "import rec.csv a.h5x",
+        "segment rec.h5 --out a",
+        "segment f.mha --out a.txt",
+    ],
+)
+def test_a_recording_is_named_so(folder, arguments, capsys):
+    assert main(arguments.split()) == 2
+    name = arguments.split()[-1]
+    assert f"{name}: a recording is named .h5 or .hdf5" in capsys.readouterr().err.replace(
+        "a simulated", "a"
+    )
+    assert not (folder / name).exists()
+
+
 @pytest.mark.parametrize("name", ["scene.mrml", "config.xml.orig", "cal"])
 def test_an_extension_without_a_format(folder, name, capsys):
     (folder / name).write_text("<x/>")

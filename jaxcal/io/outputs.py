@@ -22,30 +22,42 @@ class NotReplacedError(InputError):
     """Why a file is not replaced although it may be of the kind that is written."""
 
 
+RECORDING = (".h5", ".hdf5")
+"""Endings of the names of recordings."""
+
+
 def check_output(
-    path: Path, what: str, is_one: Callable[[Path], bool], inputs: Iterable[Path] = ()
+    path: Path,
+    what: str,
+    is_one: Callable[[Path], bool],
+    inputs: Iterable[Path] = (),
+    *,
+    endings: tuple[str, ...] = ("",),
 ) -> None:
-    """See that writing a file replaces nothing but an earlier one of its kind.
+    """See that writing a file replaces nothing but an earlier one of its kind, and is named so.
 
     Args:
-        path: the file to write. Where there is none yet, an empty one or no ordinary file, nothing
-            is checked: whoever writes it says what is wrong.
+        path: the file to write. Where there is none yet, an empty one or no ordinary file, only its
+            name is checked: whoever writes it says what is wrong.
         what: the kind in words, for messages.
         is_one: whether a file is of this kind; an error of jaxcal's means no, with a reason of its
             own where it is a :class:`NotReplacedError`.
         inputs: files that are read, which must not be replaced whatever they are.
+        endings: of the names of files of this kind, in small letters; by default any.
 
     Raises:
-        InputError: it is one of the inputs, or of another kind.
+        InputError: its name ends otherwise, or it is one of the inputs, or of another kind.
     """
     name = path_name(path)
     try:
         status = os.stat(path)
     except (OSError, ValueError):
-        return
-    if any(_same(status, each) for each in inputs):
+        status = None
+    if status is not None and any(_same(status, each) for each in inputs):
         raise InputError(f"{name}: is read by this command and not replaced: name another output")
-    if not stat.S_ISREG(status.st_mode) or status.st_size == 0:
+    if not name.lower().endswith(endings):
+        raise InputError(f"{name}: {what} is named {' or '.join(endings)}")
+    if status is None or not stat.S_ISREG(status.st_mode) or status.st_size == 0:
         return
     try:
         replaceable = is_one(path)
