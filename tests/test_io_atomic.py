@@ -1,5 +1,6 @@
 """Files are complete or absent, whatever happens while they are written."""
 
+import fcntl
 import os
 import resource
 import shutil
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+import jaxcal.io.atomic
 from jaxcal import OutputError
 from jaxcal.io.atomic import atomic_path, replace_files, write_text
 
@@ -253,6 +255,40 @@ def test_a_set_of_files_is_never_a_mix(tmp_path):
         said, _ = process.communicate()
     assert process.returncode == 0
     assert int(said) > 5
+
+
+def test_two_processes_do_not_mix_their_sets(tmp_path):
+    """Both at once, again and again: the folder holds one's files or the other's."""
+    code = (
+        "import multiprocessing, os, sys\n"
+        "from pathlib import Path\n"
+        "from jaxcal.io.atomic import replace_files\n"
+        "folder, names = Path(sys.argv[1]), ['whole', *'abcdef']\n"
+        "barrier = multiprocessing.get_context('fork').Barrier(2, timeout=20)\n"
+        "me = b'one' if os.fork() else b'two'\n"
+        "for k in range(20):\n"
+        "    barrier.wait()\n"
+        "    replace_files(folder, {name: me for name in names}, [])\n"
+        "    barrier.wait()\n"
+        "    left = {f.name: f.read_bytes() for f in folder.iterdir()}\n"
+        "    assert set(left) == set(names) and len(set(left.values())) == 1, left\n"
+        "assert me == b'two' or os.wait()[1] == 0\n"
+    )
+    with run_python(code, tmp_path) as process:
+        process.communicate()
+    assert process.returncode == 0
+
+
+def test_a_set_that_another_program_is_writing(tmp_path, monkeypatch):
+    monkeypatch.setattr(jaxcal.io.atomic, "PATIENCE_S", 0)
+    replace_files(tmp_path, {"a": b"old"}, [])
+    held = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(held, fcntl.LOCK_EX)
+    with pytest.raises(OutputError, match="is being written by another program: try again"):
+        replace_files(tmp_path, {"a": b"new"}, [])
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
+    os.close(held)
+    replace_files(tmp_path, {"a": b"new"}, [])
 
 
 def test_a_set_that_cannot_be_written_is_as_it_was(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 from test_transform import random_transform
@@ -171,6 +172,46 @@ def test_a_simulation_replaces_a_simulation(folder, monkeypatch, capsys):
     assert len(jaxcal.load("simulated.h5").calibration) == 8
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "import points.txt bench.h5",
+        "segment bench.h5 --out bench.h5",
+        "segment rec.h5 --out bench.h5",
+        "segment sweep.igs.mha --out bench.h5",
+        "simulate bench.h5",
+    ],
+)
+def test_an_acquisition_is_not_replaced(folder, arguments, capsys):
+    """A recording, with truth as of an emulated bench, that is not complete or holds raw data."""
+    known = replace(jaxcal.load("rec.h5"), truth=Truth(np.eye(4), np.zeros(3), np.zeros(6)))
+    for found in ("/tracker, /us", "not complete"):
+        jaxcal.save(known, "bench.h5")
+        with h5py.File("bench.h5", "r+") as file:
+            if found == "not complete":
+                file.attrs["complete"] = False
+            else:
+                file["us/frames"] = file["tracker/pose"] = np.zeros(3)
+        before = (folder / "bench.h5").read_bytes()
+        assert main(arguments.split()) == 2
+        assert (
+            f"bench.h5: is an acquisition with its raw data ({found}): choose another name"
+            in capsys.readouterr().err
+        )
+        assert (folder / "bench.h5").read_bytes() == before
+
+
+def test_a_recording_that_is_open_elsewhere(folder, capsys):
+    fcntl = pytest.importorskip("fcntl")
+    with open("rec.h5", "rb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert main(["import", "points.txt", "rec.h5"]) == 2
+    assert (
+        "rec.h5: is being written: close it in the program that writes it (not replaced: "
+        "name another file)" in capsys.readouterr().err
+    )
+
+
 def test_saved_from_python(folder):
     transform = random_transform()
     for name in ("rec.csv", "rec.h5", "notes.json", "points.npy", "points.txt", "config.xml"):
@@ -198,6 +239,24 @@ def test_links_and_what_is_no_file(folder, tmp_path):
 def test_a_name_says_the_format(folder, format, name, capsys):
     assert main(["export", "cal.json", name, format]) == 2
     assert "is named ." in capsys.readouterr().err
+    assert not (folder / name).exists()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "simulate a.csv",
+        "import rec.csv a.h5x",
+        "segment rec.h5 --out a",
+        "segment f.mha --out a.txt",
+    ],
+)
+def test_a_recording_is_named_so(folder, arguments, capsys):
+    assert main(arguments.split()) == 2
+    name = arguments.split()[-1]
+    assert f"{name}: a recording is named .h5 or .hdf5" in capsys.readouterr().err.replace(
+        "a simulated", "a"
+    )
     assert not (folder / name).exists()
 
 

@@ -417,7 +417,7 @@ def test_what_is_not_a_report_is_not_replaced(tmp_path):
         with pytest.raises(InputError, match="no report of jaxcal"), prepare_folder(tmp_path):
             pass
     # Killed in the moment in which the files took their names.
-    (tmp_path / ".partial-report").mkdir()
+    (tmp_path / ".partial-report-0").mkdir()
     with prepare_folder(tmp_path):
         pass
 

@@ -17,7 +17,7 @@ Every command prints its options with `--help`. `jaxcal` calibrates, `jaxcal-hw`
 | --- | --- | --- |
 | 0 | converged | done |
 | 1 | an internal error, in one line; `JAXCAL_TRACEBACK=1` shows where | the same |
-| 2 | bad usage or input, in one line; nothing was written | the same |
+| 2 | bad usage or input, and nothing was written; or a file or what is printed cannot be written, and other files may have been; in one line | the same |
 | 3 | solved, but not converged, not determined by the images, or from data in wrong frames or units | done, but the calibration did not converge |
 | 4 | | a device failed: motion has ended, `--resume` goes on; of `check`: a device is wrong |
 | 5 | converged, and less accurate than `--require` (fair, if not told otherwise) | done, and the calibration is less than fair |

@@ -10,7 +10,7 @@ from jaxcal import InputError, OutputError
 from jaxcal.cli.common import ExitCode, progress
 from jaxcal.cli.sequence_options import quaternion_option, search_options, tracking_options
 from jaxcal.io.atomic import check_writable
-from jaxcal.io.outputs import check_output, is_recording
+from jaxcal.io.outputs import RECORDING, check_output, is_recording
 
 
 @click.command("import")
@@ -76,9 +76,10 @@ def _check(sources: tuple[str, ...], out: str, options: dict[str, Any]) -> None:
         )
     if options["spacing_mm"] is not None and options["units"] == "mm":
         raise click.BadParameter("points in mm have no pixel size", param_hint="--spacing")
-    read = [*sources, options["poses"], options["spacing_from"]]
+    named = [*sources, options["poses"], options["spacing_from"]]
+    read = [each for each in named if each is not None]
     try:
-        check_output(out, "a recording", is_recording, [each for each in read if each is not None])
+        check_output(out, "a recording", is_recording, read, endings=RECORDING)
         check_writable(out)
     except (InputError, OutputError) as error:
         # Whoever forgets OUT.h5 names a source last.

@@ -15,6 +15,9 @@ from jaxcal import CalibrationError
 from jaxcal.cli.common import ExitCode
 from jaxcal.runtime.interrupts import no_interrupt_lost
 
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+"""What a system says of a file or terminal that takes no more."""
+
 
 def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None) -> int:
     """Run a command line, by default ``sys.argv``'s; returns the exit status.
@@ -57,6 +60,12 @@ def run(commands: click.Group, name: str, arguments: Sequence[str] | None = None
         if error.errno == errno.EPIPE:
             return ExitCode.BROKEN_PIPE
         said = _current_folder() or error.strerror or error
+        # What files do not take is an error of jaxcal's, above.
+        if error.errno in _NO_ROOM and error.filename is None:
+            said = (
+                f"standard output: {said} (not all was printed; files that were asked for may have "
+                "been written)"
+            )
         return _report(name, f"error: {said}", ExitCode.BAD_INPUT)
     except Exception as error:
         if os.environ.get("JAXCAL_TRACEBACK"):

@@ -73,7 +73,8 @@ if TYPE_CHECKING:
     "--out",
     type=click.Path(),
     metavar="OUT.h5",
-    help="By default REC-segmented.h5, beside REC. The name of REC itself replaces it.",
+    help="By default REC-segmented.h5, beside REC. The name of REC itself replaces it, unless REC "
+    "is an acquisition with its raw data.",
 )
 @tracking_options
 @search_options
@@ -118,13 +119,13 @@ def segment(
     from jaxcal.data.segmentation.segment import segment_recording
     from jaxcal.io.atomic import check_writable
     from jaxcal.io.hdf5 import load, save
-    from jaxcal.io.outputs import check_output, is_recording
+    from jaxcal.io.outputs import RECORDING, check_output, is_recording
     from jaxcal.io.readable import naming
     from jaxcal.runtime.jax_cache import enable_compilation_cache
 
     target = _default_out(recording) if out is None else out
-    # REC itself may be replaced: all of it is in the output.
-    check_output(target, "a recording", is_recording)
+    # REC itself may be replaced: all of it is in the output, where it is no acquisition.
+    check_output(target, "a recording", is_recording, endings=RECORDING)
     data = load(recording)
     check_writable(target)
     probe = _probe(data, sound_speed, temperature)
@@ -164,11 +165,11 @@ def _segment_frames(source: str, out: str | None, as_json: bool, options: dict[s
     from jaxcal.io.hdf5 import save
     from jaxcal.io.import_options import ImportOptions
     from jaxcal.io.importing import import_files
-    from jaxcal.io.outputs import check_output, is_recording
+    from jaxcal.io.outputs import RECORDING, check_output, is_recording
     from jaxcal.io.target_search import FATES
 
     target = _default_out(source) if out is None else out
-    check_output(target, "a recording", is_recording, [source])
+    check_output(target, "a recording", is_recording, [source], endings=RECORDING)
     # Of a source that is not there nothing is said about the output beside it.
     if os.path.exists(source):
         check_writable(target)

@@ -68,9 +68,9 @@ def simulate(
     raw = raw or probe == "curvilinear"
     if clock_mhz is not None and not raw:
         raise InputError("--clock-mhz rounds times of flight: it needs --raw")
-    from jaxcal.io.outputs import check_output, is_simulated
+    from jaxcal.io.outputs import RECORDING, check_output, is_simulated
 
-    check_output(out, "a simulated recording", is_simulated)
+    check_output(out, "a simulated recording", is_simulated, endings=RECORDING)
     import_engine()
     from jaxcal.data.probe import PRESETS
     from jaxcal.io.hdf5 import save

@@ -12,12 +12,18 @@ import os
 import secrets
 import shutil
 import stat
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from jaxcal import CalibrationError, InputError, OutputError
+
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,8 +86,11 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         temporary.write_bytes(content)
 
 
-STAGED = ".partial-report"
-"""Folder inside a folder of files in which its next content is gathered."""
+STAGED = ".partial-report*"
+"""Folders inside a folder of files in which its next content is gathered."""
+
+PATIENCE_S = 10.0
+"""How long another program's change of a folder of files, which takes less, is waited for."""
 
 
 def replace_files(
@@ -89,9 +98,10 @@ def replace_files(
 ) -> None:
     """Replace a set of files that belong together: at no moment are old and new ones mixed.
 
-    The new files are gathered in the folder :data:`STAGED` first; then the old ones are removed,
-    and then the new ones take their names, the first of them last. Who is killed in between leaves
-    a folder without that file; the next call puts it right.
+    The new files are gathered in a folder :data:`STAGED` first; then the old ones are removed, and
+    then the new ones take their names, the first of them last. Who is killed in between leaves a
+    folder without that file; the next call puts it right. One process at a time does so, where the
+    system has locks.
 
     Args:
         folder: an existing folder; other files in it are left alone.
@@ -99,11 +109,19 @@ def replace_files(
         names: of all files that such a set may have: those that it has not now are removed.
 
     Raises:
-        OutputError: they cannot be written. Old files are as they were, unless the disk failed in
-            the very moment of the change.
+        OutputError: they cannot be written, or another program is writing them. Old files are as
+            they were, unless the disk failed in the very moment of the change.
     """
     target = Path(folder)
-    staged = target / STAGED
+    with _only_writer(target) as alone:
+        if alone:
+            for left in target.glob(STAGED):
+                shutil.rmtree(left, ignore_errors=True)
+        _replace_files(target, files, names)
+
+
+def _replace_files(target: Path, files: Mapping[str, bytes], names: Iterable[str]) -> None:
+    staged = target / STAGED.replace("*", f"-{secrets.token_hex(8)}")
     known = [*files, *(name for name in names if name not in files)]
     for name in known:
         try:
@@ -111,7 +129,6 @@ def replace_files(
         except (OSError, ValueError) as error:
             raise _output_error(os.fspath(target / name), error) from error
     try:
-        shutil.rmtree(staged, ignore_errors=True)
         staged.mkdir()
         try:
             for name, content in files.items():
@@ -126,9 +143,51 @@ def replace_files(
             os.replace(staged / name, target / name)
         staged.rmdir()
     except (OSError, ValueError) as error:
-        raise _output_error(os.fspath(folder), error) from error
+        raise _output_error(os.fspath(target), error) from error
     with suppress(OSError):
         _flush(target, os.O_RDONLY)
+
+
+@contextmanager
+def _only_writer(folder: Path) -> Iterator[bool]:
+    """Wait until no other process replaces files of a folder; whether that is sure."""
+    # The folder itself is locked: no file is left over, and the lock ends with its process.
+    descriptor = None
+    with suppress(OSError, ValueError):
+        descriptor = os.open(folder, os.O_RDONLY)
+    if descriptor is None:  # on Windows, or what is wrong with the folder is said later
+        yield False
+        return
+    try:
+        end = time.monotonic() + PATIENCE_S
+        while (locked := lock(descriptor)) is False:
+            if time.monotonic() >= end:
+                raise OutputError(
+                    f"{folder}: is being written by another program: try again, or name another "
+                    "folder"
+                )
+            time.sleep(0.02)
+        yield bool(locked)
+    finally:
+        os.close(descriptor)
+
+
+def lock(descriptor: int) -> bool | None:
+    """Lock an open file or folder until it is closed or the process ends.
+
+    Returns:
+        False where another process has locked it; None where the system or the file system has no
+        locks.
+    """
+    if fcntl is None:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:

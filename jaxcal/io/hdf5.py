@@ -52,6 +52,7 @@ from jaxcal.io.untrusted import (
     child,
     flag,
     group,
+    members,
     number,
     numbers,
     open_root,
@@ -66,6 +67,10 @@ FORMAT = "jaxcal-recording"
 VERSION = 1
 IMAGES = UpTo(100_000, "images")
 ELEMENTS = UpTo(4096, "elements")
+GROUPS = ("probe", "calibration", "test", "truth", "segmentation")
+"""All that :func:`save` writes."""
+
+_MOST_GROUPS = 1000
 
 _SPELLINGS = {
     "mm": ("mm", "millimeter", "millimeters", "millimetre", "millimetres"),
@@ -134,6 +139,18 @@ def save(
     _read(io.BytesIO(image.getvalue()), name)
     with atomic_path(path) as temporary:
         temporary.write_bytes(image.getvalue())
+
+
+def raw_data(root: Node) -> str | None:
+    """What a recording has that :func:`save` would not write again: an acquisition's raw data.
+
+    Returns:
+        The names of the groups, or that its writer has not finished; None where there is nothing.
+    """
+    if flag(root, "complete") is False:
+        return "not complete"
+    known = {f"/{name}" for name in GROUPS}
+    return ", ".join(sorted({str(each) for each in members(root, _MOST_GROUPS)} - known)) or None
 
 
 def _read(source: str | os.PathLike[str] | io.BytesIO, name: str) -> Recording:

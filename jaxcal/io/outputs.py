@@ -10,38 +10,59 @@ import os
 import stat
 from collections.abc import Callable, Iterable
 
-from jaxcal import CalibrationError, InputError
+from jaxcal import CalibrationError, FormatError, InputError
 from jaxcal.io.readable import path_name
 
 Path = str | os.PathLike[str]
 
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+
+
+class NotReplacedError(InputError):
+    """Why a file is not replaced although it may be of the kind that is written."""
+
+
+RECORDING = (".h5", ".hdf5")
+"""Endings of the names of recordings."""
+
 
 def check_output(
-    path: Path, what: str, is_one: Callable[[Path], bool], inputs: Iterable[Path] = ()
+    path: Path,
+    what: str,
+    is_one: Callable[[Path], bool],
+    inputs: Iterable[Path] = (),
+    *,
+    endings: tuple[str, ...] = ("",),
 ) -> None:
-    """See that writing a file replaces nothing but an earlier one of its kind.
+    """See that writing a file replaces nothing but an earlier one of its kind, and is named so.
 
     Args:
-        path: the file to write. Where there is none yet, an empty one or no ordinary file, nothing
-            is checked: whoever writes it says what is wrong.
+        path: the file to write. Where there is none yet, an empty one or no ordinary file, only its
+            name is checked: whoever writes it says what is wrong.
         what: the kind in words, for messages.
-        is_one: whether a file is of this kind; an error of jaxcal's means no.
+        is_one: whether a file is of this kind; an error of jaxcal's means no, with a reason of its
+            own where it is a :class:`NotReplacedError`.
         inputs: files that are read, which must not be replaced whatever they are.
+        endings: of the names of files of this kind, in small letters; by default any.
 
     Raises:
-        InputError: it is one of the inputs, or of another kind.
+        InputError: its name ends otherwise, or it is one of the inputs, or of another kind.
     """
     name = path_name(path)
     try:
         status = os.stat(path)
     except (OSError, ValueError):
-        return
-    if any(_same(status, each) for each in inputs):
+        status = None
+    if status is not None and any(_same(status, each) for each in inputs):
         raise InputError(f"{name}: is read by this command and not replaced: name another output")
-    if not stat.S_ISREG(status.st_mode) or status.st_size == 0:
+    if not name.lower().endswith(endings):
+        raise InputError(f"{name}: {what} is named {' or '.join(endings)}")
+    if status is None or not stat.S_ISREG(status.st_mode) or status.st_size == 0:
         return
     try:
         replaceable = is_one(path)
+    except NotReplacedError as error:
+        raise InputError(f"{name}: {error}") from None
     except (CalibrationError, OSError):
         replaceable = False
     if not replaceable:
@@ -59,19 +80,36 @@ def begins_with(*starts: bytes) -> Callable[[Path], bool]:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is one of our recordings, be it complete or not."""
-    from jaxcal.io.hdf5 import FORMAT
+    """Whether a file is one of our recordings, with nothing that would be lost by writing another.
+
+    Raises:
+        NotReplacedError: it is an acquisition, with more than :func:`jaxcal.save` writes or to be
+            resumed; or it is HDF5 that cannot be read: damaged, or open in another program.
+    """
+    from jaxcal.io.hdf5 import FORMAT, raw_data
     from jaxcal.io.untrusted import open_root, text
 
-    with open_root(path) as root:
-        return text(root, "format") == FORMAT
+    try:
+        with open_root(path) as root:
+            if text(root, "format") != FORMAT:
+                return False
+            found = raw_data(root)
+    except FormatError as error:
+        if begins_with(_HDF5)(path):
+            raise NotReplacedError(f"{error} (not replaced: name another file)") from None
+        raise
+    if found is not None:
+        raise NotReplacedError(
+            f"is an acquisition with its raw data ({found}): choose another name"
+        )
+    return True
 
 
 def is_simulated(path: Path) -> bool:
     """Whether a file is a recording that holds the truth, as simulations do."""
     from jaxcal.io.hdf5 import load
 
-    return load(path).truth is not None
+    return is_recording(path) and load(path).truth is not None
 
 
 def _same(status: os.stat_result, other: Path) -> bool:

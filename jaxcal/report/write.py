@@ -89,7 +89,7 @@ def prepare_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 def _check_report(folder: Path) -> None:
     """See that files of a report's names are those of a report, which may be replaced."""
     found = [name for name in NAMES if (folder / name).exists()]
-    if not found or (folder / STAGED).is_dir():
+    if not found or any(folder.glob(STAGED)):
         return
     with suppress(FormatError):
         if is_calibration_record(folder / NAMES[0]):

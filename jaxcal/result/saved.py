@@ -77,9 +77,13 @@ def check_target(
     extensions = _EXTENSIONS.get(chosen) if isinstance(chosen, str) else None
     if extensions is None:
         raise InputError(f"{quoted(str(chosen))} is no format that is written")
-    if not name.lower().endswith(extensions):
-        raise InputError(f"{name}: a file of format {chosen} is named {' or '.join(extensions)}")
-    check_output(path, f"a calibration (format {chosen})", lambda _: _is_one(path, chosen), inputs)
+    check_output(
+        path,
+        f"a calibration (format {chosen})",
+        lambda _: _is_one(path, chosen),
+        inputs,
+        endings=extensions,
+    )
     return chosen
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from jaxcal import FormatError, InputError, OutputError
+from jaxcal.io.atomic import lock
 from jaxcal.io.readable import one_line
 from jaxcal.runtime.given_values import check_flag, whole_number
 from jaxcal.runtime.interrupts import no_interrupt_lost
@@ -21,11 +22,6 @@ from jaxcal.study.store import Store
 
 if TYPE_CHECKING:
     from distributed import Client
-
-try:
-    import fcntl
-except ImportError:  # not on Windows
-    fcntl = None
 
 _MOST_WORKERS = 10_000
 
@@ -169,19 +165,12 @@ def _computed(
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Keep other processes from computing the same study; the lock ends with its process."""
-    if fcntl is None:
-        yield
-        return
     path = folder / ".lock"
     try:
-        lock = path.open("wb")
+        file = path.open("wb")
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {one_line(error)}") from error
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"{folder}: is being computed by another process") from None
-        except OSError:
-            pass  # a file system without locks
+    with file:
+        if lock(file.fileno()) is False:
+            raise InputError(f"{folder}: is being computed by another process")
         yield
