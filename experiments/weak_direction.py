@@ -1,4 +1,4 @@
-"""What removes the steps of prior ``auto`` with 12 images: an integral along the weak direction.
+"""Does an integral along the weak direction remove the steps of prior ``auto`` with 12 images?
 
 With 12 images the restricted likelihood of X, target and three SDs can have two maxima: small
 errors of the range with large offsets, or the opposite. They lie along the direction of X that the

@@ -122,6 +122,31 @@ claim(
     "with 12 images it is {:.0f} and {:.0f} paths,",
     lambda: (_jumps("paths_above_a_tenth", path)[0] for path in ("mean", "outlier")),
 )
+claim(
+    ACCURACY,
+    "Of {:.0f} and {:.0f} such paths, {:.0f} and {:.0f} still have a step",
+    lambda: (
+        column("weak_direction", "default_paths")
+        + column("weak_direction", "integral_above_a_tenth")
+    ),
+)
+claim(
+    ACCURACY,
+    "of {:.0f} others each, {:.0f} and {:.0f}.",
+    lambda: (
+        column("weak_direction", "other_integral_paths", path="mean")
+        + column("weak_direction", "other_integral_above_a_tenth")
+    ),
+)
+claim(
+    ACCURACY,
+    "with 12 images the mean error in the middle of the image is {:.2f} mm, that of prior "
+    "`gaussian` {:.2f} mm.",
+    lambda: [
+        only("weak_direction_error", of, images="12")
+        for of in ("integral_mean_mm", "gaussian_mean_mm")
+    ],
+)
 
 # Held probes.
 HOLDS = tuple(f"{count} holds x {60 // count}" for count in (4, 6, 10, 20))
