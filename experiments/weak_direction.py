@@ -63,12 +63,10 @@ class Integral(NamedTuple):
     Attributes:
         image_to_probe: X of the mean.
         covariance: of the nine unknowns about the mean, in mm (turns: arcs at ``LEVER_MM``).
-        weight: of every node.
     """
 
     image_to_probe: Float[Array | np.ndarray, "*batch 4 4"]
     covariance: Float[Array | np.ndarray, "*batch 9 9"]
-    weight: Float[Array | np.ndarray, "*batch nodes"]
 
 
 def turned(vector: Float[Array, " 3"]) -> Float[Array, "3 3"]:
@@ -178,7 +176,7 @@ def integrate(
     mean = weight @ steps
     off = steps - mean
     covariance = jnp.einsum("k,kij->ij", weight, within + off[:, :, None] * off[:, None])
-    return Integral(placed(x, mean), covariance, weight)
+    return Integral(placed(x, mean), covariance)
 
 
 def integrals(problems: Problem) -> Integral:

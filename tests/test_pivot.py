@@ -84,10 +84,14 @@ def test_errors_that_no_tip_in_a_dimple_has_are_told(tmp_path, capsys):
     assert right.wrong_frames is None
 
 
-def test_poses_that_a_tracker_repeats_count_once():
+def test_poses_that_a_tracker_repeats_count_once(tmp_path, capsys):
     poses = swung(random_rotations(60), noise=0.5)
     once, twice = jaxcal.calibrate_pivot(poses), jaxcal.calibrate_pivot(np.repeat(poses, 2, axis=0))
     assert int(twice.mask.sum()) == 60
+    path = tmp_path / "poses.txt"
+    np.savetxt(path, np.repeat(poses, 2, axis=0).reshape(120, 16))
+    assert main(["pivot", str(path)]) == 0
+    assert "60 poses repeat an earlier one exactly and are not used" in capsys.readouterr().out
     np.testing.assert_allclose(twice.covariance, once.covariance, rtol=1e-9)
     with pytest.raises(InputError, match="20 used poses, 2 of them different, are too few"):
         jaxcal.calibrate_pivot(np.repeat(poses[:2], 10, axis=0))

@@ -86,4 +86,6 @@ def _print(record: dict[str, Any]) -> None:
     if record["covariance"] is not None:
         spread = [record["covariance"][axis][axis] ** 0.5 for axis in range(3)]
         lines.append("SD of the tip (mm): " + ", ".join(f"{value:.3f}" for value in spread))
+    if record["repeated"]:
+        lines.append(f"{record['repeated']} poses repeat an earlier one exactly and are not used")
     print_page(*lines, *(f"- {text}" for text in record["warnings"]))
