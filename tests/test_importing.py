@@ -160,6 +160,23 @@ def test_invalid_rows_are_counted(tmp_path):
     assert notes == [f"{tmp_path / 't.csv'}: 4 invalid rows left out"]
 
 
+def test_a_pose_of_zeros_is_that_of_a_tool_not_seen(tmp_path):
+    lines = table(NAMES, COLUMNS)
+    cells = lines[3].split(",")
+    lost = ",".join([*cells[:2], *["0"] * (len(cells) - 2)])
+    (tmp_path / "t.csv").write_text("\n".join([*lines, lost]))
+    with pytest.raises(FormatError, match=r"t\.csv:8: the rotation is all zeros.*--skip-invalid"):
+        import_files([tmp_path / "t.csv"])
+    assert len(import_files([tmp_path / "t.csv"], ImportOptions(skip_invalid=True)).recording) == 6
+
+
+def test_empty_rows_at_the_end_do_not_count(tmp_path):
+    lines = table(NAMES, COLUMNS)
+    (tmp_path / "t.csv").write_text("\n".join([*lines, ",,,,,,,,", ",,,,,,,,", ""]))
+    recording, notes, _ = import_files([tmp_path / "t.csv"])
+    assert (len(recording), notes) == (6, [])
+
+
 @pytest.mark.parametrize(
     ("names", "message"),
     [
@@ -211,6 +228,10 @@ def test_times_that_go_back(tmp_path):
     recording, notes, _ = import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True))
     assert recording.calibration.time is None
     assert "not kept" in notes[0]
+    (tmp_path / "t.csv").write_text(
+        "\n".join([*lines[:3], lines[3][lines[3].index(",") :], *lines[4:]])
+    )
+    assert len(import_files([tmp_path / "t.csv"], ImportOptions(ignore_time=True)).recording) == 6
 
 
 def test_times_in_another_unit_than_seconds(tmp_path):

@@ -40,8 +40,8 @@ _COLUMNS = (
 @click.option(
     "--skip-invalid",
     is_flag=True,
-    help="Leave out rows of a table that are marked as invalid or have gaps; a last column, line, "
-    "then says which row is which.",
+    help="Leave out rows of a table that are marked as invalid, have gaps or a pose of zeros; a "
+    "last column, line, then says which row is which.",
 )
 @click.option(
     "--out",

@@ -31,7 +31,8 @@ from jaxcal.io.outputs import RECORDING, check_output, is_recording
 @click.option(
     "--skip-invalid",
     is_flag=True,
-    help="Leave out, and count, rows of tables that are marked as invalid or have gaps.",
+    help="Leave out, and count, rows of tables that are marked as invalid, have gaps or a pose of "
+    "zeros.",
 )
 @tracking_options
 @click.option(

@@ -105,7 +105,9 @@ _SEARCH = (
         "(jaxcal[dicom]).",
     ),
     click.option(
-        "--ignore-time", is_flag=True, help="If times repeat or go back, import without them."
+        "--ignore-time",
+        is_flag=True,
+        help="If times repeat, go back or are missing, import without them.",
     ),
 )
 

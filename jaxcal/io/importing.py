@@ -86,8 +86,8 @@ def import_files(
             f"{os.fspath(sources[0])}: holds no poses: a sequence, a tracker's export or a table "
             "with poses is needed"
         )
-    table = read_rows(sources[0], options)
-    notes = table.notes
+    table = read_rows(sources[0], options, ignore_time=options.ignore_time)
+    notes = table.notes + ["time stamps are not kept"] * options.ignore_time
     if table.time is not None:
         time, said = _good_time(table.time, lambda row: f"{table.name}:{table.lines[row]}", options)
         table, notes = replace(table, time=time), notes + said

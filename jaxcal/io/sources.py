@@ -40,7 +40,9 @@ def kind_of(source: str | os.PathLike[str]) -> str:
     return "tracker" if is_tracker_export(source) else "table"
 
 
-def read_rows(source: str | os.PathLike[str], options: ImportOptions) -> PoseTable:
+def read_rows(
+    source: str | os.PathLike[str], options: ImportOptions, *, ignore_time: bool = False
+) -> PoseTable:
     """The table of a source of the kind ``table``."""
     return read_pose_table(
         source,
@@ -48,6 +50,7 @@ def read_rows(source: str | os.PathLike[str], options: ImportOptions) -> PoseTab
         pose_units=options.pose_units,
         units=options.units,
         skip_invalid=options.skip_invalid,
+        ignore_time=ignore_time,
     )
 
 

@@ -134,6 +134,10 @@ def read_table(
             )
         rows.append(cells)
         lines.append(line)
+    # A spreadsheet writes empty rows where cells below the table once held something.
+    while rows and not any(rows[-1]):
+        rows.pop()
+        lines.pop()
     if not rows:
         raise FormatError(f"{name}: holds no rows of numbers")
     return Table(name, names, rows, lines, separator or "")

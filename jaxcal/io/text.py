@@ -7,7 +7,7 @@ Blank lines and lines that start with ``#`` are skipped. A file is UTF-8 (or ASC
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
 
@@ -18,7 +18,7 @@ from jaxcal.data.poses import QuaternionOrder, check_poses, rotations_from_quate
 from jaxcal.data.recording import Recording, make_images
 from jaxcal.io.columns import LENGTHS_MM, Columns, LengthUnit, columns_of_header
 from jaxcal.io.readable import naming
-from jaxcal.io.table import Table, has_commented_header, read_table
+from jaxcal.io.table import Table, has_commented_header, parse_number, read_table
 from jaxcal.runtime.array_types import Float, Int
 from jaxcal.runtime.messages import quoted
 
@@ -95,6 +95,7 @@ def read_pose_table(
     pose_units: LengthUnit | None = None,
     units: Literal["px", "mm"] | None = None,
     skip_invalid: bool = False,
+    ignore_time: bool = False,
 ) -> PoseTable:
     """Read a table of poses, points or both.
 
@@ -106,7 +107,8 @@ def read_pose_table(
         pose_units: of translations; mm if neither this nor the header states it.
         units: of u and v, where the header does not say; px by default.
         skip_invalid: leave out rows that a column ``valid`` or ``status`` marks as invalid, and
-            rows with empty cells, NaN or Inf; otherwise they are errors.
+            rows with empty cells, NaN, Inf or a pose of zeros; otherwise they are errors.
+        ignore_time: do not read the times.
 
     Raises:
         FormatError: a file, a header or a row that cannot be read; file and line are named.
@@ -115,6 +117,8 @@ def read_pose_table(
     table = read_table(path)
     with naming(path):
         columns = _columns(table, quaternion)
+        if ignore_time:
+            columns = replace(columns, time=None)
         if quaternion is not None and columns.matrix is not None:
             raise FormatError("its poses are matrices: leave --quaternion out")
         rows, skipped = _used_rows(table, columns, skip_invalid)
@@ -297,6 +301,7 @@ def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list
         *(columns.point or ()),
         *(() if columns.time is None else (columns.time,)),
     ]
+    pose, comma = columns.quaternion or columns.matrix or (), table.separator != ","
     kept: list[int] = []
     for row, cells in enumerate(table.rows):
         missing = next((k for k in needed if _missing(cells[k])), None)
@@ -304,6 +309,8 @@ def _used_rows(table: Table, columns: Columns, skip_invalid: bool) -> tuple[list
             why = f"the row is marked as invalid ({quoted(cells[columns.valid])})"
         elif missing is not None:
             why = f"{table.column(missing)} is {quoted(cells[missing])[1:-1] or 'empty'}"
+        elif {parse_number(cells[k], decimal_comma=comma) for k in pose} == {0.0}:
+            why = "the rotation is all zeros, as of a tool that was not seen"
         else:
             kept.append(row)
             continue
