@@ -42,8 +42,7 @@ def test_a_hold_is_one_image_with_its_mean(frames, holds, each):
     joined, found = independent(images)
     np.testing.assert_array_equal(found.group, np.repeat(np.arange(holds), each))
     assert (found.frames, found.poses, found.images) == (holds * each, holds, holds)
-    assert found.words is not None
-    assert f"{holds * each} frames, {holds} different poses" in found.words
+    assert f"{holds * each} frames, {holds} different poses" in found.words[0]
     middle = np.median if each >= 5 else np.mean
     expected = middle(made.points.reshape(holds, each, 2), axis=1)
     np.testing.assert_allclose(joined.measurements[joined.mask], expected)
@@ -51,6 +50,23 @@ def test_a_hold_is_one_image_with_its_mean(frames, holds, each):
     np.testing.assert_allclose(joined.poses[joined.mask, :3, 3], shift)
     # A second time there is nothing left to do.
     assert independent(joined)[0] is joined
+
+
+def test_frames_of_frozen_tracking_are_left_out(frames):
+    made = frames.held(30, 1, np.random.default_rng(4))
+    poses, points = made.poses.copy(), made.points.copy()
+    # Frozen for three images; and a robot's hold, with a wrong click.
+    poses[8:10] = poses[7]
+    poses[20:25], points[20:25] = poses[20], points[20]
+    points[22] += 20.0
+    joined, found = independent(make_images(poses, points))
+    assert found.frozen == (7, 8, 9)
+    np.testing.assert_array_equal(np.flatnonzero(~joined.mask), [7, 8, 9, 20, 21, 23, 24])
+    np.testing.assert_allclose(joined.measurements[22], points[20])
+    assert "left out 3 images, counted from 0" in found.words[0]
+    assert found.words[0].endswith("7, 8, 9")
+    result = jaxcal.calibrate(jaxcal.Problem.from_arrays(poses, points), "conventional")
+    assert found.words[0] in result.warnings
 
 
 def test_order_and_unused_images_do_not_matter(frames):

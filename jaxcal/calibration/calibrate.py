@@ -98,8 +98,9 @@ def calibrate(
 
     Returns:
         A :class:`Calibration`; read its ``status`` and ``warnings`` before using it. The frames of
-        one pose count as one image (:mod:`jaxcal.calibration.dependence`); the others are masked
-        out in the answer and in its ``problem``. Errors that are alike in successive images widen
+        one pose count as one image, and those of frozen tracking are left out
+        (:mod:`jaxcal.calibration.dependence`); the others are masked out in the answer and in its
+        ``problem``. Errors that are alike in successive images widen
         its covariance (:mod:`jaxcal.calibration.serial_correlation`). Both are done for one problem
         with concrete arrays only; under jit, vmap or grad, and in batches, images are treated as
         independent.
@@ -136,11 +137,11 @@ def calibrate(
     left = int(np.count_nonzero(np.asarray(joined.mask) > 0))
     if left < MINIMUM_IMAGES:
         raise InputError(
-            f"{found.words or 'too few images'}; at least {MINIMUM_IMAGES} that are independent "
-            "are needed: hold the probe still at different poses"
+            f"{'; '.join(found.words) or 'too few images'}; at least {MINIMUM_IMAGES} that are "
+            "independent are needed: hold the probe still at different poses"
         )
-    notes = () if found.words is None else (found.words,)
-    return widened(replace(_solve_alone(joined, given, plan), problem=joined, notes=notes))
+    solved = _solve_alone(joined, given, plan)
+    return widened(replace(solved, problem=joined, notes=tuple(found.words)))
 
 
 def _solve_alone(problem: Problem, given: Given, plan: SolvePlan) -> Calibration:

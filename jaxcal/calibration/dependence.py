@@ -15,6 +15,10 @@ point (the median from five frames on, so one wrong click in a hold does no harm
 those *between* holds, which the solver estimates from the holds' residuals; they include what the
 mean leaves of the errors *within* a hold. The other frames of a group are masked out.
 
+*Frozen tracking.* Many trackers repeat the last pose while the tool is not seen. Frames with
+exactly the same pose, in which the target lies in different places, have a wrong pose and are left
+out.
+
 *Streams.* Images of a moving probe may differ in pose and still share slowly changing errors. The
 residuals of the conventional fit (closed form, :mod:`jaxcal.solvers.closed_form.single`) have an
 integrated autocorrelation time t, and n images are worth n / t independent ones. Where t reaches
@@ -56,6 +60,12 @@ HOLD_MM = 3.0
 ROBUST_FROM = 5
 """From so many frames on, the point of a group is the median of its frames' points."""
 
+MOVED = 0.25
+"""Frames of one pose contradict it if their points differ by this share of all points' spread, and
+by ``LEAST_MOVED``."""
+LEAST_MOVED = 3.0
+"""In the points' unit, mm or px: noise of the points, since a share of no spread is nothing."""
+
 STREAM = 4.0
 """Least autocorrelation time of a stream, in images."""
 SURE = 5.0
@@ -84,6 +94,7 @@ class Independent:
         frames: number of used images.
         poses: number of different poses among them.
         stride: one of so many poses of a stream is kept; 1 where the recording is no stream.
+        frozen: images left out, since their pose is repeated while the target moves.
     """
 
     group: Int[np.ndarray, " n"]
@@ -91,6 +102,7 @@ class Independent:
     frames: int
     poses: int
     stride: int = 1
+    frozen: tuple[int, ...] = ()
 
     @property
     def images(self) -> int:
@@ -98,21 +110,29 @@ class Independent:
         return int(self.keep.sum())
 
     @property
-    def words(self) -> str | None:
-        """What was done, for a person; None where all images are independent."""
-        if self.images == self.frames:
-            return None
+    def words(self) -> list[str]:
+        """What was done, for a person; empty where all images are independent."""
+        told = []
+        if self.frozen:
+            named = ", ".join(map(str, self.frozen[:10])) + ", ..." * (len(self.frozen) > 10)
+            told.append(
+                f"left out {len(self.frozen)} images, counted from 0, whose pose is exactly "
+                "that of another one while the target moves in them (was tracking frozen?): "
+                f"{named}"
+            )
         if self.stride > 1:
             worth = self.frames / self.images
-            return (
+            told.append(
                 f"{self.frames} frames of a moving probe, whose errors stay alike for about "
                 f"{worth:.0f} frames (is there a lag between images and poses?): they count as "
                 f"{self.images} image{'s' * (self.images != 1)}"
             )
-        return (
-            f"{self.frames} frames, {self.poses} different poses: the frames of each pose (within "
-            f"{SAME_POSE_MM:g} mm) count as one image"
-        )
+        elif self.images < self.frames:
+            told.append(
+                f"{self.frames} frames, {self.poses} different poses: the frames of each pose "
+                f"(within {SAME_POSE_MM:g} mm) count as one image"
+            )
+        return told
 
 
 def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, Independent]:
@@ -132,14 +152,19 @@ def independent(data: Any, estimate: tuple[str, ...] = ()) -> tuple[Any, Indepen
         InputError: fewer than 4 different poses.
     """
     poses, mask = np.asarray(data.poses, dtype=float), np.asarray(data.mask) > 0
+    frozen = _frozen(poses, np.asarray(data.measurements, dtype=float), mask)
+    mask = mask & ~frozen
     group = same_pose(poses, mask)
-    found = _represented(group, mask)
+    found = replace(_represented(group, mask), frozen=tuple(np.flatnonzero(frozen).tolist()))
     if found.poses < MINIMUM_IMAGES:
+        left_out = f" ({found.words[0]})" if found.frozen else ""
         raise InputError(
-            f"{found.frames} images, but only {found.poses} different "
+            f"{found.frames} images{left_out}, but only {found.poses} different "
             f"pose{'s' * (found.poses != 1)}: at least {MINIMUM_IMAGES} are needed (poses closer "
             f"than {SAME_POSE_MM:g} mm count once)"
         )
+    if found.frozen:
+        data = _changed(data, {"mask": mask})
     if found.poses < found.frames:
         data = _joined(data, found)
     if found.images >= FEWEST_OF_STREAM:
@@ -214,6 +239,24 @@ def _near(
         return empty, empty
     pairs = np.concatenate(found, axis=1)
     return pairs[0], pairs[1]
+
+
+def _frozen(
+    poses: Float[np.ndarray, "n 4 4"],
+    points: Float[np.ndarray, "n 2"],
+    mask: Bool[np.ndarray, " n"],
+) -> Bool[np.ndarray, " n"]:
+    """Frames that have exactly one pose, while the target lies in different places in them."""
+    used, frozen = np.flatnonzero(mask), np.zeros(len(mask), bool)
+    if not len(used):
+        return frozen
+    limit = max(MOVED * np.sqrt(points[used].var(axis=0).sum()), LEAST_MOVED)
+    each = np.unique(poses[used].reshape(len(used), 16), axis=0, return_inverse=True)[1]
+    for rows in map(used.__getitem__, _split(each.ravel())):
+        away = np.linalg.norm(points[rows] - np.median(points[rows], axis=0), axis=1)
+        # One wrong click does no harm where the hold's point is a median.
+        frozen[rows] = (np.median(away) if len(rows) >= ROBUST_FROM else away.max()) > limit
+    return frozen
 
 
 def _components(
