@@ -124,8 +124,8 @@ class Independent:
             worth = self.frames / self.images
             told.append(
                 f"{self.frames} frames of a moving probe, whose errors stay alike for about "
-                f"{worth:.0f} frames (is there a lag between images and poses?): they count as "
-                f"{self.images} image{'s' * (self.images != 1)}"
+                f"{worth:.0f} frames (a lag between images and poses, or another depth setting?): "
+                f"they count as {self.images} image{'s' * (self.images != 1)}"
             )
         elif self.images < self.frames:
             told.append(

@@ -87,4 +87,7 @@ def _in_time(name: str, scores: AnyArray, count: int) -> list[str]:
         parts.append(f"drift in the course of the recording (correlation {correlation:.2f})")
     if not parts:
         return []
-    return [f"the {name} {' and '.join(parts)}: latency, a slipping mount or a moving target?"]
+    return [
+        f"the {name} {' and '.join(parts)}: latency, a slipping mount, a moving target or another "
+        "depth setting?"
+    ]
