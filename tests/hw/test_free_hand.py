@@ -284,6 +284,15 @@ def test_a_servers_clock_that_is_set_back_is_no_end(tmp_path, plus_server):
     check(tmp_path / "r.h5", [0, 1, 2, 4])
 
 
+def test_a_machine_that_is_frozen_has_no_image_taken(tmp_path, plus_server):
+    """Its screen is grabbed with new time stamps: one target's pixel was taken at every pose."""
+    person = Scripted()
+    port = plus_server(mode="tracked", frozen=[30, 110])
+    assert acquire_free_hand(tmp_path / "r.h5", FreeHand("127.0.0.1", port, images=5), person) == 5
+    assert "the image stays the same while the probe moves: is the machine frozen?" in person.words
+    check(tmp_path / "r.h5", [0, 1, 5, 6, 7])
+
+
 @pytest.mark.parametrize(
     "option",
     [
