@@ -116,6 +116,23 @@ def check(path: Path, order: list[int], seed: int = 1, count: int = 9) -> None:
     assert found.mean() < 8
 
 
+def test_a_run_from_the_command_line(tmp_path, capsys, monkeypatch, tracked):
+    """Up to the calibration, which takes ten times as long; its exit status is the command's."""
+    path, calibrated = tmp_path / "rec.h5", []
+
+    def calibrate(path: str) -> dict[str, bool]:
+        calibrated.append(path)
+        return {"converged": False}
+
+    monkeypatch.setattr("hw.acquisition.outcome.calibrate_and_print", calibrate)
+    assert main(["free-hand", f"127.0.0.1:{tracked}", str(path), "--images", "5"]) == 3
+    told = capsys.readouterr()
+    assert "poses from Probe to Reference" in told.err
+    assert "image 5/5" in told.err
+    assert calibrated == [str(path)]
+    check(path, list(range(5)))
+
+
 @pytest.mark.slow
 def test_a_run_from_the_command_line_to_a_calibration(tmp_path, capsys, plus_server):
     path = tmp_path / "rec.h5"
