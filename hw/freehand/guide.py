@@ -122,7 +122,8 @@ class Guide:
         elif not self._still(np.array([before.pose, posed.pose])):
             self._stuck = posed.time
         moment.append(posed)
-        while moment[-1].time - moment[0].time > rules.hold_s * 1.2:
+        # At least two images, however seldom they come.
+        while len(moment) > 2 and moment[-1].time - moment[1].time >= rules.hold_s:
             moment.popleft()
         poses = np.array([each.pose for each in moment])
         if not self._still(poses):

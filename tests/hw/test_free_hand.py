@@ -13,7 +13,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from plus_server import COLUMNS, ROWS, SPACING_MM, TARGET_MM, holds, image_to_probe
+from plus_server import COLUMNS, ROWS, SPACING_MM, TARGET_MM, frame, holds, image_to_probe
 from scipy.spatial.transform import Rotation
 
 import jaxcal
@@ -418,6 +418,21 @@ def test_poses_between_stamps(separate):
 
 def still(pose: np.ndarray, t: float, frame: np.ndarray) -> PosedImage:
     return PosedImage(Image(t, t, 1, frame, (1.0, 1.0), "Image"), t, pose)
+
+
+@pytest.mark.parametrize("period_s", [0.05, 0.4, 0.5, 1.0])
+def test_an_image_is_taken_however_seldom_images_come(period_s):
+    rng = np.random.default_rng(0)
+    (pose, *_), (pixel, *_) = holds(3, 1)
+    guide = Guide()
+    seen = []
+    for number in range(14):
+        shaken = pose.copy()
+        shaken[:3, 3] += rng.normal(0, 0.03, 3)
+        seen.append(guide.look(still(shaken, period_s * number, frame(rng, pixel))))
+    taken = [look.taken.time for look in seen if look.taken is not None]
+    assert taken
+    assert taken[0] <= 1.0
 
 
 def test_advice_names_what_is_missing():
