@@ -416,6 +416,14 @@ def test_poses_between_stamps(separate):
         np.testing.assert_allclose(each.pose, expected, atol=2e-3)
 
 
+def test_an_image_waits_for_the_pose_of_a_negative_lag(separate):
+    """With -0.5 s no image had one: its transforms were said to have stopped coming."""
+    with UltrasoundStream("127.0.0.1", separate) as stream:
+        # The stream's stamps run six times as fast as the clock on the wall.
+        images = PosedImages(stream, lag_s=-4.0)
+        assert images.read(3.0).pose is not None
+
+
 def still(pose: np.ndarray, t: float, frame: np.ndarray) -> PosedImage:
     return PosedImage(Image(t, t, 1, frame, (1.0, 1.0), "Image"), t, pose)
 
