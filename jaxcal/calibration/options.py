@@ -349,8 +349,7 @@ def check_shapes(problem: Problem) -> None:
     """Refuse arrays that do not go together, as ``dataclasses.replace`` may leave a problem.
 
     Raises:
-        InputError: what is no array of real numbers, or has another shape than the mask asks for;
-            a concrete mask of other numbers than 0 and 1.
+        InputError: what is no array of real numbers, or has another shape than the mask asks for.
     """
     shape = tuple(np.shape(problem.mask))
     batch = shape[:-1]
@@ -376,23 +375,21 @@ def check_shapes(problem: Problem) -> None:
             raise InputError(
                 f"{name} of the problem must have shape {wanted}, not {np.shape(value)}"
             )
-    if is_traced(problem.mask):
-        return
-    mask = np.asarray(problem.mask)
-    if not ((mask == 0) | (mask == 1)).all():
-        raise InputError("mask of the problem must hold 1 (used) or 0 (left out) for every image")
 
 
 def check_values(problem: Problem) -> None:
     """Refuse NaN, Inf and too few images, if the values are concrete.
 
     Raises:
-        InputError: NaN or Inf, with the number of the image, too few images, or pixels without a
-            size.
+        InputError: a mask of other numbers than 0 and 1, NaN or Inf, with the number of the image,
+            too few images, or pixels without a size.
     """
     if is_traced(problem):
         return
-    used = np.asarray(problem.mask) > 0
+    mask = np.asarray(problem.mask)
+    if not np.isin(mask, (0, 1)).all():
+        raise InputError("mask of the problem must hold 1 (used) or 0 (left out) for every image")
+    used = mask > 0
     if used.sum() < MINIMUM_IMAGES:
         raise InputError(
             f"{int(used.sum())} used images are too few: at least {MINIMUM_IMAGES} are needed"
